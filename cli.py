@@ -334,6 +334,10 @@ def make_a_site(
     surveys: Annotated[list[Path], _place(help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK.")],
     out: OutFolder,
     balises: Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")] = None,
+    direction: Annotated[
+        Literal["both", "ahead", "back"],
+        Option(help="Of balises `every` so far: valid for trains away from the survey's start, back to it, or both."),
+    ] = "both",
     epsg: Annotated[int | None, Option(help="Of x and y in tables that do not say.")] = None,
     join: Annotated[
         float | None, Option(help="Ends of lines within so many metres meet (`survey.same_place_m`).")
@@ -349,8 +353,9 @@ def make_a_site(
     from pipeline.results.inspection import findings_table
     from pipeline.site.describe import elements_table
     from pipeline.survey.make import make_site, wish_of, write_made
+    from schemas.enums import TravelAlong
 
-    wish = wish_of(surveys, balises, epsg, join, flat)
+    wish = wish_of(surveys, balises, epsg, join, flat, TravelAlong(direction))
     site = make_site(wish, _vehicle(vehicle), _configuration(config))
     write_made(site, site_page(out.resolve().name, site), out, force)
     elements, findings = elements_table(site), findings_table(site.findings)

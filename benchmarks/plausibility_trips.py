@@ -136,6 +136,7 @@ class _Line:
             "location_accuracy_m": [5.0] * len(names),
             "linked": [True] * len(names),
             "link_reaction": ["service_brake"] * len(names),
+            "direction": ["both"] * len(names),
         }
         links = Links.create_empty()
         return Site(

@@ -197,6 +197,7 @@ def _site(length_m: float) -> Site:
             "location_accuracy_m": 12.0,
             "linked": True,
             "link_reaction": "service_brake",
+            "direction": "both",
         }
     )
     return Site(_stream(track, Track), Links.create_empty(), _stream(balises, Balises))

@@ -129,8 +129,8 @@ def balises_table(spec: LineSpec) -> pl.DataFrame:
     rows = []
     for balise in spec.balises:
         element, measure_m = element_at(spec, balise.at_m)
-        settings = (balise.kind.value, balise.location_accuracy_m, balise.linked, balise.link_reaction.value)
-        rows.append((balise.id, element, measure_m, *settings))
+        linking = (balise.location_accuracy_m, balise.linked, balise.link_reaction.value)
+        rows.append((balise.id, element, measure_m, balise.kind.value, *linking, balise.direction.value))
     return Balises.validate(pl.DataFrame(rows, schema=Balises.column_names(), orient="row"), cast=True)
 
 

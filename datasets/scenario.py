@@ -21,7 +21,7 @@ from schemas.config import (
     read_toml,
     settings_from,
 )
-from schemas.enums import BaliseKind, Fix, Reaction
+from schemas.enums import BaliseDirection, BaliseKind, Fix, Reaction
 
 Constellation = Literal["gps", "galileo"]
 LogKind = Literal["parquet", "json", "protobuf", "cdr"]
@@ -67,6 +67,7 @@ class BaliseSpec(Settings):
     location_accuracy_m: Annotated[float, Field(ge=0, le=63)] = 12.0
     linked: bool = True
     link_reaction: Reaction = Reaction.SERVICE_BRAKE
+    direction: BaliseDirection = BaliseDirection.BOTH
 
 
 class SurveySpec(Settings):

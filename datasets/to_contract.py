@@ -12,7 +12,7 @@ from dataframely import Schema
 
 from pipeline.ingest.breaches import refuse
 from pipeline.ingest.conform import conform
-from schemas.enums import BaliseKind, Reaction
+from schemas.enums import BaliseDirection, BaliseKind, Reaction
 from schemas.errors import InputError
 from schemas.inputs import Balises
 from schemas.run import Stream
@@ -37,6 +37,7 @@ def virtual_balises(places: Sequence[tuple[str, float]]) -> pl.DataFrame:
         location_accuracy_m=12.0,
         linked=True,
         link_reaction=Reaction.SERVICE_BRAKE.value,
+        direction=BaliseDirection.BOTH.value,
     )
 
 

@@ -28,7 +28,7 @@ from pipeline.undetected.columns import Diagnosis, undetected_of
 from pipeline.undetected.watched import fixes_ns
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
-from schemas.enums import VehicleFigures
+from schemas.enums import NotEvaluated, VehicleFigures
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES
@@ -246,6 +246,8 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,
         notes=notes,
+        misfits=[cause.code for check in fit.misfits for cause in check.causes],
+        faults_injected=context.run.faults is not None and context.run.faults.height > 0,
         spacing=ride.spacing,
         unproving=len(fit.unproving) + counts.contradicting,
     )
@@ -256,7 +258,7 @@ def _single_monitors(
 ) -> dict[str, pl.DataFrame]:
     other = context.config.monitors.channel_reference
     ranges = context.ranges(solution)
-    absent = NO_OTHER_SOLUTION if other in (None, solution) else f"the run has no solution {other!r} to compare with"
+    absent = NO_OTHER_SOLUTION if other in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
     return {
         "along_doppler": doppler_monitor(aligned, context.config),
         "channel": channel_monitor(aligned, compared, context.config, absent),

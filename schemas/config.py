@@ -223,15 +223,16 @@ class MatchingConfig(Settings):
     # Positions off every track are compared with tracks within so many times the reach: one that drifts away slowly
     # still shows by its movement which way the train turned.
     far_reach_factor: Annotated[Number, Field(ge=1)] = 3.0
-    # An element ends where its track goes on; farther past that end, by metres or sigmas, a position is none of it.
-    beyond_end_m: NonNegative = 15.0
-    beyond_end_sigmas: NonNegative = 4.0
     # A position is on the track within so many standard deviations of position, survey and bias together.
     on_track_sigmas: Positive = 3.0
     # The bias in that. Not `cross_bias_sigma_m`: an exact reference 0.3 m off the axis is on the track.
     on_track_bias_m: NonNegative = 1.5
     # DIAG, error models: track survey 1 m.
     survey_sigma_default_m: Positive = 1.0
+    # DOMAIN section 2: the distance of two tracks tells nothing by changing within so many sigmas of its mean, which is
+    # that over so much of the way.
+    survey_sigmas: Positive = 3.0
+    survey_mean_m: Positive = 3000.0
     # Of one run, the same on every element: antenna beside the middle of the vehicle, datum (DOMAIN section 2).
     cross_bias_sigma_m: Positive = 1.5
     # Part of the variance that outlasts minutes: ionosphere, troposphere, orbit and clock (DIAG Table 1 at 45°).
@@ -241,9 +242,6 @@ class MatchingConfig(Settings):
     table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
     # DOMAIN section 2: a probability of 0.99 has to be right in 99 of 100 runs.
     ambiguity_probability: Probability = 0.99
-    # So many net elements before and after the one in question are the same way, not another: positions about a link
-    # lie on either side of it, and elements may be shorter than positions scatter.
-    same_way_elements: Annotated[int, Field(ge=0)] = 2
     # Where tracks part or cross they are beside each other for less: that is told of no site.
     parallel_least_m: NonNegative = 100.0
     # Noise of 0.35 m/s across the track at the slowest speed that counts.
@@ -268,22 +266,14 @@ class MatchingConfig(Settings):
     orientation_distance_m: Positive = 20.0
     # The rest of a position's error: DIAG Table 1, user.
     noise_tau_s: Positive = 100.0
-    # A survey error is constant in place, not white (DOMAIN section 3); the length is ours.
-    survey_correlation_m: Positive = 1000.0
     # A position carried on without satellites drifts aside by this share of the way (a heading wrong by 6 degrees).
     estimated_drift: NonNegative = 0.1
     # Reflections follow no error model: one of them must not decide the track.
-    outlier_probability: Probability = 1e-4
+    outlier_sigmas: Positive = 4.0
     outlier_scale_m: Positive = 10.0
-    # An error returns towards the bias, as Gauss-Markov errors do; one farther outside its sigma follows no such law,
-    # so that the return from so many sigmas is all that is expected of it.
-    return_sigmas: Positive = 3.0
     # Positions closer together give the same information on the path.
     step_distance_m: Positive = 10.0
     step_time_s: Positive = 10.0
-    # Farther than this from any link steps are so many times longer: a later one shows as much.
-    clear_of_links_m: NonNegative = 100.0
-    clear_step_factor: Annotated[Number, Field(ge=1)] = 4.0
     # Over a longer step the train may have passed a whole element unseen, and come to another of the same candidates.
     long_step_m: NonNegative = 60.0
     # Ways between two steps are looked for up to this share and margin longer than the distance: longer ones are worse
@@ -296,9 +286,8 @@ class MatchingConfig(Settings):
     offset_floor_m: Positive = 0.02
     table_floor_m: Positive = 0.1
     # Off an element by what no error explains costs by the time, or a run elsewhere for a minute, which is paid for
-    # twice, would be put on a track far aside. A lost position drifts by this share of its distance to the nearest.
+    # twice, would be put on a track far aside.
     off_track_s: Positive = 8.0
-    off_track_wander: NonNegative = 0.03
     # An impossible jump is not used to find the track; after half a minute the odometer may be the wrong one.
     jump_hold_s: Positive = 30.0
     # Farther than the odometer (or without one speed and its change; no train brakes or turns by 5 m/s²) by this share,
@@ -337,6 +326,11 @@ class AlignConfig(Settings):
     # is an emergency brake.
     straight_s: Positive = 1.5
     braking_mps2: Positive = 1.8
+    # An odometer with a larger sigma says itself that it slips: three of these are the 2 km/h to which SUBSET-041
+    # 5.3.1.2 holds it at low speed.
+    slip_sigma_mps: Positive = 0.185
+    # By what share of the way a wheel that slips or slides may miscount: anti-slip control keeps it below, ours.
+    slip_way_share: Probability = 0.1
     # Smaller steps of a counter do not count: they scatter less than the white noise of one second.
     counter_step_m: Positive = 0.05
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
@@ -661,6 +655,15 @@ class SafetyConfig(Settings):
         return self.thr_vb_per_h / rate * 3600.0
 
 
+class AdviceConfig(Settings):
+    """From which loss on `runs.remedies` names a cure (DOMAIN section 5.4)."""
+
+    # A healthy run loses some time at its start. Ours.
+    low_availability: Probability = 0.9
+    # Of the moving time; a smaller loss is not worth a cure of its own. Ours.
+    lost_share: Probability = 0.02
+
+
 class Configuration(Settings):
     """The whole of a replay's configuration."""
 
@@ -677,6 +680,7 @@ class Configuration(Settings):
     site: SiteConfig = SiteConfig()
     survey: SurveyConfig = SurveyConfig()
     calibration: CalibrationConfig = CalibrationConfig()
+    advice: AdviceConfig = AdviceConfig()
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:

@@ -27,6 +27,22 @@ class BaliseKind(StrEnum):
     PHYSICAL = "physical"
 
 
+class BaliseDirection(StrEnum):
+    """In which direction along its net element a virtual balise is valid; AB is growing measure."""
+
+    AB = "AB"
+    BA = "BA"
+    BOTH = "both"
+
+
+class TravelAlong(StrEnum):
+    """For which travel balises are placed: away from the start of the survey or of a way, back to it, or both."""
+
+    BOTH = "both"
+    AHEAD = "ahead"
+    BACK = "back"
+
+
 class AreaType(StrEnum):
     """Types of area of 22E126: traffic on a main line, on a dense line, in a node, and precise positioning."""
 
@@ -132,6 +148,107 @@ class LostTo(StrEnum):
     RELINK = "relink"
 
 
+class MisfitCause(StrEnum):
+    """Why streams of a run do not fit each other; the words are in `schemas/words.py`."""
+
+    UNIT = "unit"
+    WHEEL = "wheel"
+    PULSES = "pulses"
+    SCALE_OF_FILE = "scale_of_file"
+    LATENCY_OF_FILE = "latency_of_file"
+    IMPOSSIBLE_SCALE = "impossible_scale"
+    COUNTS_BACKWARDS = "counts_backwards"
+    SPEED_WITHOUT_SIGN = "speed_without_sign"
+    COUNTER_WITHOUT_SIGN = "counter_without_sign"
+    SIGN_OF_SOMETHING_ELSE = "sign_of_something_else"
+    OFFSET_OF_REFERENCE = "offset_of_reference"
+    WHOLE_SECONDS = "whole_seconds"
+    DATUM = "datum"
+    DATUM_LIKELY = "datum_likely"
+    MAP_SHIFT = "map_shift"
+    MAP_SHIFT_BY_REFERENCE = "map_shift_by_reference"
+    HEIGHT_UNIT = "height_unit"
+    HEIGHT_ZERO = "height_zero"
+    HEIGHT_UNKNOWN = "height_unknown"
+    COPY = "copy"
+    OTHER_PLACE = "other_place"
+    VELOCITY_EXCHANGED = "velocity_exchanged"
+    VELOCITY_SIGN = "velocity_sign"
+    VELOCITY_FRAME = "velocity_frame"
+    VELOCITY_DOWN = "velocity_down"
+    GPS_AS_UTC = "gps_as_utc"
+    TAI_AS_GPS = "tai_as_gps"
+    TAI_AS_UTC = "tai_as_utc"
+    TIME_ZONE = "time_zone"
+    GPS_WEEK = "gps_week"
+    WRONG_WEEK = "wrong_week"
+    WRONG_DAY = "wrong_day"
+    DAY_AND_MONTH = "day_and_month"
+    CONSTANT_LAG = "constant_lag"
+    LATENCY = "latency"
+    STAMPED_LATE = "stamped_late"
+    STAMPED_EARLY = "stamped_early"
+    AXES_EXCHANGED = "axes_exchanged"
+    LONGITUDE_SIGN = "longitude_sign"
+    LATITUDE_SIGN = "latitude_sign"
+    BOTH_SIGNS = "both_signs"
+    RADIANS = "radians"
+    MINUTES = "minutes"
+
+
+class MisfitPlace(StrEnum):
+    """Where the cause of a misfit lies, as far as that is known."""
+
+    IN_STREAM = "in_stream"
+    RATHER_IN_STREAM = "rather_in_stream"
+    IN_SURVEY = "in_survey"
+    IN_REFERENCE = "in_reference"
+    OR_VELOCITY = "or_velocity"
+
+
+class Note(StrEnum):
+    """What the notes of a run say; their words are in `schemas/words.py`."""
+
+    CORRECTED = "corrected"
+    CHUNKS_WITHOUT_CRC = "chunks_without_crc"
+    FILES_WITHOUT_CRC = "files_without_crc"
+    TOPICS_NOT_USED = "topics_not_used"
+    MISFIT = "misfit"
+    MISFIT_MENDED = "misfit_mended"
+    FAULTS_INJECTED = "faults_injected"
+    BALISES_OFF = "balises_off"
+    FAR_OFF = "far_off"
+    PLACEHOLDERS = "placeholders"
+    CONTRADICTING = "contradicting"
+    ODOMETER_ENDS_FIRST = "odometer_ends_first"
+    ODOMETER_BEGINS_LATE = "odometer_begins_late"
+    GNSS_ENDS_FIRST = "gnss_ends_first"
+    GNSS_BEGINS_LATE = "gnss_begins_late"
+    ODOMETER_LEAPS = "odometer_leaps"
+    ODOMETER_SLOW = "odometer_slow"
+    ODOMETER_REVERSED = "odometer_reversed"
+    COVARIANCE = "covariance"
+    AMBIGUOUS = "ambiguous"
+    UNLINKED = "unlinked"
+    UNKNOWN_TELEGRAMS = "unknown_telegrams"
+    ROWS_SCATTER = "rows_scatter"
+    ROWS_SCATTER_TOO_MUCH = "rows_scatter_too_much"
+    DIGITS = "digits"
+    READS_DISPUTED = "reads_disputed"
+    READS_UNREACHABLE = "reads_unreachable"
+    NO_EVIDENCE = "no_evidence"
+    EVIDENCE_BALISE = "evidence_balise"
+    EVIDENCE_ODOMETER = "evidence_odometer"
+    UNKNOWN_SHARE = "unknown_share"
+    ODOMETER_CONTRADICTED = "odometer_contradicted"
+    LEARNED = "learned"
+    UNDIAGNOSED = "undiagnosed"
+    MOVING_UNKNOWN = "moving_unknown"
+    AVAILABLE = "available"
+    OFF_TRACK = "off_track"
+    REMEDY = "remedy"
+
+
 class VehicleFigures(StrEnum):
     """Where scale and latency come from: the vehicle file, the run itself, or nowhere (no odometer)."""
 
@@ -202,6 +319,50 @@ class MonitorState(StrEnum):
     PASS = "pass"
     FAIL = "fail"
     NOT_EVALUATED = "not_evaluated"
+
+
+class NotEvaluated(StrEnum):
+    """Why a monitor is not evaluated at an epoch: the values of `M_reason` in `epochs`."""
+
+    DISABLED = "disabled by configuration"
+    NO_ODOMETER = "no odometer"
+    BEYOND_SPAN = "outside the odometer's time span"
+    INTERRUPTED = "odometer interrupted or slipping"
+    NOISE_UNKNOWN = "noise not yet known"
+    NOISE_TOO_LARGE = "noise too large"
+    NO_POSITION = "no position"
+    OFF_TRACK = "off track"
+    NO_SIGMA = "no standard deviation of the position"
+    NO_HEIGHT = "no height in the position or the survey"
+    NO_VELOCITY = "no GNSS velocity"
+    NO_VALUE = "nothing to compute it from"
+    FIRST_EPOCH = "first epoch after a restart"
+    NO_EPOCH_BEFORE = "no epoch before"
+    AMBIGUOUS_OR_OFF = "match ambiguous or off track"
+    AMBIGUOUS = "the track is ambiguous"
+    NO_RANGES = "no satellites stream"
+    NO_RANGES_AT_EPOCH = "no satellite residuals at this epoch"
+    TOO_FEW_RANGES = "too few satellites to test the ranges"
+    NO_OTHER_SOLUTION = "no other solution configured to compare with"
+    OTHER_NOT_RECORDED = "the run does not hold the solution to compare with"
+    NO_OTHER_EPOCH = "the other solution has no position at this epoch"
+    NEVER_VALIDATED = "no balise or validated position to measure from"
+    DISTANCE_LOST = "odometer distance lost since the last validated position"
+    RELINK_OFF = "no re-link: switched off"
+    RELINK_NO_ANCHOR = "no re-link: no validated position or telegram before"
+    RELINK_DISTANCE_LOST = "no re-link: the odometer lost its distance since the anchor"
+    RELINK_SLIPPED = "no re-link: the odometer slipped too far since the anchor"
+    RELINK_NO_VEHICLE = "no re-link: without scale and its sigma in a vehicle file only at a telegram"
+
+
+NO_RELINK = (
+    NotEvaluated.RELINK_OFF,
+    NotEvaluated.RELINK_NO_ANCHOR,
+    NotEvaluated.RELINK_DISTANCE_LOST,
+    NotEvaluated.RELINK_SLIPPED,
+    NotEvaluated.RELINK_NO_VEHICLE,
+)
+"""Why a position could not be re-linked after an outage, and was not used."""
 
 
 class LdsMode(StrEnum):

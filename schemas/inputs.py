@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataframely as dy
 
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import AreaType, BaliseKind, Fix, Navigability, Reaction
+from schemas.enums import AreaType, BaliseDirection, BaliseKind, Fix, Navigability, Reaction
 from schemas.run import Stream
 
 
@@ -121,6 +121,7 @@ class Balises(dy.Schema):
     location_accuracy_m = real("m", "location accuracy Q (SUBSET-026 3.6.4.1)", nullable=False, min=0, max=63)
     linked = flag("announced by linking information")
     link_reaction = one_of(Reaction, "reaction on a linking error")
+    direction = one_of(BaliseDirection, "in which direction along its net element a virtual balise is valid")
 
 
 class Route(dy.Schema):

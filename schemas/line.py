@@ -10,6 +10,7 @@ from pydantic import Field
 
 from schemas.columns import count, flag, one_of, real, text
 from schemas.config import NonNegative, Positive, Probability, Settings
+from schemas.enums import BaliseDirection
 
 
 class LineCriteria(Settings):
@@ -160,6 +161,7 @@ class LineBalises(dy.Schema):
     netelement_id = text("net element")
     measure_m = real("m", "measure", nullable=False)
     kind = text("virtual, or physical where no piece is suitable")
+    direction = one_of(BaliseDirection, "in which direction along its net element it is valid")
     why = text("of a physical one: class and cause of the piece, per direction of travel over its net element")
     near = text("station or signal that it serves; empty where none")
     distance_m = real("m", "way from the balise before; null for the first", min=0)

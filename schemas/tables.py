@@ -18,9 +18,12 @@ from schemas.enums import (
     LdsMode,
     LdsState,
     LinkingError,
+    LostTo,
+    MisfitCause,
     MonitorState,
     PassageStatus,
     Reaction,
+    Remedy,
     RunStatus,
     RunVerdict,
     SigmaSource,
@@ -117,6 +120,7 @@ class Passages(dy.Schema):
     failure_mode = one_of(FailureMode, "ETCS failure mode")
     cause = one_of(Cause, "wrong position or no position")
     suspect_after_the_fact = flag("accepted between a fault's onset and its detection")
+    initialising = flag("accepted before any VB or TVB was validated: the most demanding case (TVB section 5)")
     hazard_id = dy.Int64(nullable=True, min=0, description="hazard that this passage belongs to")
     judgement = one_of(Judgement, "what the evidence says of the offer; null where not offered", nullable=True)
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
@@ -183,6 +187,9 @@ class _EpochsAfterMonitors(dy.Schema):
     lds_mode = one_of(LdsMode, "mode of the location determination system")
     lds_state = one_of(
         LdsState, "state of the reactive LDS; null where it needs a truth that is missing", nullable=True
+    )
+    withheld_for = one_of(
+        LostTo, "noise, slip or relink: why the position is withheld though no monitor fails", nullable=True
     )
     tvb = flag("the epoch is a valid travelling virtual balise")
     lrvb_id = text("last relevant virtual balise", nullable=True)
@@ -321,6 +328,14 @@ class Runs(dy.Schema):
     stanford_hpl_hazardous = count("as stanford_hazardous, with the receiver's HPL", nullable=True)
     stanford_hpl_unavailable = count("as stanford_unavailable, with the receiver's HPL", nullable=True)
     ambiguous_stretches = count("stretches where a parallel path is as likely")
+    remedies = ones_of(Remedy, "what would mend verdict or availability, see DOMAIN section 5.4", nullable=True)
+    misfits = ones_of(MisfitCause, "why streams of the run do not fit each other, the impossible first", nullable=True)
+    faults_injected = flag("the log says that faults were injected: rates are those of a trial", nullable=True)
+    lost_to = ones_of(
+        LostTo, "what moving time without a valid TVB was lost to, the largest share first", nullable=True
+    )
+    lost_to_share = reals("1", "share of the moving time lost to each of these", nullable=True)
+    lost_to_monitor = text("monitor that failed in most of the time lost to alarms", nullable=True)
     notes = text("remarks on the run: data left out, weak evidence, causes of low availability", nullable=True)
     failures = count("faults with time judged wrong in use, whether they hit a VB or not")
     failures_within_budget = count("of these in time: within the allowed T_D of the configured level")

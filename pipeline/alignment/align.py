@@ -13,9 +13,10 @@ from pipeline.odometry.driven import hysteresis_m, with_hysteresis
 from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
+from schemas.enums import NotEvaluated
 
-BEYOND_SPAN = "outside the odometer's time span"
-INTERRUPTED = "odometer interrupted or slipping"
+BEYOND_SPAN = NotEvaluated.BEYOND_SPAN
+INTERRUPTED = NotEvaluated.INTERRUPTED
 _OF_ODOMETER = (
     *("along_m", "odometer_m", "travelled_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m"),
     *("odometer_period_s", "odometer_scale", "scale_sigma"),
@@ -111,6 +112,9 @@ def _columns(
         pl.Series("travelled_m", travelled, nan_to_null=True),
         reason.alias("odometer_reason"),
         pl.Series("odometer_segment", odometry.segment_at_s(at)),
+        pl.Series("odometer_slips", odometry.slips_at_s(at) & inside),
+        pl.Series("odometer_counter", odometry.counter_at_s(at)),
+        pl.Series("slip_doubt_m", odometry.slip_doubt_at_s(at)),
         pl.Series("stamp_jitter_s", np.full(known.size, jitter_s)),
         pl.Series("odometer_white_m2_per_s", np.full(known.size, odometry.noise.white_m2_per_s)),
         pl.Series("odometer_rows_m", rows_m),
@@ -144,6 +148,9 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
         **dict.fromkeys(_OF_ODOMETER, nothing),
         odometer_reason=pl.lit(NO_ODOMETER),
         odometer_segment=pl.lit(0, pl.Int64),
+        odometer_slips=pl.lit(value=False),
+        odometer_counter=pl.lit(0, pl.Int64),
+        slip_doubt_m=pl.lit(0.0),
         speed_mps=pl.Series(speed, nan_to_null=True),
         direction=_direction(speed, config.matching.deadband_mps),
         latency_s=pl.lit(latency, pl.Float64),

@@ -7,14 +7,14 @@ import numpy.typing as npt
 import polars as pl
 
 from schemas.arrays import Bools, Floats
-from schemas.enums import MonitorState
+from schemas.enums import MonitorState, NotEvaluated
 
 # Reasons that several monitors give.
-DISABLED = "disabled by configuration"
-NO_ODOMETER = "no odometer"
-NO_POSITION = "no position"
-NO_SIGMA = "no standard deviation of the position"
-NO_VALUE = "nothing to compute it from"
+DISABLED = NotEvaluated.DISABLED
+NO_ODOMETER = NotEvaluated.NO_ODOMETER
+NO_POSITION = NotEvaluated.NO_POSITION
+NO_SIGMA = NotEvaluated.NO_SIGMA
+NO_VALUE = NotEvaluated.NO_VALUE
 
 States = npt.NDArray[np.int8]
 """Numbers of states in `STATES`."""

@@ -1,19 +1,15 @@
-"""What the reader of a `runs` row should know beside its figures: sentences, and what makes each of them said."""
+"""What the reader of a `runs` row should know beside its figures: notes, and what makes each of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from datetime import UTC, datetime
 
 import polars as pl
 
-from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED
 from pipeline.epochs.clock import Clock, met
-from pipeline.epochs.verdicts import NO_ODOMETER
 from pipeline.evidence import Evidence as TrainEvidence
-from pipeline.figures.lost_time import availability_words
+from pipeline.figures.lost_time import LostTime
 from pipeline.ingest.clean import StreamCounts
-from pipeline.lds.relink import UNLINKED
 from pipeline.lds.run import LdsResult
 from pipeline.matching import Match
 from pipeline.matching.fixes import contradictory_covariances
@@ -23,30 +19,27 @@ from pipeline.plausibility.fit import Fit
 from pipeline.site.checks import BALISE_PLACE
 from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import Configuration, Vehicle
-from schemas.enums import BaliseKind, Evidence, PassageStatus, VehicleFigures
+from schemas.enums import NO_RELINK, BaliseKind, Evidence, LostTo, Note, NotEvaluated, PassageStatus, VehicleFigures
 from schemas.run import IngestNotes, RunLog, Site
+from schemas.words import Remark, remarks
 
 # How much a note says, no figure: so many names stand in one, and a scatter of less than the positions themselves have
 # is not worth a word.
 _NAMED = 5
 _WORTH_M = 0.1
+_WITHOUT_ODOMETER = (NotEvaluated.NO_ODOMETER, NotEvaluated.BEYOND_SPAN, NotEvaluated.INTERRUPTED)
 
 
-def said(found: Mapping[str, object]) -> list[str]:
-    """The sentences of what there is, each with its figure or names in the place of `{}`."""
-    return [text.format(value) for text, value in found.items() if value]
-
-
-def ingest_notes(ingest: IngestNotes) -> list[str]:
+def ingest_notes(ingest: IngestNotes) -> list[Remark]:
     """What reading the log found out about it."""
-    remarks = said(
+    corrected = [Remark(Note.CORRECTED, (text,)) for text in ingest.corrections]
+    return corrected + remarks(
         {
-            "{} chunks without a checksum": ingest.chunks_without_crc,
-            "without checksums: {}": ", ".join(ingest.files_without_crc),
-            "topics not used: {}": ", ".join(ingest.skipped_topics),
+            Note.CHUNKS_WITHOUT_CRC: ingest.chunks_without_crc,
+            Note.FILES_WITHOUT_CRC: ", ".join(ingest.files_without_crc),
+            Note.TOPICS_NOT_USED: ", ".join(ingest.skipped_topics),
         }
     )
-    return [*ingest.corrections, *remarks]
 
 
 def ride_notes(
@@ -62,52 +55,38 @@ def ride_notes(
     fit: Fit,
     evidence: TrainEvidence,
     config: Configuration,
-) -> list[str]:
+) -> list[Remark]:
     """What went in, and what matching, alignment and the LDS made of it.
 
     `counts`, `fixes`: the GNSS of this solution; `evidence`: what is known of where the train was.
     """
     off_the_track = [item.place.removeprefix(BALISE_PLACE) for item in site.findings if item.severity == "error"]
     telegrams = sorted(set(lds.unknown_reads["balise_id"].to_list()))
-    return _misfits(fit) + said(
+    reverses = found.odometer_sign < 0 and vehicle.gnss_antenna_ahead_m
+    return _misfits(fit) + remarks(
         {
-            "faults were injected: {}": "" if run.faults is None else ", ".join(sorted(set(run.faults["kind"]))),
-            "balises off their net element, so that no run passes them (`balise inspect SITE` says why): {}": _few(
-                off_the_track
-            ),
-            "{} positions left out: their time is more than a day from the others": counts.far_off,
-            "{} positions are placeholders (0/0, a default place, or before the first fix): epochs without a fix": (
-                counts.placeholders
-            ),
-            "{} positions left out: another position with the same time lies elsewhere, and the first recorded one is "
-            "used. Record two receivers of one topic as two solutions": counts.contradicting,
+            Note.FAULTS_INJECTED: "" if run.faults is None else ", ".join(sorted(set(run.faults["kind"]))),
+            Note.BALISES_OFF: _few(off_the_track),
+            Note.FAR_OFF: counts.far_off,
+            Note.PLACEHOLDERS: counts.placeholders,
+            Note.CONTRADICTING: counts.contradicting,
             **_extents(run),
             **_of_odometer(odometry, config.align.straight_s),
-            "the odometer counts down at first, so the train reverses: the sign of gnss_antenna_ahead_m is changed": (
-                found.odometer_sign < 0 and vehicle.gnss_antenna_ahead_m
-            ),
-            "cov_en_m2 is impossible with its variances at {} epochs and is not used there": contradictory_covariances(
-                fixes
-            ),
-            "net element ambiguous: {}": _ambiguous(found),
-            "after {}": _unlinked(lds),
-            "telegrams read from balises that are not on the train's path: {}": ", ".join(telegrams),
+            Note.ODOMETER_REVERSED: reverses,
+            Note.COVARIANCE: contradictory_covariances(fixes),
+            Note.AMBIGUOUS: _ambiguous(found),
+            Note.UNLINKED: _unlinked(lds),
+            Note.UNKNOWN_TELEGRAMS: ", ".join(telegrams),
             **_scatter(aligned, config),
-            "balise reads contradict the reference {} times: the true position is unknown there. Check both clocks": (
-                evidence.disputed
-            ),
-            "no train can have come from one balise read (or end of the reference) to the next {} times: the true "
-            "position is unknown before, between and after them. Check the reads, and the links of the site": (
-                evidence.unreachable
-            ),
+            Note.READS_DISPUTED: evidence.disputed,
+            Note.READS_UNREACHABLE: evidence.unreachable,
         }
     )
 
 
-def _misfits(fit: Fit) -> list[str]:
+def _misfits(fit: Fit) -> list[Remark]:
     """What of the run does not fit, the impossible first."""
-    mended = "; `balise inspect RUN --site SITE` prints the lines that correct it"
-    return [f"does not fit: {check.sentence}{mended if check.lines else ''}" for check in fit.misfits]
+    return [Remark(Note.MISFIT_MENDED if check.lines else Note.MISFIT, (check.sentence,)) for check in fit.misfits]
 
 
 def _few(names: list[str]) -> str:
@@ -115,29 +94,27 @@ def _few(names: list[str]) -> str:
     return ", ".join(names[:_NAMED]) + more
 
 
-def _extents(run: RunLog) -> dict[str, bool]:
+def _extents(run: RunLog) -> dict[Note, object]:
     """Where GNSS and odometer do not cover the same time."""
     if run.odometer is None:
         return {}
     (gnss_begin, gnss_end), (begin, end) = (times_ns(stream)[[0, -1]].tolist() for stream in (run.gnss, run.odometer))
     return {
-        "the odometer ends before the GNSS": gnss_end - end > NS_PER_S,
-        "the odometer begins after the GNSS": begin - gnss_begin > NS_PER_S,
-        "the GNSS ends before the odometer": end - gnss_end > NS_PER_S,
-        "the GNSS begins after the odometer": gnss_begin - begin > NS_PER_S,
+        Note.ODOMETER_ENDS_FIRST: gnss_end - end > NS_PER_S,
+        Note.ODOMETER_BEGINS_LATE: begin - gnss_begin > NS_PER_S,
+        Note.GNSS_ENDS_FIRST: end - gnss_end > NS_PER_S,
+        Note.GNSS_BEGINS_LATE: gnss_begin - begin > NS_PER_S,
     }
 
 
-def _of_odometer(odometry: Odometry | None, straight_s: float) -> dict[str, object]:
+def _of_odometer(odometry: Odometry | None, straight_s: float) -> dict[Note, object]:
     """What the odometer's rows cannot tell."""
     if odometry is None:
         return {}
     first = "".join(f"{datetime.fromtimestamp(t_ns // NS_PER_S, UTC):%H:%M:%S}" for t_ns in odometry.leaps_ns[:1])
     return {
-        f"the odometer's distance jumps by more than a train can drive, {{}} times, first at {first}: its speed is "
-        "used there, and without an agreeing speed the distance is unknown": len(odometry.leaps_ns),
-        "the odometer has only one row every {:.3g} s: where the speed changes between rows, alarms along the track "
-        "may come from the odometer": odometry.period_s if odometry.period_s > straight_s else None,
+        Note.ODOMETER_LEAPS: (len(odometry.leaps_ns), first) if first else None,
+        Note.ODOMETER_SLOW: odometry.period_s if odometry.period_s > straight_s else None,
     }
 
 
@@ -151,28 +128,21 @@ def _ambiguous(found: Match) -> str:
     )
 
 
-def _unlinked(lds: LdsResult) -> str:
+def _unlinked(lds: LdsResult) -> tuple[int, str] | None:
+    """How many positions after outages could not be re-linked, and why not."""
     reasons = lds.epochs["link_distance_reason"].drop_nulls()
-    given = reasons.filter(reasons.str.starts_with(UNLINKED))
-    why = ", ".join(sorted(reason.removeprefix(UNLINKED) for reason in set(given)))
-    return f"{given.len()} outages the position could not be re-linked and was not used: {why}" if why else ""
+    given = reasons.filter(reasons.is_in([reason.value for reason in NO_RELINK]))
+    return (given.len(), ", ".join(sorted(set(given)))) if given.len() else None
 
 
-def _scatter(aligned: pl.DataFrame, config: Configuration) -> dict[str, object]:
+def _scatter(aligned: pl.DataFrame, config: Configuration) -> dict[Note, object]:
     """What the recorder's digits and the odometer's rows add to the thresholds, where that is much."""
     most_m, digits = most_scatter_m(config), pl.max_horizontal(pl.col(r"^digits_(along|cross|up)_m$").max())
     rows_m, digits_m = aligned.select(pl.max("odometer_rows_m").fill_null(0.0), digits.fill_null(0.0)).row(0)
-    coarse = "(coarse counter, or times stamped on receipt)"
     return {
-        f"the odometer's rows scatter by {{:.2f}} m {coarse}: the thresholds along the track allow for it": (
-            rows_m if _WORTH_M < rows_m < most_m else None
-        ),
-        f"the odometer's rows scatter by more than {{:.1f}} m {coarse}: thresholds wide enough for that would miss "
-        "failures, so alarms along the track may come from the odometer": (
-            most_m if rows_m > _WORTH_M and rows_m >= most_m else None
-        ),
-        "positions are rounded so much that they scatter by {:.2f} m (few decimals, or single precision): the "
-        "thresholds allow for it": digits_m if digits_m > _WORTH_M else None,
+        Note.ROWS_SCATTER: rows_m if _WORTH_M < rows_m < most_m else None,
+        Note.ROWS_SCATTER_TOO_MUCH: most_m if rows_m > _WORTH_M and rows_m >= most_m else None,
+        Note.DIGITS: digits_m if digits_m > _WORTH_M else None,
     }
 
 
@@ -182,31 +152,22 @@ def judged_notes(
     vehicle: VehicleFigures,
     odometer_contradicted: int,
     config: Configuration,
-) -> list[str]:
-    """What stands behind the judgements of one solution, and what would prove more (DOMAIN sections 5.1 and 5.4)."""
-    # On one side of an anchor the odometer's confidence reaches the failure limit there (SUBSET-041 5.3.1.1).
-    end_m = (config.hazards.failure_limit_m - config.lds.odometer_fixed_m) / config.lds.odometer_share
+) -> list[Remark]:
+    """What stands behind the judgements of one solution (DOMAIN sections 5.1 and 5.4)."""
     unknown = share_unknown is not None and share_unknown > config.hazards.unknown_share_limit
-    return said(
+    return remarks(
         {
-            "no evidence: no stream can show whether a position was right or wrong": evidence is None,
-            "evidence balise: the true position comes from balise reads, and from the odometer between them. Slip, "
-            "slide and scale errors that cancel each other between two reads are not seen, and after the last read the "
-            "odometer is trusted to 5 m + 5 %": evidence is Evidence.BALISE,
-            "evidence odometer: the distance from the last accepted balise can show that a position was wrong, never "
-            "that it was right": evidence is Evidence.ODOMETER,
-            "{:.1%} of the moving time in use could not be judged: to judge more, record a reference, or balise reads "
-            f"every 2 km and within {end_m:.0f} m of both ends of the run, and give the odometer's scale in the "
-            "vehicle file": share_unknown if unknown else None,
-            "the odometer's distance does not fit {} gaps between known places: odometer or vehicle file is wrong "
-            "there": odometer_contradicted,
-            "no odometer scale in a vehicle file: scale and latency are learned in the run and widen the thresholds, "
-            "so that a drift at its beginning may not be seen": vehicle is VehicleFigures.LEARNED,
+            Note.NO_EVIDENCE: evidence is None,
+            Note.EVIDENCE_BALISE: evidence is Evidence.BALISE,
+            Note.EVIDENCE_ODOMETER: evidence is Evidence.ODOMETER,
+            Note.UNKNOWN_SHARE: share_unknown if unknown else None,
+            Note.ODOMETER_CONTRADICTED: odometer_contradicted,
+            Note.LEARNED: vehicle is VehicleFigures.LEARNED,
         }
     )
 
 
-def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> list[str]:
+def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> list[Remark]:
     """Virtual balises that were accepted while no odometer could contradict the position.
 
     `epochs`: monitored, in order of time; `passages`: of the same solution.
@@ -216,25 +177,23 @@ def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> list[str]
     reasons = offers.join_asof(
         epochs.select("t", "along_raw_reason"), left_on="t_offered", right_on="t", strategy="forward"
     )["along_raw_reason"]
-    return said(
-        {
-            f"{{}} virtual balises accepted without a monitor along the track ({reason}): a jump or drift along it is "
-            "not seen there": (reasons == reason).sum()
-            for reason in (NO_ODOMETER, BEYOND_SPAN, INTERRUPTED)
-        }
-    )
+    counts = {reason: (reasons == reason.value).sum() for reason in _WITHOUT_ODOMETER}
+    return [Remark(Note.UNDIAGNOSED, (count, reason.value)) for reason, count in counts.items() if count]
 
 
-def time_notes(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> list[str]:
+def time_notes(epochs: pl.DataFrame, clock: Clock, lost: LostTime, config: Configuration) -> list[Remark]:
     """For how long nobody knows whether the train moved, and what the moving time without a valid TVB was lost to.
 
     `epochs`: monitored and judged, in order of time.
     """
-    untold_s = float(clock.held_s[met(epochs, pl.col("moving").is_null())].sum())
-    return said(
+    unknown_s = float(clock.held_s[met(epochs, pl.col("moving").is_null())].sum())
+    low = lost.share is not None and 1.0 - lost.share < config.advice.low_availability
+    aside = lost.causes.get(LostTo.NO_POSITION, 0.0) >= config.advice.lost_share
+    aside_m = epochs.filter(~pl.col("on_track"))["cross_track_m"].abs().median()
+    return remarks(
         {
-            "for {:.0f} s it is not known whether the train moved: availability counts this time as moving without a "
-            "TVB": untold_s if round(untold_s) > 0 else None,
-            "available for {}": availability_words(epochs, clock, config),
+            Note.MOVING_UNKNOWN: unknown_s if round(unknown_s) > 0 else None,
+            Note.AVAILABLE: (1.0 - lost.share, lost.words) if low and lost.share is not None else None,
+            Note.OFF_TRACK: aside_m if low and aside else None,
         }
     )

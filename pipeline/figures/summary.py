@@ -10,7 +10,9 @@ import polars as pl
 
 from pipeline.epochs.clock import Clock
 from pipeline.figures import run_figures as figures
+from pipeline.figures.lost_time import LostTime, lost_time
 from pipeline.figures.notes import ingest_notes, judged_notes, time_notes, undiagnosed_notes
+from pipeline.figures.remedies import remedies, unknown_parts
 from pipeline.figures.undetected import Spacing, undetected_figures
 from pipeline.figures.verdict import verdict_of
 from pipeline.ingest.clean import StreamCounts
@@ -18,9 +20,10 @@ from pipeline.judge.judge import Judged
 from pipeline.results.provenance import Provenance
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import RunStatus, RunVerdict, VehicleFigures
+from schemas.enums import MisfitCause, Note, Remedy, RunStatus, RunVerdict, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
+from schemas.words import Remark, notes_text, remedy_words
 
 Row = dict[str, object]
 
@@ -43,7 +46,9 @@ class SolutionResults:
     counts: StreamCounts = field(default_factory=StreamCounts)
     ingest: IngestNotes = field(default_factory=IngestNotes)
     ambiguous_stretches: int = 0
-    notes: Sequence[str] = ()
+    notes: Sequence[Remark] = ()
+    faults_injected: bool = False
+    misfits: Sequence[MisfitCause] = ()
     spacing: Spacing | None = None
     unproving: int = 0
 
@@ -52,9 +57,11 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     """One row of the `runs` table (CONTRACT section 3)."""
     epochs, clock, judged = results.epochs, Clock.of(results.epochs, config), results.judged
     unknown = figures.share_unknown(epochs, judged.used_s)
+    lost = lost_time(epochs, judged.alarms, clock, config)
     row = (
         _identity(results)
-        | {"share_unknown": unknown, "notes": _notes(results, unknown, clock, config)}
+        | {"share_unknown": unknown}
+        | lost.columns()
         | _extent(epochs, clock, judged.distance_m)
         | figures.positions(epochs, clock, config)
         | figures.accuracy(epochs)
@@ -73,7 +80,10 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     verdict = verdict_of(row, config.hazards.unknown_share_limit)
     if results.unproving and verdict is RunVerdict.SAFE:
         verdict = RunVerdict.UNPROVEN
-    return _frame(row | {"verdict": verdict})
+    row |= {"verdict": verdict}
+    stated = epochs["survey_sigma_m"].is_not_null().any()
+    cures = remedies(row, lost, unknown_parts(epochs, config), stated, config)
+    return _frame(row | {"remedies": cures, "notes": _notes(results, unknown, lost, cures, clock, config)})
 
 
 def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.DataFrame:
@@ -107,22 +117,32 @@ def _identity(results: SolutionResults) -> Row:
         "out_of_order": results.counts.out_of_order,
         "evidence": results.judged.evidence,
         "vehicle": results.vehicle,
+        "faults_injected": results.faults_injected,
+        "misfits": list(results.misfits),
         "odometer_contradicted": results.odometer_contradicted,
         "ambiguous_stretches": results.ambiguous_stretches,
         **results.alignment,
     }
 
 
-def _notes(results: SolutionResults, unknown: float | None, clock: Clock, config: Configuration) -> str | None:
+def _notes(
+    results: SolutionResults,
+    unknown: float | None,
+    lost: LostTime,
+    cures: Sequence[Remedy],
+    clock: Clock,
+    config: Configuration,
+) -> str | None:
     """What the reader should know beside the figures."""
     found = (
         *ingest_notes(results.ingest),
         *results.notes,
         *judged_notes(results.judged.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
         *undiagnosed_notes(results.epochs, results.judged.passages),
-        *time_notes(results.epochs, clock, config),
+        *time_notes(results.epochs, clock, lost, config),
+        *(Remark(Note.REMEDY, (remedy_words(cure),)) for cure in cures),
     )
-    return "; ".join(found) or None
+    return notes_text(found)
 
 
 def _extent(epochs: pl.DataFrame, clock: Clock, distance_m: float | None) -> Row:

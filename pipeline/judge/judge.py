@@ -65,15 +65,18 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
 
 
 def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, int]]:
-    """When the train passed each balise of the path, and how the path runs over its net element."""
+    """When the train passed each balise of the path, in a direction in which it is valid; how the path runs there."""
     index, balises = bench.evidence.network.track.index, bench.solution.balises.unique("balise_id", keep="first")
-    rows = balises.select("balise_id", "netelement_id", "measure_m", "sense").rows()
-    places = {name: Place(index[element], measure) for name, element, measure, _ in rows}
-    forward = {name: sense for name, _, _, sense in rows}
+    rows = balises.select("balise_id", "netelement_id", "measure_m", "sense", "valid_direction").rows()
+    places = {name: Place(index[element], measure) for name, element, measure, _, _ in rows}
+    forward = {name: sense for name, _, _, sense, _ in rows}
+    # Along the measure, as the passings are.
+    valid = {name: direction * sense for name, _, _, sense, direction in rows}
     at_ns = _look_at(bench)
     evidence = bench.evidence.at(at_ns, bench.stood)
     hazards = bench.config.hazards
-    return train_passings(at_ns, evidence, places, hazards.known_error_m, bench.config.lds.rearm_m), forward
+    passed = train_passings(at_ns, evidence, places, hazards.known_error_m, bench.config.lds.rearm_m)
+    return {name: [one for one in found if valid[name] in (0, one.sense)] for name, found in passed.items()}, forward
 
 
 def _look_at(bench: Bench) -> Ints:

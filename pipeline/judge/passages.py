@@ -181,6 +181,7 @@ def _unoffered(balise: dict[str, object], instant: int, direction: int, seen: bo
         "status": (PassageStatus.MISSED if seen else PassageStatus.NOT_AVAILABLE).value,
         "linking_error": LinkingError.NONE.value,
         "reaction": Reaction.NONE.value,
+        "initialising": False,
         "t_reckoned": instant,
         "t_true": instant,
     }

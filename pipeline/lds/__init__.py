@@ -33,6 +33,12 @@ Where the sources leave a choice, this package reads them so:
   (`relink`, the same function): where GNSS minus odometer has moved, the linking distance monitor fails; where it
   cannot be told (no vehicle file, distance lost), it is `not_evaluated` and the position is negated without an alarm
   until a telegram.
+- Withheld positions (DOMAIN section 5.2) are refused as negated ones are (`rejected_monitor`: known noise and no failed
+  monitor are one condition of a detection), but raise no alarm; `withheld_for` says why.
+- After slip that the odometer reports, the position has to re-link (`relink`, the same function). No alarm stands
+  there, so the last TVB before the slip is the anchor, unless an alarm or a telegram fixed another. The wheel was
+  counted, if wrongly: what it may be off by (`slip_doubt_m`) and the bound of the re-link must not exceed the failure
+  limit together, or a fault could hide in the slip. Beyond that only a telegram re-links.
 - A start of mission (`lds.starts_of_mission`) forgets LRVB, linking and anchor.
 - Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
 """

@@ -21,7 +21,10 @@ from schemas.stages import Crossings
 
 @dataclass(frozen=True, slots=True)
 class Balise:
-    """One balise on one leg of the travelled path."""
+    """One balise on one leg of the travelled path.
+
+    `valid_direction`: the direction of travel along growing path in which it is valid, +1 or -1; 0 both.
+    """
 
     leg: int
     balise_id: str
@@ -32,6 +35,11 @@ class Balise:
     accuracy_m: float
     linked: bool
     reaction: Reaction
+    valid_direction: int
+
+    def is_valid(self, direction: int) -> bool:
+        """A train in this direction of travel knows of it; to any other it does not exist (DOMAIN section 4)."""
+        return self.valid_direction in (0, direction)
 
 
 @dataclass(slots=True, eq=False)
@@ -41,7 +49,7 @@ class Crossing:
     `before`, `epoch`: rows of the epochs around it. `sense`: +1 where the position passes the balise along growing
     path; `direction`: direction of travel as known at `epoch`. Time, odometer and way run are interpolated; after a
     gap they are those of `epoch`. `absence`: what to say of it in a gap, None between near epochs and of telegrams.
-    `offered`, `status`: what became of it, as in `Crossings`.
+    `offered`, `status`: what became of it, as in `Crossings`; `initialising`: accepted before anything was validated.
     """
 
     balise: Balise
@@ -56,6 +64,7 @@ class Crossing:
     absence: PassageStatus | None = None
     offered: bool = False
     status: PassageStatus | None = None
+    initialising: bool = False
 
 
 _SEVERITY = (Reaction.NONE, Reaction.SERVICE_BRAKE, Reaction.TRIP)
@@ -101,6 +110,7 @@ def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
             accuracy_m=row["location_accuracy_m"],
             linked=row["linked"],
             reaction=Reaction(row["link_reaction"]),
+            valid_direction=row["valid_direction"],
         )
         for row in rows.iter_rows(named=True)
     ]
@@ -125,7 +135,17 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing
         for step in passing.tolist():
             i, k, first, last = (int(rows[step]) for rows in (before, after, passed_before, passed_after))
             found += [_crossing(journey, balise, i, k, sense) for balise, sense in _in_order(on_leg, first, last)]
-    return sorted(found, key=lambda crossing: crossing.epoch)
+    return sorted((one for one in found if _is_valid(one, journey)), key=lambda crossing: crossing.epoch)
+
+
+def _is_valid(crossing: Crossing, journey: Journey) -> bool:
+    """Valid in the train's direction of travel, whatever that of the position's step (DOMAIN section 4).
+
+    A turn is known some metres after it (`odometer_fixed_m`): on these the train's own knowledge and the way that it
+    really goes differ, and a balise of one direction is offered in neither.
+    """
+    as_it_was = journey.direction_at(crossing.t_ns)
+    return crossing.balise.is_valid(crossing.direction) and crossing.balise.is_valid(as_it_was)
 
 
 def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tuple[Balise, int]]:
@@ -140,8 +160,8 @@ def _crossing(journey: Journey, balise: Balise, before: int, k: int, sense: int)
     t_ns, path_m, odometer_m = journey.t_ns, journey.path_m, journey.odometer_m
     if near:
         share = float((balise.path_m - path_m[before]) / (path_m[k] - path_m[before]))
+    direction = int(journey.direction[k])
     back_m = 0.0 if share == 1.0 else (1.0 - share) * float(odometer_m[k] - odometer_m[before])
-    direction = int(journey.direction[k]) if journey.has_odometer else sense
     return Crossing(
         balise=balise,
         before=before,
@@ -182,7 +202,7 @@ def _row(number: int, crossing: Crossing, journey: Journey) -> dict[str, object]
         **place,
         "kind": crossing.balise.kind.value,
         "t": crossing.t_ns,
-        "direction": journey.direction_at(crossing.t_ns, crossing.direction),
+        "direction": journey.direction_at(crossing.t_ns),
         "status": crossing.status and crossing.status.value,
     }
 

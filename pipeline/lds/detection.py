@@ -64,7 +64,7 @@ class BaliseDetection:
     def pass_virtual(self, k: int, distrusted: bool, entering: bool) -> tuple[list[Crossing], bool]:
         """Offer what the position crossed in this step: what was accepted, and is the order of identities broken?
 
-        `distrusted`: negated, or a monitor fails; `entering`: no chain has begun.
+        `distrusted`: negated, withheld, or a monitor fails; `entering`: no chain has begun.
         """
         offered: list[Crossing] = []
         for crossing in self._at[BaliseKind.VIRTUAL].get(k, ()):
@@ -112,6 +112,8 @@ class BaliseDetection:
         A step out of an ambiguous position crosses what the train did not.
         """
         if distrusted:
+            # "The noise is known and no monitor has failed" is one condition of a detection (DOMAIN section 4), so that
+            # a withheld position is refused as a negated one is; `withheld_for` of the epoch says why.
             return PassageStatus.REJECTED_MONITOR
         if self._journey.refusal[crossing.before] is PassageStatus.REJECTED_AMBIGUOUS:
             return PassageStatus.REJECTED_AMBIGUOUS

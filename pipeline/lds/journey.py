@@ -23,8 +23,9 @@ class Journey:
     count, `None` where it would. `direction`: direction of travel (+1/-1 along growing path) as known at that epoch;
     `travel`: that of the step from this epoch to the next, put back to where the train turned (for
     labels only). `travelled_m`: way run, turns included. `segment`: continuity segment of the odometer, between
-    segments its distance was lost; `scale_sigma`: of its scale, None unless a vehicle file gives both. `blind`: no
-    position for longer than a crossing is interpolated over (`gap_ns`).
+    segments its distance was lost; `scale_sigma`: of its scale, None unless a vehicle file gives both. `slips`: the
+    odometer says so itself; `counter` is `segment` but that slip does not end it, and `slip_doubt_m` by how much slip
+    may have falsified it so far. `blind`: no position for longer than a crossing is interpolated over (`gap_ns`).
     """
 
     t_ns: Ints
@@ -37,6 +38,9 @@ class Journey:
     confidence_m: Floats
     odometer_m: Floats
     segment: Ints
+    slips: Bools
+    counter: Ints
+    slip_doubt_m: Floats
     scale_sigma: float | None
     direction: Ints
     travel: Ints
@@ -69,10 +73,8 @@ class Journey:
         unplaced = self.placed_nowhere[epochs].any()
         return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
 
-    def direction_at(self, t_ns: int, otherwise: int) -> int:
-        """Direction of travel at a time, turns as they were; `otherwise` where there is no odometer."""
-        if not self.has_odometer:
-            return otherwise
+    def direction_at(self, t_ns: int) -> int:
+        """Direction of travel at a time, turns as they were."""
         return int(self.travel[max(int(np.searchsorted(self.t_ns, t_ns)) - 1, 0)])
 
 
@@ -95,6 +97,9 @@ def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configur
         confidence_m=floats(epochs, "confidence_m"),
         odometer_m=odometer_m,
         segment=epochs["odometer_segment"].to_numpy().astype(np.int64),
+        slips=flags(epochs, "odometer_slips"),
+        counter=epochs["odometer_counter"].to_numpy().astype(np.int64),
+        slip_doubt_m=floats(epochs, "slip_doubt_m"),
         scale_sigma=scale_sigma,
         direction=direction,
         travel=travel,

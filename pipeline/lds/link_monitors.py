@@ -21,15 +21,16 @@ from pipeline.lds.journey import Journey
 from pipeline.lds.relink import Anchor, Comparison
 from schemas.arrays import Bools
 from schemas.config import Configuration
+from schemas.enums import NotEvaluated
 
 # Identities are counted: half a balise lies between none and one.
 ORDER_THRESHOLD = 0.5
 _BLOCK = 4096  # epochs evaluated at once
 
-AMBIGUOUS = "match ambiguous or off track"
-FIRST_EPOCH = "no epoch before"
-NEVER = "no balise or validated position to measure from"
-LOST = "odometer distance lost since the last validated position"
+AMBIGUOUS = NotEvaluated.AMBIGUOUS_OR_OFF
+FIRST_EPOCH = NotEvaluated.NO_EPOCH_BEFORE
+NEVER = NotEvaluated.NEVER_VALIDATED
+LOST = NotEvaluated.DISTANCE_LOST
 
 
 def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:

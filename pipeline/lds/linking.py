@@ -243,7 +243,7 @@ class LinkingChain:
         self._look_ahead(beyond if self.linking else [])
 
     def _in_order_of_travel(self) -> list[Balise]:
-        on_leg = [balise for balise in self._announced if balise.leg == self._leg]
+        on_leg = [one for one in self._announced if one.leg == self._leg and one.is_valid(self._direction)]
         return on_leg if self._direction > 0 else on_leg[::-1]
 
     def _look_ahead(self, ahead: list[Balise]) -> None:

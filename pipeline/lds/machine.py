@@ -1,7 +1,8 @@
 """The location determination system as a state machine over the epochs of one solution.
 
 *Initialising*: no reference, no linking. *Linked*: reference known, position in use. *Odometry*:
-reference known, no usable position just now. *Fail-safe*: position negated.
+reference known, no usable position just now. *Fail-safe*: position negated. In any mode a position is *withheld* where
+the diagnosis itself says that it cannot stand behind it (DOMAIN section 5.2): no VB is accepted, no TVB is valid.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ from pipeline.lds.relink import Anchor, Held, Recovery, Relink, breaks
 from pipeline.monitors.bank import MonitorBank
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
-from schemas.enums import BaliseKind
+from schemas.enums import BaliseKind, LostTo
 
 
 class LocationSystem:
     """Walks once along a journey; what it found stands in its public attributes afterwards.
 
-    Per epoch: `tvb`, `alarm`, `negated`, `evaluated` (the along monitors have a verdict).
+    Per epoch: `tvb`, `alarm`, `negated`, `evaluated` (`along_raw` has a verdict), `withheld_for` (why the position is
+    not used though no monitor fails, None where it is).
     """
 
     def __init__(
@@ -40,7 +42,9 @@ class LocationSystem:
         self.distance = LinkDistance(journey, config)
         self.lrvb_changes = [LrvbChange(0, None, chain_begun=False)]
         self.accepted_at_ns: dict[int, int] = {}
-        self.tvb, self.alarm, self.negated, self.evaluated = ([False] * journey.t_ns.size for _ in range(4))
+        self.tvb, self.alarm, self.negated = ([False] * journey.t_ns.size for _ in range(3))
+        self.evaluated = [False] * journey.t_ns.size
+        self.withheld_for: list[LostTo | None] = [None] * journey.t_ns.size
         # The walk reads single elements: lists are several times faster at that than arrays.
         self._t_ns: list[int] = journey.t_ns.tolist()
         self._way_m = journey.odometer_m * journey.direction
@@ -49,6 +53,7 @@ class LocationSystem:
         self._events = sorted({*self.balises.events, *self._breaks, *self._missions, *segment_epochs(journey)})
         self._relink = Relink(journey, self.tvb, config)
         self._recovery: Recovery | None = None  # while negated
+        self._slipped = False  # since slip that the odometer reported, until re-link
         self._validated = False  # a VB or a TVB
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
         self._consistent_since_ns: int | None = None
@@ -79,12 +84,16 @@ class LocationSystem:
         """
         if self._recovery is not None or self.balises.disarmed or self._chain_from is None or k <= self._chain_from:
             return k
+        if self._withheld_for(k) is not None:
+            return k
         if self._journey.has_odometer and not self.distance.can_measure(k):
             return k
         near = bisect_left(self._events, k)
         end = self._events[near] if near < len(self._events) else len(self._t_ns)
         for monitors in (self._bank, self.distance):
             end = monitors.quiet_until(k, end) if end > k else k
+        unknown = ~self._bank.noise_known[k:end]
+        end = k + int(unknown.argmax()) if unknown.any() else end
         closing = self._way_m[k:end] > self.balises.closing_m
         return k + int(closing.argmax()) if closing.any() else end
 
@@ -102,8 +111,11 @@ class LocationSystem:
         for read in self.balises.read(k):
             self._relink.note_read(read)
         bank_failed = self._bank.failed(k)
+        self._test_after_slip(k)
         self._test_after_outage(k)
-        distrusted = bank_failed or self.distance.fails(k) or self._recovery is not None
+        self.withheld_for[k] = self._withheld_for(k)
+        withheld = self.withheld_for[k] is not None
+        distrusted = bank_failed or self.distance.fails(k) or self._recovery is not None or withheld
         accepted, disordered = self.balises.pass_virtual(k, distrusted, self._chain_from is None)
         for crossing in accepted:
             self._accept(crossing, k)
@@ -115,14 +127,38 @@ class LocationSystem:
             self._seek_return(self._recovery, k, disordered)
         elif self.alarm[k]:
             self._negate(k)
-        elif self.evaluated[k] and self._journey.usable[k]:
+        elif self.evaluated[k] and self._journey.usable[k] and not withheld:
             self._validate(k)
+
+    def _withheld_for(self, k: int) -> LostTo | None:
+        """Why the diagnosis cannot stand behind a position here, as it says itself (DOMAIN section 5.2)."""
+        if not self._bank.noise_known[k]:
+            return LostTo.NOISE
+        if self._journey.slips[k]:
+            return LostTo.SLIP
+        return LostTo.RELINK if self._slipped or self._bank.begins_at(k) else None
+
+    def _test_after_slip(self, k: int) -> None:
+        """Nothing watched the position while the odometer slipped: it has to re-link, like after an alarm."""
+        if self._journey.slips[k]:
+            self._consistent_since_ns = None
+            if self._validated and not self._slipped:
+                self._relink.note_slip(k)
+                self._slipped = True
+        elif self._slipped and self._recovery is None and self._can_return(k):
+            self._slipped = not self._relink.compare(k, slipped=True).holds
+            if not self._slipped:
+                self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+
+    def _can_return(self, k: int) -> bool:
+        return self.distance.is_possible(k) and bool(self._journey.usable[k])
 
     def _test_after_outage(self, k: int) -> None:
         """Nobody looked on over the outage: the position has to re-link, or is not used."""
         if (
             k not in self._breaks
             or self._recovery is not None
+            or self._slipped
             or not (self._validated and self.distance.is_possible(k))
         ):
             return
@@ -133,6 +169,7 @@ class LocationSystem:
 
     def _accept(self, crossing: Crossing, k: int) -> None:
         self.accepted_at_ns[k] = crossing.t_ns
+        crossing.initialising = not self._validated
         self._validated = True
         self._chain_from = k if self._chain_from is None else self._chain_from
         anchor = Anchor.at_crossing(self._journey, crossing, float(self._journey.sigma_m[k]))
@@ -174,21 +211,25 @@ class LocationSystem:
         elif self._relink.compare(k).holds:
             self._return(k)
             self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+        else:
+            self.withheld_for[k] = LostTo.RELINK
 
     def _initialise_anew(self, k: int) -> None:
         """No reference and no linking: a start of mission, or a fault before anything was validated."""
         self.balises.virtual.forget()
         self.distance.forget(k)
         self._chain_from = self._consistent_since_ns = None
-        self._validated = False
+        self._validated = self._slipped = False
         if self._recovery is not None:
             self._return(k)
         self._note_lrvb(k)
 
     def _return(self, k: int) -> None:
         self._recovery = None
+        self._slipped = False
         self.negated[k] = False
         self._bank.restart(k)
+        self.withheld_for[k] = LostTo.RELINK
         # What still rang at this epoch belonged to the fault that is over.
         self.evaluated[k] = self._bank.along_evaluated(k)
         self.alarm[k] = self._bank.failed(k)

@@ -4,7 +4,8 @@ The position returns only where GNSS minus odometer is what it was at the *ancho
 before an alarm already, so the anchor lies `anchor_lag_s` before the first alarm; alarms that follow may be about the
 same fault, so a return does not move it. A physical balise says where the train is: only a telegram renews the anchor.
 The same test decides on the first position after an outage over which the bank began anew (`breaks`), for nobody looked
-on meanwhile.
+on meanwhile, and after slip that the odometer reports. No alarm stands there, so that the last TVB is the anchor. A
+wheel that slips is counted wrongly; where that may hide a position failure, there is no re-link but at a telegram.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from pipeline.monitors.bank import MonitorBank
 from pipeline.odometry.drift import drift_m2, relink_bound_m
 from schemas.arrays import NS_PER_S
 from schemas.config import AlignConfig, Configuration, LdsConfig
-from schemas.enums import BaliseKind
+from schemas.enums import BaliseKind, NotEvaluated
 
-UNLINKED = "no re-link: "
-SWITCHED_OFF = UNLINKED + "switched off"
-NO_ANCHOR = UNLINKED + "no validated position or telegram before"
-LOST = UNLINKED + "the odometer lost its distance since the anchor"
-NO_VEHICLE = UNLINKED + "without scale and its sigma in a vehicle file only at a telegram"
+SWITCHED_OFF = NotEvaluated.RELINK_OFF
+NO_ANCHOR = NotEvaluated.RELINK_NO_ANCHOR
+LOST = NotEvaluated.RELINK_DISTANCE_LOST
+SLIPPED = NotEvaluated.RELINK_SLIPPED
+NO_VEHICLE = NotEvaluated.RELINK_NO_VEHICLE
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,23 +44,41 @@ class Anchor:
     sigma_m: float
     travelled_m: float
     segment: int
+    counter: int
+    slip_doubt_m: float
     is_read: bool = False
 
     @classmethod
     def at_epoch(cls, journey: Journey, k: int) -> Anchor:
-        offset_m = float(journey.path_m[k] - journey.odometer_m[k])
-        travelled_m, segment = float(journey.travelled_m[k]), int(journey.segment[k])
-        return cls(k, int(journey.t_ns[k]), offset_m, float(journey.sigma_m[k]), travelled_m, segment)
+        return cls(
+            epoch=k,
+            t_ns=int(journey.t_ns[k]),
+            offset_m=float(journey.path_m[k] - journey.odometer_m[k]),
+            sigma_m=float(journey.sigma_m[k]),
+            travelled_m=float(journey.travelled_m[k]),
+            segment=int(journey.segment[k]),
+            counter=int(journey.counter[k]),
+            slip_doubt_m=float(journey.slip_doubt_m[k]),
+        )
 
     @classmethod
     def at_crossing(cls, journey: Journey, crossing: Crossing, sigma_m: float) -> Anchor | None:
         """The balise's own place against the odometer; None where that is not known, or its distance was lost there."""
-        segment, is_read = int(journey.segment[crossing.epoch]), crossing.balise.kind is BaliseKind.PHYSICAL
-        whole = segment == journey.segment[crossing.before]
+        k = crossing.epoch
+        whole = journey.segment[k] == journey.segment[crossing.before]
         if crossing.odometer_m is None or not whole or not isfinite(crossing.travelled_m):
             return None
-        offset_m = crossing.balise.path_m - crossing.odometer_m
-        return cls(crossing.epoch, crossing.t_ns, offset_m, sigma_m, crossing.travelled_m, segment, is_read)
+        return cls(
+            epoch=k,
+            t_ns=crossing.t_ns,
+            offset_m=crossing.balise.path_m - crossing.odometer_m,
+            sigma_m=sigma_m,
+            travelled_m=crossing.travelled_m,
+            segment=int(journey.segment[k]),
+            counter=int(journey.counter[k]),
+            slip_doubt_m=float(journey.slip_doubt_m[k]),
+            is_read=crossing.balise.kind is BaliseKind.PHYSICAL,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +87,7 @@ class Comparison:
 
     moved_m: float = np.nan
     bound_m: float = np.nan
-    reason: str | None = None
+    reason: NotEvaluated | None = None
 
     @property
     def holds(self) -> bool:
@@ -92,28 +111,41 @@ class Relink:
         self._journey, self._tvb, self._config = journey, tvb, config
         self._factor = config.monitors.threshold_factor
         self._anchor: Anchor | None = None
+        self._before_slip: Anchor | None = None
         self._alarmed = False
         self._mission_from = 0
         self.held: list[Held] = []
 
     def begin_mission(self, k: int) -> None:
         """What was before epoch `k` does not count."""
-        self._anchor, self._alarmed, self._mission_from = None, False, k
+        self._anchor = self._before_slip = None
+        self._alarmed = False
+        self._mission_from = k
 
     def note_read(self, read: Crossing) -> None:
         """A telegram says where the train is."""
-        self._anchor = Anchor.at_crossing(self._journey, read, self._config.hazards.balise_read_sigma_m) or self._anchor
+        anchor = Anchor.at_crossing(self._journey, read, self._config.hazards.balise_read_sigma_m)
+        if anchor is not None:
+            self._anchor = self._before_slip = anchor
+
+    def note_slip(self, k: int) -> None:
+        """Nothing watches the position from epoch `k` on: it has to re-link to what was validated last before."""
+        self._before_slip = self.anchor_at(k, 0.0)
 
     def note_alarm(self, k: int) -> None:
         """The first alarm with an anchor before it fixes that; only a telegram moves it from there."""
         self._anchor = self.anchor_at(k)
         self._alarmed = self._anchor is not None
 
-    def anchor_at(self, k: int) -> Anchor | None:
-        """Before the first alarm: the last TVB `anchor_lag_s` before epoch `k`, else the first TVB, or a later read."""
+    def anchor_at(self, k: int, lag_s: float | None = None) -> Anchor | None:
+        """Before the first alarm: the last TVB `lag_s` before epoch `k`, else the first TVB, or a later read.
+
+        `lag_s`: `anchor_lag_s` unless given.
+        """
         if self._alarmed:
             return self._anchor
-        old_ns = int(self._journey.t_ns[k]) - round(self._config.lds.anchor_lag_s * NS_PER_S)
+        lag_s = self._config.lds.anchor_lag_s if lag_s is None else lag_s
+        old_ns = int(self._journey.t_ns[k]) - round(lag_s * NS_PER_S)
         tvbs = self._mission_from + np.flatnonzero(self._tvb[self._mission_from : k])
         if not tvbs.size:
             return self._anchor
@@ -121,21 +153,25 @@ class Relink:
         tvb = Anchor.at_epoch(self._journey, int(tvbs[max(last_old, 0)]))
         return tvb if self._anchor is None or tvb.t_ns > self._anchor.t_ns else self._anchor
 
-    def compare(self, k: int) -> Comparison:
-        """Hold the position at epoch `k` against the anchor."""
-        anchor = self.anchor_at(k)
+    def compare(self, k: int, *, slipped: bool = False) -> Comparison:
+        """Hold the position at epoch `k` against the anchor; `slipped`: after slip that no alarm went before."""
+        begun_before = slipped and not self._alarmed
+        anchor = self._before_slip if begun_before else self.anchor_at(k)
         if not self._config.lds.relink:
             return Comparison(reason=SWITCHED_OFF)
         if anchor is None:
             return Comparison(reason=NO_ANCHOR)
-        if anchor.segment != self._journey.segment[k]:
+        if anchor.counter != self._journey.counter[k]:
             return Comparison(reason=LOST)
         if self._journey.scale_sigma is None and not (anchor.is_read and anchor.epoch == k):
             return Comparison(reason=NO_VEHICLE)
         offset_m = float(self._journey.path_m[k] - self._journey.odometer_m[k])
         found = Comparison(offset_m - anchor.offset_m, self._bound_m(anchor, k))
+        doubt_m = float(self._journey.slip_doubt_m[k]) - anchor.slip_doubt_m
+        if found.bound_m + doubt_m > self._config.hazards.failure_limit_m:
+            return Comparison(reason=SLIPPED)
         if found.holds:
-            self.held.append(Held(k, None if anchor.is_read else anchor.epoch, found.moved_m, found.bound_m))
+            self.held.append(Held(k, None if anchor.is_read else anchor.epoch, found.moved_m, found.bound_m + doubt_m))
         return found
 
     def _bound_m(self, anchor: Anchor, k: int) -> float:

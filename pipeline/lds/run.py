@@ -22,7 +22,7 @@ from pipeline.lds.linking import LrvbChange
 from pipeline.lds.machine import LocationSystem
 from pipeline.lds.relink import Held
 from pipeline.monitors.bank import MonitorBank
-from schemas.arrays import Floats
+from schemas.arrays import Bools, Floats
 from schemas.config import Configuration, LdsConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode
@@ -57,12 +57,14 @@ def run_lds(
 ) -> LdsResult:
     """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
 
-    `withheld` of the result: nothing is in use, and no VB is accepted, because the noise is not known yet, the
-    odometer says itself that it slips, or the bank has just restarted (DOMAIN section 5.2).
+    `withheld` of the result: nothing is in use, and no VB is accepted, because of `withheld_for` (DOMAIN section 5.2):
+    the noise is not known yet, the odometer says itself that it slips, or the bank has just restarted or slip ended,
+    and a re-link is due.
 
     `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
     gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
-    where unknown)`, travelled_m, odometer_segment, direction` (+1/-1, used where there is no odometer).
+    where unknown)`, travelled_m, odometer_segment, odometer_slips, odometer_counter, slip_doubt_m, direction` (+1/-1,
+    used where there is no odometer).
     `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, `odometer_m` at the read where the run has
     an odometer. A run without that stream has no reader, so its physical balises have no passages. `scale_sigma`: of
     the odometer, None unless a vehicle file gives it with the scale.
@@ -90,9 +92,11 @@ def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config
     starts = np.array([change.epoch for change in system.lrvb_changes])
     index = np.searchsorted(starts, np.arange(journey.t_ns.size), side="right") - 1
     distance_m, doubt_m = _reported_m(system.lrvb_changes, index, journey, config)
+    withheld_for = pl.Series("withheld_for", system.withheld_for, dtype=Epochs.columns()["withheld_for"].dtype)
+    withheld = withheld_for.is_not_null().alias("withheld")
     columns = [
         t,
-        _modes(system, index, journey),
+        _modes(system, index, journey, withheld.to_numpy()),
         pl.Series("tvb", system.tvb, dtype=pl.Boolean),
         pl.Series("lrvb_id", names, dtype=pl.String).gather(index),
         pl.Series("distance_from_lrvb_m", distance_m).fill_nan(None),
@@ -100,14 +104,25 @@ def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config
         pl.Series("doubt_under_m", doubt_m).fill_nan(None),
         pl.Series("exposure_s", _exposure_s(system, journey)).fill_nan(None),
         pl.Series("negated", system.negated, dtype=pl.Boolean),
-        pl.Series("withheld", np.zeros(journey.t_ns.size, dtype=np.bool_)),
-        pl.Series("diagnosis_faulty", ~np.array(system.evaluated, dtype=bool)),
+        withheld,
+        withheld_for,
+        pl.Series("diagnosis_faulty", _diagnosis_faulty(system, journey, withheld.to_numpy())),
         pl.Series("alarm", system.alarm, dtype=pl.Boolean),
     ]
     return pl.DataFrame(columns).with_columns(*system.balises.order.columns(), *system.distance.columns())
 
 
-def _modes(system: LocationSystem, index: np.ndarray, journey: Journey) -> pl.Series:
+def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools) -> Bools:
+    """P3 (DOMAIN section 4): `along_raw` has no verdict. A position withheld for that is availability lost instead.
+
+    A run without an odometer has no diagnosis along the track at all.
+    """
+    undiagnosed = ~np.array(system.evaluated, dtype=bool)
+    faulty: Bools = undiagnosed & ~withheld if journey.has_odometer else undiagnosed
+    return faulty
+
+
+def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld: Bools) -> pl.Series:
     linked = np.array(
         [
             (change.lrvb is not None and change.lrvb.odometer_m is not None)
@@ -116,7 +131,7 @@ def _modes(system: LocationSystem, index: np.ndarray, journey: Journey) -> pl.Se
         ]
     )[index]
     modes = [mode.value for mode in LdsMode]
-    in_use = np.where(journey.usable, modes.index(LdsMode.LINKED), modes.index(LdsMode.ODOMETRY))
+    in_use = np.where(journey.usable & ~withheld, modes.index(LdsMode.LINKED), modes.index(LdsMode.ODOMETRY))
     mode = np.where(linked, in_use, modes.index(LdsMode.INITIALISING))
     mode = np.where(system.negated, modes.index(LdsMode.FAIL_SAFE), mode)
     return pl.Series("lds_mode", modes, dtype=Epochs.columns()["lds_mode"].dtype).gather(mode)
@@ -176,7 +191,7 @@ def passage_rows(
 
 def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:
     balise, window, crossing = passage.balise, passage.window, passage.crossing
-    direction = journey.direction_at(passage.t_ns, passage.direction)
+    direction = journey.direction_at(passage.t_ns)
     return {
         "solution": solution,
         "balise_id": balise.balise_id,
@@ -196,6 +211,7 @@ def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str)
         "failure_mode": FailureMode.NONE.value,
         "cause": Cause.NONE.value,
         "suspect_after_the_fact": False,
+        "initialising": crossing is not None and crossing.initialising,
         "location_accuracy_m": balise.accuracy_m,
         "crossing_id": crossing and ids[id(crossing)],
         "t_reckoned": _reckoned_ns(passage, journey),

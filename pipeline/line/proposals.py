@@ -17,7 +17,7 @@ from pipeline.track.network import Network, network_of
 from schemas.arrays import Bools, Floats, floats
 from schemas.config import LdsConfig
 from schemas.conform import conform
-from schemas.enums import BaliseKind, Reaction
+from schemas.enums import BaliseDirection, BaliseKind, Reaction
 from schemas.line import LineBalises, LineCriteria, LineDirection, LineProposals, PieceClass
 from schemas.run import Site
 
@@ -49,10 +49,14 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Set:
-    """A balise that was placed; `distance_m` from the one before on the way, over the pieces `since` that one."""
+    """A balise that was placed; `distance_m` from the one before on the way, over the pieces `since` that one.
+
+    `direction`: along its net element, in which it is valid; a physical one in both.
+    """
 
     piece: int
     virtual: bool
+    direction: BaliseDirection
     distance_m: float | None
     near: str
     since: tuple[int, ...]
@@ -71,7 +75,7 @@ def proposals(line: Line) -> tuple[pl.DataFrame, pl.DataFrame]:
             continue
         for spacing_m in line.criteria.spacings_m:
             name = f"{mode}-{spacing_m:g}m"
-            placed = _disjoint(line, [one for way in ways for one in _walk(line, way, allowed, spacing_m)])
+            placed = _disjoint(line, [one for way in ways for one in _walk(line, way, allowed, sides, spacing_m)])
             balises.append(_balises(line, name, placed))
             rows.append(_figures(line, name, spacing_m, mode, placed, growing))
     empty = {name: pl.Series([], dtype=column.dtype) for name, column in LineBalises.columns().items()}
@@ -94,6 +98,7 @@ def site_balises(balises: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
         location_accuracy_m=pl.lit(criteria.location_accuracy_m),
         linked=pl.lit(value=True),
         link_reaction=pl.lit(Reaction.SERVICE_BRAKE.value),
+        direction="direction",
     )
 
 
@@ -149,7 +154,7 @@ def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> It
         oriented = edges[0].to if edges else None
 
 
-def _walk(line: Line, way: Sequence[_Place], allowed: Bools, spacing_m: float) -> Iterator[_Set]:
+def _walk(line: Line, way: Sequence[_Place], allowed: Bools, sides: Sequence[bool], spacing_m: float) -> Iterator[_Set]:
     """At each step the best piece about a spacing on; where none is allowed a physical one.
 
     Best is near a station or signal, then at the spacing itself.
@@ -167,8 +172,16 @@ def _walk(line: Line, way: Sequence[_Place], allowed: Bools, spacing_m: float) -
         index = int(np.argmin(np.abs(at_m - last_m - spacing_m))) if choice is None else choice
         distance_m = float(at_m[index]) - last_m if begun else None
         since = tuple(place.piece for place in way if last_m < place.at_m <= at_m[index])
-        yield _Set(way[index].piece, virtual, distance_m, near.get(way[index].piece, ("", 0.0))[0], since)
+        direction = _direction(way[index], sides) if virtual else BaliseDirection.BOTH
+        yield _Set(way[index].piece, virtual, direction, distance_m, near.get(way[index].piece, ("", 0.0))[0], since)
         last_m, begun = max(float(at_m[index]), last_m + spacing_m - play_m), True
+
+
+def _direction(place: _Place, sides: Sequence[bool]) -> BaliseDirection:
+    """In which direction along its net element a balise serves travel ahead along the way, or against it."""
+    if len(sides) > 1:
+        return BaliseDirection.BOTH
+    return BaliseDirection.AB if place.growing == sides[0] else BaliseDirection.BA
 
 
 def _best(
@@ -212,15 +225,18 @@ def _disjoint(line: Line, placed: list[_Set]) -> list[_Set]:
 
 
 def _named(line: Line, placed: Sequence[_Set]) -> pl.DataFrame:
-    """Place and kind of each balise."""
+    """Place, kind and direction of each balise."""
     piece = [one.piece for one in placed]
     middle_m = 0.5 * (line.pieces.from_m + line.pieces.to_m)[piece]
     names = line.pieces.names
     kind = [(BaliseKind.VIRTUAL if one.virtual else BaliseKind.PHYSICAL).value for one in placed]
-    return pl.DataFrame(
-        {"netelement_id": [names[number] for number in piece], "measure_m": np.round(middle_m, 3), "kind": kind},
-        schema={"netelement_id": pl.String, "measure_m": pl.Float64, "kind": pl.String},
-    )
+    columns = {
+        "netelement_id": [names[number] for number in piece],
+        "measure_m": np.round(middle_m, 3),
+        "kind": kind,
+        "direction": [one.direction.value for one in placed],
+    }
+    return pl.DataFrame(columns, schema={name: LineBalises.columns()[name].dtype for name in columns})
 
 
 def _balises(line: Line, name: str, placed: Sequence[_Set]) -> pl.DataFrame:

@@ -16,6 +16,8 @@ from schemas.arrays import Bools, Floats, Ints
 # Every place on an element has a search point within this distance along it. Numerics: it decides how many points are
 # searched, not which elements are within reach.
 PROBE_SPACING_M = 40.0
+# Where two elements meet at a bend, a position lies inside both over so much at most: 40 m aside at 3 degrees.
+BEND_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,45 @@ def candidates_of(points: Points, network: Network, segments: Segments, reach_m:
     feet = downhill(points.take(step[fresh]), segments, segment[fresh], segments.element)
     near = np.flatnonzero(feet.distance_m <= reach_m)
     return _candidates(len(points), network, segments, step[fresh][near], feet.take(near))
+
+
+def overtaken(found: Candidates, network: Network) -> Bools:
+    """Candidates about an end where the track goes on, whose place is on what it goes on to.
+
+    So every position has one place on a line, however many elements it is cut into. Of the two elements at a joint it
+    is on the one that it lies farther inside of: at a bend it may lie past both their ends, or inside both.
+    """
+    past_m = _past_ends_m(found)
+    one, end = np.nonzero(np.isfinite(past_m))
+    edge_first, edge_to = network.edges
+    leaving = 2 * found.element[one] + 1 - end
+    number = np.diff(edge_first)[leaving]
+    edge = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number - edge_first[leaving], number)
+    one, end, entered = np.repeat(one, number), np.repeat(end, number), edge_to[edge]
+    keys = found.step * network.count + found.element
+    wanted = found.step[one] * network.count + entered // 2
+    other = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    own_m, other_m = past_m[one, end], past_m[other, entered % 2]
+    rival = (keys[other] == wanted) & (other != one)
+    beyond = rival & (own_m > 0.0) & np.isinf(other_m)
+    nearer = rival & ((other_m < own_m) | ((other_m == own_m) & (other < one)))
+    out = np.zeros(len(keys), dtype=bool)
+    while True:
+        # At the joint itself only by one that is not beaten there: at a switch another branch may hold the place.
+        now = np.zeros(len(keys), dtype=bool)
+        now[one[beyond | (nearer & ~out[other])]] = True
+        if (now == out).all():
+            return out
+        out = now
+
+
+def _past_ends_m(found: Candidates) -> Floats:
+    """Per candidate how far it lies past its element's start and end [m], infinite where it is not about them."""
+    columns = []
+    for past, inside_m in ((-1, found.along_m), (1, found.left_m)):
+        inside = np.where((found.past == 0) & (inside_m < BEND_M), -inside_m, np.inf)
+        columns.append(np.where(found.past == past, found.beyond_m, inside))
+    return np.column_stack(columns)
 
 
 def merged(some: Candidates, others: Candidates, step_of_others: Ints) -> Candidates:

@@ -67,7 +67,7 @@ def decode(trellis: Trellis, best: Ints) -> Decoded:
     before = 0
     steps = np.flatnonzero(oriented[1:] != oriented[:-1]) + 1
     places = oriented[steps - 1], place[steps - 1], oriented[steps], place[steps]
-    moves = best_moves(trellis.network, *places, trellis.ways.take(steps), trellis.config)
+    moves = best_moves(trellis.network, *places, trellis.ways.along(steps, places[0]), trellis.config)
     for step, move in zip(steps.tolist(), moves, strict=True):
         leg[before:step], number[before:step], before = len(chains) - 1, at, step
         at = _follow(chains, at, move, int(oriented[step]))

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
-from pipeline.matching.decode import Decoded
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.search import Found
 from pipeline.matching.trellis import Trellis
+from pipeline.track.leg import Leg
 from pipeline.track.network import Network
-from pipeline.track.path import TravelledPath
+from pipeline.track.path import TravelledPath, routes_of
 from schemas.arrays import Bools, Floats, Ints, ints, spans_of
 from schemas.config import MatchingConfig
 
@@ -38,11 +39,11 @@ class Doubt:
     other: Ints
 
 
-def doubt_of(trellis: Trellis, found: Found, decoded: Decoded) -> Doubt:
-    """Probability of all states that are on the path about where the path is."""
+def doubt_of(trellis: Trellis, found: Found, legs: Sequence[Leg], leg: Ints, at_m: Floats) -> Doubt:
+    """Probability of all states that are on the path where the path is; `leg`, `at_m`: where that is at each step."""
     count = np.diff(trellis.first)
     step = np.repeat(np.arange(len(count)), count)
-    own = _on_path(trellis, decoded, step)
+    own = _on_path(trellis, legs, leg, at_m, step)
     other = np.where(own, -1.0, found.forward + found.posterior)
     worst = np.lexsort((other, step))[trellis.first[1:] - 1]
     return Doubt(
@@ -93,30 +94,26 @@ def _over_switch(network: Network, one: int, other: int) -> bool:
     return any(len(network.successors[end]) > 1 for end in ends)
 
 
-def _on_path(trellis: Trellis, decoded: Decoded, step: Ints) -> Bools:
-    """States on elements of the path about where the path is at their step; where a leg ends, also those
-    of the step beyond.
+def _on_path(trellis: Trellis, legs: Sequence[Leg], leg: Ints, at_m: Floats, step: Ints) -> Bools:
+    """States that lie on the path within reach of where the path is at their step, however it is cut into elements.
+
+    Where a leg ends, also those on the leg beyond.
     """
-    count = trellis.network.count
-    keys, key = np.unique(np.column_stack([decoded.leg, decoded.number]), axis=0, return_inverse=True)
-    around = trellis.config.same_way_elements
-    about = [elements_about(decoded, leg, number, around) for leg, number in keys.tolist()]
-    allowed = np.concatenate([index * count + elements for index, elements in enumerate(about)])
-    element = trellis.oriented // 2
-    own = np.isin(key[step] * count + element, allowed)
-    for border in np.flatnonzero(np.diff(decoded.leg)).tolist():
-        for here, there in ((border, border + 1), (border + 1, border)):
-            states = slice(int(trellis.first[here]), int(trellis.first[here + 1]))
-            own[states] |= np.isin(key[there] * count + element[states], allowed)
-    return np.asarray(own)
-
-
-def elements_about(decoded: Decoded, leg: int, number: int, around: int) -> Ints:
-    """The element of this number on a leg, and so many before and after it."""
-    chain = decoded.chains[leg]
-    here = number - chain.low
-    part = chain.oriented[max(0, here - around) : here + around + 1]
-    return np.array(part, dtype=np.int64) // 2
+    track = trellis.network.track
+    element, backward = np.divmod(trellis.oriented, 2)
+    measure_m = np.where(
+        backward == 1, track.end_m[element] - trellis.place_m, track.begin_m[element] + trellis.place_m
+    )
+    own = np.zeros(len(step), dtype=bool)
+    border = np.flatnonzero(np.diff(leg))
+    for number, route in enumerate(routes_of(track, legs)):
+        on_leg = leg == number
+        on_leg[border] |= leg[border + 1] == number
+        on_leg[border + 1] |= leg[border] == number
+        rows = np.flatnonzero(on_leg[step])
+        coordinate, _ = route.coordinate(element[rows], measure_m[rows], at_m[step[rows]])
+        own[rows] |= np.abs(coordinate - at_m[step[rows]]) <= trellis.config.reach_m
+    return own
 
 
 def _share(values: Floats, first: Ints) -> Floats:

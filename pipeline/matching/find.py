@@ -6,14 +6,14 @@ import numpy as np
 import polars as pl
 from scipy.spatial import cKDTree
 
-from pipeline.matching.candidates import Candidates, Segments, candidates_of, merged, segments_of
+from pipeline.matching.candidates import Candidates, Segments, candidates_of, merged, overtaken, segments_of
 from pipeline.matching.decode import Decoded, aligned, decode, legs_of, positions_m
 from pipeline.matching.doubt import Doubt, Posterior, doubt_of, posterior_of, stretches
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.likelihood import likelihood_of
 from pipeline.matching.search import search
-from pipeline.matching.steps import Steps, Travelled, believable, fewer_where_clear, spaced, steps_of, travelled
+from pipeline.matching.steps import Steps, Travelled, believable, spaced, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
 from pipeline.odometry import Odometry
 from pipeline.odometry.polarity import grows_with
@@ -24,6 +24,9 @@ from pipeline.track.survey import Track
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 from schemas.errors import InputError
+
+# Numerics: positions closer to a track than this share of the reach are not looked for any farther.
+_NEAR = 0.2
 
 
 def find_path(
@@ -43,13 +46,14 @@ def find_path(
     found = search(trellis)
     decoded = aligned(trellis, decode(trellis, found.best))
     legs = legs_of(trellis, decoded)
-    at = positions_m(decoded, legs)
-    if not grows_with(at, fixes.t_ns[trellis.steps.epoch], odometry, config.orientation_distance_m):
+    at_m = positions_m(decoded, legs)
+    if not grows_with(at_m, fixes.t_ns[trellis.steps.epoch], odometry, config.orientation_distance_m):
         decoded = decoded.turned(network, range(len(decoded.chains)))
         legs = legs_of(trellis, decoded)
-    doubt = doubt_of(trellis, found, decoded)
+        at_m = positions_m(decoded, legs)
+    doubt = doubt_of(trellis, found, legs, decoded.leg, at_m)
     path = TravelledPath(network.track, tuple(legs))
-    assignment = _assign(fixes, trellis.steps, decoded, positions_m(decoded, legs), doubt)
+    assignment = _assign(fixes, trellis.steps, decoded, at_m, doubt)
     return path, assignment, stretches(fixes, trellis, found, doubt, pinned, config), posterior_of(trellis, found)
 
 
@@ -61,9 +65,9 @@ def _trellis(
     Between epochs near a track, epochs further off count too: a position that drifts away slowly still shows
     by its movement which way the train turned.
     """
-    rows = fewer_where_clear(fixes, spaced(fixes, believed, config), network, config)
+    rows = spaced(fixes, believed, config)
     segments = segments_of(network.track)
-    wide = _candidates(fixes, rows, network, segments, config.far_reach_factor * config.reach_m, config)
+    wide = _candidates(fixes, rows, network, segments, config)
     nearest = np.full(len(rows), np.inf)
     np.minimum.at(nearest, wide.step, wide.distance_m)
     near = np.flatnonzero(nearest <= config.reach_m)
@@ -81,15 +85,18 @@ def _trellis(
     return trellis_of(network, steps, candidates, like, config)
 
 
-def _candidates(
-    fixes: Fixes, epoch: Ints, network: Network, segments: Segments, reach_m: float, config: MatchingConfig
-) -> Candidates:
-    everything = candidates_of(fixes.points.take(epoch), network, segments, reach_m)
-    row = epoch[everything.step]
-    sigma = np.sqrt(0.5 * (fixes.cov_ee_m2[row] + fixes.cov_nn_m2[row]))
-    near = everything.beyond_m <= np.maximum(config.beyond_end_m, config.beyond_end_sigmas * sigma)
-    onward = np.where(everything.past < 0, everything.linked_start, everything.linked_end)
-    return everything.take(np.flatnonzero(near | ~onward), len(epoch))
+def _candidates(fixes: Fixes, rows: Ints, network: Network, segments: Segments, config: MatchingConfig) -> Candidates:
+    """Places within reach; within far reach where no track is near."""
+    points = fixes.points.take(rows)
+    found = candidates_of(points, network, segments, (1.0 + _NEAR) * config.reach_m)
+    nearest_m = np.full(len(rows), np.inf)
+    np.minimum.at(nearest_m, found.step, found.distance_m)
+    far = np.flatnonzero(nearest_m > _NEAR * config.reach_m)
+    if len(far):
+        wide = candidates_of(points.take(far), network, segments, config.far_reach_factor * config.reach_m)
+        near = found.take(np.flatnonzero(nearest_m[found.step] <= _NEAR * config.reach_m), len(rows))
+        found = merged(near, wide, far)
+    return found.take(np.flatnonzero(~overtaken(found, network)), len(rows))
 
 
 def _pins(steps: Steps, pinned: Ints, candidates: Candidates) -> Bools:

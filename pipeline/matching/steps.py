@@ -9,13 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipeline.matching.fixes import Fixes
 from pipeline.odometry import Odometry
 from pipeline.track.geodesy import way_m
-from pipeline.track.network import Network
-from pipeline.track.survey import end_places
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
@@ -65,17 +62,6 @@ def spaced(fixes: Fixes, rows: Ints, config: MatchingConfig) -> Ints:
     fresh = (np.diff(far, prepend=-1.0) > 0) | (np.diff(late, prepend=-1.0) > 0)
     fresh[-1] = True
     return np.asarray(rows[fresh])
-
-
-def fewer_where_clear(fixes: Fixes, rows: Ints, network: Network, config: MatchingConfig) -> Ints:
-    """Fewer of them where no link is near, since nothing can be decided there that a later step does not show."""
-    ends, places = end_places(network.track)[network.linked_ends()], fixes.points.surface[rows]
-    apart, _ = cKDTree(ends).query(places, distance_upper_bound=config.clear_of_links_m)
-    far = np.floor(way_m(places) / (config.clear_step_factor * config.step_distance_m))
-    kept = np.isfinite(apart) | (np.diff(fixes.t_s[rows], prepend=fixes.t_s[rows[:1]]) >= 0.5 * config.step_time_s)
-    kept[1:] |= np.diff(far) > 0
-    kept[[0, -1]] = True
-    return np.asarray(rows[kept])
 
 
 def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConfig) -> Ints:

@@ -52,6 +52,7 @@ class _AxisBank:
         self.value = np.full((epochs, width), np.nan, order="F")
         self.threshold = np.full((epochs, width), np.nan, order="F")
         self.state = np.full((epochs, width), NOT_EVALUATED, dtype=np.int8, order="F")
+        self.begins = np.zeros(epochs, dtype=np.bool_)
         self._series = axis.series
         self._done = 0
         self._block = BLOCK
@@ -70,6 +71,7 @@ class _AxisBank:
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats) -> None:
         evaluated = ~part.fresh[:, None] & self._enabled[None, :]
+        self.begins[part.epoch] = part.fresh
         self.state[part.epoch] = states_of(value, threshold, evaluated)
         self.value[part.epoch] = np.where(evaluated, value, np.nan)
         self.threshold[part.epoch] = np.where(evaluated, threshold, np.nan)
@@ -84,6 +86,11 @@ class _AxisBank:
         self._done = row
         self._carry = None
         self._block = FIRST_BLOCK
+
+    @property
+    def has_rows(self) -> bool:
+        """There is an epoch that the axis can evaluate, or begin at."""
+        return self._series.epoch.size > 0
 
     def record(self) -> AxisRecord:
         return AxisRecord(self._series, self.value, self.threshold, self._enabled)
@@ -121,8 +128,10 @@ class MonitorBank:
         for frame in self._single.values():
             self._single_fails |= (frame["state"] == MonitorState.FAIL.value).to_numpy()
         self._any = np.zeros(count, dtype=np.bool_)
+        self._stops = np.zeros(count, dtype=np.bool_)
         self._fast = np.zeros(count, dtype=np.bool_)
         self._along = np.zeros(count, dtype=np.bool_)
+        self._noise_known = np.ones(count, dtype=np.bool_)
         self._known_to = -1
 
     def _look(self, epoch: int) -> None:
@@ -133,9 +142,10 @@ class MonitorBank:
         part = slice(begin, self._known_to + 1)
         fails = [axis.state[part] == FAIL for axis in self._axes]
         self._any[part] = np.logical_or.reduce([fail.any(axis=1) for fail in fails]) | self._single_fails[part]
+        self._stops[part] = self._any[part] | self._watching.begins[part]
         fast = np.logical_or.reduce([fail[:, :2].any(axis=1) for fail in fails])
         self._fast[part] = fast | self._single_fails[part]
-        self._along[part] = (self._axes[0].state[part] != NOT_EVALUATED).any(axis=1)
+        self._along[part] = self._axes[0].state[part, 0] != NOT_EVALUATED
 
     def failed(self, epoch: int) -> bool:
         """Any monitor of the bank fails at this epoch."""
@@ -152,20 +162,39 @@ class MonitorBank:
         return bool(self._fast[epoch])
 
     def along_evaluated(self, epoch: int) -> bool:
-        """The along-track monitors have a verdict (pass or fail) at this epoch."""
+        """`along_raw` has a verdict (pass or fail) at this epoch; an average alone says nothing of a step."""
         self._look(epoch)
         return bool(self._along[epoch])
 
     def quiet_until(self, epoch: int, end: int) -> int:
-        """The first epoch from `epoch` on at which a monitor fails, or that is not looked at yet; at most `end`."""
+        """The first epoch from `epoch` on at which a monitor fails or the bank begins, or that is not looked at yet.
+
+        At most `end`.
+        """
         self._look(epoch)
-        ahead = self._any[epoch : min(self._known_to + 1, end)]
+        ahead = self._stops[epoch : min(self._known_to + 1, end)]
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
     def along_evaluated_between(self, epoch: int, end: int) -> npt.NDArray[np.bool_]:
         """`along_evaluated` of the epochs [epoch, end), none of them beyond what `quiet_until` answered."""
         return self._along[epoch:end]
+
+    @property
+    def noise_known(self) -> Bools:
+        """Per epoch whether the fast noise along the track is known."""
+        return self._noise_known
+
+    def begins_at(self, epoch: int) -> bool:
+        """The bank begins here: at the start, after a gap, after lost distance or at a restart; nothing leads here."""
+        self._look(epoch)
+        return bool(self._watching.begins[epoch])
+
+    @property
+    def _watching(self) -> _AxisBank:
+        """The axis along the track, or, in a run without an odometer, the one across it."""
+        along, across, _ = self._axes
+        return along if along.has_rows else across
 
     def restart(self, epoch: int) -> None:
         """All recursions start anew at this epoch; their first increment is from it to the next."""

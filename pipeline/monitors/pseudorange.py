@@ -22,11 +22,12 @@ from pipeline.monitors.axis import BLOCK
 from pipeline.monitors.sight import line_of_sight_rows, range_variances_m2
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 from schemas.config import Configuration
+from schemas.enums import NotEvaluated
 
-NO_RANGES = "no satellites stream"
-NO_RANGES_AT_EPOCH = "no satellite residuals at this epoch"
-TOO_FEW = "too few satellites to test the ranges"
-AMBIGUOUS = "the track is ambiguous"
+NO_RANGES = NotEvaluated.NO_RANGES
+NO_RANGES_AT_EPOCH = NotEvaluated.NO_RANGES_AT_EPOCH
+TOO_FEW = NotEvaluated.TOO_FEW_RANGES
+AMBIGUOUS = NotEvaluated.AMBIGUOUS
 _RIDGE = 1e-13
 
 

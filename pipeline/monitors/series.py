@@ -13,10 +13,11 @@ from pipeline.monitors.axis import AlongEpochs, AxisSeries, Source, along_series
 from pipeline.odometry.odometry import Increments
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
+from schemas.enums import NotEvaluated
 
-OFF_TRACK = "off track"
-NO_HEIGHT = "no height in the position or the survey"
-FIRST_EPOCH = "first epoch after a restart"
+OFF_TRACK = NotEvaluated.OFF_TRACK
+NO_HEIGHT = NotEvaluated.NO_HEIGHT
+FIRST_EPOCH = NotEvaluated.FIRST_EPOCH
 _STRAIGHT_PER_M = 1e-6
 
 

@@ -14,10 +14,11 @@ from pipeline.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, ver
 from pipeline.monitors.series import FIRST_EPOCH
 from schemas.arrays import Floats, floats, times_ns
 from schemas.config import Configuration, LdsConfig
+from schemas.enums import NotEvaluated
 
-NO_VELOCITY = "no GNSS velocity"
-NO_OTHER_SOLUTION = "no other solution configured to compare with"
-NO_OTHER_EPOCH = "the other solution has no position at this epoch"
+NO_VELOCITY = NotEvaluated.NO_VELOCITY
+NO_OTHER_SOLUTION = NotEvaluated.NO_OTHER_SOLUTION
+NO_OTHER_EPOCH = NotEvaluated.NO_OTHER_EPOCH
 
 
 def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:

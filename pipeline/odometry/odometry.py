@@ -50,6 +50,8 @@ class Odometry:
     path once `oriented`. `t_s` and `distance_m` are samples (rows, and what was filled in between), in seconds since
     `epoch_ns`; `segment` counts sample by sample how often the distance was lost before; `pause[i]` marks a pause of
     the recording between samples i and i+1, inside which nothing is interpolated; `slip`: as the odometer reports.
+    `counter` numbers segments as `segment` does, but goes on over slip: there the wheel turned and was counted, and
+    `slip_doubt_m` is by how much the count may be off through slip, summed up to each sample [m].
     `scale` is true over recorded distance, by the vehicle file when that gives its sigma too, else None.
     `leaps_ns`: rows to which the recorded distance leaps farther than a train can drive.
     """
@@ -60,6 +62,8 @@ class Odometry:
     segment: Ints
     pause: Bools
     slip: Bools
+    counter: Ints
+    slip_doubt_m: Floats
     noise: Noise
     deadband_mps: float
     config: AlignConfig
@@ -93,6 +97,21 @@ class Odometry:
     def segment_at(self, t_ns: Ints) -> Ints:
         """Number of the continuity segment: distances can be compared only where it is the same."""
         return self.segment_at_s(self.seconds(t_ns))
+
+    def slips_at_s(self, t_s: Floats) -> Bools:
+        """Whether the odometer reports slip at the sample before or after these times, on its own scale [s]."""
+        before, after = self._around(t_s)
+        slips: Bools = self.slip[before] | self.slip[after]
+        return slips
+
+    def counter_at_s(self, t_s: Floats) -> Ints:
+        """Number of the counter's segment at these times; slip does not end it."""
+        counter: Ints = self.counter[self._sample_at(t_s)]
+        return counter
+
+    def slip_doubt_at_s(self, t_s: Floats) -> Floats:
+        """By how much slip may have falsified the count up to these times [m]."""
+        return np.interp(t_s, self.t_s, self.slip_doubt_m)
 
     def distance_at(self, t_ns: Ints) -> Floats:
         """Distance at these instants [m], as recorded; NaN where it is not known."""
@@ -157,12 +176,11 @@ class Odometry:
         before, after = self._around(t_s)
         paused = (before != after) & self.pause[np.minimum(before, self.pause.size - 1)]
         inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
-        known: Bools = inside & ~paused & ~self.slip[before] & ~self.slip[after]
+        known: Bools = inside & ~paused & ~self.slips_at_s(t_s)
         return known
 
     def segment_at_s(self, t_s: Floats) -> Ints:
-        index = np.searchsorted(self.t_s, t_s, side="right") - 1
-        segment: Ints = self.segment[index.clip(0, self.t_s.size - 1)]
+        segment: Ints = self.segment[self._sample_at(t_s)]
         return segment
 
     def distance_at_s(self, t_s: Floats) -> Floats:
@@ -181,6 +199,10 @@ class Odometry:
         if not self.noise.quantisation:
             return np.zeros(t_s.size)
         return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
+
+    def _sample_at(self, t_s: Floats) -> Ints:
+        index: Ints = np.searchsorted(self.t_s, t_s, side="right") - 1
+        return index.clip(0, self.t_s.size - 1)
 
     def _around(self, t_s: Floats) -> tuple[Ints, Ints]:
         """Samples before and after each time, twice the same where it is that of a sample."""
@@ -212,7 +234,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     Distance from the recorded distance where there is one, else from speed (trapezoids). A pause longer than
     `odometer_gap_s` (and than `odometer_gap_periods`) loses the way of speed-only odometry: the speeds before and after
     it give the best guess, but a new continuity segment begins. A cumulative distance carries over it. Slip that the
-    odometer itself reports loses the way too, and so does a leap of the distance where no speed tells the way.
+    odometer itself reports (`_slips`) loses the way too, and so does a leap of the distance where no speed tells the
+    way.
     `odometer_sigma_mps` is the white noise at 1 Hz; a larger declared `sigma_speed_mps`, taken as independent from row
     to row, replaces it.
     """
@@ -226,15 +249,22 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     limit_s = max(align.odometer_gap_s, align.odometer_gap_periods * period_s)
     way_m, counted = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
     unknown = np.isnan(way_m)
-    pause, slip = unknown | (dt_s > limit_s), truths(stream["slip"])
-    lost = (pause & ~counted) | slip[1:]
-    distance_m, segment = _sums(np.where(unknown, 0.0, way_m)), _sums(lost.astype(np.float64)).astype(np.int64)
+    pause = unknown | (dt_s > limit_s)
+    slip = _slips(stream, align)
+    silent = pause & ~counted
+    lost = silent | slip[1:]
+    distance_m = _sums(np.where(unknown, 0.0, way_m))
+    segment = _sums(lost.astype(np.float64)).astype(np.int64)
+    counter = _sums(silent.astype(np.float64)).astype(np.int64)
+    doubt_m = _sums(_slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align))
     white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
     noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, config) if counted.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
     if apart.size:
+        row_s = t_s
         t_s, distance_m, row = filled_in(t_s, distance_m, speed, apart, align)
-        segment, pause, slip = segment[row], pause[row[:-1]], slip[row]
+        segment, pause, slip, counter = segment[row], pause[row[:-1]], slip[row], counter[row]
+        doubt_m = np.interp(t_s, row_s, doubt_m)
     in_file = vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None
     return Odometry(
         epoch_ns=int(t_ns[0]),
@@ -243,6 +273,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         segment=segment,
         pause=pause,
         slip=slip,
+        counter=counter,
+        slip_doubt_m=doubt_m,
         noise=noise or Noise(white_m2_per_s),
         deadband_mps=config.matching.deadband_mps,
         period_s=period_s,
@@ -258,6 +290,23 @@ def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float,
     counter_m, deadband_mps = count_step_m(distance_m, whole, config.align), config.matching.deadband_mps
     scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, deadband_mps, config.align)
     return Noise(white_m2_per_s, scatter, counter_m)
+
+
+def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
+    """Rows at which the odometer itself says that it slips: by its flag, or by a sigma of its speed beyond any use."""
+    slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
+    return slips
+
+
+def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
+    """By how much the count of each way that begins or ends in slip may be off [m].
+
+    By a share of the way, and by no less than the sigma that the odometer gives: an error that lasts while it slips, so
+    that it grows with time and not with its root.
+    """
+    sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
+    doubt_m = np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s)
+    return np.where(slip[1:] | slip[:-1], doubt_m, 0.0)
 
 
 def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:

@@ -9,11 +9,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.plausibility.causes import explain_factor
-from pipeline.plausibility.check import Check, State, correction, fits, not_checked
+from pipeline.plausibility.check import Cause, Check, State, correction, fits, not_checked
 from pipeline.plausibility.records import Places, seconds_since
 from pipeline.plausibility.robust import LEAST, sampled
 from schemas.arrays import Floats, floats
 from schemas.config import PlausibilityConfig
+from schemas.enums import MisfitCause
 
 _WHAT = "GNSS velocity against displacement"
 _UP = "GNSS vertical velocity against height"
@@ -32,10 +33,10 @@ class Arrangement(NamedTuple):
         return turned
 
     @property
-    def words(self) -> str:
+    def causes(self) -> tuple[Cause, ...]:
         signs = [name for name, sign in (("east", self.east), ("north", self.north)) if sign < 0]
-        exchanged = ["east and north are exchanged"] if self.exchanged else []
-        return " and ".join(exchanged + ([f"{' and '.join(signs)} of the wrong sign"] if signs else []))
+        exchanged = (Cause(MisfitCause.VELOCITY_EXCHANGED),) if self.exchanged else ()
+        return exchanged + ((Cause(MisfitCause.VELOCITY_SIGN, (" and ".join(signs),)),) if signs else ())
 
 
 ARRANGEMENTS = tuple(Arrangement(*one) for one in product((False, True), (1.0, -1.0), (1.0, -1.0)))
@@ -98,10 +99,9 @@ def _horizontal(fit: VelocityFit, config: PlausibilityConfig) -> Check:
     as_recorded = f"they point elsewhere, by {fit.misfits[0]:.0%} of the speed"
     if fit.best and fit.misfits[0] <= most:
         advice = "Look at a run with curves before the velocity is corrected."
-        return Check(_WHAT, State.MISFIT, as_recorded, f"{arrangement.words}, it seems", advice=advice)
+        return Check(_WHAT, State.MISFIT, as_recorded, arrangement.causes, advice=advice)
     if not fit.best and fit.misfits[0] > most:
-        cause = "latitude and longitude may be exchanged, or the axes are of the train"
-        return Check(_WHAT, State.MISFIT, as_recorded, cause)
+        return Check(_WHAT, State.MISFIT, as_recorded, (Cause(MisfitCause.VELOCITY_FRAME),))
     found = f"the recorded speed is {fit.ratio:.4g} times that of the positions"
     off = abs(fit.ratio - 1.0)
     explained = explain_factor(fit.ratio, True, config) if off > config.scale_limit else None
@@ -112,7 +112,7 @@ def _horizontal(fit: VelocityFit, config: PlausibilityConfig) -> Check:
     factors = {"vel_e_mps": arrangement.east * factor, "vel_n_mps": arrangement.north * factor, "vel_u_mps": factor}
     exchange = ("vel_e_mps", "vel_n_mps") if arrangement.exchanged else None
     lines = correction("gnss", {name: value for name, value in factors.items() if value != 1.0}, exchange=exchange)
-    causes = " and ".join(filter(None, (explained.cause if explained else "", arrangement.words)))
+    causes = (explained.causes if explained else ()) + arrangement.causes
     return Check(_WHAT, State.IMPOSSIBLE, found + doubt, causes, lines)
 
 
@@ -136,4 +136,4 @@ def _vertical(gnss: Places, fit: VelocityFit) -> list[Check]:
     if agreement > 0.0:
         return [fits(_UP, found)]
     lines = correction("gnss", {"vel_u_mps": -1.0})
-    return [Check(_UP, State.IMPOSSIBLE, found, "the vertical velocity counts down", lines)]
+    return [Check(_UP, State.IMPOSSIBLE, found, (Cause(MisfitCause.VELOCITY_DOWN),), lines)]

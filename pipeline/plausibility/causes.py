@@ -8,9 +8,11 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from pipeline.plausibility.check import Cause
 from pipeline.plausibility.robust import Shift
 from schemas.arrays import Floats
 from schemas.config import PlausibilityConfig
+from schemas.enums import MisfitCause
 
 # How many of the unit make a metre, or of the speed a metre per second.
 SPEED_UNITS = {
@@ -53,17 +55,23 @@ _SUMMED = {
 # GPS time is ahead of UTC by so many seconds since (IERS Bulletin C); TAI by 19 s more.
 _LEAPS = {2017.0: 18, 2015.5: 17, 2012.5: 16, 2009.0: 15, 2006.0: 14, 1999.0: 13}
 TAI_OVER_GPS_S = 19
-# Whole ones of these are a cause; clocks on Earth are at most 14 h from each other.
-_UNITS_S = {"time zone or summer time": 3_600, "time zone": 1_800, "roll-over of the GPS week": 1024 * 604_800}
-_DAYS_S = {"wrong week": 604_800, "wrong day, or a roll-over of it": 86_400}
+# Whole ones of these are a cause.
+_HOUR_S = 3_600
+_DAY_S = 86_400
+_WEEK_S = 604_800
+_ZONES_S = (_HOUR_S, _HOUR_S // 2)
+_ROLL_OVER_WEEKS = 1024
 
 
 @dataclass(frozen=True)
 class Explained:
-    """A cause in words, and the exact figure it stands for."""
+    """Causes that explain a figure together, and the exact figure they stand for."""
 
-    cause: str
+    causes: tuple[Cause, ...]
     exact: float
+
+    def has(self, code: MisfitCause) -> bool:
+        return any(cause.code is code for cause in self.causes)
 
 
 def explain_factor(factor: float, speed: bool, config: PlausibilityConfig) -> Explained | None:
@@ -72,7 +80,7 @@ def explain_factor(factor: float, speed: bool, config: PlausibilityConfig) -> Ex
     name, exact = min(units.items(), key=lambda item: abs(factor / item[1] - 1.0))
     # A unit so near to 1 that a bad odometer could be taken for it has to be met more exactly.
     near = min(config.unit_share, abs(exact - 1.0) / 3.0)
-    return Explained(f"in {name}", exact) if abs(factor / exact - 1.0) <= near else None
+    return Explained((Cause(MisfitCause.UNIT, (name,)),), exact) if abs(factor / exact - 1.0) <= near else None
 
 
 def explain_lag(lag_s: float, t_ns: int, precision_s: float, config: PlausibilityConfig) -> Explained | None:
@@ -80,39 +88,51 @@ def explain_lag(lag_s: float, t_ns: int, precision_s: float, config: Plausibilit
     size = abs(lag_s)
     for explained in _lags(size, t_ns):
         if abs(size - explained.exact) <= max(precision_s, config.clock_near_s):
-            return Explained(explained.cause, explained.exact if lag_s > 0 else -explained.exact)
+            return Explained(explained.causes, explained.exact if lag_s > 0 else -explained.exact)
     return None
 
 
 def _lags(size_s: float, t_ns: int) -> Iterator[Explained]:
     """Candidates near a lag, the simplest first."""
     leap_s = leap_seconds(t_ns)
-    yield Explained("GPS time taken as UTC", leap_s)
-    yield Explained("TAI taken as GPS time", TAI_OVER_GPS_S)
-    yield Explained("TAI taken as UTC", TAI_OVER_GPS_S + leap_s)
+    gps = Cause(MisfitCause.GPS_AS_UTC)
+    yield Explained((gps,), leap_s)
+    yield Explained((Cause(MisfitCause.TAI_AS_GPS),), TAI_OVER_GPS_S)
+    yield Explained((Cause(MisfitCause.TAI_AS_UTC),), TAI_OVER_GPS_S + leap_s)
     for extra_s in (0, leap_s, -leap_s):
-        more = " and GPS time taken as UTC" if extra_s else ""
-        for cause, exact_s in _calendar(size_s - extra_s, t_ns):
-            yield Explained(cause + more, exact_s + extra_s)
+        for calendar in _calendar(size_s - extra_s, t_ns):
+            more = (gps,) if extra_s else ()
+            yield Explained(calendar.causes + more, calendar.exact + extra_s)
 
 
-def _calendar(rest_s: float, t_ns: int) -> Iterator[tuple[str, float]]:
-    """Whole hours, days and weeks near a lag."""
-    for name, unit_s in _UNITS_S.items():
-        count = round(rest_s / unit_s)
-        amount = f"{1024 * count} weeks" if "week" in name else f"{count * unit_s / 3600:g} h"
-        if count >= 1 and (unit_s > 3_600 or rest_s < 14.5 * 3_600):
-            yield f"a {name}: {amount}", count * unit_s
+def _calendar(rest_s: float, t_ns: int) -> Iterator[Explained]:
+    """Whole hours, weeks and days near a lag."""
+    for zone_s in _ZONES_S:
+        count = round(rest_s / zone_s)
+        # Clocks on Earth are at most 14 h from each other.
+        if count >= 1 and rest_s < 14.5 * _HOUR_S:
+            yield Explained((_amount(MisfitCause.TIME_ZONE, f"{count * zone_s / _HOUR_S:g} h"),), count * zone_s)
+    if (roll_overs := round(rest_s / (_ROLL_OVER_WEEKS * _WEEK_S))) >= 1:
+        weeks = _ROLL_OVER_WEEKS * roll_overs
+        yield Explained((_amount(MisfitCause.GPS_WEEK, f"{weeks} weeks"),), weeks * _WEEK_S)
     if (swapped_s := _swapped_s(t_ns)) is not None:
-        yield "day and month exchanged", abs(swapped_s)
-    for name, unit_s in _DAYS_S.items():
-        if (count := round(rest_s / unit_s)) >= 1:
-            yield f"a {name}: {count} {'weeks' if 'week' in name else 'days'}", count * unit_s
-            if odd := round((rest_s - count * unit_s) / 3_600):
-                yield (
-                    f"a {name}, and a time zone: {count} {'weeks' if 'week' in name else 'days'} {odd:+d} h",
-                    (count * unit_s + odd * 3_600),
-                )
+        yield Explained((Cause(MisfitCause.DAY_AND_MONTH),), abs(swapped_s))
+    yield from _whole(MisfitCause.WRONG_WEEK, "weeks", rest_s, _WEEK_S)
+    yield from _whole(MisfitCause.WRONG_DAY, "days", rest_s, _DAY_S)
+
+
+def _whole(code: MisfitCause, unit: str, rest_s: float, unit_s: int) -> Iterator[Explained]:
+    """Whole weeks or days near a lag, and these with a time zone."""
+    if (count := round(rest_s / unit_s)) < 1:
+        return
+    cause = _amount(code, f"{count} {unit}")
+    yield Explained((cause,), count * unit_s)
+    if odd := round((rest_s - count * unit_s) / _HOUR_S):
+        yield Explained((cause, _amount(MisfitCause.TIME_ZONE, f"{odd:+d} h")), count * unit_s + odd * _HOUR_S)
+
+
+def _amount(code: MisfitCause, amount: str) -> Cause:
+    return Cause(code, (amount,))
 
 
 def leap_seconds(t_ns: int) -> int:
@@ -133,10 +153,10 @@ _RADIAN_DEG = float(np.degrees(1.0))
 
 
 @dataclass(frozen=True)
-class Slip:
+class CoordinateMistake:
     """A way to write positions wrongly; `factors` and `exchanged` mend it, as `[[ingest.correct]]` can, but minutes."""
 
-    cause: str
+    code: MisfitCause
     factors: Mapping[str, float] = field(default_factory=dict)
     exchanged: bool = False
     minutes: bool = False
@@ -154,13 +174,13 @@ def _from_minutes(value: Floats) -> Floats:
     return np.asarray(whole + (value - whole) * 100.0 / 60.0)
 
 
-SLIPS = (
-    Slip("latitude and longitude are exchanged", exchanged=True),
-    Slip("longitude has the wrong sign", {"longitude_deg": -1.0}),
-    Slip("latitude has the wrong sign", {"latitude_deg": -1.0}),
-    Slip("latitude and longitude have the wrong sign", {"latitude_deg": -1.0, "longitude_deg": -1.0}),
-    Slip("positions are in radians", {"latitude_deg": _RADIAN_DEG, "longitude_deg": _RADIAN_DEG}),
-    Slip("positions are degrees and minutes (ddmm.mm of NMEA), written as decimal degrees", minutes=True),
+COORDINATE_MISTAKES = (
+    CoordinateMistake(MisfitCause.AXES_EXCHANGED, exchanged=True),
+    CoordinateMistake(MisfitCause.LONGITUDE_SIGN, {"longitude_deg": -1.0}),
+    CoordinateMistake(MisfitCause.LATITUDE_SIGN, {"latitude_deg": -1.0}),
+    CoordinateMistake(MisfitCause.BOTH_SIGNS, {"latitude_deg": -1.0, "longitude_deg": -1.0}),
+    CoordinateMistake(MisfitCause.RADIANS, {"latitude_deg": _RADIAN_DEG, "longitude_deg": _RADIAN_DEG}),
+    CoordinateMistake(MisfitCause.MINUTES, minutes=True),
 )
 
 # Geographic systems of national surveys, whose coordinates look like WGS 84 and lie 50 to 700 m from it.

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+from schemas.enums import MisfitCause, MisfitPlace
+from schemas.words import CAUSES, MISFIT_PLACES
+
 CONFIGURATION = "append to the configuration file"
 
 
@@ -19,8 +22,32 @@ class State(StrEnum):
 
 
 @dataclass(frozen=True)
+class Cause:
+    """A known cause of a misfit, with the figures and names that its words take: a unit, a datum, an amount."""
+
+    code: MisfitCause
+    figures: tuple[str | int, ...] = ()
+
+    @property
+    def words(self) -> str:
+        return CAUSES[self.code].format(*self.figures)
+
+
+@dataclass(frozen=True)
+class Whose:
+    """Where the cause of a misfit lies, with the streams that its words name."""
+
+    code: MisfitPlace
+    streams: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        return MISFIT_PLACES[self.code].format(*self.streams)
+
+
+@dataclass(frozen=True)
 class Check:
-    """One comparison: `found` in words with figures, its `cause`, and the lines that mend it.
+    """One comparison: `found` in words with figures, its `causes`, and the lines that mend it.
 
     `lines` is text for a file, `into` says what to do with it; `advice` is what to do where no line mends it. A misfit
     `of_evidence` is one of the recorders that the judge believes: nothing is proved by them.
@@ -29,16 +56,24 @@ class Check:
     what: str
     state: State
     found: str
-    cause: str = ""
+    causes: tuple[Cause, ...] = ()
     lines: str = ""
     into: str = CONFIGURATION
     advice: str = ""
     of_evidence: bool = False
+    whose: Whose | None = None
 
     @property
     def sentence(self) -> str:
         """What does not fit, in one sentence."""
-        return f"{self.what}: {self.found}" + (f" ({self.cause})" if self.cause else "")
+        return f"{self.what}: {self.found}" + (f" ({self.cause})" if self.causes else "")
+
+    @property
+    def cause(self) -> str:
+        """Why it does not fit, and whose fault that is, in words."""
+        why = " and ".join(cause.words for cause in self.causes)
+        whose = "" if self.whose is None else self.whose.words
+        return ", ".join(filter(None, (why, whose)))
 
 
 def not_checked(what: str, why: str) -> Check:

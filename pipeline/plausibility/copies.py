@@ -15,14 +15,14 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.plausibility.check import Check, State
+from pipeline.plausibility.check import Cause, Check, State
 from pipeline.plausibility.recording import Recording
 from pipeline.plausibility.robust import LEAST
 from pipeline.plausibility.shifts import fit_survey
 from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, points_of
 from schemas.arrays import Bools, Floats, floats
 from schemas.config import FixSigma
-from schemas.enums import Fix
+from schemas.enums import Fix, MisfitCause
 
 _WHAT = "reference against the positions"
 # Fewer moving places in common tell nothing.
@@ -79,9 +79,8 @@ def copy_check(of: Recording) -> Check | None:
         f"{stamps}; an independent one would be so near in {chance:.1g} of all cases, for the positions have sigma "
         f"{sigma_m.max():.2g} m"
     )
-    cause = "it is a copy of the solution, which would judge itself"
     advice = "Leave the reference out of the run, or record one with another, better instrument."
-    return Check(_WHAT, State.IMPOSSIBLE, found, cause, advice=advice)
+    return Check(_WHAT, State.IMPOSSIBLE, found, (Cause(MisfitCause.COPY),), advice=advice)
 
 
 def _track(frame: pl.DataFrame, t_s: Floats) -> _Track:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 from pipeline.plausibility.axes import velocity_checks
 from pipeline.plausibility.check import Check, State, not_checked
-from pipeline.plausibility.odometer import LATENCY, odometer_checks
+from pipeline.plausibility.odometer import odometer_checks
 from pipeline.plausibility.places import read_stamp_checks, reads_lag, reference_checks, survey_checks
 from pipeline.plausibility.recording import recording_of
 from pipeline.plausibility.witnesses import Lag, clock_checks
 from pipeline.plausibility.written import reference_elsewhere, written_checks
 from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
+from schemas.enums import MisfitCause
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
@@ -62,8 +63,8 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
         checks = survey_checks(of, of.line, beside_reference) + checks
     if of.fixes["vel_e_mps"].null_count() < of.fixes.height:
         checks += velocity_checks(of.velocity, of.gnss)
-    believed = all(check.state is not State.MISFIT for check in checks if check.what == LATENCY)
-    return Fit((*checks, *clock_checks(of, lags, (vehicle.gnss_latency_s or 0.0) if believed else 0.0)))
+    doubted = any(cause.code is MisfitCause.LATENCY_OF_FILE for check in checks for cause in check.causes)
+    return Fit((*checks, *clock_checks(of, lags, 0.0 if doubted else vehicle.gnss_latency_s or 0.0)))
 
 
 def refuse_impossible(fit: Fit, place: str, config: IngestConfig) -> None:

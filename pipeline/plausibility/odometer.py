@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from pipeline.plausibility.causes import explain_factor
-from pipeline.plausibility.check import Check, State, correction, fits, not_checked
+from pipeline.plausibility.check import Cause, Check, State, correction, fits, not_checked
 from pipeline.plausibility.pairs import PairFit, fit_pair
 from pipeline.plausibility.recording import Recording
 from pipeline.plausibility.records import Places, Record
@@ -15,6 +15,7 @@ from pipeline.plausibility.robust import LEAST
 from pipeline.plausibility.witnesses import Lag
 from schemas.arrays import runs_of
 from schemas.config import PlausibilityConfig, Vehicle
+from schemas.enums import MisfitCause
 
 LATENCY = "GNSS latency of the vehicle file"
 _SIGNS = "sign of the odometer's speed against its distance"
@@ -79,8 +80,7 @@ def _factor_check(name: str, fitted: dict[str, PairFit], config: PlausibilityCon
     if pair.near_one:
         if not pair.other_factor(1.0, config.scale_told):
             return fits(what, found)
-        cause = "a wheel diameter that is set wrongly"
-        return Check(what, State.MISFIT, found, cause, _scale_lines(pair, 1.0), _TO_VEHICLE)
+        return Check(what, State.MISFIT, found, (Cause(MisfitCause.WHEEL),), _scale_lines(pair, 1.0), _TO_VEHICLE)
     if pair.constant < config.unit_windows or not pair.other_factor(1.0, config.scale_limit):
         return Check(what, State.MISFIT, f"no constant factor ({found} usually)")
     # What the other column shows too, if it is near 1, is of the wheel or of drifting positions.
@@ -88,10 +88,10 @@ def _factor_check(name: str, fitted: dict[str, PairFit], config: PlausibilityCon
     base = next((one for one in others if abs(one - 1.0) <= 2.0 * config.scale_limit), 1.0)
     if (explained := explain_factor(factor / base, name == "speed", config)) is not None:
         lines = correction("odometer", {column: 1.0 / explained.exact})
-        return Check(what, State.IMPOSSIBLE, found, f"the {name} is {explained.cause}", lines)
+        return Check(what, State.IMPOSSIBLE, found, explained.causes, lines)
     if pair.constant >= config.pulses_windows and max(factor, 1.0 / factor) > config.pulses_factor:
         lines = correction("odometer", {column: float(f"{1.0 / factor:.5g}")})
-        return Check(what, State.IMPOSSIBLE, found, "pulses, or a unit that this program does not know", lines)
+        return Check(what, State.IMPOSSIBLE, found, (Cause(MisfitCause.PULSES),), lines)
     return Check(what, State.MISFIT, found)
 
 
@@ -119,7 +119,8 @@ def _scale_check(pair: PairFit, vehicle: Vehicle, unit: float | None = None) -> 
     found = f"{vehicle.odometer_scale:.4f}, the run shows {pair.scale(unit):.4f} (sigma {pair.scale_sigma(unit):.4f})"
     wrong = pair.other_factor(unit / vehicle.odometer_scale, least)
     no_train = abs(vehicle.odometer_scale - 1.0) > config.scale_limit
-    return _of_file(what, found, wrong, _scale_lines(pair, unit), no_train)
+    code = MisfitCause.IMPOSSIBLE_SCALE if no_train else MisfitCause.SCALE_OF_FILE
+    return _of_file(what, found, wrong, code, _scale_lines(pair, unit))
 
 
 def _latency_check(pair: PairFit, reference: Lag | None, vehicle: Vehicle) -> Check | None:
@@ -135,16 +136,15 @@ def _latency_check(pair: PairFit, reference: Lag | None, vehicle: Vehicle) -> Ch
     found = f"{file_s:.2f} s, the run shows {-pair.lag_s:.2f} s (sigma {pair.lag_sigma_s:.2f} s)"
     sigma_s = max(2 * pair.lag_sigma_s, 0.02)
     lines = f"gnss_latency_s = {-pair.lag_s:.2f}\ngnss_latency_sigma_s = {sigma_s:.2f}\n"
-    return _of_file(LATENCY, found, pair.other_lag(-file_s, least_s), lines)
+    return _of_file(LATENCY, found, pair.other_lag(-file_s, least_s), MisfitCause.LATENCY_OF_FILE, lines)
 
 
-def _of_file(what: str, found: str, wrong: bool, lines: str, no_train: bool = False) -> Check:
-    """What a figure of the vehicle file shows, `no_train`: a figure that none can have."""
+def _of_file(what: str, found: str, wrong: bool, code: MisfitCause, lines: str) -> Check:
+    """What a figure of the vehicle file shows; `code`: why, where it is wrong."""
     if not wrong:
         return fits(what, found)
-    cause = "the vehicle file is of another vehicle or out of date, or the GNSS drifts over the whole run"
-    state, cause = (State.IMPOSSIBLE, "no odometer has such a scale") if no_train else (State.MISFIT, cause)
-    return Check(what, state, found, cause, lines, "write instead in the vehicle file")
+    state = State.IMPOSSIBLE if code is MisfitCause.IMPOSSIBLE_SCALE else State.MISFIT
+    return Check(what, state, found, (Cause(code),), lines, "write instead in the vehicle file")
 
 
 def sign_check(counters: dict[str, Record]) -> list[Check]:
@@ -166,10 +166,10 @@ def sign_check(counters: dict[str, Record]) -> list[Check]:
         # A train that runs backwards all the way is rarer than a counter of the wrong sign.
         name, does = ("distance", "falls") if falls.mean() > 0.5 else ("speed", "grows")
         lines = correction("odometer", {"distance_m" if name == "distance" else "speed_mps": -1.0})
-        found, cause = f"the distance {does} at the opposite speed", f"the {name} counts backwards"
-        return [Check(_SIGNS, State.IMPOSSIBLE, found, cause, lines)]
+        found = f"the distance {does} at the opposite speed"
+        return [Check(_SIGNS, State.IMPOSSIBLE, found, (Cause(MisfitCause.COUNTS_BACKWARDS, (name,)),), lines)]
     if against > 0.1 and not back.any() and not falls.all():
-        return [Check(_SIGNS, State.MISFIT, "the speed has no sign", "it stays positive where the distance falls")]
+        return [Check(_SIGNS, State.MISFIT, "the speed has no sign", (Cause(MisfitCause.SPEED_WITHOUT_SIGN),))]
     return [fits(_SIGNS, "the same")]
 
 
@@ -192,10 +192,10 @@ def turn_check(gnss: Places, counter: Record, pair: PairFit) -> Check:
     if never and never == reversal.sum():
         found = f"the train reverses {never} times, the counter never does"
         advice = "Let the recorder write the distance falling, and the speed negative, while the train reverses."
-        return Check(_TURNS, State.MISFIT, found, "a counter without sign", advice=advice)
+        return Check(_TURNS, State.MISFIT, found, (Cause(MisfitCause.COUNTER_WITHOUT_SIGN),), advice=advice)
     if wrongly and wrongly > 0.5 * onward.sum():
         found = f"the counter turns {wrongly} times where the train goes on"
-        return Check(_TURNS, State.MISFIT, found, "the sign follows something else than the movement")
+        return Check(_TURNS, State.MISFIT, found, (Cause(MisfitCause.SIGN_OF_SOMETHING_ELSE),))
     if not (reversal | onward).any():
         return not_checked(_TURNS, "the train does not stop on the way")
     return fits(_TURNS, f"{reversal.sum()} reversals, {onward.sum()} stops")

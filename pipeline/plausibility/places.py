@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.plausibility.causes import Datum, datums_at, explain_factor
-from pipeline.plausibility.check import Check, State, correction, fits, not_checked
+from pipeline.plausibility.check import Cause, Check, State, correction, fits, not_checked
 from pipeline.plausibility.copies import copy_check
 from pipeline.plausibility.recording import Recording
 from pipeline.plausibility.records import Places
@@ -17,6 +17,7 @@ from pipeline.track.geodesy import points_of
 from pipeline.track.survey import track_of
 from schemas.arrays import NS_PER_S, Floats, times_ns
 from schemas.config import PlausibilityConfig
+from schemas.enums import MisfitCause
 from schemas.run import Site
 
 _REFERENCE = "places of the reference against the positions"
@@ -48,8 +49,8 @@ def reference_checks(of: Recording) -> tuple[Lag, list[Check], bool]:
         return lag, [not_checked(_REFERENCE, words)], False
     near, words = found.shift_m <= config.shift_told_m, f"{found.towards} of them"
     # No lines: the judge believes the reference, and nobody should shift it to where the positions want it.
-    cause, advice = "another datum, or a fixed offset between both antennas", "Find out which of both is off."
-    beside = Check(_REFERENCE, State.MISFIT, words, cause, advice=advice)
+    causes, advice = (Cause(MisfitCause.OFFSET_OF_REFERENCE),), "Find out which of the two is off."
+    beside = Check(_REFERENCE, State.MISFIT, words, causes, advice=advice)
     beside = fits(_REFERENCE, words) if near or not found.shift_is_steady else beside
     return lag, [beside, *_reference_heights(of.gnss, of.reference, found.lag_s)], near
 
@@ -91,7 +92,7 @@ def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
             "stamps of the balise reads",
             State.MISFIT,
             f"all {reads.height} are whole seconds",
-            "cut off or rounded by the recorder, so that at 40 m/s a balise may have been read 40 m away",
+            (Cause(MisfitCause.WHOLE_SECONDS),),
             advice="Record the reads with finer stamps: until then nothing is proved.",
             of_evidence=True,
         )
@@ -139,18 +140,16 @@ def _beside(found: SurveyFit, datum: Datum | None, config: PlausibilityConfig, s
             return Check(_SURVEY, State.MISFIT, f"they lie {found.aside_m:.0f} m beside the track, not by one shift")
         return fits(_SURVEY, f"{found.aside_m:.1f} m beside the track usually")
     if datum is not None:
-        cause = (
-            f"the survey {'may be' if found.one_heading else 'is'} in {datum.name}, EPSG:{datum.epsg}, not in WGS 84"
-        )
+        code = MisfitCause.DATUM_LIKELY if found.one_heading else MisfitCause.DATUM
+        causes = (Cause(code, (datum.name, datum.epsg)),)
         advice = "Name the code in the site's track: first line of track.csv, a column epsg, or crs of GeoJSON."
         lines = f"# epsg: {datum.epsg}\n"
-        return Check(_SURVEY, State.MISFIT, words, cause, lines, "write as first line of track.csv", advice)
+        return Check(_SURVEY, State.MISFIT, words, causes, lines, "write as first line of track.csv", advice)
     shift_m = {"east": round(found.east_m, 1), "north": round(found.north_m, 1)}
     lines = "".join(correction(stream, shift_m=shift_m) for stream in streams)
     advice = "Name the survey's EPSG code or mend the survey; only where the shift is known to be the map's:"
-    cause = "a datum or map shift, or an antenna far from the track's middle"
-    cause = "the reference lies where they do: a datum or map shift" if len(streams) > 1 else cause
-    return Check(_SURVEY, State.MISFIT, words, cause, lines, advice=advice)
+    code = MisfitCause.MAP_SHIFT_BY_REFERENCE if len(streams) > 1 else MisfitCause.MAP_SHIFT
+    return Check(_SURVEY, State.MISFIT, words, (Cause(code),), lines, advice=advice)
 
 
 def _heights(other: str, up_m: Floats, height_m: Floats, offset_m: float, config: PlausibilityConfig) -> list[Check]:
@@ -165,14 +164,14 @@ def _heights(other: str, up_m: Floats, height_m: Floats, offset_m: float, config
     ratio, _ = steady_median(height_m / (height_m + up_m + offset_m))
     for stream, factor in (("gnss", ratio), (other, 1.0 / ratio)):
         unit = explain_factor(factor, False, config)
-        if unit is not None and unit.cause.removeprefix("in ") in _HEIGHT_UNITS:
-            whose = "heights of the positions are" if stream == "gnss" else f"heights of the {other} are"
+        name = "" if unit is None else unit.causes[0].figures[0]
+        if unit is not None and name in _HEIGHT_UNITS:
+            causes = (Cause(MisfitCause.HEIGHT_UNIT, ("positions" if stream == "gnss" else other, name)),)
             lines = "" if stream == "survey" else correction(stream, {"height_m": 1.0 / unit.exact})
             advice = "Write the survey's heights in metres." if stream == "survey" else ""
-            return [Check(what, State.MISFIT, words, f"{whose} {unit.cause}", lines, advice=advice)]
+            return [Check(what, State.MISFIT, words, causes, lines, advice=advice)]
     if abs(apart_m) > _GEOID_M:
-        return [Check(what, State.MISFIT, words, "another unit or another zero of the heights")]
-    cause = "one of both is above the sea (geoid), the other above the ellipsoid"
+        return [Check(what, State.MISFIT, words, (Cause(MisfitCause.HEIGHT_UNKNOWN),))]
     # The judge believes the reference: where it has the other zero, somebody has to say which is right.
     lines = correction("gnss", shift_m={"up": round(apart_m, 1)}) if other == "survey" else ""
-    return [Check(what, State.MISFIT, words, cause, lines)]
+    return [Check(what, State.MISFIT, words, (Cause(MisfitCause.HEIGHT_ZERO),), lines)]

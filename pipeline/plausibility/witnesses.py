@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from pipeline.plausibility.causes import explain_lag, leap_seconds
-from pipeline.plausibility.check import Check, State, correction, fits, not_checked
+from pipeline.plausibility.check import Cause, Check, State, Whose, correction, fits, not_checked
 from pipeline.plausibility.recording import Recording
+from schemas.enums import MisfitCause, MisfitPlace
 
 NAMES = {"odometer": "odometer", "reference": "reference", "balise_reads": "balise reads"}
 
@@ -69,27 +70,28 @@ def _check(of: Recording, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
     told = of_gnss or lag
     explained = explain_lag(told.lag_s, of.epoch_ns, min(3.0 * told.sigma_s, 3.0), config)
     exact_s = round(told.lag_s if explained is None else explained.exact, 2)
-    cause = "a constant lag: a clock that was not set" if explained is None else explained.cause
-    rather = _rather_gnss(lag.lag_s, cause, of.epoch_ns, config.same_clock_s)
+    causes = (Cause(MisfitCause.CONSTANT_LAG),) if explained is None else explained.causes
+    rolled_over = explained is not None and explained.has(MisfitCause.GPS_WEEK)
+    rather = _rather_gnss(lag.lag_s, rolled_over, of.epoch_ns, config.same_clock_s)
     at_gnss = of_gnss is not None or (not known and rather)
     pair = ("GNSS", name) if at_gnss else (name, "GNSS")
-    cause += f", in the {pair[0]}" if known else f", rather in the {pair[0]} than in the {pair[1]}"
+    whose = Whose(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
     if not at_gnss:
-        return Check(what, State.IMPOSSIBLE, found, cause, correction(lag.stream, shift_s=-exact_s))
+        return Check(what, State.IMPOSSIBLE, found, causes, correction(lag.stream, shift_s=-exact_s), whose=whose)
     streams = ("gnss",) if of.run.satellites is None else ("gnss", "satellites")
     only = of.solution if len(of.run.solutions()) > 1 else None
     lines = "".join(correction(stream, shift_s=exact_s, solution=only) for stream in streams)
-    return Check(what, State.IMPOSSIBLE, found, cause, lines)
+    return Check(what, State.IMPOSSIBLE, found, causes, lines, whose=whose)
 
 
-def _rather_gnss(lag_s: float, cause: str, t_ns: int, same_s: float) -> bool:
+def _rather_gnss(lag_s: float, rolled_over: bool, t_ns: int, same_s: float) -> bool:
     """Which of two clocks it is, where nobody else tells.
 
     GPS time is ahead of UTC, so the stream with the later stamps holds it; a week rolls over in GNSS receivers.
     """
     if abs(abs(lag_s) - leap_seconds(t_ns)) < same_s:
         return lag_s < 0
-    return "roll-over of the GPS week" in cause and lag_s > 0
+    return rolled_over and lag_s > 0
 
 
 def _small(what: str, found: str, lag: Lag) -> Check:
@@ -97,9 +99,9 @@ def _small(what: str, found: str, lag: Lag) -> Check:
     latency_s = round(-lag.lag_s, 2)
     if lag.stream == "odometer" and latency_s > 0 and not lag.latency_known:
         lines = f"gnss_latency_s = {latency_s}\ngnss_latency_sigma_s = {max(round(lag.sigma_s, 3), 0.02)}\n"
-        return Check(what, State.MISFIT, found, "positions arrive too old", lines, "append to the vehicle file")
-    cause = f"one of both is stamped {'too late' if latency_s < 0 else 'too early'}, or the positions are off"
+        return Check(what, State.MISFIT, found, (Cause(MisfitCause.LATENCY),), lines, "append to the vehicle file")
+    causes = (Cause(MisfitCause.STAMPED_LATE if latency_s < 0 else MisfitCause.STAMPED_EARLY),)
     if lag.stream == "reference":
         # The judge believes the reference: nobody should shift it to where the positions want it.
-        return Check(what, State.MISFIT, found, cause, advice="Find out which clock is wrong before one is corrected.")
-    return Check(what, State.MISFIT, found, cause, correction(lag.stream, shift_s=latency_s))
+        return Check(what, State.MISFIT, found, causes, advice="Find out which clock is wrong before one is corrected.")
+    return Check(what, State.MISFIT, found, causes, correction(lag.stream, shift_s=latency_s))

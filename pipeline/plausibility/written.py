@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.plausibility.causes import SLIPS, Slip
-from pipeline.plausibility.check import Check, State, correction, not_checked
+from pipeline.plausibility.causes import COORDINATE_MISTAKES, CoordinateMistake
+from pipeline.plausibility.check import Cause, Check, State, Whose, correction, not_checked
 from pipeline.plausibility.recording import Recording
 from pipeline.plausibility.records import Places
 from pipeline.track.geodesy import points_of
 from schemas.arrays import Floats, floats
+from schemas.enums import MisfitCause, MisfitPlace
 
 _WHAT = "positions as written"
 
@@ -28,43 +29,43 @@ def written_checks(of: Recording) -> list[Check]:
     if line is None:
         return [] if recorded and all(recorded.values()) else _without_survey(of, recorded)
     words = f"they lie {far_m / 1000.0:.0f} km from every track"
-    for slip in SLIPS:
-        mended = _mended(of, slip)
+    for mistake in COORDINATE_MISTAKES:
+        mended = _mended(of, mistake)
         if mended is None or line.far_m(mended.gnss.latitude_deg, mended.gnss.longitude_deg) > same_m:
             continue
         if sum(_witnesses(mended).values()) >= sum(recorded.values()):
-            return [_slipped(slip, words)]
-        cause = f"in the survey {slip.cause}: odometer, velocity or reference fit the positions as they are"
-        return [Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="Mend the columns of the site's track.")]
+            return [_mistaken(mistake, words)]
+        causes, advice = (Cause(mistake.code),), "Mend the columns of the site's track."
+        return [Check(_WHAT, State.IMPOSSIBLE, words, causes, advice=advice, whose=Whose(MisfitPlace.IN_SURVEY))]
     advice = "Check that run and site belong together, and axes and datum of both."
-    return [Check(_WHAT, State.MISFIT, words, "run and site of different places", advice=advice)]
+    return [Check(_WHAT, State.MISFIT, words, (Cause(MisfitCause.OTHER_PLACE),), advice=advice)]
 
 
 def _without_survey(of: Recording, recorded: dict[str, bool]) -> list[Check]:
-    """The slip that makes every other stream fit, if there is one."""
+    """The mistake that makes every other stream fit, if there is one."""
     words = "no other stream fits them"
-    for slip in SLIPS:
-        mended = _mended(of, slip)
+    for mistake in COORDINATE_MISTAKES:
+        mended = _mended(of, mistake)
         found = {} if mended is None else _witnesses(mended)
         if not all(found.values()) or sum(found.values()) <= sum(recorded.values()):
             continue
         if "odometer" in found and not recorded.get("odometer", False):
-            return [_slipped(slip, words)]
+            return [_mistaken(mistake, words)]
         # Signs leave the ways as they are: the velocity alone says that they differ.
-        cause = f"{slip.cause}, or the velocity has exchanged axes or signs"
-        return [Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="A site tells which: name it with --site.")]
+        causes, advice = (Cause(mistake.code),), "A site tells which: name it with --site."
+        return [Check(_WHAT, State.IMPOSSIBLE, words, causes, advice=advice, whose=Whose(MisfitPlace.OR_VELOCITY))]
     return []
 
 
-def _slipped(slip: Slip, words: str) -> Check:
-    advice = "Convert the positions: degrees are the whole part plus the rest times 100/60." if slip.minutes else ""
-    return Check(_WHAT, State.IMPOSSIBLE, words, slip.cause, _lines("gnss", slip), advice=advice)
+def _mistaken(mistake: CoordinateMistake, words: str) -> Check:
+    advice = "Convert the positions: degrees are the whole part plus the rest times 100/60." if mistake.minutes else ""
+    return Check(_WHAT, State.IMPOSSIBLE, words, (Cause(mistake.code),), _lines("gnss", mistake), advice=advice)
 
 
-def _lines(stream: str, slip: Slip) -> str:
+def _lines(stream: str, mistake: CoordinateMistake) -> str:
     """None for minutes, which no factor mends."""
-    exchange = ("latitude_deg", "longitude_deg") if slip.exchanged else None
-    return "" if slip.minutes else correction(stream, slip.factors, exchange=exchange)
+    exchange = ("latitude_deg", "longitude_deg") if mistake.exchanged else None
+    return "" if mistake.minutes else correction(stream, mistake.factors, exchange=exchange)
 
 
 def _witnesses(of: Recording) -> dict[str, bool]:
@@ -80,8 +81,8 @@ def _witnesses(of: Recording) -> dict[str, bool]:
     return found
 
 
-def _mended(of: Recording, slip: Slip) -> Recording | None:
-    return of.placed(*slip.mended(floats(of.fixes, "latitude_deg"), floats(of.fixes, "longitude_deg")))
+def _mended(of: Recording, mistake: CoordinateMistake) -> Recording | None:
+    return of.placed(*mistake.mended(floats(of.fixes, "latitude_deg"), floats(of.fixes, "longitude_deg")))
 
 
 def _apart_m(gnss: Places, latitude_deg: Floats, longitude_deg: Floats) -> float:
@@ -99,9 +100,10 @@ def reference_elsewhere(of: Recording) -> list[Check]:
     if record is None or (far_m := _apart_m(of.gnss, record.latitude_deg, record.longitude_deg)) < limit_m:
         return []
     what, words = "places of the reference against the positions", f"it is {far_m / 1000:.0f} km from the positions"
-    for slip in SLIPS:
-        latitude, longitude = slip.mended(record.latitude_deg, record.longitude_deg)
+    for mistake in COORDINATE_MISTAKES:
+        latitude, longitude = mistake.mended(record.latitude_deg, record.longitude_deg)
         if np.max(np.abs(latitude)) <= 90.0 and _apart_m(of.gnss, latitude, longitude) < limit_m:
-            cause, advice = f"in the reference {slip.cause}", "Convert its positions." if slip.minutes else ""
-            return [Check(what, State.IMPOSSIBLE, words, cause, _lines("reference", slip), advice=advice)]
+            advice = "Convert its positions." if mistake.minutes else ""
+            whose, lines = Whose(MisfitPlace.IN_REFERENCE), _lines("reference", mistake)
+            return [Check(what, State.IMPOSSIBLE, words, (Cause(mistake.code),), lines, advice=advice, whose=whose)]
     return [not_checked(what, words)]

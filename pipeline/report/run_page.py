@@ -37,6 +37,7 @@ from schemas.config import Configuration
 from schemas.enums import TRUTH
 from schemas.run import RunTables, Site
 from schemas.tables import Alarms, Hazards, Passages, Runs
+from schemas.words import notes_apart
 
 _HAZARDS = (
     *("hazard_id", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "time_since_failure_s"),
@@ -185,7 +186,7 @@ def _navigation(names: list[str]) -> str:
 
 def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) -> str:
     """All sections of one solution; of one that failed what reading and matching found out."""
-    name, told = row["solution"], [text for text in (row["error"], *(row["notes"] or "").split("; ")) if text]
+    name, told = row["solution"], [text for text in (row["error"], *notes_apart(row["notes"])) if text]
     items = "".join(f"<li>{escape(text)}</li>" for text in told)
     notes = f'<ul class="notice {row["status"]}">{items}</ul>' if items else ""
     if not name:

@@ -17,7 +17,7 @@ from schemas.inputs import Balises
 from schemas.run import Site
 from schemas.version import SOFTWARE
 
-_BALISES = ("balise_id", "netelement_id", "measure_m", "kind", "location_accuracy_m")
+_BALISES = ("balise_id", "netelement_id", "measure_m", "kind", "direction", "location_accuracy_m")
 
 
 def site_page(name: str, site: Site) -> str:

@@ -10,7 +10,6 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.figures.lost_time import lost_to
 from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.receivers.csv_draft import draft_mapping
@@ -26,8 +25,9 @@ from schemas.run import STREAMS, Finding, Site
 
 STARTING_CONFIG = "Configuration to begin with"
 _SITE_FILES = {"track.parquet", "track.csv", "track.geojson"}
-_RUN_COLUMNS: tuple[str | pl.Expr, ...] = (
-    *("verdict", "run_id", "solution", "status", "duration_s", "distance_m", "gnss_rate_hz", "availability", lost_to()),
+_RUN_COLUMNS = (
+    *("verdict", "run_id", "solution", "status", "duration_s", "distance_m", "gnss_rate_hz", "availability"),
+    *("lost_to", "lost_to_share", "lost_to_monitor"),
     *("evidence", "vehicle", "share_unknown", "balises_on_path", "balises_accepted", "unsafe_accepted"),
     *("unproven_accepted", "failures", "failures_within_budget", *HAZARD_COUNTS, "missed_detections"),
     *("alarms", "false_alarms", "error"),
@@ -148,10 +148,7 @@ def inspect_site(
 
 
 def inspect_result(path: Address) -> dict[str, pl.DataFrame]:
-    """The verdict of a result, and its runs in their main figures; null what nobody could count.
-
-    `lost_to` is what `notes` say of a low availability.
-    """
+    """The verdict of a result, and its runs in their main figures; null what nobody could count."""
     runs = store.read_table(path, "runs").select(_RUN_COLUMNS).collect()
     head = head_of(run_verdicts(runs).values())
     return {"Verdict": _figures({"verdict": head.word, **head.counts()}), "Runs": known_counts(runs)}

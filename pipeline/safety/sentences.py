@@ -19,7 +19,7 @@ def verdict_statement(runs: pl.DataFrame) -> str:
 
 def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     """What keeps the figures from being those of traffic, and what they leave out."""
-    injected = runs.filter(pl.col("notes").str.contains("faults were injected").fill_null(value=False))
+    injected = runs.filter(pl.col("faults_injected").fill_null(value=False))
     failed = runs.filter((pl.col("status") == RunStatus.FAILED).all().over("run_id"))["run_id"].n_unique()
     said = []
     if injected.height:

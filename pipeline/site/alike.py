@@ -12,6 +12,7 @@ from pipeline.lds.windows import DEFAULTS, minimal_spacing_m, window_m
 from pipeline.matching.candidates import candidates_of, segments_of
 from pipeline.track.geodesy import points_of
 from pipeline.track.network import Network, network_of
+from pipeline.track.path import valid_along_measure
 from pipeline.track.segments import SAMPLE_SPACING_M
 from pipeline.track.survey import Track, places_along, track_of
 from schemas.arrays import Floats
@@ -57,10 +58,12 @@ def _points(balises: pl.DataFrame, network: Network) -> dict[int, list[_Point]]:
     """Balises of one kind by oriented element, in the order in which a train meets them."""
     points: dict[int, list[_Point]] = {}
     columns = ("balise_id", "netelement_id", "measure_m", "location_accuracy_m")
-    for name, netelement_id, measure_m, accuracy_m in balises.select(columns).iter_rows():
+    valid = valid_along_measure(balises)
+    for (name, netelement_id, measure_m, accuracy_m), along in zip(balises.select(columns).rows(), valid, strict=True):
         if (element := network.track.element_at(netelement_id, measure_m)) is None:
             continue
-        for oriented in (2 * element, 2 * element + 1):
+        # Even runs with the measure, odd against it.
+        for oriented in (2 * element + side for side, sense in ((0, 1), (1, -1)) if along in (0, sense)):
             at_m = network.track.along_m(oriented, measure_m)
             points.setdefault(oriented, []).append(_Point(name, element, accuracy_m, at_m))
     return {

@@ -11,7 +11,7 @@ from pipeline.ingest.breaches import line_of
 from pipeline.ingest.conform import Defaults, conform_to, rows_text, type_name
 from pipeline.ingest.csv_text import comments_of, epsg_in, read_table
 from pipeline.storage.parquet import metadata_of, read_parquet
-from schemas.enums import Reaction
+from schemas.enums import BaliseDirection, Reaction
 from schemas.errors import InputError
 from schemas.inputs import SITE_SCHEMAS
 
@@ -32,6 +32,7 @@ _DEFAULTS: Defaults = {
     "location_accuracy_m": 12.0,
     "linked": True,
     "link_reaction": Reaction.SERVICE_BRAKE.value,
+    "direction": BaliseDirection.BOTH.value,
     "leg": 0,
 }
 # As recorded: an element without measures gets those of its geometry, and plane coordinates become degrees later.

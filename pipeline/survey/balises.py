@@ -20,14 +20,16 @@ from pipeline.track.geodesy import points_of
 from pipeline.track.network import network_of
 from pipeline.track.survey import Track, track_of
 from schemas.config import Configuration, SurveyConfig
+from schemas.enums import BaliseDirection, TravelAlong
 from schemas.errors import SiteError
 from schemas.inputs import Balises
 
 
-def balises_every(network: Network, spacing_m: float) -> pl.DataFrame:
+def balises_every(network: Network, spacing_m: float, travel: TravelAlong) -> pl.DataFrame:
     """Virtual balises at whole multiples of the spacing, counted along the shortest way from the survey's start.
 
-    So the spacing holds over joints and switches; where two ways meet again it begins anew.
+    So the spacing holds over joints and switches; where two ways meet again it begins anew. `travel`: for trains away
+    from the survey's start, back to it, or both.
     """
     track = track_of(network.track)
     from_start = _from_start_m(network.ends, track.length_m)
@@ -37,11 +39,20 @@ def balises_every(network: Network, spacing_m: float) -> pl.DataFrame:
         length = float(track.length_m[element])
         begins = min(at_start, at_end)
         way = np.arange(np.floor(begins / spacing_m) + 1, np.floor((begins + length) / spacing_m) + 1) * spacing_m
-        measures = way - begins if at_start <= at_end else length - (way - begins)
-        rows += [{"netelement_id": name, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
+        away = bool(at_start <= at_end)
+        measures = way - begins if away else length - (way - begins)
+        own = {"netelement_id": name, "direction": _direction(away, travel).value}
+        rows += [{**own, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
     ids = [f"VB{number:0{len(str(len(rows)))}}" for number in range(1, len(rows) + 1)]
-    table = pl.DataFrame(rows, schema={"netelement_id": pl.String, "measure_m": pl.Float64})
+    table = pl.DataFrame(rows, schema={"netelement_id": pl.String, "direction": pl.String, "measure_m": pl.Float64})
     return _typed("balises", table.with_columns(pl.Series("balise_id", ids, dtype=pl.String), kind=pl.lit("virtual")))
+
+
+def _direction(away: bool, travel: TravelAlong) -> BaliseDirection:
+    """Along a net element whose measure grows away from the survey's start, or towards it."""
+    if travel is TravelAlong.BOTH:
+        return BaliseDirection.BOTH
+    return BaliseDirection.AB if away == (travel is TravelAlong.AHEAD) else BaliseDirection.BA
 
 
 def _typed(place: str, table: pl.DataFrame) -> pl.DataFrame:

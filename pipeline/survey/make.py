@@ -19,6 +19,7 @@ from pipeline.survey.pieces import Survey
 from pipeline.survey.sources import read_surveys
 from pipeline.survey.trace import clean_traces
 from schemas.config import Configuration, Vehicle
+from schemas.enums import TravelAlong
 from schemas.errors import SiteError, UsageError
 from schemas.run import Finding, Site
 
@@ -27,17 +28,28 @@ _FILES = ("track", "links", "balises", "route")
 
 @dataclass(frozen=True)
 class Wish:
-    """What a site is made of: balises every so many metres or of a list; ends this near [m] meet."""
+    """What a site is made of: balises every so many metres or of a list; ends this near [m] meet.
+
+    `travel`: for which direction of travel those every so many metres are valid.
+    """
 
     surveys: list[Path]
     spacing_m: float | None = None
+    travel: TravelAlong = TravelAlong.BOTH
     balise_list: Path | None = None
     epsg: int | None = None
     join_m: float | None = None
     flat: bool = False
 
 
-def wish_of(surveys: list[Path], balises: str | None, epsg: int | None, join_m: float | None, flat: bool) -> Wish:
+def wish_of(
+    surveys: list[Path],
+    balises: str | None,
+    epsg: int | None,
+    join_m: float | None,
+    flat: bool,
+    travel: TravelAlong = TravelAlong.BOTH,
+) -> Wish:
     """The words of the command; `--balises every 1000` leaves its number among the surveys. Raises `UsageError`."""
     words = [str(path) for path in surveys]
     spacing: float | None = None
@@ -51,7 +63,10 @@ def wish_of(surveys: list[Path], balises: str | None, epsg: int | None, join_m: 
             raise UsageError("is no spacing", place=f"--balises {balises}", expected="every 1000 (metres)")
     if not surveys:
         raise UsageError("no survey is named", expected="GPX, KML, GeoJSON, CSV or a run")
-    return Wish(surveys, spacing, None if spacing or balises is None else Path(balises), epsg, join_m, flat)
+    if spacing is None and travel is not TravelAlong.BOTH:
+        remedy = "In a list of balises the column `direction` says it, one by one."
+        raise UsageError("needs --balises every N", place=f"--direction {travel.value}", remedy=remedy)
+    return Wish(surveys, spacing, travel, None if spacing or balises is None else Path(balises), epsg, join_m, flat)
 
 
 def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
@@ -84,7 +99,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
 
 def _balises(wish: Wish, network: Network, survey: Survey, config: Configuration) -> pl.DataFrame | None:
     if wish.spacing_m is not None:
-        table = balises_every(network, wish.spacing_m)
+        table = balises_every(network, wish.spacing_m, wish.travel)
         return table if table.height else None
     return None if wish.balise_list is None else balises_of_list(wish.balise_list, network, wish.epsg, survey, config)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +54,17 @@ class Network:
 
     def __post_init__(self) -> None:
         self.pairs = frozenset((one, edge.to) for one, edges in enumerate(self.successors) for edge in edges)
+
+    @cached_property
+    def edges(self) -> tuple[Ints, Ints]:
+        """All ways on: `to[first[one] : first[one + 1]]` are the successors of an oriented element."""
+        first = np.concatenate([[0], np.cumsum([len(edges) for edges in self.successors])])
+        return first, np.array([edge.to for edges in self.successors for edge in edges], dtype=np.int64)
+
+    @cached_property
+    def parts(self) -> Ints:
+        """Per oriented element the number of the part of the network that it is connected with."""
+        return connected_parts(self.successors)
 
     @property
     def count(self) -> int:
@@ -155,6 +167,17 @@ def _add(edges: list[Edge], edge: Edge) -> None:
 
 def oriented_sheet(successors: list[list[Edge]]) -> tuple[list[bool], bool]:
     """Of each connected part one orientation; both where a loop lets trains come back turned round."""
+    part = connected_parts(successors)
+    turned = part.reshape(-1, 2)[:, ::-1].ravel()
+    # Of a part and its mirror image the one that holds the first element in the sense of its measure.
+    first = np.full(int(part.max()) + 1, len(part))
+    np.minimum.at(first, part[::2], np.arange(0, len(part), 2))
+    usable = first[part] <= first[turned]
+    return usable.tolist(), bool((part != turned).all())
+
+
+def connected_parts(successors: list[list[Edge]]) -> Ints:
+    """Per oriented element the number of the part of the network that it is connected with."""
     # They take long to load, and a log needs none.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -163,13 +186,7 @@ def oriented_sheet(successors: list[list[Edge]]) -> tuple[list[bool], bool]:
     here = np.repeat(np.arange(count), [len(edges) for edges in successors])
     there = np.array([edge.to for edges in successors for edge in edges], dtype=np.int64)
     graph = coo_array((np.ones(len(here)), (here, there)), shape=(count, count))
-    _, part = connected_components(graph, directed=False)
-    turned = part.reshape(-1, 2)[:, ::-1].ravel()
-    # Of a part and its mirror image the one that holds the first element in the sense of its measure.
-    first = np.full(int(part.max()) + 1, count)
-    np.minimum.at(first, part[::2], np.arange(0, count, 2))
-    usable = first[part] <= first[turned]
-    return usable.tolist(), bool((part != turned).all())
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 # `Site.route` names directions as the site reader writes them: from an element's start to its end, or back.

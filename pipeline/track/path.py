@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +15,7 @@ from pipeline.track.leg import Leg, nearest_on_leg, path_at, segments_at
 from pipeline.track.segments import Feet, no_feet
 from pipeline.track.survey import MEASURE_TOLERANCE_M, Track
 from schemas.arrays import Bools, Floats, Ints, floats
+from schemas.enums import BaliseDirection, BaliseKind
 
 Objects = npt.NDArray[np.object_]
 BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
@@ -27,8 +29,23 @@ BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
     "location_accuracy_m": pl.Float64,
     "linked": pl.Boolean,
     "link_reaction": pl.String,
+    "valid_direction": pl.Int64,
 }
 
+
+def valid_along_measure(balises: pl.DataFrame) -> pl.Series:
+    """The direction along its net element in which each balise is valid (DOMAIN section 4): +1 growing, -1 falling.
+
+    0 both: a physical one, which every train reads, and one of a table that does not say (CONTRACT section 2).
+    """
+    both = pl.Series([BaliseDirection.BOTH.value]).new_from_index(0, balises.height)
+    said = balises.get_column("direction", default=both).cast(pl.String)
+    along = said.replace_strict(_ALONG_MEASURE, return_dtype=pl.Int64)
+    virtual = balises["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value
+    return along * virtual.cast(pl.Int64)
+
+
+_ALONG_MEASURE = {BaliseDirection.AB.value: 1, BaliseDirection.BA.value: -1, BaliseDirection.BOTH.value: 0}
 
 # Of two visits of one element the one that holds the measure comes first, however near the other is:
 # an order of two costs, not a limit.
@@ -109,6 +126,23 @@ class Route:
         return inside
 
 
+def routes_of(track: Track, legs: Sequence[Leg]) -> list[Route]:
+    """Legs as routes whose coordinate is `path_m`; net elements by their numbers in the track."""
+    routes = []
+    for leg in legs:
+        own = np.array([visit.element for visit in leg.visits])
+        routes.append(
+            Route(
+                element=own,
+                forward=np.array([visit.forward for visit in leg.visits]),
+                entry_m=np.array([leg.entry_m(number) for number in range(len(own))]),
+                low_m=track.begin_m[own],
+                high_m=track.end_m[own],
+            )
+        )
+    return routes
+
+
 @dataclass(frozen=True)
 class TravelledPath:
     """The legs of a run in order of time; `path_m` is 0 at the start of the first net element."""
@@ -173,23 +207,13 @@ class TravelledPath:
 
     def routes(self, numbers: dict[str, int]) -> list[Route]:
         """The legs as routes whose coordinate is `path_m`; `numbers`: net elements as the caller counts them."""
-        routes = []
-        for leg in self.legs:
-            own = np.array([visit.element for visit in leg.visits])
-            routes.append(
-                Route(
-                    element=np.array([numbers[self.track.ids[element]] for element in own.tolist()], dtype=np.int64),
-                    forward=np.array([visit.forward for visit in leg.visits]),
-                    entry_m=np.array([leg.entry_m(number) for number in range(len(own))]),
-                    low_m=self.track.begin_m[own],
-                    high_m=self.track.end_m[own],
-                )
-            )
-        return routes
+        number = np.array([numbers[name] for name in self.track.ids], dtype=np.int64)
+        return [replace(one, element=number[one.element]) for one in routes_of(self.track, self.legs)]
 
     def balises(self, balises: pl.DataFrame | None) -> pl.DataFrame:
         """Balises on the path with path position and `sense` (of the measure along it), in order of leg and position.
 
+        `valid_direction`: the direction of travel along growing path in which a virtual one is valid, +1 or -1; 0 both.
         A place that two legs share is given on each of them, for a train may pass it on each; an element passed
         twice on one leg gives its balises twice. A balise off its element is on no path (the site's findings
         name it).
@@ -200,7 +224,9 @@ class TravelledPath:
         parts = []
         for leg, route in enumerate(self.routes(self.track.index)):
             place, path_m, sense = route.places(element.to_numpy(), floats(balises, "measure_m"))
-            parts.append(balises[place].with_columns(leg=pl.lit(leg), path_m=path_m, sense=sense))
+            along_path = valid_along_measure(balises)[place] * pl.Series(sense)
+            on_leg = balises[place].with_columns(leg=pl.lit(leg), path_m=path_m, sense=sense)
+            parts.append(on_leg.with_columns(valid_direction=along_path))
         whole = pl.concat(parts).select(pl.col(name).cast(kind) for name, kind in BALISE_COLUMNS.items())
         # Where two pieces of an element meet they share a place.
         once = whole.unique(["leg", "balise_id", pl.col("path_m").round(3)], keep="first", maintain_order=True)

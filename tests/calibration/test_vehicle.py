@@ -38,7 +38,9 @@ def simulated_run(seed: int, duration_s: int = 1000, moving: bool = True) -> tup
     position = np.interp(at - LATENCY_S, t, true) + error + 500.0
     none = np.zeros(t.size, dtype=bool)
     segment = np.zeros(t.size, dtype=np.int64)
-    track = Odometry(0, t, true / SCALE + walk, segment, none[1:], none, Noise(0.05**2), 0.3, AlignConfig())
+    track = Odometry(
+        0, t, true / SCALE + walk, segment, none[1:], none, segment, 0.0 * t, Noise(0.05**2), 0.3, AlignConfig()
+    )
     return Observations(at, position, np.full(at.size, SIGMA_M)), track
 
 

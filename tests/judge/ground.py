@@ -278,6 +278,7 @@ def _listed(balises: list[Balise]) -> pl.DataFrame:
             "location_accuracy_m": 5.0,
             "linked": True,
             "link_reaction": "service_brake",
+            "direction": "both",
         }
         for balise in balises
     ]

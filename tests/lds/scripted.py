@@ -13,11 +13,15 @@ from schemas.config import Configuration, LdsConfig, MonitorConfig
 
 SCALE_SIGMA = 1e-4
 K_T = 5.3267238
+LONGEST = 20_000  # epochs of a journey
 INSTANT = pl.Datetime("ns", "UTC")
 
 
 class ScriptedBank:
-    """FailureLog at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart."""
+    """Fails at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart.
+
+    `blind`: no verdict along the track; `unknown`: the noise is not known; `begins`: begins anew by itself.
+    """
 
     def __init__(
         self,
@@ -25,10 +29,14 @@ class ScriptedBank:
         fast: Iterable[int] | None = None,
         rings: Iterable[int] = (),
         blind: Iterable[int] = (),
+        unknown: Iterable[int] = (),
+        begins: Iterable[int] = (),
     ) -> None:
         self.fails, self.rings, self.blind = set(fails), set(rings), set(blind)
         self.fast = self.fails if fast is None else set(fast)
+        self.begins = set(begins)
         self.started = 0
+        self.noise_known = ~np.isin(np.arange(LONGEST), list(unknown))
         self.restarted: list[int] = []
 
     def failed(self, epoch: int) -> bool:
@@ -41,10 +49,13 @@ class ScriptedBank:
         return epoch > self.started and epoch not in self.blind
 
     def quiet_until(self, epoch: int, end: int) -> int:
-        return next((k for k in range(epoch, end) if self.failed(k)), end)
+        return next((k for k in range(epoch, end) if self.failed(k) or self.begins_at(k)), end)
 
     def along_evaluated_between(self, epoch: int, end: int) -> np.ndarray:
         return np.array([self.along_evaluated(k) for k in range(epoch, end)], dtype=bool)
+
+    def begins_at(self, epoch: int) -> bool:
+        return epoch in {0, *self.begins, *self.restarted}
 
     def restart(self, epoch: int) -> None:
         self.restarted.append(epoch)
@@ -74,6 +85,8 @@ def epochs_of(
         odometer_m=odometer,
         direction=pl.lit(1, pl.Int8),
         odometer_segment=pl.lit(0, pl.Int64),
+        odometer_slips=pl.lit(value=False),
+        slip_doubt_m=pl.lit(0.0),
     )
     series = [
         value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()
@@ -82,6 +95,8 @@ def epochs_of(
     placed, sure = pl.when("fix_valid").then("path_m"), pl.when("on_track").then("gate_probability")
     travelled_m = pl.col("odometer_m").forward_fill().diff().fill_null(0.0).abs().cum_sum()
     said = frame.with_columns(series)
+    if "odometer_counter" not in columns:
+        said = said.with_columns(odometer_counter="odometer_segment")
     return said.with_columns(path_m=placed, gate_probability=sure, travelled_m=travelled_m)
 
 
@@ -95,6 +110,7 @@ def balises_at(places: dict[str, float], **columns: Any) -> pl.DataFrame:
         "location_accuracy_m": 12.0,
         "linked": True,
         "link_reaction": "service_brake",
+        "valid_direction": 0,
     } | columns
     spread = {name: value if isinstance(value, list) else [value] * size for name, value in values.items()}
     frame = pl.DataFrame({"balise_id": list(places), "path_m": list(places.values())} | spread)

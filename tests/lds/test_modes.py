@@ -108,6 +108,7 @@ def test_without_an_odometer_there_is_no_tvb_and_no_linking() -> None:
     assert told(result, "status", "window_open_m") == [("accepted", None)]
     assert changes(result, "lds_mode") == [(0, "initialising")]
     assert result.epochs["diagnosis_faulty"].all()
+    assert changes(result, "withheld_for") == [(0, "relink"), (1, None)]
     assert result.epochs["distance_from_lrvb_m"].null_count() == 20
 
 
@@ -120,7 +121,8 @@ def test_negation_lasts_thirty_seconds_after_the_last_fast_failure() -> None:
     assert changes(result, "negated") == [(0, False), (20, True), (52, False)]
     assert changes(result, "alarm") == [(0, False), (20, True), (23, False)]
     assert changes(result, "tvb") == [(0, False), (7, True), (20, False), (53, True)]
-    assert changes(result, "lds_mode") == [(0, "initialising"), (6, "linked"), (20, "fail_safe"), (52, "linked")]
+    modes = [(0, "initialising"), (6, "linked"), (20, "fail_safe"), (52, "odometry"), (53, "linked")]
+    assert changes(result, "lds_mode") == modes
     assert bank.restarted == [52]
 
 

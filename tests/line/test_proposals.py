@@ -118,6 +118,11 @@ def test_one_direction_alone_is_a_direction_of_travel(found: LineResult) -> None
     held = ahead.join(good, on="netelement_id").filter(pl.col("measure_m").is_between("from_m", "to_m"))
     assert set(ahead["netelement_id"]) == {"A", "B"}
     assert held.height == ahead.height
+    assert dict(ahead.select("netelement_id", "direction").iter_rows()) == {"A": "AB", "B": "BA"}
+    back = found.balises.filter((pl.col("proposal") == "back-400m") & (pl.col("kind") == "virtual"))
+    assert dict(back.select("netelement_id", "direction").iter_rows()) == {"A": "BA", "B": "AB"}
+    rest = found.balises.filter(pl.col("proposal").str.starts_with("both") | (pl.col("kind") == "physical"))
+    assert set(rest["direction"]) == {"both"}
 
 
 def test_windows_are_disjoint_on_each_way(found: LineResult, site: Site) -> None:
@@ -136,10 +141,11 @@ def test_stations_and_signals_are_served_where_they_can_be(found: LineResult) ->
 def test_a_proposal_is_a_site_table(found: LineResult, out: Path, tmp_path: Path, site: Site) -> None:
     site.track.write_parquet(tmp_path / "track.parquet")
     site.links.write_parquet(tmp_path / "links.parquet")
-    (tmp_path / "balises.csv").write_bytes((out / "line" / "both-400m" / "balises.csv").read_bytes())
+    (tmp_path / "balises.csv").write_bytes((out / "line" / "ahead-400m" / "balises.csv").read_bytes())
     balises = read_site(tmp_path).balises
     assert balises is not None
-    assert balises.height == found.balises.filter(pl.col("proposal") == "both-400m").height
+    proposed = found.balises.filter(pl.col("proposal") == "ahead-400m")
+    assert balises["direction"].to_list() == proposed["direction"].to_list()
 
 
 def test_files_open_offline(found: LineResult, out: Path) -> None:

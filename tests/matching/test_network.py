@@ -191,7 +191,7 @@ def test_balise_reads_pin_the_track() -> None:
     balises = pl.DataFrame(
         {
             "balise_id": names, "netelement_id": ["B1"], "measure_m": [500.0], "kind": ["physical"],
-            "location_accuracy_m": [5.0], "linked": [True], "link_reaction": ["none"],
+            "location_accuracy_m": [5.0], "linked": [True], "link_reaction": ["none"], "direction": ["both"],
         }
     )  # fmt: skip
     place = Site(ladder().track, ladder().links, balises=balises)

@@ -296,11 +296,16 @@ def test_balises_get_their_path_position_in_order() -> None:
             "location_accuracy_m": [12.0] * 4,
             "linked": [True] * 4,
             "link_reaction": ["trip"] * 4,
+            "direction": ["AB", "BA", "AB", "AB"],
         }
     )
     found = matched(run(np.arange(400.0, 700.0, 50.0), np.zeros(6)), site(TWO, TWO_LINKS)).path.balises(balises)
     assert found["balise_id"].to_list() == ["near", "far"]
     assert np.allclose(found["path_m"], [50.0, 900.0], atol=1e-3)
+    # `b` is run against its measure: AB there is back along the path. Every train reads a physical one.
+    assert found["valid_direction"].to_list() == [0, -1]
+    unsaid = matched(run(np.arange(400.0, 700.0, 50.0), np.zeros(6)), site(TWO, TWO_LINKS)).path
+    assert unsaid.balises(balises.drop("direction"))["valid_direction"].to_list() == [0, 0]
 
 
 def test_a_run_somewhere_else_says_what_may_be_wrong() -> None:

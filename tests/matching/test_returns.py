@@ -40,6 +40,7 @@ def place_of(points: Floats) -> Site:
         location_accuracy_m=pl.lit(12.0),
         linked=pl.lit(True),
         link_reaction=pl.lit("none"),
+        direction=pl.lit("both"),
     )
     return Site(bare.track, bare.links, balises=Balises.validate(balises, cast=True))
 

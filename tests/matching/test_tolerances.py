@@ -11,11 +11,8 @@ import polars as pl
 import pytest
 
 from pipeline.matching import match
-from pipeline.matching.decode import Chain, Decoded
-from pipeline.matching.doubt import elements_about
 from pipeline.matching.epochs import on_track_limit_m
 from pipeline.matching.fixes import contradictory_covariances
-from pipeline.matching.likelihood import step_score
 from pipeline.matching.match import pins_of
 from pipeline.matching.steps import spaced
 from pipeline.track.geodesy import points_of
@@ -50,39 +47,16 @@ def test_no_covariance_is_larger_than_its_variances_allow(
     assert contradictory_covariances(frame) == count
 
 
-@pytest.mark.parametrize(("around", "elements"), [(0, [3]), (1, [2, 3, 4]), (2, [1, 2, 3, 4, 5]), (9, [*range(6)])])
-def test_neighbours_on_the_path_are_the_same_way(around: int, elements: list[int]) -> None:
-    """Elements 0 to 5 in their own sense, of which the numbers begin at -2."""
-    chain = Chain(tuple(range(0, 12, 2)), -2)
-    nothing = np.zeros(0)
-    decoded = Decoded((chain,), nothing.astype(int), nothing.astype(int), nothing)
-    assert elements_about(decoded, 0, 1, around).tolist() == elements
-
-
-def test_how_many_neighbours_is_a_setting() -> None:
-    """At the link of two elements a position is on either of them."""
-    place = site({"a": line((0, 0), (500, 0)), "b": line((500, 0), (1000, 0))}, [("a", 1, "b", 0, "both")])
-    fixes = run(np.arange(100.0, 900.0, 10.0), np.zeros(80))
-    for around, sure in ((0, False), (1, True)):
-        config = MatchingConfig(same_way_elements=around)
-        found = match(fixes, None, place, Vehicle(), config, FixSigma())
-        assert (found.epochs["path_probability"].min() > 0.99) is sure
-
-
-@pytest.mark.parametrize(("sigmas", "expected_m"), [(3.0, 8.5), (2.0, 9.0), (20.0, 5.0)])
-def test_an_error_far_outside_its_sigma_returns_no_faster(sigmas: float, expected_m: float) -> None:
-    """10 m aside at a sigma of 1 m, of which a half stays: 1.5 m back from three sigmas, 5 m back from all of it."""
-    one = np.ones((1, 1))
-    like = SimpleNamespace(
-        hypotheses=SimpleNamespace(bias_m=np.zeros(1)), variance_m2=one, fresh_m2=0.1 * one, keep=0.5 * one,
-        renewed_m2=np.zeros(1), fixed=np.zeros(1), outlier=1e-9, outlier_scale_m=10.0, return_sigmas=sigmas,
-    )  # fmt: skip
-    at_m = np.arange(0.0, 12.0, 0.5)
-    score = [
-        step_score(np.array([10.0]), np.array([m]), np.zeros(1, dtype=int), np.zeros(1, bool), cast(Any, like))[0, 0]
-        for m in at_m
-    ]
-    assert at_m[int(np.argmax(score))] == expected_m
+def test_an_element_shorter_than_positions_scatter_is_the_same_way() -> None:
+    """At the links of elements of 10 m a position is on any of them; the path is as sure as that of a whole one."""
+    ends = [0.0, 480.0, 490.0, 500.0, 510.0, 1000.0]
+    elements = {f"e{k}": line((ends[k], 0), (ends[k + 1], 0)) for k in range(5)}
+    place = site(elements, [(f"e{k}", 1, f"e{k + 1}", 0, "both") for k in range(4)])
+    found = match(
+        run(np.arange(100.0, 900.0, 10.0), np.zeros(80)), None, place, Vehicle(), MatchingConfig(), FixSigma()
+    )
+    assert found.epochs["path_probability"].min() > 0.999
+    assert found.epochs["gate_probability"].min() > 0.999
 
 
 def test_steps_are_a_distance_or_a_time_apart() -> None:
@@ -108,6 +82,7 @@ def test_balises_beyond_an_end_by_what_lists_round_lie_where_their_measure_says(
             "location_accuracy_m": 5.0,
             "linked": True,
             "link_reaction": "none",
+            "direction": "both",
         }
     )
     fixes = run(np.arange(400.0, 50.0, -10.0), np.zeros(35))

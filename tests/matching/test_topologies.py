@@ -174,7 +174,7 @@ def test_what_ended_a_doubt_is_named() -> None:
     place = site({"a": line((0, 0), (2000, 0)), "b": line((0, 4), (2000, 4))})
     balises = pl.DataFrame({
         "balise_id": ["r"], "netelement_id": ["a"], "measure_m": [1000.0], "kind": ["physical"],
-        "location_accuracy_m": [5.0], "linked": [True], "link_reaction": ["none"],
+        "location_accuracy_m": [5.0], "linked": [True], "link_reaction": ["none"], "direction": ["both"],
     })  # fmt: skip
     x = np.arange(0.0, 1990.0, 10.0)
     fixes = run(x, np.full(len(x), 1.9), 1.0)

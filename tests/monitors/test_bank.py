@@ -234,5 +234,5 @@ def test_an_axis_without_any_epoch_hides_no_fail_of_the_others():
 def test_quiet_until_the_next_fail_or_the_end_of_what_is_known(epoch: int, end: int, quiet: int) -> None:
     """Fails at the fourth and the ninth epoch; ten are known."""
     fails = np.isin(np.arange(10), [4, 8])
-    bank = SimpleNamespace(_look=lambda _: None, _any=fails, _known_to=9)
+    bank = SimpleNamespace(_look=lambda _: None, _stops=fails, _known_to=9)
     assert MonitorBank.quiet_until(cast(Any, bank), epoch, end) == quiet

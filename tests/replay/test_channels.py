@@ -66,7 +66,7 @@ def test_comparison_with_a_solution_that_the_run_lacks_says_so():
     one, site = journey(OFFSET)
     epochs = replay(one, site, VEHICLE, with_reference("egnos")).epochs
     assert epochs["channel_state"].unique().to_list() == ["not_evaluated"]
-    assert epochs["channel_reason"].unique().to_list() == ["the run has no solution 'egnos' to compare with"]
+    assert epochs["channel_reason"].unique().to_list() == ["the run does not hold the solution to compare with"]
 
 
 def test_fault_common_to_both_solutions_only_the_diagnosis_finds():

@@ -27,7 +27,10 @@ KNOWN = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4, gnss_latency_s=0.
 def balises(*rows: tuple[str, str, float, str]):
     frame = pl.DataFrame(rows, schema=["balise_id", "netelement_id", "measure_m", "kind"], orient="row")
     return Balises.validate(
-        frame.with_columns(location_accuracy_m=12.0, linked=True, link_reaction=pl.lit("service_brake")), cast=True
+        frame.with_columns(
+            location_accuracy_m=12.0, linked=True, link_reaction=pl.lit("service_brake"), direction=pl.lit("both")
+        ),
+        cast=True,
     )
 
 

@@ -50,6 +50,7 @@ def journey(points, way_m, rounds, links, measures, error_m=0.0):
         location_accuracy_m=pl.lit(12.0),
         linked=pl.lit(True),
         link_reaction=pl.lit("service_brake"),
+        direction=pl.lit("both"),
     )
     site = Site(bare.track, bare.links, balises=stream(Balises, balises))
     return RunLog("loop", gnss, odometer=odometer, reference=stream(Reference, truth)), site

@@ -14,6 +14,7 @@ from tests.matching.builders import line
 
 KNOWN = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4, gnss_latency_s=0.0, gnss_latency_sigma_s=0.005)
 SPEED_MPS, RATE_HZ = 20.0, 10.0
+_UNSAID = {"sensor": "primary"}
 
 
 def moved(distance_m):
@@ -50,6 +51,7 @@ def shunting():
         location_accuracy_m=pl.lit(12.0),
         linked=pl.lit(True),
         link_reaction=pl.lit("service_brake"),
+        direction=pl.lit("both"),
     )
     way, x, y = zigzag()
     noise = np.random.default_rng(3).standard_normal((3, way.size))
@@ -62,7 +64,7 @@ def shunting():
 
 def stream(schema, frame):
     columns = schema.columns()
-    missing = [pl.lit(None).alias(name) for name in columns if name not in frame.columns]
+    missing = [pl.lit(_UNSAID.get(name)).alias(name) for name in columns if name not in frame.columns]
     return schema.validate(frame.with_columns(missing).select(list(columns)), cast=True)
 
 

@@ -103,6 +103,7 @@ def test_defaults_of_balises_and_words_of_routes(tmp_path: Path) -> None:
     Route.validate(site.route)
     assert site.balises["location_accuracy_m"].to_list() == [12.0, 12.0]
     assert site.balises["link_reaction"].cast(str).to_list() == ["service_brake"] * 2
+    assert site.balises["direction"].cast(str).to_list() == ["both"] * 2
     assert site.route["direction"].to_list() == ["BA", "BA", "BA"]
 
 
@@ -182,13 +183,15 @@ def test_mixed_dimensions_are_said(tmp_path: Path) -> None:
 def test_all_breaches_come_at_once(tmp_path: Path) -> None:
     track = builders.track().with_columns(latitude_deg=pl.Series([50.0, float("nan"), *[50.0] * 7]))
     links = builders.links().with_columns(navigability=pl.lit("sideways"), position_a=pl.lit(3))
-    balises = builders.balises(kind=["virtual", "imaginary"], balise_id=["v1", None])
+    balises = builders.balises(kind=["virtual", "imaginary"], balise_id=["v1", None], direction=["AB", "up"])
     text = messages(builders.write(tmp_path, track=track, links=links, balises=balises))
     assert "track.parquet: column latitude_deg: has values that are not finite numbers; found nan in row 1" in text
     assert "links.parquet: column position_a: is out of range; found 3 in 4 rows, first 0; expected at most 1" in text
     assert "links.parquet: column navigability: has the wrong type; found 'sideways'" in text
     assert "expected one of AB BA both none" in text
     assert "balises.parquet: column kind: has the wrong type; found 'imaginary'" in text
+    wrong = "balises.parquet: column direction: has the wrong type; found 'up'; expected one of AB BA both"
+    assert text.count(wrong) == 1
     assert "balises.parquet: column balise_id: has missing values; found null in row 1" in text
 
 

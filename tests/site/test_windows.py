@@ -21,7 +21,13 @@ ROW = [("A", 1, "B", 1, "both"), ("B", 0, "C", 0, "both")]
 
 def site_of(elements: Any, links: Any, places: dict[str, tuple[str, float]], **columns: Any) -> Site:
     bare = builders.site(elements, links)
-    defaults = {"kind": "virtual", "location_accuracy_m": 12.0, "linked": True, "link_reaction": "service_brake"}
+    defaults = {
+        "kind": "virtual",
+        "location_accuracy_m": 12.0,
+        "linked": True,
+        "link_reaction": "service_brake",
+        "direction": "both",
+    }
     values = {
         name: given if isinstance(given, list) else [given] * len(places)
         for name, given in (defaults | columns).items()
@@ -50,6 +56,13 @@ def test_pairs_closer_than_the_minimal_spacing_are_named_once() -> None:
     (finding,) = told(site_of(LONG, [], on_a(V1=100.0, V2=500.0, V3=600.0, V4=1000.0)))
     assert finding[0] == "balises V2, V3"
     assert "measured from V1 overlap: 100.0 m apart, 103.2 m needed" in finding[1]
+
+
+def test_balises_of_opposite_directions_are_never_expected_together() -> None:
+    """Ahead V3 does not exist, back V2 does not; among those for one direction 100 m are too few as ever."""
+    places = on_a(V1=100.0, V2=500.0, V3=600.0, V4=1000.0)
+    assert told(site_of(LONG, [], places, direction=["both", "AB", "BA", "both"])) == []
+    assert len(told(site_of(LONG, [], places, direction=["both", "AB", "AB", "both"]))) == 1
 
 
 def test_wide_enough_is_no_finding() -> None:

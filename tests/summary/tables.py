@@ -54,8 +54,17 @@ def epochs(t_s: list[float], **columns: Any) -> pl.DataFrame:
         "moving": True,
     }
     # Between stages an epoch has columns that no table has.
-    between = {"fix_valid": pl.lit(value=True), "odometer_reason": pl.lit(None, pl.String)}
-    return table(Epochs, len(t_s), **(good | columns)).with_columns(**between)
+    between = {"fix_valid": True, "odometer_reason": None, "survey_sigma_m": 1.0}
+    of_stages = {name: columns.pop(name, value) for name, value in between.items()}
+    kinds = {"odometer_reason": pl.String, "survey_sigma_m": pl.Float64}
+    rows = table(Epochs, len(t_s), **(good | columns))
+    return rows.with_columns(
+        pl.Series(name, _each(value, len(t_s)), kinds.get(name, pl.Boolean)) for name, value in of_stages.items()
+    )
+
+
+def _each(value: Any, height: int) -> list[Any]:
+    return value if isinstance(value, list) else [value] * height
 
 
 def passages(height: int = 0, **columns: Any) -> pl.DataFrame:

@@ -18,9 +18,7 @@ from tests.summary.tables import NS, alarms, epochs, hazards, passages, table
 ACROSS = {"monitors": [["cross_raw"]], "verdict": "false", "suspect": "unknown", "netelement_id": "A"}
 
 
-def run_of(
-    run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | None = None, counted: Any = None, **found: Any
-) -> RunTables:
+def run_of(run_id: str, solutions: tuple[str, ...] = ("primary",), counted: Any = None, **found: Any) -> RunTables:
     rows: dict[str, Any] = {
         "solution": list(solutions),
         "status": "ok",
@@ -32,7 +30,6 @@ def run_of(
         "gnss_rate_hz": 10.0,
         "false_alarms": 0,
         "false_alarm_rate_per_h": 0.0,
-        "notes": notes,
         "share_unknown": 0.0,
         "verdict": "safe",
         "input_digest": run_id,
@@ -69,7 +66,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Assessment:
         "failure_accepted": [["right"]],
     }
     across = alarms(1, solution="primary", measure_m=500.0, **ACROSS)
-    write_run(run_of("a", notes="faults were injected: ramp", counted=failed, hazards=fault, alarms=across), out, {})
+    write_run(run_of("a", counted=failed | {"faults_injected": True}, hazards=fault, alarms=across), out, {})
     write_run(run_of("b", alarms=across.with_columns(measure_m=540.0)), out, {})
     write_run(run_of("c", ("gps", "primary")), out, {})
     return assess(out)

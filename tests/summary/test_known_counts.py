@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import polars as pl
-
 from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.plan import RunJob
 from pipeline.figures.known_counts import known_counts
@@ -23,6 +21,8 @@ ROWS = table(
     evidence=["odometer", None, None],
     balises_accepted=[8, 7, 0],
     hazards_1b=[1, 0, 0],
+    lost_to=[None, ["no_position", "no_odometer"], None],
+    lost_to_share=[None, [0.6, 0.4], None],
 )
 
 
@@ -47,12 +47,11 @@ def test_outcome_of_a_run() -> None:
 
 def test_inspected_result(tmp_path: Path) -> None:
     empty = {name: schema.create_empty() for name, schema in TABLES.items()}
-    notes = pl.lit("one; available for 0% of the moving time, the rest lost to: 60% no fix, 40% no odometer; two")
-    for run_id, row in (("blind", ROWS[1:2].with_columns(notes=notes)), ("seen", ROWS[:1])):
+    for run_id, row in (("blind", ROWS[1:2]), ("seen", ROWS[:1])):
         write_run(RunTables(run_id, **(empty | {"runs": row})), tmp_path, {})
     inspected = inspect_result(tmp_path)
     assert inspected["Verdict"].rows() == [
         ("verdict", "failed"), ("unsafe", "0"), ("unproven", "0"), ("safe", "0"), ("failed", "2")
     ]  # fmt: skip
-    runs = inspected["Runs"].select("run_id", "unsafe_accepted", "hazards_1b", "balises_accepted", "lost_to")
-    assert runs.rows() == [("blind", None, None, 7, "60% no fix, 40% no odometer"), ("seen", 0, 1, 8, None)]
+    runs = inspected["Runs"].select("run_id", "unsafe_accepted", "hazards_1b", "balises_accepted", "lost_to_share")
+    assert runs.rows() == [("blind", None, None, 7, [0.6, 0.4]), ("seen", 0, 1, 8, None)]

@@ -17,9 +17,10 @@ from pipeline.judge.judge import Judged
 from pipeline.results.provenance import Provenance
 from schemas.arrays import flags, times_ns
 from schemas.config import Configuration, LdsConfig
-from schemas.enums import Evidence, VehicleFigures
+from schemas.enums import Evidence, Note, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, SCALES, Runs
+from schemas.words import Remark
 from tests.summary.tables import NS, alarms, epochs, failures, hazards, passages
 
 PROVENANCE = Provenance("c" * 64, "i" * 64, "balise 0.1.0")
@@ -91,10 +92,10 @@ def test_a_failed_run() -> None:
 
 def test_damaged_input_is_partial() -> None:
     notes = IngestNotes(partial_until_ns=42 * NS, damage="chunk 7 is cut off", skipped_topics=("/diag",))
-    found = row(epochs(seconds(3)), ingest=notes, notes=("map 12 m off",))
+    found = row(epochs(seconds(3)), ingest=notes, notes=(Remark(Note.MISFIT, ("map 12 m off",)),))
     assert (found["status"], found["error"]) == ("partial", "chunk 7 is cut off")
     assert found["partial_until"].timestamp() == 42.0
-    assert found["notes"] == "topics not used: /diag; map 12 m off"
+    assert found["notes"] == "topics not used: /diag; does not fit: map 12 m off"
 
 
 def test_what_the_evidence_cannot_see_is_said() -> None:
@@ -104,7 +105,8 @@ def test_what_the_evidence_cannot_see_is_said() -> None:
     )  # fmt: skip
     assert (found["vehicle"], found["odometer_contradicted"]) == ("learned", 2)
     assert "never that it was right" in found["notes"]
-    assert "balise reads every 2 km and within 300 m of both ends" in found["notes"]
+    assert found["remedies"] == ["vehicle_file", "reference"]
+    assert "`balise convert REFERENCE --to RUN --stream reference`" in found["notes"]
     assert "does not fit 2 gaps" in found["notes"]
     assert "no odometer scale in a vehicle file" in found["notes"]
 

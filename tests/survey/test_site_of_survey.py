@@ -20,6 +20,7 @@ from pipeline.survey.pieces import Piece, Survey
 from pipeline.survey.trace import clean_traces
 from pipeline.track.geodesy import moved_deg
 from schemas.config import Configuration, SurveyConfig, Vehicle
+from schemas.enums import TravelAlong
 from schemas.errors import BaliseError
 from schemas.run import Site
 
@@ -54,7 +55,8 @@ def written(folder: Path, name: str, *features: dict[str, Any]) -> Path:
 
 
 def site_of(*surveys: Path, balises: str | None = None, **wishes: Any) -> Site:
-    wish = wish_of(list(surveys), balises, wishes.get("epsg"), wishes.get("join_m"), wishes.get("flat", False))
+    travel = wishes.get("travel", TravelAlong.BOTH)
+    wish = wish_of(list(surveys), balises, wishes.get("epsg"), wishes.get("join_m"), wishes.get("flat", False), travel)
     return make_site(wish, Vehicle(), Configuration(survey=SurveyConfig(**wishes.get("config", {}))))
 
 
@@ -199,17 +201,31 @@ def test_balises_keep_their_spacing_over_joints_and_follow_coordinates_and_kilom
     assert every["netelement_id"].to_list() == ["A", "B", "B", "B"]
     # A degree of latitude is as long as the ellipsoid says: 2,500 m come back to a millimetre.
     assert every["measure_m"].to_list() == pytest.approx([600.0, 200.0, 800.0, 1400.0], abs=1e-3)
+    # B is surveyed back to the start.
+    against = table.with_columns(km=pl.Series(km)).filter(track="B").reverse()
+    table.with_columns(km=pl.Series(km)).filter(track="A").vstack(against).write_csv(tmp_path / "against.csv")
+    for travel, directions in (("ahead", ["AB", "BA"]), ("back", ["BA", "AB"]), ("both", ["both", "both"])):
+        one_way = site_of(tmp_path / "against.csv", balises="every 600", travel=TravelAlong(travel)).balises
+        assert one_way is not None
+        assert dict(one_way.select("netelement_id", "direction").iter_rows()) == dict(
+            zip("AB", directions, strict=True)
+        )
     wanted = tmp_path / "wanted.csv"
     place = degrees(np.array([3.0]), np.array([1250.0]))
-    wanted.write_text(f"balise_id,kind,lat,lon,km\nP1,physical,{place[0][0]},{place[1][0]},\nV2,virtual,,,12.45\n")
+    head = "balise_id,kind,lat,lon,km,direction"
+    wanted.write_text(f"{head}\nP1,physical,{place[0][0]},{place[1][0]},,both\nV2,virtual,,,12.45,BA\n")
     listed = site_of(survey, balises=str(wanted))
     assert listed.balises is not None
     rows = listed.balises.select("balise_id", "netelement_id", "measure_m", "kind").rows()
     assert [(*row[:2], row[3]) for row in rows] == [("P1", "B", "physical"), ("V2", "A", "virtual")]
     assert [row[2] for row in rows] == pytest.approx([250.0, 450.0], abs=0.01)
+    assert listed.balises["direction"].to_list() == ["both", "BA"]
     assert listed.track["line_km"].to_list() == pytest.approx(km.tolist())
     wanted.write_text(f"lat,lon\n{place[0][0]},{place[1][0] + 0.001}\n")
     with pytest.raises(BaliseError, match="balise B1: lies beside the track"):
+        site_of(survey, balises=str(wanted))
+    wanted.write_text("km,direction\n12.45,forwards\n")
+    with pytest.raises(BaliseError, match=r"direction: .*'forwards'.*expected one of AB BA both"):
         site_of(survey, balises=str(wanted))
     wanted.write_text("km\n44\n")
     with pytest.raises(BaliseError, match="no track has line kilometre 44"):

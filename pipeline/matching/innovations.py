@@ -1,0 +1,65 @@
+"""How the position moves across the tracks, but for what their survey may be wrong (DOMAIN section 2).
+
+Of tracks beside each other the one with the smoother survey would always win. So all of them are judged on one
+movement, that of the track against which the position moves least. By how much the surveyed distance of another one
+has changed meanwhile is an error of the survey up to `survey_sigmas` √2 sigma, and tells nothing; what goes beyond
+does: such tracks part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import Floats, Ints
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Per state [m]: the movement that all tracks share, in the state's own sense of left, and error of the survey.
+
+    `shared_m` since the step before. `survey_m` is what has been taken for an error of the survey: offset less that
+    is the level of the position beside the track as it would be without.
+    """
+
+    shared_m: Floats
+    survey_m: Floats
+
+
+def innovations_of(
+    first: Ints, offset_m: Floats, heading_rad: Floats, tolerance_m: Floats, before: Ints, keep: Floats
+) -> Innovations:
+    """Follow every state of the search from step to step.
+
+    `before`: the state of the step before that a state goes on from, -1 for none. `keep`: per step the share of an
+    error of the survey that goes on, the rest being its mean by then.
+    """
+    step = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    moved_m = np.where(before >= 0, offset_m - offset_m[before], np.inf)
+    least = np.lexsort((np.abs(moved_m), step))[first[:-1]][step]
+    # Elements that are surveyed in opposite senses have opposite sides to their left.
+    same = np.cos(heading_rad - heading_rad[least]) >= 0.0
+    begun = before < 0
+    shared_m = np.where(begun, 0.0, np.where(same, 1.0, -1.0) * np.where(begun, 0.0, moved_m[least]))
+    parted_m = np.where(begun, 0.0, moved_m - shared_m)
+    return Innovations(shared_m, _errors_m(parted_m, tolerance_m, before, keep[step]))
+
+
+def _errors_m(parted_m: Floats, tolerance_m: Floats, before: Ints, keep: Floats) -> Floats:
+    """What of the movements that differ from the shared one has been taken for an error of the survey [m]."""
+    errors = [0.0] * len(parted_m)
+    if parted_m.any():
+        columns = before.tolist(), parted_m.tolist(), tolerance_m.tolist(), keep.tolist()
+        for row, (origin, parted, limit, kept) in enumerate(zip(*columns, strict=True)):
+            if origin >= 0:
+                errors[row] = kept * min(max(errors[origin] + parted, -limit), limit)
+    return np.array(errors)
+
+
+def movements_m(innovations: Innovations, offset_m: Floats, tolerance_m: Floats, one: Ints, other: Ints) -> Floats:
+    """Movement from states to others [m]: the shared one, and what no error of the survey explains."""
+    shared_m = innovations.shared_m[other]
+    error_m = innovations.survey_m[one] + offset_m[other] - offset_m[one] - shared_m
+    limit_m = tolerance_m[other]
+    return np.asarray(shared_m + error_m - np.clip(error_m, -limit_m, limit_m))
