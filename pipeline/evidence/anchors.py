@@ -138,7 +138,9 @@ def known_stretch(
         known = KnownPath(path, one.sense, at_m, at_m, at_m)
         low_m, high_m = _left_open(known, t_ns, stretch.sigma_m, counters, reads_ns, config)
         paths.append(replace(known, low_m=at_m + low_m, high_m=at_m + high_m))
-    return KnownStretch(t_ns, stretch.sigma_m, speed_mps * clock.delta_s, tuple(paths))
+    since_s = (t_ns - t_ns[0]) / NS_PER_S
+    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in (-clock.delta_s, 0.0, clock.delta_s)]
+    return KnownStretch(t_ns, stretch.sigma_m, np.maximum.reduce(around) * clock.delta_s, tuple(paths))
 
 
 def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
@@ -159,6 +161,8 @@ def _left_open(
     the next read.
     """
     low_m, high_m = np.zeros((2, t_ns.size))
+    if t_ns.size < 2:
+        return low_m, high_m
     step_m, root_m = _contradicted(known, t_ns, sigma_m, counters, config)
     limit_m = config.align.sure_sigmas * root_m
     stepped = np.flatnonzero((np.abs(step_m) > limit_m) & _uneven(known.at_m, t_ns, limit_m))

@@ -73,17 +73,17 @@ def _stands_ns(odometer: Odometry) -> Ints:
     return np.array((t_ns[first] + t_ns[np.minimum(last + 1, t_ns.size - 1)]) // 2, dtype=np.int64)
 
 
-def beside_m(driven_m: Floats, sigma_m: float, config: Configuration) -> Floats:
-    """Half the interval on one side of an anchor of this sigma: 5 m + 5 % of the way (SUBSET-041 5.3.1.1)."""
-    lds = config.lds
-    half: Floats = max(lds.odometer_fixed_m, config.hazards.evidence_factor * sigma_m) + lds.odometer_share * driven_m
+def beside_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
+    """Half the interval on one side of a place known to `known_m`: 5 m + 5 % of the way (SUBSET-041 5.3.1.1)."""
+    half: Floats = max(config.lds.odometer_fixed_m, known_m) + config.lds.odometer_share * driven_m
     return half
 
 
 def carried(counter: Counter, anchor: Anchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
     """Least and largest coordinate on one side of an anchor at this coordinate; NaN where the odometer is silent."""
     centre = at_m + counter.between(anchor.t_ns, t_ns).distance_m
-    half = beside_m(counter.driven_m(anchor.t_ns, t_ns), anchor.sigma_m, config) + anchor.clock_m
+    known_m = config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m
+    half = beside_m(counter.driven_m(anchor.t_ns, t_ns), known_m, config)
     return centre - half, centre + half
 
 

@@ -286,13 +286,13 @@ def evidence_of(
         clocks.append(clock_of(_lag_of_reads(pairs), by_file, hazards))
         read = on_clock(read, clocks[-1], main)
     reads_ns = np.array([one.t_ns for one in read], dtype=np.int64)
-    silent: Sequence[Span] = ()
+    shift_ns = round(clocks[0].shift_s * NS_PER_S) if found else 0
+    silent = [(begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]]
     if found:
-        ahead_m, shift_ns = vehicle.gnss_antenna_ahead_m, round(clocks[0].shift_s * NS_PER_S)
+        ahead_m = vehicle.gnss_antenna_ahead_m
         stretches = tuple(known_stretch(one, clocks[0], counters, reads_ns, ahead_m, config) for one in found)
         told = zip(found, stretches, strict=True)
         facing |= {known.paths[0].facing() for one, known in told if abs(one.with_m - one.against_m) >= least_m}
-        silent = [(begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]]
     apart = [(one, one) for one in outside(read, stretches)]
     all_borders = carried_by(lambda counter: [*(one.ends(counter) for one in stretches), *apart])
     by_reads = carried_by(lambda _: [(one, one) for one in read]) if stretches else ()

@@ -111,14 +111,22 @@ def unreachable(gaps: Sequence[Gap]) -> list[Gap]:
 
 
 def _without_contradicted(gaps: list[Gap]) -> list[Gap]:
-    """An anchor none of whose ways to others closes carries nothing outward, where no other anchor holds it."""
+    """Without what rests on an anchor that others contradict.
+
+    An anchor none of whose ways closes carries nothing outward. Nothing is said of the gaps on either side of an
+    unreachable one, for nobody knows which of its anchors is wrong.
+    """
     weighed = [gap for gap in gaps if len(gap.anchors) == 2 and gap.ways is not None]
     joined = {id(anchor) for gap in weighed for anchor in gap.anchors}
     closed = {id(anchor) for gap in weighed if gap.closed for anchor in gap.anchors}
-    doubtful = joined - closed
-    return [
-        replace(gap, ways=None) if len(gap.anchors) == 1 and id(gap.anchors[0]) in doubtful else gap for gap in gaps
-    ]
+    wrong = {id(anchor) for gap in unreachable(gaps) for anchor in gap.anchors}
+
+    def rests(gap: Gap) -> bool:
+        own = {id(anchor) for anchor in gap.anchors}
+        return bool(own & wrong) or (len(own) == 1 and bool(own & (joined - closed)))
+
+    apart = unreachable(gaps)
+    return [replace(gap, ways=None) if gap not in apart and rests(gap) else gap for gap in gaps]
 
 
 def _ways_of_length(

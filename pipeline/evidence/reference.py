@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import dist
 
@@ -13,7 +13,7 @@ from pipeline.evidence.chains import Chain
 from pipeline.evidence.near import Foot, Near, near_elements
 from pipeline.evidence.visits import Move, Node, Stay, nodes_of, pieces_of, ways_over
 from pipeline.track.geodesy import Points, points_of
-from pipeline.track.network import Network
+from pipeline.track.network import MIN_REACH_M, Network
 from pipeline.track.path import Route
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
@@ -22,6 +22,8 @@ from schemas.config import Configuration
 _STEP_M = 10.0
 # A way along the track is at most so many times the straight line between two steps: no railway curve is sharper.
 _CURVED = 1.5
+# ... and no train comes farther between two samples of a stretch; the search ends there [m].
+_FARTHEST_M = 600.0
 
 
 @dataclass(frozen=True)
@@ -72,39 +74,13 @@ def reference_stretches(
     factor = config.align.sure_sigmas
     near = near_elements(samples.points, samples.sigma_m, network.track, factor, config.hazards.survey_sigma_m)
     placed = np.flatnonzero(near.any_near)
-    placed = placed[_reachable(samples.take(placed), config)] if placed.size else placed
     found: list[Stretch] = []
     used = np.zeros(samples.t_ns.size, dtype=np.bool_)
     for rows in _between_gaps(samples.t_ns, placed, config.hazards.reference_gap_s):
-        way = _placed(samples, near, rows, network, numbers, config)
-        if way is not None:
-            found.append(way)
-            used[np.searchsorted(samples.t_ns, way.t_ns)] = True
+        for stretch in _placed(samples, near, rows, network, numbers, config):
+            found.append(stretch)
+            used[np.searchsorted(samples.t_ns, stretch.t_ns)] = True
     return found, _silent_spans(samples.t_ns, used, config.hazards.reference_gap_s)
-
-
-def _reachable(samples: Samples, config: Configuration) -> Ints:
-    """Samples that a train can have come to from one another: outward from the longest piece without a leap."""
-    t_ns, surface, sigma_m = samples.t_ns, samples.points.surface, samples.sigma_m
-
-    def leaps(a: Ints, b: Ints) -> Bools:
-        """Steps that no train can drive and no noise explains."""
-        noise_m = config.align.sure_sigmas * (sigma_m[a] + sigma_m[b])
-        most_m = config.align.fastest_mps * (t_ns[b] - t_ns[a]) / NS_PER_S + noise_m
-        beyond: Bools = np.linalg.norm(surface[b] - surface[a], axis=1) > most_m
-        return beyond
-
-    number = np.arange(t_ns.size)
-    pieces = np.split(number, np.flatnonzero(leaps(number[:-1], number[1:])) + 1)
-    longest = int(np.argmax([piece.size for piece in pieces]))
-    kept = [pieces[longest]]
-    for ahead in pieces[longest + 1 :]:
-        if not leaps(kept[-1][-1:], ahead[:1]).any():
-            kept.append(ahead)
-    for before in pieces[:longest][::-1]:
-        if not leaps(before[-1:], kept[0][:1]).any():
-            kept.insert(0, before)
-    return np.concatenate(kept)
 
 
 def _between_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
@@ -133,23 +109,21 @@ def _silent_spans(t_ns: Ints, used: Bools, gap_s: float) -> list[tuple[int, int]
 
 def _placed(
     samples: Samples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
-) -> Stretch | None:
-    """The ways of one stretch; None where no way passes, or more do than can be weighed.
-
-    Where no way leads through all of its samples, those of its longest part that has one.
-    """
+) -> list[Stretch]:
+    """The ways of samples without a gap among them: nothing where no way passes, or more do than can be weighed."""
     own = samples.take(rows)
-    steps = _steps(own)
-    first, starts, layers = max(_parts(own, near.feet(rows[steps]), steps, network), key=lambda part: len(part[2]))
-    steps = steps[first : first + len(layers) + 1]
-    nodes = nodes_of(starts, layers)
-    failed = _failed(nodes, near, rows, own.sigma_m, steps, config)
-    ways = ways_over(nodes, len(layers), failed, config.hazards.routes_limit)
-    if not ways:
-        return None
-    paths = tuple(_path(way.stays(len(layers)), near, rows, steps, network, numbers) for way in ways)
-    part = slice(int(steps[0]), int(steps[-1]) + 1)
-    return Stretch(own.t_ns[part], own.sigma_m[part], paths)
+    all_steps = _steps(own)
+    found: list[Stretch] = []
+    for part in _connected(list(_parts(own, near.feet(rows[all_steps]), all_steps, network))):
+        steps, last = all_steps[part.first : part.last + 1], len(part.layers)
+        nodes = nodes_of(part.starts, part.layers)
+        failed = _failed(nodes, near, rows, own.sigma_m, steps, config)
+        ways = ways_over(nodes, last, failed, config.hazards.routes_limit)
+        if ways:
+            paths = tuple(_path(way.stays(last), near, rows, steps, network, numbers) for way in ways)
+            inside = slice(int(steps[0]), int(steps[-1]) + 1)
+            found.append(Stretch(own.t_ns[inside], own.sigma_m[inside], paths))
+    return found
 
 
 def _steps(samples: Samples) -> Ints:
@@ -172,28 +146,64 @@ def _steps(samples: Samples) -> Ints:
     return np.array(steps, dtype=np.int64)
 
 
-_Part = tuple[int, set[int], list[list[Move]]]
+@dataclass(frozen=True)
+class _Part:
+    """Steps with a way through: the first of them, oriented elements there, and the moves to each next step.
+
+    `onward`: whether a train may have gone from the last step of one part to the first of another.
+    """
+
+    first: int
+    starts: set[int]
+    layers: list[list[Move]]
+    onward: Callable[[int, int], bool]
+
+    @property
+    def last(self) -> int:
+        return self.first + len(self.layers)
 
 
 def _parts(samples: Samples, feet: Sequence[Sequence[Foot]], steps: Ints, network: Network) -> Iterator[_Part]:
-    """Parts of the steps with a way through: first step, oriented elements there, and the moves to each next step."""
-    at_m = samples.points.surface[steps]
-    limits_m = _CURVED * np.linalg.norm(np.diff(at_m, axis=0), axis=1)
-    limits_m += np.maximum(_STEP_M, 6.0 * samples.sigma_m[steps[1:]])
-    onward = _Onward(network, float(limits_m.max(initial=0.0)))
+    """The parts of the steps; a new one begins where no move leads on: the reference leapt to another track."""
+    at_m, noise_m = samples.points.surface[steps], np.maximum(_STEP_M, 6.0 * samples.sigma_m[steps])
     places = [_inside(one, network) for one in feet]
-    first, starts = 0, {2 * element for element in places[0]}
-    alive, layers = starts, list[list[Move]]()
-    for step, limit_m in enumerate(limits_m.tolist()):
-        moves = [move for one in sorted(alive) for move in onward.moves(one, places[step], places[step + 1], limit_m)]
+
+    def limit_m(step: int, other: int) -> float:
+        return min(float(_CURVED * np.linalg.norm(at_m[other] - at_m[step]) + noise_m[other]), _FARTHEST_M)
+
+    network_moves = _Onward(network)
+
+    def onward(step: int, other: int) -> bool:
+        both = [2 * element + side for element in places[step] for side in (0, 1)]
+        limit = limit_m(step, other)
+        return any(any(network_moves.moves(one, places[step], places[other], limit)) for one in both)
+
+    first, layers = 0, list[list[Move]]()
+    alive = starts = {2 * element for element in places[0]}
+    for step in range(len(places) - 1):
+        here, there, limit = places[step], places[step + 1], limit_m(step, step + 1)
+        moves = [move for one in sorted(alive) for move in network_moves.moves(one, here, there, limit)]
         if moves:
             layers.append(moves)
             alive = {move.to for move in moves}
         else:
-            yield first, starts, layers
-            first, starts, layers = step + 1, {2 * element for element in places[step + 1]}, []
-            alive = starts
-    yield first, starts, layers
+            yield _Part(first, starts, layers, onward)
+            first, layers = step + 1, []
+            alive = starts = {2 * element for element in there}
+    yield _Part(first, starts, layers, onward)
+
+
+def _connected(parts: list[_Part]) -> list[_Part]:
+    """The longest part, and those that a train can have come from or gone on to: where else it was nobody knows."""
+    longest = max(range(len(parts)), key=lambda number: len(parts[number].layers))
+    kept = [parts[longest]]
+    for ahead in parts[longest + 1 :]:
+        if ahead.onward(kept[-1].last, ahead.first):
+            kept.append(ahead)
+    for before in parts[:longest][::-1]:
+        if before.onward(before.last, kept[0].first):
+            kept.insert(0, before)
+    return kept
 
 
 def _inside(feet: Sequence[Foot], network: Network) -> dict[int, float]:
@@ -210,10 +220,9 @@ def _inside(feet: Sequence[Foot], network: Network) -> dict[int, float]:
 class _Onward:
     """Moves over the network, of a length up to a limit."""
 
-    def __init__(self, network: Network, limit_m: float) -> None:
+    def __init__(self, network: Network) -> None:
         self.network = network
-        self.limit_m = limit_m
-        self.known: dict[int, list[tuple[int, float, tuple[int, ...]]]] = {}
+        self.known: dict[int, tuple[float, list[tuple[int, float, tuple[int, ...]]]]] = {}
 
     def moves(self, start: int, here: dict[int, float], there: dict[int, float], limit_m: float) -> Iterator[Move]:
         """From an oriented element at one step to those near the next, forward or back."""
@@ -222,24 +231,25 @@ class _Onward:
             yield Move(start, start)
         for back in (0, 1):
             left_m = self.network.length_m(start) - along_m(start ^ back, here[element])
-            for to, gap_m, between in self._from(start ^ back):
+            for to, gap_m, between in self._from(start ^ back, limit_m - left_m) if left_m <= limit_m else ():
                 if to // 2 in there and left_m + gap_m + along_m(to, there[to // 2]) <= limit_m:
                     yield Move(start, to ^ back, tuple(one ^ back for one in between), bool(back))
 
-    def _from(self, side: int) -> list[tuple[int, float, tuple[int, ...]]]:
+    def _from(self, side: int, limit_m: float) -> list[tuple[int, float, tuple[int, ...]]]:
         """What can be entered beyond the end of an oriented element, how far beyond, and over which elements."""
-        if side not in self.known:
-            found: list[tuple[int, float, tuple[int, ...]]] = []
+        searched_m, found = self.known.get(side, (-1.0, []))
+        if searched_m < limit_m:
+            searched_m, found = max(limit_m, MIN_REACH_M), []
             growing = [(side, 0.0, tuple[int, ...]())]
             while growing:
                 last, gone_m, between = growing.pop()
                 for edge in self.network.successors[last]:
-                    if edge.forward and gone_m + edge.gap_m <= self.limit_m:
+                    if edge.forward and gone_m + edge.gap_m <= searched_m:
                         found.append((edge.to, gone_m + edge.gap_m, between))
                         length_m = self.network.length_m(edge.to)
                         growing.append((edge.to, gone_m + edge.gap_m + length_m, (*between, edge.to)))
-            self.known[side] = found
-        return self.known[side]
+            self.known[side] = searched_m, found
+        return found
 
 
 def _failed(

@@ -90,4 +90,4 @@ def test_a_read_counts_where_its_balise_lies_on_its_element() -> None:
         }
     )
     found = read_anchors(reads, balises, line("both").track, HazardConfig())
-    assert [(anchor.t_ns, anchor.place) for anchor in found] == [(1, Place(0, 100.4)), (2, Place(0, -0.4))]
+    assert [(anchor.t_ns, anchor.places) for anchor in found] == [(1, (Place(0, 100.4),)), (2, (Place(0, -0.4),))]
