@@ -20,6 +20,7 @@ from typer.main import get_command
 if TYPE_CHECKING:
     import polars as pl
 
+    from pipeline.campaign import Plan
     from schemas.config import Configuration, Vehicle
     from schemas.run import RunLog
     from schemas.run import Site as Ground
@@ -60,6 +61,11 @@ _place, _file = partial(Argument, callback=_here), partial(Option, callback=_her
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
 _LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; .gz, .zip of these."
 
+_CALIBRATE = (
+    "Vehicle and noise from these fault-free runs of the same vehicle (again for more), or `auto`: each run from the "
+    "others given that raise no alarm beyond their noise. Replays them once more; a fault common to all is learned."
+)
+
 Result = Annotated[str, Argument(help="A result of `balise replay`.")]
 ResultFolder = Annotated[Path, _place(help="A result of `balise replay`.")]
 Run = Annotated[str, Argument(help="A recorded run.")]
@@ -93,6 +99,7 @@ def _about(
 
 @_command(
     "balise replay logs/*.mcap --site line9 --out week12 --vehicle train7.toml",
+    "balise replay logs/*.mcap --site line9 --out week12 --calibrate auto",
     "balise replay s3://trial/logs --site line9 --out s3://trial/week12 --jobs 8",
 )
 def replay(
@@ -108,6 +115,7 @@ def replay(
     force: Annotated[bool, Option("--force", help="Also replay runs that are already complete.")] = False,
     time_limit: Annotated[float, Option(min=0.1, help="Seconds that one run may take; a slower run fails.")] = 3600.0,
     undetected: Annotated[bool, Option("--undetected", help="Also the largest error no monitor would notice.")] = False,
+    calibrate: Annotated[list[str] | None, Option(metavar="RUNS|auto", help=_CALIBRATE)] = None,
     quiet: Quiet = False,
     as_json: Annotated[bool, Option("--json", help="JSON: progress on standard error, then the result.")] = False,
 ) -> None:
@@ -120,6 +128,7 @@ def replay(
     if undetected:
         settings = settings.model_copy(update={"undetected": settings.undetected.model_copy(update={"compute": True})})
     plan = make_plan(runs, site, out, settings, _vehicle(vehicle), route, write_route, given)
+    plan = _calibrated(plan, calibrate, jobs, quiet) if calibrate else plan
     shown = watches(quiet, as_json)
     try:
         summary = run_campaign(
@@ -134,6 +143,15 @@ def replay(
         raise Exit(128 + interrupted.signum) from None
     show_summary(summary, out, quiet, as_json)
     raise Exit(DEFECT if summary.defects else OK if summary.all_ok else RUNS_NOT_OK)
+
+
+def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
+    from pipeline.campaign.calibrated import calibrated
+    from pipeline.campaign.workers import watched
+    from pipeline.results.terminal import how_far
+
+    with watched(None if quiet else how_far("runs looked at to calibrate")):
+        return calibrated(plan, runs, jobs)
 
 
 @_command("balise dictionary --table hazards", "balise dictionary --markdown > dictionary.md")

@@ -13,7 +13,7 @@ from pipeline.figures.notes import ride_notes
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.figures.undetected import Spacing
 from pipeline.ingest.clean import CleanCounts, clean, of_the_journey, require_one_journey, require_two_times
-from pipeline.judge.bench import Bench, Solution
+from pipeline.judge.case import Case, Solution
 from pipeline.judge.judge import Judged, judge
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
@@ -28,7 +28,7 @@ from pipeline.undetected.columns import Diagnosis, undetected_of
 from pipeline.undetected.watched import fixes_ns
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
-from schemas.enums import NotEvaluated, VehicleFigures
+from schemas.enums import NotEvaluated, Reason, VehicleFigures
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES
@@ -157,11 +157,17 @@ def _failed(context: _Context, solution: str, error: InputError) -> Tables:
 def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> Tables:
     """One solution: what the train made of it, then what the judge says of that."""
     ride = _ride(context, solution, matches)
-    bench = Bench(ride.solution, context.evidence, ride.odometry, context.vehicle, context.config)
-    judged = judge(bench, context.run.reference, context.run.faults)
-    # The direction of travel is the judge's, which the errors are signed by, not the train's own.
-    seen, recorded = ride.solution.epochs.drop("direction"), ride.solution.fixes.select("satellites")
-    epochs = pl.concat([seen, judged.epochs_columns, recorded], how="horizontal")
+    case = Case(
+        solution=ride.solution,
+        evidence=context.evidence,
+        odometry=ride.odometry,
+        vehicle=context.vehicle,
+        config=context.config,
+        reference=context.run.reference,
+        faults=context.run.faults,
+    )
+    judged = judge(case)
+    epochs = pl.concat([judged.epochs, ride.solution.fixes.select("satellites")], how="horizontal")
     row = summarise(_results(context, ride, judged, epochs), context.config, context.provenance)
     found = {"hazards": judged.hazards, "passages": judged.passages, "alarms": judged.alarms}
     return {**found, "epochs": epochs, "runs": row}
@@ -249,8 +255,20 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         misfits=[cause.code for check in fit.misfits for cause in check.causes],
         faults_injected=context.run.faults is not None and context.run.faults.height > 0,
         spacing=ride.spacing,
-        unproving=len(fit.unproving) + counts.contradicting,
+        reasons=_reasons(context, name),
+        anchored_ns=context.evidence.anchored_ns,
     )
+
+
+def _reasons(context: _Context, solution: str) -> list[Reason]:
+    """What stands against a verdict whatever was judged (DOMAIN section 5.4)."""
+    doubtful = context.fits[solution].unproving or context.counts.solutions[solution].contradicting
+    applies = {
+        Reason.EVIDENCE_DISPUTED: context.evidence.disputed > 0,
+        Reason.INPUT_DOUBTFUL: bool(doubtful),
+        Reason.CLOCK_ASSUMED: context.evidence.clock_assumed,
+    }
+    return [reason for reason, applied in applies.items() if applied]
 
 
 def _single_monitors(

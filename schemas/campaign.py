@@ -49,7 +49,7 @@ def campaign_runs_schema(levels: Iterable[str]) -> type[dy.Schema]:
 def _campaign_runs_schema(levels: tuple[str, ...]) -> type[dy.Schema]:
     columns: dict[str, dy.Column] = {"run_id": text("run"), **Runs.columns()}
     columns["faults"] = count("faults in the hazard table; the rows that belong to one fault count once")
-    columns |= _estimate("hazard_rate", "faults per hour judged by a reference or balise reads", "1/h", "_per_h")
+    columns |= _estimate("hazard_rate", "faults per hour in use judged by a reference or balise reads", "1/h", "_per_h")
     columns["missed"] = count("faults with a failure that no monitor found by t_failure + budget")
     columns |= _estimate("missed_share", "share of missed ones, of the faults with a failure that a truth judged")
     columns |= _estimate("beyond_budget_share", "share of failures beyond the budget, of those where that is known")
@@ -142,7 +142,9 @@ def _figures_schema() -> type[dy.Schema]:
         "runs_unproven": count("runs with the verdict unproven"),
         "runs_safe": count("runs with the verdict safe"),
         "hours_with_evidence": real("h", "time judged right or wrong, by any evidence", min=0),
-        "hours_with_truth": real("h", "of this in runs judged by a reference or balise reads", min=0),
+        "hours_with_truth": real("h", "time in use judged right or wrong by a reference or balise reads", min=0),
+        "hours_negated": real("h", "time negated, which no rate counts", min=0),
+        "hours_unjudged": real("h", "time in use that could not be judged, which no rate counts", min=0),
         "hazards": count("faults; the rows that belong to one fault count once"),
         "hazards_judged": count("of these those that a reference or balise reads tell"),
         **_estimate("hazard_rate", "faults per hour, both by a reference or balise reads", "1/h", "_per_h"),
@@ -239,6 +241,12 @@ class CampaignDetection(dy.Schema):
     time_to_detect_median_s = real("s", "median of T_D")
     time_to_detect_p95_s = real("s", "95 % of T_D")
     time_to_detect_max_s = real("s", "largest T_D")
+    time_since_failure_median_s = real("s", "median of T_dsf, the least that the evidence leaves")
+    time_since_failure_p95_s = real("s", "95 % of it")
+    time_since_failure_max_s = real("s", "largest of it")
+    time_since_failure_may_median_s = real("s", "median of T_dsf, the largest that the evidence leaves")
+    time_since_failure_may_p95_s = real("s", "95 % of it")
+    time_since_failure_may_max_s = real("s", "largest of it")
 
 
 class CampaignLevels(dy.Schema):

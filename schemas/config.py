@@ -510,8 +510,8 @@ class HazardConfig(Settings):
     balise_read_sigma_m: Positive = 1.0
     # An error known less closely is not given as a number (DOMAIN section 5.2).
     known_error_m: Positive = 5.0
-    # More of the moving time in use unknown is `unproven` (DOMAIN section 5.4).
-    unknown_share_limit: Probability = 0.01
+    # Without diagnosis (P3) for more of the moving time in use a run is `unproven` (DOMAIN section 5.4).
+    undiagnosed_share: Probability = 0.01
     # Ours: alarms across the track of several runs that begin so near each other are of one place of the map.
     map_reach_m: Positive = 100.0
     # LPV-200 is the guaranteed service (LOC uses no other).
@@ -560,6 +560,12 @@ class CalibrationConfig(Settings):
     left_out_pieces: Annotated[int, Field(strict=True, ge=2)] = 8
     # With a sigma that varies by a smaller share, intercept and slope cannot be told apart.
     sigma_spread_share: Probability = 0.05
+    # `balise replay --calibrate`: with fewer runs nobody knows how far a further one may lie from them.
+    least_runs: Annotated[int, Field(strict=True, ge=2)] = 2
+    # A wheel wears by a tenth of this in a campaign of weeks; two vehicles mostly differ by more.
+    same_vehicle_scale: Positive = 0.01
+    # The runs that the monitors and the vehicle were calibrated by: filled in by `balise replay --calibrate`.
+    runs: tuple[str, ...] = ()
 
 
 class SiteConfig(Settings):

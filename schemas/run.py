@@ -64,6 +64,11 @@ class RunLog:
         """Names of the run's solutions, sorted."""
         return sorted(self.gnss["solution"].unique().to_list())
 
+    def main_solution(self) -> str:
+        """The one that speaks for the run where only one can: `primary`, else the first by name."""
+        solutions = self.solutions()
+        return solutions[0] if solutions and "primary" not in solutions else "primary"
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -6,7 +6,7 @@ import dataframely as dy
 import polars as pl
 
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import BaliseKind, Judgement, PassageStatus, SigmaSource
+from schemas.enums import BaliseKind, Evidence, Judgement, LdsState, PassageStatus, SigmaSource
 
 
 class Positions(dy.Schema):
@@ -109,15 +109,63 @@ class Crossings(dy.Schema):
     )
 
 
-class Failures(dy.Schema):
-    """One row per failure: a stretch judged wrong in use, whether it crosses a VB or not (DOMAIN section 5.3)."""
+class JudgedEpochs(dy.Schema):
+    """What the judge adds to the epochs of a solution, row for row (DOMAIN sections 5.2 and 5.3)."""
 
-    t_onset = instant("begin of the fault")
-    t_failure = instant("begin of the position failure", nullable=True)
-    t_end = instant("end of the episode")
-    hazardous_s = real("s", "time judged wrong in use, over the whole episode", nullable=False, min=0)
+    epoch = dy.Int64(min=0, description="row among the epochs of the solution")
+    at = instant("the instant at which the position is judged: its stamp less the latency of the vehicle file")
+    direction = dy.Int8(
+        description="direction of travel along growing path, 1 or -1; without an odometer the evidence's"
+    )
+    judgement = one_of(Judgement, "what the evidence says of the position")
+    error_low_m = real("m", "least error in the direction of travel that the evidence leaves")
+    error_high_m = real("m", "largest error in the direction of travel that the evidence leaves")
+    error_along_m = real("m", "error where reference or reads give it to `known_error_m`")
+    evidence = one_of(Evidence, "what the judgement rests on; null where nothing is known", nullable=True)
+    wrong_track = flag("judged wrong for its net element, wherever along it")
+    train_m = real("m", "path position of the train where reference or reads give it to `known_error_m`")
+    reference_m = real("m", "the same where the reference gives it")
+    unambiguous = flag("the track of the position was not in doubt by what the train knew then")
+    moving = flag("the train moves from here to the next epoch; null where not known", nullable=True)
+    stood = flag("the odometer stood while positions left their place by more than the failure limit")
+    odometer_wrong = flag("the distance since the last accepted VB is beyond 5 m + 5 % by the evidence")
+    undiagnosed = flag("state P3: no verdict of `along_raw`, by the LDS, or `odometer_wrong`")
+    in_use = flag("fix valid, unambiguous, confident, not negated, not withheld")
+    used_s = real("s", "time in use that the epoch stands for", nullable=False, min=0)
+    wrong_s = real("s", "the same where it was wrong", nullable=False, min=0)
+    counted_s = real("s", "time that the epoch stands for in shares of time", nullable=False, min=0)
+    lds_state = one_of(
+        LdsState, "state of the reactive LDS; null where it needs a truth that is missing", nullable=True
+    )
+
+
+class JudgedOffers(dy.Schema):
+    """One row per crossing of a virtual balise or telegram, judged against where the train was; joined by its id."""
+
+    crossing_id = dy.Int64(min=0, description="as in `Crossings`")
+    balise_id = text("balise")
+    t = instant("the crossing, interpolated")
+    epoch = dy.Int64(min=0, description="row of the first epoch at or after the crossing")
+    path_m = real("m", "path position of the balise", nullable=False)
+    virtual = flag("a virtual balise; else a telegram")
+    accepted = flag("a virtual balise that the LDS accepted")
+    offered = flag("a virtual balise offered; false where crossed again before it was re-armed, which only a jump does")
+    beyond_window = flag("offered after its window closed")
+    location_error_m = real("m", "error where reference or reads give it to `known_error_m`")
+    judgement = one_of(Judgement, "what the evidence says of the offer")
+    error_low_m = real("m", "least error in the direction of travel that the evidence leaves")
+    error_high_m = real("m", "largest error in the direction of travel that the evidence leaves")
+    evidence = one_of(Evidence, "what the judgement rests on; null where nothing is known", nullable=True)
+    wrong_track = flag("judged wrong for its net element, wherever along it")
+    proof_margin_m = real("m", "by how much the evidence may be wrong before what is right is no longer", min=0)
+
+
+class Failures(dy.Schema):
+    """One row per failure: judged wrong in use, over pulses, whether it crosses a VB or not (DOMAIN section 5.3)."""
+
+    t_start = instant("first position that may belong to it")
+    t_end = instant("first position that no longer does")
+    hazardous_s = real("s", "time judged wrong in use, over the whole failure", nullable=False, min=0)
     hazardous_may_s = real("s", "the same with the time that is unknown", nullable=False, min=0)
     accepted = one_of(Judgement, "worst judgement of the virtual balises accepted in it; right where none was")
     within_budget = flag("hazardous time within the budget; null where it cannot be said", nullable=True)
-    wrong_track = flag("the position was on a net element that the evidence excludes")
-    hazard_id = dy.Int64(nullable=True, min=0, description="first hazard row of the episode; null where it hit no VB")

@@ -9,7 +9,8 @@ import numpy as np
 import polars as pl
 import tomli_w
 
-from pipeline.calibration.sigmas import regress_sigmas, sigma_table, velocity_sigma_mps, worst_fit
+from pipeline.calibration.noise import beyond_noise
+from pipeline.calibration.sigmas import COMPARED, regress_sigmas, sigma_table, velocity_sigma_mps, worst_fit
 from pipeline.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
 from pipeline.ingest.clean import clean
 from pipeline.matching import match
@@ -51,6 +52,19 @@ class Calibration:
         return tomli_w.dumps({"monitors": measured}) if measured else ""
 
 
+@dataclass(frozen=True)
+class Observed:
+    """What one run tells of its vehicle; `estimate` is None where GNSS and odometer could not be compared.
+
+    `epochs`: the columns that sigmas are regressed on. `alarms`: monitors that failed beyond noise (`beyond_noise`).
+    """
+
+    run_id: str
+    estimate: RunEstimate | None
+    epochs: pl.DataFrame
+    alarms: tuple[str, ...]
+
+
 def calibrate(
     logs: Sequence[RunLog],
     site: Site,
@@ -63,28 +77,48 @@ def calibrate(
     `vehicle` brings lever arms and heights; what it says of scale and latency is measured anew, and so are the sigmas
     of `config`. Raises `InputError` where no run can be compared with an odometer.
     """
-    config, base = _uncalibrated(config or Configuration()), vehicle or Vehicle()
+    config, base = config or Configuration(), vehicle or Vehicle()
     _check_solution(logs, solution)
-    for log in logs:
-        _refuse_what_does_not_fit(log, site, base, config, solution)
-    estimates = [(log.run_id, _estimate(log, site, base, config, solution)) for log in logs]
-    found = [estimate for _, estimate in estimates if estimate is not None]
+    return calibration_of([observe(log, site, base, config, solution) for log in logs], base, config)
+
+
+def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> Observed:
+    """What a fault-free run tells: its scale and latency, and what the monitors show when it is replayed with these.
+
+    Raises `InputError` where its streams do not fit each other.
+    """
+    config = _uncalibrated(config)
+    _refuse_what_does_not_fit(log, site, vehicle, config, solution)
+    estimate = _estimate(log, site, vehicle, config, solution)
+    own = vehicle if estimate is None else _vehicle(vehicle, [estimate], config.align.latency_prior_sigma_s)
+    epochs = replay(log, site, own, config).epochs.filter(pl.col("solution") == solution)
+    alarms = beyond_noise(epochs, config.monitors.threshold_factor)
+    return Observed(log.run_id, estimate, epochs.select(COMPARED), alarms)
+
+
+def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configuration) -> Calibration:
+    """Vehicle and monitor sigmas that runs tell together.
+
+    `vehicle` and `config` as the runs were observed with. Raises `InputError` as `calibrate` does.
+    """
+    place = ", ".join(run.run_id for run in runs)
+    found = [run.estimate for run in runs if run.estimate is not None]
     if not found:
         raise InputError(
             "no run gives odometer scale and latency",
-            place=", ".join(log.run_id for log in logs),
-            expected=f"GNSS of solution `{solution}` on the track, and an odometer, while the speed changes",
+            place=place,
+            expected="GNSS of the solution on the track, and an odometer, while the speed changes",
             remedy="Calibrate on longer runs that stop and start.",
         )
-    fitted = _vehicle(base, found, config.align.latency_prior_sigma_s)
-    _refuse_figures_of_no_train(fitted, logs, config)
-    epochs = [replay(log, site, fitted, config).epochs.filter(pl.col("solution") == solution) for log in logs]
+    fitted = _vehicle(vehicle, found, config.align.latency_prior_sigma_s)
+    _refuse_figures_of_no_train(fitted, place, config)
+    epochs = [run.epochs for run in runs]
     factor = config.monitors.threshold_factor
     fits = regress_sigmas(epochs, factor, config.calibration)
     worst = worst_fit(fits)
     return Calibration(
         vehicle=fitted,
-        runs=_run_table(estimates),
+        runs=_run_table([(run.run_id, run.estimate) for run in runs]),
         sigmas=sigma_table(fits),
         sigma_intercept_m=None if worst is None else worst.intercept_m,
         sigma_slope=None if worst is None else worst.slope,
@@ -144,7 +178,7 @@ def _refuse_what_does_not_fit(log: RunLog, site: Site, vehicle: Vehicle, config:
         refuse_impossible(fit, log.run_id, config.ingest)
 
 
-def _refuse_figures_of_no_train(vehicle: Vehicle, logs: Sequence[RunLog], config: Configuration) -> None:
+def _refuse_figures_of_no_train(vehicle: Vehicle, place: str, config: Configuration) -> None:
     """Figures beyond what wheels and receivers can be off are another error, and a vehicle file would hide it."""
     scale, latency_s = vehicle.odometer_scale or 1.0, vehicle.gnss_latency_s or 0.0
     most, most_s = config.plausibility.scale_limit, config.plausibility.lag_limit_s
@@ -152,7 +186,7 @@ def _refuse_figures_of_no_train(vehicle: Vehicle, logs: Sequence[RunLog], config
         return
     raise InputError(
         "the runs give impossible figures",
-        place=", ".join(log.run_id for log in logs),
+        place=place,
         found=f"odometer_scale {scale:.4g}, gnss_latency_s {latency_s:.3g}",
         expected=f"a scale within {most:g} of 1, and a latency within {most_s:g} s",
         remedy="`balise inspect RUN --site SITE` says what does not fit; calibrate on fault-free runs.",

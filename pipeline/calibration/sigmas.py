@@ -25,6 +25,14 @@ from schemas.tables import AXES, BANK_MONITORS, SCALES
 # than a fifth of its standard error.
 _BINS = 12
 
+_READ = ("state", "value", "threshold")
+COMPARED = (
+    *(f"sigma_{axis}_m" for axis in AXES),
+    *(f"{monitor}_{part}" for monitor in BANK_MONITORS for part in _READ),
+    *("along_doppler_value", "along_doppler_threshold"),
+)
+"""Columns of epochs that sigmas are regressed on."""
+
 
 @dataclass(frozen=True)
 class SigmaFit:

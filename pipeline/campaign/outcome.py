@@ -128,20 +128,19 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame) -> RunOut
         verdict=verdict,
         hazards=sum(counts) if judged.height else None,
         missed_detections=missed if judged.height else None,
-        why=_why(runs, verdict, job.config.hazards.unknown_share_limit),
+        why=_why(runs, verdict),
         faults=tuple(hazard_words(hazards)),
     )
 
 
-def _why(runs: pl.DataFrame, verdict: RunVerdict | None, unknown_share_limit: float) -> str:
+def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:
     """What decides the verdict, of each solution that has it."""
     if verdict is None:
         return ""
     rows = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value)
     several = runs.height > 1
     return "; ".join(
-        (f"{row['solution']}: " if several else "") + verdict_reasons(row, unknown_share_limit)
-        for row in rows.iter_rows(named=True)
+        (f"{row['solution']}: " if several else "") + verdict_reasons(row) for row in rows.iter_rows(named=True)
     )
 
 
@@ -151,7 +150,7 @@ def failed_tables(job: RunJob, error: str) -> RunTables:
     from pipeline.figures.summary import failed_row
 
     folder = job.address.rstrip("/").rpartition("/")[0]
-    made = Provenance(job.config_digest, "", SOFTWARE)
+    made = Provenance(job.config_digest, "", SOFTWARE, job.config.calibration.runs)
     row = failed_row(error.replace(f"{redacted(folder)}/", ""), made)
     empty = {name: schema.create_empty() for name, schema in TABLES.items() if name != "runs"}
     return RunTables(run_id=job.run_id, runs=row, **empty)

@@ -13,7 +13,7 @@ from pathlib import Path
 from pipeline import storage
 from pipeline.results import store
 from pipeline.results.manifest import SettingsFiles, listing, settings_files
-from pipeline.site.read import read_site
+from pipeline.site.read import read_site, refuse_unrelated
 from pipeline.storage import files
 from pipeline.storage.address import Address, check_public, is_url, join, name_of, redacted, stem_of
 from schemas.config import Configuration, Vehicle, digest_of
@@ -86,6 +86,7 @@ def make_plan(
         # Nobody knows which runs there are: no run failed, the command cannot be met.
         raise UsageError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
     ground = read_site(site, config.site)
+    refuse_unrelated(ground, site)
     base = RunJob(
         run_id="",
         address="",

@@ -18,7 +18,6 @@ from pipeline.campaign.watch import Summary, Watch
 from pipeline.results import store
 from pipeline.results.manifest import note_settings
 from pipeline.storage.address import is_url
-from schemas.config import digest_of
 from schemas.errors import UsageError
 
 TIME_LIMIT_S = 3600.0
@@ -46,7 +45,8 @@ def run_campaign(
         left = with_previous(plan, {outcome.run_id for outcome in known}) if not force else plan
         store.write_config(plan.out, plan.config)
         store.write_vehicle(plan.out, plan.vehicle)
-        note_settings(plan.out, digest_of(plan.config, plan.vehicle), plan.given)
+        for digest in sorted({job.config_digest for job in plan.jobs}):
+            note_settings(plan.out, digest, plan.given)
         engine = _engine_for(jobs, len(left.jobs), scheduler, time_limit_s)
         held = [replace(job, campaign=campaign) for job in left.jobs]
         loop = CampaignLoop(held, engine, time_limit_s, watches, known)

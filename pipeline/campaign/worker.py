@@ -53,7 +53,7 @@ def replay_one(job: RunJob) -> RunOutcome:
 
 def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
     _same_software(job)
-    site = _site(job.site, job.site_digest, job.config.site)
+    site = site_of(job.site, job.site_digest, job.config.site)
     if (known := log.known_digest()) and _is_done(job, known):
         return _earlier(job, log)
     with log.here() as path:
@@ -99,7 +99,7 @@ def _write_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> 
 
 
 @lru_cache(maxsize=2)
-def _site(address: str, digest: str, config: SiteConfig) -> Site:
+def site_of(address: str, digest: str, config: SiteConfig) -> Site:
     """The site, read once per worker."""
     storage.reach(address)  # or a worker that the store does not answer would end the campaign, not fail its run
     site = read_site(address, config)
@@ -149,8 +149,8 @@ def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
     from pipeline.odometry import odometry_of
 
     cleaned, _ = clean(run, job.config)
-    solutions, matching = cleaned.solutions(), job.config.matching
-    fixes = cleaned.gnss.filter(pl.col("solution") == ("primary" if "primary" in solutions else solutions[0]))
+    matching = job.config.matching
+    fixes = cleaned.gnss.filter(pl.col("solution") == cleaned.main_solution())
     odometry = odometry_of(cleaned.odometer, job.vehicle, job.config)
     found = match(fixes, odometry, site, job.vehicle, matching, job.config.fix_sigma, cleaned.balise_reads)
     route = found_route(found, matching.ambiguity_probability)

@@ -26,7 +26,7 @@ from pipeline.figures.campaign_tables import (
     counted_runs,
     with_truth,
 )
-from pipeline.figures.independent import independent_episodes, without_copies
+from pipeline.figures.independent import DETECTION_TIMES, independent_episodes, without_copies
 from pipeline.figures.map_errors import map_places
 from pipeline.figures.undetected import spacing_of_runs
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
@@ -104,7 +104,9 @@ def _sums() -> dict[str, pl.Expr]:
         "runs_partial": (pl.col("status") == RunStatus.PARTIAL).sum(),
         "hours": pl.col("duration_s").sum() / 3600.0,
         "hours_with_evidence": pl.col("evidence_s").filter(evidence.is_not_null()).sum() / 3600.0,
-        "truth_h": pl.col("evidence_s").filter(truth).sum() / 3600.0,
+        "truth_h": pl.col("in_use_judged_s").filter(truth).sum() / 3600.0,
+        "hours_negated": pl.col("negated_s").sum() / 3600.0,
+        "hours_unjudged": (pl.col("in_use_s") - pl.col("in_use_judged_s")).sum() / 3600.0,
         "hours_judged": pl.col("judged_s").filter(judged).sum() / 3600.0,
         "false_alarms": pl.col("false_alarms").filter(judged).sum(),
         "trusted_h": pl.col("trusted_s").sum() / 3600.0,
@@ -140,14 +142,15 @@ def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, config: Safety
     """Hazardous time of every failure, and T_D of the faults, against the allowed T_D of each level (TVB eq. 7).
 
     Eq. 7 limits how long a hazardous position may be in use, so the hazardous time is compared. The quantiles of T_D
-    leave out faults that were not detected.
+    and of both bounds of T_dsf leave out faults that were not detected.
     """
     failures, episodes = failures_of(runs), independent_episodes(hazards)
     spent, may, detected = pl.col("hazardous_s"), pl.col("hazardous_may_s"), pl.col("time_to_detect_s")
     of_failures = failures.group_by("solution").agg(
         failures=pl.len(), hazardous_may_max_s=may.max(), **_quantiles(spent, "hazardous")
     )
-    of_episodes = episodes.group_by("solution").agg(detected=detected.count(), **_quantiles(detected, "time_to_detect"))
+    times = {key: value for name in DETECTION_TIMES for key, value in _quantiles(pl.col(name), name[:-2]).items()}
+    of_episodes = episodes.group_by("solution").agg(detected=detected.count(), **times)
     told = of_failures.join(of_episodes, on="solution", how="full", coalesce=True)
     levels = [(level, config.allowed_time_to_detect_s(level)) for level in config.service_levels]
     allowed = pl.DataFrame(levels, {"service_level": pl.String, "allowed_s": pl.Float64}, orient="row")

@@ -11,7 +11,7 @@ from pipeline.figures.bounds import Estimator, clopper_pearson, poisson_rate, wi
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.run_figures import acceptances, accepted, is_passage, outcomes, spread
 from pipeline.figures.undetected import undetected_spread
-from pipeline.figures.verdict import failures_in, level_rows
+from pipeline.figures.verdict import DECISIVE, level_rows
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
@@ -45,7 +45,7 @@ def counted_runs(runs: pl.DataFrame, hazards: pl.DataFrame) -> pl.DataFrame:
         "truth_accepted": pl.col("accepted_judged"),
         "truth_within": pl.col("failures_within_budget"),
         "truth_beyond": pl.col("failures_beyond_budget"),
-        "truth_h": pl.col("evidence_s").fill_null(0.0) / 3600.0,
+        "truth_h": pl.col("in_use_judged_s").fill_null(0.0) / 3600.0,
         "truth_held_s": pl.col("held_s").fill_null(0.0),
     }
     return (
@@ -74,16 +74,11 @@ def campaign_levels(runs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """
     reaction_s, period_s = config.hazards.reaction_s, 1.0 / pl.col("gnss_rate_hz")
     needed = runs.select(
-        *(*RUN, "evidence", "failures", "hazardous_max_s", "share_unknown"),
-        *("failure_hazardous_s", "failure_hazardous_may_s", "failure_accepted"),
+        *(*RUN, "evidence", "failures", "hazardous_max_s", *DECISIVE),
         hazardous_may_max_s=pl.col("failure_hazardous_may_s").list.max(),
         receiver_needs_s=period_s + (period_s if reaction_s is None else reaction_s),
     )
-    rows = [
-        run | level
-        for run in needed.iter_rows(named=True)
-        for level in level_rows(failures_in(run), run["evidence"], run["share_unknown"], config)
-    ]
+    rows = [run | level for run in needed.iter_rows(named=True) for level in level_rows(run, config)]
     quick = pl.col("receiver_needs_s") <= pl.col("allowed_s")
     kinds = {name: kind for name, kind in dtypes(CampaignLevels).items() if name != "receiver_quick_enough"}
     table = pl.DataFrame(rows, schema=kinds).with_columns(receiver_quick_enough=quick)
@@ -96,7 +91,7 @@ def _faults_per_run(hazards: pl.DataFrame) -> pl.DataFrame:
         "faults": pl.len(),
         "missed": missed.sum(),
         "truth_faults": truth.sum(),
-        "truth_failed": (pl.col("failed") & truth).sum(),
+        "truth_failed": (missed.is_not_null() & truth).sum(),
         "truth_missed": (truth & missed).sum(),
     }
     return independent_episodes(hazards).group_by(RUN).agg(**{k: v.cast(pl.Int64) for k, v in counts.items()})

@@ -6,6 +6,8 @@ import polars as pl
 
 from schemas.enums import TRUTH
 
+DETECTION_TIMES = ("time_to_detect_s", "time_since_failure_s", "time_since_failure_may_s")
+
 
 def without_copies(runs: pl.DataFrame) -> pl.DataFrame:
     """Rows of `runs` with every recording once, that of the worst verdict: a log under two names has one content.
@@ -19,15 +21,29 @@ def without_copies(runs: pl.DataFrame) -> pl.DataFrame:
 
 
 def missed_detection() -> pl.Expr:
-    """No monitor failed by `t_failure` + budget (DIAG's Pmd; DOMAIN section 5.3); null without a failure."""
+    """No monitor failed within the budget of the failure (DIAG's Pmd; DOMAIN section 5.3); null without a failure.
+
+    Missed for certain counts from `t_failure`, found for certain from `t_failure_may`; between them null.
+    """
+    failed, may = pl.col("t_failure"), pl.col("t_failure_may")
+    return pl.when(failed.is_not_null() & _late(failed)).then(True).when(may.is_not_null() & ~_late(may)).then(False)
+
+
+def _late(since: pl.Expr) -> pl.Expr:
+    """Not found by then plus the budget."""
     budget = (pl.col("budget_s") * 1e9).round().cast(pl.Int64).cast(pl.Duration("ns"))
-    late = pl.col("t_detected").is_null() | (pl.col("t_detected") > pl.col("t_failure") + budget)
-    return pl.when(pl.col("t_failure").is_not_null()).then(late)
+    return pl.col("t_detected").is_null() | (pl.col("t_detected") > since + budget)
+
+
+def since_when_at_most() -> pl.Expr:
+    """The earliest begin of a failure that the evidence leaves; null where it is silent for one that failed."""
+    silent = pl.col("t_failure").is_not_null() & pl.col("t_failure_may").is_null()
+    return pl.when(~silent.any()).then(pl.col("t_failure_may").min())
 
 
 def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
-    """One row per fault: `solution, begin, t_failure, t_end, budget_s, failed, missed, with_truth, detected,
-    time_to_detect_s`, and `run_id` where the hazards have one.
+    """One row per fault: `solution, begin, t_failure, t_failure_may, t_end, budget_s, failed, missed, with_truth,
+    detected`, `DETECTION_TIMES`, and `run_id` where the hazards have one.
 
     A fault may stand in several rows of `hazards` (one per class, and the jump back as a row `caused_by` the first);
     counted one by one they would make the bounds too narrow. Shares are of faults `with_truth` (reference or balise
@@ -41,13 +57,14 @@ def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
         .group_by(keys)
         .agg(
             t_failure=pl.col("t_failure").min(),
+            t_failure_may=since_when_at_most(),
             t_end=pl.when(t_end.null_count() == 0).then(t_end.max()),
             budget_s=pl.col("budget_s").first(),
             failed=failed.any(),
-            missed=pl.col("missed").any(),
+            missed=pl.when(failed.any()).then(pl.col("missed").filter(failed).any(ignore_nulls=False)),
             with_truth=pl.col("evidence").is_in(TRUTH).all(),
             detected=pl.col("detected").any(),
-            time_to_detect_s=pl.col("time_to_detect_s").max(),
+            **{name: pl.col(name).max() for name in DETECTION_TIMES},
         )
         .sort(keys)
     )

@@ -153,14 +153,16 @@ def judged_notes(
     odometer_contradicted: int,
     config: Configuration,
 ) -> list[Remark]:
-    """What stands behind the judgements of one solution (DOMAIN sections 5.1 and 5.4)."""
-    unknown = share_unknown is not None and share_unknown > config.hazards.unknown_share_limit
+    """What stands behind the judgements of one solution (DOMAIN sections 5.1 and 5.4).
+
+    `share_unknown`: where that keeps the run from being proved.
+    """
     return remarks(
         {
             Note.NO_EVIDENCE: evidence is None,
             Note.EVIDENCE_BALISE: evidence is Evidence.BALISE,
             Note.EVIDENCE_ODOMETER: evidence is Evidence.ODOMETER,
-            Note.UNKNOWN_SHARE: share_unknown if unknown else None,
+            Note.UNKNOWN_SHARE: share_unknown,
             Note.ODOMETER_CONTRADICTED: odometer_contradicted,
             Note.LEARNED: vehicle is VehicleFigures.LEARNED,
         }

@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.epochs.clock import may_move, met
 from pipeline.figures.lost_time import LostTime
-from schemas.arrays import Bools
+from schemas.arrays import Bools, floats
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, LostTo, Reason, Remedy, RunVerdict, VehicleFigures
 from schemas.tables import BANK_MONITORS
@@ -20,6 +20,9 @@ Row = Mapping[str, Any]
 
 FAST = tuple(name for name in BANK_MONITORS if name.endswith(("_raw", "_ewma_0p1")))
 """Monitors that the receiver's fast noise fails where the model states it too small."""
+
+_LACKING = {Reason.ACCEPTED_UNKNOWN, Reason.BUDGET_UNKNOWN, Reason.UNKNOWN_IN_USE}
+"""Reasons that more evidence would remove."""
 
 # Stamps of epochs are round to milliseconds.
 _STAMPS_S = 1e-3
@@ -41,16 +44,16 @@ def unknown_parts(epochs: pl.DataFrame, config: Configuration) -> Unknown:
     inside: Bools = np.zeros(epochs.height, dtype=np.bool_)
     if judged.size:
         inside[judged[0] : judged[-1] + 1] = True
-    least = config.hazards.unknown_share_limit * used.sum()
-    at_ends, between = (int((used & ~known & part).sum()) for part in (~inside, inside))
-    return Unknown(bool(at_ends > least), bool(between > least))
+    used_s = floats(epochs, "used_s")
+    at_ends_s, between_s = (float(used_s[used & ~known & part].sum()) for part in (~inside, inside))
+    return Unknown(at_ends_s > config.budget_s, between_s > config.budget_s)
 
 
 def remedies(run: Row, lost: LostTime, unknown: Unknown, survey_stated: bool, config: Configuration) -> list[Remedy]:
     """What would mend this run, in the order of the enum; `survey_stated`: the survey states its sigma."""
     unproven = run["verdict"] == RunVerdict.UNPROVEN
     reasons = frozenset(run.get("reasons") or ())
-    missing = unproven and _lacks_evidence(run, config)
+    missing = unproven and bool(reasons & _LACKING)
     truth = run["evidence"] in TRUTH
     scarce = run["availability"] is not None and run["availability"] < config.advice.low_availability
 
@@ -74,13 +77,6 @@ def remedies(run: Row, lost: LostTime, unknown: Unknown, survey_stated: bool, co
         Remedy.SURVEY_SIGMA: costs(LostTo.TRACK_AMBIGUOUS) and not survey_stated,
     }
     return [remedy for remedy in Remedy if table[remedy]]
-
-
-def _lacks_evidence(run: Row, config: Configuration) -> bool:
-    """Positions in use, acceptances or failures that the evidence cannot judge."""
-    undecided = run["failures"] - run["failures_within_budget"] - run["failures_beyond_budget"]
-    unknown = (run["share_unknown"] or 0.0) > config.hazards.unknown_share_limit
-    return unknown or run["unproven_accepted"] > 0 or undecided > 0
 
 
 def _too_slow(run: Row, config: Configuration) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -11,7 +12,7 @@ from pipeline.epochs.clock import Clock, availability, may_move, met, outages_s,
 from pipeline.figures.bounds import CONTINUITY_S, UNKNOWN, Estimate, columns_of, continuity, poisson_rate
 from pipeline.figures.independent import missed_detection
 from pipeline.figures.verdict import LEVEL_LISTS, level_rows
-from schemas.arrays import Floats
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
 from schemas.enums import (
     TRUTH,
@@ -26,7 +27,7 @@ from schemas.enums import (
 )
 from schemas.tables import SCALES
 
-Row = dict[str, object]
+Row = dict[str, Any]
 
 
 def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
@@ -56,13 +57,41 @@ def judged() -> pl.Expr:
     return pl.col("judgement").is_in([Judgement.RIGHT, Judgement.WRONG])
 
 
-def share_unknown(epochs: pl.DataFrame, used_s: Floats) -> float | None:
-    """Share of the moving time in use that the evidence cannot judge; None without any such time.
+def time_in_use(epochs: pl.DataFrame, recovery_s: float) -> Row:
+    """Time in use, and what of it nobody can judge or nothing diagnoses (DOMAIN section 5.4).
 
-    `used_s`: for how long each epoch stands for a position in use.
+    `epochs`: with the columns of `JudgedEpochs`. Shares are of the moving time in use, null without any.
     """
-    moving = met(epochs, may_move())
-    return share_of_time(used_s[moving], ~met(epochs, judged())[moving])
+    used_s, moves = floats(epochs, "used_s"), met(epochs, may_move())
+    seen = met(epochs, judged())
+    moving_s, unknown = used_s[moves], ~seen & moves & (used_s > 0.0)
+    return {
+        "in_use_s": float(used_s.sum()) if epochs.height else None,
+        "in_use_judged_s": float(used_s[seen].sum()) if epochs.height else None,
+        "negated_s": float(floats(epochs, "counted_s")[met(epochs, pl.col("negated"))].sum())
+        if epochs.height
+        else None,
+        "share_unknown": share_of_time(moving_s, ~seen[moves]),
+        "share_undiagnosed": share_of_time(moving_s, met(epochs, pl.col("undiagnosed"))[moves]),
+        "unknown_in_use_s": _longest_s(times_ns(epochs), used_s, unknown, recovery_s) if epochs.height else None,
+    }
+
+
+def _longest_s(t_ns: Ints, used_s: Floats, where: Bools, apart_s: float) -> float:
+    """Longest time that epochs less than `apart_s` from each other stand for [s]."""
+    rows = np.flatnonzero(where)
+    breaks = np.flatnonzero(np.diff(t_ns[rows]) >= apart_s * NS_PER_S) + 1
+    return max((float(used_s[part].sum()) for part in np.split(rows, breaks)), default=0.0)
+
+
+def proof_margin_m(epochs: pl.DataFrame, passages: pl.DataFrame, limit_m: float) -> float | None:
+    """Least proof margin of the epochs in use and the acceptances that are right [m] (DOMAIN section 5.2)."""
+    right = (pl.col("judgement") == Judgement.RIGHT) & pl.col("in_use")
+    largest_m = pl.max_horizontal(-pl.col("error_low_m"), pl.col("error_high_m"))
+    of_epochs = epochs.select((limit_m - largest_m.filter(right)).min()).item()
+    of_passages = passages.filter(accepted())["proof_margin_m"].min()
+    margins = [margin for margin in (of_epochs, of_passages) if isinstance(margin, float)]
+    return min(margins, default=None)
 
 
 def spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:
@@ -105,6 +134,7 @@ def acceptances() -> dict[str, pl.Expr]:
         "accepted_judged": accepted() & known,
         "unsafe_accepted": accepted() & (pl.col("judgement") == Judgement.WRONG).fill_null(value=False),
         "unproven_accepted": accepted() & ~known,
+        "initialising_accepted": pl.col("initialising"),
     }
 
 
@@ -140,6 +170,7 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
         **_counted(hazards, counts),
         "time_to_detect_max_s": hazards["time_to_detect_s"].max(),
         "time_since_failure_max_s": hazards["time_since_failure_s"].max(),
+        "time_since_failure_may_max_s": hazards["time_since_failure_may_s"].max(),
     }
 
 
@@ -150,37 +181,36 @@ def failure_counts(failures: pl.DataFrame) -> Row:
         "failures": failures.height,
         **_counted(failures, counts),
         "hazardous_max_s": failures["hazardous_s"].max(),
+        "hazardous_s": failures["hazardous_s"].sum(),
         "failure_hazardous_s": failures["hazardous_s"].to_list(),
         "failure_hazardous_may_s": failures["hazardous_may_s"].to_list(),
         "failure_accepted": failures["accepted"].to_list(),
     }
 
 
-def service_levels(
-    failures: pl.DataFrame, evidence: Evidence | None, unknown: float | None, config: Configuration
-) -> Row:
-    """Whether the failures were within the allowed T_D of each service level (TVB eq. 7); `unknown`: share of time."""
-    told = failures.select("hazardous_s", "hazardous_may_s", "accepted").rows()
-    rows = level_rows(told, evidence, unknown, config)
-    return {name: [row[part] for row in rows] for part, name in LEVEL_LISTS.items()}
+def service_levels(row: Row, config: Configuration) -> Row:
+    """The row against the allowed T_D of each service level (TVB eq. 7)."""
+    rows = level_rows(row, config)
+    return {name: [level[part] for level in rows] for part, name in LEVEL_LISTS.items()}
 
 
-def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence | None, clock: Clock) -> Row:
+def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence | None) -> Row:
     """Alarms and the rate of false ones, which needs a reference or balise reads and a verdict on every alarm.
 
-    The rate counts the time in which the along-track bank judged and the position was judged.
+    The rate counts the time in use in which the along-track bank judged and the position was judged (DOMAIN 6).
     """
     false = alarms.filter(pl.col("verdict") == Verdict.FALSE).height
     monitored, seen = met(epochs, _along_evaluated()), met(epochs, judged())
     truth = evidence in TRUTH and bool(seen.any())
     complete = truth and not (alarms["verdict"] == Verdict.UNKNOWN).any()
-    judged_s = float(clock.held_s[monitored & seen].sum())
+    counted_s, in_use = floats(epochs, "counted_s"), met(epochs, pl.col("in_use"))
+    judged_s = float(counted_s[monitored & seen & in_use].sum())
     rate: Estimate = poisson_rate(false, judged_s / 3600.0) if complete else UNKNOWN
     times = {
-        "held_s": clock.held_s,
-        "monitored_s": clock.held_s[monitored],
-        "evidence_s": clock.held_s[seen],
-        "judged_s": clock.held_s[monitored & seen],
+        "held_s": counted_s,
+        "monitored_s": counted_s[monitored],
+        "evidence_s": counted_s[seen],
+        "judged_s": counted_s[monitored & seen & in_use],
     }
     return {
         **{name: float(held.sum()) if epochs.height else None for name, held in times.items()},
@@ -203,15 +233,18 @@ def exposure(epochs: pl.DataFrame) -> Row:
     }
 
 
-def state_shares(epochs: pl.DataFrame, clock: Clock) -> Row:
+def state_shares(epochs: pl.DataFrame) -> Row:
     """Shares of the time, gaps apart, known to be spent in each state of the LDS (TVB section 4).
+
+    `share_p1` of the time that shares count is the hazardous time of all failures.
 
     Where the judgement is unknown for a while the four do not add up to one. Where no epoch is known to be P0, P0 is
     not known, nor is P1 unless some epoch is in it.
     """
     states = {f"share_{state.value.lower()}": pl.col("lds_state") == state for state in LdsState}
     inside = epochs.select(condition.fill_null(value=False).alias(name) for name, condition in states.items())
-    row: Row = {flag.name: share_of_time(clock.held_s, flag.to_numpy()) for flag in inside}
+    counted_s = floats(epochs, "counted_s")
+    row: Row = {flag.name: share_of_time(counted_s, flag.to_numpy()) for flag in inside}
     if epochs["lds_state"].null_count() and not inside["share_p0"].any():
         unseen = ["share_p0"] if inside["share_p1"].any() else ["share_p0", "share_p1"]
         row |= dict.fromkeys(unseen)

@@ -5,27 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import polars as pl
 
-from pipeline.epochs.clock import Clock
+from pipeline.epochs.clock import Clock, may_move
 from pipeline.figures import run_figures as figures
 from pipeline.figures.lost_time import LostTime, lost_time
 from pipeline.figures.notes import ingest_notes, judged_notes, time_notes, undiagnosed_notes
 from pipeline.figures.remedies import remedies, unknown_parts
 from pipeline.figures.undetected import Spacing, undetected_figures
-from pipeline.figures.verdict import verdict_of
+from pipeline.figures.verdict import reasons_of, verdict_of
 from pipeline.ingest.clean import StreamCounts
+from pipeline.judge.failures import failures_within
 from pipeline.judge.judge import Judged
 from pipeline.results.provenance import Provenance
+from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import MisfitCause, Note, Remedy, RunStatus, RunVerdict, VehicleFigures
+from schemas.enums import MisfitCause, Note, Reason, Remedy, RunStatus, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 from schemas.words import Remark, notes_text, remedy_words
 
-Row = dict[str, object]
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -33,8 +36,9 @@ class SolutionResults:
     """All that the stages found out about one solution; `epochs` as in `schemas.tables`.
 
     `odometer_contradicted`: gaps between anchors that the odometer does not close (DOMAIN section 5.1). `alignment`:
-    latency and odometer scale at the end of the run. `unproving`: misfits that leave nothing proved. `spacing`: of
-    physical balises, None where not computed.
+    latency and odometer scale at the end of the run. `spacing`: of physical balises, None where not computed.
+    `reasons`: those that no figure holds; `anchored_ns`: first and last instant at which a read or the reference says
+    where the train was.
     """
 
     solution: str
@@ -50,40 +54,71 @@ class SolutionResults:
     faults_injected: bool = False
     misfits: Sequence[MisfitCause] = ()
     spacing: Spacing | None = None
-    unproving: int = 0
+    reasons: Sequence[Reason] = ()
+    anchored_ns: tuple[int, int] | None = None
 
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
     """One row of the `runs` table (CONTRACT section 3)."""
     epochs, clock, judged = results.epochs, Clock.of(results.epochs, config), results.judged
-    unknown = figures.share_unknown(epochs, judged.used_s)
     lost = lost_time(epochs, judged.alarms, clock, config)
     row = (
         _identity(results)
-        | {"share_unknown": unknown}
+        | _decisive(epochs, judged.passages, judged.failures, config)
+        | ({} if judged.evidence else {"hazardous_s": None})
+        | {"duration_s": clock.duration_s, "reasons": results.reasons}
         | lost.columns()
         | _extent(epochs, clock, judged.distance_m)
         | figures.positions(epochs, clock, config)
         | figures.accuracy(epochs)
-        | figures.balise_counts(judged.passages)
         | figures.hazard_counts(judged.hazards)
-        | figures.failure_counts(judged.failures)
-        | figures.service_levels(judged.failures, judged.evidence, unknown, config)
-        | figures.alarm_counts(judged.alarms, epochs, judged.evidence, clock)
+        | figures.alarm_counts(judged.alarms, epochs, judged.evidence)
         | figures.exposure(epochs)
-        | figures.state_shares(epochs, clock)
+        | figures.state_shares(epochs)
         | figures.stanford_counts(epochs, config.lds.ci_limit_m)
         | figures.stanford_of_receiver(epochs, config.lds.ci_limit_m)
         | undetected_figures(epochs, results.spacing, config.hazards.failure_limit_m)
         | _provenance(provenance)
     )
-    verdict = verdict_of(row, config.hazards.unknown_share_limit)
-    if results.unproving and verdict is RunVerdict.SAFE:
-        verdict = RunVerdict.UNPROVEN
-    row |= {"verdict": verdict}
+    row |= _part(results, row, config) | figures.service_levels(row, config) | _verdict(row, config)
+    unknown = row["share_unknown"] if Reason.UNKNOWN_IN_USE in row["reasons"] else None
     stated = epochs["survey_sigma_m"].is_not_null().any()
     cures = remedies(row, lost, unknown_parts(epochs, config), stated, config)
     return _frame(row | {"remedies": cures, "notes": _notes(results, unknown, lost, cures, clock, config)})
+
+
+def _decisive(epochs: pl.DataFrame, passages: pl.DataFrame, failures: pl.DataFrame, config: Configuration) -> Row:
+    """What decides the verdict of a run, or of a part of it (`reasons_of`)."""
+    return {
+        **figures.time_in_use(epochs, config.lds.recovery_s),
+        **figures.balise_counts(passages),
+        **figures.failure_counts(failures),
+        "proof_margin_m": figures.proof_margin_m(epochs, passages, config.hazards.failure_limit_m),
+    }
+
+
+def _verdict(row: Row, config: Configuration) -> Row:
+    reasons = reasons_of(row, config.budget_s, config.hazards.undiagnosed_share)
+    return {"verdict": verdict_of(reasons), "reasons": reasons}
+
+
+def _part(results: SolutionResults, row: Row, config: Configuration) -> Row:
+    """The verdict of the part from the first to the last anchor, where the run goes on beyond it."""
+    if results.anchored_ns is None:
+        return {}
+    from_ns, to_ns = results.anchored_ns
+    inside = pl.col("at").dt.timestamp("ns").is_between(from_ns, to_ns)
+    moving = pl.col("counted_s").filter(may_move())
+    share = results.epochs.select(moving.filter(inside.filter(may_move())).sum() / moving.sum()).item()
+    if share is None or not 0.0 < share < 1.0:
+        return {}
+    part = results.epochs.filter(inside)
+    begin, end = part["epoch"].item(0), part["epoch"].item(-1)
+    offers = results.judged.offers.filter(pl.col("epoch").is_between(begin, end))
+    passages = results.judged.passages.join(offers.select("crossing_id"), on="crossing_id", how="semi")
+    decisive = _decisive(part, passages, failures_within(part, offers, config), config)
+    verdict = _verdict(row | decisive | {"duration_s": (to_ns - from_ns) / NS_PER_S}, config)["verdict"]
+    return {"part_verdict": verdict, "part_from": from_ns, "part_to": to_ns, "part_share": share}
 
 
 def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.DataFrame:
@@ -161,5 +196,6 @@ def _provenance(provenance: Provenance) -> Row:
         "config_digest": provenance.config_digest,
         "input_digest": provenance.input_digest,
         "software": provenance.software,
+        "calibrated_by": list(provenance.calibrated_by),
         "contract": CONTRACT_VERSION,
     }

@@ -2,56 +2,73 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import polars as pl
 
+from pipeline.judge.failures import within_budget
 from schemas.config import Configuration
-from schemas.enums import TRUTH, Evidence, Judgement, RunStatus, RunVerdict, ThrVerdict
+from schemas.enums import Judgement, Reason, RunStatus, RunVerdict, ThrVerdict
 
 Row = Mapping[str, Any]
 Failure = tuple[float, float, str]
 """Hazardous time [s], the same with what is unknown, and the worst judgement of the VBs accepted meanwhile."""
 
 
-def verdict_of(run: Row, unknown_share_limit: float) -> RunVerdict:
-    """The worst that applies, from the counts and the share of one `runs` row (DOMAIN section 5.4)."""
-    unsafe, unproven = _reasons(run, unknown_share_limit)
-    return RunVerdict.UNSAFE if unsafe else RunVerdict.UNPROVEN if unproven else RunVerdict.SAFE
+_UNSAFE = {Reason.ACCEPTED_WRONG, Reason.FAILURE_BEYOND_BUDGET, Reason.HAZARDOUS_SUM}
+_LASTING = (Reason.EVIDENCE_DISPUTED, Reason.INPUT_DOUBTFUL, Reason.CLOCK_ASSUMED)
+"""Reasons that no count of a `runs` row holds: they stand among its `reasons` from the beginning."""
 
 
-def verdict_reasons(run: Row, unknown_share_limit: float) -> str:
-    """Why the verdict is what it is."""
-    unsafe, unproven = _reasons(run, unknown_share_limit)
-    if not unsafe + unproven and run["verdict"] == RunVerdict.UNPROVEN:
-        return "its streams do not fit each other, as the notes say"
-    return "; ".join(unsafe + unproven) or "every acceptance right, every position failure within the time allowed"
+DECISIVE = (
+    *("unsafe_accepted", "unproven_accepted", "balises_accepted", "unknown_in_use_s", "share_undiagnosed"),
+    *("failure_hazardous_s", "failure_hazardous_may_s", "failure_accepted"),
+    *("hazardous_s", "duration_s", "faults_injected", "reasons"),
+)
+"""Columns of `runs` that the reasons are read from."""
 
 
-def _reasons(run: Row, unknown_share_limit: float) -> tuple[list[str], list[str]]:
-    """What makes a run unsafe, and what leaves it unproven.
+def reasons_of(run: Row, allowed_s: float, undiagnosed_share: float) -> list[Reason]:
+    """Why a run has its verdict, from the counts of one `runs` row (DOMAIN section 5.4).
 
-    A failure of which the evidence cannot say whether it was within the budget leaves the run unproven. So does a
-    `share_unknown` of None: the position was never in use while the train moved.
+    `allowed_s`: allowed T_D; `undiagnosed_share`: of the configuration. Of `run["reasons"]` stays what no count holds.
     """
-    share = run["share_unknown"]
-    undecided = run["failures"] - run["failures_within_budget"] - run["failures_beyond_budget"]
-    unsafe = {
-        "VBs accepted despite a wrong position: {}": run["unsafe_accepted"],
-        "position failures in use for longer than allowed: {}": run["failures_beyond_budget"],
+    failures = failures_in(run)
+    within, beyond = level_counts(failures, allowed_s)
+    hours_begun = max(1, math.ceil((run["duration_s"] or 0.0) / 3600.0))
+    too_long = (run["hazardous_s"] or 0.0) > allowed_s * hours_begun
+    applies = {
+        Reason.ACCEPTED_WRONG: run["unsafe_accepted"] > 0,
+        Reason.FAILURE_BEYOND_BUDGET: beyond > 0,
+        # Eq. 7 is of nature's failures: how many were injected is nobody's rate.
+        Reason.HAZARDOUS_SUM: too_long and not run["faults_injected"],
+        Reason.ACCEPTED_UNKNOWN: run["unproven_accepted"] > 0,
+        Reason.BUDGET_UNKNOWN: within + beyond < len(failures),
+        Reason.UNKNOWN_IN_USE: (run["unknown_in_use_s"] or 0.0) > allowed_s,
+        Reason.NOT_DIAGNOSED: (run["share_undiagnosed"] or 0.0) > undiagnosed_share,
+        Reason.NOTHING_ACCEPTED: run["balises_accepted"] == 0,
+        **{reason: reason in (run["reasons"] or ()) for reason in _LASTING},
     }
-    unproven = {
-        "VBs accepted that nothing can check: {}": run["unproven_accepted"],
-        "position failures of unknown length: {}": undecided,
-        "no position was in use while the train moved": share is None,
-        f"{share or 0.0:.1%} of the moving time in use could not be checked": share is not None
-        and share > unknown_share_limit,
-        "no VB was accepted": not run["balises_accepted"],
-    }
-    said, left = ([text.format(count) for text, count in found.items() if count] for found in (unsafe, unproven))
-    return said, left
+    return [reason for reason in Reason if applies[reason]]
+
+
+def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
+    """The worst that applies; an assumed clock alone changes nothing (DOMAIN section 5.4)."""
+    found = set(reasons) - {Reason.CLOCK_ASSUMED}
+    if found & _UNSAFE:
+        return RunVerdict.UNSAFE
+    return RunVerdict.UNPROVEN if found else RunVerdict.SAFE
+
+
+def verdict_reasons(run: Row) -> str:
+    """The reasons of a `runs` row in words."""
+    return (
+        ", ".join(str(reason).replace("_", " ") for reason in run["reasons"] or ())
+        or "every acceptance right, every position failure within the time allowed"
+    )
 
 
 def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
@@ -114,20 +131,20 @@ LEVEL_LISTS = {
 """What `level_rows` tells of each service level, and the list of the `runs` table that holds it."""
 
 
-def level_rows(
-    failures: Sequence[Failure],
-    evidence: Evidence | str | None,
-    share_unknown: float | None,
-    config: Configuration,
-) -> list[dict[str, object]]:
-    """The failures of one run against the allowed T_D of each service level, with the verdict on it."""
-    proven = _is_proven(evidence, share_unknown, config.hazards.unknown_share_limit)
+_OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVerdict.UNKNOWN}
+
+
+def level_rows(run: Row, config: Configuration) -> list[dict[str, object]]:
+    """One `runs` row against the allowed T_D of each service level, by the rules of its own verdict."""
+    failures = failures_in(run)
+    in_time = ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
     rows: list[dict[str, object]] = []
     for level in config.safety.service_levels:
         allowed_s = config.safety.allowed_time_to_detect_s(level)
         within, exceeded = level_counts(failures, allowed_s)
-        verdict = _verdict(len(failures), within, exceeded, proven=proven).value
-        rows.append(dict(zip(LEVEL_LISTS, (level, allowed_s, within, exceeded, verdict), strict=True)))
+        verdict = verdict_of(reasons_of(run, allowed_s, config.hazards.undiagnosed_share))
+        values = (level, allowed_s, within, exceeded, _OF_LEVEL.get(verdict, in_time).value)
+        rows.append(dict(zip(LEVEL_LISTS, values, strict=True)))
     return rows
 
 
@@ -138,23 +155,6 @@ def failures_in(run: Row) -> list[Failure]:
 
 
 def level_counts(failures: Sequence[Failure], allowed_s: float) -> tuple[int, int]:
-    """How many failures kept the allowed time whatever is unknown, and how many did not for certain.
-
-    One in which a VB was accepted wrong did not, one with an unknown acceptance may not have (DOMAIN section 5.3).
-    """
-    within = sum(may_s <= allowed_s and accepted == Judgement.RIGHT for _, may_s, accepted in failures)
-    return within, sum(spent_s > allowed_s or accepted == Judgement.WRONG for spent_s, _, accepted in failures)
-
-
-def _verdict(failures: int, within: int, exceeded: int, *, proven: bool) -> ThrVerdict:
-    """`proven`: next to nothing of the run is unknown (`_is_proven`), so that no failure can be hidden."""
-    if exceeded:
-        return ThrVerdict.EXCEEDED
-    if within < failures or not proven:
-        return ThrVerdict.UNKNOWN
-    return ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
-
-
-def _is_proven(evidence: Evidence | str | None, share_unknown: float | None, unknown_share_limit: float) -> bool:
-    """A reference or balise reads judge the position in use but for the share that a verdict may leave unknown."""
-    return evidence in TRUTH and share_unknown is not None and share_unknown <= unknown_share_limit
+    """How many failures kept the allowed time whatever is unknown, and how many did not for certain."""
+    kept = [within_budget(spent_s, may_s, Judgement(accepted), allowed_s) for spent_s, may_s, accepted in failures]
+    return kept.count(True), kept.count(False)

@@ -1,17 +1,19 @@
-"""Episodes: since when, until when and for how long in use a position was wrong (DOMAIN section 5.3)."""
+"""Episodes: since when and until when a position was wrong, and when that was seen (DOMAIN section 5.3)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
 from pipeline.epochs.failure_log import FailureLog
-from pipeline.judge.bench import Bench, Series
-from pipeline.judge.judgement import UNKNOWN, WRONG
+from pipeline.evidence.evidence import NOTHING
+from pipeline.judge.failures import Course, Failure, numbers_of
+from pipeline.judge.judgement import WRONG, Judgements
 from pipeline.judge.jumps import Jump
-from schemas.arrays import NS_PER_S, Bools, Ints, spans_of
+from schemas.arrays import NS_PER_S, Bools, flags, spans_of
 from schemas.config import HazardConfig
 
 _ODOMETER = "odometer"
@@ -19,9 +21,10 @@ _ODOMETER = "odometer"
 
 @dataclass(frozen=True)
 class Episode:
-    """A fault from its onset until the position is right again; numbers are of `Series`, `end` is the first after it.
+    """A fault from its onset until the position is right again; numbers are of `Course`, `end` is the first after it.
 
-    `step`: the jump that began it; `jump_back`: the one that ended it; `failure`: first position of a lasting wrong.
+    `step`: the jump that began it; `jump_back`: the one that ended it. `t_failure_ns`: begin of the position failure;
+    `t_failure_may_ns`: since when it may have been one. `failure`: the time wrong in use that the episode belongs to.
     """
 
     mark: int
@@ -31,127 +34,108 @@ class Episode:
     end_ns: int
     step: Jump | None
     jump_back: Jump | None
-    failure: int | None
-    failure_known: bool
+    begin_ns: int
+    failure_number: int | None
+    t_failure_ns: int | None
+    t_failure_may_ns: int | None
     detected_ns: int | None
     monitor: str | None
     alarm_before_onset: bool
-    hazardous_s: float
-    hazardous_may_s: float
+    failure: Failure | None
 
-    def undetected_ns(self, series: Series) -> tuple[int, int]:
-        """From onset to detection, or to the end; what a step offers on its way lies before its first position."""
-        begin_ns = self.onset_ns
-        if self.step is not None:
-            begin_ns = min(begin_ns, int(series.t_ns[self.step.first - 1]) + 1)
-        return begin_ns, self.end_ns if self.detected_ns is None else self.detected_ns
-
-    def holds(self, number: Ints) -> Bools:
-        """Valid positions that belong to the episode."""
-        inside: Bools = (number >= self.onset) & (number < self.end)
-        return inside
+    @property
+    def undetected_ns(self) -> tuple[int, int]:
+        """From the begin to detection, or to the end; what a step offers on its way lies before its first position."""
+        return self.begin_ns, self.end_ns if self.detected_ns is None else self.detected_ns
 
 
-def find_episodes(bench: Bench, log: FailureLog, faults: pl.DataFrame | None) -> list[Episode]:
+def find_episodes(
+    course: Course,
+    offers: pl.DataFrame,
+    failures: Sequence[Failure],
+    log: FailureLog,
+    faults: pl.DataFrame | None,
+    config: HazardConfig,
+) -> list[Episode]:
     """One episode for each time that positions left the evidence, or offered a VB wrong."""
-    series, config = bench.series, bench.config.hazards
-    marks = np.flatnonzero((series.judged.code == WRONG) | _marked(bench))
-    calm_from = _calm_from(series, config)
-    quiet = _quiet(series, config)
+    marks = np.flatnonzero(course.judged.is_wrong | _offered_wrong(course, offers))
     episodes: list[Episode] = []
     until = 0
     for mark in marks.tolist():
         if mark < until:
             continue
-        episode = _episode(series, mark, until, calm_from, quiet, log, faults, config)
+        episode = _episode(course, mark, until, failures, log, faults, config)
         episodes.append(episode)
         until = max(episode.end, mark + 1, 0 if episode.jump_back is None else episode.jump_back.last + 1)
     return episodes
 
 
-def _marked(bench: Bench) -> Bools:
-    """Valid positions that complete an offer judged wrong; what a jump offers on its way is the jump's."""
-    offers, marked = bench.offers, np.zeros(bench.series.size, dtype=np.bool_)
-    marked[offers.number[offers.offered & (offers.judged.code == WRONG)]] = True
-    for jump in bench.series.jumps:
+def _offered_wrong(course: Course, offers: pl.DataFrame) -> Bools:
+    """Positions that complete an offer judged wrong; what a jump offers on its way is the jump's."""
+    marked = np.zeros(course.size, dtype=np.bool_)
+    wrong = flags(offers, "offered") & Judgements.of(offers).is_wrong
+    marked[numbers_of(offers, course.positions)[wrong]] = True
+    for jump in course.jumps:
         marked[jump.first : jump.last + 1] = False
     return marked
 
 
 def _episode(
-    series: Series,
+    course: Course,
     mark: int,
     floor: int,
-    calm_from: Ints,
-    quiet: Bools,
+    failures: Sequence[Failure],
     log: FailureLog,
     faults: pl.DataFrame | None,
     config: HazardConfig,
 ) -> Episode:
-    calm = np.flatnonzero(quiet[floor:mark])
-    after_calm = floor + int(calm[-1]) + 1 if calm.size else floor
-    step = next((jump for jump in series.jumps if after_calm <= jump.last and jump.first <= mark), None)
-    onset = max(floor, step.first) if step is not None else after_calm
-    jump_back, end = _end(series, mark, step, calm_from, config)
-    onset_ns = _onset_ns(series, onset, mark, step, log, faults, config)
-    end_ns = int(series.t_ns[end]) if end < series.size else int(series.t_ns[-1]) + 1
+    after_quiet = course.after_quiet(floor, mark)
+    step = next((jump for jump in course.jumps if after_quiet <= jump.last and jump.first <= mark), None)
+    onset = max(floor, step.first) if step is not None else after_quiet
+    jump_back, end = _end(course, mark, step, config)
+    onset_ns = _onset_ns(course, onset, mark, step, log, faults, config)
+    end_ns = int(course.t_ns[end]) if end < course.size else int(course.t_ns[-1]) + 1
     detected_ns, monitor, before = _detection(log, onset_ns, end_ns)
-    failure = _failure(series, onset, end, step, config)
-    known = failure is not None and (failure == 0 or series.judged.code[failure - 1] != UNKNOWN)
-    # A position that takes a second to come back is wrong until then: the jump back belongs to the time in use.
-    back = slice(onset, end if jump_back is None else jump_back.last + 1)
-    code, used_s = series.judged.code[back], series.used_s[back]
-    hazardous_s = float(used_s[code == WRONG].sum())
-    may_s = hazardous_s + float(used_s[code == UNKNOWN].sum())
+    failed = _failure(course, onset, end, step, config)
+    own = (failure for failure in failures if failure.meets(onset, end))
     return Episode(
-        mark, onset, end, onset_ns, end_ns, step, jump_back, failure, known, detected_ns, monitor, before,
-        hazardous_s, may_s,
-    )  # fmt: skip
+        mark=mark,
+        onset=onset,
+        end=end,
+        onset_ns=onset_ns,
+        end_ns=end_ns,
+        step=step,
+        jump_back=jump_back,
+        begin_ns=onset_ns if step is None else min(onset_ns, int(course.t_ns[step.first - 1]) + 1),
+        failure_number=failed,
+        t_failure_ns=None if failed is None else int(course.t_ns[failed]),
+        t_failure_may_ns=None if failed is None else _failure_may_ns(course, failed, config),
+        detected_ns=detected_ns,
+        monitor=monitor,
+        alarm_before_onset=before,
+        failure=next(own, None),
+    )
 
 
-def _calm_from(series: Series, config: HazardConfig) -> Ints:
-    """For each position the first one from it on at which the error stays within half the limit for long enough."""
-    calm = (series.judged.largest_m <= 0.5 * config.failure_limit_m) & (series.judged.code != WRONG)
-    hold_ns = round(config.episode_end_s * NS_PER_S)
-    begins: Ints = np.full(series.size + 1, series.size, dtype=np.int64)
-    for first, last in spans_of(calm):
-        latest = int(np.searchsorted(series.t_ns, series.t_ns[last] - hold_ns, side="right"))
-        begins[first:latest] = np.arange(first, max(first, latest))
-    calm_from: Ints = np.minimum.accumulate(begins[::-1])[::-1][: series.size]
-    return calm_from
-
-
-def _quiet(series: Series, config: HazardConfig) -> Bools:
-    """Errors that noise explains: |e| at most min(3 sqrt(sigma_x^2 + sigma_ref^2), half the limit)."""
-    sigma_ref = 0.5 * (series.judged.high_m - series.judged.low_m) / config.evidence_factor
-    noise = config.evidence_factor * np.hypot(np.nan_to_num(series.sigma_m), np.nan_to_num(sigma_ref))
-    with np.errstate(invalid="ignore"):
-        quiet: Bools = np.abs(series.judged.middle_m) <= np.minimum(noise, 0.5 * config.failure_limit_m)
-    not_wrong: Bools = quiet & (series.judged.code != WRONG)
-    return not_wrong
-
-
-def _end(
-    series: Series, mark: int, step: Jump | None, calm_from: Ints, config: HazardConfig
-) -> tuple[Jump | None, int]:
-    """The first position after the episode, and the jump back that ends it."""
-    calm = int(calm_from[mark])
-    for jump in series.jumps:
+def _end(course: Course, mark: int, step: Jump | None, config: HazardConfig) -> tuple[Jump | None, int]:
+    """The jump back that ends the episode, and the first position after it."""
+    calm = int(course.calm_from[mark])
+    for jump in course.jumps:
         after_step = jump.first > mark and (step is None or jump.first > step.last)
-        if after_step and jump.first <= calm and _is_back(series, jump, config):
+        if after_step and jump.first <= calm and _is_back(course.judged, jump, config):
             return jump, jump.first
     return None, calm
 
 
-def _is_back(series: Series, jump: Jump, config: HazardConfig) -> bool:
+def _is_back(judged: Judgements, jump: Jump, config: HazardConfig) -> bool:
     """Against the error before it, and no longer beyond the limit after it."""
-    before = float(series.judged.middle_m[jump.first - 1])
-    after = float(series.judged.least_m[jump.last])
-    return before * jump.step_m < 0.0 and after <= config.failure_limit_m and series.judged.code[jump.last] != WRONG
+    before_m = float(judged.middle_m[jump.first - 1])
+    after_m = float(judged.least_m[jump.last])
+    return before_m * jump.step_m < 0.0 and after_m <= config.failure_limit_m and judged.code[jump.last] != WRONG
 
 
 def _onset_ns(
-    series: Series,
+    course: Course,
     onset: int,
     mark: int,
     step: Jump | None,
@@ -160,7 +144,7 @@ def _onset_ns(
     config: HazardConfig,
 ) -> int:
     """As a `faults` stream names it; else the first epoch of the step or drift, or an alarm up to 30 s before."""
-    onset_ns, mark_ns = int(series.t_ns[onset]), int(series.t_ns[mark])
+    onset_ns, mark_ns = int(course.t_ns[onset]), int(course.t_ns[mark])
     named = _named_onset_ns(faults, onset_ns, mark_ns)
     if named is not None:
         return named
@@ -191,13 +175,28 @@ def _detection(log: FailureLog, onset_ns: int, end_ns: int) -> tuple[int | None,
     return (None, None, False) if found is None else (*found, False)
 
 
-def _failure(series: Series, onset: int, end: int, step: Jump | None, config: HazardConfig) -> int | None:
-    """First position of a second of `wrong`; a step counts at once."""
-    wrong = series.judged.code[onset:end] == WRONG
+def _failure(course: Course, onset: int, end: int, step: Jump | None, config: HazardConfig) -> int | None:
+    """First position of a second of `wrong`; a step counts at once; else the first wrong one of the episode."""
+    spans = spans_of(course.judged.is_wrong[onset:end])
     hold_ns = round(config.failure_hold_s * NS_PER_S)
-    for first, last in spans_of(wrong):
+    for first, last in spans:
         begin, until = onset + first, onset + last
         at_once = step is not None and step.first <= begin <= step.last
-        if at_once or series.t_ns[until] - series.t_ns[begin] >= hold_ns:
+        if at_once or course.t_ns[until] - course.t_ns[begin] >= hold_ns:
             return begin
-    return None
+    return onset + spans[0][0] if spans else None
+
+
+def _failure_may_ns(course: Course, failed: int, config: HazardConfig) -> int | None:
+    """First of the unbroken run of unknown or wrong positions before a failure at which it may have been one.
+
+    That is where the interval reaches beyond the limit. None where the evidence is silent in that run: a failure may
+    have begun at any time of it.
+    """
+    right = np.flatnonzero(course.judged.is_right[:failed])
+    run = slice(int(right[-1]) + 1 if right.size else 0, failed + 1)
+    if (course.judged.kind[run] == NOTHING).any():
+        return None
+    # Where no place along the track can be compared, any error may be.
+    may = np.flatnonzero(~(course.judged.largest_m[run] <= config.failure_limit_m) | course.judged.is_wrong[run])
+    return int(course.t_ns[run][may[0]])

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
 
 from pipeline.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.track.path import Route
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, flags, floats, ints
 from schemas.config import HazardConfig
 from schemas.enums import Evidence, Judgement
 
@@ -22,15 +22,14 @@ RIGHT, WRONG, UNKNOWN = (JUDGEMENTS.index(one) for one in (Judgement.RIGHT, Judg
 class Positions:
     """Positions of one solution on the network at some instants.
 
-    `element`: net element by its number in the survey, -1 without a position; `direction`: of travel, +1 along
-    growing path; `unambiguous`: the track is not in doubt by the train's own knowledge.
+    `element`: net element by its number in the survey, -1 without a position; `unambiguous`: the track is not in doubt
+    by the train's own knowledge.
     """
 
     element: Ints
     measure_m: Floats
     leg: Ints
     path_m: Floats
-    direction: Ints
     unambiguous: Bools
 
     @property
@@ -41,9 +40,10 @@ class Positions:
 
 @dataclass(frozen=True)
 class Judgements:
-    """Per instant: judgement (number in `JUDGEMENTS`), least and largest error in the direction of travel [m].
+    """Per instant: judgement (number in `JUDGEMENTS`), least and largest error along the track [m].
 
-    `wrong_track`: judged wrong for its net element, whatever the place along the track.
+    Along growing path as `judge_positions` makes them, in the direction of travel once `turned`. `kind`: of evidence,
+    number in `KINDS`; `wrong_track`: judged wrong for its net element, whatever the place along the track.
     """
 
     code: Ints
@@ -52,8 +52,42 @@ class Judgements:
     kind: Ints
     wrong_track: Bools
 
-    def take(self, rows: Ints) -> Judgements:
-        return Judgements(self.code[rows], self.low_m[rows], self.high_m[rows], self.kind[rows], self.wrong_track[rows])
+    @classmethod
+    def of(cls, frame: pl.DataFrame) -> Judgements:
+        """Those of a frame that holds the columns of `columns`."""
+        return cls(
+            code=ints(frame["judgement"].to_physical()),
+            low_m=floats(frame, "error_low_m"),
+            high_m=floats(frame, "error_high_m"),
+            kind=ints(frame["evidence"].to_physical(), NOTHING),
+            wrong_track=flags(frame, "wrong_track"),
+        )
+
+    def columns(self) -> list[pl.Series]:
+        kinds = pl.Series("evidence", [*(kind.value for kind in KINDS), None], dtype=pl.Enum(Evidence))
+        return [
+            judgement_words(self.code),
+            pl.Series("error_low_m", self.low_m, nan_to_null=True),
+            pl.Series("error_high_m", self.high_m, nan_to_null=True),
+            kinds.gather(np.where(self.kind == NOTHING, len(KINDS), self.kind)),
+            pl.Series("wrong_track", self.wrong_track),
+        ]
+
+    def turned(self, direction: Ints) -> Judgements:
+        """The same with the errors in the direction of travel: +1 along growing path, -1 against it."""
+        forward = direction > 0
+        low_m = np.where(forward, self.low_m, -self.high_m)
+        return replace(self, low_m=low_m, high_m=np.where(forward, self.high_m, -self.low_m))
+
+    @property
+    def is_right(self) -> Bools:
+        right: Bools = self.code == RIGHT
+        return right
+
+    @property
+    def is_wrong(self) -> Bools:
+        wrong: Bools = self.code == WRONG
+        return wrong
 
     @property
     def middle_m(self) -> Floats:
@@ -96,12 +130,6 @@ def margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
 def judgement_words(code: Ints) -> pl.Series:
     kinds = [one.value for one in JUDGEMENTS]
     return pl.Series("judgement", kinds, dtype=pl.Enum(kinds)).gather(code)
-
-
-def evidence_words(kind: Ints) -> pl.Series:
-    """Null where there is no evidence."""
-    kinds = [*(one.value for one in KINDS), None]
-    return pl.Series("evidence", kinds, dtype=pl.Enum([one.value for one in KINDS])).gather(kind % len(kinds))
 
 
 @dataclass(frozen=True)
@@ -170,13 +198,13 @@ def _relative(positions: Positions, rows: Ints, there: Alternative, legs: Sequen
     own_sense, middle = _own_sense(positions, rows, legs), 0.5 * (there.low_m + there.high_m)
     at_m, sense = there.route.coordinate(element, measure, middle)
     low, high = at_m - there.high_m, at_m - there.low_m
-    facing = positions.direction[rows] * own_sense * sense
+    facing = own_sense * sense
     off = ~np.isfinite(at_m)
     if off.any():
         away = np.flatnonzero(off)
         by_path = _by_own_path(positions, rows[away], _only(there, off), legs)
         low[away], high[away], off[away] = by_path.low_m, by_path.high_m, by_path.off_track
-        facing[away] = positions.direction[rows[away]]
+        facing[away] = 1
     ahead = facing > 0
     return _Relative(np.where(ahead, low, -high), np.where(ahead, high, -low), off)
 
@@ -217,16 +245,14 @@ def _by_own_path(positions: Positions, rows: Ints, there: Alternative, legs: Seq
 
 
 def with_own_anchors(
-    judged: Judgements, positions: Positions, interval_m: tuple[Floats, Floats], config: HazardConfig
+    judged: Judgements, positions: Positions, train_m: tuple[Floats, Floats], config: HazardConfig
 ) -> Judgements:
     """Where there is no other evidence, by the odometer since an accepted VB: wrong, or unknown, never right.
 
-    `interval_m`: least and largest path position of the train.
+    `train_m`: least and largest path position of the train; errors along growing path.
     """
-    rows = (judged.kind == NOTHING) & positions.known & np.isfinite(interval_m[0])
-    behind, ahead = positions.path_m - interval_m[1], positions.path_m - interval_m[0]
-    forward = positions.direction > 0
-    low, high = np.where(forward, behind, -ahead), np.where(forward, ahead, -behind)
+    rows = (judged.kind == NOTHING) & positions.known & np.isfinite(train_m[0])
+    low, high = positions.path_m - train_m[1], positions.path_m - train_m[0]
     beyond = rows & ((low > config.failure_limit_m) | (high < -config.failure_limit_m))
     return Judgements(
         code=np.where(beyond, WRONG, judged.code),

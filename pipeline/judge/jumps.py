@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import polars as pl
 
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
+from pipeline.odometry import Odometry
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, spans_of, times_ns
 from schemas.config import HazardConfig
 
 
@@ -30,6 +32,16 @@ class Jump:
     first: int
     last: int
     step_m: float
+
+
+def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: int, config: HazardConfig) -> list[Jump]:
+    """All jumps of the positions, in order of time; numbers are rows of `positions`."""
+    at_ns, path_m = times_ns(positions, "at"), floats(positions, "path_m")
+    counted_m = np.full(max(at_ns.size - 1, 0), np.nan)
+    if odometry is not None:
+        counted_m = odometry.between(at_ns[:-1], at_ns[1:]).distance_m
+    steps = steps_of(times_ns(positions), path_m, floats(positions, "reference_m"), counted_m, gap_ns)
+    return find_jumps(steps, ints(positions["direction"]), config)
 
 
 def steps_of(t_ns: Ints, path_m: Floats, train_m: Floats, counted_m: Floats, gap_ns: int) -> Steps:

@@ -3,79 +3,77 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import polars as pl
 
+from pipeline.epochs.clock import crossing_gap_ns
 from pipeline.evidence.evidence import NOTHING, within_spans
-from pipeline.judge.bench import Bench
-from pipeline.judge.hazards import Draft
-from pipeline.judge.judgement import WRONG, judgement_words
-from pipeline.judge.passings import Passing
-from schemas.arrays import Bools, Ints, floats, ints
+from pipeline.judge.case import Case, Solution
+from pipeline.judge.hazards import HazardRow, speed_at
+from pipeline.judge.judgement import Judgements
+from pipeline.judge.true_crossings import TrueCrossing
+from schemas.arrays import Bools, Ints, ints, times_ns
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
 from schemas.tables import Passages
 
 
 def passages_table(
-    bench: Bench,
-    drafts: Sequence[Draft],
-    passings: dict[str, list[Passing]],
-    forward: dict[str, int],
+    case: Case,
+    epochs: pl.DataFrame,
+    offers: pl.DataFrame,
+    rows: Sequence[HazardRow],
+    crossings: dict[str, list[TrueCrossing]],
     spans: Sequence[tuple[int, int]],
 ) -> pl.DataFrame:
     """Passages of the LDS, and those that it knows nothing of, with the columns of the evidence.
 
-    `forward`: +1 where the path grows with the measure of the balise's net element; `spans`: from each fault's onset to
-    its detection.
+    `epochs`, `offers`: judged; `crossings`: of the train itself; `spans`: from each fault's onset to its detection.
     """
-    stamps = bench.t_ns[np.isfinite(bench.path_m)]
-    known = bench.solution.passages.with_columns(_assigned(bench.solution.passages, passings))
-    passages = _with_unoffered(known, bench, passings, forward, stamps)
+    stamps = times_ns(epochs.filter(pl.col("path_m").is_not_null()))
+    gap_ns = crossing_gap_ns(stamps, case.config.lds)
+    known = case.solution.passages.with_columns(_assigned(case.solution.passages, crossings))
+    passages = _with_unoffered(known, case.solution, crossings, stamps, gap_ns)
     t_true = passages["t_true"]
-    positioned = _within_gap(stamps, ints(t_true), bench.gap_ns) & t_true.is_not_null().to_numpy()
+    positioned = _within_gap(stamps, ints(t_true), gap_ns) & t_true.is_not_null().to_numpy()
     frame = passages.with_columns(
         pl.col("t_true").cast(pl.Datetime("ns", "UTC")),
-        *_of_crossings(passages, bench, drafts),
+        *_of_offers(passages, offers, rows),
         pl.Series("_positioned", positioned),
         pl.Series("suspect_after_the_fact", _inside(passages, spans)),
-        _speeds(passages, t_true, bench),
+        _speeds(passages, t_true, epochs, gap_ns),
     )
     return _with_failures(frame).select(Passages.column_names())
 
 
-def _of_crossings(passages: pl.DataFrame, bench: Bench, drafts: Sequence[Draft]) -> pl.DataFrame:
-    """Judgement, error, hazard and insertion of the crossing that each passage rests on.
+def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[HazardRow]) -> pl.DataFrame:
+    """Judgement, error, hazard and insertion of the offer that each passage rests on; of a telegram its error alone.
 
     Inserted is one by a jump, on another track, or early and wrong.
     """
-    offers, judged = bench.offers, bench.offers.judged
-    hazard, jumped = np.full(judged.code.size, NOTHING), np.zeros(judged.code.size, dtype=np.bool_)
-    for number, draft in reversed(list(enumerate(drafts))):
-        hazard[draft.hits] = number
-        jumped[draft.crossed] = True
-    early = (judged.code == WRONG) & ((judged.low_m > 0.0) | judged.wrong_track)
-    known_m = judged.known_m(bench.config.hazards.known_error_m)
-    judged_crossings = pl.DataFrame(
-        [
-            pl.Series("crossing_id", offers.crossing_id, dtype=pl.Int64),
-            judgement_words(judged.code),
-            pl.Series("location_error_m", known_m, nan_to_null=True),
-            pl.Series("hazard_id", hazard).replace(NOTHING, None),
-            pl.Series("_inserted", jumped | early),
-            pl.Series("_virtual", offers.virtual),
-        ]
+    judged = Judgements.of(offers)
+    hazard, jumped = np.full(offers.height, NOTHING), np.zeros(offers.height, dtype=np.bool_)
+    for number, row in reversed(list(enumerate(rows))):
+        hazard[row.hits] = number
+        jumped[row.crossed] = True
+    early = judged.is_wrong & ((judged.low_m > 0.0) | judged.wrong_track)
+    of_virtual = ("judgement", "error_low_m", "error_high_m", "evidence", "proof_margin_m")
+    joined = passages.select("crossing_id").join(
+        offers.select(
+            *("crossing_id", "location_error_m"),
+            *(pl.when("virtual").then(pl.col(name)).alias(name) for name in of_virtual),
+            hazard_id=pl.Series(hazard).replace(NOTHING, None),
+            _inserted=pl.Series(jumped | early),
+        ),
+        on="crossing_id",
+        how="left",
+        maintain_order="left",
     )
-    told = passages.select("crossing_id").join(judged_crossings, on="crossing_id", how="left", maintain_order="left")
-    return told.select(
-        pl.when("_virtual").then("judgement"),
-        "location_error_m",
-        "hazard_id",
-        pl.col("_inserted").fill_null(value=False),
-    )
+    return joined.drop("crossing_id").with_columns(pl.col("_inserted").fill_null(value=False))
 
 
-def _assigned(passages: pl.DataFrame, passings: dict[str, list[Passing]]) -> pl.Series:
+def _assigned(passages: pl.DataFrame, crossings: dict[str, list[TrueCrossing]]) -> pl.Series:
     """The true passing of each passage [ns]: the nearest in time to its offer or to its reckoning, each given once.
 
     A passage with neither takes what is left, in order.
@@ -86,7 +84,7 @@ def _assigned(passages: pl.DataFrame, passings: dict[str, list[Passing]]) -> pl.
         (abs(instant - t_ns), row, instant)
         for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True))
         if t_ns is not None
-        for instant, _, _ in passings.get(balise, ())
+        for instant, _, _ in crossings.get(balise, ())
     )
     result: list[int | None] = [None] * len(balises)
     taken: set[tuple[str, int]] = set()
@@ -95,7 +93,7 @@ def _assigned(passages: pl.DataFrame, passings: dict[str, list[Passing]]) -> pl.
             result[row] = instant
             taken.add((balises[row], instant))
     for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True)):
-        left = [one.t_ns for one in passings.get(balise, ()) if (balise, one.t_ns) not in taken]
+        left = [one.t_ns for one in crossings.get(balise, ()) if (balise, one.t_ns) not in taken]
         if t_ns is None and left:
             result[row] = left[0]
             taken.add((balise, left[0]))
@@ -119,12 +117,12 @@ def _inside(passages: pl.DataFrame, spans: Sequence[tuple[int, int]]) -> Bools:
     return accepted & within_spans(t_ns, spans)
 
 
-def _speeds(passages: pl.DataFrame, t_true: pl.Series, bench: Bench) -> pl.Series:
+def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, gap_ns: int) -> pl.Series:
     """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
     at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
-    known = np.isfinite(floats(bench.epochs, "speed_mps"))
-    told = at.is_not_null().to_numpy() & _within_gap(bench.t_ns[known], ints(at), bench.gap_ns)
-    return pl.Series("speed_mps", np.where(told, bench.speed_at(ints(at)), np.nan), nan_to_null=True)
+    stamps = times_ns(epochs.filter(pl.col("speed_mps").is_not_null()))
+    known = at.is_not_null().to_numpy() & _within_gap(stamps, ints(at), gap_ns)
+    return pl.Series("speed_mps", np.where(known, speed_at(epochs, ints(at)), np.nan), nan_to_null=True)
 
 
 def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:
@@ -148,21 +146,20 @@ def _word(frame: pl.DataFrame, column: str, *rows: tuple[pl.Expr, FailureMode | 
 
 
 def _with_unoffered(
-    passages: pl.DataFrame, bench: Bench, passings: dict[str, list[Passing]], forward: dict[str, int], stamps: Ints
+    passages: pl.DataFrame, solution: Solution, crossings: dict[str, list[TrueCrossing]], stamps: Ints, gap_ns: int
 ) -> pl.DataFrame:
     """One more passage for each virtual balise that the train passed and the LDS knows nothing of.
 
     The LDS follows the position: before the first one, or where it is wrong at an end of the run, no window has closed
     yet. `passages`: with their true passing; `stamps`: of valid positions.
     """
-    solution = bench.solution.name
     given = set(passages.select("balise_id", "t_true").iter_rows())
-    virtual = bench.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
+    virtual = solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
     rows = [
-        _unoffered(balise, instant, sense * forward[balise["balise_id"]], seen, solution)
+        _unoffered(balise, instant, sense * balise["sense"], seen, solution.name)
         for balise in virtual.unique("balise_id", keep="first", maintain_order=True).iter_rows(named=True)
-        for instant, sense, clear in passings.get(balise["balise_id"], ())
-        for seen in _within_gap(stamps, np.array([instant]), bench.gap_ns).tolist()
+        for instant, sense, clear in crossings.get(balise["balise_id"], ())
+        for seen in _within_gap(stamps, np.array([instant]), gap_ns).tolist()
         if clear and (balise["balise_id"], instant) not in given
     ]
     if not rows:
@@ -173,7 +170,7 @@ def _with_unoffered(
     return pl.concat([ordered, added.with_columns(_when=when)]).sort("_when", maintain_order=True).drop("_when")
 
 
-def _unoffered(balise: dict[str, object], instant: int, direction: int, seen: bool, solution: str) -> dict[str, object]:
+def _unoffered(balise: dict[str, Any], instant: int, direction: int, seen: bool, solution: str) -> dict[str, Any]:
     own = ("balise_id", "kind", "netelement_id", "measure_m", "path_m", "location_accuracy_m")
     return {name: balise[name] for name in own} | {
         "solution": solution,

@@ -37,8 +37,8 @@ Where the sources leave a choice, this package reads them so:
   monitor are one condition of a detection), but raise no alarm; `withheld_for` says why.
 - After slip that the odometer reports, the position has to re-link (`relink`, the same function). No alarm stands
   there, so the last TVB before the slip is the anchor, unless an alarm or a telegram fixed another. The wheel was
-  counted, if wrongly: what it may be off by (`slip_doubt_m`) and the bound of the re-link must not exceed the failure
-  limit together, or a fault could hide in the slip. Beyond that only a telegram re-links.
+  counted, if wrongly: what it may be off by (`slip_doubt_m`) widens the bound, up to half the failure limit. If it is
+  more than that, a fault could hide in the slip, and only a telegram re-links.
 - A start of mission (`lds.starts_of_mission`) forgets LRVB, linking and anchor.
 - Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
 """

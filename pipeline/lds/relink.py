@@ -5,7 +5,8 @@ before an alarm already, so the anchor lies `anchor_lag_s` before the first alar
 same fault, so a return does not move it. A physical balise says where the train is: only a telegram renews the anchor.
 The same test decides on the first position after an outage over which the bank began anew (`breaks`), for nobody looked
 on meanwhile, and after slip that the odometer reports. No alarm stands there, so that the last TVB is the anchor. A
-wheel that slips is counted wrongly; where that may hide a position failure, there is no re-link but at a telegram.
+wheel that slips is counted wrongly: that widens the bound, up to half the failure limit; if the count may be off by
+more, there is no re-link but at a telegram.
 """
 
 from __future__ import annotations
@@ -166,10 +167,12 @@ class Relink:
         if self._journey.scale_sigma is None and not (anchor.is_read and anchor.epoch == k):
             return Comparison(reason=NO_VEHICLE)
         offset_m = float(self._journey.path_m[k] - self._journey.odometer_m[k])
-        found = Comparison(offset_m - anchor.offset_m, self._bound_m(anchor, k))
+        most_m = 0.5 * self._config.hazards.failure_limit_m
         doubt_m = float(self._journey.slip_doubt_m[k]) - anchor.slip_doubt_m
-        if found.bound_m + doubt_m > self._config.hazards.failure_limit_m:
+        if doubt_m > most_m:
             return Comparison(reason=SLIPPED)
+        # What slip explains is no fault of the position; yet with both halves a fault stays within the failure limit.
+        found = Comparison(offset_m - anchor.offset_m, min(most_m, self._bound_m(anchor, k) + doubt_m))
         if found.holds:
             self.held.append(Held(k, None if anchor.is_read else anchor.epoch, found.moved_m, found.bound_m + doubt_m))
         return found

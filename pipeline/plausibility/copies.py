@@ -80,7 +80,7 @@ def copy_check(of: Recording) -> Check | None:
         f"{sigma_m.max():.2g} m"
     )
     advice = "Leave the reference out of the run, or record one with another, better instrument."
-    return Check(_WHAT, State.IMPOSSIBLE, found, (Cause(MisfitCause.COPY),), advice=advice)
+    return Check(_WHAT, State.IMPOSSIBLE, found, (Cause(MisfitCause.COPY),), advice=advice, of_evidence=True)
 
 
 def _track(frame: pl.DataFrame, t_s: Floats) -> _Track:

@@ -31,8 +31,8 @@ class Fit:
 
     @property
     def unproving(self) -> tuple[Check, ...]:
-        """What leaves nothing proved: the impossible, where it was let pass, and evidence that contradicts itself."""
-        return tuple(check for check in self.checks if check.state is State.IMPOSSIBLE or check.of_evidence)
+        """Evidence that contradicts itself, or is none: nothing is proved by it (DOMAIN section 5.4)."""
+        return tuple(check for check in self.checks if check.of_evidence)
 
     @property
     def misfits(self) -> tuple[Check, ...]:

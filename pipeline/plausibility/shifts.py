@@ -135,8 +135,8 @@ class SurveyFit(Shift):
     """How positions lie to the track; the shift is the survey's place minus the positions'.
 
     `aside_m`: usual distance beside the track as recorded; `constant`: one shift explains most of it, in both halves of
-    the run: a drift of the positions is no shift. `one_heading`: the shift along the track is not known. `up_m`: the
-    survey's height minus the positions', one by one.
+    the run, and puts the positions on the track: a drift of them is no shift, nor is a run beside the network.
+    `one_heading`: the shift along the track is not known. `up_m`: the survey's height minus the positions', one by one.
     """
 
     aside_m: float
@@ -185,7 +185,8 @@ def fit_survey(gnss: Places, line: Line, start_m: tuple[float, float] = (0.0, 0.
     left_m, half = float(np.median(left)), len(apart) // 2
     toward, whole = (across @ shift) * apart, (across @ shift) ** 2
     steady = all(toward[part].sum() > 0.5 * whole[part].sum() for part in (slice(half), slice(half, None)))
-    near = float(np.mean(left < 4.5 * left_m + 3.0)) > config.shift_positions
+    # By metres, not by what is left elsewhere: a shift brings no run onto a network that it left.
+    near = float(np.mean(left < 1.5 * config.shift_told_m)) > config.shift_positions
     return SurveyFit(
         east_m=float(shift[0]),
         north_m=float(shift[1]),

@@ -72,7 +72,7 @@ _RANK = {RunVerdict.UNSAFE.value: 0, None: 1, RunVerdict.UNPROVEN.value: 2, RunV
 def campaign_page(campaign: Campaign, made: Made) -> str:
     """HTML of the campaign."""
     solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
-    head, named = campaign_headline(campaign.runs, campaign.hazards, made.config)
+    head, named = campaign_headline(campaign.runs, campaign.hazards)
     # Each run counts once, by the worst of its solutions.
     counts = head_of(run_verdicts(campaign.runs).values()).counts()
     body = [
@@ -164,7 +164,7 @@ def _whys(campaign: Campaign, made: Made) -> dict[tuple[str, str], str]:
     return {
         (row["run_id"], row["solution"]): ""
         if row["verdict"] == RunVerdict.SAFE
-        else run_headline([row], faults.get((row["run_id"],), none), made.config).worst
+        else run_headline([row], faults.get((row["run_id"],), none)).worst
         for row in campaign.runs.iter_rows(named=True)
     }
 

@@ -13,8 +13,7 @@ from pipeline.figures.verdict import head_of, run_verdicts, verdict_reasons, wor
 from pipeline.report.columns import Row
 from pipeline.report.markup import Cell, cell, number, table
 from pipeline.report.words import WORDS, plural, some_of
-from schemas.config import Configuration
-from schemas.enums import RunVerdict
+from schemas.enums import Reason, RunVerdict
 from schemas.run import RunTables
 
 _ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
@@ -29,34 +28,33 @@ class Headline:
     reasons: str
 
 
-def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, config: Configuration) -> Headline:
+def run_headline(rows: Iterable[Row], hazards: pl.DataFrame) -> Headline:
     """Of one run with all its solutions, headed by the worst of them."""
     listed = list(rows)
     verdict = worst_verdict(row["verdict"] for row in listed)
     heading = next((row for row in listed if row["verdict"] == verdict), listed[0])
-    limit = config.hazards.unknown_share_limit
-    worst = _worst(heading, hazards, limit) if verdict is not None else heading["error"] or "the run failed"
+    worst = _worst(heading, hazards) if verdict is not None else heading["error"] or "the run failed"
     named = len(listed) > 1
     if named:
-        told = " ".join(_told(row, limit) for row in listed)
+        told = " ".join(_told(row) for row in listed)
         return Headline(word_of(verdict), f"{heading['solution']}: {worst}", told)
-    told = f"{verdict_reasons(heading, limit)}." if verdict == RunVerdict.UNSAFE else ""
+    told = f"{verdict_reasons(heading)}." if verdict == RunVerdict.UNSAFE else ""
     return Headline(word_of(verdict), worst, told)
 
 
-def _told(row: Row, limit: float) -> str:
-    why = "" if row["verdict"] is None else f", {verdict_reasons(row, limit)}"
+def _told(row: Row) -> str:
+    why = "" if row["verdict"] is None else f", {verdict_reasons(row)}"
     return f"{row['solution']}: {word_of(row['verdict'])}{why}."
 
 
-def _worst(run: Row, hazards: pl.DataFrame, limit: float) -> str:
+def _worst(run: Row, hazards: pl.DataFrame) -> str:
     """What made the verdict, in the fewest words that name it: the worst of the faults that did, else the counts."""
     accepted, late = pl.col("accepted_ids").list.len() > 0, pl.col("within_budget").eq(other=False)
     guilty = hazards.filter(pl.col("solution") == run["solution"], accepted | late)
-    return next(iter(hazard_words(guilty)), verdict_reasons(run, limit))
+    return next(iter(hazard_words(guilty)), verdict_reasons(run))
 
 
-def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, config: Configuration) -> tuple[Headline, str | None]:
+def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame) -> tuple[Headline, str | None]:
     """Of all runs, and the run that it names; frames with `run_id`."""
     head = head_of(run_verdicts(runs).values())
     total = sum(head.counts().values())
@@ -72,7 +70,7 @@ def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, config: Configu
     if worst.is_empty():
         return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", said), None
     row = worst.row(0, named=True)
-    reason = _worst(row, hazards.filter(pl.col("run_id") == row["run_id"]), config.hazards.unknown_share_limit)
+    reason = _worst(row, hazards.filter(pl.col("run_id") == row["run_id"]))
     return Headline(head.word, f"{reason} (run {row['run_id']})", said), row["run_id"]
 
 
@@ -131,10 +129,10 @@ def _reading(row: Row) -> str:
     return f"{row['status']}: {WORDS[row['status']]}{until}"
 
 
-def tile_figures(run: Row, balises: pl.DataFrame, unknown_limit: float) -> list[tuple[str, str, str]]:
+def tile_figures(run: Row, balises: pl.DataFrame) -> list[tuple[str, str, str]]:
     """What a reader must not miss; a tile that is bad looks bad. `balises`: as `lost_shares`."""
     share = run["share_unknown"]
-    checked = share is not None and share <= unknown_limit
+    checked = share is not None and Reason.UNKNOWN_IN_USE not in (run["reasons"] or ())
     lost, passed = (int(balises[name].sum()) for name in ("lost", "passages"))
     return [
         *((words, number(run[name]), _tone(run[name], tone)) for words, name, tone in _COUNTED),

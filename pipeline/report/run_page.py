@@ -104,7 +104,7 @@ def run_page(
         "order": [row["solution"] for row in rows],
         "solutions": {name: _solution_data(name, tables, made) for name in names},
     }
-    head = run_headline(rows, tables.hazards, made.config)
+    head = run_headline(rows, tables.hazards)
     verdict, ways = verdict_head(head.word, head.worst, head.reasons), _ways(neighbours)
     heading = f"{verdict}{ways}<h1>Run {escape(tables.run_id)}</h1>"
     foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
@@ -207,7 +207,7 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
         return frame_table(f"table-{part_name}-{key}", caption, frame, *given)
 
     in_order = "Passages of balises, in order of time"
-    shown = tiles(tile_figures(known, balises, made.config.hazards.unknown_share_limit))
+    shown = tiles(tile_figures(known, balises))
     parts = [
         part("figures", f"Summary of {name}" if several else "Summary", shown, notes),
         part("hazards", "Hazards", _hazards(key, row, hazards)),

@@ -12,16 +12,18 @@ from schemas.version import SOFTWARE
 
 @dataclass(frozen=True)
 class Provenance:
-    """The same provenance always gives the same tables."""
+    """The same provenance always gives the same tables; `calibrated_by`: runs that tell of vehicle and noise."""
 
     config_digest: str
     input_digest: str
     software: str
+    calibrated_by: tuple[str, ...] = ()
 
 
 def provenance(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> Provenance:
     """Digests of the settings and of log and site, and this program."""
-    return Provenance(digest_of(config, vehicle), input_digest(run, site.digest), SOFTWARE)
+    inputs = input_digest(run, site.digest)
+    return Provenance(digest_of(config, vehicle), inputs, SOFTWARE, config.calibration.runs)
 
 
 def input_digest(run: RunLog, site_digest: str) -> str:

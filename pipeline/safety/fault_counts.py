@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.failure_log import AlarmEpisode, FailureLog
-from pipeline.figures.independent import missed_detection
+from pipeline.figures.independent import missed_detection, since_when_at_most
 from pipeline.judge.alarms import verdict_within
 from pipeline.judge.judgement import margins_m
 from schemas.arrays import NS_PER_S, floats
@@ -28,6 +28,7 @@ def faults_of_pair(one: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
     apart = begin_ns > end_ns.cum_max().shift(1)
     return both.group_by(fault=apart.fill_null(value=False).cum_sum(), maintain_order=True).agg(
         pl.col("begin", "t_failure").min(),
+        t_failure_may=since_when_at_most(),
         t_end=pl.when(pl.col("t_end").null_count() == 0).then(pl.col("t_end").max()),
         budget_s=pl.col("budget_s").min(),
         failed=pl.col("failed").any(),
@@ -56,12 +57,12 @@ def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
     found = [_detected_ns(fails, *span) for span in ends]
     failed, missed, judged = pl.col("failed"), pl.col("missed"), pl.col("with_truth")
     seen = faults.with_columns(t_detected=pl.Series(found, dtype=pl.Int64).cast(kind))
-    seen = seen.with_columns(missed=missed_detection().fill_null(value=False))
+    seen = seen.with_columns(missed=missed_detection())
     counts = {
         "hazards": pl.len(),
         "failures": failed.sum(),
         "missed": missed.sum(),
-        "failures_judged": (failed & judged).sum(),
+        "failures_judged": (missed.is_not_null() & judged).sum(),
         "missed_judged": (missed & judged).sum(),
     }
     if "common" in faults.columns:

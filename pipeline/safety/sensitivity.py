@@ -14,7 +14,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.campaign import make_plan, run_campaign
-from pipeline.figures.verdict import failures_in, head_of, level_counts, run_verdicts, verdict_of
+from pipeline.figures.verdict import failures_in, head_of, level_counts, reasons_of, run_verdicts, verdict_of
 from pipeline.results import store
 from schemas.config import Configuration, Vehicle
 from schemas.enums import RunStatus
@@ -68,7 +68,8 @@ def _with_allowed(row: Row, allowed_s: float, config: Configuration) -> Row:
         return row
     within, beyond = level_counts(failures_in(row), allowed_s)
     counted = {**row, "failures_within_budget": within, "failures_beyond_budget": beyond}
-    return {**counted, "verdict": verdict_of(counted, config.hazards.unknown_share_limit).value}
+    reasons = reasons_of(counted, allowed_s, config.hazards.undiagnosed_share)
+    return {**counted, "reasons": reasons, "verdict": verdict_of(reasons).value}
 
 
 def _varied(runs: pl.DataFrame, config: Configuration, key: str, value: float, replay: Replay | None) -> Row:

@@ -40,11 +40,10 @@ EPOCH_COLUMNS = (
 
 @dataclass(frozen=True)
 class _Channel:
-    """Epochs under one kind of diagnosis: its fails, where it judged, and where it worked."""
+    """Epochs under one kind of diagnosis: its fails, where it worked, and where a truth judged."""
 
     clock: Clock
     fails: FailureLog
-    judged: Bools
     working: Bools
     known: Bools
     wrong: Bools
@@ -159,7 +158,7 @@ def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, c
         until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
         working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
     known, wrong, moving = (met(epochs, pl.col(name)) for name in ("known", "wrong", "moving"))
-    return _Channel(clock, fails, seen, working, known, known & wrong, moving)
+    return _Channel(clock, fails, working, known, known & wrong, moving)
 
 
 def _alarms(channel: _Channel, verdicts: list[Verdict]) -> Row:
@@ -167,8 +166,13 @@ def _alarms(channel: _Channel, verdicts: list[Verdict]) -> Row:
         "alarms": len(verdicts),
         "false_alarms": verdicts.count(Verdict.FALSE),
         "open_alarms": verdicts.count(Verdict.UNKNOWN),
-        "judged_s": float(channel.clock.held_s[channel.judged].sum()),
+        "judged_s": _at_risk_s(channel),
     }
+
+
+def _at_risk_s(channel: _Channel) -> float:
+    """Time in work that a truth judged [s]: what rates count (DOMAIN section 6)."""
+    return float(channel.clock.held_s[channel.known & channel.working].sum())
 
 
 def _working(channel: _Channel) -> Row:
@@ -178,7 +182,7 @@ def _working(channel: _Channel) -> Row:
         "working_s": float(held[channel.working & channel.moving].sum()),
         "up_s": up.up_s,
         "losses": up.losses,
-        "truth_s": float(held[channel.known].sum()),
+        "truth_s": _at_risk_s(channel),
         "wrong_s": float(held[channel.wrong & channel.working].sum()),
     }
 

@@ -26,7 +26,7 @@ COUNTS: Mapping[str, pl.DataType] = {
 
 Faults of the position and what became of them (of a pair: of either solution, those that overlap as one; `common`: both
 failed at the same time; `judged`: by a reference or balise reads; `delays_s`: T_D of those detected). Alarms (`open`:
-nobody can tell whether false) in the time in which the monitors judged. Moving time of the run, gaps included (null
+nobody can tell whether false) in the time in work that a truth judged. Moving time of the run, gaps included (null
 where it is never known to have moved), and of this in work; how often work was lost after it had gone on, moving or
 not, for `up_s`; time judged by a truth, and of this in work and judged wrong, whether it hit a virtual balise or not
 (the architecture's P1). Null what an architecture is not judged by.

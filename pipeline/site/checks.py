@@ -42,9 +42,9 @@ def remarks(
 ) -> Remarks:
     """All checks over the tables of a site."""
     track = track_of(frame)
-    known, findings = _relations_to_nowhere(track, links)
+    known, findings = relations_to_nowhere(track, links)
     passable, turning = _relations_that_turn_back(track, known)
-    found = Remarks(passable, config, findings + turning)
+    found = Remarks(passable, config, [*findings, *_relations_that_differ(known), *turning])
     _check_elements(track, declared_length_m, found)
     _check_gaps(track, found)
     found.findings += _near_misses(track, known, config)
@@ -76,7 +76,8 @@ def drop_repeated_points(file: str, frame: pl.DataFrame, breaches: list[str]) ->
     return marked.filter(~pl.col("_repeats")).drop("_repeats"), notes
 
 
-def _relations_to_nowhere(track: Track, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+def relations_to_nowhere(track: Track, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+    """The relations between elements that there are; of each other one a finding."""
     ids = list(track.ids)
     known = links["netelement_a"].is_in(ids) & links["netelement_b"].is_in(ids)
     findings = [
@@ -84,6 +85,20 @@ def _relations_to_nowhere(track: Track, links: pl.DataFrame) -> tuple[pl.DataFra
         for row in links.filter(~known).iter_rows()
     ]
     return links.filter(known), findings
+
+
+def _relations_that_differ(links: pl.DataFrame) -> Iterator[Finding]:
+    """Two ends that are related more than once, and not alike: `network_of` allows what either allows."""
+    said: dict[tuple[tuple[str, int], tuple[str, int]], list[str]] = {}
+    for a, a_end, b, b_end, way in links.iter_rows():
+        one, other = (a, a_end), (b, b_end)
+        from_other = {Navigability.AB.value: Navigability.BA.value, Navigability.BA.value: Navigability.AB.value}
+        pair, word = ((one, other), way) if one <= other else ((other, one), from_other.get(way, way))
+        said.setdefault(pair, []).append(word)
+    for ((a, a_end), (b, b_end)), words in said.items():
+        if len(set(words)) > 1:
+            text = f"end {a_end} of {a} and end {b_end} of {b} are related as {' and as '.join(dict.fromkeys(words))}"
+            yield Finding("warning", "links", f"{text}: what either allows counts", "Correct the relations.")
 
 
 def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:

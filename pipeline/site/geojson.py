@@ -2,15 +2,15 @@
 
 Read as ERA RINF exports and measurement-train networks write it: an element carries `id` or `netelement_id`, and
 `sigma_m` where its survey states one; a relation carries `netelementA`, `positionOnA`, `netelementB`, `positionOnB`
-and `navigability`, or in the words of the ERA vocabulary `elementA`, `isOnOriginOfElementA` and so on. Case and
-underscores of property names do not matter.
+and `navigability`, or in the words of the ERA vocabulary `elementA`, `isOnOriginOfElementA` and so on, of railML
+`elementA = {"ref": ...}`. Case, underscores and prefixes (`era:`) of property names do not matter.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,13 @@ from schemas.enums import Navigability
 _MALFORMED = (KeyError, TypeError, ValueError, LookupError, OverflowError, RecursionError)
 _ID_KEYS = ("netelementid", "id", "elementid", "name")
 _LENGTH_KEYS = ("lengthm", "length")
-_A_KEYS, _B_KEYS = ("netelementa", "elementa"), ("netelementb", "elementb")
+_A_KEYS, _B_KEYS = (
+    tuple(
+        name.format(side) for name in ("netelement{}", "element{}", "netelement{}id", "element{}id", "netelementid{}")
+    )
+    for side in "ab"
+)
+_START, _END = ("0", "0.0", "start", "begin", "origin"), ("1", "1.0", "end")
 _POSITIONS_A = (("positionona", "positiona"), "isonoriginofelementa")
 _POSITIONS_B = (("positiononb", "positionb"), "isonoriginofelementb")
 
@@ -58,6 +64,19 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
     except _MALFORMED as error:
         breaches.append(f"{file}: is not a GeoJSON FeatureCollection ({error})")
         return None
+    return _network(file, features, epsg, breaches)
+
+
+def has_relations(features: Iterable[Any]) -> bool:
+    """Net relations stand beside the lines: a network that says itself where trains can run. Raises `ValueError`."""
+    return any(_is_relation(_plain_keys(None, parts_of(feature)[0])) for feature in features)
+
+
+def _is_relation(keys: Mapping[str, Any]) -> bool:
+    return any(key in keys for key in (*_A_KEYS, *_B_KEYS))
+
+
+def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> Network:
     points: list[tuple[Any, ...]] = []
     relations: list[tuple[Any, ...]] = []
     lengths: dict[str, float] = {}
@@ -66,7 +85,7 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
         try:
             properties, geometry = parts_of(feature)
             keys = _plain_keys(feature.get("id"), properties)
-            if any(key in keys for key in _A_KEYS):
+            if _is_relation(keys):
                 relations.append(_relation(keys))
             elif geometry.get("type") in ("LineString", "MultiLineString"):
                 points += _element(geometry, keys, lengths)
@@ -98,7 +117,7 @@ def triple(point: Any) -> tuple[float, float, float | None]:
 
 def _plain_keys(own_id: Any, properties: Mapping[str, Any]) -> dict[str, Any]:
     """Properties by lower-case name without underscores; the feature's own `id` where they have none."""
-    keys = {re.sub(r"[_\-\s]", "", str(key)).lower(): value for key, value in properties.items()}
+    keys = {re.sub(r"^\w+:|[_\-\s]", "", str(key)).lower(): value for key, value in properties.items()}
     return keys if own_id is None else {"id": own_id, **keys}
 
 
@@ -139,16 +158,17 @@ def _metres(value: Any) -> float | None:
 
 
 def _relation(keys: Mapping[str, Any]) -> tuple[Any, ...]:
-    ends = [_first(keys, _A_KEYS), _first(keys, _B_KEYS)]
+    ends = [_referred(_first(keys, names)) for names in (_A_KEYS, _B_KEYS)]
     positions = [_position(keys, names, origin) for names, origin in (_POSITIONS_A, _POSITIONS_B)]
     # Vocabularies give the word as the last part of an address.
-    word = re.split("[/#]", str(keys.get("navigability")).strip().lower())[-1]
+    said = keys.get("navigability")
+    word = "" if said is None else re.split("[/#]", str(said).strip().lower())[-1]
     known = {member.value.lower(): member.value for member in Navigability}
     if word not in known:
-        raise ValueError(f"navigability {word!r}; expected one of {', '.join(Navigability)}")
+        raise ValueError(f"navigability {word or said!r}; expected one of {', '.join(Navigability)}")
     if None in positions:
         found = [_first(keys, names) for names, _ in (_POSITIONS_A, _POSITIONS_B)]
-        raise ValueError(f"positionOnA {found[0]!r}, positionOnB {found[1]!r}; expected 0 or 1")
+        raise ValueError(f"positionOnA {found[0]!r}, positionOnB {found[1]!r}; expected 0 or 1 (start or end)")
     if None in ends:
         raise ValueError(f"netelementA {ends[0]!r}, netelementB {ends[1]!r}; a relation joins two elements")
     return str(ends[0]), positions[0], str(ends[1]), positions[1], known[word]
@@ -159,7 +179,15 @@ def _position(keys: Mapping[str, Any], names: tuple[str, ...], origin: str) -> i
     said, at_origin = _first(keys, names), keys.get(origin)
     if said is None and isinstance(at_origin, bool):
         return 0 if at_origin else 1
-    return {"0": 0, "1": 1, "0.0": 0, "1.0": 1}.get(str(said))
+    word = str(said).strip().lower()
+    return 0 if word in _START else 1 if word in _END else None
+
+
+def _referred(element: Any) -> Any:
+    """The identity of an element that a relation names, itself or by reference."""
+    if isinstance(element, Mapping):
+        element = _first(_plain_keys(None, element), ("ref", *_ID_KEYS))
+    return element
 
 
 def _epsg(document: Mapping[str, Any]) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,8 @@ def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
     lengths = network.declared_length_m if network else {}
     unchecked = [name for name, data in files.items() if name.endswith(".parquet") and without_checksums(data)]
     notes += [Finding("note", name, "has no page checksums: damage to it may not be seen") for name in unchecked]
+    if _is_unrelated(track, links, files):
+        notes.append(Finding("warning", "links", _UNRELATED, _MAKE_A_SITE))
     found = remarks(track, links, balises, route, lengths, config)
     if found.breaches:
         raise _refusal(path, found.breaches)
@@ -69,6 +72,23 @@ def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
         digest=_digest(files),
         files=tuple((name, len(data), hashlib.sha256(data).hexdigest()) for name, data in sorted(files.items())),
     )
+
+
+def refuse_unrelated(site: Site, place: Path | str) -> None:
+    """A replay on lines that nothing joins finds the train on none of them for long. Raises `SiteError`."""
+    names = [name for name, _, _ in site.files]
+    if _is_unrelated(site.track, site.links, names):
+        raise SiteError(_UNRELATED, place=shown(place), remedy=_MAKE_A_SITE)
+
+
+_UNRELATED = "the GeoJSON has lines but no net relations: no train gets from one of them to another"
+_MAKE_A_SITE = "Make a site of it: `balise site FILE --out SITE` joins lines where they meet."
+
+
+def _is_unrelated(track: pl.DataFrame, links: pl.DataFrame, files: Collection[str]) -> bool:
+    """Several lines of GeoJSON that say nothing of how they meet; tables of a site say it by an empty one too."""
+    only_lines = not any(name.startswith("links.") for name in files) and "track.geojson" in files
+    return only_lines and links.is_empty() and track["netelement_id"].n_unique() > 1
 
 
 def _files(folder: Path | str) -> dict[str, bytes]:
@@ -105,6 +125,7 @@ def _digest(files: dict[str, bytes]) -> str:
 
 def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
     remedy = "Correct what is named; `balise dictionary` lists the columns of a site."
+    remedy = f"Correct what is named. {_MAKE_A_SITE}" if is_geojson(path) else remedy
     return SiteError(listed(breaches), place=shown(path), remedy=remedy)
 
 

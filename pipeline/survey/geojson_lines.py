@@ -1,4 +1,4 @@
-"""Lines of GeoJSON; of OpenStreetMap's the railways that trains run on, and where they cross without a switch."""
+"""Lines of GeoJSON: net elements with their relations; of OpenStreetMap the railways that trains run on."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pipeline.site.geojson import parts_of, triple
+from pipeline.site.geojson import has_relations, parts_of, read_network, triple
+from pipeline.site.read import to_wgs84
 from pipeline.survey.pieces import Survey, piece_of
-from schemas.errors import SiteError
+from schemas.config import SiteConfig
+from schemas.errors import SiteError, listed
 
 # https://wiki.openstreetmap.org/wiki/Key:railway: what a train can run on today.
 _IN_USE = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "funicular", "monorail", "miniature")
@@ -16,13 +18,16 @@ _CROSSINGS = ("railway_crossing", "tram_crossing_railway")
 _IDS = ("@id", "id", "netelement_id", "osm_id", "full_id", "name")
 
 
-def read_geojson(place: str, stem: str, data: bytes) -> Survey:
+def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig) -> Survey:
     """Each LineString a piece, named by its own id. Where features have a `railway`, only those in use are taken.
 
-    Raises `SiteError`.
+    A network that gives net relations (RailTopoModel, ERA RINF) is taken as it is. Raises `SiteError`.
     """
     try:
-        features = [_feature(item) for item in json.loads(data)["features"]]
+        items = json.loads(data)["features"]
+        if has_relations(items):
+            return _of_network(place, data, config)
+        features = [_feature(item) for item in items]
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         remedy = "Overpass exports GeoJSON under Export; its own JSON and .osm are not read."
         told = f"is not a GeoJSON FeatureCollection ({type(error).__name__}: {error})"
@@ -44,6 +49,26 @@ def read_geojson(place: str, stem: str, data: bytes) -> Survey:
             left[kind] = left.get(kind, 0) + 1
     for kind, count in sorted(left.items()):
         survey.told("note", place, f"{count} lines with railway={kind} are left out: no train runs there")
+    return survey
+
+
+def _of_network(place: str, data: bytes, config: SiteConfig) -> Survey:
+    """Net elements whole, with the relations that the network gives between their ends."""
+    breaches: list[str] = []
+    network = read_network(place, data, breaches)
+    if network is None or breaches:
+        raise SiteError(listed(breaches), remedy="Correct these features of the network.")
+    points = to_wgs84(network.track, network.track.frame, config, breaches)
+    if breaches:
+        raise SiteError(listed(breaches))
+    survey = Survey(declared_m=network.declared_length_m)
+    for (name,), own in points.group_by("netelement_id", maintain_order=True):
+        survey.pieces.append(piece_of(place, str(name), own.drop("netelement_id").to_dict(), whole=True))
+    if network.links is not None:
+        survey.relations += network.links.frame.rows()
+    if network.ignored:
+        text = f"{network.ignored} features are not used: they are neither net element nor relation"
+        survey.told("note", place, text)
     return survey
 
 

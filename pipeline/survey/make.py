@@ -85,7 +85,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
     balises = _balises(wish, network, survey, config)
     track = network.track
-    found = remarks(track, network.links, balises, None, {}, config.site)
+    found = remarks(track, network.links, balises, None, survey.declared_m, config.site)
     if found.breaches:
         raise SiteError(found.breaches[0], place=", ".join(map(str, wish.surveys)))
     findings = (
@@ -94,7 +94,8 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
         *found.findings,
         *without_balises(balises),
     )
-    return Site(track, found.links, balises, None, findings)
+    # Relations as given: what no train can run over is said, and left out, each time that the site is read.
+    return Site(track, network.links, balises, None, findings)
 
 
 def _balises(wish: Wish, network: Network, survey: Survey, config: Configuration) -> pl.DataFrame | None:

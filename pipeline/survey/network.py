@@ -1,4 +1,4 @@
-"""Pieces of line to net elements and net relations: cut where lines share a node, linked by the angle there."""
+"""Pieces of line to net elements and net relations: cut where lines share a node, linked as given, else by angle."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from pipeline.site.checks import outward
-from pipeline.survey.pieces import COLUMNS, Piece, Survey
+from pipeline.site.checks import outward, relations_to_nowhere
+from pipeline.survey.pieces import COLUMNS, Piece, Relation, Survey
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import geometric_measures_m, track_of
 from schemas.arrays import Floats, Ints, spans_of
@@ -42,20 +42,33 @@ class Network:
 def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> Network:
     """Net elements of all pieces; ends within `join_m` (else: in one place) of a vertex of another piece meet it.
 
-    What is doubtful about it is added to the survey's findings.
+    Net elements of a network with relations stay as they are, and meet where it says. What is doubtful about it is
+    added to the survey's findings.
     """
     pieces = [piece for piece in survey.pieces if len(piece) > 1]
     if (short := len(survey.pieces) - len(pieces)) > 0:
         survey.told("note", "survey", f"{short} lines with fewer than two points are left out")
     if not pieces:
         return Network([], np.zeros((0, 2), dtype=np.int64), Links.create_empty(), pl.DataFrame())
-    nodes = _nodes(pieces, config.same_place_m if join_m is None else join_m)
+    nodes = _nodes(pieces, config.same_place_m if join_m is None else join_m, survey.relations)
     pieces, nodes = _without_doubles(pieces, nodes, survey)
     switches = _nodes_at(pieces, nodes, survey.switches_deg, config)
     crossings = _crossings(pieces, nodes, switches, survey, config)
     elements, ends = _cut(pieces, nodes, crossings)
     track = _track_table(elements)
-    return Network(elements, ends, _links(track, ends, crossings, switches, survey, config), track)
+    given = _of_parts(survey.relations, elements)
+    return Network(elements, ends, _links(track, ends, given, crossings, switches, survey, config), track)
+
+
+def _of_parts(relations: list[Relation], elements: list[Piece]) -> list[Relation]:
+    """The relations given, between the parts of net elements that other surveys cut."""
+    parts = Counter(element.name.rpartition(".")[0] for element in elements if element.whole)
+    names = {element.name for element in elements}
+
+    def part(name: str, end: int) -> str:
+        return name if name in names or not parts[name] else f"{name}.{parts[name] if end else 1}"
+
+    return [(part(a, a_end), a_end, part(b, b_end), b_end, way) for a, a_end, b, b_end, way in relations]
 
 
 def _track_table(elements: list[Piece]) -> pl.DataFrame:
@@ -66,8 +79,8 @@ def _track_table(elements: list[Piece]) -> pl.DataFrame:
     return pl.DataFrame({"netelement_id": names, "measure_m": np.concatenate(measures), **columns}, nan_to_null=True)
 
 
-def _nodes(pieces: list[Piece], join_m: float) -> list[Ints]:
-    """A number per point; points that are one node have the same."""
+def _nodes(pieces: list[Piece], join_m: float, relations: list[Relation]) -> list[Ints]:
+    """A number per point; points that are one node have the same: near each other, or joined by a relation."""
     latitude = np.concatenate([piece.latitude_deg for piece in pieces])
     longitude = np.concatenate([piece.longitude_deg for piece in pieces])
     last = np.cumsum([len(piece) for piece in pieces])
@@ -76,6 +89,13 @@ def _nodes(pieces: list[Piece], join_m: float) -> list[Ints]:
     piece_of = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
     ends = np.unique(np.concatenate([last - [len(piece) for piece in pieces], last - 1]))
     pairs = list(_near_ends(points_of(latitude, longitude).surface, piece_of, ends, join_m))
+    end_row = {(piece.name, 1): int(row) - 1 for piece, row in zip(pieces, last, strict=True)}
+    end_row |= {(piece.name, 0): int(row) - len(piece) for piece, row in zip(pieces, last, strict=True)}
+    pairs += [
+        (end_row[a, a_end], end_row[b, b_end])
+        for a, a_end, b, b_end, way in relations
+        if way != Navigability.NONE.value and (a, a_end) in end_row and (b, b_end) in end_row
+    ]
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     count = int(node.max()) + 1
     same = coo_array((np.ones(len(rows)), (node[rows], node[columns])), shape=(count, count))
@@ -102,7 +122,8 @@ def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> 
     for piece, own in zip(pieces, nodes, strict=True):
         edges = [(min(a, b), max(a, b)) for a, b in zip(own[:-1].tolist(), own[1:].tolist(), strict=True)]
         new = np.array([edge not in seen and edge[0] != edge[1] for edge in edges])
-        doubled = sum(edge in seen for edge in edges)
+        new |= piece.whole
+        doubled = 0 if piece.whole else sum(edge in seen for edge in edges)
         seen.update(edges)
         if doubled:
             text = f"{doubled} of its {len(edges)} segments stand in the survey already and are left out"
@@ -119,12 +140,15 @@ def _crossings(
     """Nodes where tracks cross without a switch: those named so, and those where two lines just run through.
 
     Nobody can take such a node of two lines for a slip by its geometry; a survey that names it a switch is believed.
+    A net element that is whole branches at its ends only.
     """
     inner = np.concatenate([own[1:-1] for own in nodes])
     at_ends = np.unique(np.concatenate([own[[0, -1]] for own in nodes]))
     through, count = np.unique(inner, return_counts=True)
     told = _nodes_at(pieces, nodes, survey.crossings_deg, config)
-    by_form = set(np.setdiff1d(through[count == 2], at_ends).tolist()) - switches
+    lines = [own[1:-1] for piece, own in zip(pieces, nodes, strict=True) if not piece.whole]
+    unnamed = np.intersect1d(through[count == 2], np.concatenate([np.zeros(0, dtype=np.int64), *lines]))
+    by_form = set(np.setdiff1d(unnamed, at_ends).tolist()) - switches
     _tell_of_crossings(pieces, nodes, by_form - told, survey)
     return told | by_form
 
@@ -155,13 +179,18 @@ def _nodes_at(
 
 
 def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[list[Piece], Ints]:
-    """Elements from node to node; the parts of a piece are named `id.1`, `id.2` along it."""
-    count = np.bincount(np.concatenate(nodes)) if nodes else np.zeros(0, dtype=np.int64)
+    """Elements from node to node; the parts of a piece are named `id.1`, `id.2` along it.
+
+    A net element that is whole is cut by lines of other surveys only, not by net elements.
+    """
+    passing = _occurrences(nodes, nodes)
+    of_lines = _occurrences([own for piece, own in zip(pieces, nodes, strict=True) if not piece.whole], nodes)
     number: dict[str, int] = {}
     parts: dict[str, int] = {}
     found: list[tuple[Piece, int, int]] = []
     for piece, own in zip(pieces, nodes, strict=True):
-        inner = [row for row in range(1, len(own) - 1) if count[own[row]] > 1 and int(own[row]) not in crossings]
+        meets = of_lines[own] > 0 if piece.whole else passing[own] > 1
+        inner = [row for row in range(1, len(own) - 1) if meets[row] and int(own[row]) not in crossings]
         cuts = [0, *inner, len(own) - 1]
         parts[piece.name] = parts.get(piece.name, 0) + len(cuts) - 1
         for first, last in itertools.pairwise(cuts):
@@ -175,6 +204,12 @@ def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[l
     return elements, np.array(ends, dtype=np.int64).reshape(-1, 2)
 
 
+def _occurrences(some: list[Ints], nodes: list[Ints]) -> Ints:
+    """How often each node occurs in some of the pieces."""
+    count = 1 + max(int(own.max()) for own in nodes)
+    return np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *some]), minlength=count)
+
+
 def arms_of(ends: Ints) -> dict[int, list[tuple[int, int]]]:
     """Elements and their ends at each node."""
     arms: dict[int, list[tuple[int, int]]] = {}
@@ -184,22 +219,51 @@ def arms_of(ends: Ints) -> dict[int, list[tuple[int, int]]]:
 
 
 def _links(
-    table: pl.DataFrame, ends: Ints, crossings: set[int], switches: set[int], survey: Survey, config: SurveyConfig
+    table: pl.DataFrame,
+    ends: Ints,
+    given: list[Relation],
+    crossings: set[int],
+    switches: set[int],
+    survey: Survey,
+    config: SurveyConfig,
 ) -> pl.DataFrame:
-    """Every pair of ends at a node: navigable in both directions where a train can go that way, else not."""
+    """The relations given, as they are; of ends that none of them names every pair at a node, by its angle.
+
+    By angle a pair is navigable in both directions where a train can go that way, else not at all.
+    """
     track = track_of(table)
     directions, names = outward(track), track.ids
-    rows: list[tuple[str, int, str, int, str]] = []
+    named = {end for a, a_end, b, b_end, _ in given for end in ((a, a_end), (b, b_end))}
+    rows, guessed = list(given), []
     for node, meeting in arms_of(ends).items():
+        here = [(names[element], position) for element, position in meeting]
+        unsaid = [pair for pair in itertools.combinations(range(len(here)), 2) if not {here[k] for k in pair} <= named]
+        if len(here) > 1 and not unsaid:
+            continue
         units = [directions[arm] / max(float(np.linalg.norm(directions[arm])), 1e-9) for arm in meeting]
         pairs = _navigable(units, node in crossings, node in switches, config.switch_deg)
-        for one, other in itertools.combinations(range(len(meeting)), 2):
-            way = Navigability.BOTH if (one, other) in pairs else Navigability.NONE
-            (a, a_end), (b, b_end) = meeting[one], meeting[other]
-            rows.append((names[a], a_end, names[b], b_end, way.value))
+        for pair in unsaid:
+            way = Navigability.BOTH if pair in pairs else Navigability.NONE
+            one, other = (here[k] for k in pair)
+            rows.append((*one, *other, way.value))
+        guessed += [here] * bool(unsaid)
         if node not in crossings | switches:
-            _tell_of_node([names[element] for element, _ in meeting], pairs, survey)
-    return Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
+            _tell_of_node([name for name, _ in here], pairs, survey)
+    _tell_of_guesses(guessed, len(rows) - len(given), bool(given), survey)
+    links = Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
+    known, findings = relations_to_nowhere(track, links)
+    survey.findings += findings
+    return known
+
+
+def _tell_of_guesses(nodes: list[list[tuple[str, int]]], pairs: int, some_given: bool, survey: Survey) -> None:
+    """A finding where relations are made by angle; a warning where the survey gives relations elsewhere."""
+    if not nodes:
+        return
+    first = " and ".join(f"end {position} of {name}" for name, position in nodes[0])
+    text = f"the survey gives no relation at {len(nodes)} nodes ({first}{', ...' if len(nodes) > 1 else ''})"
+    text += f": {pairs} relations are by the angles between the lines"
+    survey.told("warning" if some_given else "note", "links", text, "Look whether trains can run so.")
 
 
 def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: float) -> set[tuple[int, int]]:

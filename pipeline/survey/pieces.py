@@ -22,7 +22,8 @@ MOST_BYTES = 100_000_000
 class Piece:
     """Points in order along one line: degrees, metres, kilometres of the line; NaN where not known.
 
-    `name` is the source's own id. `recorded`: by a vehicle that stood, came back or passed twice.
+    `name` is the source's own id. `recorded`: by a vehicle that stood, came back or passed twice. `whole`: a net
+    element of a network with relations, which ends where these say.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Piece:
     line_km: Floats
     sigma_m: Floats
     recorded: bool = False
+    whole: bool = False
 
     def __len__(self) -> int:
         return len(self.latitude_deg)
@@ -61,22 +63,28 @@ class Piece:
         return replace(self, **both)
 
 
+Relation = tuple[str, int, str, int, str]
 COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "line_km", "sigma_m")
 
 
 @dataclass
 class Survey:
     """What the files hold; places are latitude and longitude: `crossings_deg` where tracks cross without a switch,
-    `switches_deg` where the survey names one.
+    `switches_deg` where the survey names one. `relations`: rows of `Links`, as given; `declared_m`: lengths of net
+    elements as declared.
     """
 
     pieces: list[Piece] = field(default_factory=list)
+    relations: list[Relation] = field(default_factory=list)
+    declared_m: dict[str, float] = field(default_factory=dict)
     crossings_deg: list[tuple[float, float]] = field(default_factory=list)
     switches_deg: list[tuple[float, float]] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
 
     def add(self, other: Survey) -> None:
         self.pieces += other.pieces
+        self.relations += other.relations
+        self.declared_m |= other.declared_m
         self.crossings_deg += other.crossings_deg
         self.switches_deg += other.switches_deg
         self.findings += other.findings
@@ -85,7 +93,13 @@ class Survey:
         self.findings.append(Finding(severity, place, message, remedy))  # type: ignore[arg-type]
 
 
-def piece_of(place: str, name: str, columns: Mapping[str, Iterable[float | None]], recorded: bool = False) -> Piece:
+def piece_of(
+    place: str,
+    name: str,
+    columns: Mapping[str, Iterable[float | None]],
+    recorded: bool = False,
+    whole: bool = False,
+) -> Piece:
     """A piece whose positions are places on earth, without points that repeat the one before.
 
     Raises `SiteError` where a position is none.
@@ -107,16 +121,17 @@ def piece_of(place: str, name: str, columns: Mapping[str, Iterable[float | None]
             remedy="Look whether latitude and longitude are exchanged, or 0, 0 stands for a place that is not known.",
         )
     moved = np.append(True, (np.diff(latitude) != 0) | (np.diff(longitude) != 0)) if count else np.zeros(0, bool)
-    return Piece(name, **arrays, recorded=recorded).take(np.flatnonzero(moved))
+    return Piece(name, **arrays, recorded=recorded, whole=whole).take(np.flatnonzero(moved))
 
 
 def with_own_names(pieces: list[Piece]) -> list[Piece]:
-    """Each name once: the second of a name gets `#2`, in the order of the files."""
+    """Each name once: the second of a name gets `#2`, in the order of the files; relations name net elements."""
+    reserved = {piece.name for piece in pieces if piece.whole}
     taken: set[str] = set()
     named = []
     for piece in pieces:
         name, number = piece.name, 1
-        while name in taken:
+        while name in taken or (name in reserved and not piece.whole):
             number += 1
             name = f"{piece.name}#{number}"
         taken.add(name)

@@ -45,7 +45,7 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
         case ".kmz":
             return read_kmz(place, path.stem, data)
         case ".geojson" | ".json":
-            return read_geojson(place, path.stem, data)
+            return read_geojson(place, path.stem, data, config.site)
         case ".csv" | ".txt" | ".parquet":
             return read_points(place, path.stem, data, epsg, config.site)
     raise SiteError("is no survey that is known", place=place, found=suffix or "no suffix", expected=_KINDS)

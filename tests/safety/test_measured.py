@@ -30,6 +30,9 @@ def runs(height: int, **columns: Any) -> pl.DataFrame:
         "held_s": 3600.0,
         "evidence_s": 3600.0,
         "judged_s": 3600.0,
+        "in_use_s": 3600.0,
+        "in_use_judged_s": 3600.0,
+        "negated_s": 0.0,
         "evidence": "reference",
         "false_alarm_rate_per_h": 0.0,
         "false_alarms": 0,
@@ -70,6 +73,9 @@ def test_rates_over_the_campaign() -> None:
         duration_s=[3600.0, 1800.0, 7200.0, 3600.0, None, 1800.0],
         evidence_s=[3600.0, 1800.0, 7200.0, 0.0, None, 900.0],
         judged_s=[3600.0, 1440.0, 7200.0, 0.0, None, 900.0],
+        in_use_s=[3000.0, 1800.0, 7200.0, 3600.0, None, 900.0],
+        in_use_judged_s=[3000.0, 1800.0, 7200.0, 0.0, None, 600.0],
+        negated_s=[600.0, 0.0, 0.0, 0.0, None, 900.0],
         false_alarms=[2, 0, None, None, None, 1],
         false_alarm_rate_per_h=[2.0, 0.0, None, None, None, None],
         balises_accepted=[10, 5, 5, 5, 0, 5],
@@ -92,9 +98,11 @@ def test_rates_over_the_campaign() -> None:
     found = figures.row(0, named=True)
     assert (found["runs"], found["runs_failed"], found["runs_partial"], found["hours"]) == (5, 1, 1, 5.0)
     assert (found["runs_unsafe"], found["runs_unproven"], found["runs_safe"]) == (3, 2, 0)
-    assert (found["hours_with_evidence"], found["hours_with_truth"], found["hours_judged"]) == (3.75, 1.75, 1.4)
-    rate = poisson_rate(3, 1.75)
-    assert (found["hazards"], found["hazards_judged"], found["hazard_rate_per_h"]) == (3, 3, pytest.approx(3 / 1.75))
+    assert (found["hours_with_evidence"], found["hours_with_truth"], found["hours_judged"]) == (3.75, 1.5, 1.4)
+    # Rates count what was in use and judged: 600 s negated, 900 s negated and 300 s in use without a judgement do not.
+    assert (found["hours_negated"], found["hours_unjudged"]) == (pytest.approx(1500 / 3600), pytest.approx(3900 / 3600))
+    rate = poisson_rate(3, 1.5)
+    assert (found["hazards"], found["hazards_judged"], found["hazard_rate_per_h"]) == (3, 3, pytest.approx(3 / 1.5))
     assert (found["hazard_rate_low_per_h"], found["hazard_rate_high_per_h"]) == (rate.low, rate.high)
     share = clopper_pearson(1, 2)
     assert (found["missed"], found["missed_known"], found["missed_share"]) == (1, 2, 0.5)
@@ -102,7 +110,7 @@ def test_rates_over_the_campaign() -> None:
     # Of four failures one was within the budget; of one nobody can say, one was seen by the odometer alone.
     assert (found["failures"], found["failures_within_budget"], found["failures_beyond_budget"]) == (4, 1, 2)
     assert (found["failures_judged"], found["beyond_budget_share"]) == (2, 0.5)
-    assert found["beyond_budget_rate_upper_per_h"] == poisson_rate_upper(3, 1.75)
+    assert found["beyond_budget_rate_upper_per_h"] == poisson_rate_upper(3, 1.5)
     assert (found["false_alarms"], found["false_alarm_rate_per_h"]) == (2, pytest.approx(2 / 1.4))
     assert (found["accepted"], found["unsafe_accepted"], found["unproven_accepted"]) == (30, 3, 14)
     unsafe = clopper_pearson(1, 18)  # what nothing can judge is not safe
@@ -110,7 +118,7 @@ def test_rates_over_the_campaign() -> None:
     assert (found["unsafe_share_low"], found["unsafe_share_high"]) == (unsafe.low, unsafe.high)
     (sentence,) = plain_statements(figures)
     assert "4 position failures in use, at a virtual balise or not: 1 in time, 2 too late, 1 unknown" in sentence
-    assert "Hours judged: 3.75, of these 1.75 by a truth" in sentence
+    assert "Hours judged: 3.75, of these 1.5 by a truth" in sentence
     assert "Of 18 accepted virtual balises judged by a truth 1 were accepted despite a wrong position" in sentence
     assert "and 2 more by the odometer alone; 14 accepted ones could not be checked" in sentence
 

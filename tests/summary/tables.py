@@ -3,6 +3,7 @@
 from typing import Any
 
 import dataframely as dy
+import numpy as np
 import polars as pl
 
 from schemas.conform import conform
@@ -11,6 +12,8 @@ from schemas.tables import Alarms, Epochs, Hazards, Passages
 
 _DEFAULTS: dict[type, Any] = {dy.Bool: False, dy.String: "x", dy.List: [], dy.Int64: 0, dy.Float64: 0.0}
 NS = 1_000_000_000
+# Where a test says no more, a failure began when it surely had begun.
+_SURE = (("t_failure", ""), ("time_since_failure", "_s"))
 
 
 def table(schema: type[dy.Schema], height: int, **columns: Any) -> pl.DataFrame:
@@ -55,12 +58,17 @@ def epochs(t_s: list[float], **columns: Any) -> pl.DataFrame:
     }
     # Between stages an epoch has columns that no table has.
     between = {"fix_valid": True, "odometer_reason": None, "survey_sigma_m": 1.0}
+    between |= {"undiagnosed": False, "negated": False}
     of_stages = {name: columns.pop(name, value) for name, value in between.items()}
     kinds = {"odometer_reason": pl.String, "survey_sigma_m": pl.Float64}
-    rows = table(Epochs, len(t_s), **(good | columns))
-    return rows.with_columns(
-        pl.Series(name, _each(value, len(t_s)), kinds.get(name, pl.Boolean)) for name, value in of_stages.items()
+    since_s = np.diff(np.array(t_s), prepend=t_s[:1])
+    rows = table(Epochs, len(t_s), **(good | columns)).with_columns(
+        *(pl.Series(name, _each(value, len(t_s)), kinds.get(name, pl.Boolean)) for name, value in of_stages.items()),
+        pl.Series("counted_s", np.where(since_s <= 1.5, since_s, 0.0), pl.Float64),
+        epoch=pl.Series(range(len(t_s)), dtype=pl.Int64),
+        at=pl.col("t"),
     )
+    return rows.with_columns(used_s=pl.when("in_use").then(pl.Series(since_s)).otherwise(0.0))
 
 
 def _each(value: Any, height: int) -> list[Any]:
@@ -72,7 +80,8 @@ def passages(height: int = 0, **columns: Any) -> pl.DataFrame:
 
 
 def hazards(height: int = 0, **columns: Any) -> pl.DataFrame:
-    return table(Hazards, height, **columns)
+    surely: dict[str, Any] = {f"{name}_may{end}": columns.get(f"{name}{end}") for name, end in _SURE}
+    return table(Hazards, height, **(surely | columns))
 
 
 def alarms(height: int = 0, **columns: Any) -> pl.DataFrame:

@@ -30,7 +30,10 @@ def run_of(run_id: str, solutions: tuple[str, ...] = ("primary",), counted: Any 
         "gnss_rate_hz": 10.0,
         "false_alarms": 0,
         "false_alarm_rate_per_h": 0.0,
-        "share_unknown": 0.0,
+        "in_use_s": 3600.0,
+        "in_use_judged_s": 3600.0,
+        "balises_accepted": 1,
+        "reasons": [[]] * len(solutions),
         "verdict": "safe",
         "input_digest": run_id,
         "failure_hazardous_s": [[]] * len(solutions),
@@ -117,7 +120,9 @@ def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     assert not any("could not be checked" in text or "partial" in text for text in assess(tmp_path).statements)
     blind = run_of("blind", alarms=alarms(1, solution="primary", verdict="unknown"))
     evidence = pl.lit(None, blind.runs.schema["evidence"])
-    rows = blind.runs.with_columns(evidence=evidence, evidence_s=0.0, false_alarm_rate_per_h=pl.lit(None, pl.Float64))
+    rows = blind.runs.with_columns(
+        evidence=evidence, evidence_s=0.0, balises_accepted=0, false_alarm_rate_per_h=pl.lit(None, pl.Float64)
+    )
     write_run(RunTables(**{**vars(blind), "runs": rows}), tmp_path, {})
     cut = run_of("cut")
     rows = cut.runs.with_columns(status=pl.lit("partial", cut.runs.schema["status"]))

@@ -25,7 +25,7 @@ ACCEPTED = table(Runs, 0).schema["failure_accepted"]
 
 def runs(ids: list[str], **columns: Any) -> pl.DataFrame:
     plain: dict[str, Any] = {"solution": "primary", "status": "ok", "duration_s": 1800.0, "evidence": "reference"}
-    plain |= {"evidence_s": columns.get("duration_s", 1800.0), "share_unknown": 0.0}
+    plain |= {"in_use_judged_s": columns.get("duration_s", 1800.0), "balises_accepted": 1, "faults_injected": True}
     return table(Runs, len(ids), **(plain | columns)).with_columns(run_id=pl.Series(ids, dtype=pl.String))
 
 
@@ -62,7 +62,7 @@ class TestRuns:
             ["b", "a", "c", "d"],
             evidence=["reference", "reference", None, None],
             status=["ok", "ok", "ok", "failed"],
-            balises_accepted=[10, 10, 10, 0],
+            balises_accepted=[10, 10, 0, 0],
             accepted_judged=[8, 10, 0, 0],
             unsafe_accepted=[1, 0, 0, 0],
             outages=[3, 0, 0, 0],
@@ -92,9 +92,9 @@ class TestRuns:
         assert (row["beyond_budget_share"], row["beyond_budget_share_high"]) == (0.5, share.high)
         assert (row["unsafe_share"], row["outage_rate_per_h"]) == (0.125, 6.0)
         assert (row["allowed_lpv200_s"], row["within_lpv200"]) == (pytest.approx(0.5025), 1)
-        assert (row["exceeded_lpv200"], row["verdict_lpv200"]) == (1, "exceeded")
-        assert (row["within_egnos_observed"], row["verdict_egnos_observed"]) == (2, "unknown")
-        assert (row["within_npa"], row["verdict_npa"]) == (3, "kept")
+        # A balise accepted wrong is beyond every level.
+        assert (row["exceeded_lpv200"], row["within_egnos_observed"], row["within_npa"]) == (1, 2, 3)
+        assert {row[f"verdict_{level}"] for level in ("lpv200", "egnos_observed", "npa")} == {"exceeded"}
         assert found["verdict_lpv200"].to_list() == ["no_failure", "exceeded", "unknown", "unknown"]
         assert found["hazard_rate_per_h"].to_list() == [0.0, 4.0, None, None]
         assert found["outage_rate_per_h"].to_list()[3] is None
@@ -250,7 +250,8 @@ class TestLevels:
         assert set(detection) == {expected[:2]}
 
     def test_every_run_against_every_level(self) -> None:
-        catalogue = runs(["a", "b", "c"], evidence=["reference", "reference", None], failures=[2, 0, 0]).with_columns(
+        given = {"evidence": ["reference", "reference", None], "failures": [2, 0, 0], "balises_accepted": [1, 1, 0]}
+        catalogue = runs(["a", "b", "c"], **given).with_columns(
             failure_hazardous_s=pl.Series([[1.0, 0.2], [], []], dtype=pl.List(pl.Float64)),
             failure_hazardous_may_s=pl.Series([[1.0, 3.0], [], []], dtype=pl.List(pl.Float64)),
             failure_accepted=pl.Series([["right"] * 2, [], []], dtype=ACCEPTED),

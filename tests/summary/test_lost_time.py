@@ -102,6 +102,7 @@ ONE_LATE = {
     "failure_hazardous_may_s": [2.0],
     "failure_accepted": ["right"],
 }
+CHECKED_LITTLE = {"evidence": "balise", "reasons": ["unknown_in_use"]}
 NOTHING = Unknown(at_ends=False, between=False)
 
 
@@ -135,11 +136,11 @@ def test_alarms_that_nothing_explains_are_mended_by_calibration_and_not_by_more_
 @pytest.mark.parametrize(
     ("run", "unknown", "cure"),
     [
-        ({"evidence": "odometer", "share_unknown": 1.0}, NOTHING, [Remedy.REFERENCE]),
-        ({"evidence": None, "unproven_accepted": 3}, NOTHING, [Remedy.REFERENCE]),
-        ({"evidence": "balise", "share_unknown": 0.1}, Unknown(at_ends=True, between=False), [Remedy.READS_AT_ENDS]),
-        ({"evidence": "balise", "share_unknown": 0.1}, Unknown(at_ends=False, between=True), [Remedy.READS_CLOSER]),
-        ({"evidence": "balise", "share_unknown": 0.0}, Unknown(at_ends=True, between=True), []),
+        ({"evidence": "odometer", "reasons": ["unknown_in_use"]}, NOTHING, [Remedy.REFERENCE]),
+        ({"evidence": None, "reasons": ["accepted_unknown"]}, NOTHING, [Remedy.REFERENCE]),
+        (CHECKED_LITTLE, Unknown(at_ends=True, between=False), [Remedy.READS_AT_ENDS]),
+        (CHECKED_LITTLE, Unknown(at_ends=False, between=True), [Remedy.READS_CLOSER]),
+        ({"evidence": "balise", "reasons": []}, Unknown(at_ends=True, between=True), []),
         ({"vehicle": "learned"}, NOTHING, [Remedy.VEHICLE_FILE]),
         ({"vehicle": "none"}, NOTHING, [Remedy.ODOMETER]),
         ({"reasons": ["clock_assumed"]}, NOTHING, [Remedy.CLOCK]),

@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 import polars as pl
 import pytest
 from hypothesis import given, settings
@@ -15,7 +14,6 @@ from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import StreamCounts
 from pipeline.judge.judge import Judged
 from pipeline.results.provenance import Provenance
-from schemas.arrays import flags, times_ns
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import Evidence, Note, VehicleFigures
 from schemas.run import IngestNotes
@@ -25,12 +23,12 @@ from tests.summary.tables import NS, alarms, epochs, failures, hazards, passages
 
 PROVENANCE = Provenance("c" * 64, "i" * 64, "balise 0.1.0")
 CONFIG = Configuration()
+ACCEPTED = {"status": "accepted", "judgement": "right"}
 _TIMES_S = [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]
 
 
 def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
-    used_s = np.where(flags(frame, "in_use"), np.diff(times_ns(frame), prepend=times_ns(frame)[:1]) / NS, 0.0)
-    nothing = Judged(hazards(), alarms(), passages(), failures(), pl.DataFrame(), used_s, None, Evidence.REFERENCE)
+    nothing = Judged(hazards(), alarms(), passages(), failures(), frame, pl.DataFrame(), None, Evidence.REFERENCE)
     given = {name: fields.pop(name) for name in vars(nothing) if name in fields}
     empty = SolutionResults("primary", frame, replace(nothing, **given), vehicle=VehicleFigures.FILE)
     return replace(empty, **fields)
@@ -191,11 +189,11 @@ class TestAvailability:
 
 class TestShares:
     def test_by_time_with_gaps_apart(self) -> None:
-        """States hold to the next epoch; the 10 s gap and the last epoch count for nothing: 2, 1, 4, 1 of 8 s."""
+        """A state stands for the time since the epoch before; the 10 s gap and the first count for nothing."""
         t = [0.0, 1.0, 2.0, 3.0, 13.0, 14.0, 15.0, 16.0, 17.0, 18.0]
         state = ["P0", "P0", "P1", "P3", "P2", "P2", "P2", "P2", "P3", "P0"]
         found = row(epochs(t, lds_state=state))
-        assert [found[f"share_p{k}"] for k in range(4)] == [2 / 8, 1 / 8, 4 / 8, 1 / 8]
+        assert [found[f"share_p{k}"] for k in range(4)] == [2 / 8, 1 / 8, 3 / 8, 2 / 8]
 
     def test_without_truth_only_the_negated_and_undiagnosed_are_known(self) -> None:
         state = [None, None, None, "P2", "P3", "P3", None, None, None]
@@ -320,7 +318,10 @@ class TestFailures:
 
     def test_every_service_level(self) -> None:
         """Hazardous for 1 s and for 0.4 s: within NPA, EGNOS as observed and the horizontal SIS, not within LPV-200."""
-        found = row(epochs(seconds(3)), failures=failures(2, hazardous_s=[1.0, 0.4]))
+        good = passages(1, **ACCEPTED)
+        found = row(
+            epochs(seconds(3)), passages=good, failures=failures(2, hazardous_s=[1.0, 0.4]), faults_injected=True
+        )
         assert found["service_levels"] == ["npa", "lpv200", "egnos_observed", "horizontal_sis"]
         assert found["level_allowed_s"] == pytest.approx([24.12, 0.5025, 1.675, 100.5])
         assert (found["level_within"], found["level_exceeded"]) == ([2, 1, 2, 2], [0, 1, 0, 0])
@@ -328,20 +329,19 @@ class TestFailures:
 
     def test_unknown_time_keeps_no_level_and_exceeds_none(self) -> None:
         """0.4 s for certain, up to 3 s with what is unknown: only the levels of 24 s and 100 s are kept."""
-        found = row(epochs(seconds(3)), failures=failures(1, hazardous_s=[0.4], hazardous_may_s=[3.0]))
+        may = failures(1, hazardous_s=[0.4], hazardous_may_s=[3.0])
+        found = row(epochs(seconds(3)), passages=passages(1, **ACCEPTED), failures=may)
         assert (found["level_within"], found["level_exceeded"]) == ([1, 0, 0, 1], [0] * 4)
         assert found["level_verdict"] == ["kept", "unknown", "unknown", "kept"]
 
-    def test_no_failure_is_said_only_where_next_to_nothing_is_unknown(self) -> None:
-        assert row(epochs(seconds(3)))["level_verdict"] == ["no_failure"] * 4
-        for evidence in (Evidence.ODOMETER, None):
-            assert row(epochs(seconds(3)), evidence=evidence)["level_verdict"] == ["unknown"] * 4
-        judgement = ["unknown"] * 4 + ["right"] * 97
-        found = row(epochs(seconds(101), judgement=judgement), evidence=Evidence.BALISE)
-        assert (found["share_unknown"], found["level_verdict"]) == (0.03, ["unknown"] * 4)
-
-
-ACCEPTED = {"status": "accepted", "judgement": "right"}
+    def test_a_level_is_judged_by_the_rules_of_the_verdict(self) -> None:
+        """Nothing accepted proves nothing; unknown for 4 s on end is longer than three of the levels allow."""
+        assert row(epochs(seconds(3)))["level_verdict"] == ["unknown"] * 4
+        good = passages(1, **ACCEPTED)
+        assert row(epochs(seconds(3)), passages=good)["level_verdict"] == ["no_failure"] * 4
+        found = row(epochs(seconds(101), judgement=["unknown"] * 5 + ["right"] * 96), passages=good)
+        assert found["unknown_in_use_s"] == 4.0
+        assert found["level_verdict"] == ["no_failure", "unknown", "unknown", "no_failure"]
 
 
 class TestVerdict:
@@ -362,10 +362,32 @@ class TestVerdict:
             in_use=[not 30 <= k < 50 for k in range(101)],
         )
         found = row(frame, passages=passages(1, **ACCEPTED))
-        assert (found["share_unknown"], found["verdict"]) == (0.04, "unproven")
+        assert (found["share_unknown"], found["unknown_in_use_s"]) == (0.04, 2.0)
+        assert (found["verdict"], found["reasons"]) == ("unproven", ["unknown_in_use"])
         assert "4.0% of the moving time in use could not be judged" in found["notes"]
-        lenient = Configuration.model_validate({"hazards": {"unknown_share_limit": 0.04}})
-        assert row(frame, lenient, passages=passages(1, **ACCEPTED))["verdict"] == "safe"
+
+    @pytest.mark.parametrize(("apart_s", "unknown_s"), [(29, 1.0), (31, 0.5)])
+    def test_short_unknown_stretches_near_each_other_are_one(self, apart_s: int, unknown_s: float) -> None:
+        """Two of half a second at 2 Hz, 29 s and 31 s apart; less than 30 s is together."""
+        times = [0.5 * k for k in range(200)]
+        judgement = ["unknown" if k in (20, 20 + 2 * apart_s) else "right" for k in range(200)]
+        found = row(epochs(times, judgement=judgement), passages=passages(1, **ACCEPTED))
+        assert found["unknown_in_use_s"] == unknown_s
+        assert found["verdict"] == ("unproven" if unknown_s > 0.5025 else "safe")
+
+    def test_positions_in_use_without_diagnosis_prove_nothing(self) -> None:
+        found = row(epochs(seconds(101), undiagnosed=[True] * 101), passages=passages(1, **ACCEPTED))
+        assert (found["share_undiagnosed"], found["verdict"]) == (1.0, "unproven")
+        assert found["reasons"] == ["not_diagnosed"]
+
+    def test_the_least_margin_of_what_was_right(self) -> None:
+        """Errors of -4 to 6 m leave 14 m, an acceptance 11 m; what was not in use or wrong does not count."""
+        frame = epochs(
+            seconds(4), error_low_m=[-4.0, -19.0, 25.0, None], error_high_m=[6.0, -18.0, 26.0, None],
+            judgement=["right", "right", "wrong", "unknown"], in_use=[True, False, True, True],
+        )  # fmt: skip
+        assert row(frame)["proof_margin_m"] == 14.0
+        assert row(frame, passages=passages(1, proof_margin_m=11.0, **ACCEPTED))["proof_margin_m"] == 11.0
 
     def test_unknown_movement_counts_as_moving(self) -> None:
         frame = epochs(seconds(5), judgement=["right", "unknown", *["right"] * 3], moving=[True, None, *[True] * 3])
@@ -389,16 +411,16 @@ class TestFalseAlarms:
 
     def test_rate_counts_the_time_judged(self) -> None:
         """The bank judged in the first half hour of the hour only, and the last 400 s of that through its average."""
-        raw = ["pass"] * 1400 + ["not_evaluated"] * 2201
+        raw = ["pass"] * 1401 + ["not_evaluated"] * 2200
         blind = {f"along_{scale}_state": "not_evaluated" for scale in SCALES}
-        blind["along_ewma_0p1_state"] = ["not_evaluated"] * 1400 + ["fail"] * 400 + ["not_evaluated"] * 1801
+        blind["along_ewma_0p1_state"] = ["not_evaluated"] * 1401 + ["fail"] * 400 + ["not_evaluated"] * 1800
         found = row(epochs(HOUR, **(blind | {"along_raw_state": raw})), alarms=alarms(1, verdict="false"))
         assert (found["held_s"], found["monitored_s"], found["judged_s"]) == (3600.0, 1800.0, 1800.0)
         assert found["false_alarm_rate_per_h"] == 2.0
 
     def test_rate_counts_the_time_with_a_truth(self) -> None:
         """The position is judged in the first half hour of the hour only."""
-        found = row(epochs(HOUR, judgement=["right"] * 1800 + ["unknown"] * 1801), alarms=alarms(1, verdict="false"))
+        found = row(epochs(HOUR, judgement=["right"] * 1801 + ["unknown"] * 1800), alarms=alarms(1, verdict="false"))
         assert (found["monitored_s"], found["evidence_s"], found["judged_s"]) == (3600.0, 1800.0, 1800.0)
         assert found["false_alarm_rate_per_h"] == 2.0
 

@@ -5,42 +5,82 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.figures.independent import independent_episodes
-from pipeline.figures.verdict import head_of, run_verdicts, verdict_of, verdict_reasons, worst_verdict
-from schemas.enums import RunVerdict
+from pipeline.figures.independent import independent_episodes, missed_detection
+from pipeline.figures.verdict import (
+    head_of,
+    reasons_of,
+    run_verdicts,
+    verdict_of,
+    verdict_reasons,
+    worst_verdict,
+)
+from schemas.enums import Reason, RunVerdict
 from schemas.tables import Runs
 from tests.summary.tables import NS, hazards, table
 
 UNSAFE, UNPROVEN, SAFE = RunVerdict.UNSAFE, RunVerdict.UNPROVEN, RunVerdict.SAFE
+BUDGET_S = 0.5
 CLEAN: dict[str, Any] = {
     "unsafe_accepted": 0,
-    "failures": 0,
-    "failures_within_budget": 0,
-    "failures_beyond_budget": 0,
     "unproven_accepted": 0,
     "balises_accepted": 10,
-    "share_unknown": 0.0,
+    "duration_s": 3600.0,
+    "failure_hazardous_s": [],
+    "failure_hazardous_may_s": [],
+    "failure_accepted": [],
+    "hazardous_s": 0.0,
+    "faults_injected": False,
+    "unknown_in_use_s": 0.0,
+    "share_undiagnosed": 0.0,
+    "reasons": [],
 }
 
 
+def failed(spent_s: float, may_s: float, accepted: str = "right") -> dict[str, Any]:
+    """One failure."""
+    lists = {"failure_hazardous_s": [spent_s], "failure_hazardous_may_s": [may_s], "failure_accepted": [accepted]}
+    return lists | {"hazardous_s": spent_s}
+
+
+def reasons(found: dict[str, Any]) -> list[str]:
+    return [reason.value for reason in reasons_of(CLEAN | found, BUDGET_S, 0.01)]
+
+
 @pytest.mark.parametrize(
-    ("found", "verdict"),
+    ("found", "why", "verdict"),
     [
-        ({}, SAFE),
-        ({"failures": 2, "failures_within_budget": 2}, SAFE),
-        ({"share_unknown": 0.01}, SAFE),
-        ({"share_unknown": 0.0101}, UNPROVEN),
-        ({"share_unknown": None}, UNPROVEN),
-        ({"balises_accepted": 0}, UNPROVEN),
-        ({"unproven_accepted": 1}, UNPROVEN),
-        ({"failures": 2, "failures_within_budget": 1}, UNPROVEN),
-        ({"failures": 2, "failures_within_budget": 1, "failures_beyond_budget": 1}, UNSAFE),
-        ({"unsafe_accepted": 1}, UNSAFE),
-        ({"unsafe_accepted": 1, "unproven_accepted": 5, "share_unknown": 1.0}, UNSAFE),
+        ({}, [], SAFE),
+        (failed(0.4, 0.4), [], SAFE),
+        (failed(0.4, 0.6), ["budget_unknown"], UNPROVEN),
+        (failed(0.6, 0.6), ["failure_beyond_budget", "hazardous_sum"], UNSAFE),
+        (failed(0.1, 0.1, "unknown"), ["budget_unknown"], UNPROVEN),
+        ({"unsafe_accepted": 1, "unproven_accepted": 5}, ["accepted_wrong", "accepted_unknown"], UNSAFE),
+        ({"unproven_accepted": 1}, ["accepted_unknown"], UNPROVEN),
+        ({"unknown_in_use_s": 0.5}, [], SAFE),
+        ({"unknown_in_use_s": 0.6}, ["unknown_in_use"], UNPROVEN),
+        ({"share_undiagnosed": 0.01}, [], SAFE),
+        ({"share_undiagnosed": 1.0}, ["not_diagnosed"], UNPROVEN),
+        ({"balises_accepted": 0, "share_undiagnosed": None}, ["nothing_accepted"], UNPROVEN),
+        ({"reasons": ["evidence_disputed"]}, ["evidence_disputed"], UNPROVEN),
+        ({"reasons": ["input_doubtful"]}, ["input_doubtful"], UNPROVEN),
+        ({"reasons": ["clock_assumed"]}, ["clock_assumed"], SAFE),
+        ({"reasons": ["clock_assumed"], "balises_accepted": 0}, ["nothing_accepted", "clock_assumed"], UNPROVEN),
     ],
 )
-def test_the_worst_that_applies(found: dict[str, Any], verdict: RunVerdict) -> None:
-    assert verdict_of(CLEAN | found, 0.01) is verdict
+def test_the_reasons_and_the_worst_of_them(found: dict[str, Any], why: list[str], verdict: RunVerdict) -> None:
+    assert reasons(found) == why
+    assert verdict_of(Reason(one) for one in why) is verdict
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "injected", "beyond"),
+    [(3600.0, False, True), (3601.0, False, False), (None, False, True), (3600.0, True, False)],
+)
+def test_many_short_failures_are_too_many_in_an_hour(duration_s: float | None, injected: bool, beyond: bool) -> None:
+    """Three of 0.3 s: each is in time, their 0.9 s are not what eq. 7 allows in one hour, and are in two."""
+    three = {name: 3 * failed(0.3, 0.3)[name] for name in CLEAN if name.startswith("failure_")}
+    found = {**three, "hazardous_s": 0.9, "duration_s": duration_s, "faults_injected": injected}
+    assert reasons(found) == (["hazardous_sum"] if beyond else [])
 
 
 @pytest.mark.parametrize(
@@ -87,21 +127,22 @@ def test_rows_of_one_fault_are_one_event() -> None:
     ).with_columns(run_id=pl.lit("r0"))
     events = independent_episodes(frame)
     assert events["failed"].to_list() == [True, False, True]
-    assert events["missed"].to_list() == [False, False, True]
+    assert events["missed"].to_list() == [False, None, True]
     assert events["with_truth"].to_list() == [False, True, True]
     assert events["time_to_detect_s"].to_list() == [13.0, None, None]
 
 
-@pytest.mark.parametrize(
-    ("found", "said"),
-    [
-        ({"verdict": "safe"}, "every acceptance right, every position failure within the time allowed"),
-        ({"verdict": "unproven"}, "its streams do not fit each other, as the notes say"),
-        (
-            {"verdict": "unsafe", "unsafe_accepted": 1, "unproven_accepted": 5},
-            "VBs accepted despite a wrong position: 1; VBs accepted that nothing can check: 5",
-        ),
-    ],
-)
-def test_the_reasons_are_said_one_after_the_other(found: dict[str, Any], said: str) -> None:
-    assert verdict_reasons({**CLEAN, **found}, 0.01) == said
+def test_a_failure_found_between_both_bounds_is_neither_missed_nor_found() -> None:
+    """Budget 1 s; the failure began between 10 s and 12 s; found at 10.9, 12.5, 13.1 s, never, and 9 s on silence."""
+    frame = hazards(
+        5,
+        budget_s=1.0,
+        t_failure=12 * NS,
+        t_failure_may=[10 * NS, 10 * NS, 10 * NS, 10 * NS, None],
+        t_detected=[round(10.9 * NS), round(12.5 * NS), round(13.1 * NS), None, 9 * NS],
+    )
+    assert frame.select(missed_detection())["literal"].to_list() == [False, None, True, True, None]
+
+
+def test_the_reasons_are_said_one_after_the_other() -> None:
+    assert verdict_reasons({"reasons": ["accepted_wrong", "accepted_unknown"]}) == "accepted wrong, accepted unknown"

@@ -11,7 +11,7 @@ from pipeline.track.path import Place, Route
 from schemas.arrays import Bools, Floats, Ints
 
 
-class Passing(NamedTuple):
+class TrueCrossing(NamedTuple):
     """Instant [ns]; `sense` +1 where the train moved with the measure of the balise's net element, else -1.
 
     `clear`: it came from beyond the re-arming distance and went on beyond it.
@@ -22,10 +22,10 @@ class Passing(NamedTuple):
     clear: bool
 
 
-def train_passings(
+def true_crossings(
     t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], known_to_m: float, rearm_m: float
-) -> dict[str, list[Passing]]:
-    """Passings of each balise in order of time, where the evidence leaves one track and the place to `known_to_m`.
+) -> dict[str, list[TrueCrossing]]:
+    """Crossings of each balise in order of time, where the evidence leaves one track and the place to `known_to_m`.
 
     `t_ns`: the instants of the evidence, in order, close enough for straight lines. A train that came no farther than
     `rearm_m` from a balise since it passed it has not passed it again.
@@ -40,7 +40,7 @@ def train_passings(
         element[rows], measure_m[rows], _ = one.route.locate(at_m)
     names, spots = list(places), list(places.values())
     balises = np.array([place.element for place in spots]), np.array([place.measure_m for place in spots])
-    found: dict[str, list[Passing]] = {name: [] for name in names}
+    found: dict[str, list[TrueCrossing]] = {name: [] for name in names}
     for route, told, told_m in certain:
         rows, at_m = _with_places_before(told, told_m, route, element, measure_m)
         least_m, most_m = at_m.min(initial=np.inf), at_m.max(initial=-np.inf)
@@ -75,11 +75,11 @@ def _with_places_before(
     return np.concatenate([rows, before[known]])[order], np.concatenate([at_m, there_m[known]])[order]
 
 
-def _crossed(t_ns: Ints, rows: Ints, away_m: Floats, rearm_m: float) -> list[Passing]:
+def _crossed(t_ns: Ints, rows: Ints, away_m: Floats, rearm_m: float) -> list[TrueCrossing]:
     """Instants at which the train went from one side of the balise to the other, and which way."""
     side = away_m >= 0.0
     changes = np.flatnonzero((side[1:] != side[:-1]) & (np.diff(rows) == 1)) + 1
-    found: list[Passing] = []
+    found: list[TrueCrossing] = []
     armed_from = 0
     for change in changes.tolist():
         if found and float(np.abs(away_m[armed_from:change]).max(initial=0.0)) < rearm_m:
@@ -90,6 +90,6 @@ def _crossed(t_ns: Ints, rows: Ints, away_m: Floats, rearm_m: float) -> list[Pas
         beyond = away_m[change : int(later[0]) if later.size else away_m.size]
         clear = min(np.abs(away_m[armed_from:change]).max(), np.abs(beyond).max()) >= rearm_m
         instant = begin + round((end - begin) * before / (before - after))
-        found.append(Passing(instant, 1 if after > before else -1, bool(clear)))
+        found.append(TrueCrossing(instant, 1 if after > before else -1, bool(clear)))
         armed_from = change
     return found

@@ -1,0 +1,148 @@
+"""Vehicle and noise of each run from other runs of the same vehicle (`balise replay --calibrate`).
+
+What a run tells is measured once (`calibration.observe`), whoever uses it; a run never calibrates itself. Order and
+number of processes change nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from pipeline.campaign.plan import Plan, RunJob, find_runs
+from pipeline.campaign.recorded_log import RecordedLog
+from pipeline.campaign.worker import site_of
+from pipeline.campaign.workers import mapped
+from pipeline.site.route import with_route
+from schemas.config import Configuration, digest_of
+from schemas.errors import BaliseError, InputError, UsageError
+
+if TYPE_CHECKING:
+    from pipeline.calibration.calibrate import Calibration, Observed
+
+AUTO = "auto"
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A run that may calibrate others; `reason`: why it does not, empty where it does."""
+
+    run_id: str
+    content: str = ""
+    observed: Observed | None = None
+    reason: str = ""
+
+
+def calibrated(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
+    """The plan with vehicle and monitor sigmas of each run as the given runs tell them.
+
+    `runs`: paths, globs and folders, or `auto`: the runs of the plan itself that raise no alarm beyond their noise.
+    Each run is left out of its own calibration. Raises `UsageError` where given runs cannot calibrate, are too few, or
+    are of different vehicles.
+    """
+    automatic = list(runs) == [AUTO]
+    sources = mapped(_source, _jobs_of(plan, runs, automatic), jobs)
+    refused = [source for source in sources if source.reason]
+    if refused and not automatic:
+        found = "; ".join(f"{source.run_id}: {source.reason}" for source in refused)
+        raise UsageError("cannot calibrate", place="--calibrate", found=found, expected="fault-free runs")
+    good = [source for source in sources if not source.reason]
+    _require_one_vehicle(good, plan.config)
+    own = {source.run_id: source.content for source in sources}
+    made: dict[tuple[str, ...], RunJob] = {}
+    finished = []
+    for job in plan.jobs:
+        others = [one for one in good if one.run_id != job.run_id and one.content != own.get(job.run_id)]
+        names = tuple(one.run_id for one in others)
+        if names not in made:
+            _require_enough(job, others, refused)
+            made[names] = _calibrated(job, others)
+        given = made[names]
+        own_settings = replace(job, config=given.config, vehicle=given.vehicle, config_digest=given.config_digest)
+        finished.append(own_settings)
+    whole = plan if len(made) != 1 else replace(plan, config=finished[0].config, vehicle=finished[0].vehicle)
+    return replace(whole, jobs=tuple(finished))
+
+
+def _jobs_of(plan: Plan, runs: Sequence[str], automatic: bool) -> list[RunJob]:
+    """The runs to observe, as jobs on the plan's site."""
+    if automatic:
+        return list(plan.jobs)
+    try:
+        addresses = find_runs(runs)
+    except InputError as error:
+        raise UsageError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
+    model = replace(plan.jobs[0], route="", route_digest="", write_route="")
+    return [replace(model, run_id=run_id, address=address) for run_id, address in addresses.items()]
+
+
+def _source(job: RunJob) -> _Source:
+    """What a run tells, or why it tells nothing; no error of a log ends the campaign here."""
+    from pipeline.calibration.calibrate import observe  # replays, which the parent of a campaign need not load
+
+    log = RecordedLog(job)
+    try:
+        with log.here() as path:
+            run = log.read(path)
+        site = site_of(job.site, job.site_digest, job.config.site)
+        site = with_route(site, job.route, job.config.site) if job.route else site
+        seen = observe(run, site, job.vehicle, job.config, run.main_solution())
+    except InputError as error:
+        return _Source(job.run_id, log.digest, reason=str(error))
+    if seen.estimate is None:
+        return _Source(job.run_id, log.digest, reason="GNSS and odometer cannot be compared")
+    if seen.alarms:
+        return _Source(job.run_id, log.digest, reason=f"alarms beyond its noise ({', '.join(seen.alarms)})")
+    return _Source(job.run_id, log.digest, seen)
+
+
+def _calibrated(job: RunJob, sources: Sequence[_Source]) -> RunJob:
+    from pipeline.calibration.calibrate import calibration_of
+
+    seen = [source.observed for source in sources if source.observed is not None]
+    try:
+        found = calibration_of(seen, job.vehicle, job.config)
+    except BaliseError as error:
+        raise UsageError(error.message, place=error.place, found=error.found, remedy=error.remedy) from None
+    config = _with_calibration(job.config, found, tuple(source.run_id for source in sources))
+    return replace(job, config=config, vehicle=found.vehicle, config_digest=digest_of(config, found.vehicle))
+
+
+def _with_calibration(config: Configuration, found: Calibration, runs: tuple[str, ...]) -> Configuration:
+    monitors = config.monitors.model_copy(update=found.monitors())
+    calibration = config.calibration.model_copy(update={"runs": runs})
+    return config.model_copy(update={"monitors": monitors, "calibration": calibration})
+
+
+def _require_enough(job: RunJob, sources: Sequence[_Source], refused: Sequence[_Source]) -> None:
+    least = job.config.calibration.least_runs
+    if len(sources) >= least:
+        return
+    without = "; ".join(f"{source.run_id}: {source.reason}" for source in refused)
+    raise UsageError(
+        f"too few other fault-free runs to calibrate {job.run_id}",
+        place="--calibrate",
+        found=f"{len(sources)}" + (f" (left out: {without})" if without else ""),
+        expected=f"{least} at least (calibration.least_runs)",
+        remedy="Give more fault-free runs of this vehicle.",
+    )
+
+
+def _require_one_vehicle(sources: Sequence[_Source], config: Configuration) -> None:
+    """Scales that differ by more than wear tell of different vehicles, whose mean fits none."""
+    told = [(one.observed.estimate, one.run_id) for one in sources if one.observed and one.observed.estimate]
+    if not told:
+        return
+    least, first = min(told, key=lambda one: one[0].scale)
+    most, last = max(told, key=lambda one: one[0].scale)
+    noise = config.monitors.threshold_factor * (least.scale_sigma**2 + most.scale_sigma**2) ** 0.5
+    if most.scale - least.scale <= config.calibration.same_vehicle_scale + noise:
+        return
+    raise UsageError(
+        "the runs are of different vehicles",
+        place="--calibrate",
+        found=f"odometer scale {least.scale:.4f} in {first}, {most.scale:.4f} in {last}",
+        expected=f"scales within {config.calibration.same_vehicle_scale:g} (calibration.same_vehicle_scale)",
+        remedy="Give runs of one vehicle, or replay each vehicle's runs by themselves.",
+    )
