@@ -504,8 +504,6 @@ class HazardConfig(Settings):
     turn_s: Positive = 2.0
     # `suspect` uses the data from this long before alarm or hazard.
     suspect_lookback_s: NonNegative = 60.0
-    # Net elements less probable than one in a thousand are not used for the reference (DOMAIN section 5.1).
-    rival_probability: Probability = 0.001
     # Of the read itself; Q_LOCACC of the site belongs to the linking information (DOMAIN section 5.1).
     balise_read_sigma_m: Positive = 1.0
     # An error known less closely is not given as a number (DOMAIN section 5.2).
