@@ -130,6 +130,8 @@ def replay(
     plan = make_plan(runs, site, out, settings, _vehicle(vehicle), route, write_route, given)
     plan = _calibrated(plan, calibrate, jobs, quiet) if calibrate else plan
     shown = watches(quiet, as_json)
+    options = "".join(f" --{name} {file}" for name, file in (("vehicle", vehicle), ("config", config)) if file)
+    places = {"site": site, "options": options}
     try:
         summary = run_campaign(
             plan, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit, watches=shown
@@ -138,10 +140,10 @@ def replay(
         # A terminal that was closed takes no more words.
         with contextlib.suppress(OSError):
             if interrupted.summary is not None:
-                show_summary(interrupted.summary, out, quiet, as_json)
+                show_summary(interrupted.summary, out, quiet, as_json, **places)
             print("balise: interrupted; repeat the command to continue", file=sys.stderr)
         raise Exit(128 + interrupted.signum) from None
-    show_summary(summary, out, quiet, as_json)
+    show_summary(summary, out, quiet, as_json, **places)
     raise Exit(DEFECT if summary.defects else OK if summary.all_ok else RUNS_NOT_OK)
 
 

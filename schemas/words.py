@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, Remedy
+from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, Reason, Remedy
 
 BETWEEN = "; "
 """What stands between the notes of a run; no note holds it itself."""
@@ -76,6 +76,21 @@ NOTES: dict[Note, str] = {
     Note.OFF_TRACK: "positions off the track, usually {:.0f} m beside it",
     Note.REMEDY: "to mend it: {}",
 }
+
+REASONS: dict[Reason, str] = {
+    Reason.ACCEPTED_WRONG: "VBs accepted despite a wrong position: {unsafe_accepted}",
+    Reason.FAILURE_BEYOND_BUDGET: "position failures in use for longer than allowed: {failures_beyond_budget}",
+    Reason.HAZARDOUS_SUM: "wrong positions in use for {hazardous_s} s in all, more than is allowed per hour",
+    Reason.ACCEPTED_UNKNOWN: "VBs accepted that nothing can check: {unproven_accepted}",
+    Reason.BUDGET_UNKNOWN: "position failures of unknown length: {failures_undecided}",
+    Reason.UNKNOWN_IN_USE: "positions in use without a check for {unknown_in_use_s} s while moving",
+    Reason.NOT_DIAGNOSED: "positions in use without diagnosis for {share_undiagnosed} of the moving time in use",
+    Reason.NOTHING_ACCEPTED: "no VB was accepted",
+    Reason.EVIDENCE_DISPUTED: "the evidence contradicts itself, as the notes say",
+    Reason.INPUT_DOUBTFUL: "its streams do not fit each other, as the notes say",
+    Reason.CLOCK_ASSUMED: "the clock of the evidence is assumed, not measured",
+}
+NO_REASON = "every acceptance right, every position failure within the time allowed"
 
 CAUSES: dict[MisfitCause, str] = {
     MisfitCause.UNIT: "in {}",
@@ -147,16 +162,15 @@ LOST: dict[LostTo, str] = {
 LOST_OTHERWISE = "not validated (initialisation, short losses, monitors switched off)"
 
 REMEDIES: dict[Remedy, str] = {
-    Remedy.CALIBRATE: "measure the receiver's noise on other runs of this vehicle: "
-    "`balise calibrate OTHER_RUNS --site {site} --out VEHICLE.toml`",
-    Remedy.VEHICLE_FILE: "measure the odometer on other runs: "
-    "`balise calibrate OTHER_RUNS --site {site} --out VEHICLE.toml`, then "
-    "`balise replay {run} --site {site} --out {out} --vehicle VEHICLE.toml`",
+    Remedy.CALIBRATE: "measure noise and odometer on two or more other fault-free runs of this vehicle: "
+    "`balise replay {run} --site {site} --out {out}{options} --calibrate 'OTHER_RUNS/*'`",
+    Remedy.VEHICLE_FILE: "measure the odometer on two or more other fault-free runs of this vehicle: "
+    "`balise replay {run} --site {site} --out {out}{options} --calibrate 'OTHER_RUNS/*'`",
     Remedy.REFERENCE: "add a reference to the run: `balise convert REFERENCE --to {run} --stream reference`",
     Remedy.READS_AT_ENDS: "record balise reads near both ends of the run, within 300 m of them",
     Remedy.READS_CLOSER: "record balise reads closer to each other, every 2 km",
     Remedy.ROUTE: "name the track that the train took: "
-    "`balise replay {run} --site {site} --out {out} --route ROUTE.csv`",
+    "`balise replay {run} --site {site} --out {out}{options} --route ROUTE.csv`",
     Remedy.CLOCK: "set the recorders to one clock: `balise inspect {run} --site {site}` shows their lags",
     Remedy.ODOMETER: "record an odometer: without one nothing along the track is monitored",
     Remedy.FASTER_LOG: "log positions more often, at 10 Hz",
@@ -209,7 +223,41 @@ def lost_words(
     return ", ".join([*named, *([f"{rest:.0%} {LOST_OTHERWISE}"] if rest >= _LEAST_SHARE else [])])
 
 
-PLACES: dict[str, Any] = {"run": "RUN", "site": "SITE", "out": "OUT"}
+def reason_words(run: Mapping[str, Any]) -> str:
+    """Why a `runs` row has its verdict, one reason after the other, with its figures."""
+    undecided = run["failures"] - run["failures_within_budget"] - run["failures_beyond_budget"]
+    figures = {
+        **{name: run[name] for name in ("unsafe_accepted", "unproven_accepted", "failures_beyond_budget")},
+        "failures_undecided": undecided,
+        **{name: f"{run[name] or 0.0:.3g}" for name in ("hazardous_s", "unknown_in_use_s")},
+        "share_undiagnosed": f"{run['share_undiagnosed'] or 0.0:.1%}",
+    }
+    return "; ".join(REASONS[Reason(reason)].format(**figures) for reason in run["reasons"] or ()) or NO_REASON
+
+
+def part_words(run: Mapping[str, Any]) -> str:
+    """`safe from 12:00:03 to 12:41:50, 92% of the moving time`: the verdict between first and last anchor, where it is
+    another than the run's.
+    """
+    if run["part_verdict"] in (None, run["verdict"]):
+        return ""
+    clock = "%H:%M:%S"
+    return (
+        f"{run['part_verdict']} from {run['part_from']:{clock}} to {run['part_to']:{clock}}, "
+        f"{run['part_share']:.0%} of the moving time"
+    )
+
+
+def beside_words(run: Mapping[str, Any]) -> str:
+    """What stands beside every verdict: balises accepted of those on the path, availability, proof margin."""
+    accepted = f"{run['balises_accepted']} of {run['balises_on_path']} balises accepted"
+    available = run["availability"]
+    margin_m = run["proof_margin_m"]
+    told = "the train did not move" if available is None else f"available for {available:.0%} of the moving time"
+    return ", ".join([accepted, told, *([] if margin_m is None else [f"proof margin {margin_m:.1f} m"])])
+
+
+PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options": ""}
 """What a command names where nobody knows the paths."""
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import traceback
 from concurrent.futures import Future
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 
 from pipeline.campaign.plan import RunJob
 from pipeline.figures.hazard_words import hazard_words
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.figures.verdict import verdict_reasons, worst_verdict
+from pipeline.figures.verdict import worst_verdict
 from pipeline.results.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
@@ -19,6 +20,7 @@ from schemas.errors import BaliseError, InputError
 from schemas.run import RunTables
 from schemas.tables import TABLES
 from schemas.version import SOFTWARE
+from schemas.words import reason_words
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class RunOutcome:
 
     `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
     over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
-    `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved.
+    `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved. `log`: what was
+    replayed. The figures beside the verdict and `remedies` are of the solution that heads the run.
     """
 
     run_id: str
@@ -43,6 +46,12 @@ class RunOutcome:
     why: str = ""
     faults: tuple[str, ...] = ()
     proof: str = ""
+    log: str = ""
+    balises_accepted: int | None = None
+    balises_on_path: int | None = None
+    availability: float | None = None
+    proof_margin_m: float | None = None
+    remedies: tuple[str, ...] = ()
 
     @property
     def defect(self) -> bool:
@@ -115,8 +124,8 @@ def worst(runs: pl.DataFrame) -> RunStatus:
     return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in found), RunStatus.OK)
 
 
-def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame) -> RunOutcome:
-    """The outcome that a run's own tables tell."""
+def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame) -> RunOutcome:
+    """The outcome that a run's own tables show."""
     errors = runs["error"].drop_nulls().to_list()
     judged = known_counts(runs).drop_nulls("missed_detections")
     *counts, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
@@ -129,8 +138,19 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame) -> RunOut
         hazards=sum(counts) if judged.height else None,
         missed_detections=missed if judged.height else None,
         why=_why(runs, verdict),
-        faults=tuple(hazard_words(hazards)),
+        faults=tuple(hazard_words(hazards, passages)),
+        log=redacted(job.address),
+        **_beside(runs, verdict),
     )
+
+
+def _beside(runs: pl.DataFrame, verdict: RunVerdict | None) -> dict[str, Any]:
+    """What stands beside the verdict, of the solution that heads the run; nothing where all failed."""
+    if verdict is None:
+        return {}
+    row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
+    names = ("balises_accepted", "balises_on_path", "availability", "proof_margin_m")
+    return {name: row[name] for name in names} | {"remedies": tuple(row["remedies"] or ())}
 
 
 def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:
@@ -140,7 +160,7 @@ def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:
     rows = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value)
     several = runs.height > 1
     return "; ".join(
-        (f"{row['solution']}: " if several else "") + verdict_reasons(row) for row in rows.iter_rows(named=True)
+        (f"{row['solution']}: " if several else "") + reason_words(row) for row in rows.iter_rows(named=True)
     )
 
 

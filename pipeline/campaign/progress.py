@@ -17,7 +17,16 @@ from pipeline import storage
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
 from pipeline.campaign.waits import WAITS
-from pipeline.campaign.watch import Summary, UnderWay, Watch, ending_rows, outcome_line, outcome_rows, summary_line
+from pipeline.campaign.watch import (
+    Summary,
+    UnderWay,
+    Watch,
+    ending_rows,
+    outcome_line,
+    outcome_rows,
+    remedy_lines,
+    summary_line,
+)
 from pipeline.figures.verdict import word_of
 from pipeline.results.terminal import show_table, to_json
 from pipeline.storage.address import is_url, join, redacted
@@ -60,7 +69,10 @@ class JsonWatch(LineWatch):
         self._say("progress", **self.figures(under_way))
 
     def told(self, outcome: RunOutcome) -> None:
-        names = ("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections")
+        names = (
+            *("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections"),
+            *("balises_accepted", "balises_on_path", "availability", "proof_margin_m", "remedies"),
+        )
         told = {"verdict": word_of(outcome.verdict), **{name: getattr(outcome, name) for name in names}}
         self._say("run", **told | {"seconds": round(outcome.seconds, 3)} | self.figures())
 
@@ -134,8 +146,8 @@ def watches(quiet: bool, as_json: bool = False) -> list[Watch]:
     return [BarWatch() if sys.stderr.isatty() else LineWatch(), LogWatch()]
 
 
-def show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
-    """How it ended: as JSON, as messages of what failed alone, or for people."""
+def show_summary(summary: Summary, out: str, quiet: bool, as_json: bool, **places: str) -> None:
+    """How it ended: as JSON, as messages of what failed alone, or for people; `places`: as in `remedy_lines`."""
     if as_json:
         told = {"verdict": summary.head.word, "verdicts": summary.head.counts()}
         figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
@@ -147,6 +159,8 @@ def show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None
                 print(f"balise: {outcome_line(outcome)}", file=sys.stderr)
     else:
         _show_ending(summary, out)
+        for line in remedy_lines(summary, out=out, **places):
+            print(f"To mend {line}")
 
 
 def _show_ending(summary: Summary, out: str, most: int = 25) -> None:

@@ -14,6 +14,7 @@ from pipeline.figures.verdict import CampaignHead, head_of, word_of
 from pipeline.results.terminal import duration_text
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
+from schemas.words import remedy_words
 
 UnderWay = Sequence[tuple[str, float]]
 
@@ -151,10 +152,40 @@ def summary_line(summary: Summary) -> str:
 
 
 def ending_rows(summary: Summary) -> pl.DataFrame:
-    """What a person reads when a campaign has ended: `verdict, run_id, why, faults`, the worst run first."""
+    """What a person reads when a campaign has ended, the worst run first: verdict, figures beside it, why, faults."""
     ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
-    rows = [(word_of(outcome.verdict), outcome.run_id, _reason(outcome), _few(outcome.faults)) for outcome in ranked]
-    return pl.DataFrame(rows, schema=dict.fromkeys(("verdict", "run_id", "why", "faults"), pl.String), orient="row")
+    names = ("verdict", "run_id", "accepted", "available", "margin", "why", "faults")
+    rows = [
+        (word_of(outcome.verdict), outcome.run_id, *_beside(outcome), _reason(outcome), _few(outcome.faults))
+        for outcome in ranked
+    ]
+    return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")
+
+
+def _beside(outcome: RunOutcome) -> tuple[str, str, str]:
+    """Balises accepted of those on the path, availability, proof margin."""
+    if outcome.verdict is None:
+        return "-", "-", "-"
+    accepted = f"{outcome.balises_accepted} of {outcome.balises_on_path}"
+    available = "-" if outcome.availability is None else f"{outcome.availability:.0%}"
+    return accepted, available, "-" if outcome.proof_margin_m is None else f"{outcome.proof_margin_m:.1f} m"
+
+
+def remedy_lines(summary: Summary, **places: str) -> list[str]:
+    """Per remedy how many runs it would mend, and the command for the worst of them; the most frequent first.
+
+    `places`: paths as the user named them.
+    """
+    ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
+    mended: dict[str, list[RunOutcome]] = {}
+    for outcome in ranked:
+        for remedy in outcome.remedies:
+            mended.setdefault(remedy, []).append(outcome)
+    order = sorted(mended, key=lambda remedy: -len(mended[remedy]))
+    return [
+        f"{len(runs)} of {len(ranked)} runs: {remedy_words(remedy, **places | {'run': runs[0].log})}"
+        for remedy, runs in ((remedy, mended[remedy]) for remedy in order)
+    ]
 
 
 def _reason(outcome: RunOutcome) -> str:
@@ -182,11 +213,20 @@ def outcome_rows(summary: Summary) -> pl.DataFrame:
         "skipped": pl.Boolean,
         "attempts": pl.Int64,
         "error": pl.String,
+        "balises_accepted": pl.Int64,
+        "balises_on_path": pl.Int64,
+        "availability": pl.Float64,
+        "proof_margin_m": pl.Float64,
         "why": pl.String,
+        "remedies": pl.List(pl.String),
         "faults": pl.List(pl.String),
     }
     rows = [
-        (word_of(outcome.verdict), *(getattr(outcome, name) for name in list(kinds)[1:-1]), list(outcome.faults))
+        (word_of(outcome.verdict), *(_listed(getattr(outcome, name)) for name in list(kinds)[1:]))
         for outcome in summary.outcomes
     ]
     return pl.DataFrame(rows, schema=kinds, orient="row")
+
+
+def _listed(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value

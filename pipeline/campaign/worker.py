@@ -65,7 +65,7 @@ def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
         if job.write_route:
             _write_found_route(job, run, site)
     _write(job, tables, _metadata(job, log, worst(tables.runs)) | {"log_digest": run.input_digest})
-    return _proved(job, log, outcome_of(job, tables.runs, tables.hazards))
+    return _proved(job, log, outcome_of(job, tables.runs, tables.hazards, tables.passages))
 
 
 def fail_run(job: RunJob, failure: Failure, log: RecordedLog | None = None) -> RunOutcome:
@@ -129,8 +129,9 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
 
 def _earlier(job: RunJob, log: RecordedLog) -> RunOutcome:
     """The outcome of a run that is complete already."""
-    runs, hazards = (store.tables_of(job.out, name, [job.run_id]) for name in ("runs", "hazards"))
-    return _proved(job, log, replace(outcome_of(job, runs, hazards), skipped=True))
+    names = ("runs", "hazards", "passages")
+    runs, hazards, passages = (store.tables_of(job.out, name, [job.run_id]) for name in names)
+    return _proved(job, log, replace(outcome_of(job, runs, hazards, passages), skipped=True))
 
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:

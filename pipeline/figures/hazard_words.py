@@ -7,20 +7,74 @@ from typing import Any
 
 import polars as pl
 
-from schemas.enums import Timing
+from schemas.arrays import NS_PER_S
+from schemas.enums import Hazard, Judgement, PassageStatus, Timing
 
 Row = Mapping[str, Any]
 
 
-def hazard_words(hazards: pl.DataFrame) -> list[str]:
-    """One phrase per fault of a `hazards` table, the worst first; rows that another hazard made are left out."""
+def hazard_words(hazards: pl.DataFrame, passages: pl.DataFrame) -> list[str]:
+    """One phrase per fault of a `hazards` table, the worst first; rows that another hazard made are left out.
+
+    `passages`: of the same run, for where the balises were that it had accepted.
+    """
     faults = hazards.filter(pl.col("caused_by").is_null())
-    return [hazard_phrase(row) for row in sorted(faults.iter_rows(named=True), key=_badness)]
+    wrong = _wrong_acceptances(passages)
+    ranked = sorted(faults.iter_rows(named=True), key=_badness)
+    return [hazard_phrase(row, wrong.get((row["solution"], row["hazard_id"]))) for row in ranked]
 
 
-def hazard_phrase(row: Row) -> str:
-    """`VB_JUMP_1B: VB04 502 m early, accepted; no monitor saw it`."""
-    return f"{row['hazard']}: {_what(row)}, {_accepted(row)}; {_seen(row)}{_in_use(row)}"
+def hazard_phrase(row: Row, accepted: Row | None = None) -> str:
+    """`VB_JUMP_1B: VB04 accepted 303.6 m early; no monitor saw it`, or `VB_SHIFT: VB03 40 m late, not accepted; ...`.
+
+    `accepted`: the worst of the wrong acceptances of the row; a balise is as far off as its own location error says,
+    not as the fault at its largest.
+    """
+    what = f"{_what(row)}, {_accepted(row)}" if accepted is None else _wrongly_accepted(row, accepted)
+    return f"{row['hazard']}: {what}; {_seen(row)}{_in_use(row)}"
+
+
+def withstood(hazards: pl.DataFrame) -> str:
+    """`2 jumps negated within 0.2 s, 1 shift seen by no monitor and not in use`: what a safe run came through."""
+    faults = hazards.filter(pl.col("caused_by").is_null())
+    parts = []
+    for (kind,), rows in faults.group_by(pl.col("hazard").replace_strict(_KINDS), maintain_order=True):
+        for (detected,), part in rows.group_by("detected", maintain_order=True):
+            parts.append(f"{part.height} {kind}{'s' * (part.height > 1)} {_met(part, detected=bool(detected))}")
+    return ", ".join(parts)
+
+
+_KINDS = {
+    Hazard.VB_JUMP_1A.value: "jump",
+    Hazard.VB_JUMP_1B.value: "jump",
+    Hazard.VB_SHIFT.value: "shift",
+    Hazard.VB_WRONG_TRACK.value: "wrong track",
+}
+
+
+def _met(rows: pl.DataFrame, *, detected: bool) -> str:
+    """How the LDS met these faults: from the begin of the fault to the block."""
+    if not detected:
+        return "that no monitor saw, none accepted"
+    took_s = (rows["t_negated"] - rows["t_onset"]).dt.total_nanoseconds().max()
+    return "negated" if took_s is None else f"negated within {float(str(took_s)) / NS_PER_S:.3g} s"
+
+
+def _wrong_acceptances(passages: pl.DataFrame) -> dict[tuple[str, int], Row]:
+    """Of each hazard the wrong acceptance with the largest location error."""
+    wrong = passages.filter(
+        (pl.col("status") == PassageStatus.ACCEPTED.value) & (pl.col("judgement") == Judgement.WRONG.value)
+    )
+    worst = wrong.drop_nulls("hazard_id").sort(pl.col("location_error_m").abs(), descending=True, nulls_last=True)
+    rows = worst.unique(["solution", "hazard_id"], keep="first", maintain_order=True)
+    return {(row["solution"], row["hazard_id"]): row for row in rows.iter_rows(named=True)}
+
+
+def _wrongly_accepted(row: Row, accepted: Row) -> str:
+    error_m, others = accepted["location_error_m"], len(row["accepted_ids"] or []) - 1
+    side = "" if error_m is None else " early" if error_m > 0 else " late"
+    off = " at a wrong place" if error_m is None else f" {abs(error_m):.1f} m{side}"
+    return f"{accepted['balise_id']} accepted{off}" + (f", and {others} more" if others > 0 else "")
 
 
 def _badness(row: Row) -> tuple[Any, ...]:

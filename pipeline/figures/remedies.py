@@ -63,9 +63,11 @@ def remedies(run: Row, lost: LostTime, unknown: Unknown, survey_stated: bool, co
 
     healthy = lost.unfounded and not run["faults_injected"]
     noisy = healthy and lost.monitor in FAST and costs(LostTo.ALARM, LostTo.RELINK)
-    without_scale = run["vehicle"] == VehicleFigures.LEARNED
+    calibrate = noisy or costs(LostTo.NOISE)
+    # What calibrates the noise measures the odometer too.
+    without_scale = run["vehicle"] == VehicleFigures.LEARNED and not calibrate
     table = {
-        Remedy.CALIBRATE: noisy or costs(LostTo.NOISE),
+        Remedy.CALIBRATE: calibrate,
         Remedy.VEHICLE_FILE: without_scale and (costs(LostTo.RELINK) or unproven),
         Remedy.REFERENCE: missing and not truth,
         Remedy.READS_AT_ENDS: missing and truth and unknown.at_ends,

@@ -63,14 +63,6 @@ def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
     return RunVerdict.UNPROVEN if found else RunVerdict.SAFE
 
 
-def verdict_reasons(run: Row) -> str:
-    """The reasons of a `runs` row in words."""
-    return (
-        ", ".join(str(reason).replace("_", " ") for reason in run["reasons"] or ())
-        or "every acceptance right, every position failure within the time allowed"
-    )
-
-
 def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
     """The verdict that heads several; None stands for one that failed, and proves nothing beside others."""
     found = {None if verdict is None else RunVerdict(verdict) for verdict in verdicts}
@@ -119,6 +111,18 @@ def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
     """Each run's verdict, the worst of its solutions, from `runs` with `run_id`."""
     listed = runs.group_by("run_id").agg(pl.col("verdict").cast(pl.String)).sort("run_id")
     return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}
+
+
+def figures_beside(runs: pl.DataFrame) -> Row:
+    """The figures beside a campaign's verdict: sums, availability by time, and the least margin."""
+    weight_s = pl.col("held_s").filter(pl.col("availability").is_not_null()).sum()
+    available = (pl.col("availability") * pl.col("held_s")).sum() / weight_s
+    figures = runs.select(
+        pl.col("balises_accepted", "balises_on_path").sum(),
+        pl.col("proof_margin_m").min(),
+        availability=pl.when(weight_s > 0.0).then(available),
+    )
+    return figures.row(0, named=True)
 
 
 LEVEL_LISTS = {

@@ -92,8 +92,6 @@ class LocationSystem:
         end = self._events[near] if near < len(self._events) else len(self._t_ns)
         for monitors in (self._bank, self.distance):
             end = monitors.quiet_until(k, end) if end > k else k
-        unknown = ~self._bank.noise_known[k:end]
-        end = k + int(unknown.argmax()) if unknown.any() else end
         closing = self._way_m[k:end] > self.balises.closing_m
         return k + int(closing.argmax()) if closing.any() else end
 
@@ -132,7 +130,7 @@ class LocationSystem:
 
     def _withheld_for(self, k: int) -> LostTo | None:
         """Why the diagnosis cannot stand behind a position here, as it says itself (DOMAIN section 5.2)."""
-        if not self._bank.noise_known[k]:
+        if not self._bank.noise_known_at(k):
             return LostTo.NOISE
         if self._journey.slips[k]:
             return LostTo.SLIP

@@ -76,6 +76,10 @@ class _AxisBank:
         self.value[part.epoch] = np.where(evaluated, value, np.nan)
         self.threshold[part.epoch] = np.where(evaluated, threshold, np.nan)
 
+    def noise_known(self, part: slice) -> Bools:
+        """Per epoch whether the fast noise of the axis is known there."""
+        return np.ones(self.begins[part].size, dtype=np.bool_)
+
     def restart(self, epoch: int) -> None:
         """Forget all before this epoch; the first increment is from the first usable epoch here to the next."""
         row = int(np.searchsorted(self._series.epoch, epoch))
@@ -131,7 +135,7 @@ class MonitorBank:
         self._stops = np.zeros(count, dtype=np.bool_)
         self._fast = np.zeros(count, dtype=np.bool_)
         self._along = np.zeros(count, dtype=np.bool_)
-        self._noise_known = np.ones(count, dtype=np.bool_)
+        self._noise_known = np.zeros(count, dtype=np.bool_)
         self._known_to = -1
 
     def _look(self, epoch: int) -> None:
@@ -142,7 +146,8 @@ class MonitorBank:
         part = slice(begin, self._known_to + 1)
         fails = [axis.state[part] == FAIL for axis in self._axes]
         self._any[part] = np.logical_or.reduce([fail.any(axis=1) for fail in fails]) | self._single_fails[part]
-        self._stops[part] = self._any[part] | self._watching.begins[part]
+        self._noise_known[part] = self._axes[0].noise_known(part)
+        self._stops[part] = self._any[part] | self._watching.begins[part] | ~self._noise_known[part]
         fast = np.logical_or.reduce([fail[:, :2].any(axis=1) for fail in fails])
         self._fast[part] = fast | self._single_fails[part]
         self._along[part] = self._axes[0].state[part, 0] != NOT_EVALUATED
@@ -167,9 +172,9 @@ class MonitorBank:
         return bool(self._along[epoch])
 
     def quiet_until(self, epoch: int, end: int) -> int:
-        """The first epoch from `epoch` on at which a monitor fails or the bank begins, or that is not looked at yet.
+        """The first epoch from `epoch` on at which a monitor fails, the bank begins or the noise is not known.
 
-        At most `end`.
+        At most `end`, and the first epoch that is not looked at yet.
         """
         self._look(epoch)
         ahead = self._stops[epoch : min(self._known_to + 1, end)]
@@ -182,8 +187,15 @@ class MonitorBank:
 
     @property
     def noise_known(self) -> Bools:
-        """Per epoch whether the fast noise along the track is known."""
+        """Per epoch whether the fast noise along the track is known, once the LDS has walked to the end of the run."""
+        if self._any.size:
+            self._look(self._any.size - 1)
         return self._noise_known
+
+    def noise_known_at(self, epoch: int) -> bool:
+        """The fast noise along the track is known at this epoch, by what was before it."""
+        self._look(epoch)
+        return bool(self._noise_known[epoch])
 
     def begins_at(self, epoch: int) -> bool:
         """The bank begins here: at the start, after a gap, after lost distance or at a restart; nothing leads here."""

@@ -54,9 +54,10 @@ class Campaign:
 
 
 RUN_COLUMNS = (
-    *("verdict", "run_id", "why", "unsafe_accepted", "failures_beyond_budget", "missed_detections"),
-    *("unproven_accepted", "share_unknown", "balises_accepted", "balises_on_path", "location_error_max_m"),
-    *("hazards", "hazardous_max_s", "time_to_detect_max_s", "alarms", "false_alarms", "availability", "outages"),
+    *("verdict", "run_id", "balises_accepted", "balises_on_path", "availability", "proof_margin_m", "why", "remedies"),
+    *("unsafe_accepted", "failures_beyond_budget", "missed_detections", "unproven_accepted", "share_unknown"),
+    *("part_verdict", "part_share", "location_error_max_m", "hazards", "hazardous_max_s", "time_to_detect_max_s"),
+    *("alarms", "false_alarms", "lost_to", "lost_to_share", "lost_to_monitor", "outages"),
     *("evidence", "solution", "t_start", "duration_s", "distance_m", "status", "notes", "input_digest"),
 )
 _HAZARD_COLUMNS = (
@@ -72,7 +73,7 @@ _RANK = {RunVerdict.UNSAFE.value: 0, None: 1, RunVerdict.UNPROVEN.value: 2, RunV
 def campaign_page(campaign: Campaign, made: Made) -> str:
     """HTML of the campaign."""
     solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
-    head, named = campaign_headline(campaign.runs, campaign.hazards)
+    head, named = campaign_headline(campaign.runs, campaign.hazards, campaign.passages)
     # Each run counts once, by the worst of its solutions.
     counts = head_of(run_verdicts(campaign.runs).values()).counts()
     body = [
@@ -93,7 +94,7 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     }
     way = "" if named is None else f'<p class="ways">{link(campaign.hrefs[named], f"Open run {named}")}</p>'
     count = plural(campaign.runs["run_id"].n_unique(), "run")
-    heading = verdict_head(head.word, head.worst, head.reasons) + way + f"<h1>Campaign of {count}</h1>"
+    heading = verdict_head(head.word, head.worst, head.reasons, head.beside) + way + f"<h1>Campaign of {count}</h1>"
     foot = ", ".join(campaign.runs["software"].unique().sort().to_list())
     title = f"Campaign · balise: {head.word}"
     return page(title, heading, "\n".join(body), script_json(data), "campaign.js", foot)
@@ -138,7 +139,7 @@ def _runs_table(campaign: Campaign, made: Made) -> str:
             nulls_last=True,
         )
     )
-    why = _whys(campaign, made)
+    why = _whys(campaign)
 
     def digest(row: Row) -> Cell:
         whole = row["input_digest"]
@@ -158,15 +159,17 @@ def _runs_table(campaign: Campaign, made: Made) -> str:
     return frame_table("table-runs", caption, runs, RUN_COLUMNS, CampaignRuns, special)
 
 
-def _whys(campaign: Campaign, made: Made) -> dict[tuple[str, str], str]:
+def _whys(campaign: Campaign) -> dict[tuple[str, str], str]:
     """Per run and solution what is wrong with it, in a few words; nothing where it is safe."""
-    faults, none = campaign.hazards.partition_by("run_id", as_dict=True), campaign.hazards.clear()
-    return {
-        (row["run_id"], row["solution"]): ""
-        if row["verdict"] == RunVerdict.SAFE
-        else run_headline([row], faults.get((row["run_id"],), none)).worst
-        for row in campaign.runs.iter_rows(named=True)
-    }
+    faults = campaign.hazards.partition_by("run_id", as_dict=True)
+    offers = campaign.passages.filter(pl.col("hazard_id").is_not_null()).partition_by("run_id", as_dict=True)
+    whys = {}
+    for row in campaign.runs.iter_rows(named=True):
+        run = (row["run_id"],)
+        of_run = faults.get(run, campaign.hazards.clear()), offers.get(run, campaign.passages.clear())
+        safe = row["verdict"] == RunVerdict.SAFE
+        whys[row["run_id"], row["solution"]] = "" if safe else run_headline([row], *of_run).worst
+    return whys
 
 
 def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:

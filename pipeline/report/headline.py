@@ -8,53 +8,63 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.figures.hazard_words import hazard_words
-from pipeline.figures.verdict import head_of, run_verdicts, verdict_reasons, word_of, worst_verdict
+from pipeline.figures.hazard_words import hazard_words, withstood
+from pipeline.figures.verdict import figures_beside, head_of, run_verdicts, word_of, worst_verdict
 from pipeline.report.columns import Row
 from pipeline.report.markup import Cell, cell, number, table
 from pipeline.report.words import WORDS, plural, some_of
 from schemas.enums import Reason, RunVerdict
 from schemas.run import RunTables
+from schemas.words import beside_words, part_words, reason_words
 
 _ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
 
 
 @dataclass(frozen=True)
 class Headline:
-    """`word` is the verdict, `worst` the sentence behind it, `reasons` all that speaks for it."""
+    """`word` is the verdict, `worst` the sentence behind it, `beside` its figures, `reasons` all that made it."""
 
     word: str
     worst: str
     reasons: str
+    beside: str = ""
 
 
-def run_headline(rows: Iterable[Row], hazards: pl.DataFrame) -> Headline:
+def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, passages: pl.DataFrame) -> Headline:
     """Of one run with all its solutions, headed by the worst of them."""
     listed = list(rows)
     verdict = worst_verdict(row["verdict"] for row in listed)
     heading = next((row for row in listed if row["verdict"] == verdict), listed[0])
-    worst = _worst(heading, hazards) if verdict is not None else heading["error"] or "the run failed"
-    named = len(listed) > 1
-    if named:
+    if verdict is None:
+        return Headline(word_of(verdict), heading["error"] or "the run failed", "")
+    worst = _worst(heading, hazards, passages)
+    beside = ". ".join(filter(None, (beside_words(heading), part_words(heading))))
+    if len(listed) > 1:
         told = " ".join(_told(row) for row in listed)
-        return Headline(word_of(verdict), f"{heading['solution']}: {worst}", told)
-    told = f"{verdict_reasons(heading)}." if verdict == RunVerdict.UNSAFE else ""
-    return Headline(word_of(verdict), worst, told)
+        return Headline(word_of(verdict), f"{heading['solution']}: {worst}", told, beside)
+    told = f"{reason_words(heading)}." if verdict == RunVerdict.UNSAFE else ""
+    return Headline(word_of(verdict), worst, told, beside)
 
 
 def _told(row: Row) -> str:
-    why = "" if row["verdict"] is None else f", {verdict_reasons(row)}"
+    why = "" if row["verdict"] is None else f", {reason_words(row)}, {beside_words(row)}"
     return f"{row['solution']}: {word_of(row['verdict'])}{why}."
 
 
-def _worst(run: Row, hazards: pl.DataFrame) -> str:
-    """What made the verdict, in the fewest words that name it: the worst of the faults that did, else the counts."""
+def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame) -> str:
+    """What made the verdict, in the fewest words that name it: the worst of the faults that did, else the counts.
+
+    Of a safe run with faults: what it withstood.
+    """
+    own = pl.col("solution") == run["solution"]
+    if run["verdict"] == RunVerdict.SAFE and (met := withstood(hazards.filter(own))):
+        return met
     accepted, late = pl.col("accepted_ids").list.len() > 0, pl.col("within_budget").eq(other=False)
-    guilty = hazards.filter(pl.col("solution") == run["solution"], accepted | late)
-    return next(iter(hazard_words(guilty)), verdict_reasons(run))
+    guilty = hazards.filter(own, accepted | late)
+    return next(iter(hazard_words(guilty, passages)), reason_words(run))
 
 
-def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame) -> tuple[Headline, str | None]:
+def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame) -> tuple[Headline, str | None]:
     """Of all runs, and the run that it names; frames with `run_id`."""
     head = head_of(run_verdicts(runs).values())
     total = sum(head.counts().values())
@@ -62,16 +72,19 @@ def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame) -> tuple[Headli
     said = f"{plural(total, 'run')}: {counts}."
     if head.verdict is None:
         return Headline(head.word, "no run could be replayed", said), None
+    beside = beside_words(figures_beside(runs))
     if head.verdict == RunVerdict.SAFE:
-        return Headline(head.word, _ALL_SAFE, said), None
+        met = withstood(hazards)
+        return Headline(head.word, _ALL_SAFE + (f": {met}" if met else ""), said, beside), None
     rows = runs.filter(pl.col("verdict") == head.verdict.value)
     order = ("unsafe_accepted", "hazardous_max_s", "unproven_accepted", "share_unknown")
     worst = rows.sort(*order, "run_id", descending=[True] * len(order) + [False], nulls_last=True).head(1)
     if worst.is_empty():
-        return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", said), None
+        return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", said, beside), None
     row = worst.row(0, named=True)
-    reason = _worst(row, hazards.filter(pl.col("run_id") == row["run_id"]))
-    return Headline(head.word, f"{reason} (run {row['run_id']})", said), row["run_id"]
+    of_run = pl.col("run_id") == row["run_id"]
+    reason = _worst(row, hazards.filter(of_run), passages.filter(of_run))
+    return Headline(head.word, f"{reason} (run {row['run_id']})", said, beside), row["run_id"]
 
 
 _TRAINS = {

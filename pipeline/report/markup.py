@@ -124,10 +124,11 @@ def badge(kind: str, text: str = "") -> str:
     return f'<span class="badge {escape(kind)}">{escape(text or kind)}</span>'
 
 
-def verdict_head(word: str, worst: str, reasons: str = "") -> str:
+def verdict_head(word: str, worst: str, reasons: str = "", beside: str = "") -> str:
     """The verdict as the first sentence of a page, coloured by it, and what speaks for it."""
+    figures = f"<br>{escape(beside[0].upper() + beside[1:])}." if beside else ""
     why = f"<br><small>{escape(reasons)}</small>" if reasons else ""
-    return f'<p class="verdict {escape(word)}"><strong>{escape(word)}</strong>: {escape(worst)}.{why}</p>'
+    return f'<p class="verdict {escape(word)}"><strong>{escape(word)}</strong>: {escape(worst)}.{figures}{why}</p>'
 
 
 def page(title: str, heading: str, body: str, data: str, script: str, foot: str) -> str:

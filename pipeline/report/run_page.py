@@ -104,8 +104,8 @@ def run_page(
         "order": [row["solution"] for row in rows],
         "solutions": {name: _solution_data(name, tables, made) for name in names},
     }
-    head = run_headline(rows, tables.hazards)
-    verdict, ways = verdict_head(head.word, head.worst, head.reasons), _ways(neighbours)
+    head = run_headline(rows, tables.hazards, tables.passages)
+    verdict, ways = verdict_head(head.word, head.worst, head.reasons, head.beside), _ways(neighbours)
     heading = f"{verdict}{ways}<h1>Run {escape(tables.run_id)}</h1>"
     foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
     return page(f"{tables.run_id} · balise: {head.word}", heading, body, script_json(data), "run.js", foot)

@@ -26,8 +26,8 @@ from schemas.run import STREAMS, Finding, Site
 STARTING_CONFIG = "Configuration to begin with"
 _SITE_FILES = {"track.parquet", "track.csv", "track.geojson"}
 _RUN_COLUMNS = (
-    *("verdict", "run_id", "solution", "status", "duration_s", "distance_m", "gnss_rate_hz", "availability"),
-    *("lost_to", "lost_to_share", "lost_to_monitor"),
+    *("verdict", "run_id", "solution", "reasons", "part_verdict", "proof_margin_m", "remedies", "status"),
+    *("duration_s", "distance_m", "gnss_rate_hz", "availability", "lost_to", "lost_to_share", "lost_to_monitor"),
     *("evidence", "vehicle", "share_unknown", "balises_on_path", "balises_accepted", "unsafe_accepted"),
     *("unproven_accepted", "failures", "failures_within_budget", *HAZARD_COUNTS, "missed_detections"),
     *("alarms", "false_alarms", "error"),

@@ -6,15 +6,17 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.figures.verdict import head_of, run_verdicts
+from pipeline.figures.verdict import figures_beside, head_of, run_verdicts
 from schemas.enums import RunStatus, Verdict
+from schemas.words import beside_words
 
 Row = dict[str, object]
 
 
 def verdict_statement(runs: pl.DataFrame) -> str:
-    """The verdict of the campaign with its counts: the first words of what is said."""
-    return f"{head_of(run_verdicts(runs).values())}."
+    """The verdict of the campaign with its counts and the figures beside it: the first words of what is said."""
+    head = head_of(run_verdicts(runs).values())
+    return f"{head}." if head.verdict is None else f"{head}; {beside_words(figures_beside(runs))}."
 
 
 def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:

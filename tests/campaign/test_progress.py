@@ -176,3 +176,24 @@ def test_json_on_both_streams(
     lines = [json.loads(line) for line in said.err.splitlines()]
     assert sorted(line["run_id"] for line in lines if line["event"] == "run") == ([] if quiet else ["run0", "run1"])
     assert bool(lines) is not quiet
+
+
+def test_each_remedy_stands_once_with_its_command_and_the_worst_run() -> None:
+    runs = [
+        replace(OK, run_id="b", log="logs/b.mcap", remedies=("route",)),
+        replace(OLD, run_id="a", log="logs/a.mcap", remedies=("vehicle_file", "route")),
+    ]
+    lines = watch.remedy_lines(Summary(2, tuple(runs), 1.0), site="line9", out="week", options=" --config c.toml")
+    assert lines == [
+        "2 of 2 runs: name the track that the train took: "
+        "`balise replay logs/a.mcap --site line9 --out week --config c.toml --route ROUTE.csv`",
+        "1 of 2 runs: measure the odometer on two or more other fault-free runs of this vehicle: "
+        "`balise replay logs/a.mcap --site line9 --out week --config c.toml --calibrate 'OTHER_RUNS/*'`",
+    ]
+
+
+def test_what_stands_beside_a_verdict_in_the_ending() -> None:
+    safe = replace(OK, balises_accepted=28, balises_on_path=31, availability=0.964, proof_margin_m=11.26)
+    rows = watch.ending_rows(Summary(2, (safe, BAD), 1.0))
+    columns = ("verdict", "accepted", "available", "margin")
+    assert rows.select(columns).rows() == [("failed", "-", "-", "-"), ("safe", "28 of 31", "96%", "11.3 m")]

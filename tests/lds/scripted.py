@@ -13,7 +13,6 @@ from schemas.config import Configuration, LdsConfig, MonitorConfig
 
 SCALE_SIGMA = 1e-4
 K_T = 5.3267238
-LONGEST = 20_000  # epochs of a journey
 INSTANT = pl.Datetime("ns", "UTC")
 
 
@@ -36,7 +35,7 @@ class ScriptedBank:
         self.fast = self.fails if fast is None else set(fast)
         self.begins = set(begins)
         self.started = 0
-        self.noise_known = ~np.isin(np.arange(LONGEST), list(unknown))
+        self.unknown = set(unknown)
         self.restarted: list[int] = []
 
     def failed(self, epoch: int) -> bool:
@@ -49,7 +48,13 @@ class ScriptedBank:
         return epoch > self.started and epoch not in self.blind
 
     def quiet_until(self, epoch: int, end: int) -> int:
-        return next((k for k in range(epoch, end) if self.failed(k) or self.begins_at(k)), end)
+        return next((k for k in range(epoch, end) if not self._quiet(k)), end)
+
+    def _quiet(self, epoch: int) -> bool:
+        return not (self.failed(epoch) or self.begins_at(epoch)) and self.noise_known_at(epoch)
+
+    def noise_known_at(self, epoch: int) -> bool:
+        return epoch not in self.unknown
 
     def along_evaluated_between(self, epoch: int, end: int) -> np.ndarray:
         return np.array([self.along_evaluated(k) for k in range(epoch, end)], dtype=bool)

@@ -14,11 +14,21 @@ from schemas.run import RunTables
 from schemas.tables import TABLES, Runs
 from tests.summary.tables import NS, alarms, epochs, hazards, passages, table
 
-SAFE = {"verdict": "safe", "reasons": [[]], "balises_accepted": 1, "accepted_judged": 1, "share_unknown": 0.004}
+SAFE = {
+    "verdict": "safe",
+    "reasons": [[]],
+    "balises_accepted": 1,
+    "balises_on_path": 1,
+    "accepted_judged": 1,
+    "share_unknown": 0.004,
+}
 UNSAFE = {
     "verdict": "unsafe",
     "reasons": [["accepted_wrong", "failure_beyond_budget", "budget_unknown", "unknown_in_use"]],
     "balises_accepted": 2,
+    "balises_on_path": 3,
+    "availability": 0.25,
+    "held_s": 60.0,
     "unsafe_accepted": 1,
     "accepted_judged": 1,
     "unproven_accepted": 1,
@@ -39,7 +49,7 @@ def run_of(run_id: str, counts: dict[str, Any], failed_s: list[float]) -> RunTab
     errors_m, hit_by = ([0.5, None, 500.0], [None, None, 0]) if failed_s else ([0.5], [None])
     offers: dict[str, Any] = {"solution": "primary", "status": "accepted", "measure_m": 1.0, "path_m": 1.0}
     offers |= {"judgement": judgement[: len(errors_m)], "balise_id": ["VB0", "VB1", "VB2"][: len(errors_m)]}
-    fault: dict[str, Any] = {"hazard": "VB_JUMP_1B", "size_m": 500.0, "timing": "early", "budget_s": 0.5025}
+    fault: dict[str, Any] = {"hazard": "VB_JUMP_1B", "size_m": 620.0, "timing": "early", "budget_s": 0.5025}
     fault |= {"balise_ids": [["VB2"]], "accepted_ids": [["VB2"]], "t_failure": NS, "solution": "primary"}
     hit = hazards(1, **fault) if failed_s else hazards()
     return RunTables(
@@ -68,9 +78,9 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("page", "word", "reason"),
     [
-        ("index.html", "unsafe", "VB_JUMP_1B: VB2 500 m early, accepted; no monitor saw it (run bad)."),
+        ("index.html", "unsafe", "VB_JUMP_1B: VB2 accepted 500.0 m early; no monitor saw it (run bad)."),
         ("runs/good.html", "safe", "every acceptance right, every position failure within the time allowed."),
-        ("runs/bad.html", "unsafe", "VB_JUMP_1B: VB2 500 m early, accepted; no monitor saw it."),
+        ("runs/bad.html", "unsafe", "VB_JUMP_1B: VB2 accepted 500.0 m early; no monitor saw it."),
         ("runs/lost.html", "failed", "gnss.parquet: column t: not in order."),
     ],
 )
@@ -81,7 +91,8 @@ def test_the_verdict_is_the_first_word(report: Path, page: str, word: str, reaso
 
 def test_all_reasons_stand_behind_it(report: Path) -> None:
     page = (report / "runs" / "bad.html").read_text()
-    assert "accepted wrong, failure beyond budget, budget unknown, unknown in use" in page
+    assert "VBs accepted despite a wrong position: 1; position failures in use for longer than allowed: 1" in page
+    assert "position failures of unknown length: 1; positions in use without a check for" in page
     assert "accepted despite the fault" in page
     assert "1 unsafe, 1 safe, 1 failed." in (report / "index.html").read_text()
 
@@ -110,3 +121,10 @@ def test_the_files_of_a_run_are_named(report: Path) -> None:
     page = (report / "runs" / "good.html").read_text().partition('id="table-files"')[2].partition("</table>")[0]
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in page.split("<tr>")[2:]]
     assert rows == [["log", "good/gnss.parquet", "1\u202f200", "ab12"], ["log", "good/&lt;b&gt;", "7", "cd34"]]
+
+
+def test_the_figures_stand_beside_every_verdict(report: Path) -> None:
+    for page, told in (("runs/bad.html", "2 of 3 balises accepted, available for 25% of the moving time"),
+                       ("runs/good.html", "1 of 1 balises accepted, the train did not move"),
+                       ("index.html", "3 of 4 balises accepted, available for 25% of the moving time")):  # fmt: skip
+        assert told in (report / page).read_text().partition("<header>")[2].partition("<h1>")[0]

@@ -109,7 +109,7 @@ def test_the_map_is_the_suspect_where_runs_agree(found: Assessment) -> None:
 
 def test_statements_say_what_the_figures_are_not(found: Assessment) -> None:
     said = found.statements
-    assert said[0] == "unsafe: 1 unsafe, 0 unproven, 2 safe, 0 failed."
+    assert said[0].startswith("unsafe: 1 unsafe, 0 unproven, 2 safe, 0 failed; ")
     assert said[1].startswith("Faults were injected into 1 of 3 runs")
     assert any(text.startswith("primary: 1 position failures in use, at a virtual balise or not: 0") for text in said)
     assert "0 in time for 0.5025 s (lpv200; 95 %: 0.0% to 97.5%)" in said[-1]
@@ -146,7 +146,7 @@ def test_a_solution_that_failed_alone_is_named_as_such(tmp_path: Path) -> None:
     failed = lost.runs.with_columns(status=pl.lit("failed", lost.runs.schema["status"]), verdict=nothing)
     write_run(RunTables(**{**vars(lost), "runs": failed}), tmp_path, {})
     said = assess(tmp_path).statements
-    assert said[0] == "unproven: 0 unsafe, 1 unproven, 0 safe, 1 failed."
+    assert said[0].startswith("unproven: 0 unsafe, 1 unproven, 0 safe, 1 failed; ")
     assert said[1] == "1 of 2 runs failed and count nowhere."
     assert said[2].startswith("gps: 1 of 2 runs failed with this solution alone and count nowhere")
 

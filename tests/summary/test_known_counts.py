@@ -11,7 +11,7 @@ from pipeline.results.inspection import inspect_result
 from pipeline.results.store import write_run
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunTables
-from schemas.tables import TABLES, Hazards, Runs
+from schemas.tables import TABLES, Hazards, Passages, Runs
 from tests.summary.tables import table
 
 ROWS = table(
@@ -40,7 +40,10 @@ def test_outcome_of_a_run() -> None:
     job = RunJob("r", "r", "site", "", Configuration(), Vehicle(), "out", "")
     told = [
         (found.hazards, found.missed_detections)
-        for found in (outcome_of(job, rows, Hazards.create_empty()) for rows in (ROWS, ROWS[1:2], ROWS[2:]))
+        for found in (
+            outcome_of(job, rows, Hazards.create_empty(), Passages.create_empty())
+            for rows in (ROWS, ROWS[1:2], ROWS[2:])
+        )
     ]
     assert told == [(1, 0), (None, None), (None, None)]
 

@@ -124,6 +124,7 @@ def test_alarms_that_nothing_explains_are_mended_by_calibration_and_not_by_more_
     blind = {"evidence": None, "share_unknown": None, "availability": 0.0}
     assert cures(blind, noisy) == [Remedy.CALIBRATE]
     assert cures({}, noisy, monitor="up_ewma_0p1") == [Remedy.CALIBRATE]
+    assert cures({"vehicle": "learned"}, noisy) == [Remedy.CALIBRATE], "which measures the odometer too"
     assert cures({}, {LostTo.RELINK: 0.5}) == [Remedy.CALIBRATE]
     assert cures({}, {LostTo.NOISE: 0.5}) == [Remedy.CALIBRATE]
     assert cures({}, noisy, unfounded=False) == []

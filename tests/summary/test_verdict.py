@@ -1,5 +1,6 @@
 """The verdict of a run, and what heads runs and campaigns, from plain numbers (DOMAIN section 5.4)."""
 
+from datetime import UTC, datetime
 from typing import Any
 
 import polars as pl
@@ -11,11 +12,11 @@ from pipeline.figures.verdict import (
     reasons_of,
     run_verdicts,
     verdict_of,
-    verdict_reasons,
     worst_verdict,
 )
 from schemas.enums import Reason, RunVerdict
 from schemas.tables import Runs
+from schemas.words import part_words, reason_words
 from tests.summary.tables import NS, hazards, table
 
 UNSAFE, UNPROVEN, SAFE = RunVerdict.UNSAFE, RunVerdict.UNPROVEN, RunVerdict.SAFE
@@ -145,4 +146,23 @@ def test_a_failure_found_between_both_bounds_is_neither_missed_nor_found() -> No
 
 
 def test_the_reasons_are_said_one_after_the_other() -> None:
-    assert verdict_reasons({"reasons": ["accepted_wrong", "accepted_unknown"]}) == "accepted wrong, accepted unknown"
+    counts = {"unsafe_accepted": 1, "unproven_accepted": 5, "failures": 4, "failures_within_budget": 1}
+    spent = {"failures_beyond_budget": 1, "hazardous_s": 8.25, "unknown_in_use_s": None, "share_undiagnosed": 0.125}
+    run = counts | spent | {"reasons": ["accepted_wrong", "budget_unknown", "not_diagnosed", "nothing_accepted"]}
+    assert reason_words(run) == (
+        "VBs accepted despite a wrong position: 1; position failures of unknown length: 2; positions in use without "
+        "diagnosis for 12.5% of the moving time in use; no VB was accepted"
+    )
+    assert (
+        reason_words(run | {"reasons": []}) == "every acceptance right, every position failure within the time allowed"
+    )
+
+
+def test_the_part_between_the_anchors_is_named_where_it_is_better() -> None:
+    run = {"verdict": "unproven", "part_verdict": "safe", "part_share": 0.924}
+    run |= {
+        "part_from": datetime(2026, 5, 4, 12, 0, 3, tzinfo=UTC),
+        "part_to": datetime(2026, 5, 4, 12, 41, tzinfo=UTC),
+    }
+    assert part_words(run) == "safe from 12:00:03 to 12:41:00, 92% of the moving time"
+    assert part_words(run | {"part_verdict": "unproven"}) == part_words(run | {"part_verdict": None}) == ""
