@@ -41,11 +41,6 @@ class KnownPath:
         element, measure, _ = self.path.legs[int(self.path.leg[sample])].locate(self.at_m[[sample]])
         return Place(int(element[0]), float(measure[0]))
 
-    def facing(self) -> int:
-        """The oriented net element of the first sample, in the sense in which the odometer counts up."""
-        element, _, sense = self.path.legs[int(self.path.leg[0])].locate(self.at_m[:1])
-        return 2 * int(element[0]) + int(sense[0] * self.sense < 0)
-
 
 @dataclass(frozen=True)
 class KnownStretch:
@@ -82,6 +77,13 @@ class Sided:
     sense: int
     with_m: float
     against_m: float
+
+    @property
+    def facing(self) -> int:
+        """The oriented net element of the first sample, in the sense in which the odometer counts up."""
+        path = self.stretch.paths[0]
+        element, _, sense = path.legs[int(path.leg[0])].locate(path.at_m[:1])
+        return 2 * int(element[0]) + int(sense[0] * self.sense < 0)
 
 
 def sided(stretch: Stretch, counter: Counter | None, least_m: float) -> Sided:

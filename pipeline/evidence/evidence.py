@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +10,7 @@ import polars as pl
 
 from pipeline.evidence.anchors import (
     KnownStretch,
+    Sided,
     known_stretch,
     on_clock,
     outside,
@@ -264,58 +265,67 @@ def evidence_of(
     """
     hazards = config.hazards
     by_file = vehicle.gnss_latency_s is not None
-    least_m = config.matching.orientation_distance_m
     counters = [Counter.of(odometer) for odometer in odometers]
     main = counters[0] if counters else None
-    found = [sided(stretch, main, least_m) for stretch in reference[0]]
-    turned = any(min(one.with_m, one.against_m) >= least_m for one in found)
-    clocks: list[Clock] = []
-    stretches: tuple[KnownStretch, ...] = ()
-    read = read_anchors(reads, balises, network.track, hazards)
-    if found:
-        clocks.append(clock_of(reference_lag(found, main), by_file, hazards))
-    facing: set[int] = set()
-
-    def carried_by(make_borders: Callable[[Counter], list[tuple[Anchor, Anchor]]]) -> tuple[Carried, ...]:
-        return tuple(
-            _carried_by(counter, make_borders(counter), facing, turned, network, config) for counter in counters
-        )
-
-    if read and main is not None:
-        pairs = _carried_by(main, [(one, one) for one in read], facing, turned, network, config)
-        clocks.append(clock_of(_lag_of_reads(pairs), by_file, hazards))
-        read = on_clock(read, clocks[-1], main)
+    found = [sided(stretch, main, config.matching.orientation_distance_m) for stretch in reference[0]]
+    carrier = _Carrier.of(found, network, config)
+    of_reference = clock_of(reference_lag(found, main), by_file, hazards)
+    reads_found = read_anchors(reads, balises, network.track, hazards)
+    lag_of_reads = Lag() if main is None else _lag_of_reads(carrier.by(main, _points(reads_found)))
+    of_reads = clock_of(lag_of_reads, by_file, hazards)
+    read = [] if main is None else on_clock(reads_found, of_reads, main)
     reads_ns = np.array([one.t_ns for one in read], dtype=np.int64)
-    shift_ns = round(clocks[0].shift_s * NS_PER_S) if found else 0
-    silent = [(begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]]
-    if found:
-        ahead_m = vehicle.gnss_antenna_ahead_m
-        stretches = tuple(known_stretch(one, clocks[0], counters, reads_ns, ahead_m, config) for one in found)
-        told = zip(found, stretches, strict=True)
-        facing |= {known.paths[0].facing() for one, known in told if abs(one.with_m - one.against_m) >= least_m}
-    apart = [(one, one) for one in outside(read, stretches)]
-    all_borders = carried_by(lambda counter: [*(one.ends(counter) for one in stretches), *apart])
-    by_reads = carried_by(lambda _: [(one, one) for one in read]) if stretches else ()
-    return Evidence(stretches, tuple(silent), all_borders, by_reads, reads_ns, tuple(clocks), network, config)
+    ahead_m = vehicle.gnss_antenna_ahead_m
+    stretches = tuple(known_stretch(one, of_reference, counters, reads_ns, ahead_m, config) for one in found)
+    apart = outside(read, stretches)
+    shift_ns = round(of_reference.shift_s * NS_PER_S)
+    return Evidence(
+        stretches=stretches,
+        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]),
+        carried=tuple(
+            carrier.by(counter, [*(one.ends(counter) for one in stretches), *_points(apart)]) for counter in counters
+        ),
+        by_reads=tuple(carrier.by(counter, _points(read)) for counter in counters) if stretches else (),
+        reads_ns=reads_ns,
+        clocks=(of_reference,) * bool(stretches) + (of_reads,) * bool(apart),
+        network=network,
+        config=config,
+    )
 
 
-def _carried_by(
-    counter: Counter,
-    borders: list[tuple[Anchor, Anchor]],
-    facing: set[int],
-    turned: bool,
-    network: Network,
-    config: Configuration,
-) -> Carried:
-    """The gaps between what is known; an odometer that counts up whichever way the train runs carries over no stand."""
-    if not borders:
-        return Carried(counter, ())
-    borders = sorted(borders, key=lambda border: border[0].t_ns)
-    gaps = gaps_of(borders, facing, counter, network, config)
-    if turned or without_sign(gaps, facing, network):
-        counter = Counter.of(counter.odometer, without_sign=True)
-        gaps = gaps_of(borders, facing, counter, network, config)
-    return Carried(counter, tuple(gaps))
+def _points(anchors: Sequence[Anchor]) -> list[tuple[Anchor, Anchor]]:
+    """Anchors that know no more than their own instant."""
+    return [(anchor, anchor) for anchor in anchors]
+
+
+@dataclass(frozen=True)
+class _Carrier:
+    """What every odometer carries over: the network, and which way the train ran as the odometer of the LDS counted up.
+
+    `facing`: oriented net elements; `turned`: it counted up in both directions.
+    """
+
+    network: Network
+    config: Configuration
+    facing: frozenset[int]
+    turned: bool
+
+    @classmethod
+    def of(cls, found: Sequence[Sided], network: Network, config: Configuration) -> _Carrier:
+        least_m = config.matching.orientation_distance_m
+        facing = frozenset(one.facing for one in found if abs(one.with_m - one.against_m) >= least_m)
+        return cls(network, config, facing, any(min(one.with_m, one.against_m) >= least_m for one in found))
+
+    def by(self, counter: Counter, borders: list[tuple[Anchor, Anchor]]) -> Carried:
+        """The gaps between what is known; an odometer that counts up in both directions carries over no stand."""
+        if not borders:
+            return Carried(counter, ())
+        borders = sorted(borders, key=lambda border: border[0].t_ns)
+        gaps = gaps_of(borders, self.facing, counter, self.network, self.config)
+        if self.turned or without_sign(gaps, self.facing, self.network):
+            counter = Counter.of(counter.odometer, without_sign=True)
+            gaps = gaps_of(borders, self.facing, counter, self.network, self.config)
+        return Carried(counter, tuple(gaps))
 
 
 def _lag_of_reads(source: Carried) -> Lag:

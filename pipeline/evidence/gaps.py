@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
@@ -60,7 +60,7 @@ class Gap:
 
 def gaps_of(
     borders: Sequence[tuple[Anchor, Anchor]],
-    facing: set[int],
+    facing: Set[int],
     counter: Counter,
     network: Network,
     config: Configuration,
@@ -79,7 +79,7 @@ def gaps_of(
     return [_reaching(gap, sheets, counter, network, config) for gap in found]
 
 
-def without_sign(gaps: Sequence[Gap], facing: set[int], network: Network) -> bool:
+def without_sign(gaps: Sequence[Gap], facing: Set[int], network: Network) -> bool:
     """The odometer counted up whichever way the train ran."""
     return not _sheets(gaps, facing, network)
 
@@ -155,7 +155,7 @@ def _distinct(ways: list[Way]) -> list[Way]:
     return list(kept.values())
 
 
-def _sheets(gaps: Sequence[Gap], facing: set[int], network: Network) -> set[bool]:
+def _sheets(gaps: Sequence[Gap], facing: Set[int], network: Network) -> set[bool]:
     """Which orientation of the network the train keeps over the whole run; both where nothing says it.
 
     Where a loop turns trains round, or parts of the network are not connected, nothing does. None where the gaps
