@@ -8,7 +8,6 @@ import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
-from pipeline.evidence.reference import reference_stretches
 from pipeline.figures.notes import ride_notes
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.figures.undetected import Spacing
@@ -22,6 +21,7 @@ from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor, on_path_of
 from pipeline.odometry import Odometry, odometry_of
 from pipeline.plausibility.fit import Fit, fit_run, refuse_impossible
+from pipeline.reference import reference_stretches
 from pipeline.results.provenance import Provenance, provenance
 from pipeline.track.network import network_in_pieces, site_network
 from pipeline.undetected.columns import Diagnosis, undetected_of

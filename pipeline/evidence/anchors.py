@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.evidence.carrying import Anchor, Counter
 from pipeline.evidence.clock import Clock, Lag, lag_of
-from pipeline.evidence.reference import ReferencePath, Stretch
+from pipeline.reference import ReferencePath, Stretch
 from pipeline.track.path import Place
 from pipeline.track.survey import Track
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns

@@ -21,8 +21,8 @@ from pipeline.evidence.anchors import (
 from pipeline.evidence.carrying import Anchor, Counter, Interval, between_anchors, carried
 from pipeline.evidence.clock import Clock, Lag, clock_of, lag_of
 from pipeline.evidence.gaps import Gap, Way, gaps_of, unreachable, without_sign
-from pipeline.evidence.reference import Stretch
 from pipeline.odometry import Odometry
+from pipeline.reference import Stretch
 from pipeline.track.network import Network
 from pipeline.track.path import Route
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints

@@ -9,7 +9,8 @@ from itertools import pairwise, product
 import numpy as np
 
 from pipeline.evidence.carrying import Anchor, Counter, beside_m, carried, closes
-from pipeline.evidence.chains import Chain, chains_between, extended
+from pipeline.evidence.chains import chains_between, extended
+from pipeline.track.chain import Chain
 from pipeline.track.network import Network
 from schemas.arrays import NS_PER_S, Ints
 from schemas.config import Configuration

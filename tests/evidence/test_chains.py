@@ -7,7 +7,8 @@ import polars as pl
 import pytest
 
 from pipeline.evidence.anchors import read_anchors
-from pipeline.evidence.chains import Chain, chains_between, extended
+from pipeline.evidence.chains import chains_between, extended
+from pipeline.track.chain import Chain
 from pipeline.track.network import Network, network_of
 from pipeline.track.path import Place, Route
 from pipeline.track.survey import track_of

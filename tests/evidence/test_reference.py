@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.evidence.evidence import NOTHING
-from pipeline.evidence.reference import ReferencePath, reference_stretches
+from pipeline.reference import ReferencePath, reference_stretches
 from pipeline.track.network import network_in_pieces, site_network
 from schemas.arrays import Floats
 from schemas.config import Configuration

@@ -12,8 +12,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.evidence import Evidence, EvidenceSet, evidence_of
-from pipeline.evidence.reference import reference_stretches
 from pipeline.odometry import odometry_of
+from pipeline.reference import reference_stretches
 from pipeline.track.network import network_in_pieces, site_network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, Vehicle

@@ -9,9 +9,9 @@ from math import dist
 import numpy as np
 import polars as pl
 
-from pipeline.evidence.chains import Chain
-from pipeline.evidence.near import Foot, Near, near_elements
-from pipeline.evidence.visits import Move, Node, Stay, nodes_of, pieces_of, ways_over
+from pipeline.reference.near import Foot, Near, near_elements
+from pipeline.reference.visits import Move, Node, Stay, nodes_of, pieces_of, ways_over
+from pipeline.track.chain import Chain
 from pipeline.track.geodesy import Points, points_of
 from pipeline.track.network import MIN_REACH_M, Network
 from pipeline.track.path import Route
