@@ -331,6 +331,8 @@ class AlignConfig(Settings):
     slip_sigma_mps: Positive = 0.185
     # By what share of the way a wheel that slips or slides may miscount: anti-slip control keeps it below, ours.
     slip_way_share: Probability = 0.1
+    # The same of another odometer that does not slip: 0.8 % of scale was seen in recorded runs (DOMAIN section 3).
+    other_way_share: Probability = 0.01
     # Smaller steps of a counter do not count: they scatter less than the white noise of one second.
     counter_step_m: Positive = 0.05
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of

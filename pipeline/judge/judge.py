@@ -17,7 +17,7 @@ from pipeline.judge.case import Case, between_far_epochs
 from pipeline.judge.episodes import find_episodes
 from pipeline.judge.failures import course_of, failures_table, find_failures, positions_of
 from pipeline.judge.hazards import Offers, hazard_rows, hazards_table
-from pipeline.judge.judged import epochs_judged, offers_judged, standing
+from pipeline.judge.judged import epochs_judged, odometer_of, offers_judged
 from pipeline.judge.judgement import Judgements
 from pipeline.judge.jumps import jumps_of
 from pipeline.judge.movement import Span
@@ -49,10 +49,10 @@ class Judged:
 def judge(case: Case) -> Judged:
     """Judge one solution: epochs, offers, jumps, failures, episodes, then the rows."""
     config = case.config
-    stood = standing(case)
-    epochs = epochs_judged(case, stood)
+    counted = odometer_of(case)
+    epochs = epochs_judged(case, counted)
     epochs = epochs.with_columns(_across(case, epochs))
-    offers = offers_judged(case, epochs, stood)
+    offers = offers_judged(case, epochs, counted.stood)
     positions = positions_of(epochs)
     gap_ns = crossing_gap_ns(times_ns(positions), config.lds)
     course = course_of(positions, jumps_of(positions, case.odometry, gap_ns, config.hazards), config.hazards)
@@ -62,7 +62,7 @@ def judge(case: Case) -> Judged:
     hit = Offers.of(offers, course.positions)
     rows = hazard_rows(episodes, course, hit, config.hazards)
     spans = [episode.undetected_ns for episode in episodes]
-    crossings = _true_crossings(case, stood)
+    crossings = _true_crossings(case, counted.stood)
     return Judged(
         hazards=hazards_table(rows, case, epochs, course, hit),
         alarms=alarms_table(case.solution.name, epochs, log, rows, config),

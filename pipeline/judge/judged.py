@@ -8,10 +8,10 @@ import polars as pl
 from pipeline.epochs.clock import met, unambiguous
 from pipeline.evidence import true_places
 from pipeline.evidence.carrying import carried_forward
-from pipeline.evidence.evidence import KINDS, EvidenceSet, within_spans
+from pipeline.evidence.evidence import KINDS, NOTHING, EvidenceSet, within_spans
 from pipeline.judge.case import Case
 from pipeline.judge.judgement import Judgements, Positions, judge_positions, with_own_anchors
-from pipeline.judge.movement import Span, moving, odometer_steps, stood_spans, travel_direction
+from pipeline.judge.movement import Counted, Span, counted_of, moving, travel_direction
 from pipeline.judge.use import lds_states, odometer_beyond_confidence, time_in_use
 from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import HazardConfig
@@ -20,13 +20,13 @@ from schemas.enums import BaliseKind, Evidence, PassageStatus
 _REFERENCE = KINDS.index(Evidence.REFERENCE)
 
 
-def standing(case: Case) -> list[Span]:
-    """When the odometer stood although positions left their place [ns]."""
-    at_ns, path_m = case.instants_of_epochs(), floats(case.solution.epochs, "path_m")
-    return stood_spans(at_ns, path_m, *odometer_steps(case.odometry, at_ns), case.config.hazards.failure_limit_m)
+def odometer_of(case: Case) -> Counted:
+    """What the odometer says from epoch to epoch."""
+    path_m = floats(case.solution.epochs, "path_m")
+    return counted_of(case.odometry, case.instants_of_epochs(), path_m, case.config.hazards.failure_limit_m)
 
 
-def epochs_judged(case: Case, stood: list[Span]) -> pl.DataFrame:
+def epochs_judged(case: Case, counted: Counted) -> pl.DataFrame:
     """The epochs of the solution with the columns of `JudgedEpochs`: evidence, direction, judgement, movement, use."""
     epochs, config, at_ns = case.solution.epochs, case.config, case.instants_of_epochs()
     path_m = floats(epochs, "path_m")
@@ -37,15 +37,13 @@ def epochs_judged(case: Case, stood: list[Span]) -> pl.DataFrame:
         path_m=path_m,
         unambiguous=met(epochs, unambiguous(config)),
     )
-    evidence = case.evidence.at(at_ns, stood)
-    along = _judge(case, positions, at_ns, evidence, stood)
+    evidence = case.evidence.at(at_ns, counted.stood)
+    along = _judge(case, positions, at_ns, evidence, counted.stood)
     given = ints(epochs["direction"], 1)
     direction = travel_direction(given, along, at_ns, path_m, case.odometry is not None, config.hazards)
     train_m = path_m - along.known_m(config.hazards.known_error_m)
     by_reference_m = np.where(along.kind == _REFERENCE, train_m, np.nan)
-    standing_still = within_spans(at_ns, stood)
-    steps = odometer_steps(case.odometry, at_ns)
-    moved, sure = moving(at_ns, by_reference_m, along.half_m, *steps, standing_still, config)
+    moved, sure = moving(at_ns, by_reference_m, along.half_m, counted, config)
     counted_wrong = _odometer_wrong(case, train_m, along.half_m)
     undiagnosed = flags(epochs, "diagnosis_faulty") | counted_wrong
     use = time_in_use(epochs, along.code, config)
@@ -62,7 +60,7 @@ def epochs_judged(case: Case, stood: list[Span]) -> pl.DataFrame:
         pl.Series("train_m", train_m, nan_to_null=True),
         pl.Series("reference_m", by_reference_m, nan_to_null=True),
         pl.Series("unambiguous", positions.unambiguous),
-        pl.Series("stood", standing_still),
+        pl.Series("stood", within_spans(at_ns, counted.stood)),
         pl.Series("odometer_wrong", counted_wrong),
         pl.Series("undiagnosed", undiagnosed),
         moving=pl.when(pl.Series(sure)).then(pl.Series(moved)),
@@ -107,7 +105,7 @@ def _judge(case: Case, positions: Positions, at_ns: Ints, evidence: EvidenceSet,
     """Errors along growing path; where nothing else speaks, against the odometer since the last accepted VB."""
     config = case.config.hazards
     found = judge_positions(positions, evidence, case.legs(), config)
-    if case.odometry is None:
+    if case.odometry is None or not ((found.kind == NOTHING) & positions.known).any():
         return found
     accepted = _accepted(case)
     since_ns = case.instants(times_ns(accepted))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from pipeline.evidence.evidence import KINDS
+from pipeline.evidence.evidence import KINDS, within_spans
 from pipeline.judge.judgement import Judgements
 from pipeline.odometry import Odometry
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
@@ -14,27 +16,32 @@ from schemas.enums import Evidence
 Span = tuple[int, int]
 
 
-def odometer_steps(odometry: Odometry | None, at_ns: Ints) -> tuple[Bools, Bools]:
-    """Per epoch whether the train moved to the next one by the odometer, and whether the odometer counted there."""
+@dataclass(frozen=True)
+class Counted:
+    """What the odometer says of each epoch, up to the next one: that the train moved, and that it counted there.
+
+    `stood`: times in which it stood while positions left their place by more than the failure limit [ns]. Whether the
+    train moved there nobody knows by the odometer.
+    """
+
+    moves: Bools
+    heard: Bools
+    stood: list[Span]
+
+
+def counted_of(odometry: Odometry | None, at_ns: Ints, path_m: Floats, limit_m: float) -> Counted:
     if odometry is None:
         nothing = np.zeros(at_ns.size, dtype=np.bool_)
-        return nothing, nothing
-    counted = np.isfinite(odometry.between(at_ns[:-1], at_ns[1:]).distance_m)
-    return _to_the_next(odometry.moved(at_ns), at_ns.size), _to_the_next(counted, at_ns.size)
-
-
-def stood_spans(at_ns: Ints, path_m: Floats, moves: Bools, counted: Bools, limit_m: float) -> list[Span]:
-    """Times in which the odometer stood while positions left their place by more than the limit [ns].
-
-    `moves`, `counted`: per epoch, up to the next one. Whether the train moved there nobody knows by the odometer.
-    """
-    found = []
-    for first, last in spans_of(counted & ~moves):
+        return Counted(nothing, nothing, [])
+    moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
+    heard = _to_the_next(np.isfinite(odometry.between(at_ns[:-1], at_ns[1:]).distance_m), at_ns.size)
+    stood = []
+    for first, last in spans_of(heard & ~moves):
         rows = slice(first, min(last + 2, at_ns.size))
         places = path_m[rows][np.isfinite(path_m[rows])]
         if places.size and float(np.abs(places - places[0]).max()) > limit_m:
-            found.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
-    return found
+            stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
+    return Counted(moves, heard, stood)
 
 
 def travel_direction(
@@ -68,25 +75,18 @@ def travel_direction(
 
 
 def moving(
-    at_ns: Ints,
-    by_reference_m: Floats,
-    half_m: Floats,
-    moves: Bools,
-    counted: Bools,
-    stood: Bools,
-    config: Configuration,
+    at_ns: Ints, by_reference_m: Floats, half_m: Floats, counted: Counted, config: Configuration
 ) -> tuple[Bools, Bools]:
     """Per epoch whether the train moved to the next one, and whether that is known: by reference or odometer.
 
     By the reference it moved where it came farther over a second than the dead band and the noise of both places
-    allow. It is also heard where the odometer stands or is silent. `stood`: within `stood_spans`.
+    allow. It is also heard where the odometer stands or is silent.
     """
     came_m, noise_m, elapsed_s = _came(at_ns, by_reference_m, half_m, config.align.speed_window_s)
     with np.errstate(invalid="ignore"):
         by_reference = np.abs(came_m) > config.matching.deadband_mps * elapsed_s + noise_m
-    heard = np.isfinite(came_m)
-    moved = by_reference | (moves & counted)
-    sure = heard | (counted & ~stood)
+    moved = by_reference | (counted.moves & counted.heard)
+    sure = np.isfinite(came_m) | (counted.heard & ~within_spans(at_ns, counted.stood))
     return _to_the_next(moved[:-1], moved.size), _to_the_next(sure[:-1], sure.size)
 
 

@@ -14,10 +14,11 @@ from tests.judge.ground import Floats
 class Fault:
     """A fault of the GNSS from `begin_s` to `end_s`.
 
-    `kind`: `step` (`size_m` ahead along the growing route), `ramp` (`rate_mps`, gone at the end), `return` (`size_m` at
-    the middle and back to nothing), `cross` (`size_m` to the left), `other_track` (on the track beside it), `latency`
-    (stamps `size_s` late, negative early), `tunnel` (no position; behind it `size_m` that fades with 20 s), `outage`
-    (no position). `in_velocity`: the velocity carries the same fault (a filtered receiver, spoofing).
+    `kind`: `step` (`size_m` ahead along the growing route), `pulses` (the same for `size_s` of each second), `ramp`
+    (`rate_mps`, gone at the end), `return` (`size_m` at the middle and back to nothing), `cross` (`size_m` to the
+    left), `other_track` (on the track beside it), `latency` (stamps `size_s` late, negative early), `tunnel` (no
+    position; behind it `size_m` that fades with 20 s), `outage` (no position). `in_velocity`: the velocity carries the
+    same fault (a filtered receiver, spoofing).
     """
 
     kind: str
@@ -36,6 +37,8 @@ class Fault:
         since = time_s - self.begin_s
         if self.kind == "step":
             return np.where(self.inside(time_s), self.size_m, 0.0)
+        if self.kind == "pulses":
+            return np.where(self.inside(time_s) & ((since + 1e-6) % 1.0 < self.size_s), self.size_m, 0.0)
         if self.kind == "ramp":
             return np.where(self.inside(time_s), self.rate_mps * since, 0.0)
         if self.kind == "return":

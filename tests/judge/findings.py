@@ -116,6 +116,7 @@ class Rung:
             (pl.col("confidence_m").fill_null(np.inf) <= CI_LIMIT_M)
             & pl.col("on_track").fill_null(False)
             & (pl.col("gate_probability").fill_null(0) >= GATE)
+            & pl.col("withheld_for").is_null()
         )
         usable = frame.select(fit).to_series().to_numpy()
         safe = (frame["lds_mode"].cast(pl.String) == "fail_safe").to_numpy()
@@ -123,12 +124,13 @@ class Rung:
         before = np.concatenate([[False, False], safe[:-2]]) if len(safe) > 2 else safe
         return usable & ~safe & ~alarm, usable & ~(safe & before)
 
-    @cached_property
-    def span_s(self) -> Floats:
-        """Time from the epoch before, at most 1.5 periods or 1 s (DOMAIN 5.3)."""
+    def counted_s(self, mask: Bools) -> Floats:
+        """Time from the epoch before: whole where that is of the mask too, else at most one period (DOMAIN 5.3)."""
         time = self.epochs.time_s
         period = float(np.median(np.diff(time)))
-        return np.minimum(np.diff(time, prepend=time[0] - period), max(1.5 * period, 1.0))
+        step = np.diff(time, prepend=time[0] - period)
+        lasted = np.concatenate([[False], mask[:-1]])
+        return np.where(mask, np.where(lasted, step, np.minimum(step, period)), 0.0)
 
 
 def rungs_of(journey: Journey, config: Configuration | None = None) -> dict[str, Rung]:
@@ -158,6 +160,10 @@ def findings(journey: Journey, rungs: dict[str, Rung]) -> list[str]:
     """Every breach, told with rung, instant and true error."""
     found = [f"{name}: {text}" for name, rung in rungs.items() for text in _of_rung(rung)]
     names = [name for name in RUNGS if name in rungs]
+    best = [name for name in names if rungs[name].row["verdict"] == "safe"]
+    for name in names[: names.index(best[-1])] if best else []:
+        if rungs[name].row["verdict"] != "safe":
+            found.append(f"{best[-1]}: its verdict is better than that of {name}, {rungs[name].row['verdict']}")
     for stronger, weaker in ((a, b) for k, a in enumerate(names) for b in names[k + 1 :]):
         found += [f"{weaker} against {stronger}: {text}" for text in _ladder(rungs[stronger], rungs[weaker])]
     return [f"{journey.name}: {text}" for text in found]

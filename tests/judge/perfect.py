@@ -12,7 +12,6 @@ import polars as pl
 
 from tests.judge.accounts import BUDGET_S, longest_s
 from tests.judge.findings import LIMIT_M, Judgements, Rung
-from tests.judge.ground import Floats
 
 
 def perfect(rung: Rung, blur_m: float) -> Rung:
@@ -52,20 +51,25 @@ def _row(rung: Rung) -> pl.DataFrame:
     wrong = (rung.epochs.judgement == "wrong") & surely
     unsafe = int((accepted & (rung.passages.judgement == "wrong")).sum())
     unproven = int((accepted & (rung.passages.judgement == "unknown")).sum())
-    hazardous, share = longest_s(wrong, rung.span_s), _share(rung, rung.span_s)
+    hazardous, share = longest_s(rung, wrong), _share(rung)
+    moving = rung.tables.epochs["moving"].fill_null(True).to_numpy()
+    unseen = longest_s(rung, surely & moving & (rung.epochs.judgement == "unknown"))
     bad = unsafe > 0 or hazardous > BUDGET_S
-    doubtful = unproven > 0 or share > 0.01 or not accepted.any()
+    doubtful = unproven > 0 or unseen > BUDGET_S or not accepted.any()
     return rung.tables.runs.with_columns(
         verdict=pl.lit("unsafe" if bad else "unproven" if doubtful else "safe"),
         unsafe_accepted=pl.lit(unsafe),
         unproven_accepted=pl.lit(unproven),
         failures=pl.lit(int(wrong.any())),
         hazardous_max_s=pl.lit(hazardous),
+        hazardous_s=pl.lit(float(rung.counted_s(wrong).sum())),
+        share_p1=pl.lit(None, pl.Float64),
         share_unknown=pl.lit(share),
     )
 
 
-def _share(rung: Rung, span_s: Floats) -> float:
+def _share(rung: Rung) -> float:
     surely, _ = rung.in_use
     used = surely & rung.tables.epochs["moving"].fill_null(True).to_numpy()
-    return float(span_s[used & (rung.epochs.judgement == "unknown")].sum() / max(span_s[used].sum(), 1e-9))
+    unknown = rung.counted_s(used & (rung.epochs.judgement == "unknown"))
+    return float(unknown.sum() / max(rung.counted_s(used).sum(), 1e-9))

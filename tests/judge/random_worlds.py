@@ -133,6 +133,9 @@ def _fault(draw: Draw, length_s: float, aside_m: float) -> Fault:
     begin = draw.between(40.0, length_s - TAIL_S - 30.0)
     end = min(begin + draw.between(5.0, 90.0), length_s - (0.0 if draw.chance(0.3) else TAIL_S))
     size, carried = draw.sign() * draw.between(5.0, 120.0), draw.chance(0.5)
+    if kind == "step" and draw.chance(0.3):
+        # At one position a second all of them are hit, or none; at five one in five to three in five.
+        return Fault("pulses", begin, end, size_m=size, size_s=draw.between(0.1, 0.6))
     if kind == "standing":
         return Fault("step", 0.0, 1e9, size_m=size / 2)
     if kind == "latency":

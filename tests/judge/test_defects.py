@@ -9,11 +9,11 @@ import polars as pl
 import pytest
 
 from tests.judge.accounts import BUDGET_S
-from tests.judge.faults import Fault
+from tests.judge.faults import Fault, Slip
 from tests.judge.findings import CI_LIMIT_M, LIMIT_M, Rung, findings, rungs_of
 from tests.judge.ground import make_ground
 from tests.judge.ride import Leg
-from tests.judge.sensors import Better
+from tests.judge.sensors import Better, Counter
 from tests.judge.world import World, make_journey
 
 LINE = make_ground(18000.0, bend_deg=3.0)
@@ -114,7 +114,7 @@ def test_a_returned_fault_counts_its_whole_time() -> None:
     rung = rungs["reference"]
     surely, at_most = rung.in_use
     wrong = rung.epochs.judgement == "wrong"
-    counted, most = float(rung.span_s[wrong & surely].sum()), float(rung.span_s[wrong & at_most].sum())
+    counted, most = float(rung.counted_s(wrong & surely).sum()), float(rung.counted_s(wrong & at_most).sum())
     assert counted > 0 or most > 0, "the fault was never in use: nothing is tested"
     hazardous = float(rung.tables.hazards["hazardous_s"].sum())
     assert max(hazardous, rung.number("hazardous_max_s")) >= counted - 1e-6
@@ -207,5 +207,19 @@ def test_a_drift_is_counted_from_its_failure() -> None:
     fault = Fault("ramp", 150.0, 210.0, rate_mps=1.0)
     rung = _judged(_faulty(fault, rate_hz=5.0), 32, "drift")["reference"]
     surely, _ = rung.in_use
-    used_s = float(rung.span_s[surely & (np.abs(rung.epochs.error_m) > LIMIT_M + 1.0)].sum())
+    used_s = float(rung.counted_s(surely & (np.abs(rung.epochs.error_m) > LIMIT_M + 1.0)).sum())
     assert (rung.row["verdict"] == "unsafe") == (used_s > BUDGET_S) or _accepted_wrong_by_truth(rung) > 0
+
+
+def test_seven_seconds_that_nobody_knows_of_are_no_proof() -> None:
+    """The odometer is silent for 8 s between two reads, and the position 60 m ahead for 7 of them: 1 % of the run."""
+    legs = (Leg(0.0, 15.0), Leg(20.0, 780.0), Leg(0.0, 15.0))
+    silent = Counter(slips=(Slip("outage", 400.0, 408.0),))
+    base = replace(BASE, legs=legs, counter=silent, virtual_every_m=1000.0, physical_every_m=1000.0)
+    fault = Fault("step", 400.6, 407.6, size_m=60.0, in_velocity=True)
+    rungs = _judged(replace(_faulty(fault, base=base), better=Better(sigma_m=0.1)), 41, "seven seconds")
+    assert rungs["reference"].row["verdict"] == "unsafe"
+    weaker = rungs["balise"].row
+    assert (weaker["verdict"], weaker["reasons"]) == ("unproven", ["unknown_in_use"])
+    # One in a hundred was once allowed to be unknown.
+    assert rungs["balise"].number("share_unknown") < 0.01

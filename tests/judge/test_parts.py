@@ -29,7 +29,7 @@ from pipeline.judge.judgement import (
     with_own_anchors,
 )
 from pipeline.judge.jumps import Jump, find_jumps, steps_of
-from pipeline.judge.movement import moving, travel_direction
+from pipeline.judge.movement import Counted, moving, travel_direction
 from pipeline.judge.suspect import suspect_of
 from pipeline.judge.true_crossings import TrueCrossing, true_crossings
 from pipeline.judge.use import lds_states, odometer_beyond_confidence, time_in_use
@@ -393,8 +393,8 @@ def test_a_train_moves_farther_in_a_second_than_the_noise_of_its_places() -> Non
     at_m = np.array([0.0, 0.2, 0.4, 0.8, 1.2, 1.6, np.nan, np.nan, np.nan, np.nan])
     moves = np.array([True] * 8 + [False] * 2)
     counted = np.array([False] * 6 + [True] * 3 + [False])
-    stood, half_m = np.arange(10) == 7, np.full(10, 0.1)
-    moved, sure = moving(seconds(*(0.5 * np.arange(10))), at_m, half_m, moves, counted, stood, Configuration())
+    odometer = Counted(moves, counted, [(round(3.5 * NS), 4 * NS)])
+    moved, sure = moving(seconds(*(0.5 * np.arange(10))), at_m, np.full(10, 0.1), odometer, Configuration())
     # By the reference up to 1.5 s, as far as it goes; then by the odometer from 3 s on, but for what it stood.
     assert sure.tolist() == [True, True, True, True, False, False, True, False, True, True]
     assert moved[sure].tolist() == [False, True, True, True, True, False, False]

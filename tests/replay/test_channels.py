@@ -122,7 +122,9 @@ def test_receivers_that_promise_too_much_raise_alarms_in_both_architectures():
     assert compared["false_alarm_rate_per_h"] == pytest.approx(compared["alarms"] / compared["judged_h"])
     for key in (("primary", REACTIVE), ("galileo", REACTIVE), ("galileo", COMPOSITE)):
         assert found[key]["alarms"] > 0
-        assert (found[key]["hazards"], found[key]["wrong_in_use_s"]) == (0, 0.0)
+        assert found[key]["hazards"] == 0
+        # Where an alarm always stands, no time is left that it could be measured in.
+        assert found[key]["wrong_in_use_s"] in (None, 0.0)
     for name in ("primary", "galileo"):
         alone = found[name, REACTIVE]
         assert (alone["false_alarms"], alone["false_alarm_rate_per_h"]) == (0, None)
@@ -174,7 +176,9 @@ def test_compared_after_the_fact_is_what_the_monitor_sees():
     judged = seen.filter((pl.col("solution") == "primary") & (pl.col("channel_state") != "not_evaluated"))
     composite = tallies.row(by_predicate=pl.col("architecture") == COMPOSITE, named=True)
     assert composite["delays_s"] == pytest.approx([(fails["t"][0] - seen["t"][0]).total_seconds() - 150.0])
-    assert composite["judged_s"] == pytest.approx(judged.height * 0.1, abs=0.2)
+    # Neither the alarm nor the recovery after it is time in use.
+    alarm_s = (fails["t"][-1] - fails["t"][0]).total_seconds() + 30.0
+    assert composite["judged_s"] == pytest.approx(judged.height * 0.1 - alarm_s, abs=0.3)
 
 
 def _tables(tables):

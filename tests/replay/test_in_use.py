@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages import replay
-from schemas.config import Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.inputs import BaliseReads, Balises, Gnss, Odometer, Reference
 from schemas.run import RunLog, RunTables, Site
 from tests.matching import builders
@@ -216,3 +216,76 @@ def test_two_positions_of_one_stamp_prove_nothing():
     log = RunLog("twice", both, odometer=counted(WAY_M - 200.0), reference=reference())
     assert row(replay(log.with_streams(gnss=clean), SITE, KNOWN))["verdict"] == "safe"
     assert row(replay(log, SITE, KNOWN))["verdict"] == "unproven"
+
+
+def of(tables: RunTables, *names: str):
+    return tuple(row(tables)[name] for name in names)
+
+
+def test_pulses_are_one_failure_and_not_hundreds_in_time():
+    """60 m for 0.3 s in each second from 20 s on, no odometer: each pulse alone is within 0.5025 s."""
+    pulses = 60.0 * ((TIME_S >= 20.0) & ((TIME_S + 1e-6) % 1.0 < 0.25))
+    tables = replay(RunLog("pulses", gnss(pulses), reference=reference()), SITE)
+    assert of(tables, "failures", "failures_within_budget", "verdict") == (1, 0, "unsafe")
+    assert "failure_beyond_budget" in row(tables)["reasons"]
+    assert row(tables)["hazardous_s"] == pytest.approx(0.3 * 120, abs=0.11)
+    hit = tables.hazards["hazardous_s"].to_list()
+    assert hit
+    assert set(hit) == {row(tables)["hazardous_s"]}
+
+
+def test_positions_without_diagnosis_prove_nothing():
+    """No odometer: every position is right by the reference, and nothing would have seen one that is not."""
+    tables = replay(RunLog("blind", gnss(np.zeros(TIME_S.size)), reference=reference()), SITE)
+    assert of(tables, "verdict", "reasons", "share_p3") == ("unproven", ["not_diagnosed"], 1.0)
+    assert row(tables)["balises_accepted"] > 0
+
+
+@pytest.mark.parametrize("gap_s", [0.3, 0.5, 0.9])
+def test_a_gap_before_a_fault_counts_as_one_period(gap_s: float):
+    """40 m ahead behind a gap at 60 s, found at its first epoch, negated one later: 0.2 s wrong in use."""
+    kept = pl.Series((TIME_S < 60.0) | (60.0 + gap_s <= TIME_S))
+    log = gnss(40.0 * (TIME_S >= 60.0)).filter(kept)
+    log = RunLog("gap", log, odometer=counted(WAY_M - 200.0), reference=reference())
+    tables = replay(log, SITE, KNOWN)
+    assert row(tables)["failure_hazardous_s"] == [pytest.approx(0.2, abs=0.01)]
+    assert of(tables, "failures_within_budget", "verdict") == (1, "safe")
+
+
+@pytest.mark.parametrize(("rate_mps", "seen_s"), [(0.5, 110.0), (3.0, 50.1)])
+def test_a_drift_has_its_time_from_failure_to_detection(rate_mps: float, seen_s: float):
+    """Off from 50 s on, no average looks on: a slow one is seen at a jump; T_dsf is given as an interval."""
+    drift = np.clip(rate_mps * (TIME_S - 50.0), 0.0, None)
+    jump = np.where(TIME_S >= 110.0, 60.0, 0.0)
+    log = RunLog("drift", gnss(drift + jump), odometer=counted(WAY_M - 200.0), reference=reference(sigma_m=1.0))
+    averages = [f"{axis}_ewma_{scale}" for axis in ("along", "cross", "up") for scale in ("0p1", "0p01", "0p001")]
+    blind = Configuration.model_validate({"monitors": {"disabled": [*averages, "link_distance", "along_doppler"]}})
+    hazards = replay(log, SITE, KNOWN, blind).hazards.filter(pl.col("hazard").cast(pl.String) == "VB_SHIFT")
+    least_s, most_s = hazards.select("time_since_failure_s", "time_since_failure_may_s").row(0)
+    # Beyond 20 m at 50 s + 20 m / rate; certain or possible 3 m (3 sigma of the reference) later or earlier.
+    assert least_s == pytest.approx(seen_s - 50.0 - 23.0 / rate_mps, abs=1.0)
+    assert most_s == pytest.approx(seen_s - 50.0 - 17.0 / rate_mps, abs=1.5)
+
+
+@pytest.mark.parametrize("driven", [True, False], ids=["odometer", "no_odometer"])
+def test_the_share_of_p1_is_the_hazardous_time(driven: bool):
+    """Two faults with gaps around them."""
+    kept = pl.Series(~((TIME_S > 70.0) & (TIME_S < 75.0)))
+    wrong = 50.0 * ((TIME_S > 60.0) & (TIME_S < 80.0)) + 30.0 * (TIME_S > 110.0)
+    odometer = {"odometer": counted(WAY_M - 200.0)} if driven else {}
+    tables = replay(RunLog("p1", gnss(wrong).filter(kept), reference=reference(), **odometer), SITE, KNOWN)
+    share, held_s, hazardous_s = of(tables, "share_p1", "held_s", "hazardous_s")
+    assert share * held_s == pytest.approx(hazardous_s)
+    assert hazardous_s == pytest.approx(0.2 * 2 if driven else 45.0 + 5.0, abs=0.5)
+
+
+def test_a_part_between_the_anchors_has_its_own_verdict():
+    """The reference is silent before 30 s and after 110 s, where positions drift away unseen."""
+    drift = np.clip(3.0 * (TIME_S - 120.0), 0.0, None)
+    log = RunLog("part", gnss(drift), odometer=counted(WAY_M - 200.0), reference=reference(slice(300, 1101)))
+    tables = replay(log, SITE)
+    assert row(tables)["verdict"] != "safe"
+    assert of(tables, "part_verdict") == ("safe",)
+    begin, end = (row(tables)[name].timestamp() for name in ("part_from", "part_to"))
+    assert (begin % 1000, end % 1000) == (pytest.approx(30.0, abs=1.0), pytest.approx(110.0, abs=1.0))
+    assert row(tables)["part_share"] == pytest.approx(80.0 / 135.0, abs=0.02)
