@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import polars as pl
@@ -19,12 +20,7 @@ from pipeline.matching import Match, match
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor, on_path_of
-<<<<<<< HEAD
-from pipeline.odometry import Odometry, odometry_of
-=======
 from pipeline.odometry import Odometry, counted_over_slip, odometry_of
-from pipeline.odometry.polarity import polarity
->>>>>>> main
 from pipeline.plausibility.fit import Fit, fit_run, refuse_impossible
 from pipeline.reference import reference_stretches
 from pipeline.results.provenance import Provenance, provenance
@@ -109,30 +105,19 @@ def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -
     fits = {name: fit_run(cleaned, name, vehicle, config.plausibility, site) for name in cleaned.solutions()}
     cleaned = of_the_journey(cleaned)
     odometry = odometry_of(cleaned.odometer, vehicle, config)
-<<<<<<< HEAD
-    evidence = _evidence(cleaned, odometry, site, vehicle, config)
-    return _Context(cleaned, site, vehicle, config, counts, fits, odometry, evidence)
-=======
-    network = site_network(site)
-    reference = _reference_places(cleaned, site, odometry, network, vehicle, config)
-    evidence = evidence_of(reference, cleaned.balise_reads, site.balises, odometry, network, config)
-    counted = None if odometry is None else counted_over_slip(odometry, _others(cleaned, config), config.align)
+    others = [odometry_of(stream, Vehicle(), config) for stream in cleaned.other_odometers]
+    odometers = [one for one in (odometry, *others) if one is not None]
+    evidence = _evidence(cleaned, odometers, site, vehicle, config)
+    counted = None if odometry is None else counted_over_slip(odometry, odometers[1:], config.align)
     return _Context(cleaned, site, vehicle, config, counts, fits, counted, evidence)
 
 
-def _others(run: RunLog, config: Configuration) -> list[Odometry]:
-    """The odometers that the LDS does not use; no vehicle file tells of them."""
-    found = (odometry_of(stream, Vehicle(), config) for stream in run.other_odometers)
-    return [odometry for odometry in found if odometry is not None]
->>>>>>> main
-
-
-def _evidence(run: RunLog, odometry: Odometry | None, site: Site, vehicle: Vehicle, config: Configuration) -> Evidence:
-    """What is known of where the train was, once per run; the figures of the vehicle file are of the first odometer."""
+def _evidence(
+    run: RunLog, odometers: Sequence[Odometry], site: Site, vehicle: Vehicle, config: Configuration
+) -> Evidence:
+    """What is known of where the train was, once per run; figures of the vehicle file are of the first odometer."""
     network = site_network(site)
     reference = reference_stretches(run.reference, network_in_pieces(site), network.track.index, config)
-    others = [odometry_of(stream, Vehicle(), config) for stream in run.other_odometers]
-    odometers = [one for one in (odometry, *others) if one is not None]
     return evidence_of(reference, run.balise_reads, site.balises, odometers, network, vehicle, config)
 
 
