@@ -21,7 +21,7 @@ from pipeline.matching.reference import match_reference
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor, on_path_of
-from pipeline.odometry import Odometry, odometry_of
+from pipeline.odometry import Odometry, counted_over_slip, odometry_of
 from pipeline.odometry.polarity import polarity
 from pipeline.plausibility.fit import Fit, fit_run, refuse_impossible
 from pipeline.results.provenance import Provenance, provenance
@@ -110,7 +110,14 @@ def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -
     network = site_network(site)
     reference = _reference_places(cleaned, site, odometry, network, vehicle, config)
     evidence = evidence_of(reference, cleaned.balise_reads, site.balises, odometry, network, config)
-    return _Context(cleaned, site, vehicle, config, counts, fits, odometry, evidence)
+    counted = None if odometry is None else counted_over_slip(odometry, _others(cleaned, config), config.align)
+    return _Context(cleaned, site, vehicle, config, counts, fits, counted, evidence)
+
+
+def _others(run: RunLog, config: Configuration) -> list[Odometry]:
+    """The odometers that the LDS does not use; no vehicle file tells of them."""
+    found = (odometry_of(stream, Vehicle(), config) for stream in run.other_odometers)
+    return [odometry for odometry in found if odometry is not None]
 
 
 def _reference_places(

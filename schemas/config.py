@@ -331,6 +331,8 @@ class AlignConfig(Settings):
     slip_sigma_mps: Positive = 0.185
     # By what share of the way a wheel that slips or slides may miscount: anti-slip control keeps it below, ours.
     slip_way_share: Probability = 0.1
+    # The same of another odometer that does not slip: 0.8 % of scale was seen in recorded runs (DOMAIN section 3).
+    other_way_share: Probability = 0.01
     # Smaller steps of a counter do not count: they scatter less than the white noise of one second.
     counter_step_m: Positive = 0.05
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
@@ -409,6 +411,29 @@ class MonitorConfig(Settings):
     # DIAG regresses thresholds on sigma; `balise calibrate` fits both.
     sigma_intercept_m: NonNegative = 0.0
     sigma_slope: Positive = 1.0
+    # The fast noise of an axis [m], for raw and each average, as measured on other runs: it holds from the first epoch
+    # on, and replaces what the run itself shows (DOMAIN section 3). Not set: measured in the run.
+    noise_along_m: tuple[NonNegative, NonNegative, NonNegative, NonNegative] | None = None
+    noise_cross_m: tuple[NonNegative, NonNegative, NonNegative, NonNegative] | None = None
+    noise_up_m: tuple[NonNegative, NonNegative, NonNegative, NonNegative] | None = None
+    # DOMAIN section 3: not known before so long under way; renewed so often; from the last minutes, or lags.
+    noise_first_s: Positive = 30.0
+    noise_renewal_s: Positive = 10.0
+    noise_window_s: Positive = 300.0
+    noise_window_lags: Positive = 20.0
+    # A lag counts after so many of itself. Longer ones than this take longer than a run lets them: they are expected
+    # by how the noise grows over the shorter ones.
+    noise_ready_lags: Annotated[Number, Field(gt=2)] = 7.0
+    noise_longest_lag_s: Positive = 100.0
+    # The onset of a drift shows in samples of two lags; they wait so many times that before they count.
+    noise_wait_spans: NonNegative = 1.0
+    # So many standard errors are added: of 120 random receivers 116 stayed without an alarm for 4 h, without it 113.
+    noise_doubt: NonNegative = 1.0
+    # Of the second differences: the largest of these over their Gaussian values; the last needs more samples than the
+    # longest lag has.
+    noise_quantiles: tuple[Probability, ...] = (0.5, 0.95, 0.99)
+    # More, and a failure would be no more than noise; not set: `failure_limit_m` / (2 k_T), 1.88 m.
+    noise_limit_m: Positive | None = None
     # The second receiver of composite fail-safety (LOC Fig. 3).
     channel_reference: str | None = None
     disabled: tuple[str, ...] = ()
@@ -692,6 +717,12 @@ class Configuration(Settings):
             known = ", ".join(sorted(self.safety.service_levels))
             raise ValueError(f"hazards.service_level {self.hazards.service_level!r} is none of {known}")
         return self
+
+    @property
+    def noise_limit_m(self) -> float:
+        """The largest fast noise with which a position failure still shows (DOMAIN section 3) [m]."""
+        least = self.hazards.failure_limit_m / (2.0 * self.monitors.threshold_factor)
+        return self.monitors.noise_limit_m or least
 
     @property
     def budget_s(self) -> float:

@@ -20,6 +20,7 @@ from pipeline.monitors.axis import (
     most_scatter_m,
     run_axis,
 )
+from pipeline.monitors.noise import NoiseMeter
 from pipeline.monitors.recursion import AxisState
 from pipeline.odometry.drift import drift_m2, relink_bound_m
 from pipeline.odometry.odometry import Odometry
@@ -53,7 +54,8 @@ class _Learner:
     Estimates in use at an epoch come from epochs before it. From the first failing epoch on they stand still until
     the raw and fastest monitors have been quiet for `recovery_s` and GNSS minus odometer is back where it was
     before the alarm (DOMAIN section 3 and 4); a fault that persists is never learned as scale. Nor is an offset that
-    a position brings back from a break or an alarm, or its decay: see `ScaleLatencyFilter.resume`.
+    a position brings back from a break or an alarm, or its decay: see `ScaleLatencyFilter.resume`. Learning begins when
+    the noise is known, without which nobody could say what an alarm is.
     """
 
     def __init__(
@@ -87,21 +89,28 @@ class _Learner:
         gap_s = gap_limit_s(period_s, config.align.gap_reset_s) + config.align.scattered_gap_sigmas * jitter_s
         self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
         self._outages = _gaps_before(self._t_s, t_s[usable], gap_s)
+        if self._rows.size:
+            speed_mps = np.abs(odometry.speed_at_s(self._t_s))
+            moving, given_m = speed_mps > config.matching.deadband_mps, config.monitors.noise_along_m
+            self._meter = NoiseMeter(self._series(0, self._rows.size, 0), moving, given_m, config)
 
     def run(self, prior: Estimates) -> None:
-        if self._rows.size == 0:
+        position = self._meter.known_from() if self._rows.size else 0
+        if position >= self._rows.size:
             return
         # What the file gives is not learned.
         if self._vehicle.odometer_scale is not None:
             prior = prior._replace(scale_sigma=np.zeros(()))
         if self._vehicle.gnss_latency_s is not None:
             prior = prior._replace(latency_sigma_s=np.zeros(()))
-        state, position = self._filter.start(prior, *self._observation(0)), 0
+        state = self._filter.start(prior, *self._observation(position))
         while position < self._rows.size:
             state, alarm = self._learn_until_alarm(state, position)
             if alarm >= self._rows.size:
                 break
+            self._meter.freeze(alarm)
             position, unsettled_m2 = self._hold(float(estimates_of(state.joint).scale_sigma), alarm)
+            self._meter.restart(position)
             if position < self._rows.size:
                 state = self._filter.restart(state, *self._observation(position), unsettled_m2)
 
@@ -122,7 +131,7 @@ class _Learner:
             joints = np.concatenate([joints[current:], new_joints])
             self._put(np.maximum(use_from, position), joints)
             series = self._series(position, end, begin)
-            value, sigma, bank = run_axis(series, self._alphas, bank)
+            value, sigma, bank = run_axis(series, self._alphas, bank, self._meter.variance_m2(position, end))
             beyond = ~(np.abs(value) <= self._factor * sigma)  # what cannot be compared is no pass
             failing = np.flatnonzero(beyond.any(axis=1) & ~series.fresh)
             if failing.size:
@@ -219,7 +228,8 @@ class _Learner:
         while position < self._rows.size:
             end = min(position + block, self._rows.size)
             t_s, series = self._t_s[position:end], self._series(position, end, begin)
-            value, sigma, bank = run_axis(series, self._alphas[:1], bank)
+            noise_m2 = self._meter.variance_m2(position, end)[:, :2]
+            value, sigma, bank = run_axis(series, self._alphas[:1], bank, noise_m2)
             failing = ~(np.abs(value) <= self._factor * sigma).all(axis=1)
             failing |= np.arange(position, end) <= begin + 1
             failed_s = np.maximum.accumulate(np.where(failing, t_s, failed_s[-1]))

@@ -20,7 +20,7 @@ from schemas.errors import BaliseError, InputError
 from schemas.run import RunTables
 from schemas.tables import TABLES
 from schemas.version import SOFTWARE
-from schemas.words import reason_words
+from schemas.words import lost_words, reason_words
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class RunOutcome:
     `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
     over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
     `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved. `log`: what was
-    replayed. The figures beside the verdict and `remedies` are of the solution that heads the run.
+    replayed. The figures beside the verdict, `remedies` and `lost` are of the solution that heads the run;
+    `lost`: what the moving time of a run of low availability was lost to.
     """
 
     run_id: str
@@ -51,7 +52,9 @@ class RunOutcome:
     balises_on_path: int | None = None
     availability: float | None = None
     proof_margin_m: float | None = None
+    held_s: float | None = None
     remedies: tuple[str, ...] = ()
+    lost: str = ""
 
     @property
     def defect(self) -> bool:
@@ -140,17 +143,21 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame, passages:
         why=_why(runs, verdict),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(job.address),
-        **_beside(runs, verdict),
+        **_beside(runs, verdict, job.config.advice.low_availability),
     )
 
 
-def _beside(runs: pl.DataFrame, verdict: RunVerdict | None) -> dict[str, Any]:
+def _beside(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
     """What stands beside the verdict, of the solution that heads the run; nothing where all failed."""
     if verdict is None:
         return {}
     row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
-    names = ("balises_accepted", "balises_on_path", "availability", "proof_margin_m")
-    return {name: row[name] for name in names} | {"remedies": tuple(row["remedies"] or ())}
+    names = ("balises_accepted", "balises_on_path", "availability", "proof_margin_m", "held_s")
+    found = {name: row[name] for name in names} | {"remedies": tuple(row["remedies"] or ())}
+    available = row["availability"]
+    if available is None or available >= low:
+        return found
+    return found | {"lost": lost_words(row["lost_to"], row["lost_to_share"], row["lost_to_monitor"], 1.0 - available)}
 
 
 def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:

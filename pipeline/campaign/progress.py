@@ -149,7 +149,7 @@ def watches(quiet: bool, as_json: bool = False) -> list[Watch]:
 def show_summary(summary: Summary, out: str, quiet: bool, as_json: bool, **places: str) -> None:
     """How it ended: as JSON, as messages of what failed alone, or for people; `places`: as in `remedy_lines`."""
     if as_json:
-        told = {"verdict": summary.head.word, "verdicts": summary.head.counts()}
+        told = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.beside()}
         figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
         seconds = round(summary.seconds, 3)
         print(to_json({**told, **figures, "seconds": seconds, "out": out, "runs": outcome_rows(summary)}))

@@ -5,17 +5,25 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
-from pipeline.figures.verdict import CampaignHead, head_of, word_of
+from pipeline.figures.verdict import CampaignHead, figures_beside, head_of, word_of
 from pipeline.results.terminal import duration_text
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
-from schemas.words import remedy_words
+from schemas.words import beside_words, remedy_words
 
+_BESIDE = {
+    "balises_accepted": pl.Int64,
+    "balises_on_path": pl.Int64,
+    "availability": pl.Float64,
+    "proof_margin_m": pl.Float64,
+    "held_s": pl.Float64,
+}
 UnderWay = Sequence[tuple[str, float]]
 
 _WORST_FIRST = {"unsafe": 0, "failed": 1, "unproven": 2, "safe": 3}
@@ -33,6 +41,11 @@ class Summary:
     def head(self) -> CampaignHead:
         """The worst verdict of the runs that were reached, and their counts."""
         return head_of(outcome.verdict for outcome in self.outcomes)
+
+    def beside(self) -> dict[str, Any]:
+        """The figures beside the verdict over all runs that have one; nothing where none has."""
+        rows = [{name: getattr(outcome, name) for name in _BESIDE} for outcome in self.outcomes if outcome.held_s]
+        return dict(figures_beside(pl.DataFrame(rows, schema=_BESIDE))) if rows else {}
 
     def count(self, status: RunStatus) -> int:
         return sum(outcome.status == status for outcome in self.outcomes)
@@ -145,7 +158,8 @@ def outcome_line(outcome: RunOutcome) -> str:
 def summary_line(summary: Summary) -> str:
     """A campaign in one line, its verdict first."""
     counts = [f"{summary.count(status)} {status.value}" for status in RunStatus]
-    text = f"{summary.head}; {len(summary.outcomes)} of {summary.planned} runs: " + ", ".join(counts)
+    beside = f"; {beside_words(figures)}" if (figures := summary.beside()) else ""
+    text = f"{summary.head}{beside}; {len(summary.outcomes)} of {summary.planned} runs: " + ", ".join(counts)
     if summary.skipped:
         text += f" ({summary.skipped} of them complete before)"
     return f"{text}; {duration_text(summary.seconds)}"
@@ -189,11 +203,12 @@ def remedy_lines(summary: Summary, **places: str) -> list[str]:
 
 
 def _reason(outcome: RunOutcome) -> str:
-    """What is wrong with the run: why its verdict is no better, and what kept it from being read whole."""
+    """What is wrong with the run: why its verdict is no better, what cut it short, what its time was lost to."""
     why = "" if outcome.verdict is RunVerdict.SAFE else outcome.why
     cut = "" if outcome.status is RunStatus.OK else outcome.error or outcome.status.value
     status = f"partial: {cut}" if cut and outcome.status is RunStatus.PARTIAL else cut
-    return "; ".join(text for text in (why, status) if text)
+    lost = f"lost to {outcome.lost}" if outcome.lost else ""
+    return "; ".join(text for text in (why, status, lost) if text)
 
 
 def _few(faults: Sequence[str]) -> str:

@@ -196,6 +196,7 @@ class LocationSystem:
 
     def _negate(self, k: int) -> None:
         self._relink.note_alarm(k)
+        self._bank.freeze(k)
         self._recovery = Recovery(k, self._journey, self._bank, self._config)
         self.negated[k] = True
         self._consistent_since_ns = None

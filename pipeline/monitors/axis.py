@@ -17,6 +17,7 @@ from pipeline.monitors.recursion import (
     ewma_weight,
     increment_variance,
     linear_recurrence,
+    noise_of_ewma,
     variance_of_ewma,
 )
 from pipeline.odometry.odometry import Increments
@@ -89,11 +90,16 @@ def time_steps(t_s: Floats, gap_reset_s: float) -> tuple[Floats, Bools]:
     return dt_s, fresh
 
 
-def run_axis(series: AxisSeries, alphas: Floats, state: AxisState | None = None) -> tuple[Floats, Floats, AxisState]:
+def run_axis(
+    series: AxisSeries, alphas: Floats, state: AxisState | None = None, noise_m2: Floats | None = None
+) -> tuple[Floats, Floats, AxisState]:
     """Values and sigmas of the axis [m/s] from `state`, or from a restart, on, and the state to carry on with.
 
-    Shapes (rows, 1 + alphas), of one row at least: raw first, then the EWMAs.
+    Shapes (rows, 1 + alphas), of one row at least: raw first, then the EWMAs. `noise_m2`: of the same shape, the fast
+    noise beyond the model (`noise.py`), none by default; where it is not known neither is the sigma.
     """
+    noise_m2 = np.zeros((series.dt_s.size, 1 + alphas.size)) if noise_m2 is None else noise_m2
+    known_m2 = np.nan_to_num(noise_m2)
     state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1])
     moving = ~series.fresh
     weight = ewma_weight(alphas, series.dt_s) * moving[:, None]
@@ -109,9 +115,13 @@ def run_axis(series: AxisSeries, alphas: Floats, state: AxisState | None = None)
     steady = _response(keep, weight, series.steady_mps, state.steady_response)
     latency = _response(keep, weight, series.latency_mps, state.latency_response)
     raw_variance = _raw_variance(series, increment_m2)
-    sigma = np.sqrt(np.column_stack([raw_variance, variance + steady**2 + latency**2]))
+    raw_noise = 2.0 * known_m2[:, 0] / series.dt_s**2
+    noise, noise_covariance = noise_of_ewma(keep, gain, known_m2[:, 1:], state)
+    sigma = np.sqrt(np.column_stack([raw_variance + raw_noise, variance + noise + steady**2 + latency**2]))
+    sigma[np.isnan(noise_m2)] = np.nan
     value = np.column_stack([series.rate_mps, ewma])
-    return value, sigma, AxisState(ewma[-1], variance[-1], covariance, steady[-1], latency[-1])
+    carried = AxisState(ewma[-1], variance[-1], covariance, noise[-1], noise_covariance, steady[-1], latency[-1])
+    return value, sigma, carried
 
 
 def _response(keep: Floats, weight: Floats, rate_mps: Floats, before: Floats) -> Floats:

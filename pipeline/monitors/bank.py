@@ -12,12 +12,14 @@ from pipeline.epochs.verdicts import (
     DISABLED,
     FAIL,
     NOT_EVALUATED,
+    first_reason,
     no_verdicts,
     of_monitor,
     states_of,
     verdicts,
 )
 from pipeline.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, run_axis
+from pipeline.monitors.noise import NoiseMeter
 from pipeline.monitors.recursion import AxisState
 from pipeline.monitors.series import FIRST_EPOCH, Axis, axes_of
 from schemas.arrays import Bools, Floats
@@ -25,13 +27,17 @@ from schemas.config import Configuration
 from schemas.enums import MonitorState
 from schemas.tables import SCALES
 
+NOISE_UNKNOWN = "noise not yet known"
+NOISE_TOO_LARGE = "noise too large"
+
 
 @dataclass(frozen=True)
 class AxisRecord:
     """What one axis of the bank saw over a whole run, restarts included.
 
     `series`: its increments, `fresh` where a restart was too. `value`, `threshold`: per epoch and monitor (raw, then
-    the EWMAs) [m/s], NaN where not evaluated. `enabled`: which of the monitors are.
+    the EWMAs) [m/s]; the threshold NaN where not evaluated, the value where there is none. `enabled`: which of the
+    monitors are.
     """
 
     series: AxisSeries
@@ -41,54 +47,82 @@ class AxisRecord:
 
 
 class _AxisBank:
-    """One axis of the bank over all epochs of a solution; results are filled up to `_done` rows."""
+    """One axis of the bank over all epochs of a solution; results are filled up to `_done` rows.
 
-    def __init__(self, axis: Axis, epochs: int, alphas: Floats, factor: float, enabled: list[bool]) -> None:
+    `noise_m`: fast noise that the thresholds count with, per epoch and monitor; NaN where not known or no row is.
+    """
+
+    def __init__(self, axis: Axis, epochs: int, config: Configuration) -> None:
         self.axis = axis
-        self._alphas = alphas
-        self._factor = factor
-        self._enabled = np.array(enabled)
+        self._alphas = np.array(config.monitors.ewma_alphas)
+        self._factor = config.monitors.threshold_factor
+        self._limit_m = config.noise_limit_m
+        self._enabled = np.array([f"{axis.name}_{scale}" not in config.monitors.disabled for scale in SCALES])
         width = len(SCALES)
         self.value = np.full((epochs, width), np.nan, order="F")
         self.threshold = np.full((epochs, width), np.nan, order="F")
         self.state = np.full((epochs, width), NOT_EVALUATED, dtype=np.int8, order="F")
+        self.noise_m = np.full((epochs, width), np.nan, order="F")
         self.begins = np.zeros(epochs, dtype=np.bool_)
+        self._quiet = np.ones(epochs, dtype=np.bool_)
         self._series = axis.series
+        given_m: tuple[float, ...] | None = getattr(config.monitors, f"noise_{axis.name}_m")
+        self._meter = NoiseMeter(axis.series, axis.moving, given_m, config)
         self._done = 0
         self._block = BLOCK
         self._carry: AxisState | None = None
+        self._begun: tuple[int, AxisState | None] = 0, None  # the last block, and what it was begun with
 
     def advance(self, epoch: int) -> int:
         """Evaluate up to this epoch at least; returns the last epoch that is evaluated now."""
         rows = self._series.epoch
         while self._done < rows.size and rows[self._done] <= epoch:
             end = min(self._done + self._block, rows.size)
-            part = self._series.between(self._done, end)
-            value, sigma, self._carry = run_axis(part, self._alphas, self._carry)
-            self._store(part, value, self._factor * sigma)
+            self._begun = self._done, self._carry
+            part, noise_m2 = self._series.between(self._done, end), self._meter.variance_m2(self._done, end)
+            value, sigma, self._carry = run_axis(part, self._alphas, self._carry, noise_m2)
+            self._store(part, value, self._factor * sigma, np.sqrt(noise_m2))
             self._done, self._block = end, min(2 * self._block, BLOCK)
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
-    def _store(self, part: AxisSeries, value: Floats, threshold: Floats) -> None:
-        evaluated = ~part.fresh[:, None] & self._enabled[None, :]
+    def _store(self, part: AxisSeries, value: Floats, threshold: Floats, noise_m: Floats) -> None:
+        present = ~part.fresh[:, None] & self._enabled[None, :]
+        # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
+        quiet: Bools = np.all((noise_m <= self._limit_m) | ~self._enabled.any(), axis=1)
+        judged = present & quiet[:, None]
+        self.state[part.epoch] = states_of(value, threshold, judged)
+        self.value[part.epoch] = np.where(present, value, np.nan)
+        self.threshold[part.epoch] = np.where(judged, threshold, np.nan)
+        self.noise_m[part.epoch] = noise_m
         self.begins[part.epoch] = part.fresh
-        self.state[part.epoch] = states_of(value, threshold, evaluated)
-        self.value[part.epoch] = np.where(evaluated, value, np.nan)
-        self.threshold[part.epoch] = np.where(evaluated, threshold, np.nan)
+        self._quiet[part.epoch] = quiet
+
+    def freeze(self, epoch: int) -> None:
+        """Nothing from this epoch on tells of the noise, until a restart. Evaluated anew from the last block on.
+
+        Noise that is not known yet, or too large, goes on being measured: it would never be known, or smaller.
+        """
+        before = int(np.searchsorted(self._series.epoch, epoch, side="right")) - 1
+        if before >= 0 and np.all(self.noise_m[self._series.epoch[before]] <= self._limit_m):
+            self._meter.freeze(int(np.searchsorted(self._series.epoch, epoch)))
+            self._done, self._carry = self._begun
+            self._block = FIRST_BLOCK
 
     def noise_known(self, part: slice) -> Bools:
-        """Per epoch whether the fast noise of the axis is known there."""
-        return np.ones(self.begins[part].size, dtype=np.bool_)
+        """Per epoch whether the fast noise is known and no failure can hide in it; true where the axis has no row."""
+        return self._quiet[part]
 
     def restart(self, epoch: int) -> None:
-        """Forget all before this epoch; the first increment is from the first usable epoch here to the next."""
+        """Forget all before this epoch but the noise; the first increment is from the first usable epoch on."""
         row = int(np.searchsorted(self._series.epoch, epoch))
         if row < self._series.epoch.size:
             fresh = self._series.fresh.copy()
             fresh[row] = True
             self._series = replace(self._series, fresh=fresh)
+        self._meter.restart(row)
         self._done = row
         self._carry = None
+        self._begun = row, None
         self._block = FIRST_BLOCK
 
     @property
@@ -99,12 +133,20 @@ class _AxisBank:
     def record(self) -> AxisRecord:
         return AxisRecord(self._series, self.value, self.threshold, self._enabled)
 
+    def noise_reasons(self) -> pl.Series:
+        """Per epoch that the axis has a row of: why its noise lets nothing be evaluated; null where it does."""
+        unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
+        unknown[self._series.epoch] = np.any(np.isnan(self.noise_m[self._series.epoch]), axis=1)
+        too_large: Bools = np.any(self.noise_m > self._limit_m, axis=1)
+        return first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
+
     def columns(self) -> list[pl.Series]:
         """Value, threshold, state and reason of each monitor of the axis."""
+        reasons = self.axis.reasons.fill_null(self.noise_reasons()).fill_null(FIRST_EPOCH)
         columns: list[pl.Series] = []
         for index, scale in enumerate(SCALES):
-            reasons = self.axis.reasons.fill_null(FIRST_EPOCH if self._enabled[index] else DISABLED)
-            said = verdicts(self.value[:, index], self.threshold[:, index], reasons, self.state[:, index])
+            own = reasons if self._enabled[index] else self.axis.reasons.fill_null(DISABLED)
+            said = verdicts(self.value[:, index], self.threshold[:, index], own, self.state[:, index])
             columns += of_monitor(f"{self.axis.name}_{scale}", said)
         return columns
 
@@ -119,12 +161,8 @@ class MonitorBank:
 
     def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration):
         count = epochs.height
-        alphas, factor = np.array(config.monitors.ewma_alphas), config.monitors.threshold_factor
         disabled = config.monitors.disabled
-        self._axes = tuple(
-            _AxisBank(axis, count, alphas, factor, [f"{axis.name}_{scale}" not in disabled for scale in SCALES])
-            for axis in axes_of(epochs, config)
-        )
+        self._axes = tuple(_AxisBank(axis, count, config) for axis in axes_of(epochs, config))
         self._single = {
             name: no_verdicts(count, DISABLED) if name in disabled else frame for name, frame in single.items()
         }
@@ -187,7 +225,10 @@ class MonitorBank:
 
     @property
     def noise_known(self) -> Bools:
-        """Per epoch whether the fast noise along the track is known, once the LDS has walked to the end of the run."""
+        """Per epoch whether the fast noise along the track is known and no failure can hide in it.
+
+        To be asked once the LDS has walked to the end of the run.
+        """
         if self._any.size:
             self._look(self._any.size - 1)
         return self._noise_known
@@ -207,6 +248,12 @@ class MonitorBank:
         """The axis along the track, or, in a run without an odometer, the one across it."""
         along, across, _ = self._axes
         return along if along.has_rows else across
+
+    def freeze(self, epoch: int) -> None:
+        """The position is negated from this epoch on: until the next restart nothing enters the measured noise."""
+        for axis in self._axes:
+            axis.freeze(epoch)
+        self._known_to = min(self._known_to, epoch)
 
     def restart(self, epoch: int) -> None:
         """All recursions start anew at this epoch; their first increment is from it to the next."""

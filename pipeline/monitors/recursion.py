@@ -43,18 +43,23 @@ def ewma_weight(alpha: Floats, dt_s: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class AxisState:
-    """What the recursions of one axis carry on; all zero at a restart. Shapes (alphas,), (alphas, sources)."""
+    """What the recursions of one axis carry on; all zero at a restart. Shapes (alphas,), (alphas, sources).
+
+    `noise_variance`, `noise_covariance`: of the noise that each average has of its own.
+    """
 
     ewma: Floats
     variance: Floats
     covariance: Floats
+    noise_variance: Floats
+    noise_covariance: Floats
     steady_response: Floats
     latency_response: Floats
 
     @classmethod
     def at_restart(cls, alphas: int, sources: int) -> AxisState:
         zero = np.zeros(alphas)
-        return cls(zero, zero, np.zeros((alphas, sources)), zero, zero)
+        return cls(zero, zero, np.zeros((alphas, sources)), zero, zero, zero, zero)
 
 
 def variance_of_ewma(
@@ -96,6 +101,21 @@ def variance_of_ewma(
     # A sigma that falls quickly, though not by the step, can bring the printed recursion below what is new in it.
     new_m2 = (sigma_m**2 * decorrelation * (2.0 - decorrelation)).sum(axis=1) + white_m2
     return np.maximum(variance, gain**2 * new_m2[:, None]), covariances
+
+
+def noise_of_ewma(keep: Floats, gain: Floats, noise_m2: Floats, state: AxisState) -> tuple[Floats, Floats]:
+    """Variance of the EWMAs of a rate by noise without memory [m^2/s^2], another for each; all shapes (n, alphas).
+
+    The recursion of DOMAIN section 3 with phi = 0 and R = `noise_m2`; its limit at a constant step is
+    M 2 alpha^2 g^2 / (2 - alpha). Returns the last covariances too (alphas,).
+    """
+    covariance = gain * noise_m2
+    if not (noise_m2.any() or state.noise_variance.any()):
+        return np.zeros_like(gain), covariance[-1]
+    before = np.concatenate([state.noise_covariance[None], covariance[:-1]])
+    variance = linear_recurrence(keep**2, 2.0 * gain * (covariance - keep * before), state.noise_variance)
+    # Noise that falls from one renewal to the next can bring this below what is new in it.
+    return np.maximum(variance, gain * covariance), covariance[-1]
 
 
 def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> tuple[Floats, Floats, Floats]:

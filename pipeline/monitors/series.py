@@ -23,10 +23,11 @@ _STRAIGHT_PER_M = 1e-6
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis: its increments, and per epoch why there is none (empty where there is)."""
+    """One axis: its increments, at which of them the train moves, and per epoch why there is none (null: there is)."""
 
     name: str
     series: AxisSeries
+    moving: Bools
     reasons: pl.Series
 
 
@@ -38,11 +39,15 @@ def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Ax
     along_reasons = matched.zip_with(matched.is_not_null(), epochs["odometer_reason"])
     up_reasons = first_reason((matched.is_not_null(), matched), (epochs["vertical_m"].is_null(), NO_HEIGHT))
     builder = _Builder(epochs, t_s, config)
-    return (
-        Axis("along", builder.along(along_reasons), along_reasons),
-        Axis("cross", builder.across(matched, "cross_track_m", "calibrated_cross_m", "digits_cross_m"), matched),
-        Axis("up", builder.across(up_reasons, "vertical_m", "calibrated_up_m", "digits_up_m"), up_reasons),
+    moving = np.abs(np.nan_to_num(floats(epochs, "speed_mps"))) > config.matching.deadband_mps
+    across = builder.across(matched, "cross_track_m", "calibrated_cross_m", "digits_cross_m")
+    built = (
+        ("along", builder.along(along_reasons), along_reasons),
+        ("cross", across, matched),
+        ("up", builder.across(up_reasons, "vertical_m", "calibrated_up_m", "digits_up_m"), up_reasons),
     )
+    along, cross, up = (Axis(name, series, moving[series.epoch], reasons) for name, series, reasons in built)
+    return along, cross, up
 
 
 def _match_reasons(epochs: pl.DataFrame) -> pl.Series:

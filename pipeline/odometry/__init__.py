@@ -5,5 +5,6 @@ Touches no file, and knows no position: only the sign against the path is set fr
 """
 
 from pipeline.odometry.odometry import Odometry, Way, odometry_of
+from pipeline.odometry.over_slip import counted_over_slip
 
-__all__ = ["Odometry", "Way", "odometry_of"]
+__all__ = ["Odometry", "Way", "counted_over_slip", "odometry_of"]

@@ -121,7 +121,7 @@ def watched(
     fresh = series.fresh[kept] | (np.diff(kept, prepend=-1) != 1)
     fastest_m = config.undetected.max_rate_mps * np.diff(t_s, prepend=t_s[:1])
     way_s = series.dt_s[kept] / _share_seen(epochs, epoch, config.undetected.hidden_share)
-    rate, threshold = series.rate_mps[kept], _thresholds(bank, epoch)
+    rate, threshold = series.rate_mps[kept], _thresholds(bank, epoch, config.undetected.max_rate_mps)
     alphas = np.array(config.monitors.ewma_alphas)[bank.enabled[1:]]
     learned_m, learned_late_m = _learned(epochs, epoch, vehicle, config)
     rows = Watched(
@@ -148,9 +148,13 @@ def watched(
     return _with_relinks(rows, held)
 
 
-def _thresholds(bank: AxisRecord, epoch: Ints) -> Floats:
-    """Thresholds of raw and averages [m/s]; infinite where not evaluated."""
-    threshold = bank.threshold[epoch]
+def _thresholds(bank: AxisRecord, epoch: Ints, fastest_mps: float) -> Floats:
+    """Thresholds of raw and averages [m/s] as they were; infinite where there is nothing to compare.
+
+    While the noise is not known, or too large, there is a value and no threshold: what the fastest fault can make of it
+    then passes.
+    """
+    threshold = np.where(np.isfinite(bank.threshold), bank.threshold, np.abs(bank.value) + fastest_mps)[epoch]
     return np.where(np.isfinite(threshold), threshold, np.inf)
 
 

@@ -15,7 +15,17 @@ from pipeline.monitors.bank import MonitorBank
 from pipeline.odometry.odometry import Noise
 from pipeline.odometry.quantisation import QuantisationNoise
 from schemas.config import Configuration, Vehicle, threshold_factor
-from tests.align.straight import Straight, align_run, distance, epochs_of, odometer_of, odometry_from, run, times
+from tests.align.straight import (
+    NO_NOISE,
+    Straight,
+    align_run,
+    distance,
+    epochs_of,
+    odometer_of,
+    odometry_from,
+    run,
+    times,
+)
 
 CONFIG = Configuration()
 REAL = Straight(scale=1.004, latency_s=0.08)
@@ -235,12 +245,15 @@ def test_nothing_is_learned_from_positions_off_the_track():
     assert aligned["scale_sigma"][-1] < 0.9 * aligned["scale_sigma"][149]
 
 
+KNOWN_NOISE = Configuration.model_validate({"monitors": NO_NOISE})
+
+
 def ten_epochs(leap_m):
     """Twelve seconds at 20 m/s, epochs from 2 s on; between the first two of them the position leaps."""
     t_s = np.arange(2.0, 12.0)
     epochs = epochs_of(t_s, 20.0 * t_s + leap_m * (t_s > 2.0))
     odometer_s = np.arange(0.0, 13.0, 0.5)
-    aligned = align_run(epochs, odometer_of(odometer_s, distance_m=20.0 * odometer_s), Vehicle(), Configuration())
+    aligned = align_run(epochs, odometer_of(odometer_s, distance_m=20.0 * odometer_s), Vehicle(), KNOWN_NOISE)
     return aligned["scale_sigma"].to_numpy()
 
 

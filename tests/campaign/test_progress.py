@@ -193,7 +193,13 @@ def test_each_remedy_stands_once_with_its_command_and_the_worst_run() -> None:
 
 
 def test_what_stands_beside_a_verdict_in_the_ending() -> None:
-    safe = replace(OK, balises_accepted=28, balises_on_path=31, availability=0.964, proof_margin_m=11.26)
+    figures = {"balises_accepted": 28, "balises_on_path": 31, "availability": 0.964, "proof_margin_m": 11.26}
+    safe = replace(OK, **figures, held_s=900.0)
+    poor = replace(OLD, balises_accepted=2, balises_on_path=9, availability=0.0, held_s=100.0, lost="100% alarms")
     rows = watch.ending_rows(Summary(2, (safe, BAD), 1.0))
     columns = ("verdict", "accepted", "available", "margin")
     assert rows.select(columns).rows() == [("failed", "-", "-", "-"), ("safe", "28 of 31", "96%", "11.3 m")]
+    poor_row = watch.ending_rows(Summary(1, (poor,), 1.0)).row(0, named=True)
+    assert (poor_row["accepted"], poor_row["margin"], poor_row["why"]) == ("2 of 9", "-", "lost to 100% alarms")
+    line = watch.summary_line(Summary(3, (safe, poor, BAD), 1.0))
+    assert "; 30 of 40 balises accepted, available for 87% of the moving time, proof margin 11.3 m; 3 of 3 runs" in line

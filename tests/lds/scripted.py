@@ -35,6 +35,7 @@ class ScriptedBank:
         self.fast = self.fails if fast is None else set(fast)
         self.begins = set(begins)
         self.started = 0
+        self.frozen: list[int] = []
         self.unknown = set(unknown)
         self.restarted: list[int] = []
 
@@ -58,6 +59,9 @@ class ScriptedBank:
 
     def along_evaluated_between(self, epoch: int, end: int) -> np.ndarray:
         return np.array([self.along_evaluated(k) for k in range(epoch, end)], dtype=bool)
+
+    def freeze(self, epoch: int) -> None:
+        self.frozen.append(epoch)
 
     def begins_at(self, epoch: int) -> bool:
         return epoch in {0, *self.begins, *self.restarted}

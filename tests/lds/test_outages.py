@@ -9,6 +9,7 @@ import pytest
 from benchmarks.relink import Journey, Outcome, is_fast, journey, lds_of, outcome, ramp
 from pipeline.lds import LdsResult
 from schemas.config import Configuration, LdsConfig, Vehicle
+from tests.align.straight import NO_NOISE
 
 CONFIG = Configuration()
 LOST_S = 600
@@ -55,7 +56,8 @@ def test_slow_drifts_after_a_return() -> None:
     """
 
     def found(config: LdsConfig, drifts: int = 16) -> list[Outcome]:
-        return [outcome(ramp(seed, 1.0 + seed % 2), Configuration(lds=config)) for seed in range(drifts)]
+        known = Configuration.model_validate({"monitors": NO_NOISE}).model_copy(update={"lds": config})
+        return [outcome(ramp(seed, 1.0 + seed % 2), known) for seed in range(drifts)]
 
     def beyond(outcomes: list[Outcome]) -> int:
         return sum(one.beyond_s > 0 for one in outcomes)

@@ -15,9 +15,9 @@ from pipeline.monitors.series import FIRST_EPOCH, NO_HEIGHT, OFF_TRACK
 from pipeline.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor
 from schemas.config import Configuration, Vehicle, threshold_factor
 from schemas.tables import BANK_MONITORS
-from tests.align.straight import Straight, align_run, epochs_of, odometer_of, run
+from tests.align.straight import NO_NOISE, Straight, align_run, epochs_of, odometer_of, run
 
-CONFIG = Configuration()
+CONFIG = Configuration.model_validate({"monitors": NO_NOISE})
 FACTOR = threshold_factor(1e-7)
 KNOWN = Vehicle(odometer_scale=1.0, gnss_latency_s=0.0)
 
@@ -67,8 +67,8 @@ def test_a_flat_survey_of_no_stated_accuracy_may_wander():
 def test_a_stated_survey_changes_along_the_track_by_configuration_alone():
     """0.1 m, decorrelated over 20 m of way as exp(-20/500) where a length is configured; along the track never."""
     epochs = steady(3, survey_sigma_m=[0.1] * 3)
-    changing = Configuration.model_validate({"monitors": {"survey_length_m": 500.0}})
-    constant, wandering = (table(bank_of(*epochs, config=config)) for config in (Configuration(), changing))
+    changing = Configuration.model_validate({"monitors": {"survey_length_m": 500.0, **NO_NOISE}})
+    constant, wandering = (table(bank_of(*epochs, config=config)) for config in (CONFIG, changing))
     before, after = (one["cross_raw_threshold"][1] / FACTOR for one in (constant, wandering))
     assert after**2 - before**2 == pytest.approx(2 * 0.1**2 * (1 - np.exp(-20.0 / 500.0)), rel=1e-9)
     assert constant["along_raw_threshold"].equals(wandering["along_raw_threshold"])
@@ -167,7 +167,7 @@ def test_a_survey_step_at_an_element_border_is_judged_by_the_survey_not_averaged
 
 
 def test_a_switched_off_monitor_says_so_and_raises_no_alarm():
-    config = Configuration.model_validate({"monitors": {"disabled": ["along_raw", "along_doppler"]}})
+    config = Configuration.model_validate({"monitors": {"disabled": ["along_raw", "along_doppler"], **NO_NOISE}})
     epochs, odometer = steady(5)
     path = epochs["path_m"].to_numpy().copy()
     path[2:] += 4.0

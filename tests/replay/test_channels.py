@@ -15,9 +15,11 @@ from pipeline.safety.side_by_side import side_by_side
 from pipeline.safety.tally import COMPOSITE, REACTIVE, added, architecture_figures
 from schemas.config import Configuration, LdsConfig
 from schemas.errors import InputError
+from tests.align.straight import NO_NOISE
 from tests.replay.journeys import VEHICLE, journey, replay
 
 LDS = LdsConfig()
+KNOWN_NOISE = Configuration.model_validate({"monitors": NO_NOISE})
 OFFSET = {"kind": "step", "size_m": 45.0, "start_s": 150.0, "duration_s": 60.0}
 SLOW = {"kind": "ramp", "rate_mps": 0.3, "start_s": 100.0, "duration_s": 120.0}
 THERE_AND_BACK = {
@@ -51,7 +53,7 @@ def with_reference(name):
 def test_fault_of_one_solution_is_found_by_both_architectures():
     faulty, site = journey(OFFSET)
     sound, _ = journey(seed=9)
-    found = rows(replay(two(faulty, sound), site, VEHICLE))
+    found = rows(replay(two(faulty, sound), site, VEHICLE, KNOWN_NOISE))
     for key in (("primary", REACTIVE), ("galileo", COMPOSITE)):
         row = found[key]
         assert (row["failures"], row["detected"], row["missed"]) == (1, 1, 0)
@@ -116,7 +118,7 @@ def test_receivers_that_promise_too_much_raise_alarms_in_both_architectures():
     boastful = {"reported_factor": 0.2}
     one, site = journey(gnss=boastful)
     other, _ = journey(gnss=boastful, seed=9)
-    found = rows(replay(two(one, other), site, VEHICLE))
+    found = rows(replay(two(one, other), site, VEHICLE, KNOWN_NOISE))
     compared = found["galileo", COMPOSITE]
     assert compared["false_alarms"] == compared["alarms"]
     assert compared["false_alarm_rate_per_h"] == pytest.approx(compared["alarms"] / compared["judged_h"])

@@ -6,6 +6,7 @@ import polars as pl
 import pytest
 
 from schemas.config import Configuration, Vehicle
+from tests.align.straight import NO_NOISE
 from tests.replay.journeys import QUIET, VEHICLE, journey, replay, seconds
 
 # The wheel counts 1 m for 1.08 m, and the vehicle file admits it: no increment monitor can see that.
@@ -17,7 +18,7 @@ BEYOND_M = 5.0 / 0.03
 
 def states(odometer, vehicle, *faults, disabled=(), **settings):
     run, site = journey(*faults, odometer=odometer, **settings)
-    config = Configuration.model_validate({"monitors": {"disabled": list(disabled)}})
+    config = Configuration.model_validate({"monitors": {"disabled": list(disabled), **NO_NOISE}})
     return replay(run, site, vehicle, config)
 
 

@@ -20,9 +20,14 @@ def accepted(tables: RunTables) -> list[str]:
 
 
 def replayed(
-    slip: Slip | None = None, fault: Fault | None = None, vehicle: Vehicle = VEHICLE, *, read: bool = False
+    slip: Slip | None = None,
+    fault: Fault | None = None,
+    vehicle: Vehicle = VEHICLE,
+    *,
+    read: bool = False,
+    radar: Slip | None = None,
 ) -> RunTables:
-    return replay(ride(slip, fault, read=read), SITE, vehicle)
+    return replay(ride(slip, fault, read=read, radar=radar), SITE, vehicle)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.08, -0.08])
@@ -74,6 +79,23 @@ def test_after_too_much_slip_only_a_telegram_links_again() -> None:
     fast = [name for name, at_m in BALISES.items() if READ_M < at_m < 3250.0]
     assert accepted(tables) == fast
     assert tables.runs["verdict"].item() == "safe"
+
+
+LONG = Slip(0.08, lasts_s=25.0)
+DRY = Slip(0.0, lasts_s=0.0)
+
+
+def test_a_second_odometer_counts_the_way_over_long_slip() -> None:
+    """250 m of slip at each start, 20 m counted too much. V4 lies in the second, V8 at 100 m in the third."""
+    tables = replayed(LONG, radar=DRY)
+    assert tables.runs["verdict"].item() == "safe"
+    in_slip = {name for name, at_m in BALISES.items() if (at_m - 50.0) % 1600.0 <= 250.0}
+    assert accepted(tables) == [name for name in BALISES if name not in in_slip]
+    assert accepted(replayed(LONG, Fault(SECOND_START_S + 5.0, 20.0), radar=DRY)) == ["V1", "V2", "V3"]
+
+
+def test_a_second_odometer_that_slips_too_counts_nothing() -> None:
+    assert accepted(replayed(LONG, radar=LONG)) == []
 
 
 def test_without_a_vehicle_file_only_a_telegram_links_again() -> None:

@@ -108,10 +108,11 @@ def ride(
     read: bool = False,
     white_m: float = 0.0,
     scale: float = 1.0,
+    radar: Slip | None = None,
     seed: int = 1,
 ) -> RunLog:
     """One journey; `read`: the physical balise after the second start is read; `white_m`: of positions, not stated;
-    `scale`: true over counted distance.
+    `scale`: true over counted distance; `radar`: a second odometer counts backwards and 0.5 % short, with this slip.
     """
     rng = np.random.default_rng(seed)
     t_s = times()
@@ -128,6 +129,9 @@ def ride(
             pl.DataFrame({"t": _stamps([at_s]), "balise_id": ["P1"]}), cast=True
         )
     odometer = _odometer(rng, t_s, true_m / scale, slip)
+    if radar is not None:
+        second = _odometer(rng, t_s, -0.995 * true_m, radar).with_columns(sensor=pl.lit("radar"))
+        odometer = pl.concat([odometer, second]).sort("t", "sensor")
     return RunLog(run_id=f"ride{seed}", gnss=gnss, odometer=odometer).with_streams(**streams)
 
 
@@ -172,7 +176,7 @@ def _odometer(rng: np.random.Generator, t_s: Floats, true_m: Floats, slip: Slip 
         since = since_start_s(t_s)
         slips = (since > 0.0) & (since <= slip.lasts_s)
         steps = np.where(slips, (1.0 + slip.share) * steps, steps)
-    noise = np.where(steps > 0.0, 0.02 / np.sqrt(HZ) * rng.standard_normal(t_s.size), 0.0)
+    noise = np.where(steps != 0.0, 0.02 / np.sqrt(HZ) * rng.standard_normal(t_s.size), 0.0)
     said = slips & (slip is not None and slip.flag)
     sigma = None if slip is None or slip.sigma_mps is None else np.where(slips, slip.sigma_mps, 0.02)
     frame = pl.DataFrame(

@@ -21,6 +21,7 @@ from pipeline.undetected.levels import range_bounds
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
+from tests.align.straight import NO_NOISE
 from tests.replay.journeys import VEHICLE, journey
 
 ONE_HZ = {"rate_hz": 1.0}
@@ -28,7 +29,7 @@ BOTH = ("undetected_ahead_m", "undetected_behind_m")
 
 
 def config(**undetected: Any) -> Configuration:
-    return Configuration.model_validate({"undetected": {"compute": True, **undetected}})
+    return Configuration.model_validate({"monitors": NO_NOISE, "undetected": {"compute": True, **undetected}})
 
 
 @pytest.fixture(scope="module")
