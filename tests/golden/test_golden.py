@@ -66,7 +66,7 @@ def with_radar(run: RunLog, scenario: Scenario) -> RunLog:
     sensors = pl.concat([wheel, radar.gather_every(5)]).sort("t", maintain_order=True)
     assert both.balise_reads is not None
     # Another part than that of `reads_only` lies between the first read and the last.
-    return both.with_streams(odometer=sensors, balise_reads=both.balise_reads[:-1])
+    return both.with_streams(odometer=sensors, balise_reads=both.balise_reads[1:])
 
 
 def untidied(run: RunLog, _: Scenario) -> RunLog:
