@@ -22,6 +22,10 @@ from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
+from schemas.tables import AXES
+
+NO_NOISE = {f"noise_{axis}_m": (0.0, 0.0, 0.0, 0.0) for axis in AXES}
+"""For `[monitors]`: the fitted sigma stands for the fast noise too, so that the run itself measures none."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +131,8 @@ def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configura
 
 
 def _uncalibrated(config: Configuration) -> Configuration:
-    """Without the sigmas of an earlier calibration: the regression is on what the receiver states."""
-    stated = {"sigma_intercept_m": 0.0, "sigma_slope": 1.0}
+    """Without the figures of an earlier calibration, or of the run: the regression is on what the receiver states."""
+    stated = {"sigma_intercept_m": 0.0, "sigma_slope": 1.0, **NO_NOISE}
     return config.model_copy(update={"monitors": config.monitors.model_copy(update=stated)})
 
 

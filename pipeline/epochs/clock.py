@@ -59,6 +59,14 @@ def unambiguous(config: Configuration) -> pl.Expr:
     return pl.col("gate_probability") >= config.matching.ambiguity_probability
 
 
+def least_belief() -> pl.Expr:
+    """How sure the track is: what was believed at the time or what is in hindsight, whichever is less.
+
+    The track is doubtful where this is below `matching.ambiguity_probability`.
+    """
+    return pl.min_horizontal("gate_probability", "path_probability")
+
+
 def confident(config: Configuration) -> pl.Expr:
     """The confidence interval along the track is within its limit."""
     return pl.col("confidence_m") <= config.lds.ci_limit_m

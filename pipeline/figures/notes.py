@@ -121,10 +121,19 @@ def _of_odometer(odometry: Odometry | None, straight_s: float) -> dict[Note, obj
 def _ambiguous(found: Match) -> str:
     """Parts of the run where another path is nearly as likely."""
     clock = "%H:%M:%S"
-    columns = ("netelement_id", "other_netelement_id", "t_start", "t_end", "probability", "told_by")
+    columns = (
+        "netelement_id",
+        "other_netelement_id",
+        "t_start",
+        "t_end",
+        "gate_probability",
+        "path_probability",
+        "told_by",
+    )
     return ", ".join(
-        f"{one} ({probability:.2f}) or {other} from {start:{clock}} to {end:{clock}} (told apart by {told_by})"
-        for one, other, start, end, probability, told_by in found.ambiguous.select(columns).iter_rows()
+        f"{one} ({gate:.2f} at the time, {path:.2f} in hindsight) or {other} from {start:{clock}} to {end:{clock}} "
+        f"(told apart by {told_by})"
+        for one, other, start, end, gate, path, told_by in found.ambiguous.select(columns).iter_rows()
     )
 
 

@@ -25,7 +25,8 @@ AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "t_end": pl.Datetime("ns", "UTC"),
     "netelement_id": pl.String,
     "other_netelement_id": pl.String,
-    "probability": pl.Float64,
+    "gate_probability": pl.Float64,
+    "path_probability": pl.Float64,
     "told_by": pl.Enum(TOLD_BY),
 }
 
@@ -56,7 +57,9 @@ def doubt_of(trellis: Trellis, found: Found, legs: Sequence[Leg], leg: Ints, at_
 def stretches(
     fixes: Fixes, trellis: Trellis, found: Found, doubt: Doubt, pinned: Ints, config: MatchingConfig
 ) -> pl.DataFrame:
-    """Stretches where either probability of the path is below the configured one, each with its least.
+    """Stretches where the path is doubtful: believed at the time, or in hindsight, less than configured.
+
+    Both stand in the row, each the least of the stretch.
 
     `pinned`: per epoch the element that a balise read proves, -1 without one.
     """
@@ -71,7 +74,8 @@ def stretches(
         here = ids[int(trellis.oriented[found.best[worst]]) // 2]
         there = ids[other] if other >= 0 else None
         span = int(fixes.t_ns[epoch[begin]]), int(fixes.t_ns[until])
-        rows.append((*span, here, there, float(probability[worst]), _told_by(trellis, found, pinned, begin, end)))
+        least = float(doubt.gate[begin:end].min()), float(doubt.posterior[begin:end].min())
+        rows.append((*span, here, there, *least, _told_by(trellis, found, pinned, begin, end)))
     return pl.DataFrame(rows, schema=AMBIGUOUS_COLUMNS, orient="row")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
+from pipeline.epochs.clock import least_belief
 from pipeline.matching.doubt import Posterior
 from pipeline.matching.match import Match
 from pipeline.track.leg import Leg, segments_at
@@ -16,7 +17,8 @@ ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "direction": pl.String,
     "leg": pl.Int64,
     "doubtful": pl.Boolean,
-    "probability": pl.Float64,
+    "gate_probability": pl.Float64,
+    "path_probability": pl.Float64,
     "rivals": pl.String,
     "cross_bias_m": pl.Float64,
     "t_start": pl.Datetime("ns", "UTC"),
@@ -27,7 +29,8 @@ ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
 def found_route(found: Match, sure: float) -> pl.DataFrame:
     """One row per net element in the order of growing path, leg by leg: the route, and what of it is in doubt.
 
-    `doubtful`: its least probability is below `sure`, or no position tells of it. `rivals`: other elements possible
+    `doubtful`: the track was, at the time or in hindsight (the least probabilities of both stand beside it), or no
+    position tells of it. `rivals`: other elements possible
     meanwhile, the most probable first, each with its highest probability, in words. `cross_bias_m`: by how much the
     positions lie left of growing path there (median), which survey and antenna do and no GNSS fault.
     """
@@ -56,10 +59,12 @@ def _passages(track: Track, leg: Leg) -> list[list[int]]:
 
 
 def _row(found: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, sure: float) -> tuple[object, ...]:
-    path_m, probability = floats(found.epochs, "path_m"), floats(found.epochs, "path_probability")
+    path_m = floats(found.epochs, "path_m")
     segment, _ = segments_at(leg, np.nan_to_num(path_m))
-    inside = np.flatnonzero(on_leg & np.isin(leg.visit[segment], visits) & np.isfinite(probability))
-    least = float(probability[inside].min()) if len(inside) else None
+    known = found.epochs["path_probability"].is_not_null().to_numpy()
+    inside = np.flatnonzero(on_leg & np.isin(leg.visit[segment], visits) & known)
+    own = found.epochs[inside]
+    least = own.select(least_belief().min()).item()
     one = leg.visits[visits[0]]
     times = found.epochs["t"]
     return (
@@ -67,7 +72,8 @@ def _row(found: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, 
         "AB" if one.forward else "BA",
         number,
         least is None or least < sure,
-        least,
+        own["gate_probability"].min(),
+        own["path_probability"].min(),
         _rivals(found, inside, 1.0 - sure),
         float(np.median(floats(found.epochs, "cross_track_m")[inside])) if len(inside) else None,
         times[int(inside[0])] if len(inside) else None,

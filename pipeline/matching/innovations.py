@@ -36,24 +36,31 @@ def innovations_of(
     error of the survey that goes on, the rest being its mean by then.
     """
     step = np.repeat(np.arange(len(first) - 1), np.diff(first))
-    moved_m = np.where(before >= 0, offset_m - offset_m[before], np.inf)
-    least = np.lexsort((np.abs(moved_m), step))[first[:-1]][step]
-    # Elements that are surveyed in opposite senses have opposite sides to their left.
-    same = np.cos(heading_rad - heading_rad[least]) >= 0.0
     begun = before < 0
-    shared_m = np.where(begun, 0.0, np.where(same, 1.0, -1.0) * np.where(begun, 0.0, moved_m[least]))
-    parted_m = np.where(begun, 0.0, moved_m - shared_m)
-    return Innovations(shared_m, _errors_m(parted_m, tolerance_m, before, keep[step]))
+    own_m = np.where(begun, 0.0, offset_m - offset_m[before])
+    least = np.lexsort((np.abs(own_m), begun, step))[first[:-1]][step]
+    # Elements that are surveyed in opposite senses have opposite sides to their left.
+    sense = np.where(np.cos(heading_rad - heading_rad[least]) >= 0.0, 1.0, -1.0)
+    shared_m = np.where(begun, 0.0, sense * own_m[least])
+    parted_m = sense * (own_m - shared_m)
+    return Innovations(shared_m, _errors_m(first, parted_m, tolerance_m, sense, before, keep))
 
 
-def _errors_m(parted_m: Floats, tolerance_m: Floats, before: Ints, keep: Floats) -> Floats:
-    """What of the movements that differ from the shared one has been taken for an error of the survey [m]."""
-    errors = [0.0] * len(parted_m)
-    if parted_m.any():
-        columns = before.tolist(), parted_m.tolist(), tolerance_m.tolist(), keep.tolist()
-        for row, (origin, parted, limit, kept) in enumerate(zip(*columns, strict=True)):
-            if origin >= 0:
-                errors[row] = kept * min(max(errors[origin] + parted, -limit), limit)
+def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats, before: Ints, keep: Floats) -> Floats:
+    """What of the movements that differ from the shared one has been taken for an error of the survey [m].
+
+    Errors are those of tracks against each other: of each step the smallest is taken for none, or all would drift.
+    """
+    parted, limit, side, origin = parted_m.tolist(), tolerance_m.tolist(), sense.tolist(), before.tolist()
+    errors = [0.0] * len(parted)
+    begins, kept = first.tolist(), keep.tolist()
+    for step in range(1, len(kept) if parted_m.any() else 0):
+        rows = [row for row in range(begins[step], begins[step + 1]) if origin[row] >= 0]
+        grown = [side[row] * errors[origin[row]] + parted[row] for row in rows]
+        if any(grown):
+            least = min(grown, key=abs)
+            for row, error in zip(rows, grown, strict=True):
+                errors[row] = kept[step] * side[row] * min(max(error - least, -limit[row]), limit[row])
     return np.array(errors)
 
 

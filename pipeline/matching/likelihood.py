@@ -104,10 +104,14 @@ def step_terms(movement_m: Floats, level_m: Floats, candidate: Ints, like: Likel
     With x = level - b: x_k - φ x_(k-1) = φ movement + (1 - φ)(level - b).
     """
     keep = like.keep[candidate][:, None]
-    value_m = keep * movement_m[:, None] + (1.0 - keep) * level_m[:, None]
-    bias_m2 = (1.0 - keep) ** 2 * like.bias_m2
-    variance_m2 = _held(value_m, like.fresh_m2[candidate] + bias_m2, like) - bias_m2
-    terms = _quadratic(value_m, 1.0 - keep, variance_m2)
+    moved_m = keep * movement_m[:, None]
+    # Alike on all tracks that share the movement: else the variance itself would tell between them.
+    variance_m2 = _held(moved_m, like.fresh_m2[candidate], like)
+    # An error far outside all that is expected follows no law by which it returns, whatever the bias.
+    most_m = like.outlier_sigmas * np.sqrt(like.variance_m2[candidate] + like.bias_m2)
+    held_m = np.clip(level_m[:, None], -most_m, most_m)
+    slope = np.where(held_m == level_m[:, None], 1.0 - keep, 0.0)
+    terms = _quadratic(moved_m + (1.0 - keep) * held_m, slope, variance_m2)
     terms[0] += like.fixed[candidate][:, None]
     return terms
 

@@ -7,6 +7,7 @@ from html import escape
 
 import polars as pl
 
+from pipeline.epochs.clock import least_belief
 from pipeline.export.places import stretches_of
 from pipeline.report.columns import frame_table
 from pipeline.report.markup import link, section
@@ -14,10 +15,12 @@ from pipeline.report.words import some_of
 from pipeline.results.store import file_name
 
 _NOTE = (
-    "This is the path that the positions were matched to. Correct it where you know better, and hand it in with "
-    "<code>balise replay --route FILE</code>: nothing stays ambiguous then. The results do not hold which rival tracks "
-    "were possible: the notes above name them, and <code>balise replay --write-route DIR</code> writes them beside "
-    "each net element. A net element without any position is not in this list."
+    "This is the path that the positions were matched to, with how sure it was at the time "
+    "(<code>gate_probability</code>, which decides what is used) and in hindsight (<code>path_probability</code>). "
+    "Correct it where you know better, and hand it in with <code>balise replay --route FILE</code> if you know it to "
+    "be true: nothing stays ambiguous then. The results do not hold which rival tracks were possible: the notes above "
+    "name them, and <code>balise replay --write-route DIR</code> writes them beside each net element. A net element "
+    "without any position is not in this list."
 )
 _TURNED = (
     "The train came back over a net element, and the results do not tell the legs of such a ride apart: "
@@ -28,7 +31,7 @@ _TURNED = (
 def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
     """Net elements in the order of growing path, from one solution's epochs; None where the train turned over switches.
 
-    `doubtful`: the least probability of the path there is below `sure`.
+    `doubtful`: the track was, at the time or in hindsight; the least probabilities of both stand beside it.
     """
     ways = stretches_of(epochs)
     if ways.is_empty() or ways["netelement_id"].n_unique() < ways.height:
@@ -36,7 +39,12 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
     told = (
         epochs.filter(pl.col("path_m").is_not_null())
         .group_by("netelement_id")
-        .agg(probability=pl.col("path_probability").min(), t_start=pl.col("t").min(), t_end=pl.col("t").max())
+        .agg(
+            pl.col("gate_probability", "path_probability").min(),
+            belief=least_belief().min(),
+            t_start=pl.col("t").min(),
+            t_end=pl.col("t").max(),
+        )
     )
     return (
         ways.join(told, on="netelement_id", how="left")
@@ -44,10 +52,11 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
         .select(
             "netelement_id",
             pl.when(pl.col("sign") > 0).then(pl.lit("AB")).otherwise(pl.lit("BA")).alias("direction"),
-            "probability",
+            "gate_probability",
+            "path_probability",
             "t_start",
             "t_end",
-            doubtful=(pl.col("probability") < sure).fill_null(value=True),
+            doubtful=(pl.col("belief") < sure).fill_null(value=True),
         )
     )
 
@@ -63,7 +72,7 @@ def route_section(identity: str, run_id: str, epochs: pl.DataFrame, sure: float)
     said = f"In doubt: {some_of(doubtful)}." if doubtful else "No stretch is in doubt."
     href = f"data:text/csv;base64,{base64.b64encode(route.write_csv().encode()).decode()}"
     download = link(href, "route as csv", download=f"{file_name(run_id)}.csv")
-    shown = route.select("doubtful", "netelement_id", "direction", "probability", "t_start", "t_end")
+    shown = route.select("doubtful", pl.exclude("doubtful"))
     return section(
         identity,
         "Route found",

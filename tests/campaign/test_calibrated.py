@@ -76,12 +76,11 @@ class TestAuto:
         assert table["balises_accepted"].to_list() == [len(BALISES)] * 3
         assert table["config_digest"].to_list() == [job.config_digest for job in plan.jobs]
 
-    def test_without_it_nothing_is_accepted_and_scale_and_noise_are_what_they_were_made_with(
-        self, trial: Path, tmp_path: Path
-    ) -> None:
+    def test_scale_and_noise_are_what_the_runs_were_made_with(self, trial: Path, tmp_path: Path) -> None:
         for job in auto(plan_of(trial, tmp_path, "runs")).jobs:
             assert job.vehicle.odometer_scale == pytest.approx(1.002, abs=5e-4)
             assert job.config.monitors.sigma_slope > 2.0
+            assert job.config.monitors.noise_along_m == (0.0, 0.0, 0.0, 0.0)
 
     def test_same_bytes_in_any_order_and_a_second_call_has_nothing_to_do(
         self, trial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

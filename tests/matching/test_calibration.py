@@ -17,17 +17,20 @@ def found() -> list[Claim]:
 @pytest.mark.parametrize("name", ["gate", "path"])
 def test_claims_come_true_as_often_as_they_say(name: str, found: list[Claim]) -> None:
     """Of runs that claim a track with p at least p are right, two standard errors of so few runs allowed for."""
-    claimed, right = np.array([getattr(one, name) for one in found]), np.array([one.right for one in found])
+    claimed, right = (
+        np.array([getattr(one, name) for one in found]),
+        np.array([getattr(one, f"{name}_right") for one in found]),
+    )
     for level in (0.7, 0.8, 0.9, 0.95, 0.99):
         count = int((claimed >= level).sum())
-        assert count >= 40, level
+        assert count >= 30, level
         allowed = 1.0 - level + 2.0 * np.sqrt(level * (1.0 - level) / count)
         assert (~right[claimed >= level]).mean() <= allowed, level
 
 
 def test_most_runs_are_on_the_track_that_they_are_said_to_be_on(found: list[Claim]) -> None:
     """The claims are not bought by choosing badly: two of three times it is the nearest that is right."""
-    assert np.mean([one.right for one in found]) > 0.8
+    assert np.mean([one.path_right for one in found]) > 0.8
 
 
 def test_a_constant_offset_is_one_observation() -> None:

@@ -58,11 +58,23 @@ def test_a_ring_of_one_element_is_a_passage_per_lap() -> None:
     assert route["t_start"].is_sorted()
 
 
-def test_the_route_of_a_run_without_doubt_is_marked_nowhere() -> None:
+def test_the_route_is_doubtful_wherever_the_live_belief_was() -> None:
+    """Behind the switch nobody could know the branch at first; in hindsight the path is sure everywhere."""
     distance = np.arange(300.0, 1500.0, 15.0)
     x, y = along(branch("d"), distance)
-    route = found_route(matched(run(x, y), site(SWITCH, SWITCH_LINKS), odometer(distance)), 0.99)
-    assert route.select("netelement_id", "direction", "doubtful").rows() == [("s", "AB", False), ("d", "AB", False)]
+    found = matched(run(x, y), site(SWITCH, SWITCH_LINKS), odometer(distance))
+    route = found_route(found, 0.99)
+    assert route.select("netelement_id", "direction", "doubtful").rows() == [("s", "AB", False), ("d", "AB", True)]
+    assert route["path_probability"].min() > 0.99
+    assert route["gate_probability"].to_list() == [
+        found.epochs.filter(netelement_id=name)["gate_probability"].min() for name in ("s", "d")
+    ]
+
+
+def test_the_route_of_a_run_without_doubt_is_marked_nowhere() -> None:
+    place = site({"a": line((0, 0), (1000, 0)), "b": line((1000, 0), (3000, 0))}, [("a", 1, "b", 0, "both")])
+    route = found_route(matched(run(X_M, np.full(len(X_M), 1.9)), place, odometer(X_M)), 0.99)
+    assert route["doubtful"].to_list() == [False, False]
 
 
 @pytest.mark.usefixtures("in_process")

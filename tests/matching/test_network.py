@@ -56,7 +56,8 @@ def test_the_gate_doubts_the_branch_until_the_tracks_part() -> None:
     assert found.epochs["path_probability"].min() > 0.999
     row = found.ambiguous.row(0, named=True)
     assert (row["netelement_id"], row["other_netelement_id"]) == ("d", "m")
-    assert row["probability"] == pytest.approx(gate.min())
+    assert row["gate_probability"] == pytest.approx(gate.min())
+    assert row["path_probability"] > 0.999
     doubted = found.epochs.filter(pl.col("gate_probability") < 0.99)["t"]
     assert row["t_start"] == doubted.min()
     assert row["t_end"] == doubted.max()

@@ -123,12 +123,19 @@ def test_the_found_route_can_be_taken_away(out: Path, site: Site, replayed: dict
     assert route is not None
     assert breaches == []
     assert route.select("netelement_id", "direction").rows() == [("NE1", "AB"), ("NE2", "BA"), ("NE3", "AB")]
-    doubted = replayed["jump_two"].epochs.with_columns(
+    known = replayed["jump_two"].epochs.with_columns(gate_probability=pl.lit(1.0))
+    doubted = known.with_columns(
         path_probability=pl.when(pl.col("netelement_id") == "NE2").then(0.9).otherwise(pl.col("path_probability"))
     )
     found = found_route(doubted, 0.99)
     assert found is not None
     assert found.filter("doubtful")["netelement_id"].to_list() == ["NE2"]
+    live = known.with_columns(
+        gate_probability=pl.when(pl.col("netelement_id") == "NE3").then(0.9).otherwise(pl.col("gate_probability"))
+    )
+    at_the_time = found_route(live, 0.99)
+    assert at_the_time is not None
+    assert at_the_time.filter("doubtful")["netelement_id"].to_list() == ["NE3"]
     back = doubted.filter(pl.col("netelement_id") == "NE1").with_columns(path_m=pl.col("path_m") + 30_000.0)
     assert found_route(pl.concat([doubted, back]), 0.99) is None
 

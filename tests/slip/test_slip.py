@@ -7,12 +7,15 @@ import polars as pl
 import pytest
 
 from pipeline.stages import replay
-from schemas.config import Vehicle
+from schemas.config import Configuration, MonitorConfig, Vehicle
 from schemas.run import RunTables
 from tests.slip.world import BALISES, LEG_S, READ_M, STAND_S, VEHICLE, Fault, Slip, ride, site, times, way_m
 
 SECOND_START_S = LEG_S + STAND_S
 SITE = site()
+NONE = (0.0, 0.0, 0.0, 0.0)
+# Else nothing would be in use before the run has shown it.
+KNOWN = Configuration(monitors=MonitorConfig(noise_along_m=NONE, noise_cross_m=NONE, noise_up_m=NONE))
 
 
 def accepted(tables: RunTables) -> list[str]:
@@ -27,7 +30,7 @@ def replayed(
     read: bool = False,
     radar: Slip | None = None,
 ) -> RunTables:
-    return replay(ride(slip, fault, read=read, radar=radar), SITE, vehicle)
+    return replay(ride(slip, fault, read=read, radar=radar), SITE, vehicle, KNOWN)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.08, -0.08])
