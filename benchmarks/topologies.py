@@ -1,6 +1,7 @@
 """Is the track right where lines branch, cross and come back? `python -m benchmarks.topologies [--runs N] [--seed S]`.
 
-Worlds by chance: rings, balloon loops, shuttles, yards, crossings at grade and above, stations, passing loops.
+Worlds by chance: rings, balloon loops, shuttles, yards, crossings at grade and above, stations, passing loops,
+turnouts and ladders on one of two tracks.
 Tracks are drawn from curves of a radius, trains drive them from element to element, and both the track and the place of
 every epoch are known. Errors are those of `benchmarks.calibration`; nothing here uses the program's geometry.
 """
@@ -230,6 +231,36 @@ def passing_loop(rng: np.random.Generator) -> World:
     return world
 
 
+def one_sided(rng: np.random.Generator) -> World:
+    """Two tracks of which one alone has turnouts, all leading away from both."""
+    world, apart = World(), rng.uniform(4.0, 5.0)
+    names = [f"a{k}" for k in range(int(rng.integers(3, 8)))]
+    split(world, names, draw((0, 0, 0, 0), (3000.0, 0.0)))
+    world.elements["b"] = draw((0, apart, 0, 0), (3000.0, 0.0))
+    for number, name in enumerate(names[1:]):
+        x, y, height = world.elements[name][0]
+        world.elements[f"d{number}"] = draw((x, y, 0, height), (60.0, -0.1), (340.0, 0.0))
+        world.link(names[number], 1, f"d{number}", 0)
+    world.through(*(names if rng.random() < 0.5 else ["b"]))
+    return world
+
+
+def ladder(rng: np.random.Generator) -> World:
+    """Two tracks, and on the side of one of them a yard of sidings that part from a ladder."""
+    world = World()
+    names = [f"a{k}" for k in range(5)]
+    split(world, names, draw((0, 0, 0, 0), (3000.0, 0.0)))
+    world.elements["b"] = draw((0, 4.5, 0, 0), (3000.0, 0.0))
+    for number, name in enumerate(names[1:]):
+        x, y, height = world.elements[name][0]
+        out = 4.5 * (4 - number) / np.sin(0.1)
+        parts = ((30.0, -0.1), (out, 0.0), (30.0, 0.1), (2500.0 - x - out, 0.0))
+        world.elements[f"s{number}"] = draw((x, y, 0, height), *(part for part in parts if part[0] > 0.0))
+        world.link(names[number], 1, f"s{number}", 0)
+    world.through(*(names if rng.random() < 0.5 else ["b"]))
+    return world
+
+
 WORLDS: dict[str, Callable[[np.random.Generator], World]] = {
     "ring": ring,
     "balloon": balloon,
@@ -239,6 +270,8 @@ WORLDS: dict[str, Callable[[np.random.Generator], World]] = {
     "bridge": bridge,
     "station": station,
     "passing loop": passing_loop,
+    "one-sided turnouts": one_sided,
+    "ladder": ladder,
 }
 
 

@@ -15,6 +15,7 @@ from pipeline.figures.undetected import Spacing
 from pipeline.ingest.clean import CleanCounts, clean, of_the_journey, require_one_journey, require_two_times
 from pipeline.judge.case import Case, Solution
 from pipeline.judge.judge import Judged, judge
+from pipeline.judge.judged import direction_by_evidence
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
 from pipeline.matching.reference import match_reference
@@ -213,6 +214,9 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     config, found = context.config, matches[solution]
     odometry = None if context.odometry is None else context.odometry.oriented(found.odometer_sign)
     aligned = align(found.epochs, odometry, context.vehicle, config)
+    if odometry is None:
+        # Virtual balises may be valid in one direction, and that is the train's: no position's step (DOMAIN section 4).
+        aligned = aligned.with_columns(direction_by_evidence(_undecided(context, solution, aligned, found)))
     compared = _compared(context, solution, aligned, matches)
     singles = _single_monitors(context, solution, aligned, compared)
     bank = MonitorBank(aligned, singles, config)
@@ -235,6 +239,13 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     passages = lds.passages.with_columns(unnoticed.passages)
     taken = Solution(solution, context.fixes(solution), monitored, lds.crossings, passages, balises, found.path)
     return _Ride(taken, found, aligned, lds, odometry, diagnosis, unnoticed.spacing)
+
+
+def _undecided(context: _Context, solution: str, aligned: pl.DataFrame, found: Match) -> Case:
+    """Positions and evidence of a solution of which nothing is decided yet."""
+    nothing = pl.DataFrame()
+    given = Solution(solution, context.fixes(solution), aligned, nothing, nothing, nothing, found.path)
+    return Case(given, context.evidence, None, context.vehicle, context.config)
 
 
 def _reads_on_odometer(

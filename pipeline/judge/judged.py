@@ -30,13 +30,7 @@ def epochs_judged(case: Case, counted: Counted) -> pl.DataFrame:
     """The epochs of the solution with the columns of `JudgedEpochs`: evidence, direction, judgement, movement, use."""
     epochs, config, at_ns = case.solution.epochs, case.config, case.instants_of_epochs()
     path_m = floats(epochs, "path_m")
-    positions = Positions(
-        element=np.where(np.isfinite(path_m), case.element_numbers(epochs["netelement_id"]), -1),
-        measure_m=floats(epochs, "measure_m"),
-        leg=ints(epochs["leg"]),
-        path_m=path_m,
-        unambiguous=met(epochs, unambiguous(config)),
-    )
+    positions = _positions(case)
     evidence = case.evidence.at(at_ns, counted.stood)
     along = _judge(case, positions, at_ns, evidence, counted.stood)
     given = ints(epochs["direction"], 1)
@@ -65,6 +59,26 @@ def epochs_judged(case: Case, counted: Counted) -> pl.DataFrame:
         pl.Series("undiagnosed", undiagnosed),
         moving=pl.when(pl.Series(sure)).then(pl.Series(moved)),
     )
+
+
+def _positions(case: Case) -> Positions:
+    epochs, path_m = case.solution.epochs, floats(case.solution.epochs, "path_m")
+    return Positions(
+        element=np.where(np.isfinite(path_m), case.element_numbers(epochs["netelement_id"]), -1),
+        measure_m=floats(epochs, "measure_m"),
+        leg=ints(epochs["leg"]),
+        path_m=path_m,
+        unambiguous=met(epochs, unambiguous(case.config)),
+    )
+
+
+def direction_by_evidence(case: Case) -> pl.Series:
+    """Direction of travel of a run without an odometer, before anything is judged: `epochs` as they are aligned."""
+    at_ns, positions = case.instants_of_epochs(), _positions(case)
+    along = judge_positions(positions, case.evidence.at(at_ns), case.legs(), case.config.hazards)
+    given = ints(case.solution.epochs["direction"], 1)
+    found = travel_direction(given, along, at_ns, positions.path_m, has_odometer=False, config=case.config.hazards)
+    return pl.Series("direction", found, dtype=pl.Int8)
 
 
 def offers_judged(case: Case, epochs: pl.DataFrame, stood: list[Span]) -> pl.DataFrame:

@@ -64,3 +64,20 @@ def test_a_zig_zag_meets_each_balise_in_its_own_direction():
     assert tables.runs["balises_on_path"].to_list() == [5]
     assert tables.runs["balises_missed"].to_list() == [0]
     assert tables.hazards.height == tables.alarms.height == 0
+
+
+def test_without_an_odometer_the_reference_says_which_way_the_train_went():
+    """A jump of 1,000 m ahead and back: the position comes back over a balise, the train does not turn."""
+    run, site = journey(JUMP)
+    velocities = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
+    gnss = run.gnss.with_columns(pl.lit(None, pl.Float64).alias(name) for name in velocities)
+    run = run.with_streams(odometer=None, gnss=gnss)
+    forward = element_senses(run, site)
+    virtual = site.balises.filter(pl.col("kind").cast(pl.String) == "virtual")["balise_id"].to_list()
+    ahead = {name: "AB" if forward[name] else "BA" for name in virtual}
+    both, found = replay(run, site, VEHICLE), replay(run, valid_in(site, ahead), VEHICLE)
+    assert set(both.passages["direction"]) == {"growing"}
+    assert both.passages.filter(kind="virtual")["balise_id"].is_duplicated().any()
+    assert_frame_equal(found.passages, both.passages, check_exact=True)
+    back = replay(run, valid_in(site, {name: OTHER[way] for name, way in ahead.items()}), VEHICLE)
+    assert back.passages.filter(kind="virtual").is_empty()
