@@ -206,6 +206,7 @@ class _Ride:
     lds: LdsResult
     odometry: Odometry | None
     diagnosis: Diagnosis
+    white_noise: dict[str, float | None]
     spacing: Spacing | None
 
 
@@ -238,7 +239,7 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     monitored = pl.concat([seen, pl.DataFrame(bank.columns()), unnoticed.epochs], how="horizontal")
     passages = lds.passages.with_columns(unnoticed.passages)
     taken = Solution(solution, context.fixes(solution), monitored, lds.crossings, passages, balises, found.path)
-    return _Ride(taken, found, aligned, lds, odometry, diagnosis, unnoticed.spacing)
+    return _Ride(taken, found, aligned, lds, odometry, diagnosis, bank.white_noise(), unnoticed.spacing)
 
 
 def _undecided(context: _Context, solution: str, aligned: pl.DataFrame, found: Match) -> Case:
@@ -281,6 +282,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         vehicle=context.figures_from,
         odometer_contradicted=context.evidence.contradicted,
         alignment=ride.aligned.select(*_AT_THE_END, odometer_scale_sigma="scale_sigma").row(-1, named=True),
+        white_noise=ride.white_noise,
         counts=counts,
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,

@@ -163,7 +163,6 @@ ALONE = {
     "epochs": {
         "link_order_threshold": "identities are counted",
         "channel_reason": "one reason for all that have no channel",
-        "withheld_for": "noise and slip: tests/lds",
     },
     "runs": {
         "calibrated_by": "replays by `--calibrate`: tests/campaign",
