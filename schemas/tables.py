@@ -281,6 +281,11 @@ class Runs(dy.Schema):
     latency_sigma_s = real("s", "its standard deviation", min=0)
     odometer_scale = real("1", "true distance over odometer distance")
     odometer_scale_sigma = real("1", "its standard deviation", min=0)
+    white_noise_along_m = real(
+        "m", "white noise of positions along the track, as measured at the end; null: not known", min=0
+    )
+    white_noise_cross_m = real("m", "the same across the track", min=0)
+    white_noise_up_m = real("m", "the same of the height", min=0)
     cross_bias_m = real("m", "median cross-track residual over the run")
     along_error_mean_m = real("m", "mean error along the track")
     along_error_p95_m = real("m", "95 % of |error| along the track")

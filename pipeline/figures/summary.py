@@ -36,7 +36,8 @@ class SolutionResults:
     """All that the stages found out about one solution; `epochs` as in `schemas.tables`.
 
     `odometer_contradicted`: gaps between anchors that the odometer does not close (DOMAIN section 5.1). `alignment`:
-    latency and odometer scale at the end of the run. `spacing`: of physical balises, None where not computed.
+    latency and odometer scale at the end of the run. `white_noise`: its columns of `runs`.
+    `spacing`: of physical balises, None where not computed.
     `reasons`: those that no figure holds; `anchored_ns`: first and last instant at which a read or the reference says
     where the train was.
     """
@@ -47,6 +48,7 @@ class SolutionResults:
     vehicle: VehicleFigures = VehicleFigures.NONE
     odometer_contradicted: int = 0
     alignment: Row = field(default_factory=dict)
+    white_noise: Row = field(default_factory=dict)
     counts: StreamCounts = field(default_factory=StreamCounts)
     ingest: IngestNotes = field(default_factory=IngestNotes)
     ambiguous_stretches: int = 0
@@ -64,6 +66,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     lost = lost_time(epochs, judged.alarms, clock, config)
     row = (
         _identity(results)
+        | results.white_noise
         | _decisive(epochs, judged.passages, judged.failures, config)
         | ({} if judged.evidence else {"hazardous_s": None})
         | {"duration_s": clock.duration_s, "reasons": results.reasons}

@@ -29,6 +29,8 @@ from schemas.tables import SCALES
 
 NOISE_UNKNOWN = "noise not yet known"
 NOISE_TOO_LARGE = "noise too large"
+# Second differences of white noise have six times its variance, and M is a fourth of it (DOMAIN section 3).
+WHITE_PART = float(np.sqrt(4.0 / 6.0))
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,11 @@ class _AxisBank:
         unknown[self._series.epoch] = np.any(np.isnan(self.noise_m[self._series.epoch]), axis=1)
         too_large: Bools = np.any(self.noise_m > self._limit_m, axis=1)
         return first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
+
+    def white_noise_m(self) -> float | None:
+        """sqrt(4 M / 6) of one epoch at the end; None where it was never known (DOMAIN section 3)."""
+        known = self.noise_m[:, 0][np.isfinite(self.noise_m[:, 0])]
+        return float(known[-1]) * WHITE_PART if known.size else None
 
     def columns(self) -> list[pl.Series]:
         """Value, threshold, state and reason of each monitor of the axis."""
@@ -266,6 +273,10 @@ class MonitorBank:
         if self._any.size:
             self._look(self._any.size - 1)
         return self._axes[0].record()
+
+    def white_noise(self) -> dict[str, float | None]:
+        """`white_noise_*_m` of the run: the noise at one epoch, were it white, as last measured [m]."""
+        return {f"white_noise_{axis.axis.name}_m": axis.white_noise_m() for axis in self._axes}
 
     def columns(self) -> list[pl.Series]:
         """All monitor columns of the epochs table but those of the linking monitors."""

@@ -191,3 +191,11 @@ def test_a_step_is_found_within_one_epoch() -> None:
         ).columns()
         raw = next(column for column in columns if column.name == "along_raw_state")
         assert raw.to_list()[round(800.0 * receiver.rate_hz)] == MonitorState.FAIL.value
+
+
+def test_white_noise_of_the_run() -> None:
+    bank = MonitorBank(epochs_of(Receiver(white_m=0.2), 0.5, np.random.default_rng(8)), {}, CONFIG)
+    bank.columns()
+    found = bank.white_noise()
+    assert found["white_noise_along_m"] == pytest.approx(0.2, rel=0.25)
+    assert found["white_noise_up_m"] == pytest.approx(0.3, rel=0.25)
