@@ -106,7 +106,6 @@ CAUSES: dict[MisfitCause, str] = {
     MisfitCause.SPEED_WITHOUT_SIGN: "it stays positive where the distance falls",
     MisfitCause.COUNTER_WITHOUT_SIGN: "a counter without sign",
     MisfitCause.SIGN_OF_SOMETHING_ELSE: "the sign follows something else than the movement",
-    MisfitCause.EVIDENCE_CLOCKS: "one of the two is wrong, and with it the true position",
     MisfitCause.OFFSET_OF_REFERENCE: "another datum, or a fixed offset between the two antennas",
     MisfitCause.WHOLE_SECONDS: "cut off or rounded by the recorder, so that at 40 m/s a balise may have been read 40 m "
     "away",
@@ -172,7 +171,8 @@ REMEDIES: dict[Remedy, str] = {
     Remedy.READS_AT_ENDS: "record balise reads near both ends of the run, within 300 m of them",
     Remedy.READS_CLOSER: "record balise reads closer to each other, every 2 km",
     Remedy.ROUTE: "name the track that the train took: "
-    "`balise replay {run} --site {site} --out {out}{options} --route ROUTE.csv`",
+    "`balise replay {run} --site {site} --out {out}{options} --route ROUTES` "
+    "(--write-route ROUTES writes what was found)",
     Remedy.CLOCK: "set the recorders to one clock: `balise inspect {run} --site {site}` shows their lags",
     Remedy.ODOMETER: "record an odometer: without one nothing along the track is monitored",
     Remedy.FASTER_LOG: "log positions more often, at 10 Hz",

@@ -90,7 +90,7 @@ def _episode(
     config: HazardConfig,
 ) -> Episode:
     after_quiet = course.after_quiet(floor, mark)
-    step = next((jump for jump in course.jumps if after_quiet <= jump.last and jump.first <= mark), None)
+    step = next(iter(course.jumps_in(after_quiet, mark + 1)), None)
     onset = max(floor, step.first) if step is not None else after_quiet
     jump_back, end = _end(course, mark, step, config)
     onset_ns = _onset_ns(course, onset, mark, step, log, faults, config)
@@ -120,18 +120,18 @@ def _episode(
 def _end(course: Course, mark: int, step: Jump | None, config: HazardConfig) -> tuple[Jump | None, int]:
     """The jump back that ends the episode, and the first position after it."""
     calm = int(course.calm_from[mark])
-    for jump in course.jumps:
+    for jump in course.jumps_in(mark + 1, calm + 1):
         after_step = jump.first > mark and (step is None or jump.first > step.last)
-        if after_step and jump.first <= calm and _is_back(course.judged, jump, config):
+        if after_step and _is_back(course.judged, jump, config):
             return jump, jump.first
     return None, calm
 
 
 def _is_back(judged: Judgements, jump: Jump, config: HazardConfig) -> bool:
     """Against the error before it, and no longer beyond the limit after it."""
-    before_m = float(judged.middle_m[jump.first - 1])
-    after_m = float(judged.least_m[jump.last])
-    return before_m * jump.step_m < 0.0 and after_m <= config.failure_limit_m and judged.code[jump.last] != WRONG
+    ends = judged.take(np.array([jump.first - 1, jump.last]))
+    back = float(ends.middle_m[0]) * jump.step_m < 0.0
+    return back and float(ends.least_m[1]) <= config.failure_limit_m and ends.code[1] != WRONG
 
 
 def _onset_ns(

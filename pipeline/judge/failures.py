@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -37,6 +38,12 @@ class Course:
     @property
     def size(self) -> int:
         return self.t_ns.size
+
+    def jumps_in(self, begin: int, end: int) -> list[Jump]:
+        """Jumps, in order of time, that end at `begin` or later and begin before `end`."""
+        first = bisect_left(self.jumps, begin, key=lambda jump: jump.last)
+        last = bisect_left(self.jumps, end, key=lambda jump: jump.first)
+        return [jump for jump in self.jumps[max(first - 1, 0) : last] if jump.last >= begin]
 
     def after_quiet(self, floor: int, number: int) -> int:
         """The position after the last quiet one between `floor` and a position."""

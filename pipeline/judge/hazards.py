@@ -29,21 +29,29 @@ class Offers:
     """The frame of offers in arrays, `number`: the position, by its row, that completes each."""
 
     frame: pl.DataFrame
+    balise_id: list[str]
     number: Ints
+    t_ns: Ints
     path_m: Floats
     judged: Judgements
     virtual: Bools
     offered: Bools
+    accepted: Bools
+    beyond_window: Bools
 
     @classmethod
     def of(cls, frame: pl.DataFrame, positions: pl.DataFrame) -> Offers:
         return cls(
             frame=frame,
+            balise_id=frame["balise_id"].to_list(),
             number=numbers_of(frame, positions),
+            t_ns=times_ns(frame),
             path_m=floats(frame, "path_m"),
             judged=Judgements.of(frame),
             virtual=flags(frame, "virtual"),
             offered=flags(frame, "offered"),
+            accepted=flags(frame, "accepted"),
+            beyond_window=flags(frame, "beyond_window"),
         )
 
 
@@ -68,10 +76,9 @@ def hazard_rows(episodes: Iterable[Episode], course: Course, offers: Offers, con
 
 
 def _of_episode(episode: Episode, course: Course, offers: Offers, config: HazardConfig) -> list[HazardRow]:
-    inside = [jump for jump in course.jumps if episode.onset <= jump.last and jump.first < episode.end]
     taken: set[int] = set()
     rows: list[HazardRow] = []
-    for jump in inside:
+    for jump in course.jumps_in(episode.onset, episode.end):
         crossed = crossed_by(jump, offers, course)
         taken.update(crossed)
         if crossed:
@@ -86,8 +93,7 @@ def _of_episode(episode: Episode, course: Course, offers: Offers, config: Hazard
     astray = [hit for hit in hits if offers.judged.wrong_track[hit]]
     if astray:
         rows.append(HazardRow(Hazard.VB_WRONG_TRACK, episode, None, astray))
-    t_ns = times_ns(offers.frame)
-    rows.sort(key=lambda row: t_ns[row.hits[0]] if row.jump is None else course.t_ns[row.jump.first])
+    rows.sort(key=lambda row: offers.t_ns[row.hits[0]] if row.jump is None else course.t_ns[row.jump.first])
     back = _jump_back(episode, rows, offers, course)
     return [*rows, back] if back is not None else rows
 
@@ -135,8 +141,8 @@ def crossed_by(jump: Jump, offers: Offers, course: Course) -> list[int]:
 
 
 def _class_of(crossed: list[int], offers: Offers) -> Hazard:
-    distinct = offers.frame["balise_id"].gather(crossed).n_unique()
-    return Hazard.VB_JUMP_1A if distinct > 1 else Hazard.VB_JUMP_1B
+    distinct = {offers.balise_id[number] for number in crossed}
+    return Hazard.VB_JUMP_1A if len(distinct) > 1 else Hazard.VB_JUMP_1B
 
 
 def size_m(row: HazardRow, course: Course, offers: Offers) -> float | None:
@@ -147,8 +153,9 @@ def size_m(row: HazardRow, course: Course, offers: Offers) -> float | None:
     episode, jump = row.episode, row.jump
     if jump is not None and jump is episode.jump_back:
         return jump.step_m
-    lasting = course.judged.middle_m[episode.onset : episode.end]
-    error_m = np.concatenate([lasting, offers.judged.middle_m[row.hits]])
+    lasting = course.judged.take(np.arange(episode.onset, episode.end)).middle_m
+    hit = offers.judged.take(np.array(row.hits, dtype=np.int64)).middle_m
+    error_m = np.concatenate([lasting, hit])
     error_m = error_m[np.isfinite(error_m)]
     if error_m.size == 0:
         return None if jump is None else jump.step_m
@@ -196,9 +203,8 @@ def hazards_table(
 
 
 def _kind(row: HazardRow, offers: Offers) -> dict[str, Any]:
-    hit = offers.frame[row.hits]
-    ids = hit["balise_id"].unique(maintain_order=True).to_list()
-    accepted = set(hit.filter("accepted")["balise_id"])
+    ids = list(dict.fromkeys(offers.balise_id[hit] for hit in row.hits))
+    accepted = {offers.balise_id[hit] for hit in row.hits if offers.accepted[hit]}
     return {
         "hazard": row.hazard.value,
         "failure_mode": _failure_mode(row, offers).value,
@@ -219,8 +225,7 @@ def _timing(row: HazardRow, offers: Offers) -> Timing:
 def _failure_mode(row: HazardRow, offers: Offers) -> FailureMode:
     if row.hazard is not Hazard.VB_SHIFT or _timing(row, offers) is Timing.EARLY:
         return FailureMode.INSERTION
-    late = offers.frame["beyond_window"].gather(row.hits).any()
-    return FailureMode.DELETION if late else FailureMode.NONE
+    return FailureMode.DELETION if offers.beyond_window[row.hits].any() else FailureMode.NONE
 
 
 def _evidence(row: HazardRow, course: Course, offers: Offers) -> Evidence:
@@ -237,7 +242,7 @@ def instants(row: HazardRow, course: Course, offers: Offers, config: Configurati
     detected_ns = episode.detected_ns
     return {
         "t_onset": episode.onset_ns,
-        "t_hazard": int(times_ns(offers.frame)[row.hits[0]] if jump is None else course.t_ns[jump.first]),
+        "t_hazard": int(offers.t_ns[row.hits[0]] if jump is None else course.t_ns[jump.first]),
         "t_failure": episode.t_failure_ns,
         "t_failure_may": episode.t_failure_may_ns,
         "t_detected": detected_ns,
@@ -263,7 +268,7 @@ def _place(row: HazardRow, case: Case, epochs: pl.DataFrame, course: Course, off
     there = course.positions.row(number, named=True)
     path_m = there["path_m"] - there["direction"] * float(course.judged.middle_m[number])
     names, measures = case.solution.path.locate(max(there["leg"], 0), path_m)
-    hazard_ns = times_ns(offers.frame)[row.hits[:1]] if at_offer else course.t_ns[[number]]
+    hazard_ns = offers.t_ns[row.hits[:1]] if at_offer else course.t_ns[[number]]
     return {
         "netelement_id": names[0],
         "measure_m": _known(float(measures[0])),

@@ -63,6 +63,9 @@ class Judgements:
             wrong_track=flags(frame, "wrong_track"),
         )
 
+    def take(self, rows: Ints) -> Judgements:
+        return Judgements(self.code[rows], self.low_m[rows], self.high_m[rows], self.kind[rows], self.wrong_track[rows])
+
     def columns(self) -> list[pl.Series]:
         kinds = pl.Series("evidence", [*(kind.value for kind in KINDS), None], dtype=pl.Enum(Evidence))
         return [

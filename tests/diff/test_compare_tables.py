@@ -243,4 +243,6 @@ def _other(frame: pl.DataFrame, column: str, row: int, change: float) -> pl.Expr
         return pl.lit("another")
     if isinstance(dtype, pl.Datetime):
         return pl.col(column) + pl.duration(nanoseconds=1)
+    if isinstance(dtype, pl.List):
+        return pl.lit(["another"], dtype=dtype)
     return pl.lit(-1 if value is None else -value, dtype=dtype)
