@@ -172,7 +172,8 @@ REMEDIES: dict[Remedy, str] = {
     Remedy.READS_AT_ENDS: "record balise reads near both ends of the run, within 300 m of them",
     Remedy.READS_CLOSER: "record balise reads closer to each other, every 2 km",
     Remedy.ROUTE: "name the track that the train took: "
-    "`balise replay {run} --site {site} --out {out}{options} --route ROUTE.csv`",
+    "`balise replay {run} --site {site} --out {out}{options} --route ROUTES` "
+    "(--write-route ROUTES writes what was found)",
     Remedy.CLOCK: "set the recorders to one clock: `balise inspect {run} --site {site}` shows their lags",
     Remedy.ODOMETER: "record an odometer: without one nothing along the track is monitored",
     Remedy.FASTER_LOG: "log positions more often, at 10 Hz",

@@ -63,7 +63,9 @@ def remedies(run: Row, lost: LostTime, unknown: Unknown, survey_stated: bool, co
 
     healthy = lost.unfounded and not run["faults_injected"]
     noisy = healthy and lost.monitor in FAST and costs(LostTo.ALARM, LostTo.RELINK)
-    calibrate = noisy or costs(LostTo.NOISE)
+    # Some time passes in every run until the noise is known; alone it has to make availability low.
+    loud = lost.causes.get(LostTo.NOISE, 0.0) > 1.0 - config.advice.low_availability
+    calibrate = (noisy or loud) and not config.calibration.runs
     # What calibrates the noise measures the odometer too.
     without_scale = run["vehicle"] == VehicleFigures.LEARNED and not calibrate
     table = {

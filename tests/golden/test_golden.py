@@ -22,7 +22,7 @@ from pipeline.diff import compare_tables
 from pipeline.ingest import read_run
 from pipeline.site.read import read_site
 from schemas.config import Configuration, Vehicle
-from schemas.enums import BaliseKind, Hazard, PassageStatus
+from schemas.enums import BaliseKind, Hazard, NotEvaluated, PassageStatus
 from schemas.inputs import BaliseReads
 from schemas.run import RunLog, RunTables
 from schemas.tables import BANK_MONITORS, MONITORS, TABLES
@@ -136,6 +136,18 @@ def test_every_class_status_and_monitor_happens_somewhere(replayed: dict[str, Ru
     assert set(MONITORS) - failing == set()
 
 
+def test_every_reason_of_a_monitor_is_of_the_closed_set(replayed: dict[str, RunTables]) -> None:
+    known = {reason.value for reason in NotEvaluated}
+    found = {
+        reason
+        for tables in replayed.values()
+        for name in MONITORS
+        for reason in tables.epochs[f"{name}_reason"].drop_nulls().unique()
+    }
+    assert found <= known
+    assert len(found) > 5
+
+
 # Columns that hold one value, or none, in all golden runs, and why.
 ALONE = {
     "hazards": {
@@ -151,7 +163,6 @@ ALONE = {
     "epochs": {
         "link_order_threshold": "identities are counted",
         "channel_reason": "one reason for all that have no channel",
-        "withheld_for": "noise and slip: tests/lds",
     },
     "runs": {
         "calibrated_by": "replays by `--calibrate`: tests/campaign",

@@ -127,6 +127,9 @@ def test_alarms_that_nothing_explains_are_mended_by_calibration_and_not_by_more_
     assert cures({"vehicle": "learned"}, noisy) == [Remedy.CALIBRATE], "which measures the odometer too"
     assert cures({}, {LostTo.RELINK: 0.5}) == [Remedy.CALIBRATE]
     assert cures({}, {LostTo.NOISE: 0.5}) == [Remedy.CALIBRATE]
+    assert cures({}, {LostTo.NOISE: 0.08, LostTo.CONFIDENCE: 0.42}) == [], "the begin of a short run"
+    done = Configuration.model_validate({"calibration": {"runs": ["b", "c"]}})
+    assert Remedy.CALIBRATE not in remedies(RUN, LostTime(0.5, noisy, "along_raw", True), NOTHING, True, done)
     assert cures({}, noisy, unfounded=False) == []
     assert cures({"faults_injected": True}, noisy) == []
     assert cures({}, noisy, monitor="along_ewma_0p001") == []

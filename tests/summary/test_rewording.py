@@ -77,19 +77,23 @@ def dictionaries() -> Iterator[dict[Any, str]]:
             yield value
 
 
+# What was looked for once: none of it, and all of it, in every message.
+LOOKED_FOR = "faults were injected, the rest lost to: 3% no fix, a roll-over of the GPS week, in feet, in the survey"
+
+
 def gibberish(chance: random.Random) -> str:
-    letters = "".join(chance.choices("abcdefghijklmnopqrstuvwxyz ;:,%()", k=40))
-    return letters + chance.choice(["faults were injected", "rest lost to: 3% no fix", "roll-over of the GPS week", ""])
+    return "".join(chance.choices("abcdefghijklmnopqrstuvwxyz ,%()", k=40))
 
 
-def test_rewording_every_message_changes_no_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("more", ["", LOOKED_FOR])
+def test_rewording_every_message_changes_no_figure(more: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plain = tables_of(tmp_path / "plain")
     assert plain["runs"].select("faults_injected").item()
     assert plain["runs"].select(pl.col("misfits", "lost_to", "remedies").list.len() > 0).row(0) == (True,) * 3
     chance = random.Random(5)
     for sentences in dictionaries():
         for code in sentences:
-            monkeypatch.setitem(sentences, code, gibberish(chance))
+            monkeypatch.setitem(sentences, code, gibberish(chance) + more)
     reworded = tables_of(tmp_path / "reworded")
     assert plain.pop("notes").item() != reworded.pop("notes").item()
     assert plain.keys() == reworded.keys()
