@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
-from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.notes import ride_notes
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.figures.undetected import Spacing
@@ -18,18 +18,16 @@ from pipeline.judge.judge import Judged, judge
 from pipeline.judge.judged import direction_by_evidence
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
-from pipeline.matching.reference import match_reference
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor, on_path_of
 from pipeline.odometry import Odometry, counted_over_slip, odometry_of
-from pipeline.odometry.polarity import polarity
 from pipeline.plausibility.fit import Fit, fit_run, refuse_impossible
+from pipeline.reference import reference_stretches
 from pipeline.results.provenance import Provenance, provenance
-from pipeline.track.network import Network, site_network
+from pipeline.track.network import network_in_pieces, site_network
 from pipeline.undetected.columns import Diagnosis, undetected_of
 from pipeline.undetected.watched import fixes_ns
-from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
 from schemas.enums import NotEvaluated, Reason, VehicleFigures
@@ -108,36 +106,20 @@ def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -
     fits = {name: fit_run(cleaned, name, vehicle, config.plausibility, site) for name in cleaned.solutions()}
     cleaned = of_the_journey(cleaned)
     odometry = odometry_of(cleaned.odometer, vehicle, config)
-    network = site_network(site)
-    reference = _reference_places(cleaned, site, odometry, network, vehicle, config)
-    evidence = evidence_of(reference, cleaned.balise_reads, site.balises, odometry, network, config)
-    counted = None if odometry is None else counted_over_slip(odometry, _others(cleaned, config), config.align)
+    others = [odometry_of(stream, Vehicle(), config) for stream in cleaned.other_odometers]
+    odometers = [one for one in (odometry, *others) if one is not None]
+    evidence = _evidence(cleaned, odometers, site, vehicle, config)
+    counted = None if odometry is None else counted_over_slip(odometry, odometers[1:], config.align)
     return _Context(cleaned, site, vehicle, config, counts, fits, counted, evidence)
 
 
-def _others(run: RunLog, config: Configuration) -> list[Odometry]:
-    """The odometers that the LDS does not use; no vehicle file tells of them."""
-    found = (odometry_of(stream, Vehicle(), config) for stream in run.other_odometers)
-    return [odometry for odometry in found if odometry is not None]
-
-
-def _reference_places(
-    run: RunLog, site: Site, odometry: Odometry | None, network: Network, vehicle: Vehicle, config: Configuration
-) -> ReferencePlaces | None:
-    """The reference on the network, by itself; none where the run has none, or it comes near no track."""
-    if run.reference is None or run.reference.is_empty():
-        return None
-    default_m = config.hazards.reference_sigma_m
-    found = match_reference(run.reference, site, config.matching, config.hazards, run.balise_reads)
-    if found is None:
-        return None
-    rivals = found.rivals(config.hazards.rival_probability, network.track.index)
-    sigma_m = floats(run.reference.with_columns(pl.col("sigma_m").fill_null(default_m)), "sigma_m")
-    # The leading end faces along growing path where the odometer grows over the first movement.
-    path_m, distance_m = floats(found.epochs, "path_m"), config.matching.orientation_distance_m
-    facing = 1 if odometry is None else polarity(odometry, times_ns(found.epochs), path_m, distance_m)
-    ahead_m = facing * vehicle.gnss_antenna_ahead_m
-    return ReferencePlaces.of(found.epochs, found.path, rivals, sigma_m, ahead_m, network.track, config.align)
+def _evidence(
+    run: RunLog, odometers: Sequence[Odometry], site: Site, vehicle: Vehicle, config: Configuration
+) -> Evidence:
+    """What is known of where the train was, once per run; figures of the vehicle file are of the first odometer."""
+    network = site_network(site)
+    reference = reference_stretches(run.reference, network_in_pieces(site), network.track.index, config)
+    return evidence_of(reference, run.balise_reads, site.balises, odometers, network, vehicle, config)
 
 
 def _matches(context: _Context) -> tuple[dict[str, Match], dict[str, InputError]]:

@@ -513,8 +513,10 @@ class HazardConfig(Settings):
     # Half-width of evidence in its sigmas, and the sigma of a reference that states none (DOMAIN section 5.1).
     evidence_factor: Positive = 3.0
     reference_sigma_m: Positive = 1.0
-    # How far a reference may lie beside its track besides its sigma and the survey's: no antenna is in the middle.
-    reference_aside_m: NonNegative = 0.5
+    # Of a survey that states no sigma (DOMAIN section 5.1).
+    survey_sigma_m: Positive = 1.0
+    # A lag between recorders that is known less closely counts as not measured (DOMAIN section 5.1): 2 m for a tram.
+    evidence_clock_s: Positive = 0.1
     # A train that brakes by 1 m/s2 leaves a straight line by 0.5 m in 2 s.
     reference_gap_s: Positive = 2.0
     # If no way between two known places is within the odometer's confidence, ways that differ from its distance by no
@@ -527,8 +529,6 @@ class HazardConfig(Settings):
     turn_s: Positive = 2.0
     # `suspect` uses the data from this long before alarm or hazard.
     suspect_lookback_s: NonNegative = 60.0
-    # Net elements less probable than one in a thousand are not used for the reference (DOMAIN section 5.1).
-    rival_probability: Probability = 0.001
     # Of the read itself; Q_LOCACC of the site belongs to the linking information (DOMAIN section 5.1).
     balise_read_sigma_m: Positive = 1.0
     # An error known less closely is not given as a number (DOMAIN section 5.2).

@@ -161,7 +161,6 @@ class MisfitCause(StrEnum):
     SPEED_WITHOUT_SIGN = "speed_without_sign"
     COUNTER_WITHOUT_SIGN = "counter_without_sign"
     SIGN_OF_SOMETHING_ELSE = "sign_of_something_else"
-    EVIDENCE_CLOCKS = "evidence_clocks"
     OFFSET_OF_REFERENCE = "offset_of_reference"
     WHOLE_SECONDS = "whole_seconds"
     DATUM = "datum"

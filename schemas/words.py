@@ -106,7 +106,6 @@ CAUSES: dict[MisfitCause, str] = {
     MisfitCause.SPEED_WITHOUT_SIGN: "it stays positive where the distance falls",
     MisfitCause.COUNTER_WITHOUT_SIGN: "a counter without sign",
     MisfitCause.SIGN_OF_SOMETHING_ELSE: "the sign follows something else than the movement",
-    MisfitCause.EVIDENCE_CLOCKS: "one of the two is wrong, and with it the true position",
     MisfitCause.OFFSET_OF_REFERENCE: "another datum, or a fixed offset between the two antennas",
     MisfitCause.WHOLE_SECONDS: "cut off or rounded by the recorder, so that at 40 m/s a balise may have been read 40 m "
     "away",

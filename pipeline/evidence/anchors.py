@@ -1,189 +1,214 @@
-"""Anchors: balise reads, and reference samples at the ends of their pauses."""
+"""What is known by itself: balise reads, and the reference on every track that it may have run along."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
+from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.evidence.carrying import Anchor
-from pipeline.odometry import Odometry
-from pipeline.track.path import Place, Route, TravelledPath
+from pipeline.evidence.carrying import Anchor, Counter
+from pipeline.evidence.clock import Clock, Lag, lag_of
+from pipeline.reference import ReferencePath, Stretch
+from pipeline.track.path import Place
 from pipeline.track.survey import Track
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
-from schemas.config import AlignConfig, HazardConfig
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
+from schemas.config import Configuration, HazardConfig
 from schemas.enums import BaliseKind, Evidence
 
-Pairs = tuple[Ints, Ints]
+# A lag shows where the speed changes: ways of so long are compared [s].
+_LAG_WINDOW_S = 10.0
+# A train's speed is even over so long before and after [s]: what differs from it is a step.
+_EVEN_S = 2.0
 
 
 @dataclass(frozen=True)
-class ReferencePlaces:
-    """The reference on the network, placed by itself: samples in order of time, and the legs that they lie on.
+class KnownPath:
+    """A way of the reference as evidence, per sample: leg, and least and largest coordinate on it [m].
 
-    `path_m`: coordinate on the sample's leg, of the balise antenna; `rival_sample`, `rival_element`: further net
-    elements that a sample may as well lie on. `lost_ns`: samples that lie on no track, or where no train can have come.
+    `sense`: +1 where the odometer counts up as the coordinate grows, else -1.
     """
+
+    path: ReferencePath
+    sense: int
+    at_m: Floats
+    low_m: Floats
+    high_m: Floats
+
+    def place(self, sample: int) -> Place:
+        element, measure, _ = self.path.legs[int(self.path.leg[sample])].locate(self.at_m[[sample]])
+        return Place(int(element[0]), float(measure[0]))
+
+
+@dataclass(frozen=True)
+class KnownStretch:
+    """A stretch of the reference on the odometer's clock; the train was on one of its paths."""
 
     t_ns: Ints
-    leg: Ints
-    path_m: Floats
     sigma_m: Floats
-    legs: tuple[Route, ...]
-    rival_sample: Ints
-    rival_element: Ints
-    lost_ns: Ints
-
-    @classmethod
-    def of(
-        cls,
-        epochs: pl.DataFrame,
-        path: TravelledPath,
-        rivals: Pairs,
-        sigma_m: Floats,
-        ahead_m: float,
-        track: Track,
-        config: AlignConfig,
-    ) -> Self:
-        """Matched samples (`t, leg, path_m, on_track`) and their path; `ahead_m`: the reference's place ahead of the
-        balise antenna, along growing path. `rivals`: samples and net elements (numbers of the survey).
-        """
-        all_ns, all_m = times_ns(epochs), floats(epochs, "path_m")
-        placed = np.flatnonzero(flags(epochs, "on_track") & np.isfinite(all_m))
-        kept = placed[_reachable(all_ns[placed], all_m[placed], sigma_m[placed], config)]
-        leg, path_m = ints(epochs["leg"])[kept], floats(epochs, "path_m")[kept]
-        legs = tuple(path.routes(track.index))
-        number = np.full(epochs.height, -1)
-        number[kept] = np.arange(kept.size)
-        sample, element = number[rivals[0]], rivals[1]
-        other = np.flatnonzero((sample >= 0) & ~_on_own_way(legs, leg, sample, element))
-        order = other[np.argsort(sample[other], kind="stable")]
-        lost_ns = np.delete(all_ns, kept)
-        return cls(all_ns[kept], leg, path_m - ahead_m, sigma_m[kept], legs, sample[order], element[order], lost_ns)
+    clock_m: Floats
+    paths: tuple[KnownPath, ...]
 
     def anchor(self, sample: int) -> Anchor:
-        element, measure, _ = self.legs[int(self.leg[sample])].locate(self.path_m[[sample]])
-        place = Place(int(element[0]), float(measure[0]))
-        return Anchor(int(self.t_ns[sample]), place, float(self.sigma_m[sample]), Evidence.REFERENCE)
+        """The places of one sample; what a step of the reference left open counts as its clock."""
+        open_m = max(float((one.high_m - one.low_m)[sample]) for one in self.paths)
+        return Anchor(
+            t_ns=int(self.t_ns[sample]),
+            places=tuple(dict.fromkeys(one.place(sample) for one in self.paths)),
+            sigma_m=float(self.sigma_m[sample]),
+            kind=Evidence.REFERENCE,
+            clock_m=float(self.clock_m[sample]) + open_m,
+        )
 
-
-def _reachable(t_ns: Ints, path_m: Floats, sigma_m: Floats, config: AlignConfig) -> Ints:
-    """Samples that a train can have come to from one another: outward from the longest piece without a leap."""
-
-    def leaps(a: Ints, b: Ints) -> Bools:
-        """Steps that no train can drive and no noise explains."""
-        most_m = config.fastest_mps * (t_ns[b] - t_ns[a]) / NS_PER_S + config.sure_sigmas * (sigma_m[a] + sigma_m[b])
-        beyond: Bools = np.abs(path_m[b] - path_m[a]) > most_m
-        return beyond
-
-    samples = np.arange(t_ns.size)
-    pieces = np.split(samples, np.flatnonzero(leaps(samples[:-1], samples[1:])) + 1)
-    longest = int(np.argmax([piece.size for piece in pieces]))
-    kept = [pieces[longest]]
-    for ahead in pieces[longest + 1 :]:
-        if not leaps(kept[-1][-1:], ahead[:1]).any():
-            kept.append(ahead)
-    for before in pieces[:longest][::-1]:
-        if not leaps(before[-1:], kept[0][:1]).any():
-            kept.insert(0, before)
-    return np.concatenate(kept)
-
-
-def _on_own_way(legs: tuple[Route, ...], leg: Ints, sample: Ints, element: Ints) -> Bools:
-    """The net element is one that the sample's own leg runs over, sooner or later: no other track."""
-    near = np.zeros(sample.size, dtype=np.bool_)
-    for number, route in enumerate(legs):
-        rows = np.flatnonzero(sample >= 0)
-        rows = rows[leg[sample[rows]] == number]
-        near[rows] = np.isin(element[rows], route.element)
-    return near
+    def ends(self, counter: Counter | None) -> tuple[Anchor, Anchor]:
+        """The outermost samples at which the odometer counted, for only from these can a place be carried."""
+        counted = np.flatnonzero(counter.odometer.known_at(self.t_ns)) if counter is not None else np.zeros(0, np.int64)
+        first, last = (int(counted[0]), int(counted[-1])) if counted.size else (0, self.t_ns.size - 1)
+        return self.anchor(first), self.anchor(last)
 
 
 @dataclass(frozen=True)
-class Coverage:
-    """Reference samples `first` to `last`, no two neighbours farther apart than a straight line reaches.
+class Sided:
+    """A stretch with the sense of its first way, and what the odometer says of that: m counted with it and against."""
 
-    `begin`, `end`: the outermost samples at which the odometer counted, for only from these can a place be carried.
+    stretch: Stretch
+    sense: int
+    with_m: float
+    against_m: float
+
+    @property
+    def facing(self) -> int:
+        """The oriented net element of the first sample, in the sense in which the odometer counts up."""
+        path = self.stretch.paths[0]
+        element, _, sense = path.legs[int(path.leg[0])].locate(path.at_m[:1])
+        return 2 * int(element[0]) + int(sense[0] * self.sense < 0)
+
+
+def sided(stretch: Stretch, counter: Counter | None, least_m: float) -> Sided:
+    """Which way the odometer counts along the coordinate: by the first movement of `least_m` (DOMAIN section 2)."""
+    path = stretch.paths[0]
+    at_m = path.at_m
+    rows = _every(stretch.t_ns, 1.0)
+    step_m = np.where(np.diff(path.leg[rows]) == 0, np.diff(at_m[rows]), 0.0)
+    if counter is None:
+        counted_m = np.abs(step_m)
+    else:
+        counted_m = np.nan_to_num(counter.between(stretch.t_ns[rows[:-1]], stretch.t_ns[rows[1:]]).distance_m)
+    together = np.sign(step_m) * counted_m if counter is not None else step_m
+    gone = np.flatnonzero(np.abs(np.cumsum(together)) >= least_m)
+    total = float(np.cumsum(together)[gone[0]]) if gone.size else float(together.sum())
+    positive, negative = float(together[together > 0].sum()), float(-together[together < 0].sum())
+    sense = -1 if total < 0.0 else 1
+    return Sided(stretch, sense, *((positive, negative) if sense > 0 else (negative, positive)))
+
+
+def _every(t_ns: Ints, step_s: float) -> Ints:
+    """Samples so far apart in time."""
+    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, round(step_s * NS_PER_S), dtype=np.int64)
+    return np.unique(np.searchsorted(t_ns, instants))
+
+
+def reference_lag(found: Sequence[Sided], counter: Counter | None) -> Lag:
+    """The reference's clock against the odometer's, by the ways of ten seconds."""
+    begins, ends, ways = [], [], []
+    for one in found:
+        path = one.stretch.paths[0]
+        rows = _every(one.stretch.t_ns, _LAG_WINDOW_S)
+        whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
+        begin, end = rows[:-1][whole], rows[1:][whole]
+        begins.append(one.stretch.t_ns[begin])
+        ends.append(one.stretch.t_ns[end])
+        ways.append(one.sense * (path.at_m[end] - path.at_m[begin]))
+    if not ways:
+        return Lag()
+    return lag_of(np.concatenate(begins), np.concatenate(ends), np.concatenate(ways), counter)
+
+
+def known_stretch(
+    one: Sided, clock: Clock, counters: Sequence[Counter], reads_ns: Ints, ahead_m: float, config: Configuration
+) -> KnownStretch:
+    """The stretch as evidence; `reads_ns`: balise reads, at which no step of the reference stays open."""
+    stretch = one.stretch
+    t_ns = stretch.t_ns - round(clock.shift_s * NS_PER_S)
+    paths: list[KnownPath] = []
+    speed_mps = np.zeros(t_ns.size)
+    for path in stretch.paths:
+        at_m = path.at_m - one.sense * ahead_m
+        speed_mps = np.maximum(speed_mps, _speed_mps(t_ns, at_m, path.leg))
+        known = KnownPath(path, one.sense, at_m, at_m, at_m)
+        low_m, high_m = _left_open(known, t_ns, stretch.sigma_m, counters, reads_ns, config)
+        paths.append(replace(known, low_m=at_m + low_m, high_m=at_m + high_m))
+    since_s = (t_ns - t_ns[0]) / NS_PER_S
+    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in (-clock.delta_s, 0.0, clock.delta_s)]
+    return KnownStretch(t_ns, stretch.sigma_m, np.maximum.reduce(around) * clock.delta_s, tuple(paths))
+
+
+def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
+    """Speed over a second about each sample, by the reference alone."""
+    half_ns = NS_PER_S // 2
+    begin = np.searchsorted(t_ns, t_ns - half_ns)
+    end = np.minimum(np.searchsorted(t_ns, t_ns + half_ns), t_ns.size - 1)
+    elapsed_s = np.maximum((t_ns[end] - t_ns[begin]) / NS_PER_S, 1e-9)
+    return np.where((leg[begin] == leg[end]) & (end > begin), np.abs(at_m[end] - at_m[begin]) / elapsed_s, 0.0)
+
+
+def _left_open(
+    known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter], reads_ns: Ints, config: Configuration
+) -> tuple[Floats, Floats]:
+    """How far behind and ahead of each sample the train may be because the reference stepped away [m].
+
+    A step that every odometer contradicts by more than k_T roots leaves both sides possible, until the step back or
+    the next read.
     """
-
-    first: int
-    last: int
-    begin: Anchor
-    end: Anchor
-
-
-def coverages(reference: ReferencePlaces | None, odometer: Odometry | None, config: HazardConfig) -> list[Coverage]:
-    """The times that the reference covers."""
-    if reference is None or reference.t_ns.size == 0:
-        return []
-    silent = np.diff(reference.t_ns) > config.reference_gap_s * NS_PER_S
-    lost_before = np.searchsorted(np.sort(reference.lost_ns), reference.t_ns)
-    breaks = np.flatnonzero(silent | (np.diff(lost_before) > 0))
-    counted = np.zeros(reference.t_ns.size, dtype=np.bool_) if odometer is None else odometer.known_at(reference.t_ns)
-    found = []
-    for first, last in zip([0, *(breaks + 1).tolist()], [*breaks.tolist(), counted.size - 1], strict=True):
-        own = first + np.flatnonzero(counted[first : last + 1])
-        ends = (int(own[0]), int(own[-1])) if own.size else (first, last)
-        found.append(Coverage(first, last, *(reference.anchor(sample) for sample in ends)))
-    return found
+    low_m, high_m = np.zeros((2, t_ns.size))
+    if t_ns.size < 2:
+        return low_m, high_m
+    step_m, root_m = _contradicted(known, t_ns, sigma_m, counters, config)
+    limit_m = config.align.sure_sigmas * root_m
+    stepped = np.flatnonzero((np.abs(step_m) > limit_m) & _uneven(known.at_m, t_ns, limit_m))
+    events = [(int(t_ns[row + 1]), float(step_m[row]), float(limit_m[row])) for row in stepped.tolist()]
+    open_m: list[float] = []
+    for at_ns, own_m, noise_m in sorted(events + [(read_ns, 0.0, np.inf) for read_ns in reads_ns.tolist()]):
+        # How far the sides that earlier steps left are behind this one, the latest last.
+        sides_m = np.cumsum([own_m, *open_m[::-1]])[:0:-1]
+        back = np.flatnonzero(np.abs(sides_m) <= np.sqrt(2.0) * noise_m)
+        open_m = open_m[: int(back[0])] if back.size else [*open_m, own_m]
+        behind_m = np.cumsum([0.0, *open_m[::-1]])
+        rows = slice(int(np.searchsorted(t_ns, at_ns)), None)
+        low_m[rows] = -behind_m.max()
+        high_m[rows] = -behind_m.min()
+    return low_m, high_m
 
 
-def lost_spans(reference: ReferencePlaces | None, config: HazardConfig) -> list[tuple[int, int]]:
-    """Times at which the reference was heard and lay nowhere [ns], ends left out: nobody knows where the train was."""
-    if reference is None:
-        return []
-    gap_ns = round(config.reference_gap_s * NS_PER_S)
-    spans = []
-    for t_ns in reference.lost_ns.tolist():
-        after = int(np.searchsorted(reference.t_ns, t_ns))
-        before_ns = int(reference.t_ns[after - 1]) if after else t_ns
-        after_ns = int(reference.t_ns[after]) if after < reference.t_ns.size else t_ns
-        spans.append((max(before_ns, t_ns - gap_ns) + 1, min(after_ns, t_ns + gap_ns)))
-    return spans
+def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
+    """Steps that the reference's own movement about then does not explain: an odometer that fails makes none."""
+    dt_s = np.diff(t_ns) / NS_PER_S
+    speed_mps = np.diff(at_m) / dt_s
+    beside = max(1, round(_EVEN_S / float(np.median(dt_s))))
+    around = sliding_window_view(np.pad(speed_mps, beside, mode="edge"), 2 * beside + 1)
+    uneven: Bools = np.abs(speed_mps - np.median(around, axis=1)) * dt_s > limit_m
+    return uneven
 
 
-def disputed_by(one: Coverage, reference: ReferencePlaces, reads: list[Anchor], config: HazardConfig) -> int:
-    """How many reads say that the train was not where the reference has it, by more than half the failure limit."""
-    inside = [read for read in reads if reference.t_ns[one.first] <= read.t_ns <= reference.t_ns[one.last]]
-    part = slice(one.first, one.last + 1)
-    count = 0
-    for read in inside:
-        sample = one.first + int(np.abs(reference.t_ns[part] - read.t_ns).argmin())
-        since = (reference.t_ns[part] - reference.t_ns[one.first]).astype(np.float64)
-        at_m = np.interp([read.t_ns - reference.t_ns[one.first]], since, reference.path_m[part])
-        place = read.place
-        route = reference.legs[int(reference.leg[sample])]
-        balise_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
-        noise_m = config.evidence_factor * float(np.hypot(reference.sigma_m[sample], read.sigma_m))
-        apart_m = float(np.abs(balise_m - at_m)[0])
-        count += not apart_m <= noise_m + 0.5 * config.failure_limit_m
-    return count
-
-
-def facing_of(reference: ReferencePlaces, covered: list[Coverage], odometer: Odometry, least_m: float) -> set[int]:
-    """Oriented net elements over which the train ran as the odometer counted up, by the reference.
-
-    `least_m`: so much way together says which way the odometer counts (DOMAIN section 2).
-    """
-    found: set[int] = set()
-    for one in covered:
-        part = slice(one.first, one.last + 1)
-        t_ns, path_m, leg = reference.t_ns[part], reference.path_m[part], reference.leg[part]
-        counted_m = odometer.between(t_ns[:-1], t_ns[1:]).distance_m
-        together = np.where(np.diff(leg) == 0, np.sign(np.diff(path_m)) * counted_m, 0.0)
-        if abs(float(np.nansum(together))) >= least_m:
-            element, _, sense = reference.legs[int(leg[0])].locate(path_m[:1])
-            found.add(2 * int(element[0]) + int(sense[0] * np.nansum(together) < 0.0))
-    return found
+def _contradicted(
+    known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter], config: Configuration
+) -> tuple[Floats, Floats]:
+    """Per step to the next sample: its difference from the odometer nearest to it, and the root of both [m]."""
+    whole = np.diff(known.path.leg) == 0
+    least, root = np.full(t_ns.size - 1, np.inf), np.ones(t_ns.size - 1)
+    for counter in counters:
+        way = counter.between(t_ns[:-1], t_ns[1:])
+        own_m = np.sqrt(sigma_m[1:] ** 2 + sigma_m[:-1] ** 2 + way.variance_m2)
+        off_m = np.diff(known.at_m) - known.sense * way.distance_m
+        nearer = np.isfinite(off_m) & (np.abs(off_m) / own_m < np.abs(least) / root)
+        least, root = np.where(nearer, off_m, least), np.where(nearer, own_m, root)
+    return np.where(whole & np.isfinite(least), least, 0.0), root
 
 
 def read_anchors(
-    reads: pl.DataFrame | None,
-    balises: pl.DataFrame | None,
-    track: Track,
-    config: HazardConfig,
+    reads: pl.DataFrame | None, balises: pl.DataFrame | None, track: Track, config: HazardConfig
 ) -> list[Anchor]:
     """Reads of physical balises that the site knows, in order of time."""
     if reads is None or balises is None or reads.is_empty():
@@ -193,6 +218,24 @@ def read_anchors(
     known = physical[rows].select("balise_id", "measure_m", element=elements)
     read = reads.select("t", "balise_id").join(known, on="balise_id").sort("t", "balise_id")
     return [
-        Anchor(t_ns, Place(element, measure_m), config.balise_read_sigma_m, Evidence.BALISE)
+        Anchor(t_ns, (Place(element, measure_m),), config.balise_read_sigma_m, Evidence.BALISE)
         for t_ns, element, measure_m in zip(times_ns(read).tolist(), read["element"], read["measure_m"], strict=True)
     ]
+
+
+def on_clock(anchors: Sequence[Anchor], clock: Clock, counter: Counter) -> list[Anchor]:
+    """The reads on the odometer's clock, with what it may add at their speed."""
+    t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
+    clock_m = clock.delta_s * np.abs(counter.speed_mps(t_ns))
+    shift_ns = round(clock.shift_s * NS_PER_S)
+    rows = zip(anchors, clock_m.tolist(), strict=True)
+    return [replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=own_m) for anchor, own_m in rows]
+
+
+def outside(anchors: Sequence[Anchor], stretches: Sequence[KnownStretch]) -> list[Anchor]:
+    """Anchors at times that no stretch covers."""
+    t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
+    inside: Bools = np.zeros(t_ns.size, dtype=np.bool_)
+    for one in stretches:
+        inside |= (t_ns >= one.t_ns[0]) & (t_ns <= one.t_ns[-1])
+    return [anchor for anchor, within in zip(anchors, inside.tolist(), strict=True) if not within]

@@ -2,31 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import numpy as np
-
+from pipeline.track.chain import Chain
 from pipeline.track.network import Edge, Network
-from pipeline.track.path import Place, Route
-
-
-@dataclass(frozen=True)
-class Chain:
-    """Oriented net elements in order, and the coordinate [m] at which each is entered."""
-
-    oriented: tuple[int, ...]
-    entry_m: tuple[float, ...]
-
-    def route(self, network: Network) -> Route:
-        oriented = np.array(self.oriented, dtype=np.int64)
-        element, track = oriented // 2, network.track
-        return Route(
-            element=element,
-            forward=oriented % 2 == 0,
-            entry_m=np.array(self.entry_m),
-            low_m=track.begin_m[element],
-            high_m=track.end_m[element],
-        )
+from pipeline.track.path import Place
 
 
 def chains_between(

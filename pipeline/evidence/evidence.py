@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
 
 from pipeline.evidence.anchors import (
-    Coverage,
-    ReferencePlaces,
-    coverages,
-    disputed_by,
-    facing_of,
-    lost_spans,
+    KnownStretch,
+    Sided,
+    known_stretch,
+    on_clock,
+    outside,
     read_anchors,
+    reference_lag,
+    sided,
 )
-from pipeline.evidence.carrying import Interval, between_anchors, carried, closes
-from pipeline.evidence.gaps import Gap, Way, gaps_of, unreachable
+from pipeline.evidence.carrying import Anchor, Counter, Interval, between_anchors, carried
+from pipeline.evidence.clock import Clock, Lag, clock_of, lag_of
+from pipeline.evidence.gaps import Gap, Way, gaps_of, unreachable, without_sign
 from pipeline.odometry import Odometry
+from pipeline.reference import Stretch
 from pipeline.track.network import Network
 from pipeline.track.path import Route
-from schemas.arrays import Bools, Floats, Ints
-from schemas.config import Configuration
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
+from schemas.config import Configuration, Vehicle
 from schemas.enums import Evidence as Kind
 
 KINDS = tuple(Kind)
@@ -40,128 +43,191 @@ class Alternative:
     low_m: Floats
     high_m: Floats
 
+    def where(self, kept: Bools) -> Alternative:
+        """At some of its instants only."""
+        return Alternative(self.rows[kept], self.route, self.low_m[kept], self.high_m[kept])
+
+    def widened(self, factor: float) -> Alternative:
+        middle, half = 0.5 * (self.low_m + self.high_m), 0.5 * factor * (self.high_m - self.low_m)
+        return Alternative(self.rows, self.route, middle - half, middle + half)
+
+
+def _none() -> Ints:
+    return np.zeros(0, dtype=np.int64)
+
 
 @dataclass(frozen=True)
 class EvidenceSet:
     """Evidence at instants: `kind` is the number in `KINDS`, -1 where nothing is known.
 
-    Where there are several alternatives at an instant the train was on one of them. `rival_row`, `rival_element`:
-    further net elements that it may have been on, whose place along the track is not known.
+    Where there are several alternatives at an instant the train was on one of them. `disputed`: instants at which
+    reference and reads exclude each other. `rival_row`, `rival_element`: further net elements that it may have been on,
+    whose place along the track is not known.
     """
 
     kind: Ints
     alternatives: tuple[Alternative, ...]
-    rival_row: Ints
-    rival_element: Ints
+    rival_row: Ints = field(default_factory=_none)
+    rival_element: Ints = field(default_factory=_none)
+    disputed: Ints = field(default_factory=_none)
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What one odometer carries from anchors, by its gaps."""
+
+    counter: Counter
+    gaps: tuple[Gap, ...]
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """All evidence of a run; `contradicted`: gaps that the odometer of a vehicle file does not close.
+    """All evidence of a run.
 
-    `unknown`: times at which nobody knows, because the reference lay nowhere, or reads contradict it (`disputed`).
+    `silent`: times at which nobody knows, because the reference was heard and lay nowhere. `carried`: by each odometer
+    from reads and the reference's ends, outside its time; `by_reads`: from reads alone, over the whole run.
+    `contradicted`: gaps that the odometer of a vehicle file does not close. `clocks`: of the recorders there are.
     """
 
-    reference: ReferencePlaces | None
-    covered: tuple[Coverage, ...]
-    gaps: tuple[Gap, ...]
-    odometer: Odometry | None
+    stretches: tuple[KnownStretch, ...]
+    silent: tuple[Span, ...]
+    carried: tuple[Carried, ...]
+    by_reads: tuple[Carried, ...]
+    reads_ns: Ints
+    clocks: tuple[Clock, ...]
     network: Network
     config: Configuration
-    contradicted: int
-    unknown: tuple[Span, ...]
-    disputed: int
 
     @property
-    def clock_assumed(self) -> bool:
-        """The clock of reference or reads against the odometer's could not be measured, and is taken as close."""
-        return False
-
-    @property
-    def anchored_ns(self) -> Span | None:
-        """First and last anchor: beyond them nothing holds the train from the other side; none without anchors."""
-        times = [anchor.t_ns for gap in self.gaps for anchor in gap.anchors]
-        times += [anchor.t_ns for coverage in self.covered for anchor in (coverage.begin, coverage.end)]
-        return (min(times), max(times)) if times else None
+    def contradicted(self) -> int:
+        """Gaps between anchors that the odometer does not close by any way, with the scale of a vehicle file."""
+        by_file = [one.gaps for one in self.carried[:1] if one.counter.by_file]
+        return sum(bool(gap.ways) and len(gap.anchors) == 2 and not gap.closed for gaps in by_file for gap in gaps)
 
     @property
     def unreachable(self) -> int:
         """Pairs of anchors that no train can have passed one after the other."""
-        return len(unreachable(self.gaps))
+        return sum(len(unreachable(one.gaps)) for one in self.carried[:1])
+
+    @property
+    def disputed(self) -> int:
+        """Reads that exclude the reference beyond all noise of both: at k = 3 noise alone does so in a long run."""
+        kind = np.full(self.reads_ns.size, NOTHING)
+        factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
+        by_reference = [one.widened(factor) for one in self._covered(self.reads_ns, np.ones(kind.size, np.bool_), kind)]
+        by_reads = [
+            one.widened(factor) for one in self._carried(self.by_reads, self.reads_ns, kind != NOTHING, kind, ())
+        ]
+        return int(common(by_reference, by_reads, kind.size)[1].size)
+
+    @property
+    def clock_assumed(self) -> bool:
+        """The clock of reference or reads against the odometer's could not be measured, and is taken as close."""
+        return any(clock.assumed for clock in self.clocks)
+
+    @property
+    def anchored_ns(self) -> Span | None:
+        """First and last anchor: beyond them nothing holds the train from the other side; none without anchors."""
+        times = [anchor.t_ns for one in self.carried[:1] for gap in one.gaps for anchor in gap.anchors]
+        times += [int(t_ns) for one in self.stretches for t_ns in one.t_ns[[0, -1]]]
+        return (min(times), max(times)) if times else None
 
     def at(self, t_ns: Ints, stood: Sequence[Span] = ()) -> EvidenceSet:
         """Evidence at these instants.
 
         `stood`: when the odometer stood although the train may have moved; there nothing is carried from one side.
         """
-        kind, void = np.full(t_ns.size, NOTHING), within_spans(t_ns, self.unknown)
-        alternatives: list[Alternative] = []
-        rivals: list[tuple[Ints, Ints]] = []
-        for coverage in self.covered:
-            alternatives += self._covered(coverage, t_ns, void, kind, rivals)
-        for gap in self.gaps:
-            alternatives += self._carried(gap, t_ns, void, kind, stood)
-        rows, elements = (np.concatenate([part[i] for part in rivals] or [np.zeros(0, np.int64)]) for i in (0, 1))
-        return EvidenceSet(kind, tuple(alternatives), rows, elements)
+        kind, heard = np.full(t_ns.size, NOTHING), ~within_spans(t_ns, self.silent)
+        found = self._covered(t_ns, heard, kind)
+        found += self._carried(self.carried, t_ns, heard & (kind == NOTHING), kind, stood)
+        if not self.stretches or not self.by_reads:
+            return EvidenceSet(kind, tuple(found))
+        of_reads = np.full(t_ns.size, NOTHING)
+        by_reads = self._carried(self.by_reads, t_ns, heard, of_reads, stood)
+        both, disputed = common(found, by_reads, t_ns.size)
+        return EvidenceSet(np.where(kind == NOTHING, of_reads, kind), tuple(both), disputed=disputed)
 
-    def _covered(
-        self, coverage: Coverage, t_ns: Ints, void: Bools, kind: Ints, rivals: list[tuple[Ints, Ints]]
-    ) -> list[Alternative]:
-        """By the reference: straight lines between samples, each with its own sigma."""
-        assert self.reference is not None
-        part = slice(coverage.first, coverage.last + 1)
-        times, leg = self.reference.t_ns[part], self.reference.leg[part]
-        rows = np.flatnonzero((t_ns >= times[0]) & (t_ns <= times[-1]) & ~void)
-        after = np.searchsorted(times, t_ns[rows], side="left")
-        before = np.where(times[after] == t_ns[rows], after, np.maximum(after - 1, 0))
-        whole = leg[before] == leg[after]
-        rows, before, after = rows[whole], before[whole], after[whole]
-        at_m = np.interp((t_ns[rows] - times[0]).astype(np.float64), times - times[0], self.reference.path_m[part])
-        sigma = self.reference.sigma_m[part]
-        half = self.config.hazards.evidence_factor * np.maximum(sigma[before], sigma[after])
-        kind[rows] = KINDS.index(Kind.REFERENCE)
-        rivals.append(self._rivals(coverage.first + before, coverage.first + after, rows))
-        legs = leg[before]
-        return [
-            Alternative(rows[own], self.reference.legs[number], (at_m - half)[own], (at_m + half)[own])
-            for number in np.unique(legs).tolist()
-            if (own := np.flatnonzero(legs == number)).size
-        ]
-
-    def _rivals(self, before: Ints, after: Ints, rows: Ints) -> tuple[Ints, Ints]:
-        """Further elements of both samples around each instant."""
-        assert self.reference is not None
-        found = [np.zeros((2, 0), dtype=np.int64)]
-        for sample in (before, after):
-            begin = np.searchsorted(self.reference.rival_sample, sample, side="left")
-            count = np.searchsorted(self.reference.rival_sample, sample, side="right") - begin
-            index = np.repeat(begin - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
-            found.append(np.stack([np.repeat(rows, count), self.reference.rival_element[index]]))
-        pairs = np.unique(np.concatenate(found, axis=1), axis=1)
-        return pairs[0], pairs[1]
-
-    def _carried(self, gap: Gap, t_ns: Ints, void: Bools, kind: Ints, stood: Sequence[Span]) -> list[Alternative]:
-        """By the odometer, from the anchors of a gap."""
-        inside = (t_ns >= gap.begin_ns) & (t_ns <= gap.end_ns) & (kind == NOTHING) & ~void
-        if len(gap.anchors) == 1:
-            inside &= ~_after_standing(t_ns, gap, stood)
-        rows, found = np.flatnonzero(inside), []
-        for way in gap.ways or [] if rows.size else []:
-            low, high = self._interval(gap, way, t_ns[rows])
-            reached = np.isfinite(low)
-            found.append(Alternative(rows[reached], way.chain.route(self.network), low[reached], high[reached]))
-        if found:
-            kinds = {anchor.kind for anchor in gap.anchors}
-            kind[found[0].rows] = KINDS.index(Kind.BALISE if Kind.BALISE in kinds else Kind.REFERENCE)
+    def _covered(self, t_ns: Ints, heard: Bools, kind: Ints) -> list[Alternative]:
+        """By the reference: straight lines between samples, each +- (k sigma + speed times clock)."""
+        factor = self.config.hazards.evidence_factor
+        found: list[Alternative] = []
+        for one in self.stretches:
+            rows = np.flatnonzero((t_ns >= one.t_ns[0]) & (t_ns <= one.t_ns[-1]) & heard)
+            after = np.searchsorted(one.t_ns, t_ns[rows], side="left")
+            before = np.where(one.t_ns[after] == t_ns[rows], after, np.maximum(after - 1, 0))
+            half = factor * one.sigma_m + one.clock_m
+            half = np.maximum(half[before], half[after])
+            since = (t_ns[rows] - one.t_ns[0]).astype(np.float64)
+            for path in one.paths:
+                leg, stamps = path.path.leg, one.t_ns - one.t_ns[0]
+                centre = np.interp(since, stamps, path.at_m)
+                low = np.minimum((path.low_m - path.at_m)[before], (path.low_m - path.at_m)[after])
+                high = np.maximum((path.high_m - path.at_m)[before], (path.high_m - path.at_m)[after])
+                for number in np.unique(leg[before]).tolist():
+                    own = np.flatnonzero((leg[before] == number) & (leg[after] == number))
+                    low_m, high_m = (centre + low - half)[own], (centre + high + half)[own]
+                    found.append(Alternative(rows[own], path.path.legs[number], low_m, high_m))
+                    kind[rows[own]] = KINDS.index(Kind.REFERENCE)
         return found
 
-    def _interval(self, gap: Gap, way: Way, t_ns: Ints) -> Interval:
-        assert self.odometer is not None
+    def _carried(
+        self, sources: Sequence[Carried], t_ns: Ints, wanted: Bools, kind: Ints, stood: Sequence[Span]
+    ) -> list[Alternative]:
+        """By each odometer, from the anchors of its gaps: the train was where one of them says."""
+        found: list[Alternative] = []
+        for source in sources:
+            open_rows = wanted.copy()
+            for gap in source.gaps:
+                inside = (t_ns >= gap.begin_ns) & (t_ns <= gap.end_ns) & open_rows
+                if len(gap.anchors) == 1:
+                    inside &= ~_after_standing(t_ns, gap, stood)
+                rows = np.flatnonzero(inside)
+                for way in gap.ways or [] if rows.size else []:
+                    low, high = self._interval(source.counter, gap, way, t_ns[rows])
+                    reached = np.isfinite(low)
+                    route = way.chain.route(self.network)
+                    found.append(Alternative(rows[reached], route, low[reached], high[reached]))
+                    open_rows[rows[reached]] = False
+                    by_read = any(anchor.kind is Kind.BALISE for anchor in gap.anchors)
+                    kind[rows[reached]] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
+        return found
+
+    def _interval(self, counter: Counter, gap: Gap, way: Way, t_ns: Ints) -> Interval:
         if gap.begin is not None and gap.end is not None:
             begin_m, end_m = way.at_m
-            return between_anchors(self.odometer, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.config)
+            return between_anchors(counter, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.config)
         (anchor,), (at_m,) = gap.anchors, way.at_m
-        return carried(self.odometer, anchor.t_ns, at_m, anchor.sigma_m, t_ns, self.config)
+        return carried(counter, anchor, at_m, t_ns, self.config)
+
+
+def common(one: Sequence[Alternative], other: Sequence[Alternative], size: int) -> tuple[list[Alternative], Ints]:
+    """What two kinds of evidence leave together, and the instants at which they exclude each other.
+
+    The net elements common to both and the narrower interval; where they exclude each other, all that either says.
+    """
+    spoken = np.zeros((2, size), dtype=np.bool_)
+    for number, alternatives in enumerate((one, other)):
+        for alternative in alternatives:
+            spoken[number, alternative.rows] = True
+    narrowed = [_narrowed(a, b) for a in one for b in other]
+    agreed = np.zeros(size, dtype=np.bool_)
+    for alternative in narrowed:
+        agreed[alternative.rows] = True
+    alone = [alternative.where(~agreed[alternative.rows]) for alternative in (*one, *other)]
+    return narrowed + alone, np.flatnonzero(spoken.all(axis=0) & ~agreed)
+
+
+def _narrowed(one: Alternative, other: Alternative) -> Alternative:
+    """The part of the first that the second leaves too, at the instants of both; on the first's route."""
+    rows, here, there = np.intersect1d(one.rows, other.rows, assume_unique=True, return_indices=True)
+    low, high = one.low_m[here], one.high_m[here]
+    middle = 0.5 * (low + high)
+    element, measure, sense = one.route.locate(middle)
+    own_low, own_high = other.low_m[there], other.high_m[there]
+    at_m, own_sense = other.route.coordinate(element, measure, 0.5 * (own_low + own_high))
+    ends = [middle + sense * own_sense * (end_m - at_m) for end_m in (own_low, own_high)]
+    low, high = np.maximum(low, np.minimum(*ends)), np.minimum(high, np.maximum(*ends))
+    return Alternative(rows, one.route, low, high).where(low <= high)
 
 
 def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
@@ -184,45 +250,86 @@ def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
 
 
 def evidence_of(
-    reference: ReferencePlaces | None,
+    reference: tuple[Sequence[Stretch], Sequence[Span]],
     reads: pl.DataFrame | None,
     balises: pl.DataFrame | None,
-    odometer: Odometry | None,
+    odometers: Sequence[Odometry],
     network: Network,
+    vehicle: Vehicle,
     config: Configuration,
 ) -> Evidence:
     """Everything that is known of where the train was, but from GNSS.
 
-    `reference`: placed on the network by itself; `reads`, `balises`: as in the run and the site; `odometer`: as
-    recorded. Anchors are the reads outside the reference's time, and the reference's samples beside its pauses.
+    `reference`: its stretches and when it lay nowhere (`reference_stretches`); `reads`, `balises`: as in the run and
+    the site; `odometers`: as recorded, that of the LDS first.
     """
     hazards = config.hazards
-    read = read_anchors(reads, balises, network.track, hazards)
-    covered, disputed, unknown = coverages(reference, odometer, hazards), 0, lost_spans(reference, hazards)
-    if reference is not None:
-        counts = {one: disputed_by(one, reference, read, hazards) for one in covered}
-        disputed = sum(counts.values())
-        for one in [one for one in covered if counts[one]]:
-            covered.remove(one)
-            unknown.append((int(reference.t_ns[one.first]), int(reference.t_ns[one.last]) + 1))
-    apart = [one for one in read if not any(c.begin.t_ns <= one.t_ns <= c.end.t_ns for c in covered)]
-    borders = sorted(
-        [(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=lambda border: border[0].t_ns
-    )
-    gaps: list[Gap] = []
-    if odometer is not None and borders:
-        least_m = config.matching.orientation_distance_m
-        facing = set() if reference is None else facing_of(reference, covered, odometer, least_m)
-        gaps = gaps_of(borders, facing, odometer, network, config)
-    contradicted = sum(_contradicts(gap, odometer, config) for gap in gaps)
+    by_file = vehicle.gnss_latency_s is not None
+    counters = [Counter.of(odometer) for odometer in odometers]
+    main = counters[0] if counters else None
+    found = [sided(stretch, main, config.matching.orientation_distance_m) for stretch in reference[0]]
+    carrier = _Carrier.of(found, network, config)
+    of_reference = clock_of(reference_lag(found, main), by_file, hazards)
+    reads_found = read_anchors(reads, balises, network.track, hazards)
+    lag_of_reads = Lag() if main is None else _lag_of_reads(carrier.by(main, _points(reads_found)))
+    of_reads = clock_of(lag_of_reads, by_file, hazards)
+    read = [] if main is None else on_clock(reads_found, of_reads, main)
+    reads_ns = np.array([one.t_ns for one in read], dtype=np.int64)
+    ahead_m = vehicle.gnss_antenna_ahead_m
+    stretches = tuple(known_stretch(one, of_reference, counters, reads_ns, ahead_m, config) for one in found)
+    apart = outside(read, stretches)
+    shift_ns = round(of_reference.shift_s * NS_PER_S)
     return Evidence(
-        reference, tuple(covered), tuple(gaps), odometer, network, config, contradicted, tuple(unknown), disputed
+        stretches=stretches,
+        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]),
+        carried=tuple(
+            carrier.by(counter, [*(one.ends(counter) for one in stretches), *_points(apart)]) for counter in counters
+        ),
+        by_reads=tuple(carrier.by(counter, _points(read)) for counter in counters) if stretches else (),
+        reads_ns=reads_ns,
+        clocks=(of_reference,) * bool(stretches) + (of_reads,) * bool(apart),
+        network=network,
+        config=config,
     )
 
 
-def _contradicts(gap: Gap, odometer: Odometry | None, config: Configuration) -> bool:
-    """An odometer with the scale of a vehicle file that closes on none of the chains between two anchors."""
-    if gap.begin is None or gap.end is None or not gap.ways or odometer is None or odometer.scale is None:
-        return False
-    anchors = (gap.begin, gap.end)
-    return not any(closes(odometer, anchors, way.at_m[1] - way.at_m[0], config) for way in gap.ways)
+def _points(anchors: Sequence[Anchor]) -> list[tuple[Anchor, Anchor]]:
+    """Anchors that know no more than their own instant."""
+    return [(anchor, anchor) for anchor in anchors]
+
+
+@dataclass(frozen=True)
+class _Carrier:
+    """What every odometer carries over: the network, and which way the train ran as the odometer of the LDS counted up.
+
+    `facing`: oriented net elements; `turned`: it counted up in both directions.
+    """
+
+    network: Network
+    config: Configuration
+    facing: frozenset[int]
+    turned: bool
+
+    @classmethod
+    def of(cls, found: Sequence[Sided], network: Network, config: Configuration) -> _Carrier:
+        least_m = config.matching.orientation_distance_m
+        facing = frozenset(one.facing for one in found if abs(one.with_m - one.against_m) >= least_m)
+        return cls(network, config, facing, any(min(one.with_m, one.against_m) >= least_m for one in found))
+
+    def by(self, counter: Counter, borders: list[tuple[Anchor, Anchor]]) -> Carried:
+        """The gaps between what is known; an odometer that counts up in both directions carries over no stand."""
+        if not borders:
+            return Carried(counter, ())
+        borders = sorted(borders, key=lambda border: border[0].t_ns)
+        gaps = gaps_of(borders, self.facing, counter, self.network, self.config)
+        if self.turned or without_sign(gaps, self.facing, self.network):
+            counter = Counter.of(counter.odometer, without_sign=True)
+            gaps = gaps_of(borders, self.facing, counter, self.network, self.config)
+        return Carried(counter, tuple(gaps))
+
+
+def _lag_of_reads(source: Carried) -> Lag:
+    """The clock of the reads against the odometer's, by the ways between reads that one closed chain leaves."""
+    between = [(gap.begin_ns, gap.end_ns, way.at_m[1] - way.at_m[0]) for gap in source.gaps for way in gap.alone]
+    begins, ends, ways = zip(*between, strict=True) if between else ((), (), ())
+    return lag_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(ways, np.float64), source.counter)

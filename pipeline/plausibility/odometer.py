@@ -42,7 +42,6 @@ def odometer_checks(of: Recording, reference: Lag | None) -> tuple[list[Check], 
         found = fit_pair(of.reference, of.counters[name]) if own_time and of.reference is not None else None
         return found if found is not None and found.told else None
 
-    checks += _evidence_clocks(by_reference())
     scale, latency = _scale_check(pair, vehicle), _latency_check(pair, reference, vehicle)
     if scale is not None and scale.state in (State.MISFIT, State.IMPOSSIBLE):
         # Where there is a reference it has to contradict the file too: else it is the positions that drift.
@@ -58,23 +57,6 @@ def odometer_checks(of: Recording, reference: Lag | None) -> tuple[list[Check], 
     if other is not None and other.lag_told and not other.other_lag(0.0, config.lag_told_s):
         return checks, [Lag("odometer", reason=f"{lag.lag_s:+.2f} s, but none against the reference")]
     return checks, [lag]
-
-
-def _evidence_clocks(pair: PairFit | None) -> list[Check]:
-    """The clocks of odometer and reference against each other; no GNSS has a part in it."""
-    if pair is None or not (pair.shifted or pair.other_lag(0.0, pair.config.lag_told_s)):
-        return []
-    later = "later" if pair.lag_s > 0 else "earlier"
-    return [
-        Check(
-            "clock of the odometer against the reference",
-            State.MISFIT,
-            f"{pair.lag_s:+.2f} s, stamps of the odometer are {later}",
-            (Cause(MisfitCause.EVIDENCE_CLOCKS),),
-            advice="Find out which clock is wrong and correct it: until then nothing is proved.",
-            of_evidence=True,
-        )
-    ]
 
 
 def _lag(pair: PairFit, vehicle: Vehicle) -> Lag:

@@ -9,7 +9,6 @@ import polars as pl
 
 from pipeline.ingest.run import read_run
 from pipeline.matching.fixes import fixes_of
-from pipeline.matching.reference import as_fixes
 from pipeline.matching.steps import believable, travelled
 from pipeline.survey.geojson_lines import read_geojson
 from pipeline.survey.pieces import MOST_BYTES, Survey, piece_of, with_own_names
@@ -19,6 +18,8 @@ from schemas.config import Configuration, Vehicle
 from schemas.enums import Fix
 from schemas.errors import SiteError
 
+# A variance of zero means "not known" in a `gnss` stream.
+_LEAST_SIGMA_M = 1e-3
 _KINDS = "GPX, KML, KMZ, GeoJSON, CSV, Parquet, or a run (folder or .mcap) with a reference"
 
 
@@ -77,7 +78,7 @@ def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey
         expected = "a stream `reference`, or positions with fix `rtk_fixed`"
         raise SiteError("has no position better than GNSS alone", place=str(path), expected=expected)
     survey = Survey()
-    fixes = fixes_of(as_fixes(points, config.hazards.reference_sigma_m), config.fix_sigma)
+    fixes = fixes_of(_as_fixes(points, config.hazards.reference_sigma_m), config.fix_sigma)
     reached = believable(fixes, fixes.valid, travelled(fixes, None), config.matching)
     if (jumped := points.height - len(reached)) > 0:
         text = f"{jumped} positions to which no train can have come are left out"
@@ -90,3 +91,20 @@ def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey
         text = "heights are those of the antenna: the vehicle file does not say how high it is over the rail"
         survey.told("warning", f"track: {run.run_id}", text, "Give --vehicle with antenna_height_m.")
     return survey
+
+
+def _as_fixes(reference: pl.DataFrame, sigma_default_m: float) -> pl.DataFrame:
+    """The samples as a `gnss` stream whose covariance is theirs."""
+    variance = pl.col("sigma_m").fill_null(sigma_default_m).clip(lower_bound=_LEAST_SIGMA_M) ** 2
+    return reference.select(
+        "t",
+        pl.lit("reference").alias("solution"),
+        "latitude_deg",
+        "longitude_deg",
+        "height_m",
+        variance.alias("cov_ee_m2"),
+        pl.lit(0.0).alias("cov_en_m2"),
+        variance.alias("cov_nn_m2"),
+        variance.alias("cov_uu_m2"),
+        pl.lit(Fix.RTK_FIXED.value, dtype=pl.Enum(Fix)).alias("fix"),
+    )

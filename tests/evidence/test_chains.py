@@ -7,7 +7,8 @@ import polars as pl
 import pytest
 
 from pipeline.evidence.anchors import read_anchors
-from pipeline.evidence.chains import Chain, chains_between, extended
+from pipeline.evidence.chains import chains_between, extended
+from pipeline.track.chain import Chain
 from pipeline.track.network import Network, network_of
 from pipeline.track.path import Place, Route
 from pipeline.track.survey import track_of
@@ -90,4 +91,4 @@ def test_a_read_counts_where_its_balise_lies_on_its_element() -> None:
         }
     )
     found = read_anchors(reads, balises, line("both").track, HazardConfig())
-    assert [(anchor.t_ns, anchor.place) for anchor in found] == [(1, Place(0, 100.4)), (2, Place(0, -0.4))]
+    assert [(anchor.t_ns, anchor.places) for anchor in found] == [(1, (Place(0, 100.4),)), (2, (Place(0, -0.4),))]

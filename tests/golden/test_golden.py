@@ -63,7 +63,10 @@ def with_radar(run: RunLog, scenario: Scenario) -> RunLog:
     way = (speed * at_s.diff().fill_null(0.0)).cum_sum()
     radar = wheel.with_columns(sensor=pl.lit("radar"), speed_mps=0.998 * speed, distance_m=0.998 * way)
     both = with_reads(run, scenario)
-    return both.with_streams(odometer=pl.concat([wheel, radar.gather_every(5)]).sort("t", maintain_order=True))
+    sensors = pl.concat([wheel, radar.gather_every(5)]).sort("t", maintain_order=True)
+    assert both.balise_reads is not None
+    # Another part than that of `reads_only` lies between the first read and the last.
+    return both.with_streams(odometer=sensors, balise_reads=both.balise_reads[1:])
 
 
 def untidied(run: RunLog, _: Scenario) -> RunLog:
