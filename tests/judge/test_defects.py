@@ -222,5 +222,3 @@ def test_seven_seconds_that_nobody_knows_of_are_no_proof() -> None:
     weaker = rungs["balise"].row
     assert weaker["verdict"] == "unproven"
     assert "unknown_in_use" in rungs["balise"].tables.runs["reasons"][0]
-    # One in a hundred was once allowed to be unknown.
-    assert rungs["balise"].number("share_unknown") < 0.01
