@@ -220,6 +220,7 @@ def test_seven_seconds_that_nobody_knows_of_are_no_proof() -> None:
     rungs = _judged(replace(_faulty(fault, base=base), better=Better(sigma_m=0.1)), 41, "seven seconds")
     assert rungs["reference"].row["verdict"] == "unsafe"
     weaker = rungs["balise"].row
-    assert (weaker["verdict"], weaker["reasons"]) == ("unproven", ["unknown_in_use"])
+    assert weaker["verdict"] == "unproven"
+    assert "unknown_in_use" in weaker["reasons"]
     # One in a hundred was once allowed to be unknown.
     assert rungs["balise"].number("share_unknown") < 0.01
