@@ -14,6 +14,9 @@ from pipeline.matching.likelihood import Terms
 from pipeline.matching.trellis import Trellis
 from schemas.arrays import Floats, Ints
 
+# Log-probability that is none.
+_NONE = -1e6
+
 
 @dataclass(frozen=True)
 class Found:
@@ -57,9 +60,9 @@ def _forward(trellis: Trellis, begins: Ints, ends: Ints) -> tuple[Floats, list[F
     state = _gained(trellis, state, int(begins[0]), int(ends[0]), weights)
     come: list[Floats] = []
     for numbers in trellis.batches():
-        for number, moves in enumerate(trellis.moves(numbers), numbers.start + 1):
+        for number, (moves, enters) in enumerate(trellis.moves(numbers), numbers.start + 1):
             entered = state[:, :, None] + moves
-            mass = _log_mass(entered)
+            mass = _log_mass(entered) + _best_branch(entered, enters)[:, :, None]
             come.append(_share(_log_sum(mass, axis=2), axis=0))
             state = _gained(trellis, _merged(entered, mass), int(begins[number]), int(ends[number]), weights)
     return weights, come
@@ -73,6 +76,20 @@ def _gained(trellis: Trellis, state: Terms, begin: int, end: int, weights: Float
     np.cumsum(terms, axis=1, out=terms)
     weights[rows] = _log_sum(_log_mass(terms), axis=2).ravel()
     return np.asarray(terms[:, -1])
+
+
+def _best_branch(entered: Terms, enters: Ints) -> Floats:
+    """Nothing for the best of the branches of a switch that lead to a state by one end, next to impossible for others.
+
+    A train that stands on a switch seems to go to and fro over it: each time its track would be as likely again by each
+    branch.
+    """
+    total = _log_sum(_log_mass(entered), axis=2)
+    out = np.zeros_like(total)
+    for end in (1, 2):
+        own = np.where(enters == end, total, -np.inf)
+        out[(enters == end) & (own < own.max(axis=0))] = _NONE
+    return out
 
 
 def _log_mass(terms: Terms) -> Floats:

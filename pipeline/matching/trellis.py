@@ -28,7 +28,8 @@ _AT_ONCE = 50_000
 class Pairs:
     """All states of some steps with all of the step before; `first[k] : first[k + 1]` are those of the k-th step.
 
-    In order of the state before, then the one after. `score`: log-probability of the most plausible move.
+    In order of the state before, then the one after. `score`: log-probability of the most plausible move; `enters`:
+    by the start (1) or the end (2) of the oriented element, or it stays there (0).
     """
 
     steps: Ints
@@ -36,6 +37,7 @@ class Pairs:
     one: Ints
     other: Ints
     score: Floats
+    enters: Ints
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,8 @@ class Trellis:
         """Of each state without a step before it."""
         return initial_terms(self.states.offset_m, self.states.candidate, self.like)
 
-    def moves(self, numbers: slice) -> list[Terms]:
-        """Of some of the steps of `pairs`: per move `[coefficient, before, after, scale]`."""
+    def moves(self, numbers: slice) -> list[tuple[Terms, Ints]]:
+        """Of some steps of `pairs`: the terms `[coefficient, before, after, scale]`, and by which end moves enter."""
         part = slice(int(self.pairs.first[numbers.start]), int(self.pairs.first[numbers.stop]))
         one, other, score = self.pairs.one[part], self.pairs.other[part], self.pairs.score[part]
         known = np.isfinite(score)
@@ -87,7 +89,11 @@ class Trellis:
         count = np.diff(self.first)
         shapes = zip(count[steps - 1].tolist(), count[steps].tolist(), strict=True)
         split = np.split(terms, cuts, axis=1)
-        return [own.reshape(3, *shape, own.shape[2]) for own, shape in zip(split, shapes, strict=True)]
+        enters = np.split(self.pairs.enters[part], cuts)
+        return [
+            (own.reshape(3, *shape, own.shape[2]), by.reshape(shape))
+            for own, by, shape in zip(split, enters, shapes, strict=True)
+        ]
 
     def batches(self) -> Iterator[slice]:
         """The steps of `pairs` in parts with so many pairs each."""
@@ -204,8 +210,8 @@ def _pairs(network: Network, states: States, steps: Ints, ways: Ways, config: Ma
     one = np.repeat(states.first[steps - 1], sizes) + number // width
     other = np.repeat(states.first[steps], sizes) + number % width
     places = states.oriented[one], states.place_m[one], states.oriented[other], states.place_m[other]
-    score = move_scores(network, *places, ways.along(np.repeat(steps, sizes), places[0]), config).max(axis=0)
-    return Pairs(steps, begin, one, other, score)
+    scores = move_scores(network, *places, ways.along(np.repeat(steps, sizes), places[0]), config)
+    return Pairs(steps, begin, one, other, scores.max(axis=0), scores.argmax(axis=0))
 
 
 def _before(states: States, stays: Bools, pairs: Pairs) -> Ints:

@@ -199,3 +199,20 @@ def test_tracks_that_part_are_told_by_how_the_position_moves() -> None:
         assert epochs["netelement_id"].unique().to_list() == [own]
         assert epochs["gate_probability"][-1] > 0.999
         assert epochs["gate_probability"][100] < 0.99
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+def test_standing_on_a_switch_does_not_make_its_track_likelier(seed: int) -> None:
+    """Ten minutes about the switch of a track, on that track or beside it: as likely as without the branch."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(700.0)
+    x = 50.0 + 20.0 * np.minimum(t, 50.0) + 20.0 * np.maximum(t - 600.0, 0.0)
+    error = [gauss_markov(rng, 700, 1.0, 1.0, 100.0) for _ in range(2)]
+    away = np.column_stack([np.linspace(1050, 1650, 31), -2.5e-4 * np.linspace(0, 600, 31) ** 2])
+    two = {"A0": line((0, 0), (1050, 0)), "A1": line((1050, 0), (4000, 0)), "B": line((0, 4), (4000, 4))}
+    joint: list[Link] = [("A0", 1, "A1", 0, "both")]
+    places = site(two, joint, sigma_m=0.3), site(two | {"T": away}, [*joint, ("A0", 1, "T", 0, "both")], sigma_m=0.3)
+    for y_m in (0.0, 4.0):
+        fixes = run(x + error[0], y_m + error[1], sigma_m=1.0)
+        without, beside = (on_a(matched(fixes, place, odometer(x)).epochs, "gate")[-2] for place in places)
+        assert beside == pytest.approx(without, abs=0.02)
