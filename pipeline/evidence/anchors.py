@@ -226,7 +226,7 @@ def read_anchors(
 def on_clock(anchors: Sequence[Anchor], clock: Clock, counter: Counter) -> list[Anchor]:
     """The reads on the odometer's clock, with what it may add at their speed."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
-    clock_m = clock.delta_s * np.abs(counter.speed_mps(t_ns))
+    clock_m = clock.delta_s * np.abs(counter.best_speed_mps(t_ns))
     shift_ns = round(clock.shift_s * NS_PER_S)
     rows = zip(anchors, clock_m.tolist(), strict=True)
     return [replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=own_m) for anchor, own_m in rows]

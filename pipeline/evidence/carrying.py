@@ -60,10 +60,19 @@ class Counter:
         return driven
 
     def speed_mps(self, t_ns: Ints) -> Floats:
-        """Speed at instants, over a second about each [m/s]; a best guess where it is not known."""
-        at_s, half_s = self.odometer.seconds(t_ns), 0.5 * self.odometer.config.speed_window_s
-        moved_m = self.odometer.distance_at_s(at_s + half_s) - self.odometer.distance_at_s(at_s - half_s)
-        speed: Floats = (self.odometer.scale or 1.0) * moved_m / (2.0 * half_s)
+        """Speed at instants, over a second about each [m/s]; NaN where it did not count throughout that second."""
+        half_ns = round(0.5 * self.odometer.config.speed_window_s * NS_PER_S)
+        speed: Floats = self.between(t_ns - half_ns, t_ns + half_ns).distance_m / (2 * half_ns / NS_PER_S)
+        return speed
+
+    def best_speed_mps(self, t_ns: Ints) -> Floats:
+        """Speed over so much of a second about each instant as was recorded [m/s]; a best guess over a break."""
+        odometer, at_s = self.odometer, self.odometer.seconds(t_ns)
+        half_s = 0.5 * odometer.config.speed_window_s
+        begin_s = np.clip(at_s - half_s, odometer.t_s[0], odometer.t_s[-1])
+        end_s = np.clip(at_s + half_s, odometer.t_s[0], odometer.t_s[-1])
+        moved_m = odometer.distance_at_s(end_s) - odometer.distance_at_s(begin_s)
+        speed: Floats = (odometer.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9)
         return speed
 
 

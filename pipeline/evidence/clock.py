@@ -100,9 +100,9 @@ def _rest_of_lag(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter, 
     begin_ns, end_ns = _shifted(begin_ns, lag_s), _shifted(end_ns, lag_s)
     counted = counter.between(begin_ns, end_ns).distance_m
     change = counter.speed_mps(end_ns) - counter.speed_mps(begin_ns)
-    # Noise of the odometer is no change of speed, and would look like a lag.
-    change = np.where(np.abs(change) > counter.odometer.deadband_mps, change, 0.0)
-    kept = np.isfinite(counted)
+    # Noise of the odometer is no change of speed, and would look like a lag; nor is where its recording begins or ends.
+    change = np.where(np.abs(change) <= counter.odometer.deadband_mps, 0.0, change)
+    kept = np.isfinite(counted) & np.isfinite(change)
     if kept.sum() < _FEWEST:
         return 0.0, np.inf
     estimate, sigma = np.array([1.0, 0.0]), np.inf

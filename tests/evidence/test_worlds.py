@@ -59,6 +59,36 @@ def test_a_clock_that_cannot_be_measured_is_taken_as_a_tenth_of_a_second_and_sai
     assert known(GROUND, of_reference=reference(ride, rng)).clock_assumed
 
 
+@pytest.mark.parametrize("late_s", [-0.09, 0.05, 0.09])
+@pytest.mark.parametrize("file", FILES)
+def test_a_recording_that_begins_and_ends_at_speed_is_no_change_of_speed(late_s: float, file: str) -> None:
+    """Half a second beyond the odometer's recording looked like a stop, and a late clock was measured as none."""
+    rng = np.random.default_rng(6)
+    ride = Ride((0.0, 220.0), (70.0, 70.0))
+    found = known(
+        GROUND,
+        odometer(ride, rng),
+        of_reference=reference(ride, rng, sigma_m=0.02, late_s=late_s),
+        vehicle=FILES[file],
+    )
+    assert found.clock_assumed
+    at_s = np.arange(2.0, 215.0, 1.3)
+    assert bounds(found.at(ns(at_s)), ride.at(at_s))[2].all()
+
+
+def test_a_reset_of_the_odometer_is_no_change_of_speed() -> None:
+    """At constant speed nothing tells the lag, whatever the counter does in between."""
+    rng = np.random.default_rng(7)
+    ride = Ride((0.0, 220.0), (70.0, 70.0))
+    counted = (
+        odometer(ride, rng)
+        .with_row_index("row")
+        .with_columns(distance_m=pl.col("distance_m") - pl.when(pl.col("row") >= 1003).then(5000.0).otherwise(0.0))
+    )
+    found = known(GROUND, counted.drop("row"), of_reference=reference(ride, rng, sigma_m=0.02, late_s=0.05))
+    assert found.clock_assumed
+
+
 def test_a_lag_of_seconds_is_found() -> None:
     rng = np.random.default_rng(4)
     ride = wavy(40.0)
