@@ -28,7 +28,8 @@ _EVEN_S = 2.0
 class KnownPath:
     """A way of the reference as evidence, per sample: leg, and least and largest coordinate on it [m].
 
-    `sense`: +1 where the odometer counts up as the coordinate grows, else -1.
+    `sense`: +1 where the odometer counts up as the coordinate grows, else -1. `step_m`: size of the step that every
+    odometer contradicts between a sample and the next, else 0: in between the reference may be on either side of it.
     """
 
     path: ReferencePath
@@ -36,6 +37,7 @@ class KnownPath:
     at_m: Floats
     low_m: Floats
     high_m: Floats
+    step_m: Floats
 
     def place(self, sample: int) -> Place:
         element, measure, _ = self.path.legs[int(self.path.leg[sample])].locate(self.at_m[[sample]])
@@ -137,9 +139,9 @@ def known_stretch(
     for path in stretch.paths:
         at_m = path.at_m - one.sense * ahead_m
         speed_mps = np.maximum(speed_mps, _speed_mps(t_ns, at_m, path.leg))
-        known = KnownPath(path, one.sense, at_m, at_m, at_m)
-        low_m, high_m = _left_open(known, t_ns, stretch.sigma_m, counters, reads_ns, config)
-        paths.append(replace(known, low_m=at_m + low_m, high_m=at_m + high_m))
+        known = KnownPath(path, one.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
+        low_m, high_m, step_m = _left_open(known, t_ns, stretch.sigma_m, counters, reads_ns, config)
+        paths.append(replace(known, low_m=at_m + low_m, high_m=at_m + high_m, step_m=step_m))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
     around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in (-clock.delta_s, 0.0, clock.delta_s)]
     return KnownStretch(t_ns, stretch.sigma_m, np.maximum.reduce(around) * clock.delta_s, tuple(paths))
@@ -156,18 +158,19 @@ def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
 
 def _left_open(
     known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter], reads_ns: Ints, config: Configuration
-) -> tuple[Floats, Floats]:
-    """How far behind and ahead of each sample the train may be because the reference stepped away [m].
+) -> tuple[Floats, Floats, Floats]:
+    """How far behind and ahead of each sample the train may be because the reference stepped away, and the steps [m].
 
     A step that every odometer contradicts by more than k_T roots leaves both sides possible, until the step back or
     the next read.
     """
-    low_m, high_m = np.zeros((2, t_ns.size))
+    low_m, high_m, open_step_m = np.zeros((3, t_ns.size))
     if t_ns.size < 2:
-        return low_m, high_m
+        return low_m, high_m, open_step_m
     step_m, root_m = _contradicted(known, t_ns, sigma_m, counters, config)
     limit_m = config.align.sure_sigmas * root_m
     stepped = np.flatnonzero((np.abs(step_m) > limit_m) & _uneven(known.at_m, t_ns, limit_m))
+    open_step_m[stepped] = np.abs(step_m[stepped])
     events = [(int(t_ns[row + 1]), float(step_m[row]), float(limit_m[row])) for row in stepped.tolist()]
     open_m: list[float] = []
     for at_ns, own_m, noise_m in sorted(events + [(read_ns, 0.0, np.inf) for read_ns in reads_ns.tolist()]):
@@ -179,7 +182,7 @@ def _left_open(
         rows = slice(int(np.searchsorted(t_ns, at_ns)), None)
         low_m[rows] = -behind_m.max()
         high_m[rows] = -behind_m.min()
-    return low_m, high_m
+    return low_m, high_m, open_step_m
 
 
 def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:

@@ -163,6 +163,9 @@ class Evidence:
                 centre = np.interp(since, stamps, path.at_m)
                 low = np.minimum((path.low_m - path.at_m)[before], (path.low_m - path.at_m)[after])
                 high = np.maximum((path.high_m - path.at_m)[before], (path.high_m - path.at_m)[after])
+                # No straight line leads over a contradicted step: its moment is not known.
+                stepping = np.where(before != after, path.step_m[before], 0.0)
+                low, high = low - stepping, high + stepping
                 for number in np.unique(leg[before]).tolist():
                     own = np.flatnonzero((leg[before] == number) & (leg[after] == number))
                     low_m, high_m = (centre + low - half)[own], (centre + high + half)[own]

@@ -141,6 +141,17 @@ def test_a_reference_that_steps_ahead_leaves_both_sides_until_it_steps_back() ->
     assert (high - low)[~stepped].max() < 2.0
 
 
+def test_between_the_samples_of_a_step_no_straight_line_is_evidence() -> None:
+    """A reference of 1 Hz steps back after a read: the line in between crossed what the reads say, beside the train."""
+    rng = np.random.default_rng(7)
+    ride = wavy(30.0)
+    ahead = np.where((np.arange(400) >= 100) & (np.arange(400) < 140), 25.0, 0.0)
+    stepping = reference(ride, rng, rate_hz=1.0, ahead_m=ahead)
+    found = known(GROUND, odometer(ride, rng), of_reference=stepping, of_reads=reads(ride, GROUND, rng))
+    at_s = np.arange(95.0, 145.0, 0.05)
+    assert bounds(found.at(ns(at_s)), ride.at(at_s))[2].all()
+
+
 def test_a_read_says_which_side_of_a_step_is_right() -> None:
     """The reference stays 25 m ahead; from the first read on, reference and reads are in dispute."""
     rng = np.random.default_rng(8)
