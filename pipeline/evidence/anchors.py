@@ -152,6 +152,8 @@ def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
     half_ns = NS_PER_S // 2
     begin = np.searchsorted(t_ns, t_ns - half_ns)
     end = np.minimum(np.searchsorted(t_ns, t_ns + half_ns), t_ns.size - 1)
+    # A slow log has no other sample within the second before its last one.
+    begin = np.minimum(begin, np.maximum(end - 1, 0))
     elapsed_s = np.maximum((t_ns[end] - t_ns[begin]) / NS_PER_S, 1e-9)
     return np.where((leg[begin] == leg[end]) & (end > begin), np.abs(at_m[end] - at_m[begin]) / elapsed_s, 0.0)
 

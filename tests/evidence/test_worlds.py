@@ -141,6 +141,17 @@ def test_a_reference_that_steps_ahead_leaves_both_sides_until_it_steps_back() ->
     assert (high - low)[~stepped].max() < 2.0
 
 
+def test_the_last_sample_of_a_slow_reference_has_the_speed_of_the_train() -> None:
+    """At 1 Hz its clock was worth nothing there, and what was carried on from it left the truth outside."""
+    rng = np.random.default_rng(11)
+    ride = Ride((0.0, 50.0, 100.0, 150.0, 200.0), (70.0, 30.0, 70.0, 30.0, 70.0))
+    slow = reference(ride, rng, rate_hz=1.0, late_s=0.28)
+    found = known(GROUND, odometer(ride, rng), of_reference=slow)
+    (stretch,) = found.stretches
+    assert not found.clock_assumed
+    assert stretch.clock_m[-1] == pytest.approx(stretch.clock_m[-2], rel=0.05)
+
+
 def test_between_the_samples_of_a_step_no_straight_line_is_evidence() -> None:
     """A reference of 1 Hz steps back after a read: the line in between crossed what the reads say, beside the train."""
     rng = np.random.default_rng(7)
