@@ -118,6 +118,10 @@ class NoiseMeter:
                 measured_m2, doubt, ready = self._measured(index, renewals)
                 doubted_m2 = measured_m2 * (1.0 + self._config.noise_doubt * doubt)
                 noise_m2 = np.where(ready, self._no_limit_by(measured_m2, doubted_m2), noise_m2)
+            if (
+                index
+            ):  # A sigma stated too large hides white noise at long lags; after a restart it is there all the same.
+                noise_m2 = np.maximum(noise_m2, before_m2)
             grew = grows
             grows = _ratio(np.maximum(noise_m2 - (before_m2 if index else nothing), 0.0), more_m2)
             if index:  # It may grow ever less, as noise does beyond its memory, but never more.

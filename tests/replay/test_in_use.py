@@ -237,7 +237,7 @@ def test_pulses_are_one_failure_and_not_hundreds_in_time():
 def test_positions_without_diagnosis_prove_nothing():
     """No odometer: every position is right by the reference, and nothing would have seen one that is not."""
     tables = replay(RunLog("blind", gnss(np.zeros(TIME_S.size)), reference=reference()), SITE)
-    assert of(tables, "verdict", "reasons", "share_p3") == ("unproven", ["not_diagnosed"], 1.0)
+    assert of(tables, "verdict", "reasons", "share_p3") == ("unproven", ["not_diagnosed", "clock_assumed"], 1.0)
     assert row(tables)["balises_accepted"] > 0
 
 
@@ -287,7 +287,7 @@ def test_a_part_between_the_anchors_has_its_own_verdict():
     )
     tables = replay(log, SITE)
     assert of(tables, "verdict", "part_verdict") == ("unproven", "safe")
-    assert row(tables)["reasons"] == ["accepted_unknown", "unknown_in_use"]
+    assert row(tables)["reasons"] == ["accepted_unknown", "unknown_in_use", "clock_assumed"]
     begin, end = (row(tables)[name].timestamp() for name in ("part_from", "part_to"))
     assert (begin % 1000, end % 1000) == (pytest.approx(30.0, abs=1.0), pytest.approx(110.0, abs=1.0))
     assert row(tables)["part_share"] == pytest.approx(80.0 / 135.0, abs=0.02)
