@@ -210,8 +210,8 @@ def outage(gap_s: float, offset_m: float, **settings: Any) -> LdsResult:
 
 @pytest.mark.parametrize("gap_s", [70.0, 90.0, 300.0])
 def test_a_position_after_an_outage_has_to_re_link(gap_s: float) -> None:
-    # The first TVB is at 7 s, the last 300 s before the end of the longest outage at 20 s.
-    waited_s = gap_s + 13.0 if gap_s < 300.0 else 300.0
+    # The first TVB is at 7 s, less than `anchor_lag_s` before the end of the longest outage.
+    waited_s = gap_s + 13.0
     way_m = 20.0 * waited_s
     bound_m = min(10.0, K_T * sqrt(2.0 + 0.05**2 * waited_s + (1e-4 * way_m) ** 2))
     for offset_m, state in ((0.0, "pass"), (bound_m - 0.01, "pass"), (-bound_m - 0.01, "fail"), (30.0, "fail")):
