@@ -3,8 +3,9 @@
 The position returns only where GNSS minus odometer is what it was at the *anchor*. A slow drift has moved the last TVB
 before an alarm already, so the anchor lies `anchor_lag_s` before the first alarm; alarms that follow may be about the
 same fault, so a return does not move it. A physical balise says where the train is: only a telegram renews the anchor.
-The same test decides on the first position after an outage over which the bank began anew (`breaks`), or after noise that
-hid for as long what the position does, for nobody looked on meanwhile, and after slip that the odometer reports. No alarm stands there, so that the last TVB is the anchor. A
+The same test decides on the first position after an outage over which the bank began anew (`breaks`), or after noise
+that hid for as long what the position does, for nobody looked on meanwhile, and after slip that the odometer reports.
+No alarm stands there, so that the last TVB is the anchor. A
 wheel that slips is counted wrongly: that widens the bound, up to half the failure limit; if the count may be off by
 more, there is no re-link but at a telegram.
 """
