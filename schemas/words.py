@@ -173,7 +173,7 @@ REMEDIES: dict[Remedy, str] = {
     Remedy.ROUTE: "name the track that the train took: "
     "`balise replay {run} --site {site} --out {out}{options} --route ROUTES` "
     "(--write-route ROUTES writes what was found)",
-    Remedy.CLOCK: "set the recorders to one clock: `balise inspect {run} --site {site}` shows their lags",
+    Remedy.CLOCK: "set the recorders to one clock: `balise inspect {run} --site {site}{options}` shows their lags",
     Remedy.ODOMETER: "record an odometer: without one nothing along the track is monitored",
     Remedy.FASTER_LOG: "log positions more often, at 10 Hz",
     Remedy.SURVEY_SIGMA: "state the survey's accuracy: column sigma_m in the track of {site}",
