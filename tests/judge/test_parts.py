@@ -149,7 +149,6 @@ def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of()
             ([3, 4, 5], after, [106.0, 114.0, 122.0]),
         )
     )
-    none = np.zeros(0, dtype=np.int64)
     evidence = EvidenceSet(np.zeros(6, dtype=np.int64), alternatives)
     places = {"V1": Place(1, 2.0), "V2": Place(1, 60.0)}
     found = true_crossings(seconds(0, 1, 2, 3, 4, 5), evidence, places, 5.0, 3.0)
@@ -294,7 +293,6 @@ def test_each_alternative_is_weighed_however_few_instants_it_tells_of() -> None:
     route = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
     told = [Alternative(np.array(rows), route, np.array(low), np.array(low) + 2.0) for rows, low in (
         ([0, 1, 2, 3], [49.0] * 4), ([2], [89.0]), ([3], [89.0]))]  # fmt: skip
-    none = np.zeros(0, dtype=np.int64)
     evidence = EvidenceSet(np.full(4, KINDS.index(Evidence.BALISE)), tuple(told))
     found = judge_positions(placed([50.0, 80.0, 50.0, np.nan]), evidence, [route], HazardConfig())
     assert found.code.tolist() == [RIGHT, WRONG, UNKNOWN, UNKNOWN]
