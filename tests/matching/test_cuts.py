@@ -80,15 +80,18 @@ def test_elements_that_are_surveyed_aside_do_not_claim_their_neighbour(
 
 @pytest.mark.parametrize("sigma_m", [0.3, 1.0, None])
 @pytest.mark.parametrize("seed", range(3))
-def test_turnouts_that_join_a_track_do_not_move_it(sigma_m: float | None, seed: int) -> None:
+@pytest.mark.parametrize(("start_m", "steps"), [(5950.0, 280), (2900.0, 100), (2650.0, 100)])
+def test_turnouts_that_join_a_track_do_not_move_it(
+    sigma_m: float | None, seed: int, start_m: float, steps: int
+) -> None:
     """The track took over by how much the branch had come nearer: at 1 m survey P(A) was 0.004 where it is 0.39."""
-    x = 5950.0 - 20.0 * np.arange(280.0)
-    y = 2.5 + np.random.default_rng(seed).normal(0.0, 0.1, 280)
+    x = start_m - 20.0 * np.arange(float(steps))
+    y = 2.5 + np.random.default_rng(seed).normal(0.0, 0.1, steps)
     fixes = run(x, y)
     joined = on_a(matched(fixes, double_track(7, True, sigma_m), odometer(x)).epochs, "gate")
     alone = on_a(matched(fixes, double_track(7, False, sigma_m), odometer(x)).epochs, "gate")
     # A branch is a way to have come on A, so A may be likelier by it; it says nothing of B.
-    assert np.abs(joined - alone).max() < 0.1
+    assert (joined - alone).max() < 0.15
     assert (joined - alone).min() > -0.02
 
 
