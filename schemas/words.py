@@ -17,6 +17,7 @@ BETWEEN = "; "
 
 # How many losses a sentence names; from which share on.
 _NAMED, _LEAST_SHARE = 3, 0.005
+_CENTIMETRE_M = 0.01
 
 NOTES: dict[Note, str] = {
     Note.CORRECTED: "{}",
@@ -173,7 +174,7 @@ REMEDIES: dict[Remedy, str] = {
     Remedy.ROUTE: "name the track that the train took: "
     "`balise replay {run} --site {site} --out {out}{options} --route ROUTES` "
     "(--write-route ROUTES writes what was found)",
-    Remedy.CLOCK: "set the recorders to one clock: `balise inspect {run} --site {site}` shows their lags",
+    Remedy.CLOCK: "set the recorders to one clock: `balise inspect {run} --site {site}{options}` shows their lags",
     Remedy.ODOMETER: "record an odometer: without one nothing along the track is monitored",
     Remedy.FASTER_LOG: "log positions more often, at 10 Hz",
     Remedy.SURVEY_SIGMA: "state the survey's accuracy: column sigma_m in the track of {site}",
@@ -257,6 +258,20 @@ def beside_words(run: Mapping[str, Any]) -> str:
     margin_m = run["proof_margin_m"]
     told = "the train did not move" if available is None else f"available for {available:.0%} of the moving time"
     return ", ".join([accepted, told, *([] if margin_m is None else [f"proof margin {margin_m:.1f} m"])])
+
+
+NOISE_AXES: dict[str, str] = {"along": "along the track", "cross": "across it", "up": "of the height"}
+
+
+def noise_words(widened: Mapping[str, tuple[float, float]]) -> str:
+    """What measured noise does to the thresholds: by axis, raw threshold over the model's, and the white noise [m]."""
+    told = [f"{NOISE_AXES[axis]} {ratio:.1f} times (white noise {_short(noise_m)})" for axis, (ratio, noise_m) in
+            widened.items()]  # fmt: skip
+    return f"raw thresholds at the end against the model's: {', '.join(told)}" if told else ""
+
+
+def _short(length_m: float) -> str:
+    return f"{1000.0 * length_m:.0f} mm" if length_m < _CENTIMETRE_M else f"{100.0 * length_m:.0f} cm"
 
 
 PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options": ""}

@@ -169,7 +169,7 @@ def _left_open(
     low_m, high_m, open_step_m = np.zeros((3, t_ns.size))
     if t_ns.size < 2:
         return low_m, high_m, open_step_m
-    step_m, root_m = _contradicted(known, t_ns, sigma_m, counters, config)
+    step_m, root_m = _contradicted(known, t_ns, sigma_m, counters)
     limit_m = config.align.sure_sigmas * root_m
     stepped = np.flatnonzero((np.abs(step_m) > limit_m) & _uneven(known.at_m, t_ns, limit_m))
     open_step_m[stepped] = np.abs(step_m[stepped])
@@ -197,9 +197,7 @@ def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
     return uneven
 
 
-def _contradicted(
-    known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter], config: Configuration
-) -> tuple[Floats, Floats]:
+def _contradicted(known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter]) -> tuple[Floats, Floats]:
     """Per step to the next sample: its difference from the odometer nearest to it, and the root of both [m]."""
     whole = np.diff(known.path.leg) == 0
     least, root = np.full(t_ns.size - 1, np.inf), np.ones(t_ns.size - 1)

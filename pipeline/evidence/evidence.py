@@ -52,24 +52,17 @@ class Alternative:
         return Alternative(self.rows, self.route, middle - half, middle + half)
 
 
-def _none() -> Ints:
-    return np.zeros(0, dtype=np.int64)
-
-
 @dataclass(frozen=True)
 class EvidenceSet:
     """Evidence at instants: `kind` is the number in `KINDS`, -1 where nothing is known.
 
     Where there are several alternatives at an instant the train was on one of them. `disputed`: instants at which
-    reference and reads exclude each other. `rival_row`, `rival_element`: further net elements that it may have been on,
-    whose place along the track is not known.
+    reference and reads exclude each other.
     """
 
     kind: Ints
     alternatives: tuple[Alternative, ...]
-    rival_row: Ints = field(default_factory=_none)
-    rival_element: Ints = field(default_factory=_none)
-    disputed: Ints = field(default_factory=_none)
+    disputed: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ def true_places(found: EvidenceSet, track: Track) -> pl.DataFrame:
     Null where nothing is known; the measures also where there are several net elements.
     """
     parts = [_touched(one) for one in found.alternatives]
-    unplaced = pl.DataFrame({"row": found.rival_row, "element": found.rival_element})
-    touched = pl.concat([pl.DataFrame(schema=_TOUCHED), *parts, unplaced], how="diagonal")
+    touched = pl.concat([pl.DataFrame(schema=_TOUCHED), *parts])
     places = touched.group_by("row").agg(
         pl.col("element").unique().sort(), low=pl.col("low").min(), high=pl.col("high").max()
     )

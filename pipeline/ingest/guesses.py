@@ -61,11 +61,18 @@ def unit_in(name: str) -> str | None:
 
 
 def mapping_lines(
-    stream: Stream, topic: str, words: Mapping[str, str], time: list[str], scale: float | None, units: Mapping[str, str]
+    stream: Stream,
+    topic: str,
+    words: Mapping[str, str],
+    time: list[str],
+    scale: float | None,
+    units: Mapping[str, str],
+    texts: Mapping[str, str] | None = None,
 ) -> list[str]:
     """The lines of `[[ingest.STREAM]]`, none where the names do not tell of this stream.
 
-    `time`: its lines, `scale`: seconds per unit of the times; `units`: those told beside the names.
+    `time`: its lines, `scale`: seconds per unit of the times; `units`: those told beside the names;
+    `texts`: columns that hold no numbers.
     """
     found = columns_in(stream, words)
     if not found or (stream == "gnss" and not set(found) >= _POSITION):
@@ -81,7 +88,8 @@ def mapping_lines(
             factors[column] = UNITS[unit]
     if stream == "gnss" and "height_m" not in found:
         remarks.append("# height_m: only a height over the ellipsoid; one over the sea is another 20 to 60 m in Europe")
-    pairs = ", ".join(f"{column} = {json.dumps(name, ensure_ascii=False)}" for column, name in found.items())
+    fields = {**(texts or {}), **found}
+    pairs = ", ".join(f"{column} = {json.dumps(name, ensure_ascii=False)}" for column, name in fields.items())
     listed = ", ".join(f"{column} = {factor:.10g}" for column, factor in factors.items())
     lines = [f"[[ingest.{stream}]]", f"topic = {json.dumps(topic, ensure_ascii=False)}", *time]
     return [*lines, f"fields = {{ {pairs} }}", *([f"factors = {{ {listed} }}"] if listed else []), *remarks]

@@ -169,7 +169,6 @@ def judge_positions(
         weighed[rows] = True
         low[rows], high[rows] = np.fmin(low[rows], found.low_m), np.fmax(high[rows], found.high_m)
     wrong = ahead | behind
-    _weigh_rivals(positions, evidence, right, wrong, off)
     code = np.where(weighed & wrong, WRONG, np.where(weighed & right, RIGHT, UNKNOWN))
     told = weighed & np.isfinite(low)
     return Judgements(
@@ -184,15 +183,6 @@ def judge_positions(
 def _only(alternative: Alternative, kept: Bools) -> Alternative:
     rows, low, high = alternative.rows[kept], alternative.low_m[kept], alternative.high_m[kept]
     return Alternative(rows, alternative.route, low, high)
-
-
-def _weigh_rivals(positions: Positions, evidence: EvidenceSet, right: Bools, wrong: Bools, off: Bools) -> None:
-    """On a further net element that the train may have been on: not proved right, and wrong only elsewhere."""
-    rows, element = evidence.rival_row, evidence.rival_element
-    right[rows] = False
-    elsewhere = (positions.element[rows] != element) & positions.unambiguous[rows]
-    np.logical_and.at(wrong, rows, elsewhere)
-    np.logical_and.at(off, rows, elsewhere)
 
 
 def _relative(positions: Positions, rows: Ints, there: Alternative, legs: Sequence[Route]) -> _Relative:

@@ -56,7 +56,6 @@ def _alone(evidence: EvidenceSet, size: int) -> Bools:
     count = np.zeros(size, dtype=np.int64)
     for alternative in evidence.alternatives:
         count[alternative.rows] += 1
-    count[evidence.rival_row] += 1
     alone: Bools = count == 1
     return alone
 

@@ -29,6 +29,7 @@ CAUSES = {
     State.WRONG_TRACK: LineCause.WRONG_TRACK,
     State.WRONG_IN_USE: LineCause.WRONG,
 }
+_ANYWHERE = [int(State.OUTAGE), int(State.UNKNOWN)]
 _OUTCOMES: dict[str, pl.DataType | type[pl.DataType]] = {
     "piece": pl.Int64,
     "growing": pl.Boolean,
@@ -79,7 +80,7 @@ def passes_of(
     if epochs.height < 2:
         return pl.DataFrame(schema=_PASSES)
     legs, states = stretches_of(epochs), states_of(epochs, alarms["t_start"], config)
-    spans = spans_of(epochs, states, config)
+    spans = spans_of(epochs, states, legs, config)
     hits = laid_on(spans, legs, ground.pieces)
     parts = [_worst(hits, ground.pieces, criteria), _unsafe(passages, epochs, legs, ground.pieces)]
     parts += _misleading(epochs, states, legs, ground, criteria)
@@ -89,8 +90,8 @@ def passes_of(
 def laid_on(spans: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
     """The spans' columns per piece and direction that they touch, with `begin_m, end_m`: the likely way on the piece.
 
-    A right span counts on the net elements of its own positions only, so that nothing good is said of a track
-    that runs beside it on the path.
+    A span counts on the net elements of the train only, not on a track that runs beside them on the path. An outage,
+    and what is unknown, count on all of them: nobody saw which of them it led over.
     """
     found: list[pl.DataFrame] = []
     for name, sign, offset_m in legs.select("netelement_id", "sign", "offset_m").iter_rows():
@@ -100,7 +101,7 @@ def laid_on(spans: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataF
         at = _measures(spans, sign, offset_m)
         rows = pieces.track.vertices(element)
         first_m, last_m = pieces.track.measure_m[rows][0], pieces.track.measure_m[rows][-1]
-        own = (pl.col("state") > int(State.AFTER_ALARM)) | (pl.col("one") == name) | (pl.col("other") == name)
+        own = pl.col("state").is_in(_ANYWHERE) | pl.col("elements").list.contains(name)
         kept = at.filter((pl.col("high") >= first_m) & (pl.col("low") <= last_m) & own.fill_null(value=False))
         begin, end = pieces.at(element, floats(kept, "low")), pieces.at(element, floats(kept, "high"))
         index = np.repeat(np.arange(kept.height), end - begin + 1)
@@ -121,7 +122,7 @@ def _measures(spans: pl.DataFrame, sign: int, offset_m: float) -> pl.DataFrame:
     order = ("low_m", "high_m", "from_m", "to_m") if sign > 0 else ("high_m", "low_m", "to_m", "from_m")
     names = ("low", "high", "begin", "end")
     places = {name: sign * (pl.col(column) - offset_m) for name, column in zip(names, order, strict=True)}
-    return spans.select("state", "t", "one", "other", "satellites", growing=pl.col("direction") * sign > 0, **places)
+    return spans.select("state", "t", "elements", "satellites", growing=pl.col("direction") * sign > 0, **places)
 
 
 def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.DataFrame:

@@ -58,9 +58,13 @@ def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats,
         rows = [row for row in range(begins[step], begins[step + 1]) if origin[row] >= 0]
         grown = [side[row] * errors[origin[row]] + parted[row] for row in rows]
         if any(grown):
-            least = min(grown, key=abs)
-            for row, error in zip(rows, grown, strict=True):
-                errors[row] = kept[step] * side[row] * min(max(error - least, -limit[row]), limit[row])
+            taken = [min(max(error, -limit[row]), limit[row]) for row, error in zip(rows, grown, strict=True)]
+            # As far as no other leaves its tolerance: that would be a parting that counts nowhere.
+            lowest = max(error - limit[row] for row, error in zip(rows, taken, strict=True))
+            highest = min(error + limit[row] for row, error in zip(rows, taken, strict=True))
+            shift = min(max(min(taken, key=abs), lowest), highest)
+            for row, error in zip(rows, taken, strict=True):
+                errors[row] = kept[step] * side[row] * (error - shift)
     return np.array(errors)
 
 

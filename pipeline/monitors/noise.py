@@ -61,7 +61,10 @@ class NoiseMeter:
             measured_s = [
                 lag_s for lag_s in self._lags_s if lag_s <= max(self._config.noise_longest_lag_s, self._lags_s[0])
             ]
-            self._samples = [_samples(lag_s, series, t_s, self._renewal, moving, self._config) for lag_s in measured_s]
+            sums = _sums(series, self._config)
+            self._samples = [
+                _samples(lag_s, series, sums, t_s, self._renewal, moving, self._config) for lag_s in measured_s
+            ]
             self._entering = [np.arange(samples.row.size) for samples in self._samples]
 
     def freeze(self, row: int) -> None:
@@ -150,14 +153,20 @@ def _measured(samples: _Samples, entering: Ints, renewals: Ints, wait_spans: flo
     begin = np.maximum(end - samples.window, 0)
     cuts = np.unique(np.concatenate([begin, end]))
     inside = entering[cuts[0] : cuts[-1]]
-    group = np.repeat(np.arange(cuts.size - 1), np.diff(cuts)) * _BINS
+    group = np.repeat(np.arange(cuts.size - 1), np.diff(cuts))
     low, high = np.searchsorted(cuts, begin), np.searchsorted(cuts, end)
     largest = np.zeros(end.size, dtype=np.int64)
     for quantile, bins in samples.bins.items():
-        counts = np.bincount(group + bins[inside], minlength=(cuts.size - 1) * _BINS).reshape(-1, _BINS)
-        up_to = np.concatenate([np.zeros((1, _BINS), np.int64), np.cumsum(counts, axis=0)])
+        # Most bins are empty: only those that hold a sample are counted.
+        held = np.bincount(bins[inside], minlength=_BINS) > 0
+        held[0] = True
+        width = int(held.sum())
+        place = (np.cumsum(held) - 1)[bins[inside]]
+        counts = np.bincount(group * width + place, minlength=(cuts.size - 1) * width).reshape(-1, width)
+        up_to = np.concatenate([np.zeros((1, width), np.int64), np.cumsum(counts, axis=0)])
         below = np.cumsum(up_to[high] - up_to[low], axis=1)
-        largest = np.maximum(largest, (below >= quantile * (end - begin)[:, None]).argmax(axis=1))
+        reached = (below >= quantile * (end - begin)[:, None]).argmax(axis=1)
+        largest = np.maximum(largest, np.flatnonzero(held)[reached])
     pieces = np.maximum((end - begin) / samples.span, 1.0)
     return _EDGES_M2[largest], np.sqrt(2.0 / pieces), end >= samples.ready
 
@@ -167,19 +176,54 @@ def _lags_s(period_s: float, memories_s: Floats) -> list[float]:
     return [period_s, *(lag_s for lag_s in sorted({1.0, *memories_s.tolist()}) if lag_s > 1.5 * period_s)]
 
 
+@dataclass(frozen=True)
+class _Sums:
+    """Running sums of a series, whose differences are what happened between two rows.
+
+    `run`: one number for rows that increments lead through; `offset_m`: GNSS minus odometer or track; `white_m2`: of
+    the odometer; `staying_m`: what errors that stay make of the offset; `ages`: of each source beside the smooth
+    errors, the sum of dt / tau, by its column in `sigma_m`.
+    """
+
+    unknown: Bools
+    run: Ints
+    offset_m: Floats
+    white_m2: Floats
+    staying_m: list[Floats]
+    ages: dict[int, Floats]
+
+
+def _sums(series: AxisSeries, config: MonitorConfig) -> _Sums:
+    unknown = ~np.isfinite(series.rate_mps + series.sigma_m.sum(axis=1))
+    staying_mps = [rate_mps for rate_mps in (series.steady_mps, series.latency_mps) if rate_mps.any()]
+    sources = range(error_model(config)[1].size, series.sigma_m.shape[1])
+    lost = {source: np.minimum(series.decorrelation[:, source], 1.0 - 1e-12) for source in sources}
+    return _Sums(
+        unknown=unknown,
+        run=np.cumsum(series.fresh | unknown),
+        offset_m=np.cumsum(np.where(series.border | unknown, 0.0, series.rate_mps) * series.dt_s),
+        white_m2=np.cumsum(series.white_m2),
+        staying_m=[np.cumsum(rate_mps * series.dt_s) for rate_mps in staying_mps],
+        ages={source: -np.cumsum(np.log1p(-part)) for source, part in lost.items()},
+    )
+
+
 def _samples(
-    lag_s: float, series: AxisSeries, t_s: Floats, renewal: Ints, moving: Bools, config: MonitorConfig
+    lag_s: float,
+    series: AxisSeries,
+    sums: _Sums,
+    t_s: Floats,
+    renewal: Ints,
+    moving: Bools,
+    config: MonitorConfig,
 ) -> _Samples:
     period_s = float(np.median(np.diff(t_s)))
-    spacing_s = max(period_s, 0.1 * lag_s)
+    spacing_s = max(period_s, 0.1 * lag_s, config.noise_spacing_s)
     last, middle, oldest = _triples(t_s, lag_s, spacing_s, max(0.1 * lag_s, 0.5 * period_s))
-    unknown = ~np.isfinite(series.rate_mps + series.sigma_m.sum(axis=1))
-    run = np.cumsum(series.fresh | unknown)
-    kept = (run[oldest] == run[last]) & moving[last] & ~unknown[last]
+    kept = (sums.run[oldest] == sums.run[last]) & moving[last] & ~sums.unknown[last]
     last, middle, oldest = last[kept], middle[kept], oldest[kept]
-    offset_m = np.cumsum(np.where(series.border | unknown, 0.0, series.rate_mps) * series.dt_s)
-    seen_m2 = _second_difference(offset_m, last, middle, oldest) ** 2
-    model_m2 = _model_m2(series, lag_s, last, middle, oldest, config)
+    seen_m2 = _second_difference(sums.offset_m, last, middle, oldest) ** 2
+    model_m2 = _model_m2(series, sums, lag_s, last, middle, oldest, config)
     quantiles = config.noise_quantiles if lag_s < config.noise_longest_lag_s else config.noise_quantiles[:-1]
     ready_s = max(config.noise_first_s, config.noise_ready_lags * lag_s) - 2.0 * lag_s
     return _Samples(
@@ -189,7 +233,7 @@ def _samples(
         bins={q: _bin_of((seen_m2 / ndtri(0.5 + 0.5 * q) ** 2 - model_m2) / _OF_WALK) for q in quantiles},
         window=round(max(config.noise_window_s, config.noise_window_lags * lag_s) / spacing_s),
         ready=max(round(ready_s / spacing_s), 1),
-        span=2.0 * lag_s / spacing_s,
+        span=max(2.0 * lag_s / spacing_s, 1.0),
     )
 
 
@@ -216,7 +260,7 @@ def _smooth_m2(series: AxisSeries, row: Ints, lag_s: float, config: MonitorConfi
 
 
 def _model_m2(
-    series: AxisSeries, lag_s: float, last: Ints, middle: Ints, oldest: Ints, config: MonitorConfig
+    series: AxisSeries, sums: _Sums, lag_s: float, last: Ints, middle: Ints, oldest: Ints, config: MonitorConfig
 ) -> Floats:
     """Variance of the second differences by the whole model, sample by sample [m^2].
 
@@ -224,17 +268,14 @@ def _model_m2(
     and what scale and latency leave uncertain.
     """
     model_m2 = _smooth_m2(series, last, lag_s, config)
-    for source in range(error_model(config)[1].size, series.sigma_m.shape[1]):
-        age = -np.cumsum(np.log1p(-np.minimum(series.decorrelation[:, source], 1.0 - 1e-12)))  # sum of dt / tau
+    for source, age in sums.ages.items():
         later = np.exp(age[middle] - age[last])
         earlier = np.exp(age[oldest] - age[middle])
         variance_m2 = series.sigma_m[last, source] ** 2
         model_m2 += variance_m2 * (6.0 - 4.0 * (later + earlier) + 2.0 * later * earlier)
-    for staying_mps in (series.steady_mps, series.latency_mps):
-        if staying_mps.any():
-            model_m2 += _second_difference(np.cumsum(staying_mps * series.dt_s), last, middle, oldest) ** 2
-    white_m2 = np.cumsum(series.white_m2)
-    return np.asarray(model_m2 + white_m2[last] - white_m2[oldest])
+    for staying_m in sums.staying_m:
+        model_m2 += _second_difference(staying_m, last, middle, oldest) ** 2
+    return np.asarray(model_m2 + sums.white_m2[last] - sums.white_m2[oldest])
 
 
 def _bin_of(variance_m2: Floats) -> Ints:

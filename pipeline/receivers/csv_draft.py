@@ -22,6 +22,9 @@ _DATES, _WEEKS = r"(gps|utc)?(date|datum|day|tag)(utc)?", r"(gps|gpst)?(week|wk|
 _SECONDS = r"(gps)?(tow|sow|itow|timeofweek|secondsofweek|secofweek|weekseconds|gpsseconds|gpstime|seconds)(s|ms)?"
 _CLOCKS = r"(gps|utc)?(time|zeit|uhrzeit|timeofday|clock|heure)(utc)?"
 
+_SENSORS = r"(odo|odometer)?(sensor|sensorid|sensorname|geber|capteur)"
+_BALISES = r"(balise|balisen|balisegroup|bg|eurobalise)(id|nr|no|name|number|nummer)?"
+
 
 def draft_mapping(path: Path) -> str:
     """Configuration text for `balise convert`, to be saved and checked; what nothing tells is a comment."""
@@ -32,6 +35,7 @@ def draft_mapping(path: Path) -> str:
     words = {name: word_of(name) for name in table.columns if name.strip()}
     time = _time_lines(table, words, units)
     parts = [part for stream in NAMES if (part := _stream(stream, table, words, path.name, time, units))]
+    parts += [] if parts else _reads(words, path.name, time)
     head = f"# Draft from the header of {path.name}: check each line, above all units and the scale of the times.\n"
     columns = f"# Columns: {', '.join(map(one_line, table.columns))}\n"
     return head + columns + ("\n".join(parts) if parts else _EMPTY.format(topic=json.dumps(path.name)))
@@ -53,9 +57,22 @@ def _stream(
     stream: Stream, table: pl.DataFrame, words: Words, file: str, time: tuple[list[str], float | None], units: Words
 ) -> str:
     numbers = {name: word for name, word in words.items() if table[name].dtype.is_numeric()}
-    lines = mapping_lines(stream, file, numbers, *time, units)
+    # Rows of several odometers must stay apart: one after the other they are no counter.
+    sensor = first(words, _SENSORS) if stream == "odometer" else None
+    lines = mapping_lines(stream, file, numbers, *time, units, {"sensor": sensor} if sensor else {})
     unfit = _unfit(stream, table, {name: word for name, word in words.items() if name not in numbers})
     return "\n".join(["", *lines, *unfit]) + "\n" if lines or unfit else ""
+
+
+def _reads(words: Words, file: str, time: tuple[list[str], float | None]) -> list[str]:
+    """The mapping of balise reads, of a table that is nothing else."""
+    balise = first(words, _BALISES)
+    if balise is None:
+        return []
+    factors = [f"factors = {{ t = {time[1]:.10g} }}"] if time[1] else []
+    fields = f"fields = {{ balise_id = {json.dumps(balise, ensure_ascii=False)} }}"
+    lines = ["", "[[ingest.balise_reads]]", f"topic = {json.dumps(file, ensure_ascii=False)}", *time[0]]
+    return ["\n".join([*lines, fields, *factors]) + "\n"]
 
 
 def _unfit(stream: Stream, table: pl.DataFrame, words: Words) -> list[str]:

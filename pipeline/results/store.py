@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from urllib.parse import quote, unquote
 
@@ -47,9 +48,10 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
     The same tables and metadata give the same bytes. A killed process leaves either the complete
     run or one without marker, which does not count.
     """
-    others = {name: table_bytes(getattr(tables, name), name, metadata) for name in TABLES if name != _MARKER}
+    noted = {"run_id": tables.run_id, **metadata}
+    others = {name: table_bytes(getattr(tables, name), name, noted) for name in TABLES if name != _MARKER}
     digests = json.dumps({name: hashlib.sha256(content).hexdigest() for name, content in others.items()})
-    last = table_bytes(tables.runs, _MARKER, {**metadata, "tables": digests})
+    last = table_bytes(tables.runs, _MARKER, {**noted, "tables": digests})
     contents = [*others.items(), (_MARKER, last)]
     marker = table_address(out, _MARKER, tables.run_id)
     if is_url(out):
@@ -68,14 +70,26 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
 
 
 def table_bytes(frame: pl.DataFrame, table: str, metadata: Mapping[str, str]) -> bytes:
-    """A table as Parquet, held to its contract."""
+    """A table as Parquet, held to its contract, with unit and meaning in the field of each column."""
     checked = conform(frame, TABLES[table])
-    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata})
+    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata}, _fields(table))
 
 
-def parquet_bytes(frame: pl.DataFrame, metadata: Mapping[str, str]) -> bytes:
+@cache
+def _fields(table: str) -> dict[str, dict[str, str]]:
+    """Unit and meaning of each column, as CONTRACT section 3 wants them in every file."""
+    return {
+        name: {"unit": str((column.metadata or {}).get("unit", "")), "meaning": column.description or ""}
+        for name, column in TABLES[table].columns().items()
+    }
+
+
+def parquet_bytes(
+    frame: pl.DataFrame, metadata: Mapping[str, str], columns: Mapping[str, Mapping[str, str]] | None = None
+) -> bytes:
     """A frame as Parquet with its metadata; the same content always gives the same bytes."""
-    return parquet.parquet_bytes(frame, {f"{PREFIX}{key}": value for key, value in metadata.items()})
+    named = {f"{PREFIX}{key}": value for key, value in metadata.items()}
+    return parquet.parquet_bytes(frame, named, columns)
 
 
 def read_run(out: Address, run_id: str) -> RunTables:

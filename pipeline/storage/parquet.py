@@ -23,12 +23,22 @@ class ParquetError(ValueError):
     """Content that is no Parquet file, or a damaged one; `str` is one line."""
 
 
-def parquet_bytes(frame: pl.DataFrame, metadata: Mapping[str, str] | None = None) -> bytes:
-    """A frame as Parquet with its metadata; the same content always gives the same bytes."""
+def parquet_bytes(
+    frame: pl.DataFrame,
+    metadata: Mapping[str, str] | None = None,
+    columns: Mapping[str, Mapping[str, str]] | None = None,
+) -> bytes:
+    """A frame as Parquet with its metadata; the same content always gives the same bytes.
+
+    `columns`: what stands in the fields beside what polars notes of its own types (enums).
+    """
     table = frame.rechunk().to_arrow()
+    notes = columns or {}
+    fields = [field.with_metadata({**(field.metadata or {}), **notes.get(field.name, {})}) for field in table.schema]
+    schema = pa.schema(fields, metadata=dict(sorted((metadata or {}).items())) or None)
     buffer = io.BytesIO()
     pq.write_table(
-        table.replace_schema_metadata(dict(sorted((metadata or {}).items())) or None),
+        table.cast(schema),
         buffer,
         row_group_size=_ROWS_PER_GROUP,
         compression="zstd",
@@ -122,7 +132,7 @@ def without_checksums(content: bytes) -> bool:
     """Whether some column has no checksum, so that damage to it may stay unseen. Raises `ParquetError`."""
     with _reading():
         metadata = pq.read_metadata(pa.BufferReader(content))
-        groups = (metadata.row_group(number) for number in range(metadata.num_row_groups))
+        groups = (metadata.row_group(number) for number in range(metadata.num_row_groups) if metadata.num_rows)
         parts = (group.column(number) for group in groups for number in range(metadata.num_columns))
         return not all(_has_crc(content[part.data_page_offset :][:32]) for part in parts)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import polars as pl
 
 from pipeline.site.checks import remarks
 from pipeline.site.describe import without_balises
+from pipeline.storage.parquet import parquet_bytes
 from pipeline.storage.writing import replace_files
 from pipeline.survey.balises import balises_every, balises_of_list
 from pipeline.survey.doubts import doubts
@@ -112,16 +112,10 @@ def write_made(site: Site, page: str, out: Path, force: bool) -> None:
         raise UsageError("holds a site", place=str(out), remedy="Name another folder, or replace it with --force.")
     contents = {f"{name}.{suffix}": None for name in _FILES for suffix in ("csv", "geojson", "parquet")}
     tables = {"track": site.track, "links": site.links, "balises": site.balises}
-    written = {f"{name}.parquet": _parquet(table) for name, table in tables.items() if table is not None}
+    written = {f"{name}.parquet": parquet_bytes(table) for name, table in tables.items() if table is not None}
     told = pl.DataFrame([asdict(one) for one in site.findings], schema=list(Finding.__dataclass_fields__))
     beside = {"findings.csv": told.write_csv().encode(), "site.html": page.encode()}
     replace_files(out, {**contents, **written, **beside}, marker="track.parquet")
-
-
-def _parquet(table: pl.DataFrame) -> bytes:
-    buffer = io.BytesIO()
-    table.write_parquet(buffer)
-    return buffer.getvalue()
 
 
 def _number(text: str) -> float | None:

@@ -123,8 +123,8 @@ def test_configuration_tells_reason_or_source() -> None:
     assert [row[0] for row in rows if len(row) != 4 or not row[3]] == []
 
 
-# Read by the name of the stream, of the fix and of the service level.
-BY_NAME = ("ingest.", "fix_sigma.", "safety.service_levels.")
+# Read by the name of the stream, of the fix, of the service level and of the axis.
+BY_NAME = ("ingest.", "fix_sigma.", "safety.service_levels.", "monitors.noise_cross_m", "monitors.noise_up_m")
 KEYS = [
     key.rsplit(".", 1)[1]
     for file, key, _ in settings_frame().iter_rows()

@@ -149,8 +149,7 @@ def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of()
             ([3, 4, 5], after, [106.0, 114.0, 122.0]),
         )
     )
-    none = np.zeros(0, dtype=np.int64)
-    evidence = EvidenceSet(np.zeros(6, dtype=np.int64), alternatives, none, none)
+    evidence = EvidenceSet(np.zeros(6, dtype=np.int64), alternatives)
     places = {"V1": Place(1, 2.0), "V2": Place(1, 60.0)}
     found = true_crossings(seconds(0, 1, 2, 3, 4, 5), evidence, places, 5.0, 3.0)
     # 102 m lies in the middle between 98 m and 106 m; 160 m was not reached.
@@ -294,8 +293,7 @@ def test_each_alternative_is_weighed_however_few_instants_it_tells_of() -> None:
     route = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
     told = [Alternative(np.array(rows), route, np.array(low), np.array(low) + 2.0) for rows, low in (
         ([0, 1, 2, 3], [49.0] * 4), ([2], [89.0]), ([3], [89.0]))]  # fmt: skip
-    none = np.zeros(0, dtype=np.int64)
-    evidence = EvidenceSet(np.full(4, KINDS.index(Evidence.BALISE)), tuple(told), none, none)
+    evidence = EvidenceSet(np.full(4, KINDS.index(Evidence.BALISE)), tuple(told))
     found = judge_positions(placed([50.0, 80.0, 50.0, np.nan]), evidence, [route], HazardConfig())
     assert found.code.tolist() == [RIGHT, WRONG, UNKNOWN, UNKNOWN]
     assert found.low_m == pytest.approx([-1.0, 29.0, -41.0, np.nan], nan_ok=True)
@@ -462,7 +460,7 @@ def test_where_the_evidence_ends_the_position_is_held_to_it_by_its_own_path(onwa
     at_m, leg, sure = np.array([110.0]), np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool)
     given = Positions(np.array([1]), at_m - 100.0, leg, at_m, sure)
     told = Alternative(np.array([0]), route(onward), np.array([95.0]), np.array([97.0]))
-    evidence = EvidenceSet(np.array([KINDS.index(Evidence.BALISE)]), (told,), leg[:0], leg[:0])
+    evidence = EvidenceSet(np.array([KINDS.index(Evidence.BALISE)]), (told,))
     found = judge_positions(given, evidence, [route([0, 1])], HazardConfig())
     assert found.code.tolist() == [code]
     assert found.wrong_track.tolist() == [code == WRONG]

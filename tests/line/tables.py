@@ -57,6 +57,26 @@ def on_element(at_m: float) -> tuple[str, float]:
     return ("A", at_m) if at_m < SPLIT_M else ("B", LENGTH_M - at_m)
 
 
+NOWHERE: dict[str, object] = {"true_netelement_ids": None, "true_measure_low_m": None, "true_measure_high_m": None}
+
+
+def nowhere() -> dict[str, pl.Expr]:
+    """Columns of an epoch at which the evidence says nothing."""
+    return {
+        "true_netelement_ids": pl.lit(None, pl.List(pl.String)),
+        **dict.fromkeys(("true_measure_low_m", "true_measure_high_m"), pl.lit(None, pl.Float64)),
+    }
+
+
+def true_place(at_m: float, half_m: float = 2.0) -> dict[str, object]:
+    """Where the train was by the evidence, to 2 m; where that is over a joint, on both net elements."""
+    (one, low_m), (other, high_m) = on_element(at_m - half_m), on_element(at_m + half_m)
+    if one != other:
+        return NOWHERE | {"true_netelement_ids": [one, other]}
+    ends = sorted((low_m, high_m))
+    return {"true_netelement_ids": [one], "true_measure_low_m": ends[0], "true_measure_high_m": ends[1]}
+
+
 def epochs_of(number: int, places: Sequence[str] = tuple(PLACES), falling: bool | None = None) -> pl.DataFrame:
     """One run at 1 Hz, odd numbers from the far end; each starts a little elsewhere, an hour later."""
     back = bool(number % 2) if falling is None else falling
@@ -84,6 +104,7 @@ def _epoch(at_m: float, number: int, back: bool, places: Sequence[str]) -> dict[
         "measure_m": measure_m,
         "error_low_m": error_m - 2.0,
         "error_high_m": error_m + 2.0,
+        **true_place(at_m),
         "judgement": "wrong" if error_m > 22.0 else "right",
         "in_use": True,
         "on_track": True,
@@ -95,7 +116,7 @@ def _epoch(at_m: float, number: int, back: bool, places: Sequence[str]) -> dict[
     since_roof_m = (PLACES["roof"][1] - at_m) if back else at_m - PLACES["roof"][0]
     if inside("tunnel", at_m, places):
         nothing = dict.fromkeys(("path_m", "netelement_id", "measure_m", "error_low_m", "error_high_m", "confidence_m"))
-        return row | nothing | {"judgement": "unknown", "in_use": False, "on_track": False}
+        return row | nothing | NOWHERE | {"judgement": "unknown", "in_use": False, "on_track": False}
     if inside("cutting", at_m, places):
         return row | {"confidence_m": 25.0, "in_use": False, "satellites": 5}
     if "roof" in places and 0.0 <= since_roof_m < BLOCKED_M:

@@ -17,6 +17,7 @@ from tests.line.tables import (
     epochs_of,
     ground_of_line,
     line_site,
+    nowhere,
     passes_over,
 )
 
@@ -119,6 +120,7 @@ def test_what_the_reference_lost_counts_against_a_piece(site: Site) -> None:
         judgement=pl.when(at).then(pl.lit("unknown")).otherwise("judgement"),
         error_low_m=pl.when(~at).then("error_low_m"),
         error_high_m=pl.when(~at).then("error_high_m"),
+        **{name: pl.when(at).then(lost).otherwise(name) for name, lost in nowhere().items()},
     )
     parts = [right] * 40 + [passes_over([lost], site)] * 4
     many = pl.concat(part.with_columns(run_id=pl.lit(str(number))) for number, part in enumerate(parts))
@@ -195,7 +197,7 @@ def test_runs_that_overlap_in_time_are_remarked_on(begin: int, overlapping: list
 
 def test_positions_whose_place_nobody_knows_say_nothing(site: Site) -> None:
     lost = pl.lit(None, pl.Float64)
-    runs = [epochs_of(number).with_columns(error_low_m=lost, error_high_m=lost) for number in range(10)]
+    runs = [epochs_of(number).with_columns(error_low_m=lost, error_high_m=lost, **nowhere()) for number in range(10)]
     runs = [run.with_columns(judgement=pl.lit("unknown")) for run in runs]
     assert passes_over(runs, site).is_empty()
 

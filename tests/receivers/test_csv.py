@@ -235,3 +235,19 @@ def test_a_draft_can_be_saved_and_used(tmp_path):
     assert "# distance_m: left out, since 'Weg' holds no number in 1 rows, first '12x4'" in draft_mapping(log)
     log.write_text("a,b\n1,2\n")
     assert "No name tells" in draft_mapping(log)
+
+
+def test_a_draft_keeps_the_odometers_of_a_train_apart(tmp_path):
+    log = tmp_path / "odo.csv"
+    day = "2025-06-13T12:00:0"
+    rows = [f"{day}{second}Z,{sensor},{way}" for second in range(3) for sensor, way in (("tacho", 1), ("radar", 2))]
+    log.write_text("\n".join(["time,sensor,dist_m", *rows]) + "\n")
+    config = settings_from(tomllib.loads(draft_mapping(log)), Configuration, "x").ingest
+    assert gather([log], config).streams["odometer"]["sensor"].to_list() == ["tacho", "radar"] * 3
+
+
+def test_a_draft_of_balise_reads(tmp_path):
+    log = tmp_path / "reads.csv"
+    log.write_text("time,balise\n2025-06-13T12:00:00Z,PB1\n2025-06-13T12:01:00Z,PB2\n")
+    config = settings_from(tomllib.loads(draft_mapping(log)), Configuration, "x").ingest
+    assert gather([log], config).streams["balise_reads"]["balise_id"].to_list() == ["PB1", "PB2"]

@@ -48,7 +48,9 @@ def tables_of(run_id: str, solutions: tuple[str, ...] = ("primary",)) -> RunTabl
 def _value(name: str, column: dy.Column, known: dict[str, str]) -> object:
     if name in known:
         return known[name]
-    return None if column.nullable else 0
+    if column.nullable:
+        return None
+    return [] if isinstance(column, dy.List) else 0
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -64,9 +66,19 @@ def test_layout_and_metadata(tmp_path: Path) -> None:
     files = {name: (tmp_path / f"{name}/run_id=r1/{name}.parquet").read_bytes() for name in others}
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     assert json.loads(metadata.pop("balise.tables")) == digests
-    expected = {**METADATA, "table": "runs", "contract": CONTRACT_VERSION}
+    expected = {**METADATA, "run_id": "r1", "table": "runs", "contract": CONTRACT_VERSION}
     assert metadata == {f"balise.{key}": value for key, value in expected.items()}
     assert found.row_group(0).column(0).compression == "ZSTD"
+
+
+def test_every_field_tells_unit_and_meaning(tmp_path: Path) -> None:
+    store.write_run(tables_of("r1"), tmp_path, METADATA)
+    for name, contract in TABLES.items():
+        schema = pq.read_schema(tmp_path / f"{name}/run_id=r1/{name}.parquet")
+        told = {field.name: (field.metadata[b"unit"].decode(), field.metadata[b"meaning"].decode()) for field in schema}
+        columns = contract.columns().items()
+        assert told == {column: ((rule.metadata or {}).get("unit", ""), rule.description) for column, rule in columns}
+        assert store.read_table(tmp_path, name, "r1").drop("run_id").collect_schema() == contract.create_empty().schema
 
 
 def test_same_content_same_bytes(tmp_path: Path) -> None:

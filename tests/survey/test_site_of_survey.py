@@ -14,6 +14,7 @@ import pytest
 
 from pipeline.report.site_page import site_page
 from pipeline.site.read import read_site
+from pipeline.storage.parquet import without_checksums
 from pipeline.survey.make import make_site, wish_of, write_made
 from pipeline.survey.network import make_network
 from pipeline.survey.pieces import Piece, Survey
@@ -254,6 +255,7 @@ def test_gpx_kml_and_kmz_give_the_same_line_and_the_same_ids_each_time(tmp_path:
         write_made(sites[0], site_page(name, sites[0]), tmp_path / name, force=False)
     files = ("track.parquet", "links.parquet", "balises.parquet")
     assert all((tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in files)
+    assert not any(without_checksums((tmp_path / "one" / name).read_bytes()) for name in files)
     read = read_site(tmp_path / "one")
     assert read.balises is not None
     assert read.balises["balise_id"].to_list() == ["VB1", "VB2", "VB3"]
