@@ -1,6 +1,6 @@
 """The evidence ladder over many random worlds: what a judgement says against a truth that the judge cannot know.
 
-python -m benchmarks.ladder --seeds 500
+python -m benchmarks.ladder --seeds 500 [--crooked]
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import argparse
 import sys
 from collections import Counter
 
+from tests.judge.crooked_worlds import crooked_journey
 from tests.judge.findings import findings, rungs_of
 from tests.judge.random_worlds import random_journey
 
@@ -18,13 +19,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="benchmarks.ladder", description=__doc__)
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--crooked", action="store_true", help="counters reset, clocks off, disputes, two odometers")
     given = parser.parse_args()
     failed, verdicts = 0, Counter[str]()
     for seed in range(given.first, given.first + given.seeds):
-        journey = random_journey(seed)
+        journey = crooked_journey(seed) if given.crooked else random_journey(seed)
         rungs = rungs_of(journey)
         verdicts.update(f"{name} {rung.row['verdict']}" for name, rung in rungs.items())
-        found = findings(journey, rungs)
+        found = findings(journey, rungs, given.crooked)
         failed += bool(found)
         for text in found:
             print(text, flush=True)

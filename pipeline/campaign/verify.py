@@ -114,7 +114,7 @@ def _manifest(out: Address) -> Manifest:
 
 
 def _other_runs(there: Sequence[str], manifest: Manifest) -> Iterator[tuple[str, str, str]]:
-    """Runs that only one of both has; a call that was ended leaves some that the manifest does not name yet."""
+    """Runs that only one of the two has; a call that was ended leaves some that the manifest does not name yet."""
     named = manifest["runs"]
     for run in sorted({*there, *named}):
         if run not in named:

@@ -127,17 +127,24 @@ def reference_lag(found: Sequence[Sided], counter: Counter | None) -> Lag:
 
 
 def known_stretch(
-    one: Sided, clock: Clock, counters: Sequence[Counter], reads_ns: Ints, ahead_m: float, config: Configuration
+    one: Sided,
+    clock: Clock,
+    counters: Sequence[Counter],
+    reads: Sequence[Anchor],
+    ahead_m: float,
+    config: Configuration,
 ) -> KnownStretch:
-    """The stretch as evidence; `reads_ns`: balise reads, at which no step of the reference stays open."""
+    """The stretch as evidence; `reads`: balise reads, which close a step where they confirm the reference."""
     stretch = one.stretch
     t_ns = stretch.t_ns - round(clock.shift_s * NS_PER_S)
     paths: list[KnownPath] = []
     speed_mps = np.zeros(t_ns.size)
     for path in stretch.paths:
         at_m = path.at_m - one.sense * ahead_m
-        speed_mps = np.maximum(speed_mps, _speed_mps(t_ns, at_m, path.leg))
+        own_mps = _speed_mps(t_ns, at_m, path.leg)
+        speed_mps = np.maximum(speed_mps, own_mps)
         known = KnownPath(path, one.sense, at_m, at_m, at_m)
+        reads_ns = _confirming_ns(known, t_ns, stretch.sigma_m, own_mps * clock.delta_s, reads, config.hazards)
         low_m, high_m = _left_open(known, t_ns, stretch.sigma_m, counters, reads_ns, config)
         paths.append(replace(known, low_m=at_m + low_m, high_m=at_m + high_m))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
@@ -154,13 +161,34 @@ def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
     return np.where((leg[begin] == leg[end]) & (end > begin), np.abs(at_m[end] - at_m[begin]) / elapsed_s, 0.0)
 
 
+def _confirming_ns(
+    known: KnownPath, t_ns: Ints, sigma_m: Floats, clock_m: Floats, reads: Sequence[Anchor], config: HazardConfig
+) -> Ints:
+    """Reads of balises that lie where the reference was, within k roots and both clocks."""
+    found: list[int] = []
+    for read in reads:
+        if not t_ns[0] <= read.t_ns <= t_ns[-1]:
+            continue
+        since = (t_ns - t_ns[0]).astype(np.float64)
+        at_m = np.interp([float(read.t_ns - t_ns[0])], since, known.at_m)
+        sample = int(np.searchsorted(t_ns, read.t_ns))
+        route = known.path.legs[int(known.path.leg[sample])]
+        half_m = config.evidence_factor * float(np.hypot(sigma_m[sample], read.sigma_m))
+        half_m += float(clock_m[sample]) + read.clock_m
+        for place in read.places:
+            there_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
+            if abs(float(there_m[0] - at_m[0])) <= half_m:
+                found.append(read.t_ns)
+    return np.unique(np.array(found, dtype=np.int64))
+
+
 def _left_open(
     known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter], reads_ns: Ints, config: Configuration
 ) -> tuple[Floats, Floats]:
     """How far behind and ahead of each sample the train may be because the reference stepped away [m].
 
     A step that every odometer contradicts by more than k_T roots leaves both sides possible, until the step back or
-    the next read.
+    the next read that confirms the reference: one that contradicts it does not say that the reference is right.
     """
     low_m, high_m = np.zeros((2, t_ns.size))
     if t_ns.size < 2:

@@ -269,7 +269,7 @@ def evidence_of(
     read = [] if main is None else on_clock(reads_found, of_reads, main)
     reads_ns = np.array([one.t_ns for one in read], dtype=np.int64)
     ahead_m = vehicle.gnss_antenna_ahead_m
-    stretches = tuple(known_stretch(one, of_reference, counters, reads_ns, ahead_m, config) for one in found)
+    stretches = tuple(known_stretch(one, of_reference, counters, read, ahead_m, config) for one in found)
     apart = outside(read, stretches)
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return Evidence(

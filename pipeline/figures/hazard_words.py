@@ -104,9 +104,13 @@ def _accepted(row: Row) -> str:
 
 
 def _seen(row: Row) -> str:
-    """Which monitor saw it, and how late."""
+    """Which monitor saw it, and how late; a drift against its failure, since its onset may be the alarm itself."""
     if not row["detected"]:
         return "no monitor saw it"
+    since_failure_s = row["time_since_failure_s"]
+    if row["rate_mps"] is not None and since_failure_s is not None:
+        side = "before" if since_failure_s < 0.0 else "after"
+        return f"{row['monitor']} saw it {abs(since_failure_s):.3g} s {side} the position failed"
     late_s = row["time_to_detect_s"]
     return f"{row['monitor']} saw it" + ("" if late_s is None else f" {late_s:.3g} s after the fault began")
 

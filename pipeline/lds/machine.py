@@ -48,12 +48,14 @@ class LocationSystem:
         # The walk reads single elements: lists are several times faster at that than arrays.
         self._t_ns: list[int] = journey.t_ns.tolist()
         self._way_m = journey.odometer_m * journey.direction
-        self._breaks = breaks(journey, config.align)
+        self._breaks = breaks(journey, bank.after_outages)
+        self._bridged_ns = round(config.align.gap_reset_s * NS_PER_S)
         self._missions = mission_epochs(journey, config.lds)
         self._events = sorted({*self.balises.events, *self._breaks, *self._missions, *segment_epochs(journey)})
         self._relink = Relink(journey, self.tvb, config)
         self._recovery: Recovery | None = None  # while negated
         self._slipped = False  # since slip that the odometer reported, until re-link
+        self._unwatched_since_ns: int | None = None  # the noise hides whether the position moves
         self._validated = False  # a VB or a TVB
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
         self._consistent_since_ns: int | None = None
@@ -84,7 +86,7 @@ class LocationSystem:
         """
         if self._recovery is not None or self.balises.disarmed or self._chain_from is None or k <= self._chain_from:
             return k
-        if self._withheld_for(k) is not None:
+        if self._unwatched_since_ns is not None or self._withheld_for(k) is not None:
             return k
         if self._journey.has_odometer and not self.distance.can_measure(k):
             return k
@@ -152,9 +154,10 @@ class LocationSystem:
         return self.distance.is_possible(k) and bool(self._journey.usable[k])
 
     def _test_after_outage(self, k: int) -> None:
-        """Nobody looked on over the outage: the position has to re-link, or is not used."""
+        """Nobody looked on over the outage, or in the noise: the position has to re-link, or is not used."""
+        in_noise = self._was_unwatched(k)
         if (
-            k not in self._breaks
+            not (k in self._breaks or in_noise)
             or self._recovery is not None
             or self._slipped
             or not (self._validated and self.distance.is_possible(k))
@@ -164,6 +167,18 @@ class LocationSystem:
         self.distance.hold_against(found, k)
         if found.reason is not None:
             self._negate(k)
+
+    def _was_unwatched(self, k: int) -> bool:
+        """The first usable position after noise too large, or not known, for longer than the bank bridges."""
+        if not self._bank.noise_known_at(k):
+            if self._unwatched_since_ns is None:
+                self._unwatched_since_ns = self._t_ns[k]
+            return False
+        if self._unwatched_since_ns is None or not self._can_return(k):
+            return False
+        waited_ns = self._t_ns[k] - self._unwatched_since_ns
+        self._unwatched_since_ns = None
+        return waited_ns > self._bridged_ns
 
     def _accept(self, crossing: Crossing, k: int) -> None:
         self.accepted_at_ns[k] = crossing.t_ns

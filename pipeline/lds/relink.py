@@ -3,8 +3,9 @@
 The position returns only where GNSS minus odometer is what it was at the *anchor*. A slow drift has moved the last TVB
 before an alarm already, so the anchor lies `anchor_lag_s` before the first alarm; alarms that follow may be about the
 same fault, so a return does not move it. A physical balise says where the train is: only a telegram renews the anchor.
-The same test decides on the first position after an outage over which the bank began anew (`breaks`), for nobody looked
-on meanwhile, and after slip that the odometer reports. No alarm stands there, so that the last TVB is the anchor. A
+The same test decides on the first position after an outage over which the bank began anew (`breaks`), or after noise
+that hid for as long what the position does, for nobody looked on meanwhile, and after slip that the odometer reports.
+No alarm stands there, so that the last TVB is the anchor. A
 wheel that slips is counted wrongly: that widens the bound, up to half the failure limit; if the count may be off by
 more, there is no re-link but at a telegram.
 """
@@ -21,8 +22,8 @@ from pipeline.lds.crossings import Crossing
 from pipeline.lds.journey import Journey
 from pipeline.monitors.bank import MonitorBank
 from pipeline.odometry.drift import drift_m2, relink_bound_m
-from schemas.arrays import NS_PER_S
-from schemas.config import AlignConfig, Configuration, LdsConfig
+from schemas.arrays import NS_PER_S, Ints
+from schemas.config import Configuration, LdsConfig
 from schemas.enums import BaliseKind, NotEvaluated
 
 SWITCHED_OFF = NotEvaluated.RELINK_OFF
@@ -214,10 +215,11 @@ class Recovery:
         return seen and bool(self._journey.usable[k]) and t_ns - self._failed_at_ns >= self._recovery_ns
 
 
-def breaks(journey: Journey, config: AlignConfig) -> frozenset[int]:
-    """The first usable epochs after outages of position or odometer over which the bank began anew."""
-    known = np.flatnonzero(journey.comparable)
+def breaks(journey: Journey, after_outages: Ints) -> frozenset[int]:
+    """The first usable epochs after outages of position or odometer over which the bank began anew.
+
+    A position whose track is in doubt is not used, but the bank goes on watching it: that is no outage.
+    """
     usable = np.flatnonzero(journey.comparable & journey.usable)
-    after = known[1:][np.diff(journey.t_ns[known]) > config.gap_reset_s * NS_PER_S]
-    rows = np.searchsorted(usable, after)
+    rows = np.searchsorted(usable, after_outages)
     return frozenset(usable[rows[rows < usable.size]].tolist())

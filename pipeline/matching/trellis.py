@@ -215,16 +215,30 @@ def _pairs(network: Network, states: States, steps: Ints, ways: Ways, config: Ma
 
 
 def _before(states: States, stays: Bools, pairs: Pairs) -> Ints:
-    """The state that each goes on from: its own, else the most plausible that leads aside least."""
+    """The state that each goes on from: its own, else of those followed longest the likeliest that led aside least.
+
+    Where a branch joins a track, the track's own error of the survey goes on. That of the branch is by how much it has
+    come nearer since it was first in reach, which is no error.
+    """
     count, step = _counted(states.first)
-    before = np.where(stays[step], np.arange(len(step)) - count[step], -1)
+    before = np.where(stays[step], np.arange(len(step)) - count[step], -1).tolist()
     possible = np.flatnonzero(np.isfinite(pairs.score))
     one, other = pairs.one[possible], pairs.other[possible]
     cost = np.abs(states.offset_m[other] - states.offset_m[one]) - pairs.score[possible]
     order = np.lexsort((cost, other))
-    chosen, index = np.unique(other[order], return_index=True)
-    before[chosen] = one[order][index]
-    return before
+    leading: dict[int, list[tuple[int, float]]] = {}
+    for origin, state, own in zip(one[order].tolist(), other[order].tolist(), cost[order].tolist(), strict=True):
+        leading.setdefault(state, []).append((origin, own))
+    offset_m = states.offset_m.tolist()
+    begun, aside_m = step.tolist(), [0.0] * len(before)
+    for state, origin in enumerate(before):
+        if state in leading:
+            origin = min(leading[state], key=lambda way: (begun[way[0]], aside_m[way[0]] + way[1]))[0]
+        if origin >= 0:
+            begun[state] = begun[origin]
+            aside_m[state] = aside_m[origin] + abs(offset_m[state] - offset_m[origin])
+        before[state] = origin
+    return np.array(before, dtype=np.int64)
 
 
 def _ways(network: Network, steps: Steps, states: States, config: MatchingConfig) -> Ways:

@@ -107,7 +107,7 @@ def run_axis(
     gain = weight / series.dt_s[:, None]
     errors = series.sigma_m, series.sigma_before_m, series.decorrelation
     increment_m2 = increment_variance(*errors) + series.white_m2
-    variance, covariance = variance_of_ewma(keep, gain, *errors, increment_m2, series.white_m2, state)
+    variance, smooth = variance_of_ewma(keep, gain, *errors, increment_m2, series.white_m2, state)
     # A step between the surveys of two elements is no motion of the GNSS error: only the raw monitor, with the
     # survey's sigma, judges it; inside the EWMAs it would ring for long.
     smooth_rate = np.where(series.border, 0.0, series.rate_mps)
@@ -116,11 +116,11 @@ def run_axis(
     latency = _response(keep, weight, series.latency_mps, state.latency_response)
     raw_variance = _raw_variance(series, increment_m2)
     raw_noise = 2.0 * known_m2[:, 0] / series.dt_s**2
-    noise, noise_covariance = noise_of_ewma(keep, gain, known_m2[:, 1:], state)
+    noise, fast = noise_of_ewma(keep, gain, known_m2[:, 1:], state)
     sigma = np.sqrt(np.column_stack([raw_variance + raw_noise, variance + noise + steady**2 + latency**2]))
     sigma[np.isnan(noise_m2)] = np.nan
     value = np.column_stack([series.rate_mps, ewma])
-    carried = AxisState(ewma[-1], variance[-1], covariance, noise[-1], noise_covariance, steady[-1], latency[-1])
+    carried = AxisState(ewma[-1], *smooth, *fast, steady[-1], latency[-1])
     return value, sigma, carried
 
 

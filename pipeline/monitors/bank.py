@@ -22,7 +22,7 @@ from pipeline.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, run_axis
 from pipeline.monitors.noise import NoiseMeter
 from pipeline.monitors.recursion import AxisState
 from pipeline.monitors.series import FIRST_EPOCH, Axis, axes_of
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import MonitorState
 from schemas.tables import SCALES
@@ -69,6 +69,7 @@ class _AxisBank:
         self._quiet = np.ones(epochs, dtype=np.bool_)
         self._series = axis.series
         given_m: tuple[float, ...] | None = getattr(config.monitors, f"noise_{axis.name}_m")
+        self.after_outages: Ints = axis.series.epoch[axis.series.dt_s > config.align.gap_reset_s]
         self._meter = NoiseMeter(axis.series, axis.moving, given_m, config)
         self._done = 0
         self._block = BLOCK
@@ -244,6 +245,11 @@ class MonitorBank:
         """The fast noise along the track is known at this epoch, by what was before it."""
         self._look(epoch)
         return bool(self._noise_known[epoch])
+
+    @property
+    def after_outages(self) -> Ints:
+        """The first epochs along the track after gaps that the bank does not bridge (`gap_reset_s`)."""
+        return self._axes[0].after_outages
 
     def begins_at(self, epoch: int) -> bool:
         """The bank begins here: at the start, after a gap, after lost distance or at a restart; nothing leads here."""

@@ -71,14 +71,14 @@ def variance_of_ewma(
     increment_m2: Floats,
     white_m2: Floats,
     state: AxisState,
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, tuple[Floats, Floats]]:
     """Variance of the EWMAs of a rate [m^2/s^2], epoch by epoch, from a restart or a carried state.
 
     `keep` (n, alphas): b = 1 - alpha(dt), `gain` (n, alphas): alpha(dt) / dt, both zero at a row that restarts;
     `sigma_m`, `sigma_before_m` (n, sources): sqrt R_j at the row and at the row before it; `decorrelation`
     (n, sources): 1 - phi_j, given as such because it is tiny at 10 Hz; `increment_m2` (n,): variance of the increment
     (`increment_variance` and white noise), of which `white_m2` (n,) is white. Returns the variance (n, alphas) and
-    the last covariances c_j = cov(u, e_j) (alphas, sources).
+    what is carried on: the recursion's own last variance (alphas,) and covariances c_j = cov(u, e_j) (alphas, sources).
 
     The recursion of DOMAIN section 3, in which (1-phi)^2 R + R (1-phi^2) = 2 R (1-phi) and phi (phi-1) R +
     R (1-phi^2) = R (1-phi). Where sigma changes by the step (s_p to s_k: a fix lost to dead reckoning), the error
@@ -100,22 +100,25 @@ def variance_of_ewma(
     variance = linear_recurrence(keep**2, fresh, state.variance)
     # A sigma that falls quickly, though not by the step, can bring the printed recursion below what is new in it.
     new_m2 = (sigma_m**2 * decorrelation * (2.0 - decorrelation)).sum(axis=1) + white_m2
-    return np.maximum(variance, gain**2 * new_m2[:, None]), covariances
+    return np.maximum(variance, gain**2 * new_m2[:, None]), (variance[-1], covariances)
 
 
-def noise_of_ewma(keep: Floats, gain: Floats, noise_m2: Floats, state: AxisState) -> tuple[Floats, Floats]:
+def noise_of_ewma(
+    keep: Floats, gain: Floats, noise_m2: Floats, state: AxisState
+) -> tuple[Floats, tuple[Floats, Floats]]:
     """Variance of the EWMAs of a rate by noise without memory [m^2/s^2], another for each; all shapes (n, alphas).
 
     The recursion of DOMAIN section 3 with phi = 0 and R = `noise_m2`; its limit at a constant step is
-    M 2 alpha^2 g^2 / (2 - alpha). Returns the last covariances too (alphas,).
+    M 2 alpha^2 g^2 / (2 - alpha). Returns what is carried on too: the recursion's own last
+    variance and covariances (alphas,).
     """
     covariance = gain * noise_m2
     if not (noise_m2.any() or state.noise_variance.any()):
-        return np.zeros_like(gain), covariance[-1]
+        return np.zeros_like(gain), (np.zeros_like(covariance[-1]), covariance[-1])
     before = np.concatenate([state.noise_covariance[None], covariance[:-1]])
     variance = linear_recurrence(keep**2, 2.0 * gain * (covariance - keep * before), state.noise_variance)
     # Noise that falls from one renewal to the next can bring this below what is new in it.
-    return np.maximum(variance, gain * covariance), covariance[-1]
+    return np.maximum(variance, gain * covariance), (variance[-1], covariance[-1])
 
 
 def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> tuple[Floats, Floats, Floats]:

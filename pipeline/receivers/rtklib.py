@@ -206,7 +206,7 @@ def _at_baseline(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dic
         values = np.append(_degrees(words[None, :6]), values[6:])
     if len(values) != 3:
         raise InputError(
-            "holds baselines from a place that is not told",
+            "holds baselines without the base station's position",
             place=str(path),
             expected="% ref pos : latitude longitude height in the header",
             remedy="Let RTKLIB write latitude, longitude and height (out-solformat = llh).",

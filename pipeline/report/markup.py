@@ -51,7 +51,7 @@ def cell(value: object, digits: int = 3) -> Cell:
         case datetime():
             return Cell(instant(value), value.isoformat())
         case list() | tuple():
-            text = ", ".join(str(item) for item in value)
+            text = ", ".join(number(item, digits) if isinstance(item, float) else str(item) for item in value)
             return Cell(text or UNKNOWN, text)
         case _:
             return Cell(str(value), str(value))

@@ -151,7 +151,7 @@ def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
     figures = figures_for_reading(tables["figures"])
     shown = {
         "what this result was made from": some_of(tables["sources"]),
-        "by how much the verdict hangs on what was chosen": tables["sensitivity"],
+        "how much the verdict depends on what was chosen": tables["sensitivity"],
         **{f"figures of {name}, with exact 95 % bounds": table for name, table in figures.items()},
         "time to detect and hazardous time": tables["time_to_detect"].select(_SHORT["time_to_detect"]),
         "runs by verdict per service level": tables["levels"],

@@ -1,4 +1,4 @@
-"""By how much the verdict hangs on what was chosen: failure limit, service level, width of the evidence.
+"""How much the verdict depends on what was chosen: failure limit, service level, width of the evidence.
 
 Service levels need no new replay: how long each failure was in use stands in the `runs` table. The failure limit and
 the width of the evidence decide what a failure is, and the limit also when a blocked position may return, so that these

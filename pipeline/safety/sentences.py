@@ -30,10 +30,10 @@ def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
             "hazards, misses and outages per hour are those of the trial, not of traffic."
         )
     if failed:
-        said.append(f"{failed} of {runs['run_id'].n_unique()} runs failed and count nowhere.")
+        said.append(f"{failed} of {runs['run_id'].n_unique()} runs failed and are left out of all figures.")
     said += [
-        f"{solution}: {count} of {runs['run_id'].n_unique()} runs failed with this solution alone and count nowhere in"
-        " its figures."
+        f"{solution}: {count} of {runs['run_id'].n_unique()} runs failed with this solution alone and are left out"
+        " of its figures."
         for solution, count in _failed_alone(runs)
     ]
     partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()

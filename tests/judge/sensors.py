@@ -46,12 +46,16 @@ class Counter:
 
 @dataclass(frozen=True)
 class Better:
-    """The reference: `stated` false leaves its sigma null; it is silent in `pauses` (begin, end) [s]."""
+    """The reference: `stated` false leaves its sigma null; it is silent in `pauses` (begin, end) [s].
+
+    `aside`: (begin, end, metres) in which it stands ahead of the train, as none should.
+    """
 
     rate_hz: float = 1.0
     sigma_m: float = 0.1
     stated: bool = True
     pauses: tuple[tuple[float, float], ...] = ()
+    aside: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -189,6 +193,9 @@ def reference(rng: np.random.Generator, ride: Ride, route: Route, of: Better, an
     """The GNSS antenna by a better instrument."""
     time = _ticks(ride.length_s, of.rate_hz)
     errors = of.sigma_m * _cut_normal(rng, (3, len(time)))
+    if of.aside is not None:
+        begin, end, metres = of.aside
+        errors[0] += np.where((time >= begin) & (time < end), metres, 0.0)
     enu, _ = route.points(ride.way_m(time) + errors[0] + antenna_ahead_m, errors[1], errors[2])
     latitude, longitude, height = geodetic(enu)
     frame = pl.DataFrame(

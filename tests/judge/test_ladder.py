@@ -6,11 +6,11 @@ import pytest
 
 from schemas.config import Vehicle
 from tests.judge.faults import Fault, Slip
-from tests.judge.findings import findings, rungs_of
+from tests.judge.findings import findings, rung_of, rungs_of
 from tests.judge.ground import make_ground
 from tests.judge.random_worlds import random_journey
 from tests.judge.ride import Leg
-from tests.judge.sensors import Counter, Receiver
+from tests.judge.sensors import Better, Counter, Receiver, seconds
 from tests.judge.world import World, make_journey
 
 SEEDS_EACH = 8
@@ -58,3 +58,27 @@ def test_an_odometer_that_stands_behind_the_last_read(in_velocity: bool) -> None
     journey = make_journey(world, 9, "frozen")
     found = findings(journey, rungs_of(journey))
     assert not found, "\n".join(found)
+
+
+def test_a_read_that_contradicts_a_reference_aside_does_not_settle_for_it() -> None:
+    """Reference and positions stand 47 m ahead for 40 s, and a read at 138 s says so; no other read follows.
+
+    What the read carries is wide enough 20 s on to reach the wrong reference: the train is not there for that.
+    """
+    world = World(
+        make_ground(16000.0),
+        (Leg(0.0, 10.0), Leg(33.6, 220.0)),
+        receiver=Receiver(faults=(Fault("step", 131.0, 171.0, size_m=47.0),)),
+        better=Better(sigma_m=1.0, aside=(131.0, 171.0, 47.0)),
+        vehicle=None,
+        physical_every_m=20000.0,
+        first_physical_m=3760.0,
+    )
+    journey = make_journey(world, 18, "aside")
+    rung = rung_of(journey, "reference")
+    aside = (rung.epochs.time_s > 139.0) & (rung.epochs.time_s < 171.0)
+    assert journey.run.balise_reads is not None
+    read_s = seconds(journey.run.balise_reads["t"])
+    assert read_s.size == 1
+    assert 131.0 < read_s[0] < 139.0, read_s
+    assert "right" not in set(rung.epochs.judgement[aside])

@@ -38,6 +38,16 @@ class ScriptedBank:
         self.frozen: list[int] = []
         self.unknown = set(unknown)
         self.restarted: list[int] = []
+        self.after_outages = np.zeros(0, dtype=np.int64)
+
+    def watch(self, epochs: pl.DataFrame) -> ScriptedBank:
+        """As a real bank: it begins anew after 60 s without a position or the odometer."""
+        known = np.flatnonzero(
+            epochs.select(pl.all_horizontal(pl.col("path_m", "odometer_m").is_not_null())).to_series()
+        )
+        t_ns = epochs["t"].to_physical().to_numpy()
+        self.after_outages = known[1:][np.diff(t_ns[known]) > 60 * 10**9]
+        return self
 
     def failed(self, epoch: int) -> bool:
         return epoch in self.fails or (epoch in self.rings and not self.restarted)
@@ -144,7 +154,8 @@ def run(
     **lds: Any,
 ) -> LdsResult:
     on_odometer = None if reads is None else with_odometer(reads, epochs)
-    return run_lds(epochs, bank or ScriptedBank(), balises, on_odometer, scale_sigma, settings(disabled, **lds))
+    bank = (bank or ScriptedBank()).watch(epochs)
+    return run_lds(epochs, bank, balises, on_odometer, scale_sigma, settings(disabled, **lds))
 
 
 def settings(disabled: Sequence[str] = (), **lds: Any) -> Configuration:

@@ -9,7 +9,6 @@ import pytest
 from benchmarks.relink import Journey, Outcome, is_fast, journey, lds_of, outcome, ramp
 from pipeline.lds import LdsResult
 from schemas.config import Configuration, LdsConfig, Vehicle
-from tests.align.straight import NO_NOISE
 
 CONFIG = Configuration()
 LOST_S = 600
@@ -52,12 +51,12 @@ def test_without_a_vehicle_file_a_long_outage_ends_the_use_of_the_position(gap_s
 def test_slow_drifts_after_a_return() -> None:
     """16 random drifts (six without re-link: none is in use again): by the rule fewer than with the last TVB as anchor.
 
-    Of drifts that come to 10 m within the lag of the anchor none is in use beyond 20 m for longer than 93 s.
+    Of drifts that come to 10 m within the lag of the anchor none is in use beyond 20 m for longer than 93 s. The noise
+    is measured in each run.
     """
 
     def found(config: LdsConfig, drifts: int = 16) -> list[Outcome]:
-        known = Configuration.model_validate({"monitors": NO_NOISE}).model_copy(update={"lds": config})
-        return [outcome(ramp(seed, 1.0 + seed % 2), known) for seed in range(drifts)]
+        return [outcome(ramp(seed, 1.0 + seed % 2), Configuration(lds=config)) for seed in range(drifts)]
 
     def beyond(outcomes: list[Outcome]) -> int:
         return sum(one.beyond_s > 0 for one in outcomes)
@@ -69,8 +68,16 @@ def test_slow_drifts_after_a_return() -> None:
     assert sum(one.negated for one in fast) >= 10
     assert beyond(fast) <= 1
     assert max(one.beyond_s for one in fast) <= 93.0
-    assert beyond(by_rule) <= 3
+    assert beyond(by_rule) <= 1
     assert beyond(found(LdsConfig(anchor_lag_s=0.0))) >= 2 * beyond(by_rule) + 3
+
+
+@pytest.mark.parametrize("seed", [1036, 1052, 2009, 2012])
+def test_a_drift_found_late_does_not_come_back(seed: int) -> None:
+    """0.029 to 0.037 m/s: with an anchor 300 s before the alarm all are in use again beyond 20 m, for 335 s or more."""
+    found = outcome(ramp(seed, 1.0 + seed % 2), CONFIG)
+    assert found.negated
+    assert found.beyond_s == 0.0
 
 
 @pytest.mark.parametrize("rate_mps", [0.06, -0.1])

@@ -210,8 +210,8 @@ def outage(gap_s: float, offset_m: float, **settings: Any) -> LdsResult:
 
 @pytest.mark.parametrize("gap_s", [70.0, 90.0, 300.0])
 def test_a_position_after_an_outage_has_to_re_link(gap_s: float) -> None:
-    # The first TVB is at 7 s, the last 300 s before the end of the longest outage at 20 s.
-    waited_s = gap_s + 13.0 if gap_s < 300.0 else 300.0
+    # The first TVB is at 7 s, less than `anchor_lag_s` before the end of the longest outage.
+    waited_s = gap_s + 13.0
     way_m = 20.0 * waited_s
     bound_m = min(10.0, K_T * sqrt(2.0 + 0.05**2 * waited_s + (1e-4 * way_m) ** 2))
     for offset_m, state in ((0.0, "pass"), (bound_m - 0.01, "pass"), (-bound_m - 0.01, "fail"), (30.0, "fail")):
@@ -251,6 +251,42 @@ def test_a_telegram_after_an_outage_returns_the_position_without_a_vehicle_file(
     balises = balises_at({"V1": 110.0, "P1": 2910.0}, kind=KINDS)
     result = outage(90.0, 0.0, balises=balises, reads=reads_at([(145.5, "P1")]), scale_sigma=None)
     assert negations(result) == [(BEFORE, BEFORE + 36)]
+
+
+def test_a_place_in_doubt_for_minutes_is_no_outage() -> None:
+    """A stand on a switch without a vehicle file: the bank watched on, so that the position need not re-link."""
+    odometer_m = [*steps(0.0, 20.0, 21), *[400.0] * 100, *steps(420.0, 20.0, 40)]
+    doubt = [0.5 if 21 <= k < 121 else 1.0 for k in range(len(odometer_m))]
+    balises = balises_at({"V1": 110.0, "V2": 700.0})
+    result = run(epochs_of(odometer_m, gate_probability=doubt), balises, scale_sigma=None)
+    assert negations(result) == []
+    assert told(result, "status") == [("accepted",), ("accepted",)]
+    assert result.epochs["tvb"][121:].all()
+
+
+@pytest.mark.parametrize(("noise_s", "offset_m", "negated"), [(90, 0.0, False), (90, 30.0, True), (60, 0.0, False)])
+def test_a_position_after_noise_too_large_has_to_re_link(noise_s: int, offset_m: float, negated: bool) -> None:
+    """Nobody could look on in the noise: a step of 30 m inside it came back into use without an alarm."""
+    end = BEFORE + noise_s
+    odometer_m = steps(0.0, 20.0, end + 60)
+    path_m = [x + (offset_m if k >= BEFORE + 10 else 0.0) for k, x in enumerate(odometer_m)]
+    balises = balises_at({"V1": 110.0, "V2": 20.0 * (end + 40.0)})
+    result = run(epochs_of(path_m, odometer_m), balises, ScriptedBank(unknown=range(BEFORE, end)))
+    assert negations(result) == ([(end, None)] if negated else [])
+    assert result.epochs["alarm"][end] == negated
+    assert told(result, "status")[1] == ("rejected_monitor" if negated else "accepted",)
+
+
+def test_noise_without_a_vehicle_file_ends_the_use_as_an_outage_does() -> None:
+    end = BEFORE + 90
+    result = run(
+        epochs_of(steps(0.0, 20.0, end + 60)),
+        balises_at({"V1": 110.0}),
+        ScriptedBank(unknown=range(BEFORE, end)),
+        scale_sigma=None,
+    )
+    assert negations(result) == [(end, None)]
+    assert result.epochs["link_distance_reason"][end] == NO_VEHICLE
 
 
 def test_without_the_monitor_there_is_no_test_after_an_outage() -> None:

@@ -78,6 +78,23 @@ def test_elements_that_are_surveyed_aside_do_not_claim_their_neighbour(
             assert on_a(ride(place, stated_m=stated_m), "path").min() > 0.05
 
 
+@pytest.mark.parametrize("sigma_m", [0.3, 1.0, None])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("start_m", "steps"), [(5950.0, 280), (2900.0, 100), (2650.0, 100)])
+def test_turnouts_that_join_a_track_do_not_move_it(
+    sigma_m: float | None, seed: int, start_m: float, steps: int
+) -> None:
+    """The track took over by how much the branch had come nearer: at 1 m survey P(A) was 0.004 where it is 0.39."""
+    x = start_m - 20.0 * np.arange(float(steps))
+    y = 2.5 + np.random.default_rng(seed).normal(0.0, 0.1, steps)
+    fixes = run(x, y)
+    joined = on_a(matched(fixes, double_track(7, True, sigma_m), odometer(x)).epochs, "gate")
+    alone = on_a(matched(fixes, double_track(7, False, sigma_m), odometer(x)).epochs, "gate")
+    # A branch is a way to have come on A, so A may be likelier by it; it says nothing of B.
+    assert (joined - alone).max() < 0.15
+    assert (joined - alone).min() > -0.02
+
+
 @pytest.mark.parametrize(("cuts", "turnouts"), KINDS)
 def test_left_and_right_are_alike(cuts: int, turnouts: bool) -> None:
     y_m = gauss_markov(np.random.default_rng(5), 280, 1.0, 0.8, 50.0)

@@ -214,3 +214,27 @@ def test_an_axis_goes_on_from_where_it_stopped(first):
     *after, _ = run_axis(series.between(first, count), ALPHAS, state)
     for whole, parts in zip((value, sigma), zip(before, after, strict=True), strict=True):
         np.testing.assert_allclose(np.concatenate(parts), whole, rtol=1e-9)
+
+
+def test_where_a_block_ends_leaves_the_sigmas_as_they_are():
+    """Noise that falls brings the recursion below what is new: cut anywhere, it goes on as in one go."""
+    count = 14
+    dt_s, zero, nothing = np.ones(count), np.zeros(count), np.zeros(count, dtype=bool)
+    series = AxisSeries(
+        epoch=np.arange(count),
+        fresh=np.arange(count) == 0,
+        border=nothing,
+        dt_s=dt_s,
+        rate_mps=zero,
+        **errors_of(np.full(count, 1e-3), dt_s, [], MonitorConfig()),
+        white_m2=zero,
+        border_m2=zero,
+        steady_mps=zero,
+        latency_mps=zero,
+    )
+    alphas, noise_m2 = np.array([0.3]), np.tile(np.where(np.arange(count) < 6, 4.0, 0.04)[:, None], (1, 2))
+    whole = run_axis(series, alphas, None, noise_m2)[1]
+    for cut in range(1, count):
+        _, before, state = run_axis(series.between(0, cut), alphas, None, noise_m2[:cut])
+        _, after, _ = run_axis(series.between(cut, count), alphas, state, noise_m2[cut:])
+        np.testing.assert_allclose(np.concatenate([before, after]), whole, rtol=1e-12)

@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.figures.summary import failed_row
 from pipeline.report import write_report
+from pipeline.report.markup import cell
 from pipeline.results.provenance import Provenance
 from pipeline.results.store import write_run
 from schemas.run import RunTables
@@ -128,3 +129,7 @@ def test_the_figures_stand_beside_every_verdict(report: Path) -> None:
                        ("runs/good.html", "1 of 1 balises accepted, the train did not move"),
                        ("index.html", "3 of 4 balises accepted, available for 25% of the moving time")):  # fmt: skip
         assert told in (report / page).read_text().partition("<header>")[2].partition("<h1>")[0]
+
+
+def test_numbers_of_a_list_are_rounded_as_others_are() -> None:
+    assert cell([0.448815736651947, 0.12], 4).text == "0.4488, 0.12"

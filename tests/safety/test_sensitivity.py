@@ -1,4 +1,4 @@
-"""By how much the verdict hangs on the service level: from the hazardous times that stand in the table."""
+"""How much the verdict depends on the service level: from the hazardous times that stand in the table."""
 
 from __future__ import annotations
 

@@ -147,8 +147,8 @@ def test_a_solution_that_failed_alone_is_named_as_such(tmp_path: Path) -> None:
     write_run(RunTables(**{**vars(lost), "runs": failed}), tmp_path, {})
     said = assess(tmp_path).statements
     assert said[0].startswith("unproven: 0 unsafe, 1 unproven, 0 safe, 1 failed; ")
-    assert said[1] == "1 of 2 runs failed and count nowhere."
-    assert said[2].startswith("gps: 1 of 2 runs failed with this solution alone and count nowhere")
+    assert said[1] == "1 of 2 runs failed and are left out of all figures."
+    assert said[2].startswith("gps: 1 of 2 runs failed with this solution alone and are left out")
 
 
 def test_receivers_too_slow_are_named(tmp_path: Path) -> None:

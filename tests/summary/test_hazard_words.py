@@ -43,6 +43,18 @@ def test_a_balise_is_as_far_off_as_it_was_accepted(offer: dict[str, Any], said: 
     assert hazard_words(hazards(1, **JUMP), offers(**offer)) == [said]
 
 
+@pytest.mark.parametrize(("since_failure_s", "side"), [(-48.6, "48.6 s before"), (3.0, "3 s after")])
+def test_a_drift_is_held_against_its_failure(since_failure_s: float, side: str) -> None:
+    """The onset of a drift may be the alarm itself; a time to detect of 0 s would say nothing of it."""
+    drift = {
+        **JUMP, "hazard": "VB_SHIFT", "detected": True, "monitor": "along_ewma_0p1", "rate_mps": 0.4,
+        "time_to_detect_s": 0.0, "time_since_failure_s": since_failure_s, "accepted_ids": [[]],
+    }  # fmt: skip
+    none = offers(status="rejected_monitor")
+    words = f"VB_SHIFT: VB04 502 m early, not accepted; along_ewma_0p1 saw it {side} the position failed"
+    assert hazard_words(hazards(1, **drift), none) == [words]
+
+
 def test_of_several_the_worst_is_named() -> None:
     found = hazards(1, **JUMP | {"accepted_ids": [["VB04", "VB05", "VB06"]]})
     errors = passages(
