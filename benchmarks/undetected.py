@@ -217,12 +217,17 @@ def _held_by_rate(found: Profile, config: Configuration) -> bool:
 
 
 def _new_fail(clean: pl.DataFrame, faulty: pl.DataFrame, epoch: int) -> bool:
-    """A monitor fails up to the epoch that did not in the run as it was recorded."""
-    fails = (
-        (faulty[name][: epoch + 1] == "fail") & (clean[name][: epoch + 1] != "fail")
-        for name in (f"{monitor}_state" for monitor in MONITORS)
-    )
-    return any(bool(found.any()) for found in fails)
+    """A monitor fails up to the epoch that did not in the run as it was recorded, by the thresholds of that run.
+
+    The noise that a run measures follows its fault by some tenths of a percent, and a profile leaves no room for it.
+    """
+    return any(_fails_anew(clean.head(epoch + 1), faulty.head(epoch + 1), monitor) for monitor in MONITORS)
+
+
+def _fails_anew(clean: pl.DataFrame, faulty: pl.DataFrame, monitor: str) -> bool:
+    state = f"{monitor}_state"
+    beyond = (faulty[f"{monitor}_value"].abs() > clean[f"{monitor}_threshold"]).fill_null(value=True)
+    return bool(((faulty[state] == "fail") & (clean[state] != "fail") & beyond).any())
 
 
 def outcomes(runs: int, curved: bool, folder: Path) -> Iterator[Outcome]:
