@@ -44,7 +44,7 @@ NOTES: dict[Note, str] = {
     Note.ODOMETER_REVERSED: "the odometer counts down at first, so the train reverses: the sign of "
     "gnss_antenna_ahead_m is changed",
     Note.COVARIANCE: "cov_en_m2 is impossible with its variances at {} epochs and is not used there",
-    Note.AMBIGUOUS: "net element ambiguous: {}; give the route of `--write-route` with `--route` if you know it to be "
+    Note.AMBIGUOUS: "net element ambiguous: {}. Give the route of `--write-route` with `--route` if you know it to be "
     "true: what was lost there was lost to track doubt",
     Note.UNLINKED: "after {} outages the position could not be re-linked and was not used: {}",
     Note.UNKNOWN_TELEGRAMS: "telegrams read from balises that are not on the train's path: {}",

@@ -15,9 +15,10 @@ from datasets.inject import inject
 from pipeline.matching import match
 from pipeline.stages import replay
 from pipeline.track.geodesy import distances_m, earth_centred_m
-from schemas.config import FixSigma, MatchingConfig, Vehicle
+from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
+from tests.align.straight import NO_NOISE
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 pytestmark = pytest.mark.skipif(not DATA.exists(), reason="the public recordings are not beside the project")
@@ -57,8 +58,22 @@ def test_comma2k19_latency_and_scale_by_least_squares(car: tuple[RunLog, Site]) 
     assert mean == pytest.approx(0.085, abs=0.01) or latency == pytest.approx(0.085, abs=0.01)
 
 
-def test_comma2k19_replays_without_hazard(car: tuple[RunLog, Site]) -> None:
+# A minute is hardly enough to measure the noise of the positions, so it is given.
+GIVEN = Configuration.model_validate({"monitors": NO_NOISE})
+
+
+def test_comma2k19_accepts_nothing_before_its_noise_is_known(car: tuple[RunLog, Site]) -> None:
     tables = replay(*car)
+    known = tables.epochs.filter(pl.col("along_raw_state") != "not_evaluated")["t"][0]
+    accepted = tables.passages.filter(pl.col("status") == "accepted")["t_offered"]
+    assert 0 < accepted.len() < 4
+    assert (accepted > known).all()
+    assert tables.hazards.is_empty()
+    assert tables.alarms.is_empty()
+
+
+def test_comma2k19_replays_without_hazard(car: tuple[RunLog, Site]) -> None:
+    tables = replay(*car, config=GIVEN)
     assert tables.passages["status"].to_list() == ["accepted"] * 4
     assert tables.hazards.is_empty()
     assert tables.alarms.is_empty()
@@ -78,7 +93,7 @@ def test_faults_injected_into_real_noise_are_detected(
     car: tuple[RunLog, Site], values: dict[str, object], hazard: str, within_s: float
 ) -> None:
     run, site = car
-    hazards = replay(inject(run, FaultSpec.model_validate(values)), site).hazards
+    hazards = replay(inject(run, FaultSpec.model_validate(values)), site, config=GIVEN).hazards
     assert hazards["hazard"].to_list() == [hazard]
     assert hazards["detected"].all()
     assert hazards["time_to_detect_s"][0] <= within_s

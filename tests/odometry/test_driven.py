@@ -7,7 +7,8 @@ import polars as pl
 import pytest
 
 from pipeline.odometry.driven import driven_m, evenly_driven, with_hysteresis
-from schemas.config import AlignConfig
+from schemas.config import AlignConfig, Configuration
+from tests.align.straight import NO_NOISE
 from tests.replay.journeys import VEHICLE, journey, replay
 
 STOPS = {
@@ -90,8 +91,9 @@ CASES = [("noise", 0.1), ("noise", 0.5), ("counts", 0.5), ("counts", 1.0), ("cou
 @pytest.mark.parametrize("motion", [STOPS, SHUNTING])
 def test_way_turns_and_movement_are_those_of_the_train(motion, kind, size_m):
     run, site = journey(motion=motion)
-    plain = replay(run, site, VEHICLE)
-    tables = replay(run.with_streams(odometer=scattered(run.odometer, kind, size_m)), site, VEHICLE)
+    given = Configuration.model_validate({"monitors": NO_NOISE})
+    plain = replay(run, site, VEHICLE, given)
+    tables = replay(run.with_streams(odometer=scattered(run.odometer, kind, size_m)), site, VEHICLE, given)
     way, plain_way = (found.runs["distance_m"][0] for found in (tables, plain))
     assert way == pytest.approx(plain_way, abs=10.0 * size_m + 1.0)
     turns, plain_turns = (found.epochs["direction"].diff().fill_null(0).ne(0).sum() for found in (tables, plain))

@@ -6,7 +6,9 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
+from schemas.config import Configuration
 from schemas.run import RunLog, Site
+from tests.align.straight import NO_NOISE
 from tests.replay.journeys import PLACES_M, QUIET, VEHICLE, journey, replay, replayed, seconds
 
 JUMP = {"kind": "step", "size_m": 1000.0, "start_s": 120.0, "duration_s": 5.0}
@@ -94,17 +96,21 @@ def test_a_run_backwards_mirrors_its_tables():
     assert error.abs().max() < 0.2
 
 
+# A part would have to measure its noise anew, and be without a diagnosis meanwhile.
+GIVEN = Configuration.model_validate({"monitors": NO_NOISE})
+
+
 def parts_of(run, site, at):
     for keep in (pl.col("t") < at, pl.col("t") >= at):
         logs = {name: run.stream(name).filter(keep) for name in ("gnss", "odometer", "reference", "balise_reads")}
-        yield replay(RunLog("part", **logs), site, VEHICLE)
+        yield replay(RunLog("part", **logs), site, VEHICLE, GIVEN)
 
 
 @pytest.mark.parametrize("at_s", [60.0, 160.0, None])
 def test_a_run_split_between_balises_loses_no_hazard(at_s):
     """Also where it is split at the instant at which a balise is passed."""
     run, site = journey(JUMP, OFFSET)
-    whole = replay(run, site, VEHICLE)
+    whole = replay(run, site, VEHICLE, GIVEN)
     passed = whole.passages.filter(pl.col("balise_id") == "VB1")["t_offered"][0]
     at = passed if at_s is None else run.gnss["t"][0] + pl.duration(seconds=at_s)
     parts = list(parts_of(run, site, at))

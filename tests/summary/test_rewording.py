@@ -6,6 +6,7 @@ import ast
 import random
 import re
 from collections.abc import Iterator
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -71,9 +72,9 @@ def tables_of(out: Path) -> dict[str, pl.DataFrame]:
 
 
 def dictionaries() -> Iterator[dict[Any, str]]:
-    """Every dictionary of sentences of `schemas/words.py`."""
+    """Every dictionary of words for an enum in `schemas/words.py`."""
     for name, value in vars(words).items():
-        if name.isupper() and isinstance(value, dict) and name != "PLACES":
+        if name.isupper() and isinstance(value, dict) and all(isinstance(code, Enum) for code in value):
             yield value
 
 
