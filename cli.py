@@ -150,7 +150,7 @@ def replay(
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
     from pipeline.campaign.calibrated import calibrated
     from pipeline.campaign.workers import watched
-    from pipeline.results.terminal import how_far
+    from pipeline.show.terminal import how_far
 
     with watched(None if quiet else how_far("runs looked at to calibrate")):
         return calibrated(plan, runs, jobs)
@@ -227,14 +227,14 @@ def safety(
     once per value of `failure_limit_m` and `evidence_factor`, to show how the verdict depends on these.
     """
     if out is not None:
-        from pipeline.safety.assessment import assess, show
-        from pipeline.safety.sensitivity import replayed
+        from pipeline.studies.safety.assessment import assess, show
+        from pipeline.studies.safety.sensitivity import replayed
 
         again = replayed(logs or [], site, _vehicle(vehicle), jobs)
         show(assess(out, None if config is None else _configuration(config), again), as_json)
         return
-    from pipeline.results.terminal import show_tables
-    from pipeline.safety import safety_tables
+    from pipeline.show.terminal import show_tables
+    from pipeline.studies.safety import safety_tables
 
     tables = safety_tables(_configuration(config).safety)
     _print_json(tables) if as_json else show_tables(tables)
@@ -250,9 +250,9 @@ def claim(
     as_json: Json = False,
 ) -> None:
     """Compare a result with published requirements for train localisation: met, not met or not shown."""
-    from pipeline.claim import claim as hold
-    from pipeline.claim import for_reading, load_profile, read_areas
     from pipeline.results.answer_files import write_csv
+    from pipeline.studies.claim import claim as hold
+    from pipeline.studies.claim import for_reading, load_profile, read_areas
 
     wanted = load_profile(profile)
     ground = _ground(site, _used(out)) if site else None
@@ -339,7 +339,7 @@ def convert(
 ) -> None:
     """Convert receiver logs to a run, or add streams to a run."""
     from datasets.recordings import convert_logs
-    from pipeline.receivers import Purpose
+    from pipeline.make.receivers import Purpose
 
     given, day = None if config is None else _configuration(config), None if date is None else date.date()
     print("\n".join(convert_logs(logs, to, given, Purpose(solution, stream), day, force)))
@@ -369,10 +369,10 @@ def make_a_site(
     as_json: Json = False,
 ) -> None:
     """Make a site of a survey of the line: net elements, links, balises, and a page to look at."""
-    from pipeline.report.site_page import site_page
+    from pipeline.make.survey.make import make_site, wish_of, write_made
+    from pipeline.read.site.describe import elements_table
     from pipeline.results.inspection import findings_table
-    from pipeline.site.describe import elements_table
-    from pipeline.survey.make import make_site, wish_of, write_made
+    from pipeline.show.report.site_page import site_page
     from schemas.enums import TravelAlong
 
     wish = wish_of(surveys, balises, epsg, join, flat, TravelAlong(direction))
@@ -397,9 +397,9 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Measure odometer scale, GNSS latency and the monitors' sigmas on fault-free runs."""
-    from pipeline.calibration.calibrate import calibrate as measure
     from pipeline.campaign import find_runs
     from pipeline.storage import write_bytes
+    from pipeline.studies.calibration.calibrate import calibrate as measure
     from schemas.config import to_toml
 
     settings = _configuration(config)
@@ -432,7 +432,7 @@ def experiment(
         return
     wanted = experiment_of(name)
     from pipeline.campaign.workers import watched
-    from pipeline.results.terminal import how_far
+    from pipeline.show.terminal import how_far
 
     bank = None if config is None else _configuration(config)
     with watched(None if quiet else how_far("pieces of work")):
@@ -480,8 +480,8 @@ def report(
 
     Pages of runs that have not changed since the last report are left as they are.
     """
-    from pipeline.report import write_report
-    from pipeline.results.terminal import how_far
+    from pipeline.show.report import write_report
+    from pipeline.show.terminal import how_far
 
     pages = write_report(out, _ground(site, _used(out)) if site else None, jobs, None if quiet else how_far("pages"))
     if not quiet:
@@ -502,8 +502,8 @@ def line(
     as_json: Json = False,
 ) -> None:
     """Say of each piece of track whether virtual balises may be placed there, and propose some."""
-    from pipeline.line import write_line
-    from pipeline.line.write import read_points
+    from pipeline.studies.line import write_line
+    from pipeline.studies.line.write import read_points
     from schemas.config import read_toml, settings_from
     from schemas.line import LineCriteria
 
@@ -529,7 +529,7 @@ def export(
     config: ConfigFile = None,
 ) -> None:
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
-    from pipeline.export import export_run
+    from pipeline.show.export import export_run
 
     recorded = _log(log, _configuration(config), True) if log else None
     ground = _ground(site, _used(out)) if site else None
@@ -552,7 +552,7 @@ def verify(
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
     from pipeline.campaign.verify import recompute
     from pipeline.campaign.verify import verify as compare
-    from pipeline.results.terminal import how_far
+    from pipeline.show.terminal import how_far
 
     found = [compare(out, None if quiet else how_far("runs"))]
     if logs:
@@ -574,7 +574,7 @@ def diff(
     as_json: Json = False,
 ) -> None:
     """Compare two results; exit status 1 if they differ."""
-    from pipeline.diff.results import diff_results
+    from pipeline.results.diff.results import diff_results
     from schemas.errors import visible
 
     found = diff_results(out_a, out_b)
@@ -642,13 +642,13 @@ def _vehicle(file: Path | None) -> Vehicle:
 
 
 def _log(address: str, settings: Configuration, with_digest: bool = False) -> RunLog:
-    from pipeline.ingest import read_run
+    from pipeline.read.ingest import read_run
 
     return read_run(address, settings.ingest, with_digest)
 
 
 def _ground(site: str, settings: Configuration) -> Ground:
-    from pipeline.site.read import read_site
+    from pipeline.read.site.read import read_site
 
     return read_site(site, settings.site)
 
@@ -661,7 +661,7 @@ def _used(out: str | Path) -> Configuration:
 
 
 def _show(table: pl.DataFrame, title: str = "") -> None:
-    from pipeline.results.terminal import show_table
+    from pipeline.show.terminal import show_table
 
     show_table(table, title)
 
@@ -682,7 +682,7 @@ def _say(text: str) -> None:
 
 
 def _print_json(value: Any) -> None:
-    from pipeline.results.terminal import to_json
+    from pipeline.show.terminal import to_json
 
     print(to_json(value))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import polars as pl
 
 from benchmarks.results import Figure
-from pipeline.results.terminal import show_table, to_json
+from pipeline.show.terminal import show_table, to_json
 
 MODULES = (
     "start",

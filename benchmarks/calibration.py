@@ -20,8 +20,8 @@ import polars as pl
 from scipy.stats import beta
 
 from benchmarks.results import Figure
-from pipeline.matching import match
-from pipeline.odometry import odometry_of
+from pipeline.stages.matching import match
+from pipeline.stages.odometry import odometry_of
 from schemas.arrays import floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.conform import conform

@@ -29,7 +29,7 @@ from datasets.experiment.rare import (
 from datasets.experiment.rare_ranges import range_system
 from datasets.experiment.splitting import System
 from datasets.experiment.workers import generator, in_blocks
-from pipeline.figures.bounds import clopper_pearson
+from pipeline.stages.run_row.bounds import clopper_pearson
 from schemas.arrays import Floats
 
 _NORMAL_95 = 1.959963984540054

@@ -26,8 +26,8 @@ import polars as pl
 from benchmarks.fuzz_ingest import MUTATIONS, FuzzReport, Random
 from benchmarks.ingest_logs import run_of
 from datasets.mcap_log import Encoding, write_mcap
-from pipeline.ingest import read_run
-from pipeline.site.read import read_site
+from pipeline.read.ingest import read_run
+from pipeline.read.site.read import read_site
 from pipeline.storage.parquet import parquet_bytes
 from schemas.config import Configuration, IngestConfig, load_settings, to_toml
 from schemas.errors import BaliseError

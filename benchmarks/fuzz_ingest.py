@@ -25,8 +25,8 @@ import numpy as np
 
 from benchmarks.ingest_logs import run_of
 from datasets.mcap_log import Encoding, write_mcap
-from pipeline.export.mcap_file import Compression
-from pipeline.ingest import read_run
+from pipeline.read.ingest import read_run
+from pipeline.show.export.mcap_file import Compression
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.run import RunLog

@@ -25,7 +25,7 @@ import pyarrow as pa
 
 from benchmarks.ingest_logs import CASES, Case, run_of, write_case
 from benchmarks.results import Figure, stopwatch
-from pipeline.ingest import read_run
+from pipeline.read.ingest import read_run
 from schemas.config import IngestConfig
 from schemas.run import RunLog
 
@@ -157,7 +157,7 @@ def _long(folder: Path, repeats: int, short: list[Figure]) -> list[Figure]:
 _MEMORY_SCRIPT = """
 import re, sys
 from pathlib import Path
-from pipeline.ingest import read_run
+from pipeline.read.ingest import read_run
 from schemas.config import IngestConfig
 
 def status(name):

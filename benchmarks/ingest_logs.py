@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from datasets.mcap_log import Encoding, OdometerMessage, write_mcap
-from pipeline.ingest.conform import conform
+from pipeline.read.ingest.conform import conform
 from schemas.run import RunLog, Stream
 
 Case = Literal["cdr Odometry", "cdr TwistStamped", "protobuf", "json"]

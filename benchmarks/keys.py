@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 import polars as pl
 
 from datasets.random_trials import random_trial
-from pipeline.stages import replay
+from pipeline.one_run import replay
 from schemas.config import Configuration, Settings, Vehicle
 from schemas.errors import BaliseError
 from schemas.run import RunLog, Site

@@ -9,9 +9,9 @@ import argparse
 import sys
 from collections import Counter
 
-from tests.judge.crooked_worlds import crooked_journey
-from tests.judge.findings import findings, rungs_of
-from tests.judge.random_worlds import random_journey
+from tests.stages.judge.crooked_worlds import crooked_journey
+from tests.stages.judge.findings import findings, rungs_of
+from tests.stages.judge.random_worlds import random_journey
 
 
 def main() -> int:

@@ -10,12 +10,12 @@ from benchmarks.results import Figure
 from datasets.scenario import Scenario
 from datasets.trial import write_trial
 from pipeline.campaign import make_plan, run_campaign
-from pipeline.line.classes import piece_classes
-from pipeline.line.passes import Ground
-from pipeline.line.pieces import middles, pieces_of
-from pipeline.line.write import passes_of_runs, write_line
+from pipeline.read.site.read import read_site
 from pipeline.results.store import read_table
-from pipeline.site.read import read_site
+from pipeline.studies.line.classes import piece_classes
+from pipeline.studies.line.passes import Ground
+from pipeline.studies.line.pieces import middles, pieces_of
+from pipeline.studies.line.write import passes_of_runs, write_line
 from schemas.config import Configuration, settings_from
 from schemas.line import LineCriteria
 

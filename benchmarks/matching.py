@@ -14,11 +14,11 @@ import polars as pl
 from scipy.spatial import cKDTree
 
 from benchmarks.results import Figure, best_of
-from pipeline.matching import match
-from pipeline.odometry import odometry_of
-from pipeline.track.geodesy import points_of
-from pipeline.track.leg import Visit, leg_of, nearest_on_leg, path_at
-from pipeline.track.survey import geometric_measures_m, track_of
+from pipeline.stages.matching import match
+from pipeline.stages.odometry import odometry_of
+from pipeline.stages.track.geodesy import points_of
+from pipeline.stages.track.leg import Visit, leg_of, nearest_on_leg, path_at
+from pipeline.stages.track.survey import geometric_measures_m, track_of
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.inputs import Links, Track
 from schemas.run import Site
@@ -185,8 +185,8 @@ def whole_s(site: Site, fixes: pl.DataFrame, odometer: pl.DataFrame) -> float:
 
 def calibration(seeds: int) -> list[Figure]:
     """Parallel tracks 4 m apart with a crossover, Gauss-Markov errors of 100 s."""
-    from tests.matching.ladder import journey as trip_of
-    from tests.matching.ladder import ladder, matched_lateral_m
+    from tests.stages.matching.ladder import journey as trip_of
+    from tests.stages.matching.ladder import ladder, matched_lateral_m
 
     site, figures = ladder(), []
     for sigma_m in (1.0, 2.0):

@@ -32,15 +32,20 @@ ROOT = Path(__file__).parents[1]
 COPIED = ("cli.py", "pyproject.toml", "Makefile", "README.md", "pipeline", "schemas", "datasets", "benchmarks", "docs")
 # A room of the core and the tests that hold it, folders or files, the quickest first.
 ROOMS: dict[str, tuple[str, ...]] = {
-    "pipeline/evidence": ("tests/evidence", "tests/judge", "tests/replay"),
-    "pipeline/judge": ("tests/judge/test_parts.py", "tests/judge", "tests/replay"),
-    "pipeline/lds": ("tests/lds", "tests/replay"),
-    "pipeline/monitors": ("tests/monitors", "tests/replay"),
-    "pipeline/alignment": ("tests/align", "tests/calibration", "tests/replay"),
-    "pipeline/epochs": ("tests/summary", "tests/judge", "tests/replay"),
-    "pipeline/odometry": ("tests/odometry", "tests/align", "tests/lds", "tests/judge"),
-    "pipeline/matching": ("tests/matching", "tests/replay"),
-    "pipeline/figures/verdict.py": ("tests/summary", "tests/judge"),
+    "pipeline/stages/evidence": ("tests/stages/evidence", "tests/stages/judge", "tests/replay"),
+    "pipeline/stages/judge": ("tests/stages/judge/test_parts.py", "tests/stages/judge", "tests/replay"),
+    "pipeline/stages/lds": ("tests/stages/lds", "tests/replay"),
+    "pipeline/stages/monitors": ("tests/stages/monitors", "tests/replay"),
+    "pipeline/stages/alignment": ("tests/stages/alignment", "tests/studies/calibration", "tests/replay"),
+    "pipeline/stages/epochs": ("tests/stages/epochs", "tests/stages/run_row", "tests/stages/judge", "tests/replay"),
+    "pipeline/stages/odometry": (
+        "tests/stages/odometry",
+        "tests/stages/alignment",
+        "tests/stages/lds",
+        "tests/stages/judge",
+    ),
+    "pipeline/stages/matching": ("tests/stages/matching", "tests/replay"),
+    "pipeline/stages/run_row/verdict.py": ("tests/stages/run_row", "tests/stages/judge"),
 }
 _FAILED = re.compile(r"^(?:FAILED|ERROR) ([^ ]+::.*?|[^ ]+)(?: - .*)?$", re.MULTILINE)
 _CAUGHT, _PASSED, _NO_TESTS = 1, 0, 5

@@ -21,7 +21,7 @@ import numpy.typing as npt
 import polars as pl
 from scipy.signal import lfilter
 
-from pipeline.monitors.bank import MonitorBank
+from pipeline.stages.monitors.bank import MonitorBank
 from schemas.config import Configuration
 
 Floats = npt.NDArray[np.float64]

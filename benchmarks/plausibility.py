@@ -17,9 +17,9 @@ import numpy as np
 from benchmarks.plausibility_trips import Trip, trip
 from benchmarks.plausibility_wrongs import WRONGS, Wrong
 from benchmarks.results import Figure
-from pipeline.ingest.clean import clean
-from pipeline.plausibility.check import Check, State
-from pipeline.plausibility.fit import Fit, fit_run
+from pipeline.read.ingest.clean import clean
+from pipeline.studies.plausibility.check import Check, State
+from pipeline.studies.plausibility.fit import Fit, fit_run
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site

@@ -8,7 +8,7 @@ import polars as pl
 
 from datasets.expected_hazards import ExpectedRow
 from datasets.random_trials import ON_ODOMETER, RandomTrial
-from pipeline.epochs.clock import nominal_period_s
+from pipeline.stages.epochs.clock import nominal_period_s
 from schemas.enums import Verdict
 from schemas.run import RunTables
 

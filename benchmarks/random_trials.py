@@ -10,7 +10,7 @@ import sys
 
 from benchmarks.random_deviations import deviations
 from datasets.random_trials import random_trial
-from pipeline.stages import replay
+from pipeline.one_run import replay
 
 
 def main() -> int:

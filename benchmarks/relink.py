@@ -15,11 +15,11 @@ import numpy as np
 import polars as pl
 
 from benchmarks.results import Figure
-from pipeline.alignment.align import align
-from pipeline.lds import LdsResult, run_lds
-from pipeline.matching import match
-from pipeline.monitors.bank import MonitorBank
-from pipeline.odometry import odometry_of
+from pipeline.stages.alignment.align import align
+from pipeline.stages.lds import LdsResult, run_lds
+from pipeline.stages.matching import match
+from pipeline.stages.monitors.bank import MonitorBank
+from pipeline.stages.odometry import odometry_of
 from schemas.arrays import NS_PER_S, Floats
 from schemas.config import Configuration, LdsConfig, Vehicle
 from schemas.conform import shaped

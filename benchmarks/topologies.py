@@ -18,8 +18,8 @@ import polars as pl
 
 from benchmarks.calibration import degrees, fixes_at, noise, odometer_at, stated
 from benchmarks.results import Figure
-from pipeline.matching import match
-from pipeline.odometry import odometry_of
+from pipeline.stages.matching import match
+from pipeline.stages.odometry import odometry_of
 from schemas.arrays import floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.conform import conform

@@ -25,10 +25,10 @@ from datasets.inject import inject
 from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
-from pipeline.stages import diagnosed, replay
-from pipeline.undetected.columns import Diagnosis, rows_of
-from pipeline.undetected.profile import Profile, profile_at
-from pipeline.undetected.watched import windows
+from pipeline.one_run import diagnosed, replay
+from pipeline.studies.undetected.columns import Diagnosis, rows_of
+from pipeline.studies.undetected.profile import Profile, profile_at
+from pipeline.studies.undetected.watched import windows
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, Site

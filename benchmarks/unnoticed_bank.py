@@ -19,13 +19,13 @@ from scipy.special import chdtri
 from datasets.experiment.geometry import TAUS_S, Constellation, Geometry, default_geometry
 from datasets.experiment.linear_bank import BankSpec, linear_bank
 from datasets.experiment.rare import missed_detection_probability
-from pipeline.monitors.axis import AxisSeries, run_axis
-from pipeline.monitors.recursion import ewma_weight
-from pipeline.monitors.sight import clock_columns, line_of_sight_rows
-from pipeline.results.terminal import show_table
-from pipeline.undetected.error import largest_errors
-from pipeline.undetected.shapes import Shape, largest_of_shape
-from pipeline.undetected.watched import NO_ROW, Watched
+from pipeline.show.terminal import show_table
+from pipeline.stages.monitors.axis import AxisSeries, run_axis
+from pipeline.stages.monitors.recursion import ewma_weight
+from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
+from pipeline.studies.undetected.error import largest_errors
+from pipeline.studies.undetected.shapes import Shape, largest_of_shape
+from pipeline.studies.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Floats
 from schemas.config import Configuration, MonitorConfig, threshold_factor
 

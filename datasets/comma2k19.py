@@ -13,8 +13,8 @@ import polars as pl
 import pyproj
 
 from datasets.to_contract import conformed, table_of, virtual_balises
-from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
-from pipeline.track.geodesy import distances_m, points_of
+from pipeline.read.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.stages.track.geodesy import distances_m, points_of
 from schemas.arrays import NS_PER_S, Floats
 from schemas.enums import Fix
 from schemas.errors import InputError

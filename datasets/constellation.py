@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 import numpy as np
 import polars as pl
 
-from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, earth_centred_m
+from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M, earth_centred_m
 from schemas.arrays import Floats, Ints
 
 _DEG = np.pi / 180.0

@@ -14,13 +14,13 @@ from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.plan import software_digest
-from pipeline.figures.verdict import CampaignHead, head_of, word_of, worst_verdict
-from pipeline.ingest.run import read_run
-from pipeline.report import write_report
+from pipeline.one_run import replay
+from pipeline.read.ingest.run import read_run
+from pipeline.read.site.read import read_site
 from pipeline.results.manifest import listing
 from pipeline.results.store import write_config, write_run
-from pipeline.site.read import read_site
-from pipeline.stages import replay
+from pipeline.show.report import write_report
+from pipeline.stages.run_row.verdict import CampaignHead, head_of, word_of, worst_verdict
 from pipeline.storage import file_digests
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.monitors.recursion import linear_recurrence
+from pipeline.stages.monitors.recursion import linear_recurrence
 from schemas.arrays import Floats
 
 

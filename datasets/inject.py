@@ -24,7 +24,7 @@ from datasets.inject_ranges import inject_ranges
 from datasets.line import Places, shifted
 from datasets.run_path import displacement_m
 from datasets.trial import write_run_as
-from pipeline.ingest import read_run
+from pipeline.read.ingest import read_run
 from schemas.arrays import Floats
 from schemas.config import Configuration, Settings, read_toml, settings_from
 from schemas.errors import ConfigError, InputError, UsageError

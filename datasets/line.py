@@ -13,7 +13,7 @@ import polars as pl
 from scipy.ndimage import uniform_filter1d
 
 from datasets.scenario import LineSpec, ParallelSpec, SurveySpec
-from pipeline.track.geodesy import curvature_radii_m, moved_deg
+from pipeline.stages.track.geodesy import curvature_radii_m, moved_deg
 from schemas.arrays import Floats
 from schemas.conform import conform
 from schemas.errors import ConfigError

@@ -8,10 +8,10 @@ from typing import IO, Literal
 import polars as pl
 
 from datasets.mcap_messages import json_topic, odometry_topic, twist_topic
-from pipeline.export.mcap_file import Compression, write_topics
-from pipeline.export.messages import Topic, rows_topic
-from pipeline.export.position_messages import HELD, location_fix_topic, navsatfix_topic
-from pipeline.ingest.recipes import OWN_SCHEMAS
+from pipeline.read.ingest.recipes import OWN_SCHEMAS
+from pipeline.show.export.mcap_file import Compression, write_topics
+from pipeline.show.export.messages import Topic, rows_topic
+from pipeline.show.export.position_messages import HELD, location_fix_topic, navsatfix_topic
 from schemas.run import STREAMS, RunLog, Stream
 
 Encoding = Literal["json", "protobuf", "cdr"]

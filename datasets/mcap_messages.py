@@ -9,8 +9,8 @@ import dataframely as dy
 import numpy as np
 import polars as pl
 
-from pipeline.export.messages import Topic
-from pipeline.ingest.recipes import OWN_SCHEMAS
+from pipeline.read.ingest.recipes import OWN_SCHEMAS
+from pipeline.show.export.messages import Topic
 from schemas.arrays import Floats, floats, times_ns
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import Stream

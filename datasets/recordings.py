@@ -8,8 +8,8 @@ from pathlib import Path
 from datasets import infrabel
 from datasets.comma2k19 import comma2k19_run
 from datasets.trial import write_run_as
-from pipeline.ingest import read_run
-from pipeline.receivers import Converted, Purpose, as_run, extended, gather
+from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather
+from pipeline.read.ingest import read_run
 from pipeline.results.fit_report import fit_report
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import visible

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.clean import clean
-from pipeline.matching import match
-from pipeline.odometry import odometry_of
-from pipeline.track.geodesy import curvature_radii_m, distances_m, moved_deg
+from pipeline.read.ingest.clean import clean
+from pipeline.stages.matching import match
+from pipeline.stages.odometry import odometry_of
+from pipeline.stages.track.geodesy import curvature_radii_m, distances_m, moved_deg
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.monitors.sight import clock_columns, line_of_sight_rows
+from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats, Ints
 
 # DO-229 J.1: horizontal factor for precision approach and for non-precision approach, vertical factor.

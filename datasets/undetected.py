@@ -6,8 +6,8 @@ from pathlib import Path
 
 import tomli_w
 
-from pipeline.stages import diagnosed
-from pipeline.undetected.profile import Profile, epoch_of, profile_at
+from pipeline.one_run import diagnosed
+from pipeline.studies.undetected.profile import Profile, epoch_of, profile_at
 from schemas.config import Configuration, Vehicle
 from schemas.errors import OutputError
 from schemas.run import RunLog, Site

@@ -1,19 +1,32 @@
-"""The replay: `from pipeline import replay` gives the main job as a function."""
+"""The replay: `from pipeline import read_run, read_site, replay` gives the main job as functions.
+
+tables = replay(read_run("run.mcap"), read_site("site"))
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pipeline.stages import replay
+    from pipeline.one_run import replay
+    from pipeline.read.ingest import read_run
+    from pipeline.read.site.read import read_site
 
-__all__ = ["replay"]
+__all__ = ["read_run", "read_site", "replay"]
 
 
 def __getattr__(name: str) -> Any:
     # Not at once: a question to a result would wait half a second for what only a replay needs.
     if name == "replay":
-        from pipeline.stages import replay
+        from pipeline.one_run import replay
 
         return replay
+    if name == "read_run":
+        from pipeline.read.ingest import read_run
+
+        return read_run
+    if name == "read_site":
+        from pipeline.read.site.read import read_site
+
+        return read_site
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

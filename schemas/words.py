@@ -1,7 +1,7 @@
 """Every sentence for people about a run, keyed by the enum or the column that says the same to programs.
 
 Words are made here, at the edge, and nothing reads them back: whatever stands here may be reworded without a figure,
-a column or a verdict changing (`tests/summary/test_rewording.py`).
+a column or a verdict changing (`tests/replay/test_rewording.py`).
 """
 
 from __future__ import annotations

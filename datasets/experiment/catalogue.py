@@ -18,7 +18,7 @@ from datasets.experiment.catalogue_trial import JOURNEYS, Stage, stage, with_fau
 from datasets.experiment.tables import Contents, Row
 from datasets.motion import build_motion
 from pipeline.campaign.workers import mapped
-from pipeline.stages import replay
+from pipeline.one_run import replay
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import MONITORS

@@ -22,7 +22,7 @@ from datasets.experiment.thresholds import (
     two_sided,
 )
 from datasets.experiment.workers import in_pieces
-from pipeline.figures.bounds import poisson_rate
+from pipeline.stages.run_row.bounds import poisson_rate
 from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, LdsConfig, threshold_factor
 

@@ -20,7 +20,7 @@ from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, defau
 from datasets.experiment.passage import joined
 from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
-from pipeline.monitors.sight import clock_columns, line_of_sight_rows
+from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 
@@ -58,7 +58,7 @@ class Statistic(NamedTuple):
 
 
 def statistic(plan: RangePlan, heading_deg: float) -> Statistic:
-    """The monitor of `pipeline.monitors.pseudorange` for a fixed sky and heading, as one projection.
+    """The monitor of `pipeline.stages.monitors.pseudorange` for a fixed sky and heading, as one projection.
 
     Ranges have covariance V = diag(sigma^2) + survey^2 (g_c g_c' + g_u g_u'); along and clocks are free.
     """

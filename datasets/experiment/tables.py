@@ -13,7 +13,7 @@ from polars import selectors as cs
 from scipy.stats import binom
 
 from pipeline import storage
-from pipeline.figures.bounds import CONFIDENCE, clopper_pearson
+from pipeline.stages.run_row.bounds import CONFIDENCE, clopper_pearson
 from pipeline.storage.parquet import parquet_bytes
 from schemas.arrays import Floats
 

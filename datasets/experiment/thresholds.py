@@ -24,7 +24,7 @@ from datasets.experiment.plan import BANKS, HEADINGS_DEG, READINGS, Plan, Readin
 from datasets.experiment.sigmas import limit_sigmas
 from datasets.experiment.tables import table
 from datasets.experiment.workers import generator
-from pipeline.calibration.sigmas import overall_ratio
+from pipeline.studies.calibration.sigmas import overall_ratio
 from schemas.arrays import Floats
 from schemas.config import threshold_factor
 

@@ -14,12 +14,12 @@ from pipeline.campaign.plan import Plan, RunJob, find_runs
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.worker import site_of
 from pipeline.campaign.workers import mapped
-from pipeline.site.route import with_route
+from pipeline.read.site.route import with_route
 from schemas.config import Configuration, digest_of
 from schemas.errors import BaliseError, InputError, UsageError
 
 if TYPE_CHECKING:
-    from pipeline.calibration.calibrate import Calibration, Observed
+    from pipeline.studies.calibration.calibrate import Calibration, Observed
 
 AUTO = "auto"
 
@@ -79,7 +79,7 @@ def _jobs_of(plan: Plan, runs: Sequence[str], automatic: bool) -> list[RunJob]:
 
 def _source(job: RunJob) -> _Source:
     """What a run tells, or why it tells nothing; no error of a log ends the campaign here."""
-    from pipeline.calibration.calibrate import observe  # replays, which the parent of a campaign need not load
+    from pipeline.studies.calibration.calibrate import observe  # replays, which the parent of a campaign need not load
 
     log = RecordedLog(job)
     try:
@@ -98,7 +98,7 @@ def _source(job: RunJob) -> _Source:
 
 
 def _calibrated(job: RunJob, sources: Sequence[_Source]) -> RunJob:
-    from pipeline.calibration.calibrate import calibration_of
+    from pipeline.studies.calibration.calibrate import calibration_of
 
     seen = [source.observed for source in sources if source.observed is not None]
     try:
@@ -110,7 +110,7 @@ def _calibrated(job: RunJob, sources: Sequence[_Source]) -> RunJob:
 
 
 def _with_calibration(config: Configuration, found: Calibration, runs: tuple[str, ...]) -> Configuration:
-    from pipeline.calibration.calibrate import NO_NOISE
+    from pipeline.studies.calibration.calibrate import NO_NOISE
 
     monitors = config.monitors.model_copy(update=NO_NOISE | found.monitors())
     calibration = config.calibration.model_copy(update={"runs": runs})

@@ -5,8 +5,8 @@ from __future__ import annotations
 import polars as pl
 
 from pipeline import storage
-from pipeline.figures.campaign_figures import derived_tables
 from pipeline.results import catalogue, store
+from pipeline.results.figures.campaign_figures import derived_tables
 from pipeline.results.manifest import write_manifest
 from pipeline.storage.address import Address, join
 from schemas.config import Configuration, digest_of

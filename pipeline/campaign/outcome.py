@@ -10,10 +10,10 @@ from typing import Any
 import polars as pl
 
 from pipeline.campaign.plan import RunJob
-from pipeline.figures.hazard_words import hazard_words
-from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.figures.verdict import worst_verdict
+from pipeline.results.figures.hazard_words import hazard_words
+from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.results.provenance import Provenance
+from pipeline.stages.run_row.verdict import worst_verdict
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import BaliseError, InputError
@@ -174,7 +174,7 @@ def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:
 def failed_tables(job: RunJob, error: str) -> RunTables:
     """Tables without content but for the row that says why; no path, so that they are the same anywhere."""
     # Imported here because it takes a while, and only runs that fail need it.
-    from pipeline.figures.summary import failed_row
+    from pipeline.stages.run_row.summary import failed_row
 
     folder = job.address.rstrip("/").rpartition("/")[0]
     made = Provenance(job.config_digest, "", SOFTWARE, job.config.calibration.runs)

@@ -11,9 +11,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 from pipeline import storage
+from pipeline.read.site.read import read_site, refuse_unrelated
 from pipeline.results import store
 from pipeline.results.manifest import SettingsFiles, listing, settings_files
-from pipeline.site.read import read_site, refuse_unrelated
 from pipeline.storage import files
 from pipeline.storage.address import Address, check_public, is_url, join, name_of, redacted, stem_of
 from schemas.config import Configuration, Vehicle, digest_of

@@ -27,8 +27,8 @@ from pipeline.campaign.watch import (
     remedy_lines,
     summary_line,
 )
-from pipeline.figures.verdict import word_of
-from pipeline.results.terminal import show_table, to_json
+from pipeline.show.terminal import show_table, to_json
+from pipeline.stages.run_row.verdict import word_of
 from pipeline.storage.address import is_url, join, redacted
 from schemas.enums import RunStatus
 from schemas.version import SOFTWARE

@@ -12,7 +12,7 @@ import polars as pl
 from pipeline import storage
 from pipeline.campaign.outcome import changed
 from pipeline.campaign.plan import RunJob
-from pipeline.ingest import read_run
+from pipeline.read.ingest import read_run
 from pipeline.results import manifest
 from pipeline.storage.address import Address, is_url, join, redacted
 from schemas.errors import BaliseError, InputError

@@ -11,8 +11,8 @@ import polars as pl
 
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
-from pipeline.figures.verdict import CampaignHead, figures_beside, head_of, word_of
-from pipeline.results.terminal import duration_text
+from pipeline.show.terminal import duration_text
+from pipeline.stages.run_row.verdict import CampaignHead, figures_beside, head_of, word_of
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
 from schemas.words import beside_words, remedy_words

@@ -23,9 +23,9 @@ from pipeline.campaign.outcome import (
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
+from pipeline.read.site.read import read_site
+from pipeline.read.site.route import with_route
 from pipeline.results import store
-from pipeline.site.read import read_site
-from pipeline.site.route import with_route
 from pipeline.storage import files
 from pipeline.storage.address import redacted
 from schemas.config import SiteConfig
@@ -136,7 +136,7 @@ def _earlier(job: RunJob, log: RecordedLog) -> RunOutcome:
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
     # Imported here because it takes most of a second, and the parent of a campaign never needs it.
-    from pipeline.stages import replay
+    from pipeline.one_run import replay
 
     return replay(run, site, job.vehicle, job.config)
 
@@ -144,10 +144,10 @@ def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
 def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
     """The route by the run's `primary` solution, or the first by name: all of them were on the same train."""
     # Imported here for the same reason.
-    from pipeline.ingest.clean import clean
-    from pipeline.matching import match
-    from pipeline.matching.found_route import found_route
-    from pipeline.odometry import odometry_of
+    from pipeline.read.ingest.clean import clean
+    from pipeline.stages.matching import match
+    from pipeline.stages.matching.found_route import found_route
+    from pipeline.stages.odometry import odometry_of
 
     cleaned, _ = clean(run, job.config)
     matching = job.config.matching

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.ingest.clean import CleanCounts, clean
-from pipeline.plausibility.check import State
-from pipeline.plausibility.fit import Fit, fit_run, lines_of
+from pipeline.read.ingest.clean import CleanCounts, clean
+from pipeline.studies.plausibility.check import State
+from pipeline.studies.plausibility.fit import Fit, fit_run, lines_of
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site, Stream

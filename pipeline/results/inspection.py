@@ -9,14 +9,14 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.figures.verdict import head_of, run_verdicts
-from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
-from pipeline.receivers.csv_draft import draft_mapping
+from pipeline.make.receivers.csv_draft import draft_mapping
+from pipeline.read.ingest.describe import StreamSummary, TopicSummary, describe_log
+from pipeline.read.site.read import is_geojson, read_site
 from pipeline.results import store
+from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.results.fit_report import FitReport, fit_report
-from pipeline.results.terminal import show_tables
-from pipeline.site.read import is_geojson, read_site
+from pipeline.show.terminal import show_tables
+from pipeline.stages.run_row.verdict import head_of, run_verdicts
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
 from schemas.config import Configuration, Vehicle
@@ -128,9 +128,9 @@ def inspect_site(
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
     # What they need takes long to load, and a log needs none of it.
-    from pipeline.site.alike import parallel_findings, window_findings
-    from pipeline.site.describe import describe_site, elements_table, without_balises
-    from pipeline.site.survey_findings import survey_findings
+    from pipeline.read.site.alike import parallel_findings, window_findings
+    from pipeline.read.site.describe import describe_site, elements_table, without_balises
+    from pipeline.read.site.survey_findings import survey_findings
 
     config = config or Configuration()
     site = read_site(path, config.site)

@@ -21,7 +21,7 @@ from schemas.config import Vehicle
 from schemas.errors import UsageError
 from tests.campaign.compare import campaign_bytes, result_bytes
 from tests.conftest import Shared
-from tests.slip.world import BALISES, Fault, ride, site
+from tests.replay.slip.world import BALISES, Fault, ride, site
 
 NOISY = [f"ride{seed}" for seed in (1, 2, 3)]
 

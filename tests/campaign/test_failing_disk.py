@@ -13,11 +13,11 @@ import pytest
 from datasets.trial import write_run_as
 from pipeline.campaign import run_campaign, worker
 from pipeline.campaign.plan import RunJob
-from pipeline.export import export_run
-from pipeline.ingest import read_run
-from pipeline.report import write_report
+from pipeline.read.ingest import read_run
+from pipeline.read.site.read import read_site
 from pipeline.results import store
-from pipeline.site.read import read_site
+from pipeline.show.export import export_run
+from pipeline.show.report import write_report
 from pipeline.storage import UNFINISHED
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError
@@ -150,8 +150,10 @@ def test_pages_are_written_whole_or_not_at_all(
     for table in TABLES:
         shutil.copytree(undisturbed / table / "run_id=run0", out / table / "run_id=run0")
     shutil.copy(undisturbed / "config.toml", out)
-    monkeypatch.setattr("pipeline.report.write.run_page", lambda tables, *_: f"<p>{tables.runs.height} row</p>\n")
-    monkeypatch.setattr("pipeline.report.write.campaign_page", lambda campaign, _: f"{campaign.pieces.height} pieces")
+    monkeypatch.setattr("pipeline.show.report.write.run_page", lambda tables, *_: f"<p>{tables.runs.height} row</p>\n")
+    monkeypatch.setattr(
+        "pipeline.show.report.write.campaign_page", lambda campaign, _: f"{campaign.pieces.height} pieces"
+    )
     count = operations(disk, lambda: write_report(out))
     whole = content(out)
     assert count > 40

@@ -19,7 +19,7 @@ from pipeline import storage
 from pipeline.campaign import Plan, RunOutcome, Summary, make_plan, recorded_log, run_campaign
 from pipeline.campaign.outcome import lost
 from pipeline.campaign.progress import LogWatch
-from pipeline.ingest import read_run
+from pipeline.read.ingest import read_run
 from pipeline.results import store
 from schemas.config import Configuration, IngestConfig, LdsConfig
 from schemas.enums import RunStatus
@@ -209,7 +209,7 @@ def test_our_own_defect_is_told_apart(small_trial: SmallTrial, tmp_path: Path, m
 
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
     with monkeypatch.context() as patched:
-        patched.setattr(importlib.import_module("pipeline.stages"), "replay", broken)
+        patched.setattr(importlib.import_module("pipeline.one_run"), "replay", broken)
         outcome = by_run(run_campaign(plan))["run0"]
     assert outcome.defect
     assert "ZeroDivisionError" in (outcome.trace or "")

@@ -17,10 +17,10 @@ import pytest
 import typer
 
 import cli
-from pipeline.ingest import read_run
+from pipeline.read.ingest import read_run
 from schemas.config import IngestConfig
 from tests.conftest import SmallTrial
-from tests.receivers.messages import sentence
+from tests.make.receivers.messages import sentence
 
 ROOT = Path(__file__).parents[2]
 

@@ -12,7 +12,7 @@ import pytest
 from datasets.comparison import checks_table, compare, describe_faults
 from datasets.demo import DemoResult, demo, demo_scenario
 from datasets.trial import build_run
-from pipeline.results.terminal import table_lines
+from pipeline.show.terminal import table_lines
 from schemas.run import RunTables
 
 

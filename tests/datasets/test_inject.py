@@ -12,7 +12,7 @@ import pytest
 from datasets.faults import FaultSpec
 from datasets.inject import inject, inject_all, load_faults
 from datasets.trial import build_run, build_site
-from pipeline.track.geodesy import earth_centred_m
+from pipeline.stages.track.geodesy import earth_centred_m
 from schemas.errors import ConfigError, InputError
 from schemas.run import RunLog
 from tests.datasets.small import BOTH, scenario

@@ -8,7 +8,7 @@ import pytest
 
 from datasets.line import balises_table, build_line, element_at, links_table, offset_places, track_table
 from datasets.scenario import LineSpec
-from pipeline.track.geodesy import distances_m, earth_centred_m
+from pipeline.stages.track.geodesy import distances_m, earth_centred_m
 from schemas.errors import ConfigError
 from tests.datasets.small import LINE
 

@@ -13,7 +13,7 @@ import cli
 from datasets.comma2k19 import comma2k19_run
 from datasets.infrabel import infrabel_run
 from datasets.recordings import known_recording
-from pipeline.ingest import read_run
+from pipeline.read.ingest import read_run
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 

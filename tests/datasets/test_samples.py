@@ -12,13 +12,13 @@ from datasets.comma2k19 import comma2k19_run
 from datasets.faults import FaultSpec
 from datasets.infrabel import infrabel_run, infrabel_site
 from datasets.inject import inject
-from pipeline.matching import match
-from pipeline.stages import replay
-from pipeline.track.geodesy import distances_m, earth_centred_m
+from pipeline.one_run import replay
+from pipeline.stages.matching import match
+from pipeline.stages.track.geodesy import distances_m, earth_centred_m
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
-from tests.align.straight import NO_NOISE
+from tests.stages.alignment.straight import NO_NOISE
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 pytestmark = pytest.mark.skipif(not DATA.exists(), reason="the public recordings are not beside the project")

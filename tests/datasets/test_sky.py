@@ -12,7 +12,7 @@ import pytest
 import datasets
 from datasets.scenario import Scenario, load_scenario
 from datasets.trial import build_run, build_site
-from pipeline.stages import replay
+from pipeline.one_run import replay
 from schemas.run import RunLog, RunTables
 from tests.datasets.small import BOTH, scenario
 

@@ -12,9 +12,9 @@ from datasets.line import build_line
 from datasets.motion import build_motion
 from datasets.scenario import Scenario, load_scenario
 from datasets.trial import build_run, build_site, write_run_as, write_trial
-from pipeline.ingest.run import read_run
-from pipeline.site.read import read_site
-from pipeline.track.geodesy import earth_centred_m
+from pipeline.read.ingest.run import read_run
+from pipeline.read.site.read import read_site
+from pipeline.stages.track.geodesy import earth_centred_m
 from schemas.config import IngestConfig, settings_from
 from schemas.errors import ConfigError, OutputError
 from schemas.run import STREAMS, RunLog

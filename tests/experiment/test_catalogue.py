@@ -13,7 +13,7 @@ from datasets.experiment.catalogue_faults import CatalogueFault, catalogue
 from datasets.experiment.catalogue_tables import faults_table, monitors_table
 from datasets.experiment.catalogue_text import catalogue_page
 from datasets.experiment.catalogue_trial import JOURNEYS, JourneyPlan, Stage, stage, with_fault
-from pipeline.track.geodesy import distances_m
+from pipeline.stages.track.geodesy import distances_m
 from schemas.config import Configuration, MonitorConfig
 from schemas.run import RunLog, Site
 from schemas.tables import MONITORS

@@ -7,7 +7,7 @@ import pytest
 
 from datasets.experiment.catalogue_faults import CatalogueFault
 from datasets.experiment.catalogue_trial import JOURNEYS, JourneyPlan, stage, with_fault
-from pipeline.stages import replay
+from pipeline.one_run import replay
 from schemas.config import Configuration
 from schemas.run import RunLog
 

@@ -18,9 +18,9 @@ from datasets.scenario import Scenario, load_scenario
 from datasets.to_contract import table_of
 from datasets.trial import write_trial
 from pipeline import replay
-from pipeline.diff import compare_tables
-from pipeline.ingest import read_run
-from pipeline.site.read import read_site
+from pipeline.read.ingest import read_run
+from pipeline.read.site.read import read_site
+from pipeline.results.diff import compare_tables
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, Hazard, NotEvaluated, PassageStatus
 from schemas.inputs import BaliseReads
@@ -40,7 +40,7 @@ CONFIGS = {
 RUNS = [run.id for scenario in SCENARIOS for run in scenario.runs]
 # Digests follow the input files' bytes, which a new version of a library may write differently.
 NOT_COMPARED = ["input_digest", "config_digest", "software"]
-# Computed only where asked for, and held by tests/undetected.
+# Computed only where asked for, and held by tests/studies/undetected.
 ASKED_FOR = "^(undetected|t_undetected|physical_spacing)_.*$"
 
 
@@ -133,7 +133,7 @@ def test_every_class_status_and_monitor_happens_somewhere(replayed: dict[str, Ru
         hazards |= set(tables.hazards["hazard"])
         statuses |= set(tables.passages["status"])
         failing |= {name for name in MONITORS if (tables.epochs[f"{name}_state"] == "fail").any()}
-    # A wrong track needs a world with two tracks and a truth on one of them: tests/judge holds it.
+    # A wrong track needs a world with two tracks and a truth on one of them: tests/stages/judge holds it.
     assert hazards == {item.value for item in Hazard} - {Hazard.VB_WRONG_TRACK.value}
     assert {item.value for item in PassageStatus} - statuses == set()
     assert set(MONITORS) - failing == set()
@@ -155,13 +155,13 @@ def test_every_reason_of_a_monitor_is_of_the_closed_set(replayed: dict[str, RunT
 ALONE = {
     "hazards": {
         "solution": "faults of the second solution are negated before a hazard",
-        "suspect": "an opinion: tests/judge",
+        "suspect": "an opinion: tests/stages/judge",
         "caused_by": "two rows of one run at most",
         "monitor": "a step fails the raw monitor first; drifts before a failure make no hazard row here",
-        "alarm_before_onset": "tests/judge",
+        "alarm_before_onset": "tests/stages/judge",
         "budget_s": "one service level",
     },
-    "passages": {"physical_before_m": "where the undetected error is asked for: tests/undetected"},
+    "passages": {"physical_before_m": "where the undetected error is asked for: tests/studies/undetected"},
     "alarms": {"hazard_id": "one hazard row with an alarm per run"},
     "epochs": {
         "link_order_threshold": "identities are counted",
@@ -169,10 +169,10 @@ ALONE = {
     },
     "runs": {
         "calibrated_by": "replays by `--calibrate`: tests/campaign",
-        "status": "failed and partial runs: tests/campaign, tests/ingest",
+        "status": "failed and partial runs: tests/campaign, tests/read/ingest",
         "error": "the same",
         "partial_until": "the same",
-        "hazards_wrong_track": "tests/judge",
+        "hazards_wrong_track": "tests/stages/judge",
         "contract": "one version",
         "software": "one version",
         "failures_within_budget": "a step at 1 Hz keeps no budget of 0.5 s",

@@ -13,7 +13,7 @@ import polars as pl
 from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
-from pipeline import stages
+from pipeline import one_run
 from schemas.config import Configuration, Vehicle
 from schemas.inputs import BaliseReads
 from schemas.run import RunLog, RunTables, Site
@@ -90,11 +90,11 @@ class _Asked:
 
 @lru_cache(maxsize=48)
 def _replayed(asked: _Asked) -> RunTables:
-    return stages.replay(asked.run, asked.site, asked.vehicle, asked.config)
+    return one_run.replay(asked.run, asked.site, asked.vehicle, asked.config)
 
 
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
-    """`pipeline.stages.replay`, once for the same frames: tests ask different questions about one journey."""
+    """`pipeline.replay`, once for the same frames: tests ask different questions about one journey."""
     return _replayed(_Asked(run, site, vehicle, config))
 
 

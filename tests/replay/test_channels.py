@@ -7,16 +7,16 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.monitors.single import on_path_of, paired
-from pipeline.report import write_report
 from pipeline.results.store import write_run
-from pipeline.safety.assessment import assess
-from pipeline.safety.side_by_side import side_by_side
-from pipeline.safety.tally import COMPOSITE, REACTIVE, added, architecture_figures
+from pipeline.show.report import write_report
+from pipeline.stages.monitors.single import on_path_of, paired
+from pipeline.studies.safety.assessment import assess
+from pipeline.studies.safety.side_by_side import side_by_side
+from pipeline.studies.safety.tally import COMPOSITE, REACTIVE, added, architecture_figures
 from schemas.config import Configuration, LdsConfig
 from schemas.errors import InputError
-from tests.align.straight import NO_NOISE
 from tests.replay.journeys import VEHICLE, journey, replay
+from tests.stages.alignment.straight import NO_NOISE
 
 LDS = LdsConfig()
 KNOWN_NOISE = Configuration.model_validate({"monitors": NO_NOISE})

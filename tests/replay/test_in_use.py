@@ -9,14 +9,14 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages import replay
+from pipeline.one_run import replay
 from schemas.config import Configuration, Vehicle
 from schemas.inputs import BaliseReads, Balises, Gnss, Odometer, Reference
 from schemas.run import RunLog, RunTables, Site
-from tests.matching import builders
-from tests.matching.builders import line
-from tests.matching.ladder import degrees
 from tests.replay.test_shunting import stream
+from tests.stages.matching import builders
+from tests.stages.matching.builders import line
+from tests.stages.matching.ladder import degrees
 
 RATE_HZ = 10.0
 TIME_S = np.arange(0.0, 140.0, 1.0 / RATE_HZ)

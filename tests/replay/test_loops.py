@@ -6,11 +6,11 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages import replay
+from pipeline.one_run import replay
 from schemas.inputs import Balises, Gnss, Odometer, Reference
 from schemas.run import RunLog, Site
-from tests.matching import builders
 from tests.replay.test_shunting import KNOWN, RATE_HZ, moved, stream
+from tests.stages.matching import builders
 
 RADIUS_M = 300.0
 

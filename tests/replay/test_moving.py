@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.report.ground import availability_pieces
+from pipeline.show.report.ground import availability_pieces
 from tests.replay.journeys import VEHICLE, journey, replay
 
 STOP = {

@@ -8,8 +8,8 @@ from polars.testing import assert_frame_equal
 
 from schemas.config import Configuration
 from schemas.run import RunLog, Site
-from tests.align.straight import NO_NOISE
 from tests.replay.journeys import PLACES_M, QUIET, VEHICLE, journey, replay, replayed, seconds
+from tests.stages.alignment.straight import NO_NOISE
 
 JUMP = {"kind": "step", "size_m": 1000.0, "start_s": 120.0, "duration_s": 5.0}
 OFFSET = {"kind": "step", "size_m": -45.0, "start_s": 180.0, "duration_s": 60.0}

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.random_deviations import deviations
 from datasets.random_trials import KINDS
 from datasets.random_trials import random_trial as draw_trial
-from pipeline.stages import replay
+from pipeline.one_run import replay
 
 # Seeds that failed once stay. 620, 771: faults of the odometer while the position wanders by 3.2 and 3.4 sigma;
 # 1192: a monitor of height fails by chance before a slow ramp.

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.stages import replay
+from pipeline.one_run import replay
 from schemas.config import Vehicle
 from schemas.inputs import Balises, Gnss, Odometer
 from schemas.run import RunLog, Site
-from tests.matching import builders
-from tests.matching.builders import line
+from tests.stages.matching import builders
+from tests.stages.matching.builders import line
 
 KNOWN = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4, gnss_latency_s=0.0, gnss_latency_sigma_s=0.005)
 SPEED_MPS, RATE_HZ = 20.0, 10.0

@@ -6,8 +6,8 @@ import polars as pl
 import pytest
 
 from schemas.config import Configuration, Vehicle
-from tests.align.straight import NO_NOISE
 from tests.replay.journeys import QUIET, VEHICLE, journey, replay, seconds
+from tests.stages.alignment.straight import NO_NOISE
 
 # The wheel counts 1 m for 1.08 m, and the vehicle file admits it: no increment monitor can see that.
 WORN = {"scale": 1.08}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.alignment.align import align
-from pipeline.matching import match
-from pipeline.odometry import odometry_of
+from pipeline.stages.alignment.align import align
+from pipeline.stages.matching import match
+from pipeline.stages.odometry import odometry_of
 from schemas.config import Configuration, Vehicle
 from schemas.stages import Aligned, Positions
 from tests.replay.journeys import VEHICLE, journey

@@ -1,5 +1,0 @@
-"""What fault-free runs tell of a vehicle and of its monitors (`balise calibrate`).
-
-In: recorded runs and their site. Out: a vehicle file with uncertainties, and sigmas of the monitors.
-Touches no file. It replays the runs (`pipeline.stages`) and so stands above all stages of one run.
-"""

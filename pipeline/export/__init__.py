@@ -1,9 +1,0 @@
-"""Results for other programs: MCAP viewers and geographic information systems.
-
-In: a run, its result and its site. Out: MCAP, GeoJSON, GPX.
-Touches files. It computes nothing that a table does not hold.
-"""
-
-from pipeline.export.write import export_run
-
-__all__ = ["export_run"]

@@ -1,0 +1,11 @@
+"""Logs of GNSS receivers as runs (`balise convert`).
+
+In: UBX, SBF, NMEA, NovAtel, RTKLIB `.pos`, bags, CSV with a mapping; packed or not. Out: the streams of a run, new or
+added to one.
+Touches files. Damaged messages are counted and left out, never guessed.
+"""
+
+from pipeline.make.receivers.adding import Purpose
+from pipeline.make.receivers.convert import Converted, Gatherings, as_run, convert, extended, gather
+
+__all__ = ["Converted", "Gatherings", "Purpose", "as_run", "convert", "extended", "gather"]

@@ -1,0 +1,116 @@
+"""Bags of ROS 1 (`.bag`) and ROS 2 (`.db3`, folders): their messages as an MCAP log, which ingest then reads."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import polars as pl
+
+from pipeline.read.ingest.run import read_run
+from schemas.config import IngestConfig
+from schemas.errors import BaliseError, InputError
+from schemas.run import STREAMS, RunLog, Stream
+
+_HEADER = "std_msgs/msg/Header"
+_ENDINGS = (".bag", ".db3")
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag, or an MCAP log."""
+    return path.suffix.lower() in (*_ENDINGS, ".mcap") or (path / "metadata.yaml").is_file()
+
+
+def read_bag(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
+    """All streams of a bag, by schema name or as `[ingest]` maps its topics; what was left over."""
+    if path.suffix.lower() == ".mcap":
+        return _streams(read_run(path, config, with_digest=False), {})
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / "bag.mcap"
+        left = _transcribe(path, log)
+        try:
+            return _streams(read_run(log, config, with_digest=False), left)
+        except BaliseError as error:
+            error.place = None if error.place is None else error.place.replace(str(log), str(path))
+            error.message = error.message.replace(str(log), str(path))
+            raise
+
+
+def _streams(run: RunLog, left: dict[str, int]) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
+    found = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
+    if run.notes.damage is not None:
+        left = left | {f"end of the log, {run.notes.damage}": 1}
+    return found, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
+
+
+def _transcribe(path: Path, to: Path) -> dict[str, int]:
+    """Write the messages with their definitions; those of a topic whose definition is not known are counted."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise InputError(
+            f"cannot be read without the package {error.name}", place=str(path), remedy="Install the extra `bags`."
+        ) from None
+    try:
+        # Bags of ROS 1 always hold their definitions, older ones of ROS 2 never do.
+        known = None if path.suffix.lower() == ".bag" else get_typestore(Stores.LATEST)
+        with AnyReader([path], default_typestore=known) as bag:
+            return _write(bag, to)
+    except BaliseError:
+        raise
+    except Exception as error:  # the reader's own errors share no base class
+        raise InputError(
+            f"is not a whole bag: {str(error).splitlines()[0] if str(error) else type(error).__name__}",
+            place=str(path),
+            expected="a ROS 1 .bag, a ROS 2 .db3, or the folder of one with its metadata.yaml",
+            remedy="`rosbag reindex` or `ros2 bag reindex` repairs bags that were not closed.",
+        ) from None
+
+
+def _write(bag: Any, to: Path) -> dict[str, int]:
+    from mcap.writer import CompressionType, Writer
+
+    left: dict[str, int] = {}
+    types = bag.typestore if bag.is2 else _without_sequence(bag.typestore)
+    with to.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start(profile="ros2")
+        channels = {}
+        for connection in bag.connections:
+            definition = _definition(types, connection.msgtype)
+            if definition is None:
+                left[f"message on {connection.topic} ({connection.msgtype}), whose definition is not in the bag"] = (
+                    connection.msgcount
+                )
+                continue
+            schema = writer.register_schema(connection.msgtype, "ros2msg", definition.encode())
+            channels[connection.id, connection.owner] = writer.register_channel(connection.topic, "cdr", schema)
+        for connection, t_ns, raw in bag.messages([c for c in bag.connections if (c.id, c.owner) in channels]):
+            data = bytes(raw) if bag.is2 else bytes(types.ros1_to_cdr(raw, connection.msgtype))
+            writer.add_message(channels[connection.id, connection.owner], t_ns, data, t_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return left
+
+
+def _without_sequence(known: Any) -> Any:
+    """The types of a ROS 1 bag with the header of ROS 2, which has no sequence number: so they are transcribed."""
+    from rosbags.typesys import Stores, get_typestore
+
+    types = dict(known.fielddefs)
+    constants, fields = types.get(_HEADER, ([], []))
+    types |= {_HEADER: (constants, [field for field in fields if field[0] != "seq"])} if _HEADER in types else {}
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    return store
+
+
+def _definition(types: Any, name: str) -> str | None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return str(types.generate_msgdef(name, ros_version=2)[0])
+        except Exception:  # not known to the reader's types
+            return None

@@ -1,0 +1,266 @@
+"""Receiver logs as a run: UBX, SBF, NMEA, NovAtel, RTKLIB, bags, or CSV with a column mapping."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import date
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from pipeline.make.receivers import nmea, novatel, sbf, ubx
+from pipeline.make.receivers.adding import Purpose, Streams, added, assigned
+from pipeline.make.receivers.bags import is_bag, read_bag
+from pipeline.make.receivers.csv import TABLES, names_file, read_csv
+from pipeline.make.receivers.epochs import Epochs, Gathered
+from pipeline.make.receivers.frames import Frame, Protocol, frames, name_of
+from pipeline.make.receivers.rtklib import is_solution, read_solution
+from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked
+from pipeline.read.ingest.breaches import refuse
+from pipeline.read.ingest.conform import conform
+from pipeline.read.ingest.mapping import mappings_of
+from schemas.config import FixSigma, IngestConfig
+from schemas.errors import InputError
+from schemas.run import STREAMS, RunLog, Stream
+
+
+@dataclass(frozen=True)
+class Converted:
+    """The run, and what could not be used: reason to number."""
+
+    run: RunLog
+    dropped: dict[str, int]
+
+    def gathered(self) -> Gatherings:
+        """The streams alone."""
+        frames = {name: self.run.stream(name) for name in STREAMS}
+        return Gatherings({name: frame for name, frame in frames.items() if frame is not None}, self.dropped)
+
+
+def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -> Converted:
+    """Receiver logs of one journey as one new run: `gather` and `as_run`."""
+    return as_run(gather(logs, config), run_id)
+
+
+def as_run(found: Gatherings, run_id: str, purpose: Purpose | None = None, sigmas: FixSigma | None = None) -> Converted:
+    """A new run of what logs hold, the positions as `purpose` says; raises `InputError` where they hold none."""
+    streams = assigned(found.streams, purpose or Purpose(), sigmas or FixSigma())
+    gnss = streams.pop("gnss", None)
+    if gnss is None:
+        raise InputError(
+            "no epoch with a time and a position",
+            place=run_id,
+            found=", ".join(streams) or None,
+            expected="GNSS positions, which a new run needs",
+            remedy="Convert the log of the receiver first or in the same call." + _reasons(found.dropped),
+        )
+    return Converted(RunLog(run_id, gnss).with_streams(**streams), found.dropped)
+
+
+def extended(run: RunLog, place: Path, found: Gatherings, purpose: Purpose, sigmas: FixSigma, force: bool) -> Converted:
+    """A run that stands at a place, with what logs hold added to it."""
+    return Converted(added(run, assigned(found.streams, purpose, sigmas), force, place), found.dropped)
+
+
+@dataclass(frozen=True)
+class Gatherings:
+    """The streams of all logs, as the contract has them, and what could not be used: reason to number."""
+
+    streams: Streams
+    dropped: dict[str, int]
+
+
+def gather(logs: list[Path], config: IngestConfig | None = None, date: date | None = None) -> Gatherings:
+    """What the logs hold: positions, or whatever else a mapping or a topic makes a stream of.
+
+    `date`: the day of the first sentence, for NMEA logs that hold none. Raises `InputError` where no log of a receiver
+    holds an epoch, or where two logs tell of the same time under one solution.
+    """
+    dropped: Counter[str] = Counter()
+    parts: list[tuple[Path, Streams]] = []
+    failures: list[NoEpochError] = []
+    strangers: list[UnknownError] = []
+    for log in logs:
+        with unpacked(log) as inner:
+            for plain in inner:
+                try:
+                    streams, counts = _convert_one(plain, config or IngestConfig(), date)
+                except UnknownError as error:
+                    if plain == log:
+                        raise
+                    strangers.append(error)
+                except NoEpochError as error:
+                    failures.append(error)
+                else:
+                    parts.append((log if plain == log else log / plain.name, streams))
+                    dropped.update(counts)
+    if failures and not any("gnss" in streams for _, streams in parts):
+        raise failures[0]
+    if strangers and not parts:
+        raise strangers[0]
+    counts = {"log without an epoch": len(failures), "file of an archive that is no log": len(strangers)}
+    dropped.update({reason: count for reason, count in counts.items() if count})
+    _refuse_overlaps(parts)
+    return Gatherings(_joined(parts), dict(dropped))
+
+
+class NoEpochError(InputError):
+    """A log of a receiver whose messages tell no position with a time."""
+
+
+class UnknownError(InputError):
+    """A file without a message of a known receiver."""
+
+
+def _reasons(dropped: Mapping[str, int]) -> str:
+    return "".join(f" Not used: {reason} ({count})." for reason, count in sorted(dropped.items()))
+
+
+def _joined(parts: list[tuple[Path, Streams]]) -> Streams:
+    """The streams of all logs, one after the other, as the contract has them."""
+    breaches: list[InputError] = []
+    collected: dict[Stream, list[pl.DataFrame]] = {}
+    for log, streams in parts:
+        for name, frame in streams.items():
+            if frame.height:
+                collected.setdefault(name, []).append(conform(frame, name, str(log), breaches))
+    refuse(breaches)
+    return {name: pl.concat(frames) for name, frames in collected.items()}
+
+
+def _refuse_overlaps(parts: list[tuple[Path, Streams]]) -> None:
+    """Two receivers under one name would be read as one that jumps between their positions."""
+    spans: list[tuple[Any, Any, Any, Path]] = [
+        (name, fixes["t"].min(), fixes["t"].max(), log)
+        for log, streams in parts
+        if "gnss" in streams
+        for (name,), fixes in streams["gnss"].drop_nulls("t").group_by("solution", maintain_order=True)
+    ]
+    for (name, start, end, log), (of, since, until, other) in combinations(spans, 2):
+        if name == of and log != other and start < until and since < end:
+            raise InputError(
+                "two logs hold positions of the same time under one solution",
+                place=f"{log}, {other}",
+                found=f"solution {name} in both, from {max(start, since)} on",
+                expected="one receiver per call",
+                remedy="Convert the second log into the same run with --solution NAME, or --stream reference.",
+            )
+
+
+def _convert_one(log: Path, config: IngestConfig, date: date | None) -> tuple[Streams, Mapping[str, int]]:
+    if is_bag(log):
+        return read_bag(log, _of_topics(config))
+    if log.suffix.lower() == ".csv" or names_file(config, log):
+        return read_csv(log, config)
+    try:
+        content = log.read_bytes()
+    except OSError as error:
+        expected = f"a file, or the folder of a bag with its {BAG_FOLDER}" if log.is_dir() else None
+        raise InputError(f"cannot be read: {error.strerror}", place=str(log), expected=expected) from None
+    if is_solution(content):
+        return read_solution(content, log)
+    return _read(content, log, date)
+
+
+def _of_topics(config: IngestConfig) -> IngestConfig:
+    """Without the mappings of tables, whose names are no topics of a bag."""
+    kept: dict[str, object] = {
+        stream: tuple(m for m in mappings_of(config, stream) if not m.topic.lower().endswith(TABLES))
+        for stream in STREAMS
+        if stream != "faults"
+    }
+    return config.model_copy(update=kept)
+
+
+def _read(content: bytes, log: Path, date: date | None) -> tuple[Streams, Mapping[str, int]]:
+    """The epochs of the protocol that tells most; what is damaged or told twice is counted."""
+    dropped: Counter[str] = Counter()
+    gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
+    for frame in frames(content, lambda: dropped.update(["damaged message"])):
+        if frame.protocol in gathered:
+            _decode(frame, gathered[frame.protocol])
+    nmea.settle_days(gathered[Protocol.NMEA], date)
+    novatel.settle_source(gathered[Protocol.NOVATEL])
+    told = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
+    best = max(told, key=lambda protocol: _worth(protocol, told[protocol]))
+    for protocol, epochs in told.items():
+        if protocol is best or not told[best].positions:
+            dropped.update(gathered[protocol].dropped)
+        elif epochs.positions:
+            dropped[f"{protocol} position beside those of {best}"] += epochs.positions
+    if not told[best].epochs:
+        raise _no_epoch(content, log, dropped)
+    return told[best].streams(), dropped
+
+
+def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
+    """What there is in place of positions tells what to change at the receiver."""
+    met = Counter(name_of(frame) for frame in frames(content, lambda: None))
+    if not met:
+        hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, content)), _OTHER)
+        return UnknownError(
+            "holds no message of a known receiver" if content else "is empty",
+            place=str(log),
+            expected="UBX, SBF, NMEA, NovAtel, RTKLIB .pos, a bag, or CSV",
+            remedy=hint + _reasons(dropped),
+        )
+    return NoEpochError(
+        "no epoch with a time and a position",
+        place=str(log),
+        found=", ".join(f"{name} ({count})" for name, count in met.most_common(_MOST_NAMES)),
+        expected="UBX NAV-PVT or NAV-SOL, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
+        "NovAtel BESTPOS or INSPVA",
+        remedy="Let the receiver record one of these messages, or give the day of NMEA without one by --date."
+        + _reasons(dropped),
+    )
+
+
+def _worth(protocol: Protocol, epochs: Epochs) -> int:
+    """A receiver that sends NMEA beside its own protocol rounds there, and leaves out how accurate it is."""
+    return epochs.positions * (1 if protocol is Protocol.NMEA else 2)
+
+
+def _decode(frame: Frame, gathered: Gathered) -> None:
+    parse, decode = _PROTOCOLS[frame.protocol]
+    try:
+        message = parse(frame.content)
+    except ImportError as error:
+        raise InputError(
+            f"cannot be read without the package {error.name}",
+            place=f"{frame.protocol} messages",
+            remedy=f"Install the extra `{'novatel' if frame.protocol is Protocol.NOVATEL else 'receivers'}`.",
+        ) from None
+    except Exception:
+        # The parsers' own errors share no base class.
+        gathered.drop(_UNFIT)
+        return
+    try:
+        if message is not None:
+            decode(gathered, message, frame.content)
+    except (AttributeError, OverflowError):  # a message that ends before its fields do, a time beyond all calendars
+        gathered.drop(_UNFIT)
+
+
+# What is left out though it is almost a log, and what to do.
+_OTHER = "Convert it to CSV and give a mapping, if the receiver is another one."
+_ALMOST = {
+    rb"\$[A-Z]{2}(GGA|GNS|RMC),[^*\r\n]*\r?\n": "NMEA without checksums cannot be checked: let the logger keep them.",
+    rb"(?m)^<(BEST|PSR|INS)": "Abbreviated ASCII of NovAtel has no checksums: log BESTPOSA or BESTPOSB.",
+    rb"\A\s*\d{4}(/\d\d/\d\d|\s+\d+\.\d+\s)": "If it is of RTKLIB, let it write its header (out-outhead = on).",
+}
+_MOST_NAMES = 20
+_UNFIT = "message that does not fit its definition"
+
+
+# By protocol: what makes a message of a frame, and what adds it to its epoch. The first wins a tie.
+_PROTOCOLS: dict[Protocol, tuple[Callable[[bytes], Any], Callable[[Gathered, Any, bytes], None]]] = {
+    Protocol.UBX: (ubx.parse, ubx.decode),
+    Protocol.SBF: (sbf.parse, sbf.decode),
+    Protocol.NOVATEL: (novatel.parse, novatel.decode),
+    Protocol.NMEA: (nmea.parse, nmea.decode),
+}

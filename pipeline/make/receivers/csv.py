@@ -1,0 +1,158 @@
+"""CSV logs with a column mapping: the same `[ingest.STREAM]` tables as for MCAP, with columns for fields."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from pipeline.make.receivers.csv_times import instants, time_columns
+from pipeline.read.ingest.breaches import refuse
+from pipeline.read.ingest.csv_text import LogTable, read_log_table
+from pipeline.read.ingest.mapping import mappings_of
+from pipeline.read.ingest.mcap_model import Channel
+from pipeline.read.ingest.plan import Sample, Source, mapped_source
+from pipeline.stages.epochs.clock import GAP_PERIODS
+from schemas.config import IngestConfig, StreamMapping
+from schemas.errors import InputError
+from schemas.run import STREAMS, Stream
+
+# Why a row was left out.
+CUT_ROW = "row that breaks off at the end of the file"
+TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
+_UNITS_ROW = "row of units"
+_SHORT_ROW = "end of a row, which is missing (taken as empty)"
+# What rows of a stream are for. Fewer positions tell no usual step.
+_VALUES: dict[Stream, tuple[str, ...]] = {
+    "gnss": ("latitude_deg", "longitude_deg"),
+    "odometer": ("distance_m", "speed_mps"),
+    "reference": ("latitude_deg", "longitude_deg"),
+    "balise_reads": ("balise_id",),
+}
+_FEWEST = 3
+# Decimal mark, and what may separate thousands beside it.
+_MARKS = {",": "[.'\u2019 \u00a0\u202f]", ".": "[,'\u2019 \u00a0\u202f]"}
+
+
+def names_file(config: IngestConfig, path: Path) -> bool:
+    """Whether a mapping is for this file: tables do not always end in `.csv`."""
+    named = {mapping.topic for stream in STREAMS for mapping in mappings_of(config, stream)}
+    return path.suffix.lower() in TABLES and bool(named & {path.name, path.stem})
+
+
+def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
+    """Streams of a CSV file, each mapping whose `topic` is the file's name, its stem or `*` makes one; what was left
+    out, reason to number.
+    """
+    log = read_log_table(path, infer=True)
+    table = with_points(log)
+    streams: dict[Stream, pl.DataFrame] = {}
+    empty: Counter[str] = Counter()
+    for name in STREAMS:
+        for mapping in mappings_of(config, name):
+            if mapping.topic in (path.name, path.stem, "*"):
+                mapped = _mapped(table, mapping, name, path)
+                frame = mapped.filter(_told(mapped, name, "fix" in mapping.fields))
+                empty[f"row without a value of {name}"] += mapped.height - frame.height
+                streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
+    if not streams:
+        raise InputError(
+            "no mapping for this file",
+            place=str(path),
+            found="columns " + ", ".join(table.columns),
+            expected=f'a table [ingest.gnss] with topic = "{path.name}"',
+            remedy="Give a mapping by --config; `balise inspect` of the file prints a draft.",
+        )
+    left = {CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short} | empty
+    return streams, {reason: count for reason, count in left.items() if count}
+
+
+def _told(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
+    """Rows that tell something of a stream: tables of several recorders leave cells empty.
+
+    An empty position may as well be an outage, which a kind of fix would say. Without one it is none where the
+    positions around it follow each other as they usually do.
+    """
+    names = [name for name in _VALUES.get(stream, ()) if name in frame.columns]
+    if not names:
+        return pl.repeat(True, frame.height, eager=True)
+    told = frame.select(pl.any_horizontal(pl.col(names).is_not_null())).to_series()
+    if stream != "gnss" or told.sum() < _FEWEST or told.all():
+        return told if stream != "gnss" else pl.repeat(True, frame.height, eager=True)
+    t_ns = frame["t"].to_physical().fill_null(0).to_numpy()
+    at = np.sort(t_ns[told.to_numpy()])
+    after = at.searchsorted(t_ns).clip(1, at.size - 1)
+    steps = np.diff(at)
+    between = (t_ns > at[0]) & (t_ns < at[-1]) & (steps[after - 1] <= GAP_PERIODS * np.median(steps))
+    return told | has_fix | pl.Series(~between)
+
+
+def with_points(log: LogTable) -> pl.DataFrame:
+    """The table with its numbers as such: those with a decimal comma where no number of the file has a decimal point,
+    and those with separated thousands.
+
+    Between commas, 1,234 in quotes may be a fraction or a thousand and more: such a file must have other numbers too.
+    """
+    texts = log.table.select(pl.col(pl.String).replace("", None))
+    fitting = {mark: {name for name in texts.columns if _fits(texts[name], mark)} for mark in _MARKS}
+    numbers = set.union(*fitting.values())
+    has_point = any(dtype.is_float() for dtype in log.table.schema.values())
+    marks = [mark for mark, names in fitting.items() if names == numbers and not (mark == "," and has_point)]
+    if not marks or (len(marks) == len(_MARKS) and log.separator == ","):
+        return log.table
+    plain = pl.col(sorted(numbers)).replace("", None).str.replace("\u2212", "-").str.replace_all(_MARKS[marks[0]], "")
+    return log.table.with_columns(plain.str.replace(marks[0], ".", literal=True).cast(pl.Float64))
+
+
+def _fits(column: pl.Series, mark: str) -> bool:
+    """Whether every cell is a number with this decimal mark."""
+    whole = rf"(?:\d{{1,3}}(?:{_MARKS[mark]}\d{{3}})+|\d+)"
+    number = rf"^\s*[+\-\u2212]?(?:{whole}(?:[{mark}]\d+)?|[{mark}]\d+)(?:[eE][+-]?\d+)?\s*$"
+    return column.null_count() < len(column) and bool(column.drop_nulls().str.contains(number).all())
+
+
+def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path) -> pl.DataFrame:
+    if not mapping.time.startswith("field:"):
+        raise InputError("a CSV has no log time", place=str(path), expected='time = "field:COLUMN"')
+    kinds = {name: _kind(dtype) for name, dtype in table.schema.items()}
+    sample = Sample(Channel(0, path.name, "csv", None, str(path)), kinds)
+    absent = [name for name in time_columns(table, mapping) if name not in table.columns]
+    first = mapping.time if absent else f"field:{time_columns(table, mapping)[0]}"
+    source = mapped_source(sample, stream, mapping.model_copy(update={"time": first}))
+    refuse(source.breaches)
+    fields = pl.DataFrame([_typed(table[name], source, path) for name in source.types])
+    columns = {name: _not_nan(expression, fields) for name, expression in source.columns.items()}
+    if stream in ("gnss", "satellites"):
+        columns = {"solution": pl.lit(mapping.solution, dtype=pl.String)} | columns
+    times = instants(table, mapping, path)
+    return pl.DataFrame({"t": times}).with_columns(fields.select(pl.lit(0).alias("t"), **columns).drop("t"))
+
+
+def _kind(dtype: pl.DataType) -> str:
+    if dtype.is_integer():
+        return "int"
+    return "float" if dtype.is_float() else "flag" if dtype == pl.Boolean else "text"
+
+
+def _typed(recorded: pl.Series, source: Source, path: Path) -> pl.Series:
+    try:
+        return recorded.cast(source.types[recorded.name])
+    except pl.exceptions.PolarsError:
+        wanted = ", ".join(name for name in source.columns if recorded.name in source.recipe.fields_of(name))
+        unfit = recorded.cast(source.types[recorded.name], strict=False).is_null() & (recorded != "")
+        row = int(unfit.arg_max() or 0)
+        raise InputError(
+            f"cannot be {wanted}",
+            place=f"{path}: column {recorded.name}",
+            found=f"{recorded[row]} in row {row + 1}, {unfit.sum()} rows of this kind",
+            expected="numbers" if source.types[recorded.name].is_numeric() else "true or false",
+            remedy="Correct these cells, or empty them where nothing is known.",
+        ) from None
+
+
+def _not_nan(expression: pl.Expr, fields: pl.DataFrame) -> pl.Expr:
+    """In a text, NaN is how programs write that they have no value."""
+    is_float = fields.lazy().select(expression.alias("value")).collect_schema()["value"].is_float()
+    return expression.fill_nan(None) if is_float else expression

@@ -1,0 +1,158 @@
+"""NMEA 0183: GGA, GNS or RMC, with RMC or ZDA for the date, GST for accuracy, gathered by time of day."""
+
+from __future__ import annotations
+
+from datetime import UTC, date, datetime, time
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from pipeline.make.receivers.epochs import Epoch, Gathered
+from pipeline.read.ingest.guesses import UNITS
+from schemas.arrays import NS_PER_S
+from schemas.enums import Fix
+
+# 9 is of NovAtel's receivers; 7 and 8 are typed in or simulated.
+_FIXES = {
+    0: Fix.NONE, 1: Fix.AUTONOMOUS, 2: Fix.DIFFERENTIAL, 3: Fix.AUTONOMOUS, 4: Fix.RTK_FIXED, 5: Fix.RTK_FLOAT,
+    6: Fix.ESTIMATED, 9: Fix.SBAS,
+}  # fmt: skip
+# Mode letters of RMC and GNS, the best first: a solution is as good as its best satellite system.
+_MODES = {
+    "R": Fix.RTK_FIXED, "F": Fix.RTK_FLOAT, "D": Fix.DIFFERENTIAL, "P": Fix.AUTONOMOUS, "A": Fix.AUTONOMOUS,
+    "E": Fix.ESTIMATED,
+}  # fmt: skip
+# Differential corrections whose station is an SBAS satellite: 120-158 as PRN, 33-64 as NMEA satellite number.
+_SBAS_PRNS, _SBAS_NUMBERS, _NUMBER_TO_PRN = range(120, 159), range(33, 65), 87
+_DAY_NS = 86_400 * NS_PER_S
+
+
+def parse(raw: bytes) -> Any:
+    """The sentence, none if it is of no interest."""
+    from pynmeagps import NMEAReader
+
+    return NMEAReader.parse(raw) if raw[3:6] in _WANTED and raw[6:7] == b"," else None
+
+
+def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
+    """Add what this sentence says to its epoch, whose key is the time of day; most tell no more of the time."""
+    if not isinstance(message.time, time):
+        gathered.drop("time not valid")
+        return
+    epoch = gathered.at(message.time, message.identity if message.msgID in _POSITIONS else "", raw)
+    # Before its first position a receiver tells a date of its own making.
+    if message.msgID == "RMC" and isinstance(message.date, date) and (message.status == "A" or message.lat != ""):
+        epoch.t_ns = _time_ns(message.date, message.time)
+    elif message.msgID == "ZDA" and (day := _date_of(message)):
+        epoch.t_ns = _time_ns(day, message.time)
+    _DECODERS[message.msgID](epoch, message)
+
+
+def settle_days(gathered: Gathered, told: date | None = None) -> None:
+    """Give the epochs without a date theirs: past midnight the next, before the first date counted back from it.
+
+    Where no sentence tells a date, the first epoch is of the day `told`. A time with neither date nor position before
+    the first date may be that of a receiver just switched on, whose clock is not set yet: it is dropped.
+    """
+    epochs = gathered.epochs
+    first = next((number for number, epoch in enumerate(epochs) if epoch.t_ns is not None), None)
+    if first is None and told is not None and epochs:
+        first, epochs[0].t_ns = 0, _time_ns(told, epochs[0].key)
+    early = epochs[:first]
+    if first is not None:
+        early = [epoch for epoch in early if epoch.gnss.get("fix", Fix.NONE.value) == Fix.NONE.value]
+    gathered.drop("time without a date", len(early))
+    dropped = {epoch.number for epoch in early}
+    gathered.epochs = [epoch for epoch in epochs if epoch.number not in dropped]
+    for way in (1, -1):
+        for known, epoch in pairwise(gathered.epochs[::way]):
+            if epoch.t_ns is None and known.t_ns is not None:
+                epoch.t_ns = _beside(known.t_ns, epoch.key, way)
+
+
+def _beside(known_ns: int, moment: time, way: int) -> int:
+    """The time of an epoch after (1) or before (-1) one whose time is known: of the same day, or past midnight."""
+    t_ns = known_ns - known_ns % _DAY_NS + _time_ns(date(1970, 1, 1), moment)
+    return t_ns + way * _DAY_NS if way * (known_ns - t_ns) > _DAY_NS // 2 else t_ns
+
+
+def _time_ns(day: date, moment: time) -> int:
+    """UTC [ns since 1970]."""
+    whole = datetime.combine(day, moment.replace(microsecond=0), tzinfo=UTC)
+    return int(whole.timestamp()) * NS_PER_S + moment.microsecond * 1000
+
+
+def _date_of(m: Any) -> date | None:
+    try:
+        return date(int(m.year), int(m.month), int(m.day))
+    except ValueError:
+        return None
+
+
+def _position(epoch: Epoch, m: Any) -> None:
+    """GGA: kind of fix and position, of which an RMC of the epoch may have said less."""
+    _put(epoch, m, _FIXES.get(int(m.quality or 0), Fix.NONE))
+
+
+def _position_of_systems(epoch: Epoch, m: Any) -> None:
+    """GNS: a letter of `posMode` per satellite system; where a GGA has told its kind of fix, that stands."""
+    if epoch.gnss.get("satellites") is None:
+        _put(epoch, m, next((fix for mode, fix in _MODES.items() if mode in str(m.posMode)), Fix.NONE))
+
+
+def _put(epoch: Epoch, m: Any, fix: Fix) -> None:
+    """What GGA and GNS share; height over the ellipsoid is height over the geoid plus the separation."""
+    station = int(m.diffStation) if str(m.diffStation).isdigit() else None
+    prn = station + _NUMBER_TO_PRN if station is not None and station in _SBAS_NUMBERS else station
+    if fix is Fix.DIFFERENTIAL and prn in _SBAS_PRNS:
+        fix = Fix.SBAS
+        epoch.gnss |= {"sbas_prn": prn, "sbas_age_s": m.diffAge if isinstance(m.diffAge, float) else None}
+    epoch.gnss |= {"fix": fix.value, "satellites": int(m.numSV) if m.numSV != "" else None}
+    if fix is Fix.NONE or m.lat == "" or m.lon == "":
+        return
+    epoch.gnss |= {"latitude_deg": m.lat, "longitude_deg": m.lon}
+    if isinstance(m.alt, float) and isinstance(m.sep, float):
+        epoch.gnss["height_m"] = m.alt + m.sep
+
+
+def _motion(epoch: Epoch, m: Any) -> None:
+    """RMC: velocity; its position and mode count only where neither GGA nor GNS is sent."""
+    valid = m.status == "A"
+    fix = _MODES.get(getattr(m, "posMode", "") or "A", Fix.NONE) if valid else Fix.NONE
+    place = {"latitude_deg": m.lat, "longitude_deg": m.lon} if m.lat != "" and m.lon != "" else {}
+    epoch.gnss = {"fix": fix.value, **place} | epoch.gnss
+    if valid and isinstance(m.spd, float) and isinstance(m.cog, float):
+        course, speed = np.radians(m.cog), m.spd * UNITS["knots"]
+        epoch.gnss |= {"vel_e_mps": float(speed * np.sin(course)), "vel_n_mps": float(speed * np.cos(course))}
+
+
+def _accuracy(epoch: Epoch, m: Any) -> None:
+    if all(isinstance(value, float) for value in (m.stdLat, m.stdLong, m.stdAlt)):
+        epoch.gnss |= {"cov_ee_m2": m.stdLong**2, "cov_nn_m2": m.stdLat**2, "cov_uu_m2": m.stdAlt**2}
+        epoch.gnss |= _correlation(m) | {"cov_eu_m2": 0.0, "cov_nu_m2": 0.0}
+
+
+def _correlation(m: Any) -> dict[str, float]:
+    """GST gives the error ellipse: its orientation is that of the major axis, from true north."""
+    if not all(isinstance(value, float) for value in (m.stdMajor, m.stdMinor, m.orient)):
+        return {"cov_en_m2": 0.0}
+    angle = np.radians(m.orient)
+    shared = float((m.stdMajor**2 - m.stdMinor**2) * np.sin(angle) * np.cos(angle))
+    # Rounding, or an ellipse of something else: the deviations of the axes count.
+    return {"cov_en_m2": shared if abs(shared) <= m.stdLat * m.stdLong else 0.0}
+
+
+def _nothing(_epoch: Epoch, _m: Any) -> None:
+    """ZDA gives only the date."""
+
+
+_POSITIONS = ("GGA", "GNS", "RMC")
+_WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA")
+_DECODERS = {
+    "GGA": _position,
+    "GNS": _position_of_systems,
+    "RMC": _motion,
+    "GST": _accuracy,
+    "ZDA": _nothing,
+}

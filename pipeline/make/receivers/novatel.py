@@ -1,0 +1,130 @@
+"""NovAtel OEM, ASCII and binary: BESTPOS, BESTGNSSPOS or PSRPOS, BESTVEL, INSPVAX or INSPVA, gathered by GPS time.
+
+OEM7 commands and logs reference manual.
+"""
+
+from __future__ import annotations
+
+import struct
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from pipeline.make.receivers.epochs import Epoch, Gathered, covariance, velocity
+from pipeline.make.receivers.frames import NOVATEL_NAMES
+from pipeline.read.ingest.novatel import FIX_BY_CODE
+from pipeline.read.ingest.timescale import utc_of_week
+from schemas.enums import Fix
+
+# Messages with a position, by rank: that of the receiver before those of the inertial solution.
+_RANKS = {"INSPVAS": 0, "INSPVA": 0, "INSPVAX": 1, "PSRPOS": 2, "BESTGNSSPOS": 3, "BESTPOS": 4}
+_INERTIAL = ("INSPVAS", "INSPVA", "INSPVAX")
+_COARSE = 100  # "GPS reference time status": below it the time is approximate or not known
+_WGS84 = 61
+# "Inertial solution status": high variance, good, free, alignment complete. The others are no solution.
+_SOLVED = (2, 3, 6, 7)
+_VELOCITY = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
+# Of the format: BESTVEL comes at 1 Hz at least, one of two may be late; over more there is no velocity of an epoch.
+_LONGEST_BETWEEN_NS = 1_500_000_000
+
+
+def parse(raw: bytes) -> Any:
+    """The message, none if it is of no interest."""
+    return _decoder().decode(raw) if _name(raw) in NOVATEL_NAMES.values() else None
+
+
+@cache
+def _decoder() -> Any:
+    from novatel_edie import oem
+
+    return oem.Decoder()
+
+
+def _name(raw: bytes) -> str:
+    if raw[:1] in (b"#", b"%"):
+        return raw[1:].split(b",")[0].decode().removesuffix("A")
+    return NOVATEL_NAMES.get(struct.unpack_from("<H", raw, 4)[0], "")
+
+
+def decode(gathered: Gathered, m: Any, raw: bytes) -> None:
+    """Add what this message says to its epoch."""
+    name = _name(raw)
+    if name not in ("INSPVAS", "INSPVA") and int(m.header.time_status) < _COARSE:
+        gathered.drop("time not valid")
+        return
+    week, ms = int(m.header.week), round(float(m.header.milliseconds))
+    if name == "BESTVEL" and int(m.status):
+        return
+    epoch = gathered.at((name if name == "BESTVEL" else "", week, ms), name if name in _RANKS else "", raw)
+    epoch.t_ns = utc_of_week(week, ms * 1_000_000)
+    if name == "BESTVEL":
+        epoch.t_ns -= round(m.latency * 1e9)
+        epoch.gnss |= _velocity(m)
+    elif name in _INERTIAL:
+        _inertial(epoch, m, _RANKS[name])
+    elif int(m.datum_id) != _WGS84:
+        gathered.drop("position in another datum than WGS 84")
+    else:
+        fix = FIX_BY_CODE.get(int(m.position_type), Fix.NONE) if int(m.solution_status) == 0 else Fix.NONE
+        _place(epoch, m, _RANKS[name], fix)
+        epoch.tell("satellites", _RANKS[name], {"satellites": int(m.num_soln_svs)})
+
+
+def settle_source(gathered: Gathered) -> None:
+    """Keep the epochs of the message of highest rank, with their velocities: several in turn would be several receivers
+    under one name.
+    """
+    velocities = [epoch for epoch in gathered.epochs if epoch.key[0] == "BESTVEL"]
+    gathered.epochs = [epoch for epoch in gathered.epochs if epoch.key[0] != "BESTVEL"]
+    names = {
+        name for epoch in gathered.epochs if epoch.gnss.get("fix", Fix.NONE) != Fix.NONE for name in epoch.positions
+    }
+    best = max(names, key=lambda name: _RANKS[name], default=None)
+    if best is None:
+        return
+    other = [epoch for epoch in gathered.epochs if epoch.positions and best not in epoch.positions]
+    gathered.drop(f"NovAtel position beside those of {best}", len(other))
+    gathered.epochs = [epoch for epoch in gathered.epochs if best in epoch.positions]
+    _give(velocities, gathered.epochs)
+
+
+def _inertial(epoch: Epoch, m: Any, rank: int) -> None:
+    """INSPVAX tells what its position rests on, INSPVA does not."""
+    solved = int(m.ins_solution_status) in _SOLVED
+    kind = FIX_BY_CODE.get(int(m.position_type), Fix.NONE) if hasattr(m, "position_type") else Fix.ESTIMATED
+    _place(epoch, m, rank, kind if solved else Fix.NONE)
+    epoch.tell("velocity", rank, velocity(m.east_vel, m.north_vel, m.up_vel))
+
+
+def _place(epoch: Epoch, m: Any, rank: int, fix: Fix) -> None:
+    """Height over the ellipsoid: with the undulation, where the message has one; INSPVA gives it as it is.
+
+    The field of the height has one name in old definitions of a message, and another in new ones.
+    """
+    height = (m.height if hasattr(m, "height") else m.orthometric_height) + getattr(m, "undulation", 0.0)
+    epoch.tell("fix", rank, {"fix": fix.value})
+    epoch.tell("place", rank, {"latitude_deg": m.latitude, "longitude_deg": m.longitude, "height_m": height})
+    if hasattr(m, "latitude_std_dev"):
+        east, north, up = m.longitude_std_dev**2, m.latitude_std_dev**2, m.height_std_dev**2
+        epoch.tell("accuracy", rank, covariance(east, 0.0, 0.0, north, 0.0, up))
+
+
+def _velocity(m: Any) -> dict[str, float]:
+    """BESTVEL: speed over ground, its direction, and the vertical speed."""
+    course = np.radians(m.ground_track)
+    return velocity(m.horizontal_speed * np.sin(course), m.horizontal_speed * np.cos(course), m.z)
+
+
+def _give(velocities: list[Epoch], epochs: list[Epoch]) -> None:
+    """The velocity of each epoch between the two of BESTVEL around it: "latency" is how much older it is."""
+    if not velocities or not epochs:
+        return
+    told = sorted((epoch.t_ns or 0, *(epoch.gnss[name] for name in _VELOCITY)) for epoch in velocities)
+    at, wanted = np.array([row[0] for row in told]), np.array([epoch.t_ns for epoch in epochs])
+    before = at[np.maximum(np.searchsorted(at, wanted, side="right") - 1, 0)]
+    after = at[np.minimum(np.searchsorted(at, wanted), len(at) - 1)]
+    near = (before <= wanted) & (wanted <= after) & (after - before <= _LONGEST_BETWEEN_NS)
+    between = [np.interp((wanted - at[0]) * 1e-9, (at - at[0]) * 1e-9, [row[i] for row in told]) for i in (1, 2, 3)]
+    for number in np.flatnonzero(near):
+        epochs[number].gnss |= velocity(*(v[number] for v in between))

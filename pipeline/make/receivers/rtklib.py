@@ -1,0 +1,254 @@
+"""RTKLIB solutions (`.pos`): one row per epoch, what its columns are in the header.
+
+Read are all forms of the RTKLIB manual 2.4.3, appendix B.1: GPST, UTC and JST as calendar or week and seconds;
+degrees, degrees with minutes and seconds, earth-fixed places, and baselines from the reference in the header.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from pipeline.make.receivers.earth_fixed import earth_fixed, east_north_up, geodetic
+from pipeline.read.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
+from schemas.arrays import NS_PER_S, Floats
+from schemas.enums import Fix
+from schemas.errors import InputError
+from schemas.inputs import Gnss
+from schemas.run import Stream
+
+# RTKLIB manual, appendix B.1, "Q"; PPP is a service, as with other receivers.
+_QUALITY = {
+    0: Fix.NONE, 1: Fix.RTK_FIXED, 2: Fix.RTK_FLOAT, 3: Fix.SBAS, 4: Fix.DIFFERENTIAL, 5: Fix.AUTONOMOUS,
+    6: Fix.DIFFERENTIAL, 7: Fix.ESTIMATED,
+}  # fmt: skip
+_AHEAD_NS = {"GPST": 0, "UTC": 0, "JST": 9 * 3600 * NS_PER_S}  # of UTC, GPS time beside its leap seconds
+_TOGETHER = (
+    ("latitude", "longitude", "height"), ("x-ecef", "y-ecef", "z-ecef"), ("e-baseline", "n-baseline", "u-baseline"),
+    ("vx", "vy", "vz"),
+)  # fmt: skip
+_DATE = re.compile(r"\d{4}/\d\d?/\d\d?")
+_GEOID = "height over the geoid: left empty, since the file has no separation"
+CUT_ROW = "row that breaks off at the end of the file"
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What the header says: scale of the times, names of the columns without units, and the comments themselves."""
+
+    scale: str
+    columns: tuple[str, ...]
+    sexagesimal: bool
+    comments: str
+
+    @property
+    def tokens(self) -> int:
+        """Words in a row: time takes two, and a coordinate in degrees, minutes and seconds takes three."""
+        return 2 + len(self.columns) + (4 if self.sexagesimal else 0)
+
+
+def is_solution(content: bytes) -> bool:
+    """Whether a file begins as RTKLIB's solutions do."""
+    head = content[:4096].lstrip(b"\xef\xbb\xbf \r\n")
+    return head.startswith(b"%") and (b"RTKLIB" in head or re.search(rb"%\s+(GPST|UTC|JST)\b", head) is not None)
+
+
+def read_solution(content: bytes, path: Path) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
+    """`gnss` of a solution, and what was left out. Raises `InputError` for whatever the header does not explain."""
+    lines = content.decode("utf-8", "replace").splitlines()
+    layout = _layout([line for line in lines if line.startswith("%")], path)
+    rows, dropped = _rows(lines, layout, content.endswith((b"\n", b"\r")), path)
+    if not rows:
+        raise InputError("holds no epoch", place=str(path), expected="rows below the header")
+    words = np.array(rows)
+    frame = pl.DataFrame({"t": _times(words, layout, path), "solution": "primary"})
+    numbers = _numbers(words, layout, path)
+    columns = _place(numbers, layout, path) | _covariance(numbers, layout, path) | _quality(numbers, path)
+    if "geodetic" in layout.comments:
+        columns["height_m"] = None
+        dropped[_GEOID] = len(rows)
+    known = {
+        name: pl.Series(value, dtype=Gnss.columns()[name].dtype) for name, value in columns.items() if value is not None
+    }
+    fixes = frame.with_columns(**known)
+    is_placed = pl.col("fix") != Fix.NONE.value
+    kept = ("t", "solution", "fix", "satellites")
+    return {"gnss": fixes.with_columns(pl.when(is_placed).then(pl.exclude(kept)))}, dropped
+
+
+def _layout(comments: list[str], path: Path) -> _Layout:
+    headers = [re.split(r"[\s,;]+", line.lstrip("% ").strip()) for line in comments]
+    headers = [words for words in headers if words[0] in _AHEAD_NS and {"Q", "ns"} <= set(words)]
+    if not headers:
+        raise InputError(
+            "has no line that names its columns",
+            place=str(path),
+            expected="a line such as %  GPST  latitude(deg) longitude(deg) height(m) Q ns ...",
+            remedy="Let RTKLIB write its header (out-outhead = on): without it the scale of the times is not known.",
+        )
+    scale, *units = headers[0]
+    names = tuple(re.sub(r"\(.*\)$", "", word) for word in units)
+    lacking = [name for group in _TOGETHER if {*group} & {*names} for name in group if name not in names]
+    if lacking:
+        found, remedy = ", ".join(names), "Let RTKLIB write the file again."
+        raise InputError(f"has no column {', '.join(lacking)}", place=str(path), found=found, remedy=remedy)
+    places = {line for line in comments if "e-baseline" in names and re.match(r"%\s*ref pos\s*:", line)}
+    if any(words != headers[0] for words in headers) or len(places) > 1:
+        found = ", ".join(sorted({" ".join(words[:3]) for words in headers} | places))
+        remedy = "Give the files that were joined one by one."
+        raise InputError("holds solutions of several forms", place=str(path), found=found, remedy=remedy)
+    return _Layout(scale, names, any("(d'" in word for word in units), "\n".join(comments))
+
+
+def _rows(lines: list[str], layout: _Layout, ended: bool, path: Path) -> tuple[list[list[str]], dict[str, int]]:
+    """The words of each row; a last row without its end is left out."""
+    rows: list[list[str]] = []
+    for number, line in enumerate(lines, 1):
+        if line.startswith("%") or not line.strip():
+            continue
+        words = re.split(r"[\s,;]+", line.strip().rstrip(",;"))
+        if len(words) != layout.tokens:
+            if number == len(lines) and not ended:
+                return rows, {CUT_ROW: 1}
+            raise InputError(
+                "does not fit the header",
+                place=f"{path}: line {number}",
+                found=f"{len(words)} values",
+                expected=f"{layout.tokens}: time, {', '.join(layout.columns)}",
+                remedy="Take the line out, or let RTKLIB write the file again.",
+            )
+        rows.append(words)
+    return rows, {}
+
+
+def _times(words: Any, layout: _Layout, path: Path) -> pl.Series:
+    """UTC of the first two words of each row."""
+    if _DATE.fullmatch(words[0, 0]):
+        text = pl.Series(np.char.add(np.char.add(words[:, 0], "T"), words[:, 1]))
+        told = text.str.to_datetime("%Y/%m/%dT%H:%M:%S%.f", time_unit="ns", strict=False).dt.timestamp("ns")
+    else:
+        week = pl.Series(words[:, 0]).cast(pl.Int64, strict=False)
+        tow = pl.Series(words[:, 1]).cast(pl.Float64, strict=False)
+        in_week = (tow * 1e6).round().cast(pl.Int64, strict=False) * 1000  # RTKLIB writes microseconds at most
+        told = GPS_EPOCH_NS + week.set(~week.is_between(0, 9999), None) * WEEK_NS + in_week
+    if told.null_count():
+        row = int(told.is_null().arg_max() or 0)
+        raise InputError(
+            "is no time",
+            place=f"{path}: row {row + 1} of the epochs",
+            found=" ".join(words[row, :2]),
+            expected=f"y/m/d h:m:s, or week and seconds, in {layout.scale}",
+        )
+    t_ns = told.to_numpy()
+    utc = utc_from_gps(t_ns) if layout.scale == "GPST" else t_ns - _AHEAD_NS[layout.scale]
+    return pl.Series(utc).cast(pl.Datetime("ns", "UTC"))
+
+
+def _numbers(words: Any, layout: _Layout, path: Path) -> dict[str, Floats]:
+    """The columns by name; degrees, minutes and seconds made degrees."""
+    rest = words[:, 2:]
+    try:
+        values = rest.astype(np.float64)
+    except ValueError as error:
+        raise InputError(f"holds a value that is no number: {error}", place=str(path)) from None
+    if layout.sexagesimal:
+        values = np.hstack([_degrees(rest[:, :6]), values[:, 6:]])
+    return dict(zip(layout.columns, values.T, strict=True))
+
+
+def _degrees(words: Any) -> Floats:
+    """Latitude and longitude of two times degrees, minutes and seconds; -0 degrees have a sign as well."""
+    signs = np.where(np.char.startswith(words[:, [0, 3]], "-"), -1.0, 1.0)
+    degrees: Floats = signs * (np.abs(words.astype(np.float64)).reshape(-1, 2, 3) @ np.array([1.0, 1 / 60, 1 / 3600]))
+    return degrees
+
+
+def _place(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:
+    """Place and, where given, velocity."""
+    if "Tokyo" in layout.comments:
+        raise InputError("is in the Tokyo datum", place=str(path), expected="WGS 84", remedy="Set out-datum = wgs84.")
+    if "latitude" in numbers:
+        names = ("latitude_deg", "longitude_deg", "height_m")
+        place = {name: numbers[name.rpartition("_")[0]] for name in names}
+    elif "x-ecef" in numbers:
+        place = geodetic(*(numbers[f"{axis}-ecef"] for axis in "xyz"))
+    elif "e-baseline" in numbers:
+        place = _at_baseline(numbers, layout, path)
+    else:
+        raise InputError(
+            "holds no places",
+            place=str(path),
+            found=", ".join(numbers),
+            expected="latitude and longitude, x/y/z-ecef, or e/n/u-baseline",
+        )
+    return place | _velocity(numbers, place)
+
+
+def _velocity(numbers: dict[str, Floats], place: dict[str, Floats]) -> dict[str, Any]:
+    if "vx" in numbers:
+        turn = east_north_up(place["latitude_deg"], place["longitude_deg"])
+        local = np.einsum("ijn,jn->in", turn, np.array([numbers["vx"], numbers["vy"], numbers["vz"]]))
+        return dict(zip(("vel_e_mps", "vel_n_mps", "vel_u_mps"), local, strict=True))
+    return {f"vel_{axis}_mps": numbers[f"v{axis}"] for axis in "enu" if f"v{axis}" in numbers}
+
+
+def _at_baseline(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:
+    """Places from baselines: the reference stands in the header, in the form that places have."""
+    told = re.search(r"^%\s*ref pos\s*:\s*(.*)$", layout.comments, re.MULTILINE)
+    words = np.array(re.split(r"[\s,;]+", told[1].strip()) if told else [])
+    values = words.astype(np.float64)
+    if len(values) == 7:  # degrees, minutes and seconds
+        values = np.append(_degrees(words[None, :6]), values[6:])
+    if len(values) != 3:
+        raise InputError(
+            "holds baselines without the base station's position",
+            place=str(path),
+            expected="% ref pos : latitude longitude height in the header",
+            remedy="Let RTKLIB write latitude, longitude and height (out-solformat = llh).",
+        )
+    base = np.array(earth_fixed(*values))
+    baseline = np.array([numbers[f"{axis}-baseline"] for axis in "enu"])
+    return geodetic(*(base[:, None] + east_north_up(values[0], values[1]).T @ baseline))
+
+
+def _covariance(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:
+    """Deviations, and of two axes the signed root of their covariance, as variances [m2]."""
+    axes = "xyz" if "sdx" in numbers else "enu"
+    matrix = np.zeros((3, 3, len(numbers["Q"])))
+    for row, first in enumerate(axes):
+        for column, second in enumerate(axes):
+            names = (f"sd{first}",) if row == column else (f"sd{first}{second}", f"sd{second}{first}")
+            name = next((name for name in names if name in numbers), None)
+            if name is None:
+                return {}
+            matrix[row, column] = np.sign(numbers[name]) * numbers[name] ** 2
+    if axes == "xyz":
+        place = _place(numbers, layout, path)
+        turn = east_north_up(place["latitude_deg"], place["longitude_deg"])
+        matrix = np.einsum("ijn,jkn,lkn->iln", turn, matrix, turn)
+    upper = {f"cov_{a}{b}_m2": matrix[i, j] for i, a in enumerate("enu") for j, b in enumerate("enu") if i <= j}
+    # No deviation at all is how RTKLIB writes that it has none.
+    unknown = (matrix[0, 0] <= 0) & (matrix[1, 1] <= 0)
+    return {name: pl.Series(values).set(pl.Series(unknown), None) for name, values in upper.items()}
+
+
+def _quality(numbers: dict[str, Floats], path: Path) -> dict[str, Any]:
+    strange = [code for code in np.unique(numbers["Q"]) if code not in _QUALITY]
+    if strange:
+        raise InputError(
+            "holds a quality that RTKLIB does not know",
+            place=f"{path}: column Q",
+            found=", ".join(f"{code:g}" for code in strange),
+            expected="0 to 7",
+        )
+    kinds = [_QUALITY[int(code)].value for code in numbers["Q"]]
+    columns: dict[str, Any] = {"fix": kinds, "satellites": numbers["ns"].astype(np.int64)}
+    if "age" in numbers:
+        sbas = pl.Series(kinds) == Fix.SBAS.value
+        columns["sbas_age_s"] = pl.Series(numbers["age"]).set(~sbas, None)
+    return columns

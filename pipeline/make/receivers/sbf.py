@@ -1,0 +1,100 @@
+"""Septentrio SBF: PVTGeodetic or PVTCartesian with their covariances and DOP (HPL, VPL), gathered by GPS time."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+
+from pipeline.make.receivers.earth_fixed import east_north_up, geodetic, local_velocity
+from pipeline.make.receivers.epochs import Epoch, Gathered, covariance
+from pipeline.read.ingest.recipes_drivers import SBF_FIXES
+from pipeline.read.ingest.timescale import utc_of_week
+from schemas.enums import Fix
+
+_NO_TOW, _NO_WEEK = 0xFFFFFFFF, 0xFFFF
+_DO_NOT_USE = -2e10
+_SBAS_PRNS = range(120, 159)
+
+
+def parse(raw: bytes) -> Any:
+    """The block, none if it is of no interest."""
+    from pysbf2 import SBFReader
+
+    return SBFReader.parse(raw) if int.from_bytes(raw[4:6], "little") & _BLOCK_NUMBER in _WANTED else None
+
+
+def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
+    """Add what this block says to its epoch."""
+    decoder = _DECODERS[message.identity]
+    tow_ms, week = struct.unpack_from("<IH", raw, 8)
+    if tow_ms == _NO_TOW or week == _NO_WEEK:
+        gathered.drop("time not valid")
+        return
+    position = message.identity if message.identity in _POSITIONS else ""
+    epoch = gathered.at((week, tow_ms), position, raw)
+    epoch.t_ns = utc_of_week(week, tow_ms * 1_000_000)
+    decoder(epoch, message)
+
+
+def _solution(epoch: Epoch, m: Any) -> bool:
+    """What both PVT blocks share; true where they hold a position."""
+    fix = SBF_FIXES.get(m.Type, Fix.NONE) if m.Error == 0 else Fix.NONE
+    epoch.gnss |= {"fix": fix.value, "satellites": m.NrSV if m.NrSV != 255 else None}
+    # Base stations are numbered too: only an SBAS solution refers to a satellite.
+    if fix is Fix.SBAS and m.ReferenceID in _SBAS_PRNS:
+        epoch.gnss["sbas_prn"] = m.ReferenceID
+        epoch.gnss["sbas_age_s"] = m.MeanCorrAge if round(m.MeanCorrAge * 100) != _NO_WEEK else None
+    return fix is not Fix.NONE
+
+
+def _geodetic(epoch: Epoch, m: Any) -> None:
+    if _solution(epoch, m) and m.Latitude != _DO_NOT_USE:
+        place = {"latitude_deg": float(np.degrees(m.Latitude)), "longitude_deg": float(np.degrees(m.Longitude))}
+        epoch.gnss |= place | _known({"height_m": m.Height, "vel_e_mps": m.Ve, "vel_n_mps": m.Vn, "vel_u_mps": m.Vu})
+
+
+def _cartesian(epoch: Epoch, m: Any) -> None:
+    if not _solution(epoch, m) or m.X == _DO_NOT_USE:
+        return
+    place = geodetic(m.X, m.Y, m.Z)
+    epoch.gnss |= place
+    if m.Vx != _DO_NOT_USE:
+        epoch.gnss |= local_velocity(place["latitude_deg"], place["longitude_deg"], (m.Vx, m.Vy, m.Vz))
+
+
+def _geodetic_covariance(epoch: Epoch, m: Any) -> None:
+    epoch.gnss |= _known(covariance(m.Cov_lonlon, m.Cov_latlon, m.Cov_lonhgt, m.Cov_latlat, m.Cov_lathgt, m.Cov_hgthgt))
+
+
+def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
+    """Turned into east, north, up where the epoch's position is known (SBF writes it first)."""
+    latitude, longitude = epoch.gnss.get("latitude_deg"), epoch.gnss.get("longitude_deg")
+    if latitude is None or longitude is None or m.Cov_xx == _DO_NOT_USE:
+        return
+    turn = east_north_up(latitude, longitude)
+    xx, yy, zz, xy, xz, yz = m.Cov_xx, m.Cov_yy, m.Cov_zz, m.Cov_xy, m.Cov_xz, m.Cov_yz
+    local = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+    epoch.gnss |= _known(covariance(*local[np.triu_indices(3)]))
+
+
+def _protection(epoch: Epoch, m: Any) -> None:
+    epoch.gnss |= _known({"hpl_m": m.HPL, "vpl_m": m.VPL})
+
+
+def _known(values: dict[str, float]) -> dict[str, float]:
+    """Septentrio marks what it does not know with -2e10."""
+    return {name: value for name, value in values.items() if value != _DO_NOT_USE}
+
+
+_BLOCK_NUMBER = 0x1FFF  # the other bits of the id are the revision
+_POSITIONS = ("PVTGeodetic", "PVTCartesian")
+_WANTED = (4001, 4006, 4007, 5905, 5906)
+_DECODERS = {
+    "PVTGeodetic": _geodetic,
+    "PVTCartesian": _cartesian,
+    "PosCovGeodetic": _geodetic_covariance,
+    "PosCovCartesian": _cartesian_covariance,
+    "DOP": _protection,
+}

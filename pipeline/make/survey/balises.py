@@ -1,0 +1,166 @@
+"""Balises on the net elements: every so many metres, or where a list says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from pipeline.make.survey.network import Network
+from pipeline.make.survey.pieces import Survey, measures_at
+from pipeline.make.survey.sources import content_of_survey
+from pipeline.make.survey.tables import placed_table
+from pipeline.read.site.tables import RawTable, typed_table
+from pipeline.stages.matching.candidates import candidates_of, segments_of
+from pipeline.stages.track.geodesy import points_of
+from pipeline.stages.track.network import network_of
+from pipeline.stages.track.survey import Track, track_of
+from schemas.config import Configuration, SurveyConfig
+from schemas.enums import BaliseDirection, TravelAlong
+from schemas.errors import SiteError
+from schemas.inputs import Balises
+
+
+def balises_every(network: Network, spacing_m: float, travel: TravelAlong) -> pl.DataFrame:
+    """Virtual balises at whole multiples of the spacing, counted along the shortest way from the survey's start.
+
+    So the spacing holds over joints and switches; where two ways meet again it begins anew. `travel`: for trains away
+    from the survey's start, back to it, or both.
+    """
+    track = track_of(network.track)
+    from_start = _from_start_m(network.ends, track.length_m)
+    rows: list[dict[str, Any]] = []
+    for element, name in enumerate(track.ids):
+        at_start, at_end = from_start[network.ends[element]]
+        length = float(track.length_m[element])
+        begins = min(at_start, at_end)
+        way = np.arange(np.floor(begins / spacing_m) + 1, np.floor((begins + length) / spacing_m) + 1) * spacing_m
+        away = bool(at_start <= at_end)
+        measures = way - begins if away else length - (way - begins)
+        own = {"netelement_id": name, "direction": _direction(away, travel).value}
+        rows += [{**own, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
+    ids = [f"VB{number:0{len(str(len(rows)))}}" for number in range(1, len(rows) + 1)]
+    table = pl.DataFrame(rows, schema={"netelement_id": pl.String, "direction": pl.String, "measure_m": pl.Float64})
+    return _typed("balises", table.with_columns(pl.Series("balise_id", ids, dtype=pl.String), kind=pl.lit("virtual")))
+
+
+def _direction(away: bool, travel: TravelAlong) -> BaliseDirection:
+    """Along a net element whose measure grows away from the survey's start, or towards it."""
+    if travel is TravelAlong.BOTH:
+        return BaliseDirection.BOTH
+    return BaliseDirection.AB if away == (travel is TravelAlong.AHEAD) else BaliseDirection.BA
+
+
+def _typed(place: str, table: pl.DataFrame) -> pl.DataFrame:
+    breaches: list[str] = []
+    typed = typed_table(RawTable(place, table), "balises", breaches)
+    if typed is None:
+        raise SiteError(breaches[0])
+    if (repeated := typed.filter(typed["balise_id"].is_duplicated())["balise_id"]).len():
+        raise SiteError("occurs more than once", place=f"{place}: column balise_id", found=repeated[0])
+    return Balises.validate(typed, cast=True)
+
+
+def _from_start_m(ends: np.ndarray, length_m: np.ndarray) -> np.ndarray:
+    """Distance of each node from the start of the first element of its part of the network."""
+    count = int(ends.max()) + 1
+    pairs = np.sort(ends, axis=1)
+    order = np.lexsort((length_m, pairs[:, 1], pairs[:, 0]))
+    _, first = np.unique(pairs[order], axis=0, return_index=True)
+    kept = order[first]
+    graph = coo_array((length_m[kept], (pairs[kept, 0], pairs[kept, 1])), shape=(count, count)).tocsr()
+    found = np.full(count, np.inf)
+    for node in ends[:, 0].tolist():
+        if not np.isfinite(found[node]):
+            found = np.minimum(found, dijkstra(graph, directed=False, indices=node))
+    return found
+
+
+def balises_of_list(
+    path: Path, network: Network, epsg: int | None, survey: Survey, config: Configuration
+) -> pl.DataFrame:
+    """The balises of a table, each at its net element and measure, its coordinates, or its line kilometre.
+
+    Raises `SiteError` for a balise that no track, or more than one, can be meant for.
+    """
+    place = str(path)
+    table = placed_table(place, content_of_survey(path), epsg, config.site)
+    track = track_of(network.track)
+    if "balise_id" not in table.columns:
+        table = table.with_columns(balise_id=pl.Series([f"B{row}" for row in range(1, table.height + 1)]))
+    kind = pl.col("kind").fill_null("virtual") if "kind" in table.columns else pl.lit("virtual")
+    table = table.with_columns(kind=kind)
+    placer = _Placer(place, network, track, survey, config.survey)
+    found = [placer.placed(row) for row in table.iter_rows(named=True)]
+    columns = {"netelement_id": pl.String, "measure_m": pl.Float64}
+    placed = pl.DataFrame(found, schema=columns, orient="row")
+    return _typed(place, table.with_columns(placed))
+
+
+class _Placer:
+    """Where on the track a row of a list is."""
+
+    def __init__(self, place: str, network: Network, track: Track, survey: Survey, config: SurveyConfig) -> None:
+        self.place, self.network, self.track, self.survey, self.config = place, network, track, survey, config
+        self.ground, self.segments = network_of(track, network.links), segments_of(track)
+
+    def placed(self, row: dict[str, Any]) -> tuple[str, float]:
+        given = {key for key, value in row.items() if value is not None}
+        if {"netelement_id", "measure_m"} <= given:
+            return str(row["netelement_id"]), float(row["measure_m"])
+        if {"latitude_deg", "longitude_deg"} <= given:
+            return self._at_coordinates(row)
+        if "line_km" in given:
+            return self._at_kilometre(row)
+        expected = "latitude_deg and longitude_deg (or x_m and y_m), line_km, or netelement_id and measure_m"
+        raise self._refusal(row, "has no place", expected=expected)
+
+    def _refusal(self, row: dict[str, Any], message: str, **told: str) -> SiteError:
+        return SiteError(message, place=f"{self.place}: balise {row['balise_id']}", **told)
+
+    def _at_coordinates(self, row: dict[str, Any]) -> tuple[str, float]:
+        point = points_of(np.array([row["latitude_deg"]]), np.array([row["longitude_deg"]]))
+        far_m = self.config.balise_beside_m
+        near = candidates_of(point, self.ground, self.segments, 2 * far_m)
+        ranked = sorted(zip(near.distance_m.tolist(), near.element.tolist(), near.along_m.tolist(), strict=True))
+        wanted = row.get("netelement_id")
+        if wanted is not None:
+            ranked = [one for one in ranked if self.track.ids[one[1]] == wanted]
+        if not ranked or ranked[0][0] > far_m:
+            found = f"{ranked[0][0]:.1f} m" if ranked else f"none within {2 * far_m:g} m"
+            raise self._refusal(row, "lies beside the track", found=found, expected=f"at most {far_m:g} m")
+        self._tell_rival(row, ranked)
+        return self.track.ids[ranked[0][1]], ranked[0][2]
+
+    def _tell_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
+        near = [one for one in ranked[1:] if one[0] < ranked[0][0] + self.config.same_track_m]
+        nodes = set(self.network.ends[ranked[0][1]].tolist())
+        for _, other, _ in near:
+            if not nodes & set(self.network.ends[other].tolist()):
+                text = f"may as well lie on {self.track.ids[other]} as on {self.track.ids[ranked[0][1]]}"
+                self.survey.told("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
+
+    def _at_kilometre(self, row: dict[str, Any]) -> tuple[str, float]:
+        wanted, km = row.get("netelement_id"), float(row["line_km"])
+        found = [
+            (element.name, measure)
+            for number, element in enumerate(self.network.elements)
+            if wanted in (None, element.name)
+            for measure in measures_at(
+                element.line_km, self.track.measure_m[self.track.vertices(number)], km, self.config
+            )
+        ]
+        if not found:
+            expected = "a line kilometre of the survey, not one that it jumps over"
+            raise self._refusal(row, f"no track has line kilometre {km:g}", expected=expected)
+        # A joint is the end of one element and the start of the next: one place.
+        inner = [one for one in found if one[1] > 0] or found
+        if len(inner) > 1:
+            places = ", ".join(f"{name} at {measure:.1f} m" for name, measure in sorted(inner))
+            remedy = "Name netelement_id in the list; where one element has it twice, give measure_m too."
+            raise self._refusal(row, f"line kilometre {km:g} is on {places}", remedy=remedy)
+        return inner[0]

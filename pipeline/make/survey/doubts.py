@@ -1,0 +1,165 @@
+"""What is doubtful about a network made of a survey, beside what every site is checked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+
+from pipeline.make.survey.network import Network, arms_of
+from pipeline.make.survey.pieces import Piece, kilometre_spans
+from pipeline.stages.matching.candidates import candidates_of, segments_of
+from pipeline.stages.track.geodesy import points_of, way_m
+from pipeline.stages.track.network import Network as Ground
+from pipeline.stages.track.network import network_of
+from pipeline.stages.track.segments import SAMPLE_SPACING_M
+from pipeline.stages.track.survey import in_pieces, places_along, track_of
+from schemas.arrays import Floats
+from schemas.config import SiteConfig, SurveyConfig
+from schemas.enums import Navigability
+from schemas.run import Finding
+
+
+def doubts(network: Network, config: SurveyConfig, site: SiteConfig) -> list[Finding]:
+    """Kinks, tracks that were surveyed twice, open ends beside other track, heights and kilometres that do not fit."""
+    track = track_of(network.track)
+    in_parts = network_of(in_pieces(track), network.links)
+    found = [*_heights(network.elements), *_doubled(in_parts, config)]
+    found += _open_ends(network_of(track, network.links), config.same_track_m, site.near_ends_m)
+    for element in network.elements:
+        found += [*_kinks(element, config), *_kilometres(element, config), *_scattered(element, config)]
+    return [*found, *_corners(network, config)]
+
+
+def _heights(elements: list[Piece]) -> Iterator[Finding]:
+    flat = [np.isnan(element.height_m).all() for element in elements]
+    if all(flat):
+        text = "no point has a height: the site is 2-D, and nothing is diagnosed in height"
+        yield Finding("note", "track: column height_m", text)
+        return
+    for element in elements:
+        missing = int(np.isnan(element.height_m).sum())
+        if 0 < missing < len(element):
+            text = f"{missing} of {len(element)} points have no height: the element is taken as 2-D"
+            yield Finding("warning", f"track: {element.name}", text, "Survey all or none.")
+    text = "heights are taken as ellipsoidal (WGS 84); maps and many programs give them above sea level"
+    yield Finding("note", "track: column height_m", text, "Leave them out with --flat if you are not sure.")
+
+
+def _kinks(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
+    steps = np.diff(element.surface, axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    unit = steps / length[:, None]
+    turn = np.arccos(np.clip(np.einsum("ij,ij->i", unit[:-1], unit[1:]), -1.0, 1.0))
+    short = np.minimum(length[:-1], length[1:])
+    sharp = (turn > np.radians(config.corner_deg)) & (short / np.maximum(turn, 1e-9) < config.kink_radius_m)
+    # A corner within centimetres is how dense surveys scatter.
+    aside = short * np.sin(np.minimum(turn, np.pi / 2)) > config.kink_aside_m
+    kinks = np.flatnonzero(aside & (sharp | (turn > np.radians(config.kink_deg))))
+    if len(kinks):
+        worst = kinks[int(np.argmax(turn[kinks]))] + 1
+        sharpest = f"{np.degrees(turn[worst - 1]):.0f} degrees at {element.place(worst)}"
+        text = f"{len(kinks)} kinks; the sharpest turns by {sharpest}"
+        yield Finding("warning", f"track: {element.name}", text, "Look whether a point is wrong or out of order.")
+
+
+def _corners(network: Network, config: SurveyConfig) -> Iterator[Finding]:
+    """Kinks where two elements meet that a train runs over."""
+    used = network.links.filter(pl.col("navigability").cast(pl.String) != Navigability.NONE.value)
+    passed = set(used.select("netelement_a", "position_a").iter_rows())
+    for meeting in arms_of(network.ends).values():
+        first = network.elements[meeting[0][0]].name, meeting[0][1]
+        if len(meeting) == 2 and meeting[0][0] != meeting[1][0] and first in passed:
+            one, other = (_last_step(network.elements[element], position) for element, position in meeting)
+            corner = replace(one.followed_by(other.take([0])), name=f"{one.name}, {other.name}")
+            yield from _kinks(corner, config)
+
+
+def _last_step(element: Piece, position: int) -> Piece:
+    """The last two points before an end, the end last."""
+    return element.take([1, 0] if position == 0 else [-2, -1])
+
+
+def _kilometres(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
+    way = way_m(element.surface)
+    known, off_m, jumps = kilometre_spans(element.line_km, way, config)
+    if jumps.any():
+        row = int(np.argmax(np.where(jumps, off_m, 0.0)))
+        first, last = known[row], known[row + 1]
+        text = (
+            f"line kilometre goes from {element.line_km[first]:.3f} to {element.line_km[last]:.3f} "
+            f"over {way[last] - way[first]:.0f} m of track ({jumps.sum()} such places)"
+        )
+        yield Finding("warning", f"track: {element.name}", text, "A jump of the kilometres, or points out of order.")
+
+
+def _scattered(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
+    """Points that lie aside of a smooth line through their neighbours make the element longer than the track is."""
+    flat, solid = replace(element, height_m=np.zeros(len(element))).solid, element.solid
+    way = way_m(flat)
+    by_plan = _longer_m(flat, way, config.uneven_steps)
+    by_height = max(0.0, min(_longer_m(solid, way, config.uneven_steps) - by_plan, float(way_m(solid)[-1] - way[-1])))
+    if by_plan + by_height > max(config.shape_m, config.longer_share * way[-1]):
+        what, longer_m, remedy = "positions", by_plan, "Export all decimals; do not draw by hand."
+        if by_height > by_plan:
+            what, longer_m, remedy = "heights", by_height, "Mend them, or leave them out with --flat."
+        text = f"{what} scatter: they make the element about {longer_m:.1f} m longer than the track is"
+        yield Finding("warning", f"track: {element.name}", text, remedy)
+
+
+def _longer_m(places: Floats, way: Floats, uneven_steps: float) -> float:
+    """By how much scatter lengthens a line: each point's variance over its spacing.
+
+    The variance is that of its distance from the cubic through two neighbours on either side, which curves and
+    transitions follow; points with neighbours at uneven distances cannot be judged.
+    """
+    if len(way) < 5:
+        return 0.0
+    at = np.stack([way[shift : len(way) - 4 + shift] for shift in range(5)])
+    step = np.diff(at, axis=0)
+    even = step.max(axis=0) < uneven_steps * step.min(axis=0)
+    sides = (0, 1, 3, 4)
+    factors = ([(at[2] - at[k]) / (at[own] - at[k]) for k in sides if k != own] for own in sides)
+    weights = np.stack([np.prod(own, axis=0) for own in factors])
+    beside = np.stack([places[shift : len(way) - 4 + shift] for shift in sides])
+    miss = places[2:-2] - np.einsum("kn,knj->nj", weights, beside)
+    variance_m2 = (miss**2).sum(axis=1) / (1.0 + (weights**2).sum(axis=0))
+    return float((variance_m2 / step.mean(axis=0))[even].sum())
+
+
+def _doubled(ground: Ground, config: SurveyConfig) -> Iterator[Finding]:
+    """Tracks that lie on each other; an element that turns back is in pieces, which are compared like others."""
+    track = ground.track
+    along = places_along(track, SAMPLE_SPACING_M)
+    segments, both = segments_of(track), []
+    # So many at once as can be held.
+    for rows in np.array_split(np.arange(len(along.element)), 1 + len(along.element) // 100_000):
+        points = points_of(along.latitude_deg[rows], along.longitude_deg[rows])
+        found = candidates_of(points, ground, segments, config.same_track_m)
+        own = along.element[rows][found.step]
+        both.append(np.column_stack([own, found.element])[own < found.element])
+    pairs, count = np.unique(np.concatenate(both), axis=0, return_counts=True)
+    for (one, other), samples in zip(pairs.tolist(), count.tolist(), strict=True):
+        if samples * SAMPLE_SPACING_M > config.doubled_m:
+            whom = "itself" if track.ids[one] == track.ids[other] else track.ids[other]
+            text = f"lies within {config.same_track_m:g} m of {whom} over {samples * SAMPLE_SPACING_M:.0f} m"
+            yield Finding("warning", f"track: {track.ids[one]}", text, "Look whether one track was surveyed twice.")
+
+
+def _open_ends(ground: Ground, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
+    """Ends that lie beside the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
+    track = ground.track
+    element, position = np.nonzero(~ground.linked_ends())
+    row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)
+    points = points_of(track.latitude_deg[row], track.longitude_deg[row])
+    # Farther aside is the next track.
+    found = candidates_of(points, ground, segments_of(track), 2 * same_track_m)
+    middle = np.minimum(found.along_m, found.left_m) > near_ends_m
+    for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
+        end, other = int(found.step[near]), track.ids[int(found.element[near])]
+        beside = f"{found.distance_m[near]:.1f} m from the middle of {other}"
+        text = f"end {position[end]} lies {beside} and is not joined to it"
+        remedy = "Give both lines a point in common there, if it is a switch."
+        yield Finding("warning", f"track: {track.ids[int(element[end])]}", text, remedy)

@@ -1,0 +1,112 @@
+"""Lines of GeoJSON: net elements with their relations; of OpenStreetMap the railways that trains run on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pipeline.make.survey.pieces import Survey, piece_of
+from pipeline.read.site.geojson import has_relations, parts_of, read_network, triple
+from pipeline.read.site.read import to_wgs84
+from schemas.config import SiteConfig
+from schemas.errors import SiteError, listed
+
+# https://wiki.openstreetmap.org/wiki/Key:railway: what a train can run on today.
+_IN_USE = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "funicular", "monorail", "miniature")
+_CROSSINGS = ("railway_crossing", "tram_crossing_railway")
+_IDS = ("@id", "id", "netelement_id", "osm_id", "full_id", "name")
+
+
+def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig) -> Survey:
+    """Each LineString a piece, named by its own id. Where features have a `railway`, only those in use are taken.
+
+    A network that gives net relations (RailTopoModel, ERA RINF) is taken as it is. Raises `SiteError`.
+    """
+    try:
+        items = json.loads(data)["features"]
+        if has_relations(items):
+            return _of_network(place, data, config)
+        features = [_feature(item) for item in items]
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        remedy = "Overpass exports GeoJSON under Export; its own JSON and .osm are not read."
+        told = f"is not a GeoJSON FeatureCollection ({type(error).__name__}: {error})"
+        raise SiteError(told, place=place, remedy=remedy) from None
+    survey = Survey()
+    railways = any("railway" in tags for tags, _ in features)
+    left: dict[str, int] = {}
+    for number, (tags, geometry) in enumerate(features):
+        kind = _kind(tags) if railways else "line"
+        lines = list(_lines(geometry))
+        if geometry.get("type") == "Point" and kind in (*_CROSSINGS, "switch"):
+            longitude, latitude, _ = _numbers(f"{place}: feature {number}", geometry.get("coordinates"))
+            (survey.switches_deg if kind == "switch" else survey.crossings_deg).append((latitude, longitude))
+        elif lines and (not railways or kind in _IN_USE):
+            name = next((str(tags[key]).strip() for key in _IDS if tags.get(key) not in (None, "")), stem)
+            for line in lines:
+                survey.pieces.append(_piece(f"{place}: feature {number}", name, line))
+        elif lines:
+            left[kind] = left.get(kind, 0) + 1
+    for kind, count in sorted(left.items()):
+        survey.told("note", place, f"{count} lines with railway={kind} are left out: no train runs there")
+    return survey
+
+
+def _of_network(place: str, data: bytes, config: SiteConfig) -> Survey:
+    """Net elements whole, with the relations that the network gives between their ends."""
+    breaches: list[str] = []
+    network = read_network(place, data, breaches)
+    if network is None or breaches:
+        raise SiteError(listed(breaches), remedy="Correct these features of the network.")
+    points = to_wgs84(network.track, network.track.frame, config, breaches)
+    if breaches:
+        raise SiteError(listed(breaches))
+    survey = Survey(declared_m=network.declared_length_m)
+    for (name,), own in points.group_by("netelement_id", maintain_order=True):
+        survey.pieces.append(piece_of(place, str(name), own.drop("netelement_id").to_dict(), whole=True))
+    if network.links is not None:
+        survey.relations += network.links.frame.rows()
+    if network.ignored:
+        text = f"{network.ignored} features are not used: they are neither net element nor relation"
+        survey.told("note", place, text)
+    return survey
+
+
+def _kind(tags: Mapping[str, Any]) -> str:
+    """The value of `railway`; a railway out of use may have a tag of its own for that."""
+    return next((key for key in ("disused", "abandoned") if tags.get(key) == "yes"), str(tags.get("railway")))
+
+
+def _feature(item: Any) -> tuple[dict[str, Any], Mapping[str, Any]]:
+    """Tags and geometry; some programs put tags into a property of their own."""
+    properties, geometry = parts_of(item)
+    nested = properties.get("tags")
+    tags = dict(properties) | (dict(nested) if isinstance(nested, Mapping) else {})
+    if item.get("id") not in (None, ""):
+        tags["@id"] = item["id"]
+    return tags, geometry
+
+
+def _lines(geometry: Mapping[str, Any]) -> Iterator[Any]:
+    coordinates = geometry.get("coordinates")
+    if geometry.get("type") == "LineString":
+        yield coordinates
+    elif geometry.get("type") == "MultiLineString" and isinstance(coordinates, list):
+        yield from coordinates
+
+
+def _piece(place: str, name: str, line: Any) -> Any:
+    if not isinstance(line, list):
+        raise SiteError("coordinates are no list", place=place)
+    triples = [_numbers(place, point) for point in line]
+    longitude, latitude, height = zip(*triples, strict=True) if triples else ((), (), ())
+    return piece_of(place, name, {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height})
+
+
+def _numbers(place: str, point: Any) -> tuple[float, float, float | None]:
+    try:
+        return triple(point)
+    except ValueError:
+        raise SiteError(
+            "a coordinate cannot be read", place=place, found=repr(point)[:60], expected="[longitude, latitude]"
+        ) from None

@@ -1,0 +1,125 @@
+"""The story from surveys to a site."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from pipeline.make.survey.balises import balises_every, balises_of_list
+from pipeline.make.survey.doubts import doubts
+from pipeline.make.survey.network import Network, make_network
+from pipeline.make.survey.pieces import Survey
+from pipeline.make.survey.sources import read_surveys
+from pipeline.make.survey.trace import clean_traces
+from pipeline.read.site.checks import remarks
+from pipeline.read.site.describe import without_balises
+from pipeline.storage.parquet import parquet_bytes
+from pipeline.storage.writing import replace_files
+from schemas.config import Configuration, Vehicle
+from schemas.enums import TravelAlong
+from schemas.errors import SiteError, UsageError
+from schemas.run import Finding, Site
+
+_FILES = ("track", "links", "balises", "route")
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a site is made of: balises every so many metres or of a list; ends this near [m] meet.
+
+    `travel`: for which direction of travel those every so many metres are valid.
+    """
+
+    surveys: list[Path]
+    spacing_m: float | None = None
+    travel: TravelAlong = TravelAlong.BOTH
+    balise_list: Path | None = None
+    epsg: int | None = None
+    join_m: float | None = None
+    flat: bool = False
+
+
+def wish_of(
+    surveys: list[Path],
+    balises: str | None,
+    epsg: int | None,
+    join_m: float | None,
+    flat: bool,
+    travel: TravelAlong = TravelAlong.BOTH,
+) -> Wish:
+    """The words of the command; `--balises every 1000` leaves its number among the surveys. Raises `UsageError`."""
+    words = [str(path) for path in surveys]
+    spacing: float | None = None
+    if balises is not None and balises.startswith("every"):
+        text = balises.removeprefix("every").strip(" =:")
+        if not text:
+            text = next((word for word in words if _number(word) is not None and not Path(word).exists()), "")
+            surveys = [path for path in surveys if str(path) != text]
+        spacing = _number(text.removesuffix("m"))
+        if spacing is None or not 1.0 <= spacing <= 1e6:
+            raise UsageError("is no spacing", place=f"--balises {balises}", expected="every 1000 (metres)")
+    if not surveys:
+        raise UsageError("no survey is named", expected="GPX, KML, GeoJSON, CSV or a run")
+    if spacing is None and travel is not TravelAlong.BOTH:
+        remedy = "In a list of balises the column `direction` says it, one by one."
+        raise UsageError("needs --balises every N", place=f"--direction {travel.value}", remedy=remedy)
+    return Wish(surveys, spacing, travel, None if spacing or balises is None else Path(balises), epsg, join_m, flat)
+
+
+def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
+    """The site of surveys, with findings of the survey and of the site itself. `track` has `line_km` besides.
+
+    Raises `SiteError`, `UsageError`.
+    """
+    if wish.join_m is not None and not 0.0 <= wish.join_m <= config.site.joined_m:
+        expected = f"0 to {config.site.joined_m:g} m"
+        raise UsageError("is no reach", place=f"--join {wish.join_m:g}", expected=expected)
+    survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config), config.survey)
+    if wish.flat:
+        survey.pieces = [replace(piece, height_m=np.full(len(piece), np.nan)) for piece in survey.pieces]
+    network = make_network(survey, wish.join_m, config.survey)
+    if not network.elements:
+        raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
+    balises = _balises(wish, network, survey, config)
+    track = network.track
+    found = remarks(track, network.links, balises, None, survey.declared_m, config.site)
+    if found.breaches:
+        raise SiteError(found.breaches[0], place=", ".join(map(str, wish.surveys)))
+    findings = (
+        *survey.findings,
+        *doubts(network, config.survey, config.site),
+        *found.findings,
+        *without_balises(balises),
+    )
+    # Relations as given: what no train can run over is said, and left out, each time that the site is read.
+    return Site(track, network.links, balises, None, findings)
+
+
+def _balises(wish: Wish, network: Network, survey: Survey, config: Configuration) -> pl.DataFrame | None:
+    if wish.spacing_m is not None:
+        table = balises_every(network, wish.spacing_m, wish.travel)
+        return table if table.height else None
+    return None if wish.balise_list is None else balises_of_list(wish.balise_list, network, wish.epsg, survey, config)
+
+
+def write_made(site: Site, page: str, out: Path, force: bool) -> None:
+    """The site as Parquet and its page; a site that is there stays, unless `force`. Raises `UsageError`."""
+    there = [name for name in _FILES for suffix in ("parquet", "csv", "geojson") if (out / f"{name}.{suffix}").exists()]
+    if there and not force:
+        raise UsageError("holds a site", place=str(out), remedy="Name another folder, or replace it with --force.")
+    contents = {f"{name}.{suffix}": None for name in _FILES for suffix in ("csv", "geojson", "parquet")}
+    tables = {"track": site.track, "links": site.links, "balises": site.balises}
+    written = {f"{name}.parquet": parquet_bytes(table) for name, table in tables.items() if table is not None}
+    told = pl.DataFrame([asdict(one) for one in site.findings], schema=list(Finding.__dataclass_fields__))
+    beside = {"findings.csv": told.write_csv().encode(), "site.html": page.encode()}
+    replace_files(out, {**contents, **written, **beside}, marker="track.parquet")
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None

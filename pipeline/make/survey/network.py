@@ -1,0 +1,302 @@
+"""Pieces of line to net elements and net relations: cut where lines share a node, linked as given, else by angle."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import polars as pl
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from pipeline.make.survey.pieces import COLUMNS, Piece, Relation, Survey
+from pipeline.read.site.checks import outward, relations_to_nowhere
+from pipeline.stages.track.geodesy import points_of
+from pipeline.stages.track.survey import geometric_measures_m, track_of
+from schemas.arrays import Floats, Ints, spans_of
+from schemas.config import SurveyConfig
+from schemas.enums import Navigability
+from schemas.inputs import Links
+
+# OpenStreetMap writes seven decimals of a degree: equal positions are the same node.
+_NODE_DEG = 1e-7
+
+
+@dataclass(frozen=True)
+class Network:
+    """Net elements with the nodes at their two ends, and the links between ends.
+
+    `track`: the table of their points, with `line_km` beside the contract's columns.
+    """
+
+    elements: list[Piece]
+    ends: Ints
+    links: pl.DataFrame
+    track: pl.DataFrame
+
+
+def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> Network:
+    """Net elements of all pieces; ends within `join_m` (else: in one place) of a vertex of another piece meet it.
+
+    Net elements of a network with relations stay as they are, and meet where it says. What is doubtful about it is
+    added to the survey's findings.
+    """
+    pieces = [piece for piece in survey.pieces if len(piece) > 1]
+    if (short := len(survey.pieces) - len(pieces)) > 0:
+        survey.told("note", "survey", f"{short} lines with fewer than two points are left out")
+    if not pieces:
+        return Network([], np.zeros((0, 2), dtype=np.int64), Links.create_empty(), pl.DataFrame())
+    nodes = _nodes(pieces, config.same_place_m if join_m is None else join_m, survey.relations)
+    pieces, nodes = _without_doubles(pieces, nodes, survey)
+    switches = _nodes_at(pieces, nodes, survey.switches_deg, config)
+    crossings = _crossings(pieces, nodes, switches, survey, config)
+    elements, ends = _cut(pieces, nodes, crossings)
+    track = _track_table(elements)
+    given = _of_parts(survey.relations, elements)
+    return Network(elements, ends, _links(track, ends, given, crossings, switches, survey, config), track)
+
+
+def _of_parts(relations: list[Relation], elements: list[Piece]) -> list[Relation]:
+    """The relations given, between the parts of net elements that other surveys cut."""
+    parts = Counter(element.name.rpartition(".")[0] for element in elements if element.whole)
+    names = {element.name for element in elements}
+
+    def part(name: str, end: int) -> str:
+        return name if name in names or not parts[name] else f"{name}.{parts[name] if end else 1}"
+
+    return [(part(a, a_end), a_end, part(b, b_end), b_end, way) for a, a_end, b, b_end, way in relations]
+
+
+def _track_table(elements: list[Piece]) -> pl.DataFrame:
+    """Points of the elements in order, measures along their geometry; null for what is not known."""
+    measures = [geometric_measures_m(one.latitude_deg, one.longitude_deg, one.height_m) for one in elements]
+    columns = {name: np.concatenate([getattr(one, name) for one in elements]) for name in COLUMNS}
+    names = list(itertools.chain.from_iterable([one.name] * len(one) for one in elements))
+    return pl.DataFrame({"netelement_id": names, "measure_m": np.concatenate(measures), **columns}, nan_to_null=True)
+
+
+def _nodes(pieces: list[Piece], join_m: float, relations: list[Relation]) -> list[Ints]:
+    """A number per point; points that are one node have the same: near each other, or joined by a relation."""
+    latitude = np.concatenate([piece.latitude_deg for piece in pieces])
+    longitude = np.concatenate([piece.longitude_deg for piece in pieces])
+    last = np.cumsum([len(piece) for piece in pieces])
+    keys = np.rint(np.column_stack([latitude, longitude]) / _NODE_DEG).astype(np.int64)
+    node = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    piece_of = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    ends = np.unique(np.concatenate([last - [len(piece) for piece in pieces], last - 1]))
+    pairs = list(_near_ends(points_of(latitude, longitude).surface, piece_of, ends, join_m))
+    end_row = {(piece.name, 1): int(row) - 1 for piece, row in zip(pieces, last, strict=True)}
+    end_row |= {(piece.name, 0): int(row) - len(piece) for piece, row in zip(pieces, last, strict=True)}
+    pairs += [
+        (end_row[a, a_end], end_row[b, b_end])
+        for a, a_end, b, b_end, way in relations
+        if way != Navigability.NONE.value and (a, a_end) in end_row and (b, b_end) in end_row
+    ]
+    rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    count = int(node.max()) + 1
+    same = coo_array((np.ones(len(rows)), (node[rows], node[columns])), shape=(count, count))
+    joined = connected_components(same, directed=False)[1][node]
+    return [np.asarray(part) for part in np.split(joined, last[:-1])]
+
+
+def _near_ends(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> Iterator[tuple[int, int]]:
+    """Each end with the nearest vertex of another piece within reach, or with an end of its own (a ring)."""
+    tree = cKDTree(surface)
+    at_end = np.zeros(len(surface), dtype=bool)
+    at_end[ends] = True
+    for end, near in zip(ends, tree.query_ball_point(surface[ends], join_m), strict=True):
+        others = [row for row in near if row != end and (piece_of[row] != piece_of[end] or at_end[row])]
+        if others:
+            way = np.linalg.norm(surface[others] - surface[end], axis=1)
+            yield int(end), others[int(np.argmin(way))]
+
+
+def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> tuple[list[Piece], list[Ints]]:
+    """Each stretch between two nodes once: the first line that has it keeps it."""
+    seen: set[tuple[int, int]] = set()
+    kept, kept_nodes = [], []
+    for piece, own in zip(pieces, nodes, strict=True):
+        edges = [(min(a, b), max(a, b)) for a, b in zip(own[:-1].tolist(), own[1:].tolist(), strict=True)]
+        new = np.array([edge not in seen and edge[0] != edge[1] for edge in edges])
+        new |= piece.whole
+        doubled = 0 if piece.whole else sum(edge in seen for edge in edges)
+        seen.update(edges)
+        if doubled:
+            text = f"{doubled} of its {len(edges)} segments stand in the survey already and are left out"
+            survey.told("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")
+        for first, last in spans_of(new):
+            kept.append(piece.take(np.arange(first, last + 2)))
+            kept_nodes.append(own[first : last + 2])
+    return kept, kept_nodes
+
+
+def _crossings(
+    pieces: list[Piece], nodes: list[Ints], switches: set[int], survey: Survey, config: SurveyConfig
+) -> set[int]:
+    """Nodes where tracks cross without a switch: those named so, and those where two lines just run through.
+
+    Nobody can take such a node of two lines for a slip by its geometry; a survey that names it a switch is believed.
+    A net element that is whole branches at its ends only.
+    """
+    inner = np.concatenate([own[1:-1] for own in nodes])
+    at_ends = np.unique(np.concatenate([own[[0, -1]] for own in nodes]))
+    through, count = np.unique(inner, return_counts=True)
+    told = _nodes_at(pieces, nodes, survey.crossings_deg, config)
+    lines = [own[1:-1] for piece, own in zip(pieces, nodes, strict=True) if not piece.whole]
+    unnamed = np.intersect1d(through[count == 2], np.concatenate([np.zeros(0, dtype=np.int64), *lines]))
+    by_form = set(np.setdiff1d(unnamed, at_ends).tolist()) - switches
+    _tell_of_crossings(pieces, nodes, by_form - told, survey)
+    return told | by_form
+
+
+def _tell_of_crossings(pieces: list[Piece], nodes: list[Ints], unnamed: set[int], survey: Survey) -> None:
+    """One note for each pair of lines that cross."""
+    names: dict[int, set[str]] = {node: set() for node in unnamed}
+    for piece, own in zip(pieces, nodes, strict=True):
+        for node in own[np.isin(own, list(unnamed))].tolist():
+            names[node].add(piece.name)
+    for pair, count in sorted(Counter(tuple(sorted(both)) for both in names.values()).items()):
+        times = f" ({count} times)" if count > 1 else ""
+        text = f"cross where neither ends{times}: taken as a crossing without a switch"
+        remedy = "Where trains turn off (a slip), name the node `railway=switch`, or end the lines there."
+        survey.told("note", f"track: {', '.join(pair)}", text, remedy)
+
+
+def _nodes_at(
+    pieces: list[Piece], nodes: list[Ints], places_deg: list[tuple[float, float]], config: SurveyConfig
+) -> set[int]:
+    """The nodes at places (latitude, longitude)."""
+    if not places_deg:
+        return set()
+    tree = cKDTree(np.concatenate([piece.surface for piece in pieces]))
+    wanted = points_of(*np.array(places_deg).T).surface
+    row = tree.query(wanted, distance_upper_bound=config.same_place_m)[1]
+    return set(np.concatenate(nodes)[row[row < tree.n]].tolist())
+
+
+def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[list[Piece], Ints]:
+    """Elements from node to node; the parts of a piece are named `id.1`, `id.2` along it.
+
+    A net element that is whole is cut by lines of other surveys only, not by net elements.
+    """
+    passing = _occurrences(nodes, nodes)
+    of_lines = _occurrences([own for piece, own in zip(pieces, nodes, strict=True) if not piece.whole], nodes)
+    number: dict[str, int] = {}
+    parts: dict[str, int] = {}
+    found: list[tuple[Piece, int, int]] = []
+    for piece, own in zip(pieces, nodes, strict=True):
+        meets = of_lines[own] > 0 if piece.whole else passing[own] > 1
+        inner = [row for row in range(1, len(own) - 1) if meets[row] and int(own[row]) not in crossings]
+        cuts = [0, *inner, len(own) - 1]
+        parts[piece.name] = parts.get(piece.name, 0) + len(cuts) - 1
+        for first, last in itertools.pairwise(cuts):
+            found.append((piece.take(np.arange(first, last + 1)), int(own[first]), int(own[last])))
+    elements, ends = [], []
+    for piece, first, last in found:
+        number[piece.name] = number.get(piece.name, 0) + 1
+        name = piece.name if parts[piece.name] == 1 else f"{piece.name}.{number[piece.name]}"
+        elements.append(replace(piece, name=name))
+        ends.append((first, last))
+    return elements, np.array(ends, dtype=np.int64).reshape(-1, 2)
+
+
+def _occurrences(some: list[Ints], nodes: list[Ints]) -> Ints:
+    """How often each node occurs in some of the pieces."""
+    count = 1 + max(int(own.max()) for own in nodes)
+    return np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *some]), minlength=count)
+
+
+def arms_of(ends: Ints) -> dict[int, list[tuple[int, int]]]:
+    """Elements and their ends at each node."""
+    arms: dict[int, list[tuple[int, int]]] = {}
+    for (element, position), node in np.ndenumerate(ends):
+        arms.setdefault(int(node), []).append((element, position))
+    return arms
+
+
+def _links(
+    table: pl.DataFrame,
+    ends: Ints,
+    given: list[Relation],
+    crossings: set[int],
+    switches: set[int],
+    survey: Survey,
+    config: SurveyConfig,
+) -> pl.DataFrame:
+    """The relations given, as they are; of ends that none of them names every pair at a node, by its angle.
+
+    By angle a pair is navigable in both directions where a train can go that way, else not at all.
+    """
+    track = track_of(table)
+    directions, names = outward(track), track.ids
+    named = {end for a, a_end, b, b_end, _ in given for end in ((a, a_end), (b, b_end))}
+    rows, guessed = list(given), []
+    for node, meeting in arms_of(ends).items():
+        here = [(names[element], position) for element, position in meeting]
+        unsaid = [pair for pair in itertools.combinations(range(len(here)), 2) if not {here[k] for k in pair} <= named]
+        if len(here) > 1 and not unsaid:
+            continue
+        units = [directions[arm] / max(float(np.linalg.norm(directions[arm])), 1e-9) for arm in meeting]
+        pairs = _navigable(units, node in crossings, node in switches, config.switch_deg)
+        for pair in unsaid:
+            way = Navigability.BOTH if pair in pairs else Navigability.NONE
+            one, other = (here[k] for k in pair)
+            rows.append((*one, *other, way.value))
+        guessed += [here] * bool(unsaid)
+        if node not in crossings | switches:
+            _tell_of_node([name for name, _ in here], pairs, survey)
+    _tell_of_guesses(guessed, len(rows) - len(given), bool(given), survey)
+    links = Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
+    known, findings = relations_to_nowhere(track, links)
+    survey.findings += findings
+    return known
+
+
+def _tell_of_guesses(nodes: list[list[tuple[str, int]]], pairs: int, some_given: bool, survey: Survey) -> None:
+    """A finding where relations are made by angle; a warning where the survey gives relations elsewhere."""
+    if not nodes:
+        return
+    first = " and ".join(f"end {position} of {name}" for name, position in nodes[0])
+    text = f"the survey gives no relation at {len(nodes)} nodes ({first}{', ...' if len(nodes) > 1 else ''})"
+    text += f": {pairs} relations are by the angles between the lines"
+    survey.told("warning" if some_given else "note", "links", text, "Look whether trains can run so.")
+
+
+def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: float) -> set[tuple[int, int]]:
+    """Pairs of arms that a train can take; at a crossing each arm goes on straight only.
+
+    Two arms that meet two are a crossing, unless the survey names a switch (a slip) there.
+    """
+    turns = {
+        (one, other): float(np.degrees(np.arccos(np.clip(-units[one] @ units[other], -1.0, 1.0))))
+        for one, other in itertools.combinations(range(len(units)), 2)
+    }
+    # A train bends by its curve alone, 57 degrees over the 20 m that an end's direction is taken from and the sharpest
+    # tram curve of 20 m.
+    most = 90.0 if len(units) == 2 else switch_deg
+    possible = {pair for pair, turn in turns.items() if turn <= most}
+    ways = [sum(arm in pair for pair in possible) for arm in range(len(units))]
+    two_by_two = ways == [2, 2, 2, 2]
+    if not (crossing or (two_by_two and not switch)):
+        return possible
+    straight: set[tuple[int, int]] = set()
+    for pair in sorted(possible, key=lambda pair: turns[pair]):
+        if not {arm for taken in straight for arm in taken} & set(pair):
+            straight.add(pair)
+    return straight
+
+
+def _tell_of_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
+    place = f"links: {', '.join(names)}"
+    lonely = [name for arm, name in enumerate(names) if len(names) > 1 and not any(arm in pair for pair in pairs)]
+    if lonely:
+        text = f"no train gets from {', '.join(lonely)} to another of these: the corner is too sharp"
+        survey.told("warning", place, text, "Mend the survey there, or the relation.")
+    if len(names) > 3:
+        kind = "a crossing without a switch" if len(pairs) == len(names) / 2 else "switches, by their angles"
+        text = f"{len(names)} ends meet at one node, which the survey does not name: taken as {kind}"
+        survey.told("note", place, text, "Name the node `railway=switch` or `railway=railway_crossing`.")

@@ -1,0 +1,110 @@
+"""Which reader a survey needs, by its name; and the line of a run: its reference, else its RTK positions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from pipeline.make.survey.geojson_lines import read_geojson
+from pipeline.make.survey.pieces import MOST_BYTES, Survey, piece_of, with_own_names
+from pipeline.make.survey.tables import read_points
+from pipeline.make.survey.xml_lines import read_kmz, read_xml
+from pipeline.read.ingest.run import read_run
+from pipeline.stages.matching.fixes import fixes_of
+from pipeline.stages.matching.steps import believable, travelled
+from schemas.config import Configuration, Vehicle
+from schemas.enums import Fix
+from schemas.errors import SiteError
+
+# A variance of zero means "not known" in a `gnss` stream.
+_LEAST_SIGMA_M = 1e-3
+_KINDS = "GPX, KML, KMZ, GeoJSON, CSV, Parquet, or a run (folder or .mcap) with a reference"
+
+
+def read_surveys(paths: list[Path], epsg: int | None, vehicle: Vehicle, config: Configuration) -> Survey:
+    """All pieces of all files, each under a name of its own. Raises `SiteError`, for a run `InputError`."""
+    survey = Survey()
+    for path in paths:
+        survey.add(_read(path, epsg, vehicle, config))
+    if not any(len(piece) > 1 for piece in survey.pieces):
+        raise SiteError("holds no line", place=", ".join(map(str, paths)), expected="a line of two points or more")
+    survey.pieces = with_own_names(survey.pieces)
+    return survey
+
+
+def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration) -> Survey:
+    suffix = path.suffix.lower()
+    if path.is_dir() or suffix == ".mcap":
+        return read_recorded(path, vehicle, config)
+    place, data = str(path), content_of_survey(path)
+    match suffix:
+        case ".gpx" | ".kml":
+            return read_xml(place, path.stem, data)
+        case ".kmz":
+            return read_kmz(place, path.stem, data)
+        case ".geojson" | ".json":
+            return read_geojson(place, path.stem, data, config.site)
+        case ".csv" | ".txt" | ".parquet":
+            return read_points(place, path.stem, data, epsg, config.site)
+    raise SiteError("is no survey that is known", place=place, found=suffix or "no suffix", expected=_KINDS)
+
+
+def content_of_survey(path: Path) -> bytes:
+    """The file, unless it is too large to be one."""
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise SiteError("is too large", place=str(path), expected=f"at most {MOST_BYTES // 1_000_000} MB")
+        return path.read_bytes()
+    except OSError as error:
+        raise SiteError(f"cannot be read: {error.strerror}", place=str(path)) from None
+
+
+def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
+    """One recorded piece; heights are those of the rail where the vehicle file says how high the antenna is.
+
+    Raises `InputError` where the run cannot be read, `SiteError` where it has no position better than GNSS alone.
+    """
+    run = read_run(str(path), config.ingest, with_digest=False)
+    points = run.reference
+    if points is None:
+        fixed = run.gnss.filter(pl.col("fix").cast(pl.String) == Fix.RTK_FIXED.value)
+        sigma_m = ((pl.col("cov_ee_m2") + pl.col("cov_nn_m2")) / 2).sqrt()
+        first = fixed["solution"].unique().sort().head(1)
+        points = fixed.filter(pl.col("solution").is_in(first.implode())).with_columns(sigma_m=sigma_m)
+    points = points.drop_nulls(["latitude_deg", "longitude_deg"]).sort("t")
+    if points.height < 2:
+        expected = "a stream `reference`, or positions with fix `rtk_fixed`"
+        raise SiteError("has no position better than GNSS alone", place=str(path), expected=expected)
+    survey = Survey()
+    fixes = fixes_of(_as_fixes(points, config.hazards.reference_sigma_m), config.fix_sigma)
+    reached = believable(fixes, fixes.valid, travelled(fixes, None), config.matching)
+    if (jumped := points.height - len(reached)) > 0:
+        text = f"{jumped} positions to which no train can have come are left out"
+        survey.told("warning", f"track: {run.run_id}", text, "Look at the recording there.")
+    points = points[reached]
+    height = points["height_m"].fill_null(np.nan) - vehicle.antenna_height_m
+    columns = {"latitude_deg": points["latitude_deg"], "longitude_deg": points["longitude_deg"], "height_m": height}
+    survey.pieces.append(piece_of(str(path), run.run_id, {**columns, "sigma_m": points["sigma_m"]}, recorded=True))
+    if "antenna_height_m" not in vehicle.model_fields_set and points["height_m"].null_count() < points.height:
+        text = "heights are those of the antenna: the vehicle file does not say how high it is over the rail"
+        survey.told("warning", f"track: {run.run_id}", text, "Give --vehicle with antenna_height_m.")
+    return survey
+
+
+def _as_fixes(reference: pl.DataFrame, sigma_default_m: float) -> pl.DataFrame:
+    """The samples as a `gnss` stream whose covariance is theirs."""
+    variance = pl.col("sigma_m").fill_null(sigma_default_m).clip(lower_bound=_LEAST_SIGMA_M) ** 2
+    return reference.select(
+        "t",
+        pl.lit("reference").alias("solution"),
+        "latitude_deg",
+        "longitude_deg",
+        "height_m",
+        variance.alias("cov_ee_m2"),
+        pl.lit(0.0).alias("cov_en_m2"),
+        variance.alias("cov_nn_m2"),
+        variance.alias("cov_uu_m2"),
+        pl.lit(Fix.RTK_FIXED.value, dtype=pl.Enum(Fix)).alias("fix"),
+    )

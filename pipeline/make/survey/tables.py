@@ -1,0 +1,111 @@
+"""Tables of points, CSV or Parquet, under the names that spreadsheets and surveyors give their columns."""
+
+from __future__ import annotations
+
+import re
+
+import polars as pl
+
+from pipeline.make.survey.pieces import COLUMNS, Survey, piece_of
+from pipeline.read.site.read import to_wgs84
+from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table
+from schemas.config import SiteConfig
+from schemas.errors import SiteError
+
+_NAMES = {
+    "netelement_id": ("netelementid", "netelement", "element", "track", "trackid", "line", "lineid"),
+    "latitude_deg": ("latitudedeg", "latitude", "lat"),
+    "longitude_deg": ("longitudedeg", "longitude", "lon", "lng", "long"),
+    "x_m": ("xm", "x", "easting", "eastingm", "east", "eastm"),
+    "y_m": ("ym", "y", "northing", "northingm", "north", "northm"),
+    "height_m": ("heightm", "height", "h", "elevation", "ele", "altitude", "alt", "z", "zm"),
+    "line_km": ("linekm", "km", "kilometre", "kilometer", "kilometrage", "chainagekm", "kp", "pk", "lrskm"),
+    "line_m": ("linem", "chainage", "chainagem", "station", "stationm"),
+    "sigma_m": ("sigmam", "sigma", "accuracy", "accuracym"),
+}
+NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "line_km", "sigma_m")
+
+
+def read_points(place: str, stem: str, data: bytes, epsg: int | None, config: SiteConfig) -> Survey:
+    """One piece per net element, in the order of the rows; one piece in all without a column for it."""
+    table = placed_table(place, data, epsg, config)
+    for name in ("latitude_deg", "longitude_deg"):
+        if name not in table.columns:
+            raise SiteError(
+                "has no positions",
+                place=place,
+                found=f"columns {', '.join(table.columns)}",
+                expected="latitude_deg and longitude_deg, or x_m and y_m with an EPSG code",
+            )
+        if (missing := table[name].is_null()).any():
+            raise SiteError("has no value", place=f"{place}: column {name}: row {missing.arg_true()[0] + 1}")
+    if "netelement_id" not in table.columns:
+        table = table.with_columns(netelement_id=pl.lit(stem))
+    survey = Survey()
+    for (name,), part in table.group_by(["netelement_id"], maintain_order=True):
+        columns = {key: part[key] for key in COLUMNS if key in part.columns}
+        survey.pieces.append(piece_of(place, str(name), columns))
+    return survey
+
+
+def placed_table(place: str, data: bytes, epsg: int | None, config: SiteConfig) -> pl.DataFrame:
+    """A table with the contract's column names, numbers as numbers, positions in WGS 84, line metres as kilometres.
+
+    `epsg`: of x and y where the file does not say. Columns that are not known stay as they are. Raises `SiteError`.
+    """
+    breaches: list[str] = []
+    raw = load_table(place, data, breaches)
+    if raw is None:
+        raise SiteError(breaches[0])
+    table = _renamed(place, raw.frame)
+    known = (*NUMBERS, "x_m", "y_m", "line_m", "measure_m", "location_accuracy_m")
+    table = table.with_columns(_numbers(place, table[name]) for name in known if name in table.columns)
+    if "line_m" in table.columns and "line_km" not in table.columns:
+        table = table.with_columns(line_km=pl.col("line_m") / 1000)
+    return _in_degrees(place, table, raw.epsg if raw.epsg != EPSG_WGS84 else epsg, config)
+
+
+def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None, config: SiteConfig) -> pl.DataFrame:
+    if not {"x_m", "y_m"} <= set(table.columns) or "latitude_deg" in table.columns:
+        return table
+    if epsg is None:
+        raise SiteError(
+            "has x and y, but names no EPSG code",
+            place=place,
+            remedy="Write `# epsg: 31370` (yours) as its first line, or give --epsg.",
+        )
+    breaches: list[str] = []
+    plane = RawTable(place, table, epsg)
+    known = table["x_m"].is_not_null() & table["y_m"].is_not_null()
+    named = table.filter(known).rename({"x_m": "longitude_deg", "y_m": "latitude_deg"})
+    turned = to_wgs84(plane, named, config, breaches)
+    if breaches or not known.all():
+        raise SiteError(breaches[0] if breaches else f"{place}: row {(~known).arg_true()[0] + 1} has no x or no y")
+    return turned
+
+
+def _renamed(place: str, frame: pl.DataFrame) -> pl.DataFrame:
+    by_name = {alias: name for name, aliases in _NAMES.items() for alias in aliases}
+    plain = {name: re.sub(r"\[.*?\]|\(.*?\)|[^a-z]", "", name.lower()) for name in frame.columns}
+    found = {name: by_name[word] for name, word in plain.items() if word in by_name}
+    twice = sorted({name for name in found.values() if list(found.values()).count(name) > 1})
+    if twice:
+        same = [name for name, meaning in found.items() if meaning in twice]
+        raise SiteError("columns mean the same", place=place, found=", ".join(same), remedy="Keep one of them.")
+    return frame.rename(found)
+
+
+def _numbers(place: str, column: pl.Series) -> pl.Series:
+    """Numbers, with a decimal comma where no number of the column has a point."""
+    if column.dtype != pl.String:
+        return column.cast(pl.Float64)
+    text = column.replace("", None)
+    if not text.str.contains(".", literal=True).any():
+        text = text.str.replace(",", ".", literal=True)
+    values = text.cast(pl.Float64, strict=False)
+    wrong = (values.is_null() & text.is_not_null()) | ~values.fill_null(0.0).is_finite()
+    if wrong.any():
+        row = int(wrong.arg_true()[0])
+        where = f"{place}: column {column.name}: row {row + 1}"
+        raise SiteError("cannot be read", place=where, found=repr(column[row]), expected="a number")
+    return values

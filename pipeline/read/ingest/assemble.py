@@ -1,0 +1,173 @@
+"""Decoded fields to stream frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.read.ingest.conform import DEFAULTS, conform
+from pipeline.read.ingest.plan import Source, missing_field
+from pipeline.read.ingest.reader import ORDINAL
+from schemas.errors import InputError
+from schemas.inputs import STREAM_SCHEMAS
+from schemas.run import STREAMS, Stream
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Fields of all messages of a source, one row per message, with its times and place in the file."""
+
+    source: Source
+    solution: str | None
+    frame: pl.DataFrame
+
+
+def stream_frames(
+    decoded: Sequence[Decoded], breaches: list[InputError], few: float, remarks: list[str]
+) -> dict[str, pl.DataFrame]:
+    """One frame per stream that has a source, rows in order of the file; `remarks` tells what was left out.
+
+    `few`: share of the messages that may be left out for their date.
+    """
+    frames: dict[str, pl.DataFrame] = {}
+    for stream in STREAMS:
+        parts = [part for part in decoded if part.source.recipe.stream == stream]
+        if parts:
+            frames[stream] = _stream(stream, parts, breaches, few, remarks)
+    return frames
+
+
+def _stream(
+    stream: Stream, parts: Sequence[Decoded], breaches: list[InputError], few: float, remarks: list[str]
+) -> pl.DataFrame:
+    place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
+    breaches += [
+        missing_field(part.source.channel, [], column, [path])
+        for part in parts
+        for column, path in part.source.doubtful.items()
+        if part.frame[path].null_count() == part.frame.height
+    ]
+    supplements = [part for part in parts if part.source.recipe.supplement]
+    rows = [_rows(part, supplements, few, remarks) for part in parts if not part.source.recipe.supplement]
+    joined = pl.concat(rows, how="diagonal_relaxed")
+    frame = joined if len(rows) == 1 else joined.sort(ORDINAL, maintain_order=True)
+    return conform(frame, stream, place, breaches)
+
+
+def _supplemented(frame: pl.DataFrame, part: Decoded, supplements: Sequence[Decoded]) -> pl.DataFrame:
+    """With the columns that other messages of the same receiver hold for the same epochs."""
+    key = list(part.source.recipe.key)
+    for other in supplements:
+        if other.source.recipe.key != part.source.recipe.key or not _same_receiver(part, other):
+            continue
+        columns = [expression.alias(name) for name, expression in other.source.columns.items()]
+        extra = other.frame.select(*key, *columns).unique(subset=key, keep="first", maintain_order=True)
+        keys = part.frame.select(key)
+        frame = frame.hstack(keys).join(extra, on=key, how="left", maintain_order="left").drop(key)
+    return frame
+
+
+def _same_receiver(part: Decoded, other: Decoded) -> bool:
+    """Drivers publish the messages of one receiver side by side."""
+    return part.source.channel.topic.rpartition("/")[0] == other.source.channel.topic.rpartition("/")[0]
+
+
+def _rows(part: Decoded, supplements: Sequence[Decoded], few: float, remarks: list[str]) -> pl.DataFrame:
+    source = part.source
+    columns = part.frame.select(ORDINAL, **source.columns)
+    try:
+        times = [time.instants(part.frame, name) for name, time in source.times.items()]
+    except (ValueError, pl.exceptions.PolarsError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
+    columns = _explicit(columns, source)
+    frame = _supplemented(_named(columns.with_columns(times), part), part, supplements)
+    if "t" not in source.times:
+        return frame
+    if frame["t"].null_count() and _may_be_left_out(part, frame["t"].is_null(), few, remarks):
+        frame = frame.drop_nulls("t")
+    return _stamped(frame, source, remarks)
+
+
+def _may_be_left_out(part: Decoded, unknown: pl.Series, few: float, remarks: list[str]) -> bool:
+    """Whether messages without time may be left out, which is counted.
+
+    They may where a receiver does not know the time yet, and where a few have a date that no trial can have.
+    """
+    source, time = part.source, part.source.times["t"]
+    if source.recipe.time is not None:
+        remarks.append(f"{source.channel.topic}: {unknown.sum()} messages without a valid time")
+        return True
+    wrong = part.frame.select(~pl.any_horizontal(pl.col(*time.fields).is_null())).to_series() & unknown
+    if wrong.sum() > few * wrong.len():
+        row = int(wrong.arg_max() or 0)
+        written = ", ".join(str(part.frame[name][row]) for name in time.fields)
+        raise InputError(
+            "has impossible time stamps",
+            place=source.channel.place,
+            found=f"{wrong.sum()} of {wrong.len()}, the first in message {row} of the topic: {written}",
+            expected="times from 1970 to 2200",
+            remedy='Check the unit of the stamps ([ingest] factors), or map the topic with time = "log".',
+        )
+    if wrong.any():
+        remarks.append(f"{source.channel.topic}: {wrong.sum()} messages with a date before 1970 or after 2200")
+    return bool((wrong == unknown).all())
+
+
+_NEVER_ZERO = ("hpl_m", "vpl_m", "sbas_prn", "sigma_m", "sigma_speed_mps")
+
+
+def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
+    """What a protobuf field without presence holds: a column that is 0 throughout was not recorded."""
+    if not source.implicit:
+        return frame
+    contract = STREAM_SCHEMAS[source.recipe.stream].columns()
+    names = [name for name in source.implicit if contract[name].nullable and frame[name].dtype.is_numeric()]
+    silent = [name for name in names if not (frame[name] != 0).any()]
+    if "speed_mps" in silent and not _counted(frame, silent):  # a train that stands says so
+        silent.remove("speed_mps")
+    empty = [pl.lit(None, dtype=frame[name].dtype).alias(name) for name in silent]
+    zero = [
+        pl.when(pl.col(name) != 0).then(name).alias(name)
+        for name in names
+        if name in _NEVER_ZERO and name not in silent
+    ]
+    text = [pl.col(name).replace("", None) for name in DEFAULTS if name in source.implicit]
+    return frame.with_columns(*empty, *zero, *text)
+
+
+def _counted(frame: pl.DataFrame, silent: Sequence[str]) -> bool:
+    """Whether the odometer gives a distance."""
+    return "distance_m" in set(frame.columns) - set(silent) and frame["distance_m"].null_count() < frame.height
+
+
+def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.DataFrame:
+    """Without the messages whose stamp is 0, as of a driver that did not know the time yet."""
+    if source.recipe.own:
+        return frame
+    unset = frame["t"].to_physical() == 0
+    count = int(unset.sum())
+    if count <= 1:  # a single 0 may be the start of a clock
+        return frame
+    if count == frame.height:
+        raise InputError(
+            "has no time of validity",
+            place=source.channel.place,
+            found="time stamp 0 in all messages",
+            expected="the time at which the position was valid",
+            remedy='If the time of recording is accurate enough, map the topic with time = "log".',
+        )
+    remarks.append(f"{source.channel.topic}: {count} messages with a stamp of 0")
+    return frame.filter(~unset.fill_null(False))
+
+
+def _named(frame: pl.DataFrame, part: Decoded) -> pl.DataFrame:
+    """With the solution: what the messages say, else the source's."""
+    if part.solution is None:
+        return frame
+    name = pl.lit(part.solution, dtype=pl.String)
+    if "solution" in part.source.columns:
+        name = pl.coalesce(pl.col("solution"), name)
+    return frame.with_columns(name.alias("solution"))

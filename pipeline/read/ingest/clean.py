@@ -1,0 +1,274 @@
+"""Streams in order of time, without duplicated stamps; what had to be mended is counted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.read.ingest.conform import DEFAULTS
+from pipeline.read.ingest.placeholders import without_placeholders
+from schemas.arrays import NS_PER_S, Bools
+from schemas.config import Configuration, PlausibilityConfig, Vehicle
+from schemas.errors import InputError
+from schemas.run import STREAMS, IngestNotes, RunLog, Stream
+
+_KEYS: dict[Stream, list[str]] = {
+    "gnss": ["solution", "t"],
+    "odometer": ["sensor", "t"],
+    "satellites": ["solution", "t", "sv"],
+    "balise_reads": ["t", "balise_id"],
+}
+_PLACE = ("latitude_deg", "longitude_deg")
+_DAY_NS = 86_400 * NS_PER_S
+# Streams that say something only of positions: without them a run is replayed all the same.
+_OF_POSITIONS: tuple[Stream, ...] = ("satellites", "reference", "balise_reads")
+
+
+@dataclass(frozen=True)
+class StreamCounts:
+    """Rows dropped because their key stands twice, and rows that came before an earlier one.
+
+    `far_off`: dropped for a time of another day than the others, or than the positions. Of GNSS also `contradicting`,
+    how many of the doubles are of another place than the one that stays, and `placeholders`, how many positions are
+    none.
+    """
+
+    duplicates: int = 0
+    out_of_order: int = 0
+    contradicting: int = 0
+    far_off: int = 0
+    placeholders: int = 0
+
+
+@dataclass(frozen=True)
+class CleanCounts:
+    """What cleaning found, per GNSS solution and per other stream."""
+
+    solutions: dict[str, StreamCounts] = field(default_factory=dict)
+    streams: dict[str, StreamCounts] = field(default_factory=dict)
+
+
+def clean(run: RunLog, config: Configuration = Configuration()) -> tuple[RunLog, CleanCounts]:  # noqa: B008 - frozen
+    """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
+
+    A few rows more than a day from the others (a receiver that did not know the date yet), all before 1970, and single
+    reads, reference and satellites of another day than the positions are left out; placeholders stay as epochs without
+    a fix.
+    Raises `InputError` where no solution or not the odometer has two different times, or both have no time in common:
+    nothing can be replayed.
+    """
+    streams: dict[str, pl.DataFrame] = {}
+    counts: dict[str, StreamCounts] = {}
+    far = run.gnss.clear()
+    for name in STREAMS:
+        frame = run.stream(name)
+        if frame is None or name == "faults":
+            continue
+        stray = _strays(frame, config.ingest.wrong_dates_share)
+        if name in _OF_POSITIONS:
+            elsewhere = _far_from_any(frame["t"], streams["gnss"]["t"])
+            # Where no row is near, the clock of the whole recorder is wrong, which the fit of the run tells.
+            stray |= elsewhere & (not elsewhere.all())
+        if name == "gnss":
+            far, recorded = frame.filter(stray), frame.filter(~stray)
+        kept, found = _in_order(frame.filter(~stray) if stray.any() else frame, _KEYS.get(name, ["t"]))
+        streams[name], counts[name] = kept, replace(found, far_off=int(stray.sum()))
+    others: tuple[pl.DataFrame, ...] = ()
+    if "odometer" in streams:
+        streams["odometer"], others = _by_sensor(streams["odometer"], config.lds.odometer_sensor, run.run_id)
+    streams["gnss"], placeholders = _with_fixes(streams["gnss"], config)
+    parts = recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
+    names = [part["solution"][0] for part in parts]
+    solutions = {
+        name: replace(_of_solution(part, far), placeholders=placeholders.get(name, 0))
+        for name, part in zip(names, parts, strict=True)
+    }
+    gnss, odometer = streams["gnss"], streams.get("odometer")
+    sizes = gnss.group_by("solution", maintain_order=True).len()
+    if not (sizes["len"] >= 2).any():
+        of = f" of solution {gnss['solution'][0]!r}" if gnss.height else ""
+        require_two_times(gnss.head(1), f"{run.run_id}: gnss", of)
+    if odometer is not None:
+        require_two_times(odometer, f"{run.run_id}: odometer")
+        _require_common_time(run.with_streams(**streams))
+    cleaned = replace(run, notes=_noted(run.notes, counts), other_odometers=others or run.other_odometers)
+    return cleaned.with_streams(**streams), CleanCounts(solutions, counts)
+
+
+def of_the_journey(run: RunLog) -> RunLog:
+    """The cleaned run without the streams of which no row lies within a day of a position; `notes` say so.
+
+    Their clocks are wrong, which the fit of the run tells: what is judged must not carry anything over years.
+    """
+    away = [
+        name
+        for name in _OF_POSITIONS
+        if (frame := run.stream(name)) is not None and frame.height and _far_from_any(frame["t"], run.gnss["t"]).all()
+    ]
+    if not away:
+        return run
+    told = [f"{name}: left out, its times are all more than a day from the positions" for name in away]
+    notes = replace(run.notes, skipped_topics=(*run.notes.skipped_topics, *told))
+    satellites, reference, reads = (None if name in away else run.stream(name) for name in _OF_POSITIONS)
+    return replace(run, notes=notes, satellites=satellites, reference=reference, balise_reads=reads)
+
+
+def _by_sensor(odometer: pl.DataFrame, used: str, run_id: str) -> tuple[pl.DataFrame, tuple[pl.DataFrame, ...]]:
+    """The odometer that the LDS uses, and the others in the order of their names."""
+    if "sensor" not in odometer.columns:
+        return odometer, ()
+    sensors = {str(key[0]): part for key, part in odometer.partition_by("sensor", as_dict=True).items()}
+    if odometer.height and used not in sensors:
+        raise InputError(
+            "has no such sensor",
+            place=f"{run_id}: odometer, column sensor",
+            found=", ".join(sorted(sensors)),
+            expected=used,
+            remedy=f"Name the odometer that the LDS uses: [lds] odometer_sensor = {json.dumps(min(sensors))}",
+        )
+    return sensors.pop(used, odometer), tuple(sensors[name] for name in sorted(sensors))
+
+
+def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame, dict[str, int]]:
+    """Positions without placeholders, and how many these were, by solution."""
+    if not {"fix", *_PLACE} <= set(gnss.columns):
+        return gnss, {}
+    counts: dict[str, int] = {}
+    marked: list[pl.DataFrame] = []
+    for part in gnss.with_row_index("_row").partition_by("solution", maintain_order=True):
+        found, count = without_placeholders(part, config.ingest, config.align.fastest_mps)
+        marked.append(found)
+        counts[part["solution"][0]] = count
+    return (pl.concat(marked).sort("_row").drop("_row") if any(counts.values()) else gnss), counts
+
+
+def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
+    """Also with the rows that were left out of streams other than GNSS, whose runs say it for each solution."""
+    told = [
+        f"{name}: {found.far_off} rows left out: their time is more than a day from the others or the positions"
+        for name, found in counts.items()
+        if found.far_off and name != "gnss"
+    ]
+    return replace(notes, skipped_topics=(*notes.skipped_topics, *told))
+
+
+def _strays(frame: pl.DataFrame, few: float) -> Bools:
+    """Rows before 1970, and those that more than a day parts from most of their solution, where they are `few`."""
+    t_ns = frame["t"].cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy()
+    stray: Bools = t_ns < 0
+    if not t_ns.size or int(t_ns.max()) - int(t_ns.min()) <= _DAY_NS:
+        return stray
+    solutions = frame["solution"].to_numpy() if "solution" in frame.columns else np.zeros(t_ns.size)
+    for name in np.unique(solutions[~stray]):
+        rows = np.flatnonzero((solutions == name) & ~stray)
+        far = _far_from_most(t_ns[rows])
+        stray[rows] = far & (far.sum() <= few * rows.size)
+    return stray
+
+
+def _far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
+    """Times outside the largest group without a gap of more than a day."""
+    order = np.argsort(t_ns, kind="stable")
+    group = np.concatenate(([0], np.cumsum(np.diff(t_ns[order]) > _DAY_NS)))
+    far = np.zeros(t_ns.size, dtype=np.bool_)
+    far[order] = group != np.bincount(group).argmax()
+    return far
+
+
+def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
+    """Times more than a day before or after every position, in 64 bits without overflow."""
+    t_ns, known = (series.cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy() for series in (t, positions))
+    if not known.size:
+        return np.zeros(t.len(), dtype=np.bool_)
+    known = np.sort(known)
+    at = np.searchsorted(np.minimum(known, np.iinfo(np.int64).max - _DAY_NS) + _DAY_NS, t_ns)
+    far: Bools = (at == known.size) | (t_ns < known[np.minimum(at, known.size - 1)] - _DAY_NS)
+    return far
+
+
+def require_one_journey(fixes: pl.DataFrame, place: str) -> None:
+    """Refuse a cleaned solution that a gap of more than a day parts: no train is on the way for so long unseen."""
+    gaps = np.diff(fixes["t"].to_physical().to_numpy()) > _DAY_NS
+    if gaps.any():
+        row = int(gaps.argmax())
+        raise InputError(
+            "holds positions more than a day apart",
+            place=f"{place}, column t",
+            found=f"{fixes['t'][row]} and {fixes['t'][row + 1]}",
+            expected="the times of one journey",
+            remedy="Split the recording, or correct its times.",
+        )
+
+
+def _of_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
+    counts = _in_order(part, ["t"])[1]
+    contradicting = 0
+    if counts.duplicates:
+        first = [pl.col(name).first().over("t") for name in _PLACE]
+        elsewhere = [(pl.col(name) != kept).fill_null(False) for name, kept in zip(_PLACE, first, strict=True)]
+        contradicting = int(part.select(pl.any_horizontal(elsewhere).sum()).item())
+    far_off = far.filter(pl.col("solution") == part["solution"][0]).height
+    return replace(counts, contradicting=contradicting, far_off=far_off)
+
+
+def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
+    """What `clean` would count in one stream, of GNSS in one solution."""
+    return _in_order(frame.drop_nulls("t"), _KEYS.get(stream, ["t"]))[1]
+
+
+def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
+    frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
+    if (np.diff(frame["t"].to_physical().to_numpy()) > 0).all():
+        return frame, StreamCounts()
+    latest = pl.col("t").cum_max()  # of those recorded so far
+    keys = [key for key in keys if key in frame.columns]
+    sources = [key for key in keys if key in DEFAULTS]
+    late = frame.select((pl.col("t") < (latest.over(sources) if sources else latest)).sum()).item()
+    ordered = frame if late == 0 and frame["t"].is_sorted() else frame.sort("t", maintain_order=True)
+    unique = ordered.unique(subset=keys, keep="first", maintain_order=True)
+    return unique, StreamCounts(frame.height - unique.height, late)
+
+
+def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
+    """Refuse a cleaned stream with fewer than two times."""
+    if stream.height < 2:
+        raise InputError(
+            f"all rows have the same time{of}" if stream.height else f"no row has a time after 1970{of}",
+            place=f"{place}, column t",
+            found=f"{stream.height} distinct time{'' if stream.height == 1 else 's'}",
+            expected="at least two epochs at different times",
+            remedy="Check the recorder's time stamps, or `time` in the [ingest] mapping.",
+        )
+
+
+def _require_common_time(run: RunLog) -> None:
+    """Refuse an odometer of another time than the GNSS: not one position could be held against it."""
+    gnss, odometer = run.gnss, run.odometer
+    if gnss.is_empty() or odometer is None:
+        return
+    (begin, end), (odometer_begin, odometer_end) = (stream["t"].to_physical()[[0, -1]] for stream in (gnss, odometer))
+    if odometer_begin > end or odometer_end < begin:
+        raise InputError(
+            "does not overlap the GNSS in time",
+            place=f"{run.run_id}: odometer, column t",
+            found=f"{odometer['t'][0]} to {odometer['t'][-1]}",
+            expected=f"times within {gnss['t'][0]} to {gnss['t'][-1]}",
+            remedy=_clock_remedy(run),
+        )
+
+
+def _clock_remedy(run: RunLog) -> str:
+    """What makes both records one journey, if anything does."""
+    # Imported here because only such a run needs it.
+    from pipeline.studies.plausibility.fit import fit_run, remedy_of
+
+    known = "Check date and time scale (UTC or GPS) of both recorders, or leave the odometer out."
+    if not {"fix", *_PLACE} <= set(run.gnss.columns):
+        return known
+    found = fit_run(run, run.solutions()[0], Vehicle(), PlausibilityConfig()).impossible
+    return " ".join([known, *(f"{check.sentence}." for check in found), remedy_of(found)]).rstrip(" ")

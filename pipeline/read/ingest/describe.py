@@ -1,0 +1,232 @@
+"""What a log holds, what would be made of it, and what is left over: for `balise inspect`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import polars as pl
+
+from pipeline.read.ingest.clean import StreamCounts, stamp_counts
+from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of
+from pipeline.read.ingest.guesses import NAMES, columns_in, mapping_lines, word_of
+from pipeline.read.ingest.mcap_block import Block, Messages
+from pipeline.read.ingest.mcap_model import Channel
+from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
+from pipeline.read.ingest.plan import Sample, sources_of
+from pipeline.read.ingest.run import read_run
+from pipeline.stages.epochs.clock import GAP_PERIODS
+from pipeline.storage import files
+from pipeline.storage.address import Address, join, name_of
+from schemas.config import IngestConfig
+from schemas.errors import BaliseError, InputError
+from schemas.run import STREAMS, IngestNotes, RunLog, Stream
+
+_MOST_SAMPLES = 1000  # topics whose fields are looked for: each takes the time of parsing its schema
+
+
+@dataclass(frozen=True)
+class StreamSummary:
+    """One stream, of GNSS one solution: `rate_hz` from the median step, gaps longer than 1.5 steps."""
+
+    stream: Stream
+    solution: str | None
+    rows: int
+    t_start_ns: int | None
+    t_end_ns: int | None
+    rate_hz: float | None
+    gaps: int
+    longest_gap_s: float | None
+    duplicates: int
+    out_of_order: int
+    fix_mix: Mapping[str, int]
+    columns: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """One topic of an MCAP file; `mapping` is stream column to recorded fields, empty where left over."""
+
+    topic: str
+    schema: str
+    encoding: str
+    messages: int
+    rate_hz: float | None
+    stream: Stream | None
+    mapping: Mapping[str, str]
+    fields: Mapping[str, str]
+    remark: str = ""
+
+
+@dataclass(frozen=True)
+class LogDescription:
+    """What `balise inspect` shows of a log; `problems` is what keeps it from being replayed."""
+
+    path: str
+    kind: str
+    size_bytes: int
+    streams: tuple[StreamSummary, ...]
+    topics: tuple[TopicSummary, ...]
+    left_over: tuple[str, ...]
+    notes: IngestNotes
+    problems: tuple[str, ...]
+    starting_config: str
+    run: RunLog | None = None
+
+
+def describe_log(path: Address, config: IngestConfig) -> LogDescription:
+    """Describe a run; a log that cannot be replayed is described as far as it can be read."""
+    is_mcap = name_of(path).endswith(".mcap")
+    topics = _topics(path, config) if is_mcap else ()
+    parts = [path] if is_mcap else [join(path, name) for name in files.list_dir(path) if name.endswith(".parquet")]
+    run: RunLog | None = None
+    problems: tuple[str, ...] = ()
+    try:
+        run = read_run(path, config, with_digest=False)
+    except BaliseError as error:
+        problems = (str(error),)
+    summaries = tuple(_summaries(run)) if run else ()
+    notes = run.notes if run else IngestNotes()
+    left = tuple(topic.topic for topic in topics if topic.stream is None) or notes.skipped_topics
+    return LogDescription(
+        path=str(path),
+        kind="mcap" if is_mcap else "parquet",
+        size_bytes=sum(files.size_of(file) for file in parts),
+        streams=summaries,
+        topics=topics,
+        left_over=left,
+        notes=notes,
+        problems=problems,
+        starting_config=starting_config(topics),
+        run=run,
+    )
+
+
+def _summaries(run: RunLog) -> Iterator[StreamSummary]:
+    for stream in STREAMS:
+        if (frame := run.stream(stream)) is not None:
+            parts = frame.partition_by("solution", maintain_order=True) if stream == "gnss" else [frame]
+            yield from (_summary(stream, part) for part in parts)
+
+
+def _summary(stream: Stream, frame: pl.DataFrame) -> StreamSummary:
+    # Satellites share the time of their epoch: an epoch is one step.
+    t_ns = frame.to_series(0).to_physical().drop_nulls().to_numpy()
+    ordered = np.diff(np.unique(t_ns))
+    step = float(np.median(ordered)) if len(ordered) else None
+    stamps = stamp_counts(stream, frame) if stream != "faults" else StreamCounts()
+    late = ordered[ordered > GAP_PERIODS * step] if step else ordered[:0]
+    mix = frame["fix"].value_counts().sort("fix") if stream == "gnss" else None
+    return StreamSummary(
+        stream=stream,
+        solution=frame["solution"][0] if stream == "gnss" else None,
+        rows=frame.height,
+        t_start_ns=int(t_ns.min()) if len(t_ns) else None,
+        t_end_ns=int(t_ns.max()) if len(t_ns) else None,
+        rate_hz=1e9 / step if step else None,
+        gaps=len(late),
+        longest_gap_s=float(late.max()) / 1e9 if len(late) else None,
+        duplicates=stamps.duplicates,
+        out_of_order=stamps.out_of_order,
+        fix_mix=dict(mix.iter_rows()) if mix is not None else {},
+        columns=tuple(name for name in frame.columns if frame[name].null_count() < frame.height),
+    )
+
+
+@dataclass
+class _Met:
+    """What the walk has met of one channel."""
+
+    channel: Channel
+    fields: Mapping[str, str]
+    messages: int = 0
+    span_ns: list[int] = field(default_factory=list)
+
+
+class _Census:
+    """Counts messages of all channels and looks at the first of each."""
+
+    def __init__(self) -> None:
+        self.met: dict[int, _Met] = {}
+
+    def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        for channel_id, messages in block.items():
+            if channel_id not in self.met:
+                fields = _fields(channels[channel_id], messages) if len(self.met) < _MOST_SAMPLES else {}
+                self.met[channel_id] = _Met(channels[channel_id], fields)
+            met = self.met[channel_id]
+            times = messages.log_time
+            met.messages += len(messages)
+            met.span_ns += [int(times.min()), int(times.max())]
+
+
+def _fields(channel: Channel, messages: Messages) -> Mapping[str, str]:
+    """The fields of the first message; none of pictures and point clouds, which are too large to look into."""
+    if messages.length[0] > LARGEST_MESSAGE:
+        return {}
+    try:
+        return fields_of(decoder_for(channel)(messages.payload(0)))
+    except (UndecodableError, InputError):
+        return {}
+
+
+def _topics(path: Address, config: IngestConfig) -> tuple[TopicSummary, ...]:
+    """All topics as far as the log can be read; damage is a problem that reading reports."""
+    census = _Census()
+    try:
+        walk_log(path, config, census)
+    except InputError:
+        if not census.met:
+            return ()
+    return tuple(_topic(census.met[channel_id], config) for channel_id in sorted(census.met))
+
+
+def _topic(met: _Met, config: IngestConfig) -> TopicSummary:
+    sample = Sample(met.channel, met.fields)
+    span_s = (max(met.span_ns) - min(met.span_ns)) / 1e9
+    sources = sources_of(sample, config) if met.fields else []
+    source = next((source for source in sources if not source.dropped), None)
+    mapping = {}
+    if source is not None:
+        mapping = {name: " + ".join(time.fields) for name, time in source.times.items()}
+        mapping |= {
+            name: ", ".join(expression.meta.root_names()) or "constant" for name, expression in source.columns.items()
+        }
+    return TopicSummary(
+        topic=met.channel.topic,
+        schema=met.channel.schema_name,
+        encoding=met.channel.encoding,
+        messages=met.messages,
+        rate_hz=(met.messages - 1) / span_s if span_s > 0 else None,
+        stream=source.recipe.stream if source else None,
+        mapping=mapping,
+        fields=met.fields,
+        remark=source.recipe.remark if source else "",
+    )
+
+
+def starting_config(topics: Sequence[TopicSummary]) -> str:
+    """Configuration text that maps what is left over, as far as names allow a guess; to be checked."""
+    parts = [part for topic in topics if topic.stream is None and topic.fields for part in (_suggestion(topic),)]
+    if not parts:
+        return ""
+    return "# Check every line: names tell neither units nor whether a height is ellipsoidal.\n\n" + "\n".join(parts)
+
+
+def _suggestion(topic: TopicSummary) -> str:
+    numbers = [path for path, kind in topic.fields.items() if kind in ("int", "float")]
+    words = {path: word_of(path.split(".")[-1]) for path in sorted(numbers, key=lambda path: (path.count("."), path))}
+    for stream in NAMES:
+        time = ['time = "auto"  # or "log", "publish", "field:PATH"']
+        if lines := mapping_lines(stream, topic.topic, words, time, None, {}):
+            used = set(columns_in(stream, words).values())
+            return "\n".join([*lines, f"# other fields: {_others(topic.fields, used)}\n"])
+    return (
+        f'# [[ingest.STREAM]]\n# topic = "{topic.topic}"  # {topic.schema or "no schema"}\n'
+        f"# fields: {_others(topic.fields, set())}\n"
+    )
+
+
+def _others(fields: Mapping[str, str], used: set[str]) -> str:
+    return ", ".join(path for path in list(fields)[:30] if path not in used)

@@ -1,0 +1,86 @@
+"""What the configuration says of a stream, as a recipe."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+
+import dataframely as dy
+import polars as pl
+
+from pipeline.read.ingest.recipe import FIX_TYPE, Recipe
+from pipeline.read.ingest.recipes import recorded_type
+from schemas.config import IngestConfig, StreamMapping
+from schemas.enums import Fix
+from schemas.errors import ConfigError
+from schemas.inputs import STREAM_SCHEMAS
+from schemas.run import Stream
+
+
+def mappings_of(config: IngestConfig, stream: Stream) -> tuple[StreamMapping, ...]:
+    """What the configuration says about a stream (injected faults cannot be mapped)."""
+    mappings: tuple[StreamMapping, ...] = getattr(config, stream, ())
+    return mappings
+
+
+def mapped_recipe(base: Recipe | None, fields: Mapping[str, str], stream: Stream, mapping: StreamMapping) -> Recipe:
+    """The mapping over the recipe of the schema, `base`, if that is one of the same stream.
+
+    `fields`: those of the first message, with their kinds.
+    """
+    if base is None or base.stream != stream:
+        fix = {"fix": pl.lit(Fix.AUTONOMOUS.value, dtype=FIX_TYPE)} if stream == "gnss" else {}
+        base = Recipe(stream=stream, columns=fix, stamps={})
+    contract = STREAM_SCHEMAS[stream].columns()
+    _refuse_unknown_columns(stream, mapping, contract)
+    paths = {name: path for name, path in mapping.fields.items() if name != "t"}
+    columns = dict(base.columns) | {name: pl.col(path) for name, path in paths.items()}
+    types = dict(base.types) | {path: recorded_type(contract[name]) for name, path in paths.items()}
+    if "fix" in paths and mapping.fix_codes:
+        types[paths["fix"]], columns["fix"] = _coded(fields.get(paths["fix"]), paths["fix"], mapping)
+    columns |= {name: _constant(stream, mapping, name, contract[name]) for name in mapping.constants}
+    columns |= {name: columns[name] * factor for name, factor in mapping.factors.items() if name in columns}
+    return replace(base, columns=columns, types=types)
+
+
+def _refuse_unknown_columns(stream: Stream, mapping: StreamMapping, contract: Mapping[str, dy.Column]) -> None:
+    named = {*mapping.fields, *mapping.constants, *mapping.factors}
+    unknown = sorted(named - set(contract))
+    if unknown:
+        raise ConfigError(
+            "maps columns that this stream does not have",
+            place=f"[ingest.{stream}] topic {mapping.topic}",
+            found=", ".join(unknown),
+            expected=", ".join(contract),
+        )
+
+
+def _coded(kind: str | None, path: str, mapping: StreamMapping) -> tuple[pl.DataType, pl.Expr]:
+    """Kinds of fix by recorded number or text, as the `kind` of the field is.
+
+    A code that is not listed stays as it is, and is refused later.
+    """
+    kinds: dict[object, str] = {code: kind.value for code, kind in mapping.fix_codes.items()}
+    dtype: pl.DataType = pl.String()
+    if kind != "text" and all(re.fullmatch(r"-?\d+", code) for code in mapping.fix_codes):
+        kinds, dtype = {int(str(code)): kind for code, kind in kinds.items()}, pl.Int64()
+    known = pl.col(path).replace_strict(kinds, default=None, return_dtype=pl.String)
+    return dtype, pl.coalesce(known, pl.format("code {}", pl.col(path)))
+
+
+def _constant(stream: Stream, mapping: StreamMapping, name: str, column: dy.Column) -> pl.Expr:
+    value = mapping.constants[name]
+    words = column.categories if isinstance(column, dy.Enum) else None
+    if isinstance(column, dy.Float64 | dy.Int64):  # to Python, true is a number as well
+        fits = isinstance(value, float) and (value.is_integer() or isinstance(column, dy.Float64))
+    else:
+        fits = isinstance(value, bool if isinstance(column, dy.Bool) else str)
+    if not fits or (words is not None and value not in words):
+        raise ConfigError(
+            "is not a valid constant for this column",
+            place=f"[ingest.{stream}] topic {mapping.topic}: constants.{name}",
+            found=repr(value),
+            expected=", ".join(words) if words is not None else str(column.dtype),
+        )
+    return pl.lit(value, dtype=FIX_TYPE if words is not None else column.dtype)

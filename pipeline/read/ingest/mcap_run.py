@@ -1,0 +1,174 @@
+"""A run as one MCAP file."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Iterator, Mapping
+from typing import Protocol
+
+import numpy as np
+import polars as pl
+
+from pipeline.read.ingest.assemble import Decoded, stream_frames
+from pipeline.read.ingest.breaches import refuse
+from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of, undecodable
+from pipeline.read.ingest.mcap_block import Block, Messages
+from pipeline.read.ingest.mcap_model import Channel
+from pipeline.read.ingest.mcap_records import DamageError
+from pipeline.read.ingest.mcap_walk import McapWalk
+from pipeline.read.ingest.plan import Sample, is_candidate, settle, solution_of, sources_of
+from pipeline.read.ingest.reader import SourceReader
+from pipeline.storage import files
+from pipeline.storage.address import Address, stem_of
+from schemas.arrays import times_ns
+from schemas.config import IngestConfig
+from schemas.errors import InputError
+from schemas.run import IngestNotes, RunLog
+
+_MIB = 1024 * 1024
+LARGEST_MESSAGE = 4 * _MIB  # of messages that are decoded; pictures and point clouds are not
+_DECODED_TOGETHER = 16 * _MIB
+MOST_TOPICS = 256  # that may feed a stream: no train has as many receivers
+
+
+class McapStreams:
+    """Feeds the messages of a log to readers, which are chosen as channels appear."""
+
+    def __init__(self, config: IngestConfig) -> None:
+        self._config = config
+        self.readers: dict[int, list[SourceReader]] = {}
+
+    def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        for channel_id, messages in block.items():
+            readers = self.readers.get(channel_id)
+            if readers is None:
+                readers = self.readers[channel_id] = self._readers(messages, channels[channel_id])
+            if readers:
+                _check_sizes(messages, channels[channel_id])
+            for reader in readers:
+                for part in _pieces(messages):
+                    reader.add(part)
+
+    def _readers(self, messages: Messages, channel: Channel) -> list[SourceReader]:
+        if not is_candidate(channel, self._config):
+            return []
+        if sum(map(bool, self.readers.values())) >= MOST_TOPICS:
+            raise InputError(
+                f"holds more than {MOST_TOPICS} topics of positions, speeds or reads",
+                place=channel.file,
+                expected="the topics of one train",
+                remedy="Select topics with [ingest] in the configuration, or remove the others from the log.",
+            )
+        _check_sizes(messages, channel)
+        return [SourceReader(source) for source in sources_of(_sample_of(messages, channel), self._config)]
+
+
+def _check_sizes(messages: Messages, channel: Channel) -> None:
+    largest = int(messages.length.max())
+    if largest > LARGEST_MESSAGE:
+        raise InputError(
+            f"has a message of {largest} bytes",
+            place=channel.place,
+            expected=f"at most {LARGEST_MESSAGE} bytes in a topic that feeds a stream",
+        )
+
+
+def _pieces(messages: Messages) -> Iterator[Messages]:
+    """The messages of an unusually large block in parts: decoding needs several times their size."""
+    if messages.length.sum() < _DECODED_TOGETHER:
+        yield messages
+        return
+    cuts = np.flatnonzero(np.diff(messages.length.cumsum() // _DECODED_TOGETHER)) + 1
+    yield from (messages.chosen(rows) for rows in np.split(np.arange(len(messages)), cuts))
+
+
+def _sample_of(messages: Messages, channel: Channel) -> Sample:
+    """The fields of the channel's first message."""
+    try:
+        return Sample(channel, fields_of(decoder_for(channel)(messages.payload(0))))
+    except UndecodableError as error:
+        raise undecodable(channel, messages, 0, error) from None
+
+
+def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
+    """All streams of a log, read strictly from front to back in pieces."""
+    streams = McapStreams(config)
+    walk, digest = walk_log(path, config, streams, with_digest)
+    frames, slow_messages, left_over = _frames(path, config, walk, streams)
+    return RunLog(
+        run_id=stem_of(path),
+        notes=IngestNotes(
+            partial_until_ns=times_ns(frames["gnss"]).max().item() if walk.cut_at is not None else None,
+            damage=f"cut off at byte {walk.cut_at}" if walk.cut_at is not None else None,
+            slow_path_messages=slow_messages,
+            chunks_without_crc=walk.without_crc,
+            skipped_topics=left_over,
+        ),
+        input_digest=digest,
+        gnss=frames["gnss"],
+    ).with_streams(**frames)
+
+
+class BlockSink(Protocol):
+    def add(self, block: Block, channels: Mapping[int, Channel]) -> None: ...
+
+
+def walk_log(
+    path: Address, config: IngestConfig, streams: BlockSink, with_digest: bool = False
+) -> tuple[McapWalk, str]:
+    """Walk the whole log into `streams`; damage becomes one error that names file, byte and kind.
+
+    `with_digest`: also the SHA-256 of the file, else an empty text.
+    """
+    try:
+        with files.open_binary(path) as raw, io.BufferedReader(raw, _MIB) as stream:  # type: ignore[type-var]
+            size = stream.seek(0, io.SEEK_END)
+            walk = McapWalk(stream, size, str(path), int(config.chunk_limit_mib * _MIB))
+            for block in walk.blocks():
+                streams.add(block, walk.channels)
+            stream.seek(0)
+            return walk, hashlib.file_digest(stream, "sha256").hexdigest() if with_digest else ""
+    except DamageError as damage:
+        raise InputError(
+            str(damage), place=str(path), remedy="Record or copy the log again, or try `mcap recover`."
+        ) from None
+    except OSError as error:
+        raise InputError(f"cannot be read: {error}", place=str(path)) from None
+
+
+def _frames(
+    path: Address, config: IngestConfig, walk: McapWalk, streams: McapStreams
+) -> tuple[dict[str, pl.DataFrame], int, tuple[str, ...]]:
+    """Frames of all streams, messages decoded one by one, and the topics that fed none."""
+    readers = [reader for found in streams.readers.values() for reader in found]
+    met = [walk.channels[channel_id] for channel_id in streams.readers]
+    settled = settle([reader.source for reader in readers], [c.topic for c in met], config, str(path))
+    chosen = [reader for reader in readers if any(reader.source is source for source in settled)]
+    decoded = [Decoded(r.source, solution_of(r.source, settled), r.frame()) for r in chosen]
+    used = {source.channel.topic for source in settled}
+    unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
+    left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
+    breaches: list[InputError] = []
+    remarks: list[str] = []
+    frames = stream_frames(decoded, breaches, config.wrong_dates_share, remarks)
+    if "gnss" not in frames:
+        breaches.append(_no_gnss(path, walk, left_over))
+    refuse(breaches)
+    return frames, sum(reader.slow_messages for reader in chosen), (*left_over, *remarks)
+
+
+def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> InputError:
+    if walk.cut_at is not None and not walk.met.message_counts:
+        return InputError(
+            f"is cut off at byte {walk.cut_at}, before any complete message",
+            place=str(path),
+            remedy="Record or copy the log again.",
+        )
+    return InputError(
+        "holds no GNSS stream",
+        place=str(path),
+        found=", ".join(left_over[:40]) or "no messages",
+        expected="a topic of a known schema, or one mapped by [ingest.gnss]",
+        remedy="Map a topic in the configuration; `balise inspect` prints one to start from.",
+    )

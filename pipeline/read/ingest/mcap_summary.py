@@ -1,0 +1,92 @@
+"""What a log says about itself at its end, held against what the walk met."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from isal.isal_zlib import crc32
+from mcap.opcode import Opcode
+from mcap.records import Chunk, ChunkIndex, Footer, Statistics
+
+from pipeline.read.ingest.mcap_records import HEAD_SIZE, DamageError, parse
+
+
+@dataclass
+class Met:
+    """What the walk counted on its way.
+
+    `chunk_sum` adds up what a chunk index must say of each chunk, in any order: a log may have a million of them.
+    """
+
+    message_counts: Counter[int] = field(default_factory=Counter)
+    chunks: int = 0
+    chunk_sum: int = 0
+    attachments: int = 0
+    metadata: int = 0
+    span_ns: tuple[int, int] | None = None
+
+    def add_chunk(self, chunk: Chunk, offset: int, length: int) -> None:
+        """A chunk whose record has this offset and length."""
+        start_ns, end_ns = chunk.message_start_time, chunk.message_end_time
+        self.chunks += 1
+        self.chunk_sum += hash(
+            (start_ns, end_ns, offset, length, len(chunk.data), chunk.uncompressed_size, chunk.compression)
+        )
+
+    def add_times(self, low_ns: int, high_ns: int) -> None:
+        old = self.span_ns or (low_ns, high_ns)
+        self.span_ns = (min(old[0], low_ns), max(old[1], high_ns))
+
+
+class Summary:
+    """The summary section, record by record; raises where it contradicts what was met."""
+
+    def __init__(self, start: int, met: Met) -> None:
+        self._start = start
+        self._met = met
+        self._crc = 0
+        self._indexed = 0
+        self._index_sum = 0
+
+    def add(self, opcode: int, whole: bytes, position: int) -> None:
+        """A record before the footer."""
+        self._crc = crc32(whole, self._crc)
+        if opcode == Opcode.CHUNK_INDEX:
+            told = parse(ChunkIndex, whole[HEAD_SIZE:], position)
+            span_ns = (told.message_start_time, told.message_end_time)
+            place = (told.chunk_start_offset, told.chunk_length)
+            content = (told.compressed_size, told.uncompressed_size, told.compression)
+            self._indexed += 1
+            self._index_sum += hash((*span_ns, *place, *content))
+        elif opcode == Opcode.STATISTICS:
+            self._check_statistics(parse(Statistics, whole[HEAD_SIZE:], position), position)
+
+    def _check_statistics(self, told: Statistics, position: int) -> None:
+        met = self._met
+        per_channel = {channel: count for channel, count in told.channel_message_counts.items() if count}
+        pairs: list[tuple[str, object, object]] = [
+            ("messages", told.message_count, met.message_counts.total()),
+            ("chunks", told.chunk_count, met.chunks),
+            ("attachments", told.attachment_count, met.attachments),
+            ("metadata records", told.metadata_count, met.metadata),
+            ("messages per channel", per_channel or dict(met.message_counts), dict(met.message_counts)),
+        ]
+        if met.span_ns:
+            # Some writers take a first time of 0 for none yet, and tell of the earliest after it.
+            start_ns = told.message_start_time if met.span_ns[0] else 0
+            pairs.append(("times", (start_ns, told.message_end_time), met.span_ns))
+        for name, expected, found in pairs:
+            if expected != found:
+                raise DamageError(position, f"the statistics record gives {expected} {name}, the file holds {found}")
+
+    def finish(self, footer: bytes, position: int) -> None:
+        """The footer. A chunk index lists every chunk once, or there is none."""
+        told = parse(Footer, footer[HEAD_SIZE:], position)
+        start = self._start if position != self._start else 0
+        if told.summary_start != start:
+            raise DamageError(position, f"the footer places the summary at {told.summary_start}, it is at {start}")
+        if told.summary_crc and crc32(footer[:-4], self._crc) != told.summary_crc:
+            raise DamageError(position, "the checksum of the summary does not match")
+        if self._indexed and (self._indexed, self._index_sum) != (self._met.chunks, self._met.chunk_sum):
+            raise DamageError(position, "the chunk index disagrees with the chunks")

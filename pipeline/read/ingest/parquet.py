@@ -1,0 +1,87 @@
+"""A run as a folder of Parquet files, one per stream."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+import polars as pl
+
+from pipeline.read.ingest.breaches import refuse
+from pipeline.read.ingest.conform import conform
+from pipeline.storage import files
+from pipeline.storage.address import Address, join, stem_of
+from pipeline.storage.parquet import ParquetError, Schema, read_parquet, without_checksums
+from schemas.errors import InputError
+from schemas.inputs import STREAM_SCHEMAS
+from schemas.run import STREAMS, IngestNotes, RunLog, Stream
+
+
+def read_folder(path: Address, with_digest: bool = True) -> RunLog:
+    """A folder `RUN/` of `gnss.parquet`, `odometer.parquet`, ...; every breach of every file in one error."""
+    present = set(files.list_dir(path))
+    breaches: list[InputError] = []
+    if "gnss.parquet" not in present:
+        breaches.append(_no_gnss(path, present))
+    digest = hashlib.sha256()
+    frames: dict[str, pl.DataFrame] = {}
+    skipped: list[str] = []
+    unproved: list[str] = []
+    for stream in STREAMS:
+        if f"{stream}.parquet" not in present:
+            continue
+        file = join(path, f"{stream}.parquet")
+        content = files.read_bytes(file)
+        if with_digest:
+            digest.update(f"{stream}:{len(content)}:".encode())
+            digest.update(content)
+        recorded = _read(content, stream, str(file), breaches)
+        if recorded is not None:
+            frames[stream] = conform(recorded, stream, str(file), breaches)
+            unproved += [f"{stream}.parquet"] if without_checksums(content) else []
+            skipped += [f"{stream}.parquet: column {name}" for name in _others(recorded.columns, stream)]
+    refuse(breaches)
+    skipped += sorted(present - {f"{stream}.parquet" for stream in STREAMS})
+    return RunLog(
+        run_id=stem_of(path),
+        notes=IngestNotes(skipped_topics=tuple(skipped), files_without_crc=tuple(unproved)),
+        input_digest=digest.hexdigest() if with_digest else "",
+        gnss=frames["gnss"],
+    ).with_streams(**frames)
+
+
+def _no_gnss(path: Address, present: set[str]) -> InputError:
+    return InputError(
+        "holds no GNSS stream",
+        place=str(path),
+        found=", ".join(sorted(present)[:10]) or "an empty folder",
+        expected="gnss.parquet",
+        remedy="Give a run folder or an MCAP file; `balise convert` makes runs of receiver logs.",
+    )
+
+
+def _read(content: bytes, stream: Stream, place: str, breaches: list[InputError]) -> pl.DataFrame | None:
+    if not content:
+        breaches.append(InputError("is empty", place=place, found="0 bytes", expected="a Parquet file"))
+        return None
+    contract = STREAM_SCHEMAS[stream].columns()
+    met: Schema = {}
+
+    def known(found: Schema) -> list[str]:
+        met.update(found)
+        return [name for name in found if name in contract]
+
+    try:
+        frame = read_parquet(content, known)
+    except ParquetError as error:
+        breaches.append(
+            InputError(f"cannot be read as Parquet ({error})", place=place, remedy="Record or copy the file again.")
+        )
+        return None
+    return frame.with_columns(pl.lit(None).alias(name) for name in _others(met, stream))
+
+
+def _others(columns: Iterable[str], stream: Stream) -> list[str]:
+    """Columns outside the contract, of which only the names are kept."""
+    known = STREAM_SCHEMAS[stream].columns()
+    return [name for name in columns if name not in known]

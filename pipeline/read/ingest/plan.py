@@ -1,0 +1,266 @@
+"""Which streams a channel of a log may feed, how its messages make rows, and which of the channels do feed them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.read.ingest.breaches import refuse
+from pipeline.read.ingest.conform import DEFAULTS
+from pipeline.read.ingest.generic import definition_of
+from pipeline.read.ingest.mapping import mapped_recipe, mappings_of
+from pipeline.read.ingest.mcap_model import Channel
+from pipeline.read.ingest.recipe import Recipe
+from pipeline.read.ingest.recipes import recipes_for
+from pipeline.read.ingest.stamps import (
+    LOG_TIME,
+    PUBLISH_TIME,
+    TIME_KINDS,
+    CivilTime,
+    TimeSource,
+    stamp_parts,
+    time_source,
+)
+from schemas.config import IngestConfig, StreamMapping
+from schemas.errors import ConfigError, InputError
+from schemas.inputs import STREAM_SCHEMAS
+from schemas.run import STREAMS, Stream
+
+_POSITION = ("latitude_deg", "longitude_deg")
+_USUAL_STAMPS = ("header.stamp", "timestamp", "stamp")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A channel with the fields of its first message and their kinds."""
+
+    channel: Channel
+    fields: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Source:
+    """One channel that feeds a stream: fields to decode, columns and times over them.
+
+    `doubtful` are fields that the first message lacks and some message must have, by column. `implicit` are
+    nullable columns of this project's protobuf messages whose field cannot be left out: 0 may say that it was.
+    """
+
+    channel: Channel
+    recipe: Recipe
+    mapping: StreamMapping | None
+    columns: Mapping[str, pl.Expr]
+    times: Mapping[str, TimeSource | CivilTime]
+    types: Mapping[str, pl.DataType]
+    breaches: Sequence[InputError]
+    doubtful: Mapping[str, str]
+    implicit: Sequence[str]
+
+    @property
+    def dropped(self) -> bool:
+        """A driver's optional message that is not as its recipe knows it: left over, not an error."""
+        optional = self.recipe.stream == "satellites" or self.recipe.supplement
+        return bool(self.breaches) and optional and self.mapping is None and not self.recipe.own
+
+
+def sources_of(sample: Sample, config: IngestConfig) -> list[Source]:
+    """What the channel may feed: by configuration, else by its schema."""
+    known = _by_schema(sample)
+    found: list[Source] = []
+    for stream in STREAMS:
+        mappings = mappings_of(config, stream)
+        found += [mapped_source(sample, stream, m) for m in mappings if m.topic == sample.channel.topic]
+        if known is not None and known.recipe.stream == stream and (not mappings or known.recipe.supplement):
+            found.append(known)
+    return found
+
+
+def is_candidate(channel: Channel, config: IngestConfig) -> bool:
+    """Whether anything may be made of the channel at all."""
+    mapped = any(mapping.topic == channel.topic for stream in STREAMS for mapping in mappings_of(config, stream))
+    return mapped or bool(recipes_for(channel.schema_name, channel.topic))
+
+
+def _by_schema(sample: Sample) -> Source | None:
+    """By the first recipe of the schema whose fields are all there, else by the first at all."""
+    known = [_source(sample, recipe) for recipe in recipes_for(sample.channel.schema_name, sample.channel.topic)]
+    return next((source for source in known if not source.breaches), known[0] if known else None)
+
+
+def mapped_source(sample: Sample, stream: Stream, mapping: StreamMapping) -> Source:
+    """The source that the configuration makes of a channel."""
+    known = _by_schema(sample)
+    recipe = mapped_recipe(known.recipe if known else None, sample.fields, stream, mapping)
+    return _source(sample, recipe, mapping)
+
+
+def _source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None) -> Source:
+    """How the channel's messages make rows; `breaches` tells what they lack."""
+    contract = STREAM_SCHEMAS[recipe.stream].columns()
+    closed = sample.channel.encoding != "json"  # JSON messages may leave keys out one by one
+    columns: dict[str, pl.Expr] = {}
+    breaches: list[InputError] = []
+    doubtful: dict[str, str] = {}
+    for name, expression in recipe.columns.items():
+        absent = [path for path in recipe.fields_of(name) if not _is_there(sample, recipe, path)]
+        wanted = mapping is not None and name in mapping.fields
+        if not absent or (not closed and contract[name].nullable):
+            columns[name] = expression
+            if absent and (wanted or (name in _POSITION and not recipe.own)):
+                doubtful[name] = absent[0]
+        elif wanted or not (contract[name].nullable or name in DEFAULTS):
+            breaches.append(missing_field(sample.channel, sample.fields, name, absent))
+    times = _times(sample, recipe, mapping, breaches)
+    paths = dict.fromkeys([*recipe.key, *(path for name in columns for path in recipe.fields_of(name))])
+    types = {path: recipe.type_of(path) for path in paths}
+    for time in times.values():
+        types |= time.types
+    implicit = _without_presence(sample.channel, columns) if recipe.own else ()
+    return Source(sample.channel, recipe, mapping, columns, times, types, breaches, doubtful, implicit)
+
+
+def _without_presence(channel: Channel, columns: Iterable[str]) -> tuple[str, ...]:
+    """Columns whose protobuf field has its default where it was not set (proto3 without `optional`)."""
+    if channel.encoding != "protobuf":
+        return ()
+    known = definition_of(channel).DESCRIPTOR.fields_by_name
+    return tuple(name for name in columns if name in known and not known[name].has_presence)
+
+
+def _is_there(sample: Sample, recipe: Recipe, path: str) -> bool:
+    in_element = f"{recipe.rows}[0].{path}"
+    # An array that happens to be empty in the first message says nothing about its elements.
+    return path in sample.fields or (
+        bool(recipe.rows)
+        and (in_element in sample.fields or not any(name.startswith(recipe.rows + "[") for name in sample.fields))
+    )
+
+
+def missing_field(channel: Channel, fields: Iterable[str], column: str, absent: Sequence[str]) -> InputError:
+    return InputError(
+        f"has no field {', '.join(absent)} for column {column}",
+        place=channel.place,
+        found=", ".join(list(fields)[:40]) or None,
+        remedy="Name the field of this column in `fields` of [ingest] in the configuration.",
+    )
+
+
+def _times(
+    sample: Sample, recipe: Recipe, mapping: StreamMapping | None, breaches: list[InputError]
+) -> dict[str, TimeSource | CivilTime]:
+    """The time of validity, and further times (end of a fault), which look like it and may be absent."""
+    if recipe.time is not None and (mapping is None or mapping.time == "auto"):
+        return {"t": recipe.time}
+    (column, path), *others = (recipe.stamps or {"t": ""}).items()
+    first = _time(sample, path, mapping, breaches)
+    extra = {name: first.of_field(path, other) for name, other in others}
+    return {column: first, **extra}
+
+
+def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: list[InputError]) -> TimeSource:
+    """The time of validity: as configured, else the payload's stamp, else the log time."""
+    wanted = mapping.time if mapping else "auto"
+    log_time = time_source((LOG_TIME,), {LOG_TIME: "int"}, mapping)
+    if wanted == "log":
+        return log_time
+    if wanted == "publish":
+        return time_source((PUBLISH_TIME,), {PUBLISH_TIME: "int"}, mapping)
+    named = wanted.removeprefix("field:") if wanted != "auto" else mapping.fields.get("t") if mapping else None
+    for candidate in (named,) if named else (path, *_USUAL_STAMPS):
+        parts = stamp_parts(sample.fields, candidate)
+        unfit = [sample.fields[part] for part in parts if sample.fields[part] not in TIME_KINDS]
+        if parts and not unfit:
+            return time_source(parts, sample.fields, mapping)
+        if unfit and named:
+            place = f"{sample.channel.place}: field {candidate}"
+            breaches.append(InputError("is not a time", place=place, found=unfit[0], expected="numbers or text"))
+            return log_time
+    if named:
+        breaches.append(missing_field(sample.channel, sample.fields, "t", [named]))
+    return log_time
+
+
+def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfig, file: str) -> list[Source]:
+    """The sources that stand, once all channels are known; raises for what is missing or in doubt."""
+    breaches = _absent_topics(topics, config, file)
+    kept: list[Source] = []
+    for stream in STREAMS:
+        chosen = _preferred([s for s in sources if s.recipe.stream == stream and not s.dropped])
+        if stream == "gnss":
+            _refuse_shared_solutions(chosen)
+        elif stream != "satellites":
+            breaches += _competing(stream, chosen, file)
+        breaches += [breach for source in chosen for breach in source.breaches]
+        kept += chosen
+    refuse(breaches)
+    return kept
+
+
+def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[InputError]:
+    return [
+        InputError(
+            f"is configured for {stream} but has no messages",
+            place=f"{file}: topic {mapping.topic}",
+            found=", ".join(sorted(set(topics))) or "no topics",
+            remedy="Correct [ingest] in the configuration; `balise inspect` lists the topics.",
+        )
+        for stream in STREAMS
+        for mapping in mappings_of(config, stream)
+        if mapping.topic not in topics
+    ]
+
+
+def _preferred(sources: Sequence[Source]) -> list[Source]:
+    """This project's own schema alone where it is present; a supplement only with what it adds to."""
+    own = [source for source in sources if source.recipe.own]
+    if own:
+        return own
+    whole = [source for source in sources if not source.recipe.supplement]
+    return list(sources) if whole else []
+
+
+def _refuse_shared_solutions(sources: Sequence[Source]) -> None:
+    """Two receivers under one name would be read as one that jumps between their positions."""
+    topics: dict[str, str] = {}
+    for source in sources:
+        name = source.mapping.solution if source.mapping and not source.recipe.supplement else None
+        if name is not None and topics.setdefault(name, source.channel.topic) != source.channel.topic:
+            raise ConfigError(
+                "several topics feed the same solution",
+                place=f"[ingest.gnss] solution {name}",
+                found=f"{topics[name]}, {source.channel.topic}",
+                expected="one name per topic",
+                remedy="Give each [[ingest.gnss]] a `solution` of its own.",
+            )
+
+
+def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[InputError]:
+    """GNSS may come from several topics, and odometers of which each names its sensor; nothing tells others apart."""
+    topics = list(dict.fromkeys(source.channel.topic for source in sources))
+    sensors = {source.mapping.constants.get("sensor") for source in sources if source.mapping}
+    if len(topics) < 2 or (stream == "odometer" and None not in sensors and len(sensors) == len(topics)):
+        return []
+    return [
+        InputError(
+            f"several topics could be the {stream}",
+            place=file,
+            found=", ".join(topics),
+            expected="one",
+            remedy=f"Choose one with `topic` in [ingest.{stream}] of the configuration"
+            + (", or give each topic `constants = {sensor = ...}` of its own." if stream == "odometer" else "."),
+        )
+    ]
+
+
+def solution_of(source: Source, settled: Sequence[Source]) -> str | None:
+    """The name of a solution: as configured, `primary` for the only topic, else after the topic."""
+    if source.recipe.stream not in ("gnss", "satellites"):
+        return None
+    if source.mapping and source.mapping.solution is not None:
+        return source.mapping.solution
+    whole = [other for other in settled if other.recipe.stream == "gnss" and not other.recipe.supplement]
+    if len({other.channel.topic for other in whole}) < 2:
+        return "primary"
+    return source.channel.topic.strip("/").replace("/", "_") or "primary"

@@ -1,0 +1,159 @@
+"""The layout of a protobuf message, by the descriptors that the log carries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from pipeline.read.ingest.generic import parse_path
+from pipeline.read.ingest.layout import Field, Layout, UnfitError, Values, constant, fixed, flag, layout_of, text
+from pipeline.read.ingest.mcap_block import Bytes
+
+# Wire types (protobuf encoding guide).
+_VARINT, _I64, _LEN, _I32 = 0, 1, 2, 5
+# descriptor.proto: FieldDescriptorProto.Type
+_BOOL, _STRING, _MESSAGE = 8, 9, 11
+_FIXED_WIDTH = {1: "<f8", 6: "<u8", 16: "<i8", 2: "<f4", 7: "<u4", 15: "<i4"}
+# What remains of the 64 bits: an int32 below zero is written with all 64 bits of its sign.
+_VARINTS = {3: np.int64, 4: np.uint64, 5: np.int32, 13: np.uint32, 14: np.int32}
+_ZIGZAG = (17, 18)  # sint32, sint64
+
+Raw = tuple[int, int, int]  # wire type, from, to
+
+
+def layout_by(descriptor: Any, types: Mapping[str, pl.DataType]) -> Callable[[bytes], Layout]:
+    """What finds the layout of a message: where the fields asked for lie in it."""
+    tree: dict[str | int, Any] = {}
+    for path in types:
+        node = tree
+        for step in parse_path(path):
+            node = node.setdefault(step, {})
+        node[""] = path
+    return partial(_layout, descriptor, tree, types)
+
+
+def _layout(descriptor: Any, tree: Mapping[Any, Any], types: Mapping[str, pl.DataType], payload: bytes) -> Layout:
+    walk = _Walk(payload, types)
+    walk.message(descriptor, tree, 0, len(payload))
+    return layout_of(payload, walk.static, walk.fields)
+
+
+class _Walk:
+    """The walk through one message; what is not wanted only shapes the layout."""
+
+    def __init__(self, payload: bytes, types: Mapping[str, pl.DataType]) -> None:
+        self.fields: dict[str, Field] = {}
+        self.static = bytearray(len(payload))
+        self._payload = payload
+        self._types = types
+
+    def message(self, descriptor: Any, tree: Mapping[Any, Any], start: int, end: int) -> None:
+        """The wanted fields of the message in this extent."""
+        met = self._scan(start, end)
+        for step, subtree in tree.items():
+            field = descriptor.fields_by_name.get(step) if isinstance(step, str) else None
+            if field is None:
+                raise UnfitError(f"no field {step}")
+            found = met.get(field.number, [])
+            if len(found) > 1:
+                raise UnfitError("a field occurs twice")
+            if not found:
+                self._absent(field, subtree)
+            elif field.is_repeated:
+                self._packed(field, subtree, *found[0])
+            elif field.type == _MESSAGE and found[0][0] == _LEN:
+                self.message(field.message_type, subtree, *found[0][1:])
+            else:
+                self._keep(subtree, _value(field.type, *found[0]))
+
+    def _scan(self, at: int, end: int) -> dict[int, list[Raw]]:
+        """All fields of one message by number; tags, lengths and widths of varints are marked as static."""
+        met: dict[int, list[Raw]] = {}
+        while at < end:
+            tag, start = self._varint(at, end, 0xFF)
+            number, wire = tag >> 3, tag & 7
+            if wire == _VARINT:
+                _, at = self._varint(start, end, 0x80)
+            elif wire == _LEN:
+                length, start = self._varint(start, end, 0xFF)
+                at = start + length
+            elif wire in (_I64, _I32):
+                at = start + (8 if wire == _I64 else 4)
+            else:
+                raise UnfitError("a group or unknown wire type")
+            if at > end or number == 0:
+                raise UnfitError("a field runs past its message")
+            met.setdefault(number, []).append((wire, start, at))
+        return met
+
+    def _varint(self, at: int, end: int, mask: int) -> tuple[int, int]:
+        """Value and next offset; the mask fixes the value itself, or its width only."""
+        value = 0
+        for place in range(10):
+            if at >= end:
+                break
+            byte = self._payload[at]
+            self.static[at] = mask
+            value |= (byte & 0x7F) << (7 * place)
+            at += 1
+            if byte < 0x80:
+                return value, at
+        raise UnfitError("a number runs past its message, or has more than ten bytes")
+
+    def _packed(self, field: Any, tree: Mapping[Any, Any], wire: int, start: int, end: int) -> None:
+        """Elements of a packed array of fixed width."""
+        dtype = _FIXED_WIDTH.get(field.type)
+        if dtype is None or wire != _LEN or (end - start) % int(dtype[2]):
+            raise UnfitError("an array without fixed width")
+        for index, subtree in tree.items():
+            offset = start + int(dtype[2]) * index if isinstance(index, int) else end
+            if offset < end:
+                self._keep(subtree, fixed(offset, dtype))
+            else:
+                self._null(subtree)
+
+    def _absent(self, field: Any, tree: Mapping[Any, Any]) -> None:
+        """A field that is left out: null where presence is known or it is an array, else the default."""
+        if field.is_repeated or field.has_presence:
+            self._null(tree)
+        elif (path := tree.get("")) is not None:
+            self.fields[path] = constant(field.default_value, self._types[path])
+
+    def _null(self, tree: Mapping[Any, Any]) -> None:
+        for step, node in tree.items():
+            if step == "":
+                self.fields[node] = constant(None, self._types[node])
+            else:
+                self._null(node)
+
+    def _keep(self, tree: Mapping[Any, Any], field: Field) -> None:
+        path = tree.get("")
+        if path is None or len(tree) > 1:
+            raise UnfitError("a field is used as a message")
+        self.fields[path] = field.as_type(self._types[path])
+
+
+def _value(kind: int, wire: int, start: int, end: int) -> Field:
+    if kind in _FIXED_WIDTH and wire == (_I64 if _FIXED_WIDTH[kind].endswith("8") else _I32):
+        return fixed(start, _FIXED_WIDTH[kind])
+    if kind == _STRING and wire == _LEN:
+        return text(start, end - start)
+    if kind == _BOOL and wire == _VARINT and end - start == 1:
+        return flag(start)
+    if wire == _VARINT and (kind in _VARINTS or kind in _ZIGZAG):
+        return Field(pl.Int64, start, end, lambda rows: _numbers(rows, kind))
+    raise UnfitError("wire type")
+
+
+def _numbers(septets: Bytes, kind: int) -> Values:
+    """Varints of one width."""
+    total = np.zeros(len(septets), dtype=np.uint64)
+    for place in range(septets.shape[1]):
+        total |= (septets[:, place] & 0x7F).astype(np.uint64) << np.uint64(7 * place)
+    if kind in _ZIGZAG:
+        return (total >> np.uint64(1)).astype(np.int64) ^ -(total & np.uint64(1)).astype(np.int64)
+    return total.astype(_VARINTS[kind])

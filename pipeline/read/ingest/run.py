@@ -1,0 +1,49 @@
+"""Reading one recorded run, whatever it is stored as."""
+
+from __future__ import annotations
+
+from pipeline.read.ingest.correct import corrected
+from pipeline.read.ingest.mcap_run import MOST_TOPICS, read_mcap
+from pipeline.read.ingest.parquet import read_folder
+from pipeline.storage import files
+from pipeline.storage.address import Address, name_of, shown
+from schemas.config import IngestConfig
+from schemas.errors import InputError
+from schemas.run import RunLog
+
+_DEFAULTS = IngestConfig()
+
+
+def read_run(path: Address, config: IngestConfig = _DEFAULTS, with_digest: bool = True) -> RunLog:
+    """One run from `RUN.mcap` or a folder `RUN/` of Parquet files (CONTRACT section 1).
+
+    `with_digest`: also the SHA-256 of its files, which results are stamped with; else `input_digest` is empty.
+
+    Every stream has exactly the contract's columns and types; rows stay in recorded order, duplicates
+    included. Raises one `InputError` that lists all breaches; a log that is cut off is read up to the
+    damage and says so in `notes`. What the configuration corrects in the streams is corrected (`[[ingest.correct]]`).
+    """
+    run = _recorded(path, config, with_digest)
+    if (count := run.gnss["solution"].n_unique()) > MOST_TOPICS:
+        raise InputError(
+            "holds more solutions of the position than any train has receivers",
+            place=f"{shown(path)}: gnss, column solution",
+            found=str(count),
+            expected=f"at most {MOST_TOPICS}",
+        )
+    return corrected(run, config.correct)
+
+
+def _recorded(path: Address, config: IngestConfig, with_digest: bool) -> RunLog:
+    if name_of(path).endswith(".mcap"):
+        return read_mcap(path, config, with_digest)
+    if files.is_dir(path):
+        return read_folder(path, with_digest)
+    if not files.exists(path):
+        raise InputError("does not exist", place=shown(path), expected="RUN.mcap or a folder RUN/")
+    raise InputError(
+        "is neither an MCAP file nor a folder",
+        place=shown(path),
+        expected="RUN.mcap or a folder RUN/ of Parquet files",
+        remedy="`balise convert` makes runs of receiver logs.",
+    )

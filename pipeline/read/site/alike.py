@@ -1,0 +1,201 @@
+"""What cannot be told apart: balises by linking (LOC section III), and tracks by positions alone (DOMAIN section 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.lds.windows import DEFAULTS, minimal_spacing_m, window_m
+from pipeline.stages.matching.candidates import candidates_of, segments_of
+from pipeline.stages.track.geodesy import points_of
+from pipeline.stages.track.network import Network, network_of
+from pipeline.stages.track.path import valid_along_measure
+from pipeline.stages.track.segments import SAMPLE_SPACING_M
+from pipeline.stages.track.survey import Track, places_along, track_of
+from schemas.arrays import Floats
+from schemas.config import LdsConfig, MatchingConfig, SiteConfig
+from schemas.enums import BaliseKind
+from schemas.run import Finding, Site
+
+_DEFAULTS = SiteConfig()
+
+
+@dataclass(frozen=True)
+class _Point:
+    """An announced balise `at_m` from the entry of an oriented element."""
+
+    balise_id: str
+    element: int
+    accuracy_m: float
+    at_m: float
+
+
+def window_findings(site: Site, config: LdsConfig = DEFAULTS, limits: SiteConfig = _DEFAULTS) -> list[Finding]:
+    """One warning per pair of announced balises whose windows overlap, both measured from a balise before them.
+
+    Ways over several net elements and switches count, in each direction that navigability allows. Virtual and
+    physical balises are linked apart.
+    """
+    if site.balises is None:
+        return []
+    network = network_of(track_of(site.track), site.links)
+    found: dict[tuple[str, str], Finding] = {}
+    for (_,), balises in site.balises.filter("linked").group_by("kind", maintain_order=True):
+        points = _points(balises, network)
+        for oriented, on_it in sorted(points.items()):
+            for index, reference in enumerate(on_it):
+                for near, far in _ahead(network, points, oriented, index, limits.announced_m):
+                    if finding := _judge(reference, near, far, config):
+                        first, second = sorted((near[0].balise_id, far[0].balise_id))
+                        found.setdefault((first, second), finding)
+    return [found[pair] for pair in sorted(found)]
+
+
+def _points(balises: pl.DataFrame, network: Network) -> dict[int, list[_Point]]:
+    """Balises of one kind by oriented element, in the order in which a train meets them."""
+    points: dict[int, list[_Point]] = {}
+    columns = ("balise_id", "netelement_id", "measure_m", "location_accuracy_m")
+    valid = valid_along_measure(balises)
+    for (name, netelement_id, measure_m, accuracy_m), along in zip(balises.select(columns).rows(), valid, strict=True):
+        if (element := network.track.element_at(netelement_id, measure_m)) is None:
+            continue
+        # Even runs with the measure, odd against it.
+        for oriented in (2 * element + side for side, sense in ((0, 1), (1, -1)) if along in (0, sense)):
+            at_m = network.track.along_m(oriented, measure_m)
+            points.setdefault(oriented, []).append(_Point(name, element, accuracy_m, at_m))
+    return {
+        oriented: sorted(on_it, key=lambda point: (point.at_m, point.balise_id)) for oriented, on_it in points.items()
+    }
+
+
+_Met = tuple[_Point, float]
+"""A balise with its distance from the reference [m]."""
+
+
+def _ahead(
+    network: Network, points: dict[int, list[_Point]], oriented: int, index: int, announced_m: float
+) -> Iterator[tuple[_Met, _Met]]:
+    """The next two balises on each way ahead of one, as far as it is announced."""
+    reference = points[oriented][index]
+    waiting: list[tuple[int, float, int, tuple[_Met, ...]]] = [(oriented, -reference.at_m, index + 1, ())]
+    seen: set[tuple[int, tuple[str, ...]]] = set()
+    while waiting:
+        here, entry_m, first, met = waiting.pop()
+        key = here, tuple(point.balise_id for point, _ in met)
+        if key in seen or entry_m > announced_m:
+            continue
+        seen.add(key)
+        met = (*met, *((point, entry_m + point.at_m) for point in points.get(here, [])[first:]))[:2]
+        if len(met) == 2:
+            yield met[0], met[1]
+            continue
+        exit_m = entry_m + network.length_m(here)
+        waiting += [(edge.to, exit_m + edge.gap_m, 0, met) for edge in network.successors[here] if edge.forward]
+
+
+def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Finding | None:
+    (expected, distance_m), (later, later_m) = near, far
+    close_m = window_m(distance_m, expected.accuracy_m, reference.accuracy_m, config).close_m
+    open_m = window_m(later_m, later.accuracy_m, reference.accuracy_m, config).open_m
+    if open_m > close_m:
+        return None
+    needed_m = minimal_spacing_m(distance_m, expected.accuracy_m, later.accuracy_m, reference.accuracy_m, config)
+    return Finding(
+        "warning",
+        f"balises {expected.balise_id}, {later.balise_id}",
+        f"expectation windows measured from {reference.balise_id} overlap: {later_m - distance_m:.1f} m apart, "
+        f"{needed_m:.1f} m needed",
+        "Linking alone cannot tell them apart; place them farther apart, or rely on the monitors between them.",
+    )
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """A part of an element beside another one, by measure."""
+
+    element: int
+    other: int
+    begin_m: float
+    end_m: float
+    apart_m: float
+
+
+def parallel_findings(site: Site, config: MatchingConfig) -> list[Finding]:
+    """One warning per pair of elements and stretch; nothing where a route is given.
+
+    The bias of the run and the survey alone decide here, as for a receiver without any noise: a run right on its own
+    track claims 1 / (1 + exp(-d² / 2V)) for tracks d apart, V the sum of both variances.
+    """
+    if site.route is not None:
+        return []
+    network = network_of(track_of(site.track), site.links)
+    return [
+        _finding(site, network, stretch, config)
+        for stretch in _stretches(network, config)
+        if stretch.end_m - stretch.begin_m >= config.parallel_least_m
+    ]
+
+
+def most_claimed(apart_m: float, survey_m: float, config: MatchingConfig) -> float:
+    """What a run right on one of two tracks claims for it at most, by positions alone."""
+    variance_m2 = config.cross_bias_sigma_m**2 + survey_m**2
+    return float(1.0 / (1.0 + np.exp(-(apart_m**2) / (2.0 * variance_m2))))
+
+
+def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
+    """Per pair of elements the parts of the first that lie too near the second."""
+    track = network.track
+    along = places_along(track, SAMPLE_SPACING_M)
+    element, measure_m = along.element, along.measure_m
+    survey_m = _survey_m(track, config)
+    odds = np.log(config.ambiguity_probability / (1.0 - config.ambiguity_probability))
+    limit_m = np.sqrt(2.0 * odds * (config.cross_bias_sigma_m**2 + survey_m**2))
+    points = points_of(along.latitude_deg, along.longitude_deg)
+    found = candidates_of(points, network, segments_of(track), float(limit_m.max()))
+    own = element[found.step]
+    # Two surveys never end at the same place.
+    near = (found.beyond_m <= config.survey_sigma_default_m) & (own < found.element)
+    near &= found.distance_m < limit_m[own]
+    pairs, row = own[near] * network.count + found.element[near], found.step[near]
+    apart_m = found.distance_m[near]
+    order = np.lexsort((row, pairs))
+    pairs, row, apart_m = pairs[order], row[order], apart_m[order]
+    cuts = np.flatnonzero((np.diff(pairs) != 0) | (np.diff(row) > 1)) + 1
+    for part in np.split(np.arange(len(row)), cuts):
+        if len(part):
+            one, other = divmod(int(pairs[part[0]]), network.count)
+            at_m = measure_m[row[part]]
+            yield _Stretch(one, other, float(at_m[0]), float(at_m[-1]), float(np.median(apart_m[part])))
+
+
+def _finding(site: Site, network: Network, stretch: _Stretch, config: MatchingConfig) -> Finding:
+    name, other = network.track.ids[stretch.element], network.track.ids[stretch.other]
+    claim = most_claimed(stretch.apart_m, float(_survey_m(network.track, config)[stretch.element]), config)
+    text = (
+        f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {other} lies {stretch.apart_m:.1f} m beside it; positions "
+        f"alone give one of them a probability of {claim:.2f} at most, so that virtual balises there are ambiguous"
+    )
+    return Finding("warning", f"element {name}", text, _remedy(site, network, stretch))
+
+
+def _remedy(site: Site, network: Network, stretch: _Stretch) -> str:
+    """What would tell: a route always, reads and switches where there are some."""
+    told = ["a route (`balise replay --write-route`, `--route`)"]
+    names = [network.track.ids[stretch.element], network.track.ids[stretch.other]]
+    balises = [] if site.balises is None else site.balises.select("balise_id", "netelement_id", "kind").rows()
+    reads = [balise for balise, name, kind in balises if name in names and str(kind) == BaliseKind.PHYSICAL.value]
+    if reads:
+        told.append(f"a read of {', '.join(reads[:3])}")
+    oriented = [2 * element + sense for element in (stretch.element, stretch.other) for sense in (0, 1)]
+    if any(len(network.successors[one]) > 1 for one in oriented):
+        told.append("a switch taken at its end")
+    return f"To tell the two apart: {', '.join(told)}."
+
+
+def _survey_m(track: Track, config: MatchingConfig) -> Floats:
+    """Per element the survey's sigma, the least of its points; the configured one where it states none."""
+    stated = np.where(np.isfinite(track.sigma_m), track.sigma_m, config.survey_sigma_default_m)
+    return np.asarray(np.minimum.reduceat(stated, track.first[:-1]))

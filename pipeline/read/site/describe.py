@@ -1,0 +1,100 @@
+"""What a site holds, in figures for `inspect`."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.track.network import Network, network_of
+from pipeline.stages.track.survey import Track, track_of
+from schemas.run import Finding, Site
+
+
+def describe_site(site: Site) -> dict[str, object]:
+    """Figures of a site by name; lengths and spacings in metres, `box_deg` south, west, north, east.
+
+    `parts` counts connected pieces of network, `switches` ends from which more than one way leads on.
+    """
+    track = track_of(site.track)
+    network = network_of(track, site.links)
+    spacing = np.concatenate([np.diff(track.measure_m[part]) for _, _, part in track.elements()])
+    known = track.sigma_m[np.isfinite(track.sigma_m)]
+    kinds = [] if site.balises is None else site.balises["kind"].cast(str).to_list()
+    ways = [len(edges) for edges in network.successors]
+    return {
+        "elements": len(track.ids),
+        "points": len(track.measure_m),
+        "length_m": float(track.length_m.sum()),
+        "longest_m": float(track.length_m.max()),
+        "shortest_m": float(track.length_m.min()),
+        "dimensions": _dimensions(track),
+        "spacing_median_m": float(np.median(spacing)),
+        "spacing_max_m": float(spacing.max()),
+        "sigma_median_m": float(np.median(known)) if len(known) else None,
+        "without_sigma": int(np.isnan(track.sigma_m).sum()),
+        "relations": dict(sorted(Counter(site.links["navigability"].cast(str).to_list()).items())),
+        "parts": _parts(network),
+        "switches": sum(count > 1 for count in ways),
+        "open_ends": sum(count == 0 for count in ways),
+        "balises": dict(sorted(Counter(kinds).items())),
+        "route_elements": None if site.route is None else site.route.height,
+        "box_deg": (
+            float(track.latitude_deg.min()),
+            float(track.longitude_deg.min()),
+            float(track.latitude_deg.max()),
+            float(track.longitude_deg.max()),
+        ),
+    }
+
+
+def without_balises(balises: pl.DataFrame | None) -> tuple[Finding, ...]:
+    """A finding where a site has no balises, because then nothing is judged but positions."""
+    if balises is not None and balises.height:
+        return ()
+    text = "the site has none: a replay ends with matching and monitors, and says nothing of balises"
+    return (Finding("warning", "balises", text, "Add balises.csv, or make the site with --balises."),)
+
+
+def elements_table(site: Site) -> pl.DataFrame:
+    """Per net element its id, length [m], points, balises, and the elements that a train can reach from either end."""
+    track = track_of(site.track)
+    reached: dict[tuple[str, int], list[str]] = {}
+    for a, a_end, b, b_end, way in site.links.iter_rows():
+        if way != "none":
+            reached.setdefault((a, a_end), []).append(b)
+            reached.setdefault((b, b_end), []).append(a)
+    counts = Counter([] if site.balises is None else site.balises["netelement_id"].to_list())
+    rows = [
+        (
+            name,
+            round(float(track.length_m[element]), 1),
+            part.stop - part.start,
+            counts[name],
+            ", ".join(reached.get((name, 0), [])),
+            ", ".join(reached.get((name, 1), [])),
+        )
+        for element, name, part in track.elements()
+    ]
+    columns = ("netelement_id", "length_m", "points", "balises", "before_start", "after_end")
+    return pl.DataFrame(rows, schema=list(columns), orient="row")
+
+
+def _dimensions(track: Track) -> str:
+    flat = [bool(np.isnan(track.height_m[part]).any()) for _, _, part in track.elements()]
+    if all(flat):
+        return "2-D"
+    return "3-D" if not any(flat) else f"mixed: {sum(flat)} of {len(flat)} elements 2-D"
+
+
+def _parts(network: Network) -> int:
+    """Connected pieces of the network, whatever the navigability."""
+    # They take long to load, and a log needs none.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = [(start // 2, edge.to // 2) for start, edges in enumerate(network.successors) for edge in edges]
+    rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    joined = coo_array((np.ones(len(rows)), (rows, columns)), shape=(network.count, network.count))
+    return int(connected_components(joined, directed=False, return_labels=False))

@@ -1,0 +1,206 @@
+"""RailTopoModel networks as GeoJSON: net elements are LineStrings, net relations join their ends.
+
+Read as ERA RINF exports and measurement-train networks write it: an element carries `id` or `netelement_id`, and
+`sigma_m` where its survey states one; a relation carries `netelementA`, `positionOnA`, `netelementB`, `positionOnB`
+and `navigability`, or in the words of the ERA vocabulary `elementA`, `isOnOriginOfElementA` and so on, of railML
+`elementA = {"ref": ...}`. Case, underscores and prefixes (`era:`) of property names do not matter.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import polars as pl
+
+from pipeline.read.site.tables import EPSG_WGS84, RawTable
+from schemas.enums import Navigability
+
+_MALFORMED = (KeyError, TypeError, ValueError, LookupError, OverflowError, RecursionError)
+_ID_KEYS = ("netelementid", "id", "elementid", "name")
+_LENGTH_KEYS = ("lengthm", "length")
+_A_KEYS, _B_KEYS = (
+    tuple(
+        name.format(side) for name in ("netelement{}", "element{}", "netelement{}id", "element{}id", "netelementid{}")
+    )
+    for side in "ab"
+)
+_START, _END = ("0", "0.0", "start", "begin", "origin"), ("1", "1.0", "end")
+_POSITIONS_A = (("positionona", "positiona"), "isonoriginofelementa")
+_POSITIONS_B = (("positiononb", "positionb"), "isonoriginofelementb")
+
+
+_TRACK_COLUMNS = {
+    "netelement_id": pl.String,
+    **dict.fromkeys(("longitude_deg", "latitude_deg", "height_m", "sigma_m"), pl.Float64),
+}
+_LINK_COLUMNS = {
+    "netelement_a": pl.String,
+    "position_a": pl.Int64,
+    "netelement_b": pl.String,
+    "position_b": pl.Int64,
+    "navigability": pl.String,
+}
+
+
+@dataclass
+class Network:
+    """What one GeoJSON file holds; `declared_length_m` where elements state their length."""
+
+    track: RawTable
+    links: RawTable | None
+    declared_length_m: dict[str, float]
+    ignored: int
+
+
+def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
+    """Net elements and net relations of a FeatureCollection, or breaches."""
+    try:
+        document = json.loads(data)
+        features, epsg = list(document["features"]), _epsg(document)
+    except _MALFORMED as error:
+        breaches.append(f"{file}: is not a GeoJSON FeatureCollection ({error})")
+        return None
+    return _network(file, features, epsg, breaches)
+
+
+def has_relations(features: Iterable[Any]) -> bool:
+    """Net relations stand beside the lines: a network that says itself where trains can run. Raises `ValueError`."""
+    return any(_is_relation(_plain_keys(None, parts_of(feature)[0])) for feature in features)
+
+
+def _is_relation(keys: Mapping[str, Any]) -> bool:
+    return any(key in keys for key in (*_A_KEYS, *_B_KEYS))
+
+
+def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> Network:
+    points: list[tuple[Any, ...]] = []
+    relations: list[tuple[Any, ...]] = []
+    lengths: dict[str, float] = {}
+    ignored = 0
+    for number, feature in enumerate(features):
+        try:
+            properties, geometry = parts_of(feature)
+            keys = _plain_keys(feature.get("id"), properties)
+            if _is_relation(keys):
+                relations.append(_relation(keys))
+            elif geometry.get("type") in ("LineString", "MultiLineString"):
+                points += _element(geometry, keys, lengths)
+            else:
+                ignored += 1
+        except _MALFORMED as error:
+            breaches.append(f"{file}: feature {number}: {error}")
+    track = RawTable(file, pl.DataFrame(points, schema=_TRACK_COLUMNS, orient="row"), epsg)
+    links = RawTable(file, pl.DataFrame(relations, schema=_LINK_COLUMNS, orient="row")) if relations else None
+    return Network(track, links, lengths, ignored)
+
+
+def parts_of(feature: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """Properties and geometry of a feature, empty where it has none. Raises `ValueError`."""
+    found = [(feature.get(name) or {}) if isinstance(feature, Mapping) else None for name in ("properties", "geometry")]
+    if not all(isinstance(part, Mapping) for part in found):
+        raise ValueError("a feature is no object with properties and a geometry")
+    return found[0], found[1]  # type: ignore[return-value]
+
+
+def triple(point: Any) -> tuple[float, float, float | None]:
+    """Longitude, latitude and height (none where there is none). Raises `ValueError`."""
+    try:
+        longitude, latitude, *height = point
+        return float(longitude), float(latitude), float(height[0]) if height and height[0] is not None else None
+    except _MALFORMED:
+        raise ValueError("coordinates are not numbers [longitude, latitude(, height)]") from None
+
+
+def _plain_keys(own_id: Any, properties: Mapping[str, Any]) -> dict[str, Any]:
+    """Properties by lower-case name without underscores; the feature's own `id` where they have none."""
+    keys = {re.sub(r"^\w+:|[_\-\s]", "", str(key)).lower(): value for key, value in properties.items()}
+    return keys if own_id is None else {"id": own_id, **keys}
+
+
+def _first(keys: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+    return next((keys[name] for name in names if keys.get(name) is not None), None)
+
+
+def _element(geometry: Mapping[str, Any], keys: Mapping[str, Any], lengths: dict[str, float]) -> list[tuple[Any, ...]]:
+    """The points of a net element; its declared length goes into `lengths`, NaN where it states none."""
+    name = _first(keys, _ID_KEYS)
+    if name is None:
+        raise ValueError("a LineString without property id or netelement_id")
+    if str(name) in lengths:
+        raise ValueError(f"net element {name} occurs twice in the file")
+    lines = [geometry.get("coordinates") or []]
+    if geometry["type"] == "MultiLineString":
+        lines = lines[0]
+        if len(lines) != 1:
+            raise ValueError(f"{name}: MultiLineString of {len(lines)} parts; a net element is one line")
+    if not isinstance(lines[0], list):
+        raise ValueError(f"{name}: coordinates are not a list of points")
+    declared = _first(keys, _LENGTH_KEYS)
+    declared_m = _metres(declared) if isinstance(declared, int | float) else None
+    sigma_m = _metres(keys.get("sigmam"))
+    points = [(str(name), *triple(point), sigma_m) for point in lines[0]]
+    lengths[str(name)] = float("nan") if declared_m is None else declared_m
+    return points
+
+
+def _metres(value: Any) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 2**1023:
+        # Python does not even write integers of 4,300 digits.
+        large = isinstance(value, int) and value.bit_length() > 1024
+        raise ValueError(f"{'a very large integer' if large else repr(value)[:80]}; expected a number of metres")
+    return float(value)
+
+
+def _relation(keys: Mapping[str, Any]) -> tuple[Any, ...]:
+    ends = [_referred(_first(keys, names)) for names in (_A_KEYS, _B_KEYS)]
+    positions = [_position(keys, names, origin) for names, origin in (_POSITIONS_A, _POSITIONS_B)]
+    # Vocabularies give the word as the last part of an address.
+    said = keys.get("navigability")
+    word = "" if said is None else re.split("[/#]", str(said).strip().lower())[-1]
+    known = {member.value.lower(): member.value for member in Navigability}
+    if word not in known:
+        raise ValueError(f"navigability {word or said!r}; expected one of {', '.join(Navigability)}")
+    if None in positions:
+        found = [_first(keys, names) for names, _ in (_POSITIONS_A, _POSITIONS_B)]
+        raise ValueError(f"positionOnA {found[0]!r}, positionOnB {found[1]!r}; expected 0 or 1 (start or end)")
+    if None in ends:
+        raise ValueError(f"netelementA {ends[0]!r}, netelementB {ends[1]!r}; a relation joins two elements")
+    return str(ends[0]), positions[0], str(ends[1]), positions[1], known[word]
+
+
+def _position(keys: Mapping[str, Any], names: tuple[str, ...], origin: str) -> int | None:
+    """End 0 or 1 of an element, or whether it is its origin (ERA vocabulary); none where neither is said."""
+    said, at_origin = _first(keys, names), keys.get(origin)
+    if said is None and isinstance(at_origin, bool):
+        return 0 if at_origin else 1
+    word = str(said).strip().lower()
+    return 0 if word in _START else 1 if word in _END else None
+
+
+def _referred(element: Any) -> Any:
+    """The identity of an element that a relation names, itself or by reference."""
+    if isinstance(element, Mapping):
+        element = _first(_plain_keys(None, element), ("ref", *_ID_KEYS))
+    return element
+
+
+def _epsg(document: Mapping[str, Any]) -> int:
+    """EPSG code of the `crs` member (GeoJSON 2008), WGS 84 without one (RFC 7946)."""
+    crs = document.get("crs")
+    if crs is None:
+        return int(document.get("epsg") or EPSG_WGS84)
+    properties = crs.get("properties") if isinstance(crs, Mapping) else {"name": crs}
+    named = properties if isinstance(properties, Mapping) else {}
+    name = str(named.get("name", named.get("code", "")))
+    if name.upper().endswith("CRS84"):
+        return EPSG_WGS84
+    code = re.search(r"(\d+)$", name)
+    if code is None:
+        raise ValueError(f"crs {name!r}: expected a name such as urn:ogc:def:crs:EPSG::31370")
+    return int(code.group(1))

@@ -1,0 +1,106 @@
+"""Hazards of two results matched by time and class."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import polars as pl
+
+from pipeline.results.diff.tables import Difference, compare_tables
+from schemas.tables import Hazards
+
+# Of the comparison of two results, which have a configuration each: an onset moves by an epoch at 1 Hz either way.
+HAZARD_WINDOW_S = 2.0
+# Columns of a hazard that say what it was, whether it was seen in time and what it hit.
+_DECIDING = {
+    *("failure_mode", "timing", "evidence", "caused_by", "monitor", "detected", "within_budget"),
+    *("balise_ids", "accepted_ids"),
+}
+
+
+@dataclass(frozen=True)
+class HazardChange:
+    """A hazard that stands in one result only, or in both with other values."""
+
+    change: Literal["appeared", "vanished", "changed"]
+    solution: str
+    hazard: str
+    t_hazard: str
+    differences: tuple[Difference, ...] = ()
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is more than other figures of the same hazard."""
+        return self.change != "changed" or bool({item.column for item in self.differences} & _DECIDING)
+
+    @property
+    def short(self) -> str:
+        """The change in one line; of changed values the columns alone."""
+        columns = ", ".join(item.column for item in self.differences if item.column in _DECIDING)
+        head = f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
+        return f"{head}: {columns}" if columns else head
+
+    def __str__(self) -> str:
+        text = f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
+        return text + "".join(f"\n    {item.column}: {item.message}" for item in self.differences)
+
+
+def compare_hazards(a: pl.DataFrame, b: pl.DataFrame) -> tuple[list[Difference], list[HazardChange]]:
+    """Differences of the tables' schemas, and the hazards that appeared, vanished or changed, in time order.
+
+    The numbers of hazards (`hazard_id`, `caused_by`) count as changed only where none came or went.
+    """
+    schema = [item for item in compare_tables(a.clear(), b.clear(), Hazards) if item.kind == "schema"]
+    if any(item.column in {"solution", "hazard", "t_hazard"} for item in schema):
+        return schema, []
+    pairs = _matched(a, b)
+    gone = [row for row in range(a.height) if row not in pairs]
+    come = [row for row in range(b.height) if row not in set(pairs.values())]
+    ids = ["hazard_id", "caused_by"] if gone or come else []
+    changes = [(_stamp(a, row), _change("vanished", a, row)) for row in gone]
+    changes += [(_stamp(b, row), _change("appeared", b, row)) for row in come]
+    for row_a, row_b in pairs.items():
+        one, other = (frame.drop(ids, strict=False)[row : row + 1] for frame, row in ((a, row_a), (b, row_b)))
+        found = [item for item in compare_tables(one, other, Hazards) if item.kind == "values"]
+        if found:
+            changes.append((_stamp(a, row_a), _change("changed", a, row_a, tuple(found))))
+    return schema, [change for _, change in sorted(changes, key=lambda item: item[0])]
+
+
+def _matched(a: pl.DataFrame, b: pl.DataFrame) -> dict[int, int]:
+    """Rows of `a` to rows of `b`: each at most once, the nearest in time first."""
+    rows_a, rows_b = (
+        frame.select("solution", pl.col("hazard").cast(pl.String), t=pl.col("t_hazard").to_physical()).rows()
+        for frame in (a, b)
+    )
+    window_ns = round(HAZARD_WINDOW_S * 1e9)
+    near = sorted(
+        (apart_ns, row_a, row_b)
+        for row_a, (solution_a, class_a, t_a) in enumerate(rows_a)
+        for row_b, (solution_b, class_b, t_b) in enumerate(rows_b)
+        if (solution_a, class_a) == (solution_b, class_b)
+        and (apart_ns := 0 if t_a == t_b else window_ns + 1 if None in (t_a, t_b) else abs(t_a - t_b)) <= window_ns
+    )
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, row_a, row_b in near:
+        if row_a not in pairs and row_b not in taken:
+            pairs[row_a] = row_b
+            taken.add(row_b)
+    return dict(sorted(pairs.items()))
+
+
+def _stamp(frame: pl.DataFrame, row: int) -> int:
+    """The hazard's time [ns]; those without one come first."""
+    return int(frame["t_hazard"].to_physical()[row] or 0)
+
+
+def _change(
+    change: Literal["appeared", "vanished", "changed"],
+    frame: pl.DataFrame,
+    row: int,
+    differences: tuple[Difference, ...] = (),
+) -> HazardChange:
+    t_text = frame["t_hazard"].dt.to_string("%Y-%m-%dT%H:%M:%S%.3fZ")[row] or "an unknown time"
+    return HazardChange(change, frame["solution"][row], str(frame["hazard"][row]), t_text, differences)

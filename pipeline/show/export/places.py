@@ -1,0 +1,204 @@
+"""Where results are on the ground: net element and measure back to WGS 84, by the surveyed track, and of a solution."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.track.geodesy import moved_deg, points_of
+from pipeline.stages.track.survey import Track, track_of
+from schemas.arrays import Floats, floats
+from schemas.run import Site
+
+_POINTS = 3000
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Positions in degrees and metres, NaN where not known; `heading_deg` of growing measure, clockwise from north."""
+
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    heading_deg: Floats
+
+
+def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) -> Ground:
+    """Places on the rails. Between survey points position is linear; beyond the ends the last chord goes on."""
+    survey = track_of(track)
+    columns = [np.full(len(measure_m), np.nan) for _ in range(4)]
+    names = netelement_id.to_frame("name").with_row_index("row")
+    for name, rows in names.drop_nulls().group_by("name", maintain_order=True):
+        number = survey.index.get(str(name[0]))
+        if number is None:
+            continue
+        index = rows["row"].to_numpy()
+        for column, values in zip(columns, _on_element(survey, number, measure_m[index]), strict=True):
+            column[index] = values
+    return Ground(*columns)
+
+
+def beside(ground: Ground, sign: Floats, left_m: Floats, above_m: Floats) -> Ground:
+    """Places `left_m` to the left of growing path and `above_m` over the rails.
+
+    `sign` is +1 where path and measure grow together, -1 where against each other. For metres, not kilometres.
+    """
+    heading = np.radians(ground.heading_deg)
+    east, north = -left_m * sign * np.cos(heading), left_m * sign * np.sin(heading)
+    level = np.nan_to_num(ground.height_m)
+    latitude, longitude = moved_deg(ground.latitude_deg, ground.longitude_deg, level, east, north)
+    height = ground.height_m + np.nan_to_num(above_m)
+    return Ground(latitude, longitude, height, ground.heading_deg)
+
+
+def stretches_of(epochs: pl.DataFrame) -> pl.DataFrame:
+    """The stretches of net elements that a solution's epochs were matched to, each once, in order of time.
+
+    `netelement_id, sign, offset_m, first_m, last_m`: `path_m = offset_m + sign * measure_m` there, from `first_m` to
+    `last_m` of the path. Path and measure differ by a constant on an element (up to sign), so every pair of epochs
+    there shows both.
+    """
+    known = epochs.select("netelement_id", "measure_m", "path_m").drop_nulls()
+    return (
+        known.with_columns(run=pl.col("netelement_id").rle_id())
+        .group_by("run", "netelement_id", maintain_order=True)
+        .agg(
+            turn=(pl.col("measure_m").diff() * pl.col("path_m").diff()).sum(),
+            measure=pl.col("measure_m").last(),
+            path=pl.col("path_m").last(),
+            first_m=pl.col("path_m").min(),
+            last_m=pl.col("path_m").max(),
+        )
+        .filter(pl.col("turn") != 0.0)
+        .with_columns(sign=pl.col("turn").sign().cast(pl.Int64))
+        .with_columns(offset_m=pl.col("path") - pl.col("sign") * pl.col("measure"))
+        .group_by("netelement_id", "sign", pl.col("offset_m").round(0).alias("about"), maintain_order=True)
+        .agg(pl.col("offset_m").median(), pl.col("first_m").min(), pl.col("last_m").max())
+        .drop("about")
+    )
+
+
+def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, margin_m: float = 50.0) -> Ground:
+    """Places of path positions on the stretches; NaN further than `margin_m` beyond what was travelled."""
+    best, measure_m = np.full(len(path_m), np.inf), np.full(len(path_m), np.nan)
+    names = np.full(len(path_m), None, dtype=object)
+    survey = track_of(track)
+    for name, sign, offset_m, first_m, last_m in stretches.iter_rows():
+        # Path positions of the whole element, not just of the epochs on it.
+        ends = [first_m, last_m]
+        if name in survey.index:
+            measures = survey.measure_m[survey.vertices(survey.index[name])][[0, -1]]
+            ends += list(offset_m + sign * measures)
+        away = np.maximum(np.maximum(min(ends) - path_m, path_m - max(ends)), 0.0)
+        nearer = (away < best) & (away <= margin_m)
+        best[nearer], names[nearer] = away[nearer], name
+        measure_m[nearer] = sign * (path_m[nearer] - offset_m)
+    return ground_of(track, pl.Series(names, dtype=pl.String), measure_m)
+
+
+def sign_of(epochs: pl.DataFrame, stretches: pl.DataFrame) -> Floats:
+    """Per epoch +1 where its path grows with the measure, -1 against it, NaN where that is not known."""
+    rows = epochs.select("netelement_id", "measure_m", "path_m").with_row_index("row")
+    fitting = (
+        rows.join(stretches, on="netelement_id", how="left", maintain_order="left")
+        .with_columns(misfit=(pl.col("path_m") - pl.col("sign") * pl.col("measure_m") - pl.col("offset_m")).abs())
+        .sort("row", "misfit", nulls_last=True, maintain_order=True)
+        .group_by("row", maintain_order=True)
+        .first()
+    )
+    return fitting["sign"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+
+
+def plane_m(ground: Ground, origin: tuple[float, float]) -> tuple[Floats, Floats]:
+    """East and north of an origin (latitude, longitude) in its tangent plane [m], for drawing."""
+    plane = points_of(np.array([origin[0]]), np.array([origin[1]]))
+    offset = points_of(ground.latitude_deg, ground.longitude_deg).surface - plane.surface[0]
+    return offset @ plane.east[0], offset @ plane.north[0]
+
+
+def origin_of(site: Site) -> tuple[float, float]:
+    """Latitude and longitude of the track's first point, the origin of drawings."""
+    first = site.track.row(0, named=True)
+    return float(first["latitude_deg"]), float(first["longitude_deg"])
+
+
+def element_lines_m(site: Site) -> Iterator[tuple[str, Floats, Floats]]:
+    """Each net element as a line east and north of the origin [m], of no more points than a screen shows."""
+    survey = track_of(site.track)
+    nothing = np.full(len(survey.latitude_deg), np.nan)
+    east, north = plane_m(Ground(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))
+    for _, name, rows in survey.elements():
+        yield name, _thinned(east[rows]), _thinned(north[rows])
+
+
+def _thinned(values: Floats) -> Floats:
+    """Some thousand of the values, the last one among them."""
+    return np.append(values[: -1 : max(1, -(-len(values) // _POINTS))], values[-1:])
+
+
+def _on_element(track: Track, number: int, measure_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Latitude, longitude, height, heading of measures on one element."""
+    rows = track.vertices(number)
+    measures = track.measure_m[rows]
+    if len(measures) < 2:
+        nothing = np.full(len(measure_m), np.nan)
+        return nothing, nothing, nothing, nothing
+    segment = np.clip(np.searchsorted(measures, measure_m, side="right") - 1, 0, len(measures) - 2)
+    step = np.diff(measures)
+    share = (measure_m - measures[segment]) / np.where(step > 0, step, np.nan)[segment]
+    latitude, longitude, height = (column[rows] for column in (track.latitude_deg, track.longitude_deg, track.height_m))
+    east = np.diff(longitude) * np.cos(np.radians(latitude[:-1]))
+    heading = np.degrees(np.arctan2(east, np.diff(latitude))) % 360.0
+    along = (column[segment] + share * np.diff(column)[segment] for column in (latitude, longitude, height))
+    return (*along, heading[segment])  # type: ignore[return-value]
+
+
+_COVARIANCE = ("ee", "en", "eu", "nn", "nu", "uu")
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Frames of `t, latitude_deg, longitude_deg, height_m`, rows without a position left out.
+
+    `gnss` is the corrected position that was matched (of the balise antenna, at its time of validity), `matched`
+    its foot on the rails, `truth` where the evidence puts the train on the rails. Heights are those of the survey,
+    null on a 2-D one.
+    """
+
+    gnss: pl.DataFrame
+    matched: pl.DataFrame
+    truth: pl.DataFrame
+
+
+def positions_of(epochs: pl.DataFrame, site: Site) -> Positions:
+    """Positions of one solution's epochs. Truth is the path position less the error along it (CONTRACT section 3)."""
+    column = {name: floats(epochs, name) for name in _NEEDED}
+    rails = ground_of(site.track, epochs["netelement_id"], column["measure_m"])
+    stretches = stretches_of(epochs)
+    sign = sign_of(epochs, stretches)
+    gnss = beside(rails, sign, column["cross_track_m"], column["vertical_m"])
+    true_path = column["path_m"] - column["direction"] * column["error_along_m"]
+    truth = ground_at(site.track, stretches, true_path)
+    return Positions(_frame(epochs["t"], gnss), _frame(epochs["t"], rails), _frame(epochs["t"], truth))
+
+
+_NEEDED = ("measure_m", "path_m", "cross_track_m", "vertical_m", "direction", "error_along_m")
+
+
+def as_gnss(frame: pl.DataFrame) -> pl.DataFrame:
+    """Positions in the columns of the `gnss` stream that position messages are made of; covariance not known."""
+    unknown = [pl.lit(None, dtype=pl.Float64).alias(f"cov_{axes}_m2") for axes in _COVARIANCE]
+    return frame.with_columns(*unknown, fix=pl.lit("estimated"))
+
+
+def _frame(t: pl.Series, ground: Ground) -> pl.DataFrame:
+    columns = {
+        "latitude_deg": ground.latitude_deg,
+        "longitude_deg": ground.longitude_deg,
+        "height_m": ground.height_m,
+    }
+    frame = pl.DataFrame({"t": t, **columns}).with_columns(pl.col(pl.Float64).fill_nan(None))
+    return frame.filter(pl.col("latitude_deg").is_not_null() & pl.col("longitude_deg").is_not_null())

@@ -1,0 +1,122 @@
+"""Columns of tables on a page: titles and units from their names, meanings from their contract, values with bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+import dataframely as dy
+import polars as pl
+
+from pipeline.show.report.markup import UNKNOWN, Cell, cell, number, table
+from pipeline.show.report.words import OPINIONS, TITLES, WORDS
+from pipeline.stages.run_row.bounds import bounds_of
+
+Row = Mapping[str, Any]
+Special = Mapping[str, Callable[[Row], Cell]]
+"""How the cells of some columns are made."""
+
+_UNITS = {"_per_h": "1/h", "_mps": "m/s", "_hz": "Hz", "_m": "m", "_s": "s", "_h": "h"}
+_MOST_NAMES = 8
+# A table shows 2,000 runs: what is `bad` or in `doubt` above zero, and which words look how.
+_TONES = {
+    **dict.fromkeys(("unsafe_accepted", "failures_beyond_budget", "missed_detections", "exceeded"), "bad"),
+    **dict.fromkeys(("accepted_ids", "common_missed"), "bad"),
+    **dict.fromkeys(("unproven_accepted", "share_unknown", "unknown"), "doubt"),
+    **dict.fromkeys(("lost", "missed", "not_available", "false_alarms"), "lost"),
+}
+_WORD_TONES = {"wrong": "bad", "exceeded": "bad", "unknown": "doubt", "right": "good", "kept": "good"}
+
+
+def frame_table(
+    identity: str,
+    caption: str,
+    frame: pl.DataFrame,
+    names: Sequence[str] = (),
+    contract: type[dy.Schema] | None = None,
+    special: Special | None = None,
+) -> str:
+    """A frame as a table; `names`: all columns unless said otherwise. Bounds stand beside their figure."""
+    special = special or {}
+    shown = list(names) or _figure_names(frame.columns)
+    bounds = bounds_of(frame.columns)
+    meanings = _meanings(contract)
+    rows = [
+        [special[name](row) if name in special else _cell(row, name, bounds.get(name)) for name in shown]
+        for row in frame.iter_rows(named=True)
+    ]
+    return table(identity, caption, [(title(name), meanings.get(name, "")) for name in shown], rows)
+
+
+def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema]) -> str:
+    """One row as a table downwards: the name of each column as in the data, its value with unit and bounds, and what
+    it means.
+    """
+    meanings, bounds = _meanings(contract), bounds_of(row)
+    rows = [
+        [Cell(name, name), Cell(_text(row, name, bounds.get(name))), Cell(meanings[name], meanings[name])]
+        for name in _figure_names(row)
+    ]
+    return table(identity, caption, [("figure", "column in the data"), ("value", ""), ("meaning", "")], rows)
+
+
+def _figure_names(names: Collection[str]) -> list[str]:
+    """The columns that are no bounds of others."""
+    beside = {bound for pair in bounds_of(names).values() for bound in pair}
+    return [name for name in names if name not in beside]
+
+
+def _meanings(contract: type[dy.Schema] | None) -> dict[str, str]:
+    columns = {} if contract is None else contract.columns()
+    return {name: column.description or "" for name, column in columns.items()}
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """A column's name without its unit, and the ending that says the unit."""
+    ending = next((ending for ending in _UNITS if name.endswith(ending)), "")
+    return name.removesuffix(ending), ending
+
+
+def title(name: str) -> str:
+    """A column's title for people."""
+    if name in TITLES:
+        return TITLES[name]
+    stem, ending = _parts(name)
+    words = stem.replace("_", " ")
+    return f"{words} [{_UNITS[ending]}]" if ending else words
+
+
+def _cell(row: Row, name: str, bounds: tuple[str, str] | None) -> Cell:
+    value = row[name]
+    if bounds:
+        return Cell(_bounded(value, row[bounds[0]], row[bounds[1]], UNKNOWN), value)
+    if isinstance(value, list) and len(value) > _MOST_NAMES:
+        value = [*value[:_MOST_NAMES], f"and {len(value) - _MOST_NAMES} more"]
+    plain = cell(value, 4)
+    if isinstance(value, str):
+        opinion = name == "suspect"
+        words = (OPINIONS if opinion else WORDS).get(value, value)
+        return Cell(words, value, tone="" if opinion else _WORD_TONES.get(value, ""))
+    return Cell(plain.text, plain.order, tone=_tone(name, value))
+
+
+def _tone(name: str, value: object) -> str:
+    if name == "within_budget":
+        return "bad" if value is False else ""
+    return _TONES.get(name, "") if value else ""
+
+
+def _text(row: Row, name: str, bounds: tuple[str, str] | None) -> str:
+    value, unit = row[name], _UNITS.get(_parts(name)[1], "")
+    if bounds:
+        text = _bounded(value, row[bounds[0]], row[bounds[1]], "not known")
+    else:
+        text = "not known" if value is None else cell(value, 4).text
+    return text if text == "not known" else f"{text} {unit}".strip()
+
+
+def _bounded(value: float | None, low: float | None, high: float | None, unknown: str) -> str:
+    """A figure with its 95 % bounds; `at least` where only the lower one is known."""
+    if value is None:
+        return unknown if low is None else f"at least {number(low)}"
+    return f"{number(value)} (95 %: {number(low)} to {number(high)})"

@@ -1,0 +1,177 @@
+"""The head of a page: the verdict in one sentence, facts of when, where and with what, and the figures as tiles."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.results.figures.hazard_words import hazard_words, withstood
+from pipeline.show.report.columns import Row
+from pipeline.show.report.markup import Cell, cell, number, table
+from pipeline.show.report.words import WORDS, plural, some_of
+from pipeline.stages.run_row.verdict import figures_beside, head_of, run_verdicts, word_of, worst_verdict
+from schemas.enums import Reason, RunVerdict
+from schemas.run import RunTables
+from schemas.words import beside_words, part_words, reason_words
+
+_ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
+
+
+@dataclass(frozen=True)
+class Headline:
+    """`word` is the verdict, `worst` the sentence behind it, `beside` its figures, `reasons` all that made it."""
+
+    word: str
+    worst: str
+    reasons: str
+    beside: str = ""
+
+
+def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, passages: pl.DataFrame) -> Headline:
+    """Of one run with all its solutions, headed by the worst of them."""
+    listed = list(rows)
+    verdict = worst_verdict(row["verdict"] for row in listed)
+    heading = next((row for row in listed if row["verdict"] == verdict), listed[0])
+    if verdict is None:
+        return Headline(word_of(verdict), heading["error"] or "the run failed", "")
+    worst = _worst(heading, hazards, passages)
+    beside = ". ".join(filter(None, (beside_words(heading), part_words(heading))))
+    if len(listed) > 1:
+        told = " ".join(_told(row) for row in listed)
+        return Headline(word_of(verdict), f"{heading['solution']}: {worst}", told, beside)
+    told = f"{reason_words(heading)}." if verdict == RunVerdict.UNSAFE else ""
+    return Headline(word_of(verdict), worst, told, beside)
+
+
+def _told(row: Row) -> str:
+    why = "" if row["verdict"] is None else f", {reason_words(row)}, {beside_words(row)}"
+    return f"{row['solution']}: {word_of(row['verdict'])}{why}."
+
+
+def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame) -> str:
+    """What made the verdict, in the fewest words that name it: the worst of the faults that did, else the counts.
+
+    Of a safe run with faults: what it withstood.
+    """
+    own = pl.col("solution") == run["solution"]
+    if run["verdict"] == RunVerdict.SAFE and (met := withstood(hazards.filter(own))):
+        return met
+    accepted, late = pl.col("accepted_ids").list.len() > 0, pl.col("within_budget").eq(other=False)
+    guilty = hazards.filter(own, accepted | late)
+    return next(iter(hazard_words(guilty, passages)), reason_words(run))
+
+
+def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame) -> tuple[Headline, str | None]:
+    """Of all runs, and the run that it names; frames with `run_id`."""
+    head = head_of(run_verdicts(runs).values())
+    total = sum(head.counts().values())
+    counts = ", ".join(f"{count} {name}" for name, count in head.counts().items() if count)
+    said = f"{plural(total, 'run')}: {counts}."
+    if head.verdict is None:
+        return Headline(head.word, "no run could be replayed", said), None
+    beside = beside_words(figures_beside(runs))
+    if head.verdict == RunVerdict.SAFE:
+        met = withstood(hazards)
+        return Headline(head.word, _ALL_SAFE + (f": {met}" if met else ""), said, beside), None
+    rows = runs.filter(pl.col("verdict") == head.verdict.value)
+    order = ("unsafe_accepted", "hazardous_max_s", "unproven_accepted", "share_unknown")
+    worst = rows.sort(*order, "run_id", descending=[True] * len(order) + [False], nulls_last=True).head(1)
+    if worst.is_empty():
+        return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", said, beside), None
+    row = worst.row(0, named=True)
+    of_run = pl.col("run_id") == row["run_id"]
+    reason = _worst(row, hazards.filter(of_run), passages.filter(of_run))
+    return Headline(head.word, f"{reason} (run {row['run_id']})", said, beside), row["run_id"]
+
+
+_TRAINS = {
+    "file": "odometer and antenna as in the vehicle file",
+    "learned": "no vehicle file: odometer scale and GNSS latency learned in the run",
+    "none": "no odometer: no monitor along the track can work",
+}
+FILES = "_files"
+_COUNTED = (
+    ("accepted at a wrong place", "unsafe_accepted", "bad"),
+    ("wrong in use for too long", "failures_beyond_budget", "bad"),
+    ("faults not found in time", "missed_detections", "bad"),
+    ("accepted, could not be checked", "unproven_accepted", "doubt"),
+)
+JUDGES = {"reference": "a reference", "balise": "balise reads", "odometer": "the odometer alone"}
+
+
+def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -> list[tuple[str, str]]:
+    """When, where, with what, by which program, from which files."""
+    first = rows[0]
+    found = {
+        "Date": _span(first),
+        "Line": _line(first, tables.epochs),
+        "Train": _TRAINS.get(first["vehicle"], "not known"),
+        "Receivers": ", ".join(
+            f"{row['solution']} {number(row['gnss_rate_hz'])} Hz" for row in rows if row["solution"]
+        ),
+        "Judged by": JUDGES.get(first["evidence"], "nothing: the log has no reference, no reads, no odometer"),
+        "Reading of the log": ", ".join(dict.fromkeys(_reading(row) for row in rows)),
+        "Program": f"{first['software']}, tables {first['contract']}",
+        "Digest of log and site": first["input_digest"],
+        "Digest of configuration and vehicle": first["config_digest"],
+        "Digest of the log": metadata.get("log_digest", ""),
+    }
+    return [(name, value) for name, value in found.items() if value]
+
+
+def _span(row: Row) -> str:
+    if row["t_start"] is None:
+        return "not known"
+    hours = f"{row['t_start']:%Y-%m-%d, %H:%M:%S} to {row['t_end']:%H:%M:%S} UTC"
+    return f"{hours} ({row['duration_s'] / 60.0:.1f} min)" if row["duration_s"] is not None else hours
+
+
+def _line(row: Row, epochs: pl.DataFrame) -> str:
+    names = epochs["netelement_id"].drop_nulls().unique(maintain_order=True).to_list()
+    if not names:
+        return "not known"
+    driven = f", {row['distance_m'] / 1000.0:.1f} km driven" if row["distance_m"] is not None else ""
+    return f"{some_of(names, 6)}{driven}, {row['balises_on_path']} balises passed"
+
+
+def _reading(row: Row) -> str:
+    until = f" up to {row['partial_until']:%H:%M:%S} UTC" if row["partial_until"] is not None else ""
+    return f"{row['status']}: {WORDS[row['status']]}{until}"
+
+
+def tile_figures(run: Row, balises: pl.DataFrame) -> list[tuple[str, str, str]]:
+    """What a reader must not miss; a tile that is bad looks bad. `balises`: as `lost_shares`."""
+    share = run["share_unknown"]
+    checked = share is not None and Reason.UNKNOWN_IN_USE not in (run["reasons"] or ())
+    lost, passed = (int(balises[name].sum()) for name in ("lost", "passages"))
+    return [
+        *((words, number(run[name]), _tone(run[name], tone)) for words, name, tone in _COUNTED),
+        ("of the time in use not checked", _percent(share), "good" if checked else "doubt"),
+        ("balises lost, of those passed", f"{lost} of {passed}", _tone(lost, "lost")),
+        ("false alarms", number(run["false_alarms"]), _tone(run["false_alarms"], "lost")),
+        ("of moving time with a valid TVB", _percent(run["availability"]), "" if run["availability"] else "lost"),
+    ]
+
+
+def _tone(count: int | None, tone: str) -> str:
+    """Nobody counted: in doubt."""
+    return "doubt" if count is None else tone if count else "good"
+
+
+def _percent(share: float | None) -> str:
+    return "not known" if share is None else f"{share:.1%}"
+
+
+def file_table(metadata: Mapping[str, str]) -> str:
+    """The files that the run was made from, as `[name, bytes, SHA-256]` under each key that ends so."""
+    listed = {key: json.loads(value) for key, value in sorted(metadata.items()) if key.endswith(FILES)}
+    heads = [("part", ""), ("file", ""), ("bytes", ""), ("SHA-256", "")]
+    rows = [
+        [Cell(part := key.removesuffix(FILES), part), *(cell(value) for value in file)]
+        for key, files in listed.items()
+        for file in files
+    ]
+    return table("table-files", "Files that this run was made from", heads, rows) if rows else ""

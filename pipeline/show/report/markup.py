@@ -1,0 +1,217 @@
+"""Pieces of a page: HTML whose text is escaped, and numbers for its script, the same bytes for the same content."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cache
+from html import escape
+from importlib.resources import files
+from string import Template
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Json = Any
+
+UNKNOWN = "–"
+_LONG = 32
+# What a page takes along: it is one file.
+_SHARED_SCRIPTS = ("tables.js", "scales.js", "plots.js")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What is shown, what it is sorted by, and HTML instead of the text where there is some.
+
+    `tone`: `bad` (wrong), `doubt` (not known), `lost` or `good`; a sign before the text says the same.
+    """
+
+    text: str
+    order: float | str | None = None
+    html: str | None = None
+    tone: str = ""
+
+
+def cell(value: object, digits: int = 3) -> Cell:
+    """A value as a person reads it; numbers and instants sort by themselves."""
+    match value:
+        case None:
+            return Cell(UNKNOWN)
+        case bool():
+            return Cell("yes" if value else "no", "yes" if value else "no")
+        case int() | float():
+            return Cell(number(value, digits), float(value))
+        case datetime():
+            return Cell(instant(value), value.isoformat())
+        case list() | tuple():
+            text = ", ".join(number(item, digits) if isinstance(item, float) else str(item) for item in value)
+            return Cell(text or UNKNOWN, text)
+        case _:
+            return Cell(str(value), str(value))
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number with so many significant digits, whole numbers as they are."""
+    if value is None:
+        return UNKNOWN
+    if isinstance(value, int) or (float(value).is_integer() and abs(value) < 1e9):
+        return f"{int(value):,}".replace(",", "\u202f")
+    if abs(value) >= 10 ** (digits - 1):
+        return f"{value:,.{max(0, digits - 3)}f}".replace(",", "\u202f")
+    return f"{value:.{digits}g}"
+
+
+def instant(value: datetime) -> str:
+    """UTC to the millisecond."""
+    return value.strftime("%Y-%m-%d %H:%M:%S.") + f"{value.microsecond // 1000:03d}"
+
+
+def link(href: str, text: str, **attributes: str) -> str:
+    extra = "".join(f' {name.replace("_", "-")}="{escape(value)}"' for name, value in attributes.items())
+    return f'<a href="{escape(href)}"{extra}>{escape(text)}</a>'
+
+
+def table(identity: str, caption: str, heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Cell]]) -> str:
+    """A table whose columns have a title and a meaning; the script sorts it, and searches a long one."""
+    if not rows:
+        return f'<p class="none">{escape(caption)}: none.</p>'
+    numeric = [any(isinstance(item.order, float) for item in column) for column in zip(*rows, strict=True)]
+    body = "\n".join(f"<tr>{''.join(map(_td, row, numeric))}</tr>" for row in rows)
+    titles = "".join(map(_th, heads, numeric))
+    return (
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">'
+        f'<table class="data" id="{identity}"><caption>{escape(caption)}</caption>'
+        f"<thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def pairs(rows: Iterable[tuple[str, str]]) -> str:
+    """Names and values, text only."""
+    items = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in rows)
+    return f'<dl class="pairs">{items}</dl>'
+
+
+def tiles(rows: Iterable[tuple[str, str, str]]) -> str:
+    """The figures that matter, large: name, value and tone as of a cell."""
+    items = "".join(
+        f'<div class="tile {tone}"><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>' for name, value, tone in rows
+    )
+    return f'<dl class="tiles">{items}</dl>'
+
+
+def section(identity: str, title: str, *content: str) -> str:
+    inner = "\n".join(part for part in content if part)
+    return f'<section id="{identity}"><h2>{escape(title)}</h2>\n{inner}\n</section>'
+
+
+def figure(name: str, title: str, explanation: str = "") -> str:
+    """A place for a drawing; the script fills it."""
+    note = f"<p>{escape(explanation)}</p>" if explanation else ""
+    return (
+        f'<figure id="figure-{name}"><figcaption><h3>{escape(title)}</h3>{note}</figcaption>'
+        f'<div class="plot" id="plot-{name}" role="img" aria-label="{escape(title)}"></div></figure>'
+    )
+
+
+def badge(kind: str, text: str = "") -> str:
+    return f'<span class="badge {escape(kind)}">{escape(text or kind)}</span>'
+
+
+def verdict_head(word: str, worst: str, reasons: str = "", beside: str = "") -> str:
+    """The verdict as the first sentence of a page, coloured by it, and what speaks for it."""
+    figures = f"<br>{escape(beside[0].upper() + beside[1:])}." if beside else ""
+    why = f"<br><small>{escape(reasons)}</small>" if reasons else ""
+    return f'<p class="verdict {escape(word)}"><strong>{escape(word)}</strong>: {escape(worst)}.{figures}{why}</p>'
+
+
+def page(title: str, heading: str, body: str, data: str, script: str, foot: str) -> str:
+    """A whole page in one file. The policy lets no script run but ours, and no request leave.
+
+    `title` and `foot` stand on each sheet of paper.
+    """
+    shared, printed = _text("report.css"), _sheets(title, foot)
+    code = _code(script)
+    policy = (
+        f"default-src 'none'; script-src {_digest(code)}; style-src {_digest(shared)} {_digest(printed)}; "
+        "img-src data:; base-uri 'none'; form-action 'none'"
+    )
+    parts = {"heading": heading, "body": _numbered(body), "data": data, "code": code, "shared": shared}
+    return Template(_text("page.html")).substitute(parts, policy=policy, title=escape(title), printed=printed)
+
+
+@cache
+def _text(name: str) -> str:
+    return (files("pipeline.show.report") / name).read_text(encoding="utf-8")
+
+
+@cache
+def _code(script: str) -> str:
+    return "\n".join(_text(name) for name in (*_SHARED_SCRIPTS, script))
+
+
+@cache
+def _digest(content: str) -> str:
+    """The source of the policy that allows this very script or style."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
+
+
+def _sheets(head: str, foot: str) -> str:
+    """What stands at the top and the bottom of each sheet of paper."""
+    return (
+        f"@page {{ @top-left {{ content: {_css_text(head)}; }} @bottom-left {{ content: {_css_text(foot)}; }}"
+        ' @bottom-right { content: "page " counter(page) " of " counter(pages); } }'
+    )
+
+
+def _css_text(text: str) -> str:
+    """A string of CSS in which no character of the text can end anything."""
+    return '"' + re.sub(r"[^A-Za-z0-9 .,:]", lambda found: f"\\{ord(found[0]):x} ", text) + '"'
+
+
+def _numbered(body: str) -> str:
+    """Figures and tables with their numbers, in the order of the page."""
+    for opening, word in (("<figcaption><h3>", "Figure"), ("<caption>", "Table")):
+        first, *parts = body.split(opening)
+        body = first + "".join(f"{opening}{word} {number}. {part}" for number, part in enumerate(parts, start=1))
+    return body
+
+
+def _th(head: tuple[str, str], numeric: bool) -> str:
+    title, meaning = head
+    kind = ' class="number"' if numeric else ""
+    told = f' title="{escape(meaning)}"' if meaning else ""
+    return f'<th scope="col"{kind}{told}>{escape(title)}</th>'
+
+
+def _td(item: Cell, numeric: bool) -> str:
+    order = item.order
+    key = "" if order is None else f' data-order="{escape(repr(order) if isinstance(order, float) else order)}"'
+    shape = "number" if numeric else "long" if len(item.text) > _LONG else ""
+    kinds = [name for name in (shape, item.tone) if name]
+    classes = f' class="{" ".join(kinds)}"' if kinds else ""
+    return f"<td{key}{classes}>{item.html if item.html is not None else escape(item.text)}</td>"
+
+
+def packed(values: npt.ArrayLike, kind: str) -> dict[str, str]:
+    """Little-endian numbers as base64; `kind` is `f4`, `u4` or `u1`. NaN stands for not known."""
+    array = np.asarray(values).astype(f"<{kind}")
+    return {"kind": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def packed_line(name: str, x: npt.ArrayLike, y: npt.ArrayLike) -> Json:
+    """A named line of a drawing."""
+    return {"name": name, "x": packed(x, "f4"), "y": packed(y, "f4")}
+
+
+def script_json(value: Json) -> str:
+    """JSON that may stand inside a script element."""
+    text = json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False, sort_keys=True)
+    # Neither an end tag nor a comment of HTML may arise from data.
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

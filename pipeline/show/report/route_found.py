@@ -1,0 +1,82 @@
+"""The path that a run was matched to, as a route file to confirm or correct (CONTRACT section 2)."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+
+import polars as pl
+
+from pipeline.results.store import file_name
+from pipeline.show.export.places import stretches_of
+from pipeline.show.report.columns import frame_table
+from pipeline.show.report.markup import link, section
+from pipeline.show.report.words import some_of
+from pipeline.stages.epochs.clock import least_belief
+
+_NOTE = (
+    "This is the path that the positions were matched to, with how sure it was at the time "
+    "(<code>gate_probability</code>, which decides what is used) and in hindsight (<code>path_probability</code>). "
+    "Correct it where you know better, and hand it in with <code>balise replay --route FILE</code> if you know it to "
+    "be true: nothing stays ambiguous then. The results do not hold which rival tracks were possible: the notes above "
+    "name them, and <code>balise replay --write-route DIR</code> writes them beside each net element. A net element "
+    "without any position is not in this list."
+)
+_TURNED = (
+    "The train came back over a net element, and the results do not tell the legs of such a ride apart: "
+    "<code>balise replay --write-route DIR</code> writes the route of this run."
+)
+
+
+def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
+    """Net elements in the order of growing path, from one solution's epochs; None where the train turned over switches.
+
+    `doubtful`: the track was, at the time or in hindsight; the least probabilities of both stand beside it.
+    """
+    ways = stretches_of(epochs)
+    if ways.is_empty() or ways["netelement_id"].n_unique() < ways.height:
+        return None
+    told = (
+        epochs.filter(pl.col("path_m").is_not_null())
+        .group_by("netelement_id")
+        .agg(
+            pl.col("gate_probability", "path_probability").min(),
+            belief=least_belief().min(),
+            t_start=pl.col("t").min(),
+            t_end=pl.col("t").max(),
+        )
+    )
+    return (
+        ways.join(told, on="netelement_id", how="left")
+        .sort("first_m")
+        .select(
+            "netelement_id",
+            pl.when(pl.col("sign") > 0).then(pl.lit("AB")).otherwise(pl.lit("BA")).alias("direction"),
+            "gate_probability",
+            "path_probability",
+            "t_start",
+            "t_end",
+            doubtful=(pl.col("belief") < sure).fill_null(value=True),
+        )
+    )
+
+
+def route_section(identity: str, run_id: str, epochs: pl.DataFrame, sure: float) -> str:
+    """The route with its doubtful stretches, and a file of it to take away; nothing without matched positions."""
+    if epochs["path_m"].null_count() == epochs.height:
+        return ""
+    route = found_route(epochs, sure)
+    if route is None:
+        return section(identity, "Route found", f"<p>{_TURNED}</p>")
+    doubtful = route.filter("doubtful")["netelement_id"].to_list()
+    said = f"In doubt: {some_of(doubtful)}." if doubtful else "No stretch is in doubt."
+    href = f"data:text/csv;base64,{base64.b64encode(route.write_csv().encode()).decode()}"
+    download = link(href, "route as csv", download=f"{file_name(run_id)}.csv")
+    shown = route.select("doubtful", pl.exclude("doubtful"))
+    return section(
+        identity,
+        "Route found",
+        f'<p class="notice {"partial" if doubtful else "ok"}">{escape(said)} {download}</p>',
+        f"<p>{_NOTE}</p>",
+        frame_table(f"table-{identity}", "Route found, in the order of the path", shown),
+    )

@@ -1,0 +1,259 @@
+"""The page of one run: the verdict and why, what happened, where, when, and what the replay made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+from urllib.parse import quote
+
+import polars as pl
+
+from pipeline.results.figures.campaign_tables import campaign_balises, with_truth
+from pipeline.results.figures.known_counts import known_counts
+from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
+from pipeline.show.report.columns import Row, figures, frame_table
+from pipeline.show.report.ground import plan_data
+from pipeline.show.report.headline import FILES, JUDGES, facts, file_table, run_headline, tile_figures
+from pipeline.show.report.markup import (
+    Cell,
+    Json,
+    figure,
+    link,
+    page,
+    pairs,
+    script_json,
+    section,
+    tiles,
+    verdict_head,
+)
+from pipeline.show.report.route_found import route_section
+from pipeline.show.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
+from pipeline.show.report.words import WORDS, plots_of
+from pipeline.stages.run_row.noise import widened_by_noise
+from pipeline.stages.run_row.verdict import LEVEL_LISTS
+from schemas.campaign import CampaignLevels
+from schemas.config import Configuration
+from schemas.enums import TRUTH
+from schemas.run import RunTables, Site
+from schemas.tables import Alarms, Hazards, Passages, Runs
+from schemas.words import noise_words, notes_apart
+
+_HAZARDS = (
+    *("hazard_id", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "time_since_failure_s"),
+    *("hazardous_s", "hazardous_may_s", "budget_s", "size_m", "timing", "balise_ids", "failure_mode", "rate_mps"),
+    *("t_onset", "t_failure", "t_detected", "suspect", "evidence", "speed_mps", "caused_by"),
+)
+_PASSAGES = (
+    *("balise_id", "judgement", "status", "location_error_m", "t_offered", "t_true", "kind", "direction"),
+    *("location_accuracy_m", "speed_mps", "window_open_m", "odometer_distance_m", "window_close_m", "confidence_m"),
+    *("linking_error", "reaction", "failure_mode", "cause", "suspect_after_the_fact", "hazard_id"),
+)
+_ALARMS = (
+    *("t_start", "t_end", "verdict", "monitors", "peak_ratio", "suspect", "hazard_id", "netelement_id", "measure_m"),
+)
+ALLOWED = "Wrong positions in use against the allowed T_D (TVB eq. 7)"
+_KEYS = "Keys: n p next and previous hazard, + - 0 zoom, ← → time, [ ] previous and next run"
+
+
+@dataclass(frozen=True)
+class Made:
+    """What stands on every page: limits, and the configuration as it was resolved."""
+
+    config: Configuration
+    config_text: str | None
+    site: Site | None
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """The runs before and after in the campaign, each with its page; None at the ends."""
+
+    before: tuple[str, str] | None = None
+    after: tuple[str, str] | None = None
+
+
+def run_page(
+    tables: RunTables,
+    metadata: Mapping[str, str],
+    made: Made,
+    architectures: pl.DataFrame,
+    neighbours: Neighbours,
+) -> str:
+    """HTML of one run with all its solutions; one is shown at a time, all of them are in the page.
+
+    `architectures`: the run's solutions side by side, no rows where there is but one.
+    """
+    rows = list(tables.runs.iter_rows(named=True))
+    names = [row["solution"] for row in rows if row["solution"]]
+    parts = [_solution(f"s{number}", row, tables, made, len(rows) > 1) for number, row in enumerate(rows)]
+    side_by_side = architectures_section("architectures", architectures)
+    told = pairs(facts(rows, tables, metadata))
+    digests = pairs(sorted((name, value) for name, value in metadata.items() if not name.endswith(FILES)))
+    provenance = section("provenance", "Provenance", file_table(metadata), digests, configuration(made))
+    body = "\n".join([told, _navigation(names), *parts, side_by_side, provenance])
+    hazards = made.config.hazards
+    data = {
+        "run": tables.run_id,
+        "limits": {
+            "ci_limit_m": made.config.lds.ci_limit_m,
+            "failure_limit_m": hazards.failure_limit_m,
+            "shift_limit_m": hazards.shift_limit_m,
+            "budget_s": made.config.budget_s,
+        },
+        "order": [row["solution"] for row in rows],
+        "solutions": {name: _solution_data(name, tables, made) for name in names},
+    }
+    head = run_headline(rows, tables.hazards, tables.passages)
+    verdict, ways = verdict_head(head.word, head.worst, head.reasons, head.beside), _ways(neighbours)
+    heading = f"{verdict}{ways}<h1>Run {escape(tables.run_id)}</h1>"
+    foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
+    return page(f"{tables.run_id} · balise: {head.word}", heading, body, script_json(data), "run.js", foot)
+
+
+def _ways(neighbours: Neighbours) -> str:
+    """To the campaign, and to the runs beside this one."""
+    ways = [link("../index.html", "Campaign", data_go="campaign")]
+    for go, words, other in (("previous", "← run", neighbours.before), ("next", "run →", neighbours.after)):
+        if other is not None:
+            ways.append(link(other[1], f"{words} {other[0]}", data_go=go))
+    return f'<p class="ways">{" · ".join(ways)}</p>'
+
+
+def _solution_data(name: str, tables: RunTables, made: Made) -> Json:
+    epochs, passages, hazards, alarms = (
+        frame.filter(pl.col("solution") == name)
+        for frame in (tables.epochs, tables.passages, tables.hazards, tables.alarms)
+    )
+    moments_ns = moments_of(hazards, alarms)
+    return {
+        "time": time_data(epochs, moments_ns, made.config.align.gap_reset_s),
+        "plan": plan_data(epochs, passages, made.site, moments_ns),
+        "stanford": stanford_data(epochs, made.config.lds.ci_limit_m),
+        "hazards": [
+            {"id": row["hazard_id"], "class": row["hazard"], **{name: _milliseconds(row[name]) for name in MOMENTS}}
+            for row in hazards.iter_rows(named=True)
+        ],
+        "passages": [_passage_data(row) for row in passages.with_columns(outcome=outcome()).iter_rows(named=True)],
+    }
+
+
+def _passage_data(row: Row) -> Json:
+    return {
+        "id": row["balise_id"],
+        "outcome": row["outcome"],
+        "status": WORDS[row["status"]],
+        "t_ms": _milliseconds(row["t_offered"] or row["t_true"]),
+        "path_m": row["path_m"],
+        "error_m": row["location_error_m"],
+        "open_m": row["window_open_m"],
+        "close_m": row["window_close_m"],
+        "odometer_m": row["odometer_distance_m"],
+    }
+
+
+def hazard_cell(row: Row, title: str, page_href: str = "", **attributes: str) -> Cell:
+    """A link that zooms a run's page to a hazard; one that no monitor found stands out."""
+    href = f"{page_href}#s={quote(row['solution'], safe='')}&h={row['hazard_id']}"
+    return Cell(title, title, link(href, title, **attributes), "" if row["detected"] else "bad")
+
+
+def _milliseconds(value: Any) -> float | None:
+    """An instant as the page's scripts take it."""
+    return None if value is None else round(value.timestamp() * 1000.0, 3)
+
+
+def _navigation(names: list[str]) -> str:
+    buttons = "".join(
+        f'<button type="button" data-solution="{escape(name)}" aria-pressed="false">{escape(name)}</button>'
+        for name in names
+    )
+    chooser = f'<div role="group" aria-label="Solution">{buttons}</div>' if len(names) > 1 else ""
+    moves = (
+        ("back", "← earlier", "←"), ("forward", "later →", "→"), ("in", "zoom in", "+"), ("out", "zoom out", "-"),
+        ("all", "whole run", "0"), ("previous", "previous hazard", "p"), ("next", "next hazard", "n"),
+    )  # fmt: skip
+    tools = "".join(
+        f'<button type="button" data-move="{move}" title="key {key}">{text}</button>' for move, text, key in moves
+    )
+    if not names:
+        return ""
+    return (
+        f'<nav class="tools" aria-label="Time axis">{chooser}<div role="group" aria-label="Zoom">{tools}</div>'
+        f'<p id="window" aria-live="polite"></p><p class="keys">{_KEYS}</p></nav>'
+    )
+
+
+def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) -> str:
+    """All sections of one solution; of one that failed what reading and matching found out."""
+    name, told = row["solution"], [text for text in (row["error"], *notes_apart(row["notes"])) if text]
+    items = "".join(f"<li>{escape(text)}</li>" for text in told)
+    notes = f'<ul class="notice {row["status"]}">{items}</ul>' if items else ""
+    if not name:
+        return notes
+    own = pl.col("solution") == name
+    hazards, passages, alarms, epochs, runs = (
+        frame.filter(own) for frame in (tables.hazards, tables.passages, tables.alarms, tables.epochs, tables.runs)
+    )
+    known = known_counts(runs).row(0, named=True)
+    named = (frame.with_columns(run_id=pl.lit(tables.run_id)) for frame in (passages, runs))
+    balises = lost_shares(campaign_balises(with_truth(*named)))
+    levels = pl.DataFrame({name: row[column] or [] for name, column in LEVEL_LISTS.items()})
+
+    def part(part_name: str, title: str, *content: str) -> str:
+        return section(f"{part_name}-{key}", title, *content)
+
+    def rows(part_name: str, caption: str, frame: pl.DataFrame, *given: Any) -> str:
+        return frame_table(f"table-{part_name}-{key}", caption, frame, *given)
+
+    noise = noise_words(widened_by_noise(epochs, row, made.config))
+    noise = f"<p>{escape(noise.capitalize())}.</p>" if noise else ""
+    in_order = "Passages of balises, in order of time"
+    shown = tiles(tile_figures(known, balises))
+    parts = [
+        part("figures", f"Summary of {name}" if several else "Summary", shown, notes),
+        part("hazards", "Hazards", _hazards(key, row, hazards)),
+        part("balises", "Balises", balise_table(f"table-balises-{key}", "Balises, the worst first", balises)),
+        part("drawings", "Drawings", noise, *(figure(f"{key}-{plot}", *told) for plot, *told in plots_of("run"))),
+        part("passages", "Passages", rows("passages", in_order, passages, _PASSAGES, Passages, {"status": _status})),
+        part("levels", "Service levels", rows("levels", ALLOWED, levels, (), CampaignLevels)),
+        part("alarms", "Alarms", rows("alarms", "Alarm episodes", alarms, _ALARMS, Alarms)),
+        part("reasons", "Monitors not evaluated", rows("reasons", "Why monitors could not judge", reasons(epochs))),
+        route_section(f"route-{key}", tables.run_id, epochs, made.config.matching.ambiguity_probability),
+        part("all", "All figures", figures(f"table-all-{key}", "All figures of the run", known, Runs)),
+    ]
+    return f'<div class="solution" id="{key}" data-solution="{escape(name)}">' + "\n".join(parts) + "</div>"
+
+
+def _status(row: Row) -> Cell:
+    word = WORDS[row["status"]]
+    return Cell(word, word, tone="" if row["status"] == "accepted" else "lost")
+
+
+def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
+    if hazards.height:
+        caption = "Hazards; a link zooms every drawing to its hazard"
+        return frame_table(f"table-hazards-{key}", caption, hazards, _HAZARDS, Hazards, {"hazard_id": _hazard_name})
+    if run["evidence"] is None:
+        return '<p class="notice partial">No hazard was found, but there was nothing to judge the positions by.</p>'
+    if run["evidence"] not in TRUTH:
+        return (
+            '<p class="notice partial">No hazard was found, but the odometer alone can only show that a position'
+            " was wrong, never that it was right.</p>"
+        )
+    share = run["share_unknown"]
+    left = "no position was in use" if share is None else f"{share:.1%} of the moving time in use could not be checked"
+    return f'<p class="none">No hazard was found, judged by {JUDGES[run["evidence"]]}; {left}.</p>'
+
+
+def _hazard_name(row: Row) -> Cell:
+    return hazard_cell(row, f"{row['hazard_id']} {row['hazard']}", data_hazard=str(row["hazard_id"]))
+
+
+def configuration(made: Made) -> str:
+    """The resolved configuration, folded."""
+    if made.config_text is None:
+        return '<p class="notice partial">The result holds no config.toml: limits are the defaults.</p>'
+    text = f'<pre tabindex="0">{escape(made.config_text)}</pre>'
+    return f"<details><summary>Configuration as it was used (TOML)</summary>{text}</details>"

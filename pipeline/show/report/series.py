@@ -1,0 +1,158 @@
+"""What the time axes and the Stanford diagram of a run's page show, one solution at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import polars as pl
+
+from pipeline.show.report.decimate import WHOLE_SERIES, Band, band, detail_rows, kept_rows
+from pipeline.show.report.markup import Json, packed
+from pipeline.stages.epochs.clock import gap_limit_s, nominal_period_s
+from schemas.arrays import Bools, Floats, Ints, floats
+from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
+from schemas.tables import MONITORS
+
+SERIES = (
+    "speed_mps",
+    "error_along_m",
+    "error_cross_m",
+    "error_up_m",
+    "cross_track_m",
+    "vertical_m",
+    "confidence_m",
+    "exposure_s",
+    "distance_from_lrvb_m",
+    "path_m",
+    "undetected_ahead_m",
+    "undetected_behind_m",
+)
+NO_EPOCH, UNKNOWN = "no epoch", "not known"
+MONITOR_CODES = (NO_EPOCH, MonitorState.PASS.value, MonitorState.NOT_EVALUATED.value, MonitorState.FAIL.value)
+_BINS = 56
+MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")
+
+
+def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Json:
+    """Series and bands over time; times are milliseconds from `t0_ms`. Across a gap lines are broken."""
+    if epochs.is_empty():
+        return {"t0_ms": 0, "t1_ms": 0, "t": None, "series": {}, "bands": []}
+    t_ns = epochs["t"].to_physical().to_numpy()
+    t0_ms = int(t_ns[0] // 1_000_000)
+    t_ms = t_ns // 1_000_000 - t0_ms
+    limit_s = gap_limit_s(nominal_period_s(t_ns), gap_reset_s)
+    hold_ms = max(1, int(limit_s * 1000))
+    gaps = np.flatnonzero(np.diff(t_ms) > hold_ms) + 1
+    shown_ms = np.insert(t_ms, gaps, t_ms[gaps - 1] + hold_ms)
+    whole = detail_rows(shown_ms * 1_000_000, moments_ns - t0_ms * 1_000_000)
+    columns = {name: floats(epochs, name) for name in SERIES} | _ratios(epochs)
+    columns["residual_m"] = _residual(epochs)
+    known = {name: values for name, values in columns.items() if np.isfinite(values).any()}
+    return {
+        "t0_ms": t0_ms,
+        "t1_ms": int(t_ns[-1] // 1_000_000),
+        "t": packed(shown_ms, "u4") if len(shown_ms) <= WHOLE_SERIES else None,
+        "series": {name: _series(shown_ms, np.insert(values, gaps, np.nan), whole) for name, values in known.items()},
+        "bands": [_band(*row, t_ms, hold_ms) for row in _states(epochs)],
+    }
+
+
+def moments_of(*frames: pl.DataFrame) -> Ints:
+    """Every instant that hazards and alarms name [ns]."""
+    names = (*MOMENTS, "t_start")
+    columns = [frame[name].drop_nulls() for frame in frames for name in names if name in frame.columns]
+    parts = [column.to_physical().to_numpy() for column in columns]
+    return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
+
+
+def reasons(epochs: pl.DataFrame) -> pl.DataFrame:
+    """Why monitors were not evaluated: `reason, epochs, monitors`; of each monitor the four most frequent."""
+    counts = [
+        epochs.select(reason=f"{name}_reason").drop_nulls().group_by("reason").len("epochs").with_columns(monitor=pl.lit(name))
+        .sort("epochs", "reason", descending=[True, False]).head(4)
+        for name in MONITORS
+    ]  # fmt: skip
+    return pl.concat(counts).group_by("reason", "epochs", maintain_order=True).agg(monitors="monitor")
+
+
+def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
+    """Each monitor's statistic over its threshold, signed: beyond -1 and 1 it fails."""
+    ratios = {}
+    for monitor in MONITORS:
+        value, threshold = floats(epochs, f"{monitor}_value"), floats(epochs, f"{monitor}_threshold")
+        evaluated = (epochs[f"{monitor}_state"] != MonitorState.NOT_EVALUATED).to_numpy() & (threshold > 0)
+        ratios[f"ratio_{monitor}"] = np.divide(value, threshold, out=np.full(len(value), np.nan), where=evaluated)
+    return ratios
+
+
+def _residual(epochs: pl.DataFrame) -> Floats:
+    """GNSS minus odometer along the path, from where both are first known [m]."""
+    both = floats(epochs, "path_m") - floats(epochs, "odometer_m")
+    known = np.flatnonzero(np.isfinite(both))
+    return both - both[known[0]] if len(known) else both
+
+
+def _series(t_ms: Ints, values: Floats, whole: Bools) -> Json:
+    if len(values) <= WHOLE_SERIES:
+        return {"y": packed(values, "f4")}  # at every time in `t`
+    rows = kept_rows(values, whole)
+    return {"x": packed(t_ms[rows], "u4"), "y": packed(values[rows], "f4")}
+
+
+def _states(epochs: pl.DataFrame) -> list[tuple[str, str, Sequence[str], Ints]]:
+    """Name, group and states from harmless to bad, and the code of each epoch."""
+    modes = (NO_EPOCH, LdsMode.LINKED, LdsMode.INITIALISING, LdsMode.ODOMETRY, LdsMode.FAIL_SAFE)
+    states = (NO_EPOCH, LdsState.P0, UNKNOWN, LdsState.P3, LdsState.P2, LdsState.P1)
+    judgements = (NO_EPOCH, Judgement.RIGHT, Judgement.UNKNOWN, Judgement.WRONG)
+    rows: list[tuple[str, str, Sequence[str], Ints]] = [
+        ("LDS mode", "lds", modes, _codes(epochs["lds_mode"], modes)),
+        ("LDS state", "lds", states, _codes(epochs["lds_state"], states)),
+        ("judgement", "lds", judgements, _codes(epochs["judgement"], judgements)),
+        ("TVB", "lds", (NO_EPOCH, "TVB", "no TVB"), 2 - epochs["tvb"].cast(pl.Int64).to_numpy()),
+        ("alarm", "lds", (NO_EPOCH, "no alarm", "alarm"), 1 + epochs["alarm"].cast(pl.Int64).to_numpy()),
+    ]
+    rows += [(name, "monitors", MONITOR_CODES, _codes(epochs[f"{name}_state"], MONITOR_CODES)) for name in MONITORS]
+    return rows
+
+
+def _codes(states: pl.Series, order: Sequence[str]) -> Ints:
+    names = [str(name) for name in order]
+    codes = pl.Series(range(len(names)), dtype=pl.Int64)
+    known = states.cast(pl.String).fill_null(UNKNOWN)
+    return known.replace_strict(pl.Series(names), codes, return_dtype=pl.Int64).to_numpy()
+
+
+def _band(name: str, group: str, states: Sequence[str], codes: Ints, t_ms: Ints, hold_ms: int) -> Json:
+    pieces: Band = band(t_ms, codes, hold_ms, gap_code=0)
+    return {
+        "name": name,
+        "group": group,
+        "states": [str(state) for state in states],
+        "starts": packed(pieces.starts_ms, "u4"),
+        "codes": packed(pieces.codes, "u1"),
+        "end_ms": pieces.end_ms,
+    }
+
+
+def stanford_data(epochs: pl.DataFrame, limit_m: float) -> Json:
+    """Counts of epochs of known error on a square grid up to twice the limit; the last bin holds all beyond it."""
+    known = epochs.select(error=pl.col("error_along_m").abs(), bound=pl.col("confidence_m")).drop_nulls()
+    width = 2.0 * limit_m / _BINS
+    cells = (
+        known.select(
+            x=(pl.col("error") / width).floor().clip(0, _BINS - 1).cast(pl.Int64),
+            y=(pl.col("bound") / width).floor().clip(0, _BINS - 1).cast(pl.Int64),
+        )
+        .group_by("x", "y")
+        .len("count")
+        .sort("x", "y")
+    )
+    counts = np.array(cells["count"].to_list(), dtype=np.int64)
+    return {
+        "width_m": width,
+        "bins": _BINS,
+        "limit_m": limit_m,
+        "cells": [list(row) for row in cells.iter_rows()],
+        "epochs": int(counts.sum()),
+    }

@@ -1,0 +1,156 @@
+"""Reports on disk: a page for the campaign and one per run, each a file that needs no other."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from urllib.parse import quote
+
+import polars as pl
+
+from pipeline import storage
+from pipeline.campaign.plan import software_digest
+from pipeline.campaign.workers import each
+from pipeline.results import catalogue
+from pipeline.results.figures.campaign_figures import derived_tables
+from pipeline.results.store import (
+    check_site,
+    complete_runs,
+    file_name,
+    metadata_of,
+    read_config,
+    read_run,
+    table_address,
+)
+from pipeline.show.report.campaign_page import Campaign, campaign_page
+from pipeline.show.report.ground import availability_pieces, together
+from pipeline.show.report.run_page import Made, Neighbours, run_page
+from pipeline.storage import files
+from pipeline.studies.safety.side_by_side import side_by_side
+from pipeline.studies.safety.tally import COUNTS, added
+from schemas.config import Configuration, to_toml
+from schemas.run import Site
+from schemas.tables import TABLES
+
+# Kept of each run until it changes: what its page was made from, how many bytes it has, and what the run adds to the
+# page of the campaign, rows of `availability_pieces` and `side_by_side`.
+_KEPT = "pages"
+
+
+@dataclass(frozen=True)
+class _Page:
+    """What the page of one run is made from; `made_of`: the digest of that, empty where nobody knows the state."""
+
+    out: Path
+    run: str
+    path: Path
+    made: Made
+    neighbours: Neighbours
+    made_of: str = ""
+
+
+def write_report(
+    out: Path, site: Site | None = None, jobs: int = 0, progress: Callable[[int, int], None] | None = None
+) -> list[Path]:
+    """Write `OUT/report`: `index.html`, `runs/RUN.html`; returns the files, the index first.
+
+    The pages open from disk and make no request. Plans need the site; without it
+    places are drawn along the path. Pages of runs that are no longer in the result are removed; those that were made
+    from these very tables, settings and program are left as they are. `jobs` processes make the others, by
+    default one per core where there are many; `progress` is told how many pages of how many are done.
+    """
+    names = {run: page_name(run) for run in complete_runs(out)}
+    config = read_config(out)
+    made = Made(config or Configuration(), None if config is None else to_toml(config), site)
+    states = catalogue.states(out, *TABLES) or {}
+    ways = [None, *((run, quote(name)) for run, name in names.items()), None]
+    folder, index = out / "report" / "runs", out / "report" / "index.html"
+    pages = [
+        _with_digest(_Page(out, run, folder / name, made, Neighbours(ways[at], ways[at + 2])), states.get(run))
+        for at, (run, name) in enumerate(names.items())
+    ]
+    shares = _known(out, pages)
+    left = [page for page in pages if page.run not in shares]
+    # Starting a process takes as long as some pages.
+    jobs = jobs or min(os.cpu_count() or 1, 1 + len(left) // 20)
+    for page, share in zip(left, each(_written, left, jobs), strict=True):
+        shares[page.run] = share
+        if progress is not None:
+            progress(len(shares), len(pages))
+    rows = pl.concat([shares[run] for run in names])
+    # Runs that changed while they were read must not pass for what was read.
+    if states and states == catalogue.states(out, *TABLES):
+        catalogue.keep(out, _KEPT, rows, states)
+    for name in set(files.list_dir(folder)) - set(names.values()):
+        if name.endswith(".html"):
+            storage.remove(folder / name)
+    hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
+    storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, rows), made).encode())
+    return [index, *(page.path for page in pages)]
+
+
+def page_name(run_id: str) -> str:
+    """File name of a run's page."""
+    return f"{file_name(run_id)}.html"
+
+
+def _with_digest(page: _Page, state: str | None) -> _Page:
+    """With the SHA-256 over all that the page follows from: tables, settings, site, neighbours and program.
+
+    Empty where files have no state, or the site has no digest: such a page is never known to be there.
+    """
+    site = page.made.site
+    if not state or (site is not None and not site.digest):
+        return page
+    places = (page.run, page.neighbours, None if site is None else site.digest)
+    text = f"{software_digest()}\n{page.made.config_text}\n{state}\n{places}"
+    return replace(page, made_of=hashlib.sha256(text.encode()).hexdigest())
+
+
+def _known(out: Path, pages: Sequence[_Page]) -> dict[str, pl.DataFrame]:
+    """What is kept of the runs whose pages are there and would be the same again, a row each."""
+    kept, _ = catalogue.kept(out, _KEPT)
+    rows = {row["made_of"][0]: row for row in kept.iter_slices(1)}
+    found = ((page, rows.get(page.made_of)) for page in pages if page.made_of)
+    return {page.run: row for page, row in found if row is not None and _size(page.path) == row["page_bytes"][0]}
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file; -1 for none."""
+    return path.stat().st_size if path.exists() else -1
+
+
+def _written(page: _Page) -> pl.DataFrame:
+    """Write the page; returns the row to keep of it."""
+    metadata = metadata_of(Path(table_address(page.out, "runs", page.run)))
+    check_site(page.made.site, metadata.get("site_digest"), page.run)
+    tables = read_run(page.out, page.run)
+    judged = (tables.epochs, tables.hazards, tables.alarms, tables.runs)
+    tallies = side_by_side(*judged, page.made.config) if tables.runs.height > 1 else pl.DataFrame(schema=COUNTS)
+    content = run_page(tables, metadata, page.made, tallies, page.neighbours).encode()
+    storage.write_bytes(page.path, content)
+    return pl.DataFrame({"made_of": page.made_of, "page_bytes": len(content)}).with_columns(
+        pieces=pl.lit(availability_pieces(tables.epochs.lazy()).to_struct()).implode(),
+        tallies=pl.lit(tallies.to_struct()).implode(),
+    )
+
+
+def _unlisted(rows: pl.DataFrame, name: str) -> pl.DataFrame:
+    """What the runs add, one after the other."""
+    return rows[name].explode().drop_nulls().struct.unnest()
+
+
+def _campaign(out: Path, made: Made, hrefs: dict[str, str], rows: pl.DataFrame) -> Campaign:
+    found = catalogue.gather(out)
+    return Campaign(
+        runs=found["runs"],
+        hazards=found["hazards"],
+        passages=found["passages"],
+        derived=derived_tables(found["runs"], found["hazards"], found["passages"], found["alarms"], made.config),
+        pieces=together(_unlisted(rows, "pieces")),
+        hrefs=hrefs,
+        architectures=added([_unlisted(rows, "tallies")]),
+    )

@@ -1,0 +1,267 @@
+"""Odometer scale and GNSS latency along a run: from the vehicle file, or learned causally and held under alarm."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from itertools import pairwise
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.alignment.odometer_filter import Estimates, FilterState, ScaleLatencyFilter, estimates_of, prior_of
+from pipeline.stages.epochs.clock import gap_limit_s
+from pipeline.stages.monitors.axis import (
+    BLOCK,
+    FIRST_BLOCK,
+    AlongEpochs,
+    AxisSeries,
+    along_series,
+    error_model,
+    most_scatter_m,
+    run_axis,
+)
+from pipeline.stages.monitors.noise import NoiseMeter
+from pipeline.stages.monitors.recursion import AxisState
+from pipeline.stages.odometry.drift import drift_m2, relink_bound_m
+from pipeline.stages.odometry.odometry import Odometry
+from schemas.arrays import Bools, Floats, Ints, floats, times_ns
+from schemas.config import Configuration, Vehicle
+
+
+def learn(
+    positions: pl.DataFrame, usable: Bools, jitter_s: float, odometry: Odometry, vehicle: Vehicle, config: Configuration
+) -> Estimates:
+    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only.
+
+    `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `usable`: those on the track; `jitter_s`: see
+    `stamp_jitter_s`.
+    """
+    prior = prior_of(vehicle, config.align)
+    learned = prior.over(positions.height)
+    if vehicle.odometer_scale is not None and vehicle.gnss_latency_s is not None:
+        return learned
+    _Learner(positions, usable, jitter_s, odometry, vehicle, config, learned).run(prior)
+    if vehicle.odometer_scale is not None:
+        learned.scale_sigma[:] = prior.scale_sigma
+    if vehicle.gnss_latency_s is not None:
+        learned.latency_sigma_s[:] = prior.latency_sigma_s
+    return learned
+
+
+class _Learner:
+    """Runs the filter along the run and freezes it under alarm of the along-track monitors.
+
+    Estimates in use at an epoch come from epochs before it. From the first failing epoch on they stand still until
+    the raw and fastest monitors have been quiet for `recovery_s` and GNSS minus odometer is back where it was
+    before the alarm (DOMAIN section 3 and 4); a fault that persists is never learned as scale. Nor is an offset that
+    a position brings back from a break or an alarm, or its decay: see `ScaleLatencyFilter.resume`. Learning begins when
+    the noise is known, without which nobody could say what an alarm is.
+    """
+
+    def __init__(
+        self,
+        positions: pl.DataFrame,
+        usable: Bools,
+        jitter_s: float,
+        odometry: Odometry,
+        vehicle: Vehicle,
+        config: Configuration,
+        learned: Estimates,
+    ) -> None:
+        self._config, self._odometry, self._vehicle, self._learned = config, odometry, vehicle, learned
+        self._jitter_s = jitter_s
+        self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
+        self._alphas = np.array(config.monitors.ewma_alphas)
+        self._factor, self._limit_m = config.monitors.threshold_factor, config.hazards.failure_limit_m
+        # Latencies of five sigmas have to find a known distance too.
+        margin_ns, t_ns = round(5e9 * config.align.latency_prior_sigma_s), times_ns(positions)
+        self._rows = np.flatnonzero(usable & odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns))
+        self._path_m, self._own_m, self._digits_m = (
+            floats(positions, name)[self._rows] for name in ("along_m", "calibrated_along_m", "digits_along_m")
+        )
+        self._sigma_m = np.hypot(self._own_m, self._digits_m)
+        t_s = odometry.seconds(t_ns)
+        self._t_ns, self._t_s = t_ns[self._rows], t_s[self._rows]
+        self._segment = odometry.segment_at_s(self._t_s)
+        # Single times are looked up in a list, which is several times faster than in an array.
+        self._times: list[float] = self._t_s.tolist()
+        period_s = float(np.median(np.diff(t_s)))
+        gap_s = gap_limit_s(period_s, config.align.gap_reset_s) + config.align.scattered_gap_sigmas * jitter_s
+        self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
+        self._outages = _gaps_before(self._t_s, t_s[usable], gap_s)
+        if self._rows.size:
+            speed_mps = np.abs(odometry.speed_at_s(self._t_s))
+            moving, given_m = speed_mps > config.matching.deadband_mps, config.monitors.noise_along_m
+            self._meter = NoiseMeter(self._series(0, self._rows.size, 0), moving, given_m, config)
+
+    def run(self, prior: Estimates) -> None:
+        position = self._meter.known_from() if self._rows.size else 0
+        if position >= self._rows.size:
+            return
+        # What the file gives is not learned.
+        if self._vehicle.odometer_scale is not None:
+            prior = prior._replace(scale_sigma=np.zeros(()))
+        if self._vehicle.gnss_latency_s is not None:
+            prior = prior._replace(latency_sigma_s=np.zeros(()))
+        state = self._filter.start(prior, *self._observation(position))
+        while position < self._rows.size:
+            state, alarm = self._learn_until_alarm(state, position)
+            if alarm >= self._rows.size:
+                break
+            self._meter.freeze(alarm)
+            position, unsettled_m2 = self._hold(float(estimates_of(state.joint).scale_sigma), alarm)
+            self._meter.restart(position)
+            if position < self._rows.size:
+                state = self._filter.restart(state, *self._observation(position), unsettled_m2)
+
+    def _observation(self, position: int) -> tuple[float, float]:
+        """Time [s] and GNSS path position [m] at a position."""
+        return float(self._t_s[position]), float(self._path_m[position])
+
+    def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
+        """Learn block by block; returns the state in use at the first failing epoch, and its position."""
+        bank: AxisState | None = None
+        use_from, joints = np.array([begin]), state.joint[None]
+        position, block = begin, FIRST_BLOCK
+        while position < self._rows.size:
+            end = min(position + block, self._rows.size)
+            current = _in_use(use_from, position)
+            state, new_from, new_joints = self._updates(state, position, end)
+            use_from = np.concatenate([use_from[current:], new_from])
+            joints = np.concatenate([joints[current:], new_joints])
+            self._put(np.maximum(use_from, position), joints)
+            series = self._series(position, end, begin)
+            value, sigma, bank = run_axis(series, self._alphas, bank, self._meter.variance_m2(position, end))
+            beyond = ~(np.abs(value) <= self._factor * sigma)  # what cannot be compared is no pass
+            failing = np.flatnonzero(beyond.any(axis=1) & ~series.fresh)
+            if failing.size:
+                alarm = position + int(failing[0])
+                held = joints[_in_use(use_from, alarm)]
+                self._put(np.array([alarm]), held[None])
+                # Of what the block's last state has still to settle the alarm knows nothing: it may lie behind it.
+                return FilterState(held, self._times[alarm], state.origin_m), alarm
+            position, block = end, min(2 * block, BLOCK)
+        return state, position
+
+    def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Ints, Floats]:
+        """The filter's last state in these positions; from where each of its states may be used; the joint states."""
+        due = self._due(state.t_s, begin, end)
+        before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
+        broken = (self._segment[before] != self._segment[due]) | (self._breaks[before] != self._breaks[due])
+        joints = np.empty((due.size, *state.joint.shape))
+        for first, last in pairwise((0, *np.flatnonzero(broken).tolist(), due.size)):
+            if first == last:
+                continue
+            if broken[first]:
+                state = self._beyond_break(state, int(before[first]), int(due[first]))
+            part = due[first:last]
+            observed = self._t_s[part], self._path_m[part], self._sigma_m[part]
+            joints[first:last] = self._filter.run(state, *observed, self._jitter_s)
+            state = self._filter.after(state, joints[last - 1], float(self._t_s[part[-1]]))
+        # An update reads the odometer so long after its epoch, so its result may be used only after that.
+        use_from = np.searchsorted(self._t_s, self._t_s[due] + self._config.align.latency_span_s)
+        return state, np.maximum(use_from, due + 1), joints
+
+    def _beyond_break(self, state: FilterState, before: int, position: int) -> FilterState:
+        """The state at the first position after a break; where the odometer lost its way, nothing tells of a move."""
+        if self._segment[before] == self._segment[position]:
+            observed = *self._observation(position), float(self._sigma_m[position]), self._jitter_s
+            return self._filter.resume(state, *observed, self._limit_m)
+        away = self._outages[before] != self._outages[position]
+        return self._filter.restart(state, *self._observation(position), self._limit_m**2 if away else 0.0)
+
+    def _due(self, last_s: float, begin: int, end: int) -> Ints:
+        """Positions of the updates: the first a filter period after the last one, and so on."""
+        period_s = self._config.align.filter_period_s * (1.0 - 1e-6)
+        due: list[int] = []
+        position = self._next(last_s + period_s, begin)
+        while position < end:
+            due.append(position)
+            position = self._next(self._times[position] + period_s, position + 1)
+        return np.array(due, dtype=np.int64)
+
+    def _put(self, use_from: Ints, joints: Floats) -> None:
+        """Fill the estimates in use, each from its position on."""
+        epochs = np.append(self._rows, self._learned.scale.size)  # a position past the last is past all epochs
+        self._learned.put(epochs[use_from], estimates_of(joints))
+
+    def _next(self, t_s: float, at_least: int) -> int:
+        """First position at or after this time, and not before `at_least`."""
+        return max(at_least, bisect_left(self._times, t_s))
+
+    def _series(self, begin: int, end: int, restart: int) -> AxisSeries:
+        """Along-track increments of these positions; the one at `restart` has none before it."""
+        part = slice(max(begin - 1, restart), end)
+        in_use = self._learned.at(self._rows[part])
+        at_s = self._t_s[part] - in_use.latency_s
+        epochs = AlongEpochs(
+            epoch=self._rows[part],
+            t_s=self._t_s[part],
+            along_m=self._path_m[part],
+            segment=self._odometry.segment_at_s(at_s),
+            sigma_m=self._own_m[part],
+            digits_m=self._digits_m[part],
+            jitter_s=self._jitter_s,
+            scale_sigma=in_use.scale_sigma,
+            latency_sigma_s=in_use.latency_sigma_s,
+            white_m2_per_s=self._odometry.noise.white_m2_per_s,
+            rows_m=self._rows_m(at_s),
+            period_s=self._odometry.period_s,
+        )
+        odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s)
+        return along_series(epochs, odometer, self._config).between(begin - part.start, end - part.start)
+
+    def _rows_m(self, at_s: Floats) -> Floats | None:
+        """Quantisation noise of the odometer's rows; none at a stand may be some under way."""
+        if not self._odometry.noise.quantisation:
+            return None
+        return np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config))
+
+    def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:
+        """Position from which learning goes on after the alarm at `alarm`, and what it has still to settle [m2].
+
+        The number of positions if it never goes on. What may settle is how far the position is from its place then.
+        """
+        begin = position = alarm - 1  # the first position of all cannot fail
+        bank: AxisState | None = None
+        away_m, failed_s, block = np.zeros(1), np.full(1, -np.inf), FIRST_BLOCK
+        while position < self._rows.size:
+            end = min(position + block, self._rows.size)
+            t_s, series = self._t_s[position:end], self._series(position, end, begin)
+            noise_m2 = self._meter.variance_m2(position, end)[:, :2]
+            value, sigma, bank = run_axis(series, self._alphas[:1], bank, noise_m2)
+            failing = ~(np.abs(value) <= self._factor * sigma).all(axis=1)
+            failing |= np.arange(position, end) <= begin + 1
+            failed_s = np.maximum.accumulate(np.where(failing, t_s, failed_s[-1]))
+            away_m = away_m[-1] + np.cumsum(series.rate_mps * series.dt_s)
+            variance_m2 = self._drift_m2(begin, position, end, scale_sigma)
+            near = np.abs(away_m) <= relink_bound_m(variance_m2, self._factor, self._limit_m)
+            back = np.flatnonzero(near & (t_s - failed_s >= self._config.lds.recovery_s))
+            if back.size:
+                first = int(back[0])
+                return position + first, float(away_m[first] ** 2 + variance_m2[first])
+            position, block = end, min(2 * block, BLOCK)
+        return self._rows.size, 0.0
+
+    def _drift_m2(self, anchor: int, begin: int, end: int, scale_sigma: float) -> Floats:
+        """By how much GNSS minus odometer moves from the anchor to these positions without a fault [m^2]."""
+        sigma_m, t_ns = self._sigma_m, self._t_ns
+        way_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
+        return drift_m2(
+            sigma_m[anchor] ** 2 + sigma_m[begin:end] ** 2,
+            self._t_s[begin:end] - self._t_s[anchor],
+            np.cumsum(way_m),
+            self._config.monitors.odometer_sigma_mps,
+            max(scale_sigma, self._vehicle.odometer_scale_sigma or 0.0),
+        )
+
+
+def _gaps_before(at_s: Floats, t_s: Floats, gap_s: float) -> Ints:
+    """How many gaps of a series of times end up to each of these times."""
+    ends = t_s[1:][np.diff(t_s) > gap_s]
+    return np.searchsorted(ends, at_s, side="right")
+
+
+def _in_use(use_from: Ints, position: int) -> int:
+    """Index of the last state that may be used at a position."""
+    return int(np.searchsorted(use_from, position, side="right")) - 1

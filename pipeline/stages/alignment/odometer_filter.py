@@ -1,0 +1,252 @@
+"""Causal estimate of odometer scale and GNSS latency inside a run: an extended Kalman filter.
+
+Observed is the GNSS path position against the odometer's distance at the time of validity:
+
+    x(t) = offset + (1 + scale error) * (D(t - latency) - D_0) + sigma(t) * sum_j sqrt(share_j) e_j(t)
+
+with unit first-order Gauss-Markov errors e_j of the monitor bank's own model, so that the estimate's covariance
+tells what the data really say about scale and latency; the offset walks with the odometer's white noise.
+
+After a break a position may come back beside its place, and return to it or stay there, by no more than the monitors
+let pass. So the offset may have moved over the break, and walks on until a position has settled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.stages.odometry.odometry import Odometry
+from schemas.arrays import Floats, Ints
+from schemas.config import AlignConfig, Vehicle
+
+
+class Estimates(NamedTuple):
+    """Scale (true over odometer distance) and latency [s] with their standard deviations: of one, or epoch by epoch."""
+
+    scale: Floats
+    scale_sigma: Floats
+    latency_s: Floats
+    latency_sigma_s: Floats
+
+    @classmethod
+    def of(cls, scale: float, scale_sigma: float, latency_s: float, latency_sigma_s: float) -> Estimates:
+        """One of each."""
+        return cls(*(np.asarray(value) for value in (scale, scale_sigma, latency_s, latency_sigma_s)))
+
+    def over(self, epochs: int) -> Estimates:
+        """The same at so many epochs."""
+        return Estimates(*(np.full(epochs, value) for value in self))
+
+    def at(self, rows: Ints) -> Estimates:
+        return Estimates(*(column[rows] for column in self))
+
+    def put(self, begins: Ints, changes: Estimates) -> None:
+        """Set changes: each holds from its epoch to the next, the last for good."""
+        lengths = np.diff(begins, append=self.scale.size)
+        for column, value in zip(self, changes, strict=True):
+            column[begins[0] :] = np.repeat(value, lengths)
+
+
+def stamp_jitter_s(t_s: Floats, clock_periods: float) -> float:
+    """Standard deviation of the stamps about a regular clock [s].
+
+    A receiver measures at regular times; a recorder that stamps on receipt scatters them, and at 40 m/s ten
+    milliseconds are 0.4 m from one epoch to the next. Only the stamps are looked at, never a position. Steps of more
+    than `clock_periods` tell nothing.
+    """
+    dt = np.diff(t_s)
+    period = float(np.median(dt))
+    periods = np.round(dt / period)
+    regular = (periods >= 1) & (periods <= clock_periods)
+    away = (dt - periods * period)[regular]
+    return float(np.sqrt(np.mean(away**2) / 2.0)) if away.size else 0.0
+
+
+_OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
+_OFFSET_PRIOR_M2 = 1e6
+# Half the square of so many sigmas that no doubt is left; beyond it the exponential would overflow.
+_CERTAIN = 100.0
+
+
+class FilterState(NamedTuple):
+    """State of (offset, scale error, latency, e_j...) at a time and from an odometer origin.
+
+    `joint` holds the covariance and, as its last column, the mean: shape (states, states + 1). `unsettled_m2`: the
+    variance that the offset has still to walk until a position that came back has settled.
+    """
+
+    joint: Floats
+    t_s: float
+    origin_m: float
+    unsettled_m2: float = 0.0
+
+
+def estimates_of(joints: Floats) -> Estimates:
+    """Scale and latency of joint states, shape (..., states, states + 1)."""
+    means, deviations = joints[..., -1], np.sqrt(np.diagonal(joints, axis1=-2, axis2=-1))
+    return Estimates(1.0 + means[..., _SCALE], deviations[..., _SCALE], means[..., _LATENCY], deviations[..., _LATENCY])
+
+
+@dataclass(frozen=True)
+class ScaleLatencyFilter:
+    """Model of the errors; states are passed in and out."""
+
+    shares: Floats
+    taus_s: Floats
+    odometry: Odometry
+    config: AlignConfig
+
+    def start(self, prior: Estimates, t_s: float, path_m: float) -> FilterState:
+        """A new state at this epoch: offset and GNSS errors unknown, scale and latency as in `prior`."""
+        errors = self.shares.size
+        origin_m = float(self.odometry.distance_at_s(np.array([t_s - prior.latency_s]))[0])
+        mean = np.concatenate([[path_m, prior.scale - 1.0, prior.latency_s], np.zeros(errors)])
+        variances = [_OFFSET_PRIOR_M2, prior.scale_sigma**2, prior.latency_sigma_s**2]
+        covariance = np.diag(np.concatenate([variances, np.ones(errors)]))
+        return FilterState(np.column_stack([covariance, mean]), t_s, origin_m)
+
+    def restart(self, state: FilterState, t_s: float, path_m: float, unsettled_m2: float = 0.0) -> FilterState:
+        """Offset and GNSS errors unknown again; what was learned of scale and latency stays."""
+        fresh = self.start(estimates_of(state.joint), t_s, path_m)
+        kept = slice(_SCALE, _ERRORS)
+        fresh.joint[kept, kept] = state.joint[kept, kept]
+        return fresh._replace(unsettled_m2=max(unsettled_m2, self._unsettled_m2(state, t_s)))
+
+    def resume(
+        self, state: FilterState, t_s: float, path_m: float, sigma_m: float, jitter_s: float, limit_m: float
+    ) -> FilterState:
+        """The state at the first position after a break, before anything is learned from it.
+
+        Whether it came back beside its place, by up to about `limit_m`, it tells itself, as far as the odometer does.
+        The offset may have moved so far, and may move so far again while the position settles.
+        """
+        joint, row = np.empty_like(state.joint), self._rows(np.array([sigma_m]))[0]
+        left_m2 = self._unsettled_m2(state, t_s)
+        self._predict(state.joint, _nanoseconds(t_s - state.t_s), state.unsettled_m2 - left_m2, joint)
+        seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
+        variance_m2 = (
+            row.dot(seen[:-1]).item() + self.config.white_share * sigma_m**2 + self._scatter_m2(jitter_s, speed_mps)
+        )
+        probability = self.config.break_moved_probability * -math.expm1((state.t_s - t_s) / self.config.break_moving_s)
+        # More than the offset's own prior would say no more, and leave no digits for the position's noise.
+        brought_m2 = min(moved_m2(seen.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
+        joint[_OFFSET, _OFFSET] += brought_m2
+        return FilterState(joint, t_s, state.origin_m, left_m2 + brought_m2)
+
+    def after(self, state: FilterState, joint: Floats, t_s: float) -> FilterState:
+        """The state that has become `joint` by a later time."""
+        return state._replace(joint=joint, t_s=t_s, unsettled_m2=self._unsettled_m2(state, t_s))
+
+    def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: float) -> Floats:
+        """The joint state after each of these epochs, shape (epochs, states, states + 1).
+
+        Times [s], GNSS path positions and their sigmas, shapes (epochs,); `jitter_s`: how the stamps scatter.
+        """
+        joints = np.empty((t_s.size, *state.joint.shape))
+        times_s, rows = t_s.tolist(), self._rows(sigma_m)
+        steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
+        unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / self.config.settling_tau_s)
+        settled_m2 = (-np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
+        white_m2 = (self.config.white_share * sigma_m**2).tolist()
+        before = state.joint
+        epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, steps_ns, settled_m2, strict=True)
+        for joint, row, now_s, place_m, own_m2, step_ns, walked_m2 in epochs:
+            self._predict(before, step_ns, walked_m2, joint)
+            seen, speed_mps = self._seen(joint, row, now_s, place_m, state.origin_m)
+            spread = seen[:-1]
+            variance_m2 = row.dot(spread).item() + own_m2 + self._scatter_m2(jitter_s, speed_mps)
+            joint -= (spread / variance_m2)[:, None] * seen
+            before = joint
+        return joints
+
+    def _rows(self, sigma_m: Floats) -> Floats:
+        """By how much each state moves the position; what follows from the odometer comes in epoch by epoch."""
+        rows: Floats = sigma_m[:, None] * np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
+        rows[:, _OFFSET] = 1.0
+        return rows
+
+    def _predict(self, before: Floats, step_ns: int, settled_m2: float, joint: Floats) -> None:
+        """Write to `joint` what a joint state becomes over a step in which so much of the offset settles."""
+        decay, noise = self._transition(step_ns)
+        np.multiply(before, decay, out=joint)
+        joint += noise
+        joint[_OFFSET, _OFFSET] += settled_m2
+
+    def _seen(self, joint: Floats, row: Floats, now_s: float, place_m: float, origin_m: float) -> tuple[Floats, float]:
+        """Covariance of the states with what is observed and, as its last, how far the states miss it; the speed.
+
+        Completes `row`. The miss is all but the latency, about whose mean the distance was read, and the scale's own
+        way.
+        """
+        scale, latency_s = 1.0 + joint.item(_SCALE, -1), joint.item(_LATENCY, -1)
+        way_m, speed_mps = self._odometer_at(now_s - latency_s, origin_m)
+        row[_SCALE], row[_LATENCY] = way_m, -scale * speed_mps
+        seen: Floats = row.dot(joint)
+        seen[-1] += way_m + scale * speed_mps * latency_s - place_m
+        return seen, speed_mps
+
+    def _scatter_m2(self, jitter_s: float, speed_mps: float) -> float:
+        """Variance of stamps and of the odometer's rows, both without memory [m^2]."""
+        rows = self.odometry.noise.quantisation
+        return rows.still_m2 + (jitter_s**2 + rows.moving_s2) * speed_mps**2
+
+    def _unsettled_m2(self, state: FilterState, t_s: float) -> float:
+        """What the offset has still to walk at a later time."""
+        return state.unsettled_m2 * math.exp((state.t_s - t_s) / self.config.settling_tau_s)
+
+    def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
+        """Way from the origin [m] and speed [m/s].
+
+        The speed is centred, but at the ends of the odometer: one from the same odometer noise as the innovation would
+        bias the latency upwards.
+        """
+        times_s, span_s = self.odometry.t_s, self.config.latency_span_s
+        begin_s, end_s = max(at_s - span_s, times_s.item(0)), min(at_s + span_s, times_s.item(-1))
+        before, distance, after = np.interp((begin_s, at_s, end_s), times_s, self.odometry.distance_m).tolist()
+        return distance - origin_m, (after - before) / (end_s - begin_s)
+
+    @cached_property
+    def _transition(self) -> Callable[[int], tuple[Floats, Floats]]:
+        """`_transition_over` with a memory: a receiver's epochs are mostly the same time apart."""
+        return lru_cache(maxsize=32)(self._transition_over)
+
+    def _transition_over(self, dt_ns: int) -> tuple[Floats, Floats]:
+        """Decay of the joint state over this time, and the noise that comes in."""
+        dt_s = dt_ns * 1e-9
+        decay = np.concatenate([np.ones(_ERRORS), np.exp(-dt_s / self.taus_s)])
+        noise = 1.0 - decay * decay
+        noise[_OFFSET] = self.odometry.noise.white_m2_per_s * dt_s
+        return np.outer(decay, np.append(decay, 1.0)), np.column_stack([np.diag(noise), np.zeros(decay.size)])
+
+
+def moved_m2(beside_m: float, variance_m2: float, limit_m: float, probability: float) -> float:
+    """Mean square of what a position moved by over a break, given how far it was seen beside its place.
+
+    Before it was seen it had moved with this probability, and then by a normal deviation of `limit_m` (Bayes).
+    """
+    gain = limit_m**2 / (limit_m**2 + variance_m2)
+    evidence = math.exp(min(0.5 * gain * beside_m**2 / variance_m2, _CERTAIN))
+    odds = probability / (1.0 - probability) * math.sqrt(1.0 - gain) * evidence
+    return odds / (1.0 + odds) * gain * (gain * beside_m**2 + variance_m2)
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(seconds * 1e9)
+
+
+def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimates:
+    """Scale and latency as the vehicle file gives them, else the configured prior around 1 and 0."""
+    scale_known = vehicle.odometer_scale is not None
+    latency_known = vehicle.gnss_latency_s is not None
+    return Estimates.of(
+        scale=vehicle.odometer_scale if vehicle.odometer_scale is not None else 1.0,
+        scale_sigma=(vehicle.odometer_scale_sigma or 0.0) if scale_known else config.scale_prior_sigma,
+        latency_s=vehicle.gnss_latency_s if vehicle.gnss_latency_s is not None else 0.0,
+        latency_sigma_s=(vehicle.gnss_latency_sigma_s or 0.0) if latency_known else config.latency_prior_sigma_s,
+    )

@@ -1,0 +1,10 @@
+"""Where the train was, as a set: net elements and an interval (DOMAIN section 5.1).
+
+In: reference, balise reads, odometer, survey, figures of the vehicle file. Out: evidence at any instants.
+Nothing that came from GNSS is known here, and nothing of matching, alignment, monitors, LDS or judge is imported.
+"""
+
+from pipeline.stages.evidence.evidence import Evidence, EvidenceSet, evidence_of
+from pipeline.stages.evidence.places import true_places
+
+__all__ = ["Evidence", "EvidenceSet", "evidence_of", "true_places"]

@@ -1,0 +1,272 @@
+"""What is known by itself: balise reads, and the reference on every track that it may have run along."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import polars as pl
+from numpy.lib.stride_tricks import sliding_window_view
+
+from pipeline.stages.evidence.carrying import Anchor, Counter
+from pipeline.stages.evidence.clock import Clock, Lag, lag_of
+from pipeline.stages.reference import ReferencePath, Stretch
+from pipeline.stages.track.path import Place
+from pipeline.stages.track.survey import Track
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
+from schemas.config import Configuration, HazardConfig
+from schemas.enums import BaliseKind, Evidence
+
+# A lag shows where the speed changes: ways of so long are compared [s].
+_LAG_WINDOW_S = 10.0
+# A train's speed is even over so long before and after [s]: what differs from it is a step.
+_EVEN_S = 2.0
+
+
+@dataclass(frozen=True)
+class KnownPath:
+    """A way of the reference as evidence, per sample: leg, and least and largest coordinate on it [m].
+
+    `sense`: +1 where the odometer counts up as the coordinate grows, else -1. `step_m`: size of the step that every
+    odometer contradicts between a sample and the next, else 0: in between the reference may be on either side of it.
+    """
+
+    path: ReferencePath
+    sense: int
+    at_m: Floats
+    low_m: Floats
+    high_m: Floats
+    step_m: Floats
+
+    def place(self, sample: int) -> Place:
+        element, measure, _ = self.path.legs[int(self.path.leg[sample])].locate(self.at_m[[sample]])
+        return Place(int(element[0]), float(measure[0]))
+
+
+@dataclass(frozen=True)
+class KnownStretch:
+    """A stretch of the reference on the odometer's clock; the train was on one of its paths."""
+
+    t_ns: Ints
+    sigma_m: Floats
+    clock_m: Floats
+    paths: tuple[KnownPath, ...]
+
+    def anchor(self, sample: int) -> Anchor:
+        """The places of one sample; what a step of the reference left open counts as its clock."""
+        open_m = max(float((one.high_m - one.low_m)[sample]) for one in self.paths)
+        return Anchor(
+            t_ns=int(self.t_ns[sample]),
+            places=tuple(dict.fromkeys(one.place(sample) for one in self.paths)),
+            sigma_m=float(self.sigma_m[sample]),
+            kind=Evidence.REFERENCE,
+            clock_m=float(self.clock_m[sample]) + open_m,
+        )
+
+    def ends(self, counter: Counter | None) -> tuple[Anchor, Anchor]:
+        """The outermost samples at which the odometer counted, for only from these can a place be carried."""
+        counted = np.flatnonzero(counter.odometer.known_at(self.t_ns)) if counter is not None else np.zeros(0, np.int64)
+        first, last = (int(counted[0]), int(counted[-1])) if counted.size else (0, self.t_ns.size - 1)
+        return self.anchor(first), self.anchor(last)
+
+
+@dataclass(frozen=True)
+class Sided:
+    """A stretch with the sense of its first way, and what the odometer says of that: m counted with it and against."""
+
+    stretch: Stretch
+    sense: int
+    with_m: float
+    against_m: float
+
+    @property
+    def facing(self) -> int:
+        """The oriented net element of the first sample, in the sense in which the odometer counts up."""
+        path = self.stretch.paths[0]
+        element, _, sense = path.legs[int(path.leg[0])].locate(path.at_m[:1])
+        return 2 * int(element[0]) + int(sense[0] * self.sense < 0)
+
+
+def sided(stretch: Stretch, counter: Counter | None, least_m: float) -> Sided:
+    """Which way the odometer counts along the coordinate: by the first movement of `least_m` (DOMAIN section 2)."""
+    path = stretch.paths[0]
+    at_m = path.at_m
+    rows = _every(stretch.t_ns, 1.0)
+    step_m = np.where(np.diff(path.leg[rows]) == 0, np.diff(at_m[rows]), 0.0)
+    if counter is None:
+        counted_m = np.abs(step_m)
+    else:
+        counted_m = np.nan_to_num(counter.between(stretch.t_ns[rows[:-1]], stretch.t_ns[rows[1:]]).distance_m)
+    together = np.sign(step_m) * counted_m if counter is not None else step_m
+    gone = np.flatnonzero(np.abs(np.cumsum(together)) >= least_m)
+    total = float(np.cumsum(together)[gone[0]]) if gone.size else float(together.sum())
+    positive, negative = float(together[together > 0].sum()), float(-together[together < 0].sum())
+    sense = -1 if total < 0.0 else 1
+    return Sided(stretch, sense, *((positive, negative) if sense > 0 else (negative, positive)))
+
+
+def _every(t_ns: Ints, step_s: float) -> Ints:
+    """Samples so far apart in time."""
+    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, round(step_s * NS_PER_S), dtype=np.int64)
+    return np.unique(np.searchsorted(t_ns, instants))
+
+
+def reference_lag(found: Sequence[Sided], counter: Counter | None) -> Lag:
+    """The reference's clock against the odometer's, by the ways of ten seconds."""
+    begins, ends, ways = [], [], []
+    for one in found:
+        path = one.stretch.paths[0]
+        rows = _every(one.stretch.t_ns, _LAG_WINDOW_S)
+        whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
+        begin, end = rows[:-1][whole], rows[1:][whole]
+        begins.append(one.stretch.t_ns[begin])
+        ends.append(one.stretch.t_ns[end])
+        ways.append(one.sense * (path.at_m[end] - path.at_m[begin]))
+    if not ways:
+        return Lag()
+    return lag_of(np.concatenate(begins), np.concatenate(ends), np.concatenate(ways), counter)
+
+
+def known_stretch(
+    one: Sided,
+    clock: Clock,
+    counters: Sequence[Counter],
+    reads: Sequence[Anchor],
+    ahead_m: float,
+    config: Configuration,
+) -> KnownStretch:
+    """The stretch as evidence; `reads`: balise reads, which close a step where they confirm the reference."""
+    stretch = one.stretch
+    t_ns = stretch.t_ns - round(clock.shift_s * NS_PER_S)
+    paths: list[KnownPath] = []
+    speed_mps = np.zeros(t_ns.size)
+    for path in stretch.paths:
+        at_m = path.at_m - one.sense * ahead_m
+        own_mps = _speed_mps(t_ns, at_m, path.leg)
+        speed_mps = np.maximum(speed_mps, own_mps)
+        known = KnownPath(path, one.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
+        reads_ns = _confirming_ns(known, t_ns, stretch.sigma_m, own_mps * clock.delta_s, reads, config.hazards)
+        low_m, high_m, step_m = _left_open(known, t_ns, stretch.sigma_m, counters, reads_ns, config)
+        paths.append(replace(known, low_m=at_m + low_m, high_m=at_m + high_m, step_m=step_m))
+    since_s = (t_ns - t_ns[0]) / NS_PER_S
+    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in (-clock.delta_s, 0.0, clock.delta_s)]
+    return KnownStretch(t_ns, stretch.sigma_m, np.maximum.reduce(around) * clock.delta_s, tuple(paths))
+
+
+def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
+    """Speed over a second about each sample, by the reference alone."""
+    half_ns = NS_PER_S // 2
+    begin = np.searchsorted(t_ns, t_ns - half_ns)
+    end = np.minimum(np.searchsorted(t_ns, t_ns + half_ns), t_ns.size - 1)
+    # A slow log has no other sample within the second before its last one.
+    begin = np.minimum(begin, np.maximum(end - 1, 0))
+    elapsed_s = np.maximum((t_ns[end] - t_ns[begin]) / NS_PER_S, 1e-9)
+    return np.where((leg[begin] == leg[end]) & (end > begin), np.abs(at_m[end] - at_m[begin]) / elapsed_s, 0.0)
+
+
+def _confirming_ns(
+    known: KnownPath, t_ns: Ints, sigma_m: Floats, clock_m: Floats, reads: Sequence[Anchor], config: HazardConfig
+) -> Ints:
+    """Reads of balises that lie where the reference was, within k roots and both clocks."""
+    found: list[int] = []
+    for read in reads:
+        if not t_ns[0] <= read.t_ns <= t_ns[-1]:
+            continue
+        since = (t_ns - t_ns[0]).astype(np.float64)
+        at_m = np.interp([float(read.t_ns - t_ns[0])], since, known.at_m)
+        sample = int(np.searchsorted(t_ns, read.t_ns))
+        route = known.path.legs[int(known.path.leg[sample])]
+        half_m = config.evidence_factor * float(np.hypot(sigma_m[sample], read.sigma_m))
+        half_m += float(clock_m[sample]) + read.clock_m
+        for place in read.places:
+            there_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
+            if abs(float(there_m[0] - at_m[0])) <= half_m:
+                found.append(read.t_ns)
+    return np.unique(np.array(found, dtype=np.int64))
+
+
+def _left_open(
+    known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter], reads_ns: Ints, config: Configuration
+) -> tuple[Floats, Floats, Floats]:
+    """How far behind and ahead of each sample the train may be because the reference stepped away, and the steps [m].
+
+    A step that every odometer contradicts by more than k_T roots leaves both sides possible, until the step back or
+    the next read that confirms the reference: one that contradicts it does not say that the reference is right.
+    """
+    low_m, high_m, open_step_m = np.zeros((3, t_ns.size))
+    if t_ns.size < 2:
+        return low_m, high_m, open_step_m
+    step_m, root_m = _contradicted(known, t_ns, sigma_m, counters)
+    limit_m = config.align.sure_sigmas * root_m
+    stepped = np.flatnonzero((np.abs(step_m) > limit_m) & _uneven(known.at_m, t_ns, limit_m))
+    open_step_m[stepped] = np.abs(step_m[stepped])
+    events = [(int(t_ns[row + 1]), float(step_m[row]), float(limit_m[row])) for row in stepped.tolist()]
+    open_m: list[float] = []
+    for at_ns, own_m, noise_m in sorted(events + [(read_ns, 0.0, np.inf) for read_ns in reads_ns.tolist()]):
+        # How far the sides that earlier steps left are behind this one, the latest last.
+        sides_m = np.cumsum([own_m, *open_m[::-1]])[:0:-1]
+        back = np.flatnonzero(np.abs(sides_m) <= np.sqrt(2.0) * noise_m)
+        open_m = open_m[: int(back[0])] if back.size else [*open_m, own_m]
+        behind_m = np.cumsum([0.0, *open_m[::-1]])
+        rows = slice(int(np.searchsorted(t_ns, at_ns)), None)
+        low_m[rows] = -behind_m.max()
+        high_m[rows] = -behind_m.min()
+    return low_m, high_m, open_step_m
+
+
+def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
+    """Steps that the reference's own movement about then does not explain: an odometer that fails makes none."""
+    dt_s = np.diff(t_ns) / NS_PER_S
+    speed_mps = np.diff(at_m) / dt_s
+    beside = max(1, round(_EVEN_S / float(np.median(dt_s))))
+    around = sliding_window_view(np.pad(speed_mps, beside, mode="edge"), 2 * beside + 1)
+    uneven: Bools = np.abs(speed_mps - np.median(around, axis=1)) * dt_s > limit_m
+    return uneven
+
+
+def _contradicted(known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter]) -> tuple[Floats, Floats]:
+    """Per step to the next sample: its difference from the odometer nearest to it, and the root of both [m]."""
+    whole = np.diff(known.path.leg) == 0
+    least, root = np.full(t_ns.size - 1, np.inf), np.ones(t_ns.size - 1)
+    for counter in counters:
+        way = counter.between(t_ns[:-1], t_ns[1:])
+        own_m = np.sqrt(sigma_m[1:] ** 2 + sigma_m[:-1] ** 2 + way.variance_m2)
+        off_m = np.diff(known.at_m) - known.sense * way.distance_m
+        nearer = np.isfinite(off_m) & (np.abs(off_m) / own_m < np.abs(least) / root)
+        least, root = np.where(nearer, off_m, least), np.where(nearer, own_m, root)
+    return np.where(whole & np.isfinite(least), least, 0.0), root
+
+
+def read_anchors(
+    reads: pl.DataFrame | None, balises: pl.DataFrame | None, track: Track, config: HazardConfig
+) -> list[Anchor]:
+    """Reads of physical balises that the site knows, in order of time."""
+    if reads is None or balises is None or reads.is_empty():
+        return []
+    physical = balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.PHYSICAL.value)
+    rows, elements = track.holding(physical)
+    known = physical[rows].select("balise_id", "measure_m", element=elements)
+    read = reads.select("t", "balise_id").join(known, on="balise_id").sort("t", "balise_id")
+    return [
+        Anchor(t_ns, (Place(element, measure_m),), config.balise_read_sigma_m, Evidence.BALISE)
+        for t_ns, element, measure_m in zip(times_ns(read).tolist(), read["element"], read["measure_m"], strict=True)
+    ]
+
+
+def on_clock(anchors: Sequence[Anchor], clock: Clock, counter: Counter) -> list[Anchor]:
+    """The reads on the odometer's clock, with what it may add at their speed."""
+    t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
+    clock_m = clock.delta_s * np.abs(counter.best_speed_mps(t_ns))
+    shift_ns = round(clock.shift_s * NS_PER_S)
+    rows = zip(anchors, clock_m.tolist(), strict=True)
+    return [replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=own_m) for anchor, own_m in rows]
+
+
+def outside(anchors: Sequence[Anchor], stretches: Sequence[KnownStretch]) -> list[Anchor]:
+    """Anchors at times that no stretch covers."""
+    t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
+    inside: Bools = np.zeros(t_ns.size, dtype=np.bool_)
+    for one in stretches:
+        inside |= (t_ns >= one.t_ns[0]) & (t_ns <= one.t_ns[-1])
+    return [anchor for anchor, within in zip(anchors, inside.tolist(), strict=True) if not within]

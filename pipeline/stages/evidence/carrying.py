@@ -1,0 +1,193 @@
+"""Carrying a known place along the track by the odometer (DOMAIN section 5.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.stages.odometry import Odometry
+from pipeline.stages.odometry.odometry import Way as Counted
+from pipeline.stages.track.path import Place
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
+from schemas.config import Configuration
+from schemas.enums import Evidence
+
+Interval = tuple[Floats, Floats]
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A place known by evidence at an instant: one of `places`; `clock_m`: what its clock may add [m]."""
+
+    t_ns: int
+    places: tuple[Place, ...]
+    sigma_m: float
+    kind: Evidence
+    clock_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Counter:
+    """An odometer as evidence: between two instants only where it counted throughout; `breaks_ns`: where it did not."""
+
+    odometer: Odometry
+    breaks_ns: Ints
+
+    @classmethod
+    def of(cls, odometer: Odometry, without_sign: bool = False) -> Counter:
+        """Nothing is carried over a pause or a reset, nor over a stand without a sign: it may hide a turn."""
+        pause = np.flatnonzero(odometer.pause)
+        silent_ns = odometer.epoch_ns + (0.5e9 * (odometer.t_s[pause] + odometer.t_s[pause + 1])).astype(np.int64)
+        stands = _stands_ns(odometer) if without_sign else np.zeros(0, dtype=np.int64)
+        return cls(odometer, np.unique(np.concatenate([silent_ns, np.array(odometer.leaps_ns, np.int64), stands])))
+
+    @property
+    def by_file(self) -> bool:
+        """Scale and its sigma are those of a vehicle file."""
+        return self.odometer.scale is not None
+
+    def between(self, begin_ns: Ints | int, end_ns: Ints) -> Counted:
+        """True distance between instants and its variance; NaN over a break."""
+        counted = self.odometer.between(begin_ns, end_ns)
+        breaks = [np.searchsorted(self.breaks_ns, t_ns, side="right") for t_ns in (begin_ns, end_ns)]
+        return Counted(np.where(breaks[0] == breaks[1], counted.distance_m, np.nan), counted.variance_m2)
+
+    def driven_m(self, since_ns: Ints | int, t_ns: Ints) -> Floats:
+        """Way driven from instants, or from one, to others, turns included [m]."""
+        driven: Floats = np.abs(self.odometer.travelled_at(t_ns) - self.odometer.travelled_at(np.atleast_1d(since_ns)))
+        return driven
+
+    def speed_mps(self, t_ns: Ints) -> Floats:
+        """Speed at instants, over a second about each [m/s]; NaN where it did not count throughout that second."""
+        half_ns = round(0.5 * self.odometer.config.speed_window_s * NS_PER_S)
+        speed: Floats = self.between(t_ns - half_ns, t_ns + half_ns).distance_m / (2 * half_ns / NS_PER_S)
+        return speed
+
+    def best_speed_mps(self, t_ns: Ints) -> Floats:
+        """Speed over so much of a second about each instant as was recorded [m/s]; a best guess over a break."""
+        odometer, at_s = self.odometer, self.odometer.seconds(t_ns)
+        half_s = 0.5 * odometer.config.speed_window_s
+        begin_s = np.clip(at_s - half_s, odometer.t_s[0], odometer.t_s[-1])
+        end_s = np.clip(at_s + half_s, odometer.t_s[0], odometer.t_s[-1])
+        moved_m = odometer.distance_at_s(end_s) - odometer.distance_at_s(begin_s)
+        speed: Floats = (odometer.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9)
+        return speed
+
+
+def _stands_ns(odometer: Odometry) -> Ints:
+    t_ns = np.arange(odometer.begin_ns, odometer.end_ns, NS_PER_S, dtype=np.int64)
+    first, last = runs_of(~odometer.moved(t_ns))
+    return np.array((t_ns[first] + t_ns[np.minimum(last + 1, t_ns.size - 1)]) // 2, dtype=np.int64)
+
+
+def beside_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
+    """Half the interval on one side of a place known to `known_m`: 5 m + 5 % of the way (SUBSET-041 5.3.1.1)."""
+    half: Floats = max(config.lds.odometer_fixed_m, known_m) + config.lds.odometer_share * driven_m
+    return half
+
+
+def carried(counter: Counter, anchor: Anchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
+    """Least and largest coordinate on one side of an anchor at this coordinate; NaN where the odometer is silent."""
+    centre = at_m + counter.between(anchor.t_ns, t_ns).distance_m
+    known_m = config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m
+    half = beside_m(counter.driven_m(anchor.t_ns, t_ns), known_m, config)
+    return centre - half, centre + half
+
+
+def between_anchors(
+    counter: Counter, anchors: tuple[Anchor, Anchor], at_m: tuple[float, float], t_ns: Ints, config: Configuration
+) -> Interval:
+    """Least and largest coordinate between two anchors that lie at these coordinates of their route.
+
+    Where a vehicle file's odometer closes, the inverse-variance mean of what both say, +- (k roots + closing error):
+    what was lost may have been lost at one place. Else the hull of both.
+    """
+    factor, clock_m = config.hazards.evidence_factor, [anchor.clock_m for anchor in anchors]
+    ways = [counter.between(anchor.t_ns, t_ns) for anchor in anchors]
+    places = [at + way.distance_m for at, way in zip(at_m, ways, strict=True)]
+    variances = [anchor.sigma_m**2 + way.variance_m2 for anchor, way in zip(anchors, ways, strict=True)]
+    if counter.by_file and closes(counter, anchors, at_m[1] - at_m[0], config):
+        weights = [1.0 / variance for variance in variances]
+        share = weights[0] / (weights[0] + weights[1])
+        centre = share * places[0] + (1.0 - share) * places[1]
+        # The distance of both is the closing error, at every instant.
+        half = factor / np.sqrt(weights[0] + weights[1]) + np.abs(places[0] - places[1])
+        half += share * clock_m[0] + (1.0 - share) * clock_m[1]
+        return centre - half, centre + half
+    halves = [factor * np.sqrt(variance) + own_m for variance, own_m in zip(variances, clock_m, strict=True)]
+    low = np.minimum(places[0] - halves[0], places[1] - halves[1])
+    return low, np.maximum(places[0] + halves[0], places[1] + halves[1])
+
+
+def closes(counter: Counter, anchors: tuple[Anchor, Anchor], apart_m: float, config: Configuration) -> bool:
+    """The odometer's way from anchor to anchor is their distance.
+
+    Within k roots of both anchors and the way, without a vehicle file within 5 m + 5 % of the way.
+    """
+    begin, end = anchors
+    end_ns = np.array([end.t_ns])
+    way = counter.between(begin.t_ns, end_ns)
+    if counter.by_file:
+        root = np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + way.variance_m2)
+        limit = config.hazards.evidence_factor * root
+    else:
+        limit = beside_m(counter.driven_m(begin.t_ns, end_ns), 0.0, config)
+    return bool((np.abs(apart_m - way.distance_m) <= limit)[0])
+
+
+def carried_forward(
+    accepted_ns: Ints,
+    path_m: Floats,
+    t_ns: Ints,
+    odometer: Odometry,
+    stood: Sequence[tuple[int, int]],
+    config: Configuration,
+) -> Interval:
+    """Least and largest path position of the train [m], NaN where no accepted balise reaches.
+
+    5 m + 5 % of the way since the last balise accepted (`accepted_ns`, in order, at `path_m` of the solution's own
+    path), never bridged. It can show that something was wrong, never that it was right. A balise that was accepted
+    beyond the limit by the one before is no anchor. `odometer` grows with the path.
+    """
+    counter = Counter.of(odometer)
+    used = _consistent(accepted_ns, path_m, counter, config)
+    low, high = np.full((2, t_ns.size), np.nan)
+    if used.size:
+        last = np.searchsorted(accepted_ns[used], t_ns, side="right") - 1
+        rows = np.flatnonzero(last >= 0)
+        own = used[last[rows]]
+        found = _since_accepted(counter, accepted_ns[own], path_m[own], t_ns[rows], config)
+        void = _stood_since(accepted_ns[own], t_ns[rows], stood)
+        low[rows], high[rows] = (np.where(void, np.nan, values) for values in found)
+    return low, high
+
+
+def _since_accepted(counter: Counter, since_ns: Ints, at_m: Floats, t_ns: Ints, config: Configuration) -> Interval:
+    centre = at_m + counter.between(since_ns, t_ns).distance_m
+    half = beside_m(counter.driven_m(since_ns, t_ns), 0.0, config)
+    return centre - half, centre + half
+
+
+def _consistent(accepted_ns: Ints, path_m: Floats, counter: Counter, config: Configuration) -> Ints:
+    """Accepted balises, but for those that the odometer since the one before puts beyond the limit."""
+    used: list[int] = []
+    limit_m = config.hazards.failure_limit_m
+    for number in range(path_m.size):
+        here = slice(number, number + 1)
+        if used:
+            before = np.array(used[-1:])
+            low, high = _since_accepted(counter, accepted_ns[before], path_m[before], accepted_ns[here], config)
+            if path_m[number] < low[0] - limit_m or path_m[number] > high[0] + limit_m:
+                continue
+        if counter.odometer.known_at(accepted_ns[here])[0]:
+            used.append(number)
+    return np.array(used, dtype=np.int64)
+
+
+def _stood_since(begin_ns: Ints, t_ns: Ints, stood: Sequence[tuple[int, int]]) -> Bools:
+    void = np.zeros(t_ns.size, dtype=np.bool_)
+    for from_ns, until_ns in stood:
+        void |= (t_ns >= from_ns) & (begin_ns <= until_ns)
+    return void

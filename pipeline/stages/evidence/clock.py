@@ -1,0 +1,120 @@
+"""The clock of reference or reads against the odometer's, measured over the run and never with the GNSS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.stages.evidence.carrying import Counter
+from schemas.arrays import NS_PER_S, Floats, Ints
+from schemas.config import HazardConfig
+
+# Numerics: lags are sought so far, in such steps; the rest is regressed, in so many rounds.
+_FARTHEST_S, _STEP_S, _ROUNDS = 30.0, 0.5, 4
+# So many ways at least tell a lag, and so many say whether it is one of seconds.
+_FEWEST, _FEWEST_FAR = 6, 12
+# A lag of seconds leaves less than this share of what the ways differ by as recorded.
+_EXPLAINS = 0.5
+# What lies farther from the others than so many of their deviations is a slip, or a step of the reference.
+_USUAL = 4.0
+
+
+@dataclass(frozen=True)
+class Lag:
+    """Stamp of a moment by the recorder minus that by the odometer [s]; an infinite sigma: not known."""
+
+    lag_s: float = 0.0
+    sigma_s: float = float("inf")
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How a recorder's clock is taken: its stamps less `shift_s`, +- `delta_s`; `assumed`: it could not be measured."""
+
+    lag: Lag
+    shift_s: float
+    delta_s: float
+    assumed: bool
+
+
+def clock_of(lag: Lag, vehicle_file: bool, config: HazardConfig) -> Clock:
+    """DOMAIN section 5.1: delta = k sigma on the odometer's clock with a vehicle file, else |lag| + k sigma.
+
+    `vehicle_file`: it gives the latency of the GNSS against the odometer, whose clock the judge uses then.
+    """
+    noise_s = config.evidence_factor * lag.sigma_s
+    if noise_s <= config.evidence_clock_s:
+        if vehicle_file:
+            return Clock(lag, lag.lag_s, noise_s, assumed=False)
+        return Clock(lag, 0.0, abs(lag.lag_s) + noise_s, assumed=False)
+    if abs(lag.lag_s) > noise_s:
+        return Clock(lag, 0.0, abs(lag.lag_s) + noise_s, assumed=False)
+    return Clock(lag, 0.0, config.evidence_clock_s, assumed=True)
+
+
+def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None) -> Lag:
+    """The lag of a recorder that saw the train go these ways from some stamps to others, as the odometer counts up.
+
+    way = scale * counted - lag * change of speed, by least squares without outliers; sigma is that of the fit, or half
+    of what both halves of the run differ by.
+    """
+    if counter is None or begin_ns.size < _FEWEST:
+        return Lag()
+    coarse_s = _coarse_lag_s(begin_ns, end_ns, way_m, counter) if begin_ns.size >= _FEWEST_FAR else 0.0
+    lag_s, sigma_s = coarse_s, np.inf
+    for _ in range(_ROUNDS):
+        rest_s, sigma_s = _rest_of_lag(begin_ns, end_ns, way_m, counter, lag_s)
+        if not np.isfinite(sigma_s) or abs(lag_s + rest_s - coarse_s) > 2.0 * _STEP_S + 3.0 * sigma_s:
+            return Lag()
+        lag_s += rest_s
+    half = begin_ns.size // 2
+    parts = (slice(None, half), slice(half, None))
+    halves = [_rest_of_lag(begin_ns[part], end_ns[part], way_m[part], counter, lag_s) for part in parts]
+    apart_s = [rest_s for rest_s, own_s in halves if own_s < 3.0 * sigma_s]
+    if len(apart_s) == 2:
+        sigma_s = max(sigma_s, 0.5 * abs(apart_s[0] - apart_s[1]))
+    return Lag(float(lag_s), float(sigma_s))
+
+
+def _shifted(t_ns: Ints, lag_s: float) -> Ints:
+    return np.asarray(t_ns - round(lag_s * NS_PER_S), dtype=np.int64)
+
+
+def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter) -> float:
+    """The lag of seconds that makes the ways agree; 0 where none does much better than none."""
+    lags_s = np.arange(-_FARTHEST_S, _FARTHEST_S + _STEP_S, _STEP_S)
+    spreads = []
+    for lag_s in lags_s.tolist():
+        counted = counter.between(_shifted(begin_ns, lag_s), _shifted(end_ns, lag_s)).distance_m
+        known = np.isfinite(counted)
+        enough = known.sum() >= 0.5 * known.size and float(np.abs(counted[known]).sum()) > 0.0
+        spreads.append(float(np.median(np.abs(way_m - counted)[known])) if enough else np.inf)
+    none = spreads[lags_s.size // 2]
+    best = int(np.argmin(spreads))
+    return float(lags_s[best]) if spreads[best] < _EXPLAINS * none else 0.0
+
+
+def _rest_of_lag(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter, lag_s: float) -> tuple[float, float]:
+    """What is left of the lag once `lag_s` is taken off, and its sigma [s]; infinite where nothing tells it."""
+    begin_ns, end_ns = _shifted(begin_ns, lag_s), _shifted(end_ns, lag_s)
+    counted = counter.between(begin_ns, end_ns).distance_m
+    change = counter.speed_mps(end_ns) - counter.speed_mps(begin_ns)
+    # Noise of the odometer is no change of speed, and would look like a lag; nor is where its recording begins or ends.
+    change = np.where(np.abs(change) <= counter.odometer.deadband_mps, 0.0, change)
+    kept = np.isfinite(counted) & np.isfinite(change)
+    if kept.sum() < _FEWEST:
+        return 0.0, np.inf
+    estimate, sigma = np.array([1.0, 0.0]), np.inf
+    for _ in range(_ROUNDS):
+        design = np.column_stack([counted, -change])[kept]
+        normal = design.T @ design
+        if kept.sum() < _FEWEST or np.linalg.det(normal) <= 1e-9 * max(float(np.prod(np.diag(normal))), 1e-9):
+            return 0.0, np.inf
+        estimate = np.linalg.solve(normal, design.T @ way_m[kept])
+        left = way_m - np.column_stack([counted, -change]) @ estimate
+        spread = float(np.std(left[kept]) * np.sqrt(kept.sum() / (kept.sum() - 2.0)))
+        sigma = spread * float(np.sqrt(np.linalg.inv(normal)[1, 1]))
+        usual = 1.4826 * float(np.median(np.abs(left[np.isfinite(left)])))
+        kept = np.isfinite(left) & (np.abs(left) <= _USUAL * usual + 1e-6)
+    return float(estimate[1]), float(sigma)

@@ -1,0 +1,331 @@
+"""Where the train was at any instants: every track and interval that the evidence leaves (DOMAIN section 5.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.evidence.anchors import (
+    KnownStretch,
+    Sided,
+    known_stretch,
+    on_clock,
+    outside,
+    read_anchors,
+    reference_lag,
+    sided,
+)
+from pipeline.stages.evidence.carrying import Anchor, Counter, Interval, between_anchors, carried
+from pipeline.stages.evidence.clock import Clock, Lag, clock_of, lag_of
+from pipeline.stages.evidence.gaps import Gap, Way, gaps_of, unreachable, without_sign
+from pipeline.stages.odometry import Odometry
+from pipeline.stages.reference import Stretch
+from pipeline.stages.track.network import Network
+from pipeline.stages.track.path import Route
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
+from schemas.config import Configuration, Vehicle
+from schemas.enums import Evidence as Kind
+
+KINDS = tuple(Kind)
+NOTHING = -1
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One track that the train may have been on at some of the instants, and where on it [m]."""
+
+    rows: Ints
+    route: Route
+    low_m: Floats
+    high_m: Floats
+
+    def where(self, kept: Bools) -> Alternative:
+        """At some of its instants only."""
+        return Alternative(self.rows[kept], self.route, self.low_m[kept], self.high_m[kept])
+
+    def widened(self, factor: float) -> Alternative:
+        middle, half = 0.5 * (self.low_m + self.high_m), 0.5 * factor * (self.high_m - self.low_m)
+        return Alternative(self.rows, self.route, middle - half, middle + half)
+
+
+@dataclass(frozen=True)
+class EvidenceSet:
+    """Evidence at instants: `kind` is the number in `KINDS`, -1 where nothing is known.
+
+    Where there are several alternatives at an instant the train was on one of them. `disputed`: instants at which
+    reference and reads exclude each other.
+    """
+
+    kind: Ints
+    alternatives: tuple[Alternative, ...]
+    disputed: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What one odometer carries from anchors, by its gaps."""
+
+    counter: Counter
+    gaps: tuple[Gap, ...]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All evidence of a run.
+
+    `silent`: times at which nobody knows, because the reference was heard and lay nowhere. `carried`: by each odometer
+    from reads and the reference's ends, outside its time; `by_reads`: from reads alone, over the whole run.
+    `contradicted`: gaps that the odometer of a vehicle file does not close. `clocks`: of the recorders there are.
+    """
+
+    stretches: tuple[KnownStretch, ...]
+    silent: tuple[Span, ...]
+    carried: tuple[Carried, ...]
+    by_reads: tuple[Carried, ...]
+    reads_ns: Ints
+    clocks: tuple[Clock, ...]
+    network: Network
+    config: Configuration
+
+    @property
+    def contradicted(self) -> int:
+        """Gaps between anchors that the odometer does not close by any way, with the scale of a vehicle file."""
+        by_file = [one.gaps for one in self.carried[:1] if one.counter.by_file]
+        return sum(bool(gap.ways) and len(gap.anchors) == 2 and not gap.closed for gaps in by_file for gap in gaps)
+
+    @property
+    def unreachable(self) -> int:
+        """Pairs of anchors that no train can have passed one after the other."""
+        return sum(len(unreachable(one.gaps)) for one in self.carried[:1])
+
+    @property
+    def disputed(self) -> int:
+        """Reads that exclude the reference beyond all noise of both: at k = 3 noise alone does so in a long run."""
+        kind = np.full(self.reads_ns.size, NOTHING)
+        factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
+        by_reference = [one.widened(factor) for one in self._covered(self.reads_ns, np.ones(kind.size, np.bool_), kind)]
+        by_reads = [
+            one.widened(factor) for one in self._carried(self.by_reads, self.reads_ns, kind != NOTHING, kind, ())
+        ]
+        return int(common(by_reference, by_reads, kind.size)[1].size)
+
+    @property
+    def clock_assumed(self) -> bool:
+        """The clock of reference or reads against the odometer's could not be measured, and is taken as close."""
+        return any(clock.assumed for clock in self.clocks)
+
+    @property
+    def anchored_ns(self) -> Span | None:
+        """First and last anchor: beyond them nothing holds the train from the other side; none without anchors."""
+        times = [anchor.t_ns for one in self.carried[:1] for gap in one.gaps for anchor in gap.anchors]
+        times += [int(t_ns) for one in self.stretches for t_ns in one.t_ns[[0, -1]]]
+        return (min(times), max(times)) if times else None
+
+    def at(self, t_ns: Ints, stood: Sequence[Span] = ()) -> EvidenceSet:
+        """Evidence at these instants.
+
+        `stood`: when the odometer stood although the train may have moved; there nothing is carried from one side.
+        """
+        kind, heard = np.full(t_ns.size, NOTHING), ~within_spans(t_ns, self.silent)
+        found = self._covered(t_ns, heard, kind)
+        found += self._carried(self.carried, t_ns, heard & (kind == NOTHING), kind, stood)
+        if not self.stretches or not self.by_reads:
+            return EvidenceSet(kind, tuple(found))
+        of_reads = np.full(t_ns.size, NOTHING)
+        by_reads = self._carried(self.by_reads, t_ns, heard, of_reads, stood)
+        both, disputed = common(found, by_reads, t_ns.size)
+        return EvidenceSet(np.where(kind == NOTHING, of_reads, kind), tuple(both), disputed=disputed)
+
+    def _covered(self, t_ns: Ints, heard: Bools, kind: Ints) -> list[Alternative]:
+        """By the reference: straight lines between samples, each +- (k sigma + speed times clock)."""
+        factor = self.config.hazards.evidence_factor
+        found: list[Alternative] = []
+        for one in self.stretches:
+            rows = np.flatnonzero((t_ns >= one.t_ns[0]) & (t_ns <= one.t_ns[-1]) & heard)
+            after = np.searchsorted(one.t_ns, t_ns[rows], side="left")
+            before = np.where(one.t_ns[after] == t_ns[rows], after, np.maximum(after - 1, 0))
+            half = factor * one.sigma_m + one.clock_m
+            half = np.maximum(half[before], half[after])
+            since = (t_ns[rows] - one.t_ns[0]).astype(np.float64)
+            for path in one.paths:
+                leg, stamps = path.path.leg, one.t_ns - one.t_ns[0]
+                centre = np.interp(since, stamps, path.at_m)
+                low = np.minimum((path.low_m - path.at_m)[before], (path.low_m - path.at_m)[after])
+                high = np.maximum((path.high_m - path.at_m)[before], (path.high_m - path.at_m)[after])
+                # No straight line leads over a contradicted step: its moment is not known.
+                stepping = np.where(before != after, path.step_m[before], 0.0)
+                low, high = low - stepping, high + stepping
+                for number in np.unique(leg[before]).tolist():
+                    own = np.flatnonzero((leg[before] == number) & (leg[after] == number))
+                    low_m, high_m = (centre + low - half)[own], (centre + high + half)[own]
+                    found.append(Alternative(rows[own], path.path.legs[number], low_m, high_m))
+                    kind[rows[own]] = KINDS.index(Kind.REFERENCE)
+        return found
+
+    def _carried(
+        self, sources: Sequence[Carried], t_ns: Ints, wanted: Bools, kind: Ints, stood: Sequence[Span]
+    ) -> list[Alternative]:
+        """By each odometer, from the anchors of its gaps: the train was where one of them says."""
+        found: list[Alternative] = []
+        for source in sources:
+            open_rows = wanted.copy()
+            for gap in source.gaps:
+                inside = (t_ns >= gap.begin_ns) & (t_ns <= gap.end_ns) & open_rows
+                if len(gap.anchors) == 1:
+                    inside &= ~_after_standing(t_ns, gap, stood)
+                rows = np.flatnonzero(inside)
+                for way in gap.ways or [] if rows.size else []:
+                    low, high = self._interval(source.counter, gap, way, t_ns[rows])
+                    reached = np.isfinite(low)
+                    route = way.chain.route(self.network)
+                    found.append(Alternative(rows[reached], route, low[reached], high[reached]))
+                    open_rows[rows[reached]] = False
+                    by_read = any(anchor.kind is Kind.BALISE for anchor in gap.anchors)
+                    kind[rows[reached]] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
+        return found
+
+    def _interval(self, counter: Counter, gap: Gap, way: Way, t_ns: Ints) -> Interval:
+        if gap.begin is not None and gap.end is not None:
+            begin_m, end_m = way.at_m
+            return between_anchors(counter, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.config)
+        (anchor,), (at_m,) = gap.anchors, way.at_m
+        return carried(counter, anchor, at_m, t_ns, self.config)
+
+
+def common(one: Sequence[Alternative], other: Sequence[Alternative], size: int) -> tuple[list[Alternative], Ints]:
+    """What two kinds of evidence leave together, and the instants at which they exclude each other.
+
+    The net elements common to both and the narrower interval; where they exclude each other, all that either says.
+    """
+    spoken = np.zeros((2, size), dtype=np.bool_)
+    for number, alternatives in enumerate((one, other)):
+        for alternative in alternatives:
+            spoken[number, alternative.rows] = True
+    narrowed = [_narrowed(a, b) for a in one for b in other]
+    agreed = np.zeros(size, dtype=np.bool_)
+    for alternative in narrowed:
+        agreed[alternative.rows] = True
+    alone = [alternative.where(~agreed[alternative.rows]) for alternative in (*one, *other)]
+    return narrowed + alone, np.flatnonzero(spoken.all(axis=0) & ~agreed)
+
+
+def _narrowed(one: Alternative, other: Alternative) -> Alternative:
+    """The part of the first that the second leaves too, at the instants of both; on the first's route."""
+    rows, here, there = np.intersect1d(one.rows, other.rows, assume_unique=True, return_indices=True)
+    low, high = one.low_m[here], one.high_m[here]
+    middle = 0.5 * (low + high)
+    element, measure, sense = one.route.locate(middle)
+    own_low, own_high = other.low_m[there], other.high_m[there]
+    at_m, own_sense = other.route.coordinate(element, measure, 0.5 * (own_low + own_high))
+    ends = [middle + sense * own_sense * (end_m - at_m) for end_m in (own_low, own_high)]
+    low, high = np.maximum(low, np.minimum(*ends)), np.minimum(high, np.maximum(*ends))
+    return Alternative(rows, one.route, low, high).where(low <= high)
+
+
+def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
+    """Instants of the spans, their ends left out."""
+    inside = np.zeros(t_ns.size, dtype=np.bool_)
+    for begin_ns, end_ns in spans:
+        inside |= (t_ns >= begin_ns) & (t_ns < end_ns)
+    return inside
+
+
+def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
+    """Instants to which nothing can be carried, because the odometer stood on the way from the anchor."""
+    void = np.zeros(t_ns.size, dtype=np.bool_)
+    for begin_ns, end_ns in stood:
+        if gap.begin is not None and end_ns > gap.begin_ns:
+            void |= t_ns >= begin_ns
+        if gap.end is not None and begin_ns < gap.end_ns:
+            void |= t_ns <= end_ns
+    return void
+
+
+def evidence_of(
+    reference: tuple[Sequence[Stretch], Sequence[Span]],
+    reads: pl.DataFrame | None,
+    balises: pl.DataFrame | None,
+    odometers: Sequence[Odometry],
+    network: Network,
+    vehicle: Vehicle,
+    config: Configuration,
+) -> Evidence:
+    """Everything that is known of where the train was, but from GNSS.
+
+    `reference`: its stretches and when it lay nowhere (`reference_stretches`); `reads`, `balises`: as in the run and
+    the site; `odometers`: as recorded, that of the LDS first.
+    """
+    hazards = config.hazards
+    by_file = vehicle.gnss_latency_s is not None
+    counters = [Counter.of(odometer) for odometer in odometers]
+    main = counters[0] if counters else None
+    found = [sided(stretch, main, config.matching.orientation_distance_m) for stretch in reference[0]]
+    carrier = _Carrier.of(found, network, config)
+    of_reference = clock_of(reference_lag(found, main), by_file, hazards)
+    reads_found = read_anchors(reads, balises, network.track, hazards)
+    lag_of_reads = Lag() if main is None else _lag_of_reads(carrier.by(main, _points(reads_found)))
+    of_reads = clock_of(lag_of_reads, by_file, hazards)
+    read = [] if main is None else on_clock(reads_found, of_reads, main)
+    reads_ns = np.array([one.t_ns for one in read], dtype=np.int64)
+    ahead_m = vehicle.gnss_antenna_ahead_m
+    stretches = tuple(known_stretch(one, of_reference, counters, read, ahead_m, config) for one in found)
+    apart = outside(read, stretches)
+    shift_ns = round(of_reference.shift_s * NS_PER_S)
+    return Evidence(
+        stretches=stretches,
+        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]),
+        carried=tuple(
+            carrier.by(counter, [*(one.ends(counter) for one in stretches), *_points(apart)]) for counter in counters
+        ),
+        by_reads=tuple(carrier.by(counter, _points(read)) for counter in counters) if stretches else (),
+        reads_ns=reads_ns,
+        clocks=(of_reference,) * bool(stretches) + (of_reads,) * bool(apart),
+        network=network,
+        config=config,
+    )
+
+
+def _points(anchors: Sequence[Anchor]) -> list[tuple[Anchor, Anchor]]:
+    """Anchors that know no more than their own instant."""
+    return [(anchor, anchor) for anchor in anchors]
+
+
+@dataclass(frozen=True)
+class _Carrier:
+    """What every odometer carries over: the network, and which way the train ran as the odometer of the LDS counted up.
+
+    `facing`: oriented net elements; `turned`: it counted up in both directions.
+    """
+
+    network: Network
+    config: Configuration
+    facing: frozenset[int]
+    turned: bool
+
+    @classmethod
+    def of(cls, found: Sequence[Sided], network: Network, config: Configuration) -> _Carrier:
+        least_m = config.matching.orientation_distance_m
+        facing = frozenset(one.facing for one in found if abs(one.with_m - one.against_m) >= least_m)
+        return cls(network, config, facing, any(min(one.with_m, one.against_m) >= least_m for one in found))
+
+    def by(self, counter: Counter, borders: list[tuple[Anchor, Anchor]]) -> Carried:
+        """The gaps between what is known; an odometer that counts up in both directions carries over no stand."""
+        if not borders:
+            return Carried(counter, ())
+        borders = sorted(borders, key=lambda border: border[0].t_ns)
+        gaps = gaps_of(borders, self.facing, counter, self.network, self.config)
+        if self.turned or without_sign(gaps, self.facing, self.network):
+            counter = Counter.of(counter.odometer, without_sign=True)
+            gaps = gaps_of(borders, self.facing, counter, self.network, self.config)
+        return Carried(counter, tuple(gaps))
+
+
+def _lag_of_reads(source: Carried) -> Lag:
+    """The clock of the reads against the odometer's, by the ways between reads that one closed chain leaves."""
+    between = [(gap.begin_ns, gap.end_ns, way.at_m[1] - way.at_m[0]) for gap in source.gaps for way in gap.alone]
+    begins, ends, ways = zip(*between, strict=True) if between else ((), (), ())
+    return lag_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(ways, np.float64), source.counter)

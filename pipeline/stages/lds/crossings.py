@@ -1,0 +1,251 @@
+"""Where the position passes a virtual balise, and telegrams of physical ones on the path: found once, here.
+
+The raw matched position counts (DOMAIN section 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import isnan
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.lds.journey import Journey
+from pipeline.stages.lds.windows import Window
+from schemas.conform import dtypes
+from schemas.enums import BaliseKind, LinkingError, PassageStatus, Reaction
+from schemas.stages import Crossings
+
+
+@dataclass(frozen=True, slots=True)
+class Balise:
+    """One balise on one leg of the travelled path.
+
+    `valid_direction`: the direction of travel along growing path in which it is valid, +1 or -1; 0 both.
+    """
+
+    leg: int
+    balise_id: str
+    kind: BaliseKind
+    netelement_id: str
+    measure_m: float
+    path_m: float
+    accuracy_m: float
+    linked: bool
+    reaction: Reaction
+    valid_direction: int
+
+    def is_valid(self, direction: int) -> bool:
+        """A train in this direction of travel knows of it; to any other it does not exist (DOMAIN section 4)."""
+        return self.valid_direction in (0, direction)
+
+
+@dataclass(slots=True, eq=False)
+class Crossing:
+    """The position passes a virtual balise, or the reader reads a physical one.
+
+    `before`, `epoch`: rows of the epochs around it. `sense`: +1 where the position passes the balise along growing
+    path; `direction`: direction of travel as known at `epoch`. Time, odometer and way run are interpolated; after a
+    gap they are those of `epoch`. `absence`: what to say of it in a gap, None between near epochs and of telegrams.
+    `offered`, `status`: what became of it, as in `Crossings`; `initialising`: accepted before anything was validated.
+    """
+
+    balise: Balise
+    before: int
+    epoch: int
+    t_ns: int
+    sense: int
+    direction: int
+    odometer_m: float | None
+    travelled_m: float
+    confidence_m: float | None
+    absence: PassageStatus | None = None
+    offered: bool = False
+    status: PassageStatus | None = None
+    initialising: bool = False
+
+
+_SEVERITY = (Reaction.NONE, Reaction.SERVICE_BRAKE, Reaction.TRIP)
+
+
+@dataclass(slots=True)
+class Passage:
+    """What the train makes of a balise that it passes: a row of `passages` in the making.
+
+    `crossing`: the one that offered it; `t_ns`: of the offer, else when it was settled; `direction`: of travel as
+    known then; `announced_odometer_m`: where the train passes it by linking.
+    """
+
+    balise: Balise
+    t_ns: int
+    direction: int
+    status: PassageStatus = PassageStatus.MISSED
+    crossing: Crossing | None = None
+    window: Window | None = None
+    odometer_distance_m: float | None = None
+    linking_error: LinkingError = LinkingError.NONE
+    reaction: Reaction = Reaction.NONE
+    announced_odometer_m: float | None = None
+
+    def record(self, error: LinkingError, reaction: Reaction) -> None:
+        """The first linking error of a passage stays, the most severe reaction counts."""
+        if self.linking_error is LinkingError.NONE:
+            self.linking_error = error
+        self.reaction = max(self.reaction, reaction, key=_SEVERITY.index)
+
+
+def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
+    """Balises of one kind in order of leg, path position and identity."""
+    rows = frame.filter(pl.col("kind").cast(pl.String) == kind.value).sort("leg", "path_m", "balise_id")
+    return [
+        Balise(
+            leg=row["leg"],
+            balise_id=row["balise_id"],
+            kind=kind,
+            netelement_id=row["netelement_id"],
+            measure_m=row["measure_m"],
+            path_m=row["path_m"],
+            accuracy_m=row["location_accuracy_m"],
+            linked=row["linked"],
+            reaction=Reaction(row["link_reaction"]),
+            valid_direction=row["valid_direction"],
+        )
+        for row in rows.iter_rows(named=True)
+    ]
+
+
+def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing]:
+    """Crossings in order of the epoch that completes them, those of one step in the order of being passed.
+
+    A balise is passed growing when the position comes from before it to it or beyond, and falling
+    when it comes from there to before it, so that touching it and turning back are two passings.
+    """
+    known = np.flatnonzero(journey.positioned)
+    found: list[Crossing] = []
+    for leg in sorted({balise.leg for balise in balises}):
+        on_leg = [balise for balise in balises if balise.leg == leg]
+        at_m = np.array([balise.path_m for balise in on_leg])
+        steps = np.flatnonzero(journey.leg[known[1:]] == leg)
+        before, after = known[steps], known[steps + 1]
+        passed_before = np.searchsorted(at_m, journey.path_m[before], side="right")
+        passed_after = np.searchsorted(at_m, journey.path_m[after], side="right")
+        passing = np.flatnonzero(passed_before != passed_after)
+        for step in passing.tolist():
+            i, k, first, last = (int(rows[step]) for rows in (before, after, passed_before, passed_after))
+            found += [_crossing(journey, balise, i, k, sense) for balise, sense in _in_order(on_leg, first, last)]
+    return sorted((one for one in found if _is_valid(one, journey)), key=lambda crossing: crossing.epoch)
+
+
+def _is_valid(crossing: Crossing, journey: Journey) -> bool:
+    """Valid in the train's direction of travel, whatever that of the position's step (DOMAIN section 4).
+
+    A turn is known some metres after it (`odometer_fixed_m`): on these the train's own knowledge and the way that it
+    really goes differ, and a balise of one direction is offered in neither.
+    """
+    as_it_was = journey.direction_at(crossing.t_ns)
+    return crossing.balise.is_valid(crossing.direction) and crossing.balise.is_valid(as_it_was)
+
+
+def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tuple[Balise, int]]:
+    if after > before:
+        yield from ((balise, 1) for balise in balises[before:after])
+    else:
+        yield from ((balise, -1) for balise in reversed(balises[after:before]))
+
+
+def _crossing(journey: Journey, balise: Balise, before: int, k: int, sense: int) -> Crossing:
+    near, share = bool(journey.t_ns[k] - journey.t_ns[before] <= journey.gap_ns), 1.0
+    t_ns, path_m, odometer_m = journey.t_ns, journey.path_m, journey.odometer_m
+    if near:
+        share = float((balise.path_m - path_m[before]) / (path_m[k] - path_m[before]))
+    direction = int(journey.direction[k])
+    back_m = 0.0 if share == 1.0 else (1.0 - share) * float(odometer_m[k] - odometer_m[before])
+    return Crossing(
+        balise=balise,
+        before=before,
+        epoch=k,
+        t_ns=int(t_ns[before]) + round(share * int(t_ns[k] - t_ns[before])),
+        sense=sense,
+        direction=direction,
+        odometer_m=_known(float(odometer_m[k]) - back_m),
+        travelled_m=float(journey.travelled_m[k]) - back_m * direction,
+        confidence_m=_known(float(journey.confidence_m[k])),
+        absence=None if near else journey.absence(slice(before + 1, k)),
+    )
+
+
+def _known(value: float) -> float | None:
+    return None if isnan(value) else value
+
+
+def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
+    """All crossings of a solution; the place in this list is the `crossing_id`."""
+    return sorted(crossings, key=lambda crossing: (crossing.t_ns, crossing.epoch, crossing.balise.kind.value))
+
+
+def crossing_rows(crossings: Sequence[Crossing], journey: Journey) -> pl.DataFrame:
+    """The table of crossings (`Crossings`), `crossings` in order of time."""
+    rows = [_row(number, crossing, journey) for number, crossing in enumerate(crossings)]
+    return pl.DataFrame(rows, schema=dtypes(Crossings))
+
+
+def _row(number: int, crossing: Crossing, journey: Journey) -> dict[str, object]:
+    own = {name: getattr(crossing, name) for name in ("before", "epoch", "sense", "odometer_m", "offered")}
+    place = {
+        name: getattr(crossing.balise, name) for name in ("balise_id", "netelement_id", "measure_m", "leg", "path_m")
+    }
+    return {
+        "crossing_id": number,
+        **own,
+        **place,
+        "kind": crossing.balise.kind.value,
+        "t": crossing.t_ns,
+        "direction": journey.direction_at(crossing.t_ns),
+        "status": crossing.status and crossing.status.value,
+    }
+
+
+def reads_of(
+    frame: pl.DataFrame | None, balises: list[Balise], journey: Journey
+) -> tuple[list[Crossing], pl.DataFrame]:
+    """Telegrams (`t, balise_id`, `odometer_m` at each) in order of time, and those of balises not on the path."""
+    if frame is None:
+        return [], pl.DataFrame(schema={"t": pl.Datetime("ns", "UTC"), "balise_id": pl.String})
+    known = frame["balise_id"].is_in([balise.balise_id for balise in balises])
+    rows = frame.filter(known).sort("t", "balise_id").with_columns(t_ns=pl.col("t").dt.epoch("ns"))
+    odometer = rows["odometer_m"] if "odometer_m" in rows.columns else [None] * rows.height
+    reads: list[Crossing] = []
+    last: Crossing | None = None
+    for t_ns, balise_id, odometer_m in zip(rows["t_ns"], rows["balise_id"], odometer, strict=True):
+        places = [balise for balise in balises if balise.balise_id == balise_id]
+        reads.append(_read(t_ns, places, odometer_m, journey, last))
+        last = last if odometer_m is None else reads[-1]
+    return reads, frame.filter(~known).select("t", "balise_id")
+
+
+def _read(
+    t_ns: int, places: list[Balise], odometer_m: float | None, journey: Journey, last: Crossing | None
+) -> Crossing:
+    """One telegram at the visit of the path that it belongs to; `last`: the one before with a known odometer."""
+    epoch = min(int(np.searchsorted(journey.t_ns, t_ns)), journey.t_ns.size - 1)
+    before = max(int(np.searchsorted(journey.t_ns, t_ns, side="right")) - 1, 0)
+    here_m = float(np.nan_to_num(journey.path_m[epoch]))
+    # Where the train is, the telegram before and the odometer tell; the position only where these do not tell it.
+    before_m = None if last is None or journey.segment[last.before] != journey.segment[before] else last.odometer_m
+    if last is not None and before_m is not None and odometer_m is not None:
+        here_m = last.balise.path_m + odometer_m - before_m
+    leg, direction = int(journey.leg[epoch]), int(journey.direction[epoch])
+    since_m = float(journey.odometer_m[epoch]) - (np.nan if odometer_m is None else odometer_m)
+    return Crossing(
+        balise=min(places, key=lambda balise: (balise.leg != leg, abs(balise.path_m - here_m))),
+        before=before,
+        epoch=epoch,
+        t_ns=t_ns,
+        sense=direction,
+        direction=direction,
+        odometer_m=odometer_m,
+        travelled_m=float(journey.travelled_m[epoch]) - since_m * int(journey.travel[max(epoch - 1, 0)]),
+        confidence_m=None,
+    )

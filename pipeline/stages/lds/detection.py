@@ -1,0 +1,172 @@
+"""Balises as the train meets them: what the position crosses and the reader reads, offered to the linking chains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isnan
+
+import numpy as np
+
+from pipeline.stages.lds.crossings import Balise, Crossing
+from pipeline.stages.lds.journey import Journey, turning_epochs
+from pipeline.stages.lds.link_monitors import LinkOrder, disorder
+from pipeline.stages.lds.linking import LinkingChain
+from schemas.config import Configuration, LdsConfig
+from schemas.enums import BaliseKind, PassageStatus
+
+
+class BaliseDetection:
+    """Virtual and physical balises along a journey; asked epoch by epoch, in order.
+
+    `events`: the epochs at which a balise is crossed or read, or the train turns.
+    """
+
+    def __init__(
+        self,
+        journey: Journey,
+        balises: dict[BaliseKind, list[Balise]],
+        crossings: Sequence[Crossing],
+        config: Configuration,
+    ) -> None:
+        self._journey, self._config = journey, config
+        self._at: dict[BaliseKind, dict[int, list[Crossing]]] = {kind: {} for kind in BaliseKind}
+        for crossing in crossings:
+            self._at[crossing.balise.kind].setdefault(crossing.epoch, []).append(crossing)
+        self._turns = turning_epochs(journey)
+        self._disarmed = Disarmed(journey, config.lds)
+        self._along_m: list[float] = (journey.odometer_m * journey.direction).tolist()
+        self.virtual = LinkingChain(balises[BaliseKind.VIRTUAL], config.lds)
+        # A run without telegrams has no reader, so its physical balises have no passages.
+        self.physical = LinkingChain(balises[BaliseKind.PHYSICAL] if self._at[BaliseKind.PHYSICAL] else [], config.lds)
+        self.order = LinkOrder(journey, config)
+        self.events = sorted({*self._turns, *(crossing.epoch for crossing in crossings)})
+
+    @property
+    def closing_m(self) -> float:
+        """Odometer reading, times direction of travel, at which the next window closes."""
+        return min(self.virtual.closing_m, self.physical.closing_m)
+
+    @property
+    def disarmed(self) -> bool:
+        """A balise was detected so near that noise could detect it again."""
+        return bool(self._disarmed)
+
+    def turn(self, k: int) -> None:
+        """Both chains learn that the train goes another way from this epoch on."""
+        for chain in (self.virtual, self.physical) if k in self._turns else ():
+            chain.turn(self._journey, k)
+
+    def read(self, k: int) -> list[Crossing]:
+        """Telegrams accepted by the rules of linking; only windows can reject them, no monitor."""
+        reads = self._at[BaliseKind.PHYSICAL].get(k, ())
+        return [read for read in reads if not self._disarmed.holds(read.balise) and self._offer(read, None)]
+
+    def pass_virtual(self, k: int, distrusted: bool, entering: bool) -> tuple[list[Crossing], bool]:
+        """Offer what the position crossed in this step: what was accepted, and is the order of identities broken?
+
+        `distrusted`: negated, withheld, or a monitor fails; `entering`: no chain has begun.
+        """
+        offered: list[Crossing] = []
+        for crossing in self._at[BaliseKind.VIRTUAL].get(k, ()):
+            if self._disarmed.holds(crossing.balise):
+                self.virtual.cross_again(crossing)
+            elif crossing.absence is None:
+                offered.append(crossing)
+            else:
+                self.virtual.pass_unoffered(crossing, crossing.absence)
+                self._disarmed.add(crossing)
+        if not offered:
+            return [], False
+        overdue = sum(self.virtual.is_overdue(crossing.balise) for crossing in offered)
+        accepted = [one for one in offered if self._offer(one, self._refusal_of(one, distrusted, entering))]
+        return accepted, self._order_fails(k, offered, overdue)
+
+    def rearm(self, k: int) -> None:
+        """Balises that the train has left behind can be detected again."""
+        if self._disarmed:
+            self._disarmed.rearm(k)
+
+    def close_windows(self, k: int, t_ns: int) -> None:
+        """Windows that the train has left are closed."""
+        along_m = self._along_m[k]
+        if along_m > self.virtual.closing_m:
+            self.virtual.advance(float(self._journey.odometer_m[k]), t_ns, self._absence(k))
+        if along_m > self.physical.closing_m:
+            self.physical.advance(float(self._journey.odometer_m[k]), t_ns, PassageStatus.MISSED)
+
+    def finish(self, t_ns: int) -> None:
+        """Balises that the train has passed by its odometer when the run ends without a position."""
+        known = np.flatnonzero(np.isfinite(self._journey.odometer_m))
+        absence = self._absence(len(self._along_m) - 1) if known.size else PassageStatus.MISSED
+        if absence is not PassageStatus.MISSED:
+            self.virtual.finish(float(self._journey.odometer_m[known[-1]]), t_ns, absence)
+
+    def _offer(self, crossing: Crossing, refusal: PassageStatus | None) -> bool:
+        chain = self.virtual if crossing.balise.kind is BaliseKind.VIRTUAL else self.physical
+        self._disarmed.add(crossing)
+        return chain.offer(crossing, refusal)
+
+    def _refusal_of(self, crossing: Crossing, distrusted: bool, entering: bool) -> PassageStatus | None:
+        """Why a virtual balise is not detected at this crossing, whatever linking says.
+
+        A step out of an ambiguous position crosses what the train did not.
+        """
+        if distrusted:
+            # "The noise is known and no monitor has failed" is one condition of a detection (DOMAIN section 4), so that
+            # a withheld position is refused as a negated one is; `withheld_for` of the epoch says why.
+            return PassageStatus.REJECTED_MONITOR
+        if self._journey.refusal[crossing.before] is PassageStatus.REJECTED_AMBIGUOUS:
+            return PassageStatus.REJECTED_AMBIGUOUS
+        refusal = self._journey.refusal[crossing.epoch]
+        if refusal is None and entering and self._config.lds.entry_from_unfitted_area and self._journey.has_odometer:
+            # Insertion is what endangers an entry: the diagnosis must stand behind the first VB too.
+            return PassageStatus.REJECTED_MONITOR
+        return refusal
+
+    def _absence(self, k: int) -> PassageStatus:
+        """What to say of a balise that the train has passed and the position has not."""
+        return self._journey.absence(slice(k, k + 1)) if self._journey.blind[k] else PassageStatus.MISSED
+
+    def _order_fails(self, k: int, offered: list[Crossing], overdue: int) -> bool:
+        if not self.order.is_evaluated(k):
+            return False
+        out_of_order = disorder(offered, overdue, self._journey, self._config)
+        self.order.note(k, out_of_order)
+        return out_of_order > 0
+
+
+class Disarmed:
+    """Balises just detected, re-armed max(`rearm_m`, `rearm_sigmas`) away by the odometer (DOMAIN section 4).
+
+    Where the run has no odometer, the position's distance from the balise has to serve.
+    """
+
+    def __init__(self, journey: Journey, config: LdsConfig) -> None:
+        self._journey, self._config = journey, config
+        self._at: dict[str, tuple[Balise, float]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._at)
+
+    def holds(self, balise: Balise) -> bool:
+        """A crossing of this balise is not an offer."""
+        return balise.balise_id in self._at
+
+    def add(self, crossing: Crossing) -> None:
+        odometer_m = float("nan") if crossing.odometer_m is None else crossing.odometer_m
+        self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
+
+    def rearm(self, k: int) -> None:
+        """Re-arm what the train has left behind at epoch `k`."""
+        away_m = max(self._config.rearm_m, self._config.rearm_sigmas * float(self._journey.sigma_m[k]))
+        for name, (balise, at_m) in list(self._at.items()):
+            if abs(self._moved_m(k, balise, at_m)) >= away_m:
+                del self._at[name]
+
+    def _moved_m(self, k: int, balise: Balise, at_m: float) -> float:
+        if not self._journey.has_odometer:
+            return float(self._journey.path_m[k]) - balise.path_m
+        odometer_m = float(self._journey.odometer_m[k])
+        if isnan(at_m):
+            self._at[balise.balise_id] = (balise, odometer_m)
+        return odometer_m - at_m

@@ -1,0 +1,164 @@
+"""The epochs of one solution as columns that the state machine walks along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.epochs.clock import confident, crossing_gap_ns, met, unambiguous
+from pipeline.stages.odometry.driven import turns_of
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
+from schemas.config import Configuration, LdsConfig
+from schemas.enums import PassageStatus
+
+
+@dataclass(frozen=True)
+class Journey:
+    """Epochs in order of time; a NaN is a value that is not known.
+
+    `positioned`: placed on the path. `refusal`: why a detection at this epoch would not
+    count, `None` where it would. `direction`: direction of travel (+1/-1 along growing path) as known at that epoch;
+    `travel`: that of the step from this epoch to the next, put back to where the train turned (for
+    labels only). `travelled_m`: way run, turns included. `segment`: continuity segment of the odometer, between
+    segments its distance was lost; `scale_sigma`: of its scale, None unless a vehicle file gives both. `slips`: the
+    odometer says so itself; `counter` is `segment` but that slip does not end it, and `slip_doubt_m` by how much slip
+    may have falsified it so far. `blind`: no position for longer than a crossing is interpolated over (`gap_ns`).
+    """
+
+    t_ns: Ints
+    leg: Ints
+    path_m: Floats
+    positioned: Bools
+    placed_nowhere: Bools
+    refusal: list[PassageStatus | None]
+    sigma_m: Floats
+    confidence_m: Floats
+    odometer_m: Floats
+    segment: Ints
+    slips: Bools
+    counter: Ints
+    slip_doubt_m: Floats
+    scale_sigma: float | None
+    direction: Ints
+    travel: Ints
+    travelled_m: Floats
+    blind: Bools
+    gap_ns: int
+
+    @cached_property
+    def usable(self) -> Bools:
+        """A detection at this epoch would count."""
+        return np.array([refusal is None for refusal in self.refusal], dtype=bool)
+
+    @cached_property
+    def ambiguous(self) -> Bools:
+        """The place on the track is in doubt."""
+        return np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in self.refusal], dtype=bool)
+
+    @cached_property
+    def comparable(self) -> Bools:
+        """The position can be held against the odometer."""
+        known: Bools = np.isfinite(self.odometer_m) & np.isfinite(self.sigma_m)
+        return known & self.positioned & ~self.ambiguous
+
+    @cached_property
+    def has_odometer(self) -> bool:
+        return bool(np.isfinite(self.odometer_m).any())
+
+    def absence(self, epochs: slice) -> PassageStatus:
+        """What to say of a balise passed while no position was on the path: off all track, or none."""
+        unplaced = self.placed_nowhere[epochs].any()
+        return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
+
+    def direction_at(self, t_ns: int) -> int:
+        """Direction of travel at a time, turns as they were."""
+        return int(self.travel[max(int(np.searchsorted(self.t_ns, t_ns)) - 1, 0)])
+
+
+def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> Journey:
+    """Take the columns of matched and aligned epochs: the only place where the LDS reads them (see `run_lds`)."""
+    t_ns = times_ns(epochs)
+    path_m = floats(epochs, "path_m")
+    positioned = np.isfinite(path_m)
+    odometer_m = floats(epochs, "odometer_m")
+    direction, travel = _directions(odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
+    gap_ns = crossing_gap_ns(t_ns, config.lds)
+    return Journey(
+        t_ns=t_ns,
+        leg=epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64),
+        path_m=path_m,
+        positioned=positioned,
+        placed_nowhere=flags(epochs, "fix_valid") & ~positioned,
+        refusal=_refusals(epochs, positioned, config),
+        sigma_m=floats(epochs.select(pl.col("position_sigma_m").forward_fill()), "position_sigma_m"),
+        confidence_m=floats(epochs, "confidence_m"),
+        odometer_m=odometer_m,
+        segment=epochs["odometer_segment"].to_numpy().astype(np.int64),
+        slips=flags(epochs, "odometer_slips"),
+        counter=epochs["odometer_counter"].to_numpy().astype(np.int64),
+        slip_doubt_m=floats(epochs, "slip_doubt_m"),
+        scale_sigma=scale_sigma,
+        direction=direction,
+        travel=travel,
+        travelled_m=floats(epochs, "travelled_m"),
+        blind=_blind(t_ns, positioned, gap_ns),
+        gap_ns=gap_ns,
+    )
+
+
+def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
+    last_ns = np.maximum.accumulate(np.where(positioned, t_ns, np.iinfo(np.int64).min))
+    first = np.argmax(positioned) if positioned.any() else t_ns.size
+    blind: Bools = t_ns - np.maximum(last_ns, t_ns[0] - gap_ns) > gap_ns
+    blind[:first] = True
+    return blind
+
+
+def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) -> list[PassageStatus | None]:
+    """Ambiguity before confidence; what is not known (null) is never taken as good."""
+    refusals = np.full(positioned.size, None)
+    refusals[~met(epochs, confident(config))] = PassageStatus.REJECTED_CONFIDENCE
+    refusals[~met(epochs, unambiguous(config))] = PassageStatus.REJECTED_AMBIGUOUS
+    refusals[~positioned] = PassageStatus.NOT_AVAILABLE
+    return list(refusals)
+
+
+def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[Ints, Ints]:
+    """Direction of travel along growing path, as known at each epoch and as it was.
+
+    With an odometer the train has turned once it came back by `turn_m` (the odometer's own fixed
+    error): a wheel's jitter at standstill is no turn. Without one: the matched direction, held.
+    """
+    if not np.isfinite(odometer_m).any():
+        held = matched.replace(0, None).fill_null(strategy="forward").fill_null(1)
+        direction = held.to_numpy().astype(np.int64)
+        return direction, direction
+    known = np.flatnonzero(np.isfinite(odometer_m))
+    direction, travel = np.ones((2, odometer_m.size), dtype=np.int64)
+    for turned_at, seen_at, sense in turns_of(odometer_m[known], turn_m):
+        direction[known[seen_at] :] = sense
+        travel[known[turned_at] :] = sense
+    return direction, travel
+
+
+def turning_epochs(journey: Journey) -> frozenset[int]:
+    """Epochs at which direction or leg differ from those of the epoch before, odometer known."""
+    known = np.flatnonzero(np.isfinite(journey.odometer_m))
+    changed = (np.diff(journey.direction[known]) != 0) | (np.diff(journey.leg[known]) != 0)
+    return frozenset(known[1:][changed].tolist())
+
+
+def segment_epochs(journey: Journey) -> list[int]:
+    """The first epochs of the odometer's continuity segments but the first: its distance was lost before them."""
+    found: list[int] = (np.flatnonzero(np.diff(journey.segment)) + 1).tolist()
+    return found
+
+
+def mission_epochs(journey: Journey, config: LdsConfig) -> frozenset[int]:
+    """The first epochs at or after the configured starts of mission that lie inside the run."""
+    starts_ns = np.array([round(start.timestamp() * NS_PER_S) for start in config.starts_of_mission], dtype=np.int64)
+    inside = starts_ns[(starts_ns > journey.t_ns[:1].sum()) & (starts_ns <= journey.t_ns[-1:].sum())]
+    return frozenset(np.searchsorted(journey.t_ns, inside).tolist())

@@ -1,0 +1,181 @@
+"""The linking monitors: order of balise identities, and GNSS against odometer distance."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.epochs.verdicts import (
+    DISABLED,
+    NO_ODOMETER,
+    NO_POSITION,
+    NO_SIGMA,
+    first_reason,
+    of_monitor,
+    verdicts,
+)
+from pipeline.stages.lds.crossings import Crossing
+from pipeline.stages.lds.journey import Journey
+from pipeline.stages.lds.relink import Anchor, Comparison
+from schemas.arrays import Bools
+from schemas.config import Configuration
+from schemas.enums import NotEvaluated
+
+# Identities are counted: half a balise lies between none and one.
+ORDER_THRESHOLD = 0.5
+_BLOCK = 4096  # epochs evaluated at once
+
+AMBIGUOUS = NotEvaluated.AMBIGUOUS_OR_OFF
+FIRST_EPOCH = NotEvaluated.NO_EPOCH_BEFORE
+NEVER = NotEvaluated.NEVER_VALIDATED
+LOST = NotEvaluated.DISTANCE_LOST
+
+
+def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:
+    """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards).
+
+    Two or more at once, or one against the direction of travel, are out of order where the
+    odometer's step does not explain the position's; `overdue` ones, whose window has closed, always.
+    """
+    i, j = offered[0].before, offered[0].epoch
+    odometer_step_m = journey.odometer_m[j] - journey.odometer_m[i]
+    excess_m = abs(journey.path_m[j] - journey.path_m[i] - odometer_step_m)
+    noise_m = config.monitors.threshold_factor * sqrt(journey.sigma_m[i] ** 2 + journey.sigma_m[j] ** 2)
+    unexplained = excess_m > noise_m + config.lds.odometer_share * abs(odometer_step_m)
+    backwards = offered[0].sense != journey.direction[j]
+    return len(offered) if unexplained and (len(offered) > 1 or backwards) else overdue
+
+
+class LinkOrder:
+    """Order of balise identities, step by step."""
+
+    def __init__(self, journey: Journey, config: Configuration) -> None:
+        self._reason = _order_reasons(journey, "link_order" in config.monitors.disabled)
+        self._evaluated: Bools = self._reason.is_null().to_numpy()
+        self._value = np.zeros(journey.t_ns.size)
+
+    def is_evaluated(self, k: int) -> bool:
+        return bool(self._evaluated[k])
+
+    def note(self, k: int, out_of_order: int) -> None:
+        self._value[k] = out_of_order
+
+    def columns(self) -> list[pl.Series]:
+        """`link_order_*` as in the contract of epochs."""
+        threshold = np.full(self._value.size, ORDER_THRESHOLD)
+        return of_monitor("link_order", verdicts(self._value, threshold, self._reason))
+
+
+class LinkDistance:
+    """GNSS against odometer distance since the LRVB, or since the TVB that began the chain.
+
+    Bounds: the odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T. At the first
+    position after an outage it is the distance since the re-link anchor, within the bound of a re-link (`relink`).
+    """
+
+    def __init__(self, journey: Journey, config: Configuration) -> None:
+        self._journey, self._config = journey, config.lds
+        self._factor = config.monitors.threshold_factor
+        reasons = _distance_reasons(journey, "link_distance" in config.monitors.disabled)
+        self._possible: Bools = reasons.is_null().to_numpy()
+        self._reason = reasons.to_numpy().astype(np.object_)  # None where it is evaluated
+        self._offset_m = journey.path_m - journey.odometer_m
+        self._value = np.full(journey.t_ns.size, np.nan)
+        self._threshold = np.full(journey.t_ns.size, np.nan)
+        self._fails = np.zeros(journey.t_ns.size, dtype=bool)
+        self._anchor: Anchor | None = None
+        self._done = 0
+
+    def measure_from(self, anchor: Anchor | None, k: int) -> None:
+        """From epoch `k` on the distance counts from this anchor."""
+        self._anchor, self._done = anchor, k
+
+    def is_possible(self, k: int) -> bool:
+        """There is a position and an odometer to compare at this epoch."""
+        return bool(self._possible[k])
+
+    def can_measure(self, k: int) -> bool:
+        """What the distance counts from is in the same continuity segment of the odometer as this epoch."""
+        return self._anchor is not None and self._anchor.segment == self._journey.segment[k]
+
+    def fails(self, k: int) -> bool:
+        if self._anchor is None:
+            return False
+        if k >= self._done:
+            self._evaluate(self._anchor, k)
+        return bool(self._fails[k])
+
+    def quiet_until(self, k: int, end: int) -> int:
+        """The first epoch from `k` on that fails or is not evaluated yet; at most `end`."""
+        if self._anchor is None:
+            return end
+        if k >= self._done:
+            self._evaluate(self._anchor, k)
+        ahead = self._fails[k : min(self._done, end)]
+        first = int(ahead.argmax())
+        return k + (first if ahead[first] else ahead.size)
+
+    def _evaluate(self, anchor: Anchor, k: int) -> None:
+        """A block ahead at once: elementwise, so every epoch still knows only its own past."""
+        self._done = min(k + _BLOCK, self._fails.size)
+        ahead = slice(k, self._done)
+        way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
+        noise_m = self._factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
+        threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
+        lost = self._possible[ahead] & (self._journey.segment[ahead] != anchor.segment)
+        known = self._possible[ahead] & ~lost
+        self._reason[ahead][self._possible[ahead]] = None
+        self._reason[ahead][lost] = LOST
+        self._value[ahead] = np.where(known, self._offset_m[ahead] - anchor.offset_m, np.nan)
+        self._threshold[ahead] = np.where(known, threshold_m, np.nan)
+        self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
+
+    def hold_against(self, found: Comparison, k: int) -> None:
+        """The verdict on a position after an outage joins that of the bounds at epoch `k`, whose fail remains."""
+        if self.fails(k):
+            return
+        self._value[k], self._threshold[k] = found.moved_m, found.bound_m
+        self._fails[k] = found.reason is None and not found.holds
+        self._reason[k] = found.reason
+
+    def forget(self, k: int) -> None:
+        """From epoch `k` on there is nothing to measure from."""
+        self.measure_from(None, k)
+        self._value[k:] = self._threshold[k:] = np.nan
+        self._reason[k:][self._possible[k:]] = None
+
+    def columns(self) -> list[pl.Series]:
+        """`link_distance_*` as in the contract of epochs."""
+        reasons = pl.Series(self._reason.tolist(), dtype=pl.String)
+        unknown = reasons.is_null() & pl.Series(np.isnan(self._value))
+        reasons = first_reason((reasons.is_not_null(), reasons), (unknown, NEVER))
+        return of_monitor("link_distance", verdicts(self._value, self._threshold, reasons))
+
+
+def _order_reasons(journey: Journey, disabled: bool) -> pl.Series:
+    """Per step, so both its ends must be good for it; a step ends at the epoch that it is noted at."""
+    known = np.flatnonzero(journey.positioned)
+    before = np.full(journey.t_ns.size, -1)
+    before[known[1:]] = known[:-1]
+    odometer, ambiguous, sigma = np.isfinite(journey.odometer_m), journey.ambiguous, np.isfinite(journey.sigma_m)
+    return first_reason(
+        (np.full(before.size, disabled), DISABLED),
+        (~odometer, NO_ODOMETER),
+        (~journey.positioned, NO_POSITION),
+        (before < 0, FIRST_EPOCH),
+        (~odometer[before], NO_ODOMETER),
+        (ambiguous | ambiguous[before], AMBIGUOUS),
+        (~(sigma & sigma[before]), NO_SIGMA),
+    )
+
+
+def _distance_reasons(journey: Journey, disabled: bool) -> pl.Series:
+    return first_reason(
+        (np.full(journey.t_ns.size, disabled), DISABLED),
+        (~np.isfinite(journey.odometer_m), NO_ODOMETER),
+        (~journey.positioned, NO_POSITION),
+        (journey.ambiguous, AMBIGUOUS),
+        (~np.isfinite(journey.sigma_m), NO_SIGMA),
+    )

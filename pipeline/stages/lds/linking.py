@@ -1,0 +1,278 @@
+"""ETCS linking: one chain of announced balises, virtual or physical, and what the train makes of each.
+
+Distances along the chain are odometer distances from the last relevant balise (LRVB or LRBG), positive
+in the direction of travel. One balise is expected at a time, in the order announced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipeline.stages.lds.crossings import Balise, Crossing, Passage
+from pipeline.stages.lds.journey import Journey
+from pipeline.stages.lds.windows import Window, window_after_turn_m, window_m
+from schemas.config import LdsConfig
+from schemas.enums import LinkingError, PassageStatus, Reaction
+
+# SUBSET-026 3.16.2.7 (TVB eq. 4): two consecutive expected balise groups that are not found apply the service brake.
+MISSED_IN_A_ROW = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The last relevant balise: where odometer and way run stood when it was detected."""
+
+    balise: Balise
+    odometer_m: float | None
+    travelled_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class LrvbChange:
+    """From `epoch` on: the LRVB, and whether the TVB chain has begun."""
+
+    epoch: int
+    lrvb: Reference | None
+    chain_begun: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    distance_m: float
+    travelled_m: float
+
+
+class LinkingChain:
+    """Announced balises of one kind, the reference, and the passages so far.
+
+    `closing_m`: odometer reading, times direction of travel, at which the open window closes.
+    """
+
+    def __init__(self, balises: Sequence[Balise], config: LdsConfig) -> None:
+        self.passages: list[Passage] = []
+        self.reference: Reference | None = None
+        self._announced = [balise for balise in balises if balise.linked]
+        self._config = config
+        self._direction = 1
+        self._leg: int | None = None
+        self._turn: _Turn | None = None
+        self._ahead: list[Balise] = []
+        self._optional: set[str] = set()
+        self._missed_in_a_row = 0
+        self.closing_m = float("inf")
+        # The passage that a balise ahead already has, through an offer before its window closed ...
+        self._own: dict[str, Passage] = {}
+        # ... the same, crossed back since without an offer of its own ...
+        self._set_aside: dict[str, Passage] = {}
+        # ... and that of a balise whose window closed without any offer.
+        self._unoffered: dict[str, Passage] = {}
+
+    @property
+    def linking(self) -> bool:
+        """A reference with a known odometer reading: windows can be drawn from it."""
+        return self.reference is not None and self.reference.odometer_m is not None
+
+    def forget(self) -> None:
+        """A new initialisation: no reference, no linking."""
+        self.reference = None
+        self._look_ahead([])
+        for kept in (self._own, self._set_aside, self._unoffered):
+            kept.clear()
+
+    def is_overdue(self, balise: Balise) -> bool:
+        """Its window has closed without any offer."""
+        return balise.balise_id in self._unoffered
+
+    def advance(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
+        """The train has come to this odometer reading; `absence`: status of what it did not find."""
+        if self.linking:
+            self._close_windows(self._distance_m(odometer_m), t_ns, absence)
+
+    def turn(self, journey: Journey, k: int) -> None:
+        """The train goes the other way from this epoch on, or on another leg: expect what lies on its new way."""
+        if self.reference is None or not self.linking:
+            return
+        self._direction, self._leg = int(journey.direction[k]), int(journey.leg[k])
+        travelled_m = float(journey.travelled_m[k]) - self.reference.travelled_m
+        self._turn = _Turn(self._distance_m(float(journey.odometer_m[k])), travelled_m)
+        for kept in (self._own, self._set_aside, self._unoffered):
+            kept.clear()
+        windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel()]
+        here_m = self._turn.distance_m
+        self._optional = {balise.balise_id for balise, window in windows if window.holds(here_m)}
+        self._look_ahead([balise for balise, window in windows if window.close_m > here_m])
+
+    def offer(self, crossing: Crossing, refusal: PassageStatus | None) -> bool:
+        """Judge an offered balise; its passage is written whatever comes of it. True where it is accepted.
+
+        `refusal`: why it does not count as a detection, None where it does.
+        """
+        distance_m = None
+        if self.linking and crossing.odometer_m is not None:
+            distance_m = self._distance_m(crossing.odometer_m)
+            self._close_windows(distance_m, crossing.t_ns, PassageStatus.MISSED)
+        overdue = crossing.sense == crossing.direction and self.is_overdue(crossing.balise)
+        passage = self._passage_of(crossing)
+        passage.odometer_distance_m = distance_m
+        if distance_m is None and not overdue:
+            passage.window = None
+        if refusal is not None:
+            passage.status = refusal
+        elif overdue:
+            passage.status = PassageStatus.REJECTED_WINDOW
+        elif distance_m is None:
+            passage.status = PassageStatus.ACCEPTED
+        else:
+            self._judge(passage, distance_m)
+        crossing.offered, crossing.status = True, passage.status
+        accepted = passage.status is PassageStatus.ACCEPTED
+        if accepted:
+            self._refer_to(crossing)
+        return accepted
+
+    def pass_unoffered(self, crossing: Crossing, status: PassageStatus) -> None:
+        """The position was on one side before a gap and on the other after it."""
+        crossing.status = status
+        name = crossing.balise.balise_id
+        if crossing.sense != crossing.direction:
+            self.cross_again(crossing)
+        elif name in self._unoffered:
+            self._unoffered[name].status = status
+        else:
+            passage = self._new_passage(crossing.balise, crossing.t_ns, crossing.direction)
+            passage.status = status
+            self._own[name] = passage
+
+    def cross_again(self, crossing: Crossing) -> None:
+        """Crossed once more before it was re-armed: not offered, but the position changed sides."""
+        forward = crossing.sense == crossing.direction
+        taken, kept = (self._set_aside, self._own) if forward else (self._own, self._set_aside)
+        passage = taken.pop(crossing.balise.balise_id, None)
+        if passage is not None:
+            kept[crossing.balise.balise_id] = passage
+
+    def finish(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
+        """The run ends without a position: `absence` is the status of what was passed by reckoning."""
+        if not self.linking:
+            return
+        distance_m = self._distance_m(odometer_m)
+        for balise in self._ahead:
+            unseen = balise.balise_id not in self._own and balise.balise_id not in self._optional
+            if unseen and self._announced_m(balise) < distance_m:
+                passage = self._new_passage(balise, t_ns, self._direction)
+                passage.status = absence
+
+    def _distance_m(self, odometer_m: float) -> float:
+        assert self.reference is not None
+        assert self.reference.odometer_m is not None
+        return (odometer_m - self.reference.odometer_m) * self._direction
+
+    def _announced_m(self, balise: Balise) -> float:
+        assert self.reference is not None
+        return (balise.path_m - self.reference.balise.path_m) * self._direction
+
+    def _window(self, balise: Balise) -> Window:
+        assert self.reference is not None
+        distance_m = self._announced_m(balise)
+        reference_accuracy_m = self.reference.balise.accuracy_m
+        if self._turn is None:
+            return window_m(distance_m, balise.accuracy_m, reference_accuracy_m, self._config)
+        travelled_m = self._turn.travelled_m + abs(distance_m - self._turn.distance_m)
+        margin_m = balise.accuracy_m + reference_accuracy_m + self._config.odometer_fixed_m
+        return window_after_turn_m(distance_m, travelled_m, margin_m, self._config)
+
+    def _judge(self, passage: Passage, distance_m: float) -> None:
+        """A detection while linking is in force (SUBSET-026 3.16.2.3.1)."""
+        balise = passage.balise
+        if not balise.linked:
+            passage.status = PassageStatus.REJECTED_UNLINKED
+            return
+        passage.status = PassageStatus.REJECTED_WINDOW
+        position = self._position_ahead(balise)
+        if position is None:
+            return
+        expected = self._ahead[position]
+        if expected.balise_id == balise.balise_id and self._window(balise).holds(distance_m):
+            passage.status = PassageStatus.ACCEPTED
+        elif expected.balise_id != balise.balise_id and self._window(expected).holds(distance_m):
+            passage.record(LinkingError.ORDER, expected.reaction)
+        else:
+            passage.record(LinkingError.EARLY, balise.reaction)
+
+    def _position_ahead(self, balise: Balise) -> int | None:
+        """Index of the expected balise that this offer stands against, `None` where it is not ahead.
+
+        Balises near which the train turned may or may not be passed: they stand in nobody's way.
+        """
+        names = [ahead.balise_id for ahead in self._ahead]
+        if balise.balise_id not in names:
+            return None
+        position = names.index(balise.balise_id)
+        in_its_way = (i for i in range(position) if names[i] not in self._optional)
+        return next(in_its_way, position)
+
+    def _close_windows(self, distance_m: float, t_ns: int, absence: PassageStatus) -> None:
+        while self._ahead and distance_m > self._window(self._ahead[0]).close_m:
+            self._close(self._ahead[0], t_ns, absence)
+            self._look_ahead(self._ahead[1:])
+
+    def _close(self, balise: Balise, t_ns: int, absence: PassageStatus) -> None:
+        """Not found in its window; the second in a row brakes (3.16.2.7; TVB eq. 4)."""
+        if balise.balise_id in self._optional:
+            return
+        passage = self._own.pop(balise.balise_id, None)
+        if passage is None:
+            passage = self._new_passage(balise, t_ns, self._direction)
+            passage.status = absence
+            self._unoffered[balise.balise_id] = passage
+        self._missed_in_a_row += 1
+        passage.record(LinkingError.MISSED, balise.reaction)
+        if self._missed_in_a_row >= MISSED_IN_A_ROW:
+            passage.record(LinkingError.MISSED, Reaction.SERVICE_BRAKE)
+
+    def _refer_to(self, crossing: Crossing) -> None:
+        """An accepted balise becomes the reference; what lies beyond it is expected next."""
+        balise = crossing.balise
+        self.reference = Reference(balise, crossing.odometer_m, crossing.travelled_m)
+        self._direction, self._leg, self._turn = crossing.direction, balise.leg, None
+        self._missed_in_a_row = 0
+        self._optional = set()
+        self._own.pop(balise.balise_id, None)
+        beyond = [other for other in self._in_order_of_travel() if self._announced_m(other) > 0]
+        self._look_ahead(beyond if self.linking else [])
+
+    def _in_order_of_travel(self) -> list[Balise]:
+        on_leg = [one for one in self._announced if one.leg == self._leg and one.is_valid(self._direction)]
+        return on_leg if self._direction > 0 else on_leg[::-1]
+
+    def _look_ahead(self, ahead: list[Balise]) -> None:
+        self._ahead = ahead
+        self.closing_m = float("inf")
+        if ahead and self.reference is not None and self.reference.odometer_m is not None:
+            start_m = self.reference.odometer_m * self._direction
+            self.closing_m = start_m + self._window(ahead[0]).close_m
+
+    def _passage_of(self, crossing: Crossing) -> Passage:
+        """The passage that this offer belongs to: a new one, or one whose window closed before."""
+        name = crossing.balise.balise_id
+        forward = crossing.sense == crossing.direction
+        passage = self._unoffered.pop(name, None) if forward else None
+        if passage is None:
+            passage = self._new_passage(crossing.balise, crossing.t_ns, crossing.direction)
+            self._own.pop(name, None)
+            self._set_aside.pop(name, None)
+            if forward:
+                self._own[name] = passage
+        passage.crossing, passage.t_ns = crossing, crossing.t_ns
+        return passage
+
+    def _new_passage(self, balise: Balise, t_ns: int, direction: int) -> Passage:
+        passage = Passage(balise, t_ns, direction)
+        if balise.balise_id in (ahead.balise_id for ahead in self._ahead):
+            passage.window = self._window(balise)
+        if self.reference is not None and self.reference.odometer_m is not None:
+            along_m = balise.path_m - self.reference.balise.path_m
+            passage.announced_odometer_m = self.reference.odometer_m + along_m
+        self.passages.append(passage)
+        return passage

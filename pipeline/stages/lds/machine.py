@@ -1,0 +1,252 @@
+"""The location determination system as a state machine over the epochs of one solution.
+
+*Initialising*: no reference, no linking. *Linked*: reference known, position in use. *Odometry*:
+reference known, no usable position just now. *Fail-safe*: position negated. In any mode a position is *withheld* where
+the diagnosis itself says that it cannot stand behind it (DOMAIN section 5.2): no VB is accepted, no TVB is valid.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+
+from pipeline.stages.lds.crossings import Balise, Crossing
+from pipeline.stages.lds.detection import BaliseDetection
+from pipeline.stages.lds.journey import Journey, mission_epochs, segment_epochs
+from pipeline.stages.lds.link_monitors import LinkDistance
+from pipeline.stages.lds.linking import LrvbChange
+from pipeline.stages.lds.relink import Anchor, Held, Recovery, Relink, breaks
+from pipeline.stages.monitors.bank import MonitorBank
+from schemas.arrays import NS_PER_S
+from schemas.config import Configuration
+from schemas.enums import BaliseKind, LostTo
+
+
+class LocationSystem:
+    """Walks once along a journey; what it found stands in its public attributes afterwards.
+
+    Per epoch: `tvb`, `alarm`, `negated`, `evaluated` (`along_raw` has a verdict), `withheld_for` (why the position is
+    not used though no monitor fails, None where it is).
+    """
+
+    def __init__(
+        self,
+        journey: Journey,
+        bank: MonitorBank,
+        balises: dict[BaliseKind, list[Balise]],
+        crossings: Sequence[Crossing],
+        config: Configuration,
+    ) -> None:
+        self._journey, self._bank, self._config = journey, bank, config.lds
+        self.balises = BaliseDetection(journey, balises, crossings, config)
+        self.distance = LinkDistance(journey, config)
+        self.lrvb_changes = [LrvbChange(0, None, chain_begun=False)]
+        self.accepted_at_ns: dict[int, int] = {}
+        self.tvb, self.alarm, self.negated = ([False] * journey.t_ns.size for _ in range(3))
+        self.evaluated = [False] * journey.t_ns.size
+        self.withheld_for: list[LostTo | None] = [None] * journey.t_ns.size
+        # The walk reads single elements: lists are several times faster at that than arrays.
+        self._t_ns: list[int] = journey.t_ns.tolist()
+        self._way_m = journey.odometer_m * journey.direction
+        self._breaks = breaks(journey, bank.after_outages)
+        self._bridged_ns = round(config.align.gap_reset_s * NS_PER_S)
+        self._missions = mission_epochs(journey, config.lds)
+        self._events = sorted({*self.balises.events, *self._breaks, *self._missions, *segment_epochs(journey)})
+        self._relink = Relink(journey, self.tvb, config)
+        self._recovery: Recovery | None = None  # while negated
+        self._slipped = False  # since slip that the odometer reported, until re-link
+        self._unwatched_since_ns: int | None = None  # the noise hides whether the position moves
+        self._validated = False  # a VB or a TVB
+        self._chain_from: int | None = None  # validated positions after this epoch are TVBs
+        self._consistent_since_ns: int | None = None
+        self._consistent_at_ns = 0
+
+    @property
+    def held(self) -> list[Held]:
+        """The re-links that held, in order."""
+        return self._relink.held
+
+    def run(self) -> None:
+        """Walk along all epochs."""
+        k = 0
+        while k < len(self._t_ns):
+            end = self._uneventful_until(k)
+            if end > k:
+                self._pass_uneventful(k, end)
+            else:
+                self._step(k)
+            k = max(end, k + 1)
+        if k:
+            self.balises.finish(self._t_ns[-1])
+
+    def _uneventful_until(self, k: int) -> int:
+        """The first epoch from `k` on that has to be stepped through; those before it can only be TVBs.
+
+        So it is on linked way where no balise, read, turn, outage, loss of distance, alarm or end of a window is near.
+        """
+        if self._recovery is not None or self.balises.disarmed or self._chain_from is None or k <= self._chain_from:
+            return k
+        if self._unwatched_since_ns is not None or self._withheld_for(k) is not None:
+            return k
+        if self._journey.has_odometer and not self.distance.can_measure(k):
+            return k
+        near = bisect_left(self._events, k)
+        end = self._events[near] if near < len(self._events) else len(self._t_ns)
+        for monitors in (self._bank, self.distance):
+            end = monitors.quiet_until(k, end) if end > k else k
+        closing = self._way_m[k:end] > self.balises.closing_m
+        return k + int(closing.argmax()) if closing.any() else end
+
+    def _pass_uneventful(self, k: int, end: int) -> None:
+        evaluated = self._bank.along_evaluated_between(k, end)
+        self.evaluated[k:end] = evaluated.tolist()
+        self.tvb[k:end] = (evaluated & self._journey.usable[k:end]).tolist()
+        self._validated = True
+
+    def _step(self, k: int) -> None:
+        if k in self._missions:
+            self._relink.begin_mission(k)
+            self._initialise_anew(k)
+        self.balises.turn(k)
+        for read in self.balises.read(k):
+            self._relink.note_read(read)
+        bank_failed = self._bank.failed(k)
+        self._test_after_slip(k)
+        self._test_after_outage(k)
+        self.withheld_for[k] = self._withheld_for(k)
+        withheld = self.withheld_for[k] is not None
+        distrusted = bank_failed or self.distance.fails(k) or self._recovery is not None or withheld
+        accepted, disordered = self.balises.pass_virtual(k, distrusted, self._chain_from is None)
+        for crossing in accepted:
+            self._accept(crossing, k)
+        self.balises.rearm(k)
+        self.balises.close_windows(k, self._t_ns[k])
+        self.evaluated[k] = self._bank.along_evaluated(k)
+        self.alarm[k] = bank_failed or disordered or self.distance.fails(k)
+        if self._recovery is not None:
+            self._seek_return(self._recovery, k, disordered)
+        elif self.alarm[k]:
+            self._negate(k)
+        elif self.evaluated[k] and self._journey.usable[k] and not withheld:
+            self._validate(k)
+
+    def _withheld_for(self, k: int) -> LostTo | None:
+        """Why the diagnosis cannot stand behind a position here, as it says itself (DOMAIN section 5.2)."""
+        if not self._bank.noise_known_at(k):
+            return LostTo.NOISE
+        if self._journey.slips[k]:
+            return LostTo.SLIP
+        return LostTo.RELINK if self._slipped or self._bank.begins_at(k) else None
+
+    def _test_after_slip(self, k: int) -> None:
+        """Nothing watched the position while the odometer slipped: it has to re-link, like after an alarm."""
+        if self._journey.slips[k]:
+            self._consistent_since_ns = None
+            if self._validated and not self._slipped:
+                self._relink.note_slip(k)
+                self._slipped = True
+        elif self._slipped and self._recovery is None and self._can_return(k):
+            self._slipped = not self._relink.compare(k, slipped=True).holds
+            if not self._slipped:
+                self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+
+    def _can_return(self, k: int) -> bool:
+        return self.distance.is_possible(k) and bool(self._journey.usable[k])
+
+    def _test_after_outage(self, k: int) -> None:
+        """Nobody looked on over the outage, or in the noise: the position has to re-link, or is not used."""
+        in_noise = self._was_unwatched(k)
+        if (
+            not (k in self._breaks or in_noise)
+            or self._recovery is not None
+            or self._slipped
+            or not (self._validated and self.distance.is_possible(k))
+        ):
+            return
+        found = self._relink.compare(k)
+        self.distance.hold_against(found, k)
+        if found.reason is not None:
+            self._negate(k)
+
+    def _was_unwatched(self, k: int) -> bool:
+        """The first usable position after noise too large, or not known, for longer than the bank bridges."""
+        if not self._bank.noise_known_at(k):
+            if self._unwatched_since_ns is None:
+                self._unwatched_since_ns = self._t_ns[k]
+            return False
+        if self._unwatched_since_ns is None or not self._can_return(k):
+            return False
+        waited_ns = self._t_ns[k] - self._unwatched_since_ns
+        self._unwatched_since_ns = None
+        return waited_ns > self._bridged_ns
+
+    def _accept(self, crossing: Crossing, k: int) -> None:
+        self.accepted_at_ns[k] = crossing.t_ns
+        crossing.initialising = not self._validated
+        self._validated = True
+        self._chain_from = k if self._chain_from is None else self._chain_from
+        anchor = Anchor.at_crossing(self._journey, crossing, float(self._journey.sigma_m[k]))
+        if anchor is not None:
+            self.distance.measure_from(anchor, k)
+        self._note_lrvb(k)
+
+    def _validate(self, k: int) -> None:
+        """A usable position that the diagnosis stands behind is a TVB once the chain has begun."""
+        if self._has_initialised(k) if self._chain_from is None else k > self._chain_from:
+            self.tvb[k] = self._validated = True
+            if not self.distance.can_measure(k):
+                self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+
+    def _has_initialised(self, k: int) -> bool:
+        """Consistent for `init_s` without a break: a TVB may arise between two VBs (SR)."""
+        t_ns = self._t_ns[k]
+        if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns:
+            self._consistent_since_ns = t_ns
+        self._consistent_at_ns = t_ns
+        if t_ns - self._consistent_since_ns < self._config.init_s * NS_PER_S:
+            return False
+        self._chain_from = k
+        self._note_lrvb(k)
+        return True
+
+    def _negate(self, k: int) -> None:
+        self._relink.note_alarm(k)
+        self._bank.freeze(k)
+        self._recovery = Recovery(k, self._journey, self._bank, self._config)
+        self.negated[k] = True
+        self._consistent_since_ns = None
+
+    def _seek_return(self, recovery: Recovery, k: int, disordered: bool) -> None:
+        self.negated[k] = True
+        if not recovery.is_over(k, self.evaluated[k], disordered):
+            return
+        if not self._validated:
+            self._initialise_anew(k)
+        elif self._relink.compare(k).holds:
+            self._return(k)
+            self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+        else:
+            self.withheld_for[k] = LostTo.RELINK
+
+    def _initialise_anew(self, k: int) -> None:
+        """No reference and no linking: a start of mission, or a fault before anything was validated."""
+        self.balises.virtual.forget()
+        self.distance.forget(k)
+        self._chain_from = self._consistent_since_ns = None
+        self._validated = self._slipped = False
+        if self._recovery is not None:
+            self._return(k)
+        self._note_lrvb(k)
+
+    def _return(self, k: int) -> None:
+        self._recovery = None
+        self._slipped = False
+        self.negated[k] = False
+        self._bank.restart(k)
+        self.withheld_for[k] = LostTo.RELINK
+        # What still rang at this epoch belonged to the fault that is over.
+        self.evaluated[k] = self._bank.along_evaluated(k)
+        self.alarm[k] = self._bank.failed(k)
+
+    def _note_lrvb(self, k: int) -> None:
+        self.lrvb_changes.append(LrvbChange(k, self.balises.virtual.reference, self._chain_from is not None))

@@ -1,0 +1,233 @@
+"""The LDS stage: matched, aligned epochs of one solution in; LDS columns, crossings and passages out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.lds.crossings import (
+    Crossing,
+    Passage,
+    balises_of,
+    crossing_rows,
+    find_crossings,
+    in_order_of_time,
+    reads_of,
+)
+from pipeline.stages.lds.journey import Journey, journey_of
+from pipeline.stages.lds.linking import LrvbChange
+from pipeline.stages.lds.machine import LocationSystem
+from pipeline.stages.lds.relink import Held
+from pipeline.stages.monitors.bank import MonitorBank
+from schemas.arrays import Bools, Floats
+from schemas.config import Configuration, LdsConfig
+from schemas.conform import dtypes
+from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode
+from schemas.tables import Epochs, Passages
+
+
+@dataclass(frozen=True)
+class LdsResult:
+    """What the LDS made of one solution.
+
+    `epochs`: `t` and the LDS columns, row for row with the input. `crossings`: as in `schemas.stages.Crossings`, each
+    balise crossed or read. `passages`: as in the contract, in order of time, joined to crossings by `crossing_id`;
+    what needs a truth is null or `none`; beside it `t_reckoned`: when the train passes a balise that was not offered,
+    by LRVB and odometer. `unknown_reads`: telegrams of balises not on the path. `held`: re-links that held.
+    """
+
+    epochs: pl.DataFrame
+    crossings: pl.DataFrame
+    passages: pl.DataFrame
+    unknown_reads: pl.DataFrame
+    held: tuple[Held, ...]
+
+
+def run_lds(
+    epochs: pl.DataFrame,
+    bank: MonitorBank,
+    balises: pl.DataFrame,
+    balise_reads: pl.DataFrame | None,
+    scale_sigma: float | None,
+    config: Configuration,
+    solution: str = "primary",
+) -> LdsResult:
+    """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
+
+    `withheld` of the result: nothing is in use, and no VB is accepted, because of `withheld_for` (DOMAIN section 5.2):
+    the noise is not known yet, the odometer says itself that it slips, or the bank has just restarted or slip ended,
+    and a re-link is due.
+
+    `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
+    gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
+    where unknown)`, travelled_m, odometer_segment, odometer_slips, odometer_counter, slip_doubt_m, direction` (+1/-1,
+    used where there is no odometer).
+    `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, `odometer_m` at the read where the run has
+    an odometer. A run without that stream has no reader, so its physical balises have no passages. `scale_sigma`: of
+    the odometer, None unless a vehicle file gives it with the scale.
+    """
+    journey = journey_of(epochs, scale_sigma, config)
+    on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
+    reads, unknown = reads_of(balise_reads, on_path[BaliseKind.PHYSICAL], journey)
+    found = [*find_crossings(journey, on_path[BaliseKind.VIRTUAL]), *reads]
+    system = LocationSystem(journey, bank, on_path, found, config)
+    system.run()
+    crossings = in_order_of_time(found)
+    passages = system.balises.virtual.passages + system.balises.physical.passages
+    return LdsResult(
+        epochs=epoch_columns(epochs["t"], system, journey, config.lds),
+        crossings=crossing_rows(crossings, journey),
+        passages=passage_rows(passages, crossings, journey, solution),
+        unknown_reads=unknown,
+        held=tuple(system.held),
+    )
+
+
+def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config: LdsConfig) -> pl.DataFrame:
+    """`t` and the LDS columns, row for row with the journey."""
+    names = [change.lrvb and change.lrvb.balise.balise_id for change in system.lrvb_changes]
+    starts = np.array([change.epoch for change in system.lrvb_changes])
+    index = np.searchsorted(starts, np.arange(journey.t_ns.size), side="right") - 1
+    distance_m, doubt_m = _reported_m(system.lrvb_changes, index, journey, config)
+    withheld_for = pl.Series("withheld_for", system.withheld_for, dtype=Epochs.columns()["withheld_for"].dtype)
+    withheld = withheld_for.is_not_null().alias("withheld")
+    columns = [
+        t,
+        _modes(system, index, journey, withheld.to_numpy()),
+        pl.Series("tvb", system.tvb, dtype=pl.Boolean),
+        pl.Series("lrvb_id", names, dtype=pl.String).gather(index),
+        pl.Series("distance_from_lrvb_m", distance_m).fill_nan(None),
+        pl.Series("doubt_over_m", doubt_m).fill_nan(None),
+        pl.Series("doubt_under_m", doubt_m).fill_nan(None),
+        pl.Series("exposure_s", _exposure_s(system, journey)).fill_nan(None),
+        pl.Series("negated", system.negated, dtype=pl.Boolean),
+        withheld,
+        withheld_for,
+        pl.Series("diagnosis_faulty", _diagnosis_faulty(system, journey, withheld.to_numpy())),
+        pl.Series("alarm", system.alarm, dtype=pl.Boolean),
+    ]
+    return pl.DataFrame(columns).with_columns(*system.balises.order.columns(), *system.distance.columns())
+
+
+def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools) -> Bools:
+    """P3 (DOMAIN section 4): `along_raw` has no verdict. A position withheld for that is availability lost instead.
+
+    A run without an odometer has no diagnosis along the track at all.
+    """
+    undiagnosed = ~np.array(system.evaluated, dtype=bool)
+    faulty: Bools = undiagnosed & ~withheld if journey.has_odometer else undiagnosed
+    return faulty
+
+
+def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld: Bools) -> pl.Series:
+    linked = np.array(
+        [
+            (change.lrvb is not None and change.lrvb.odometer_m is not None)
+            or (change.chain_begun and journey.has_odometer)
+            for change in system.lrvb_changes
+        ]
+    )[index]
+    modes = [mode.value for mode in LdsMode]
+    in_use = np.where(journey.usable & ~withheld, modes.index(LdsMode.LINKED), modes.index(LdsMode.ODOMETRY))
+    mode = np.where(linked, in_use, modes.index(LdsMode.INITIALISING))
+    mode = np.where(system.negated, modes.index(LdsMode.FAIL_SAFE), mode)
+    return pl.Series("lds_mode", modes, dtype=Epochs.columns()["lds_mode"].dtype).gather(mode)
+
+
+def _reported_m(
+    changes: list[LrvbChange], index: np.ndarray, journey: Journey, config: LdsConfig
+) -> tuple[Floats, Floats]:
+    """Odometer distance since the LRVB, and the over- and under-reading amount of that report.
+
+    SUBSET-026 3.6.4: location accuracy of the reference plus the odometer's confidence on the way run.
+    """
+    values = [
+        (np.nan, np.nan, np.nan)
+        if (lrvb := change.lrvb) is None
+        else (
+            np.nan if lrvb.odometer_m is None else lrvb.odometer_m,
+            lrvb.travelled_m,
+            lrvb.balise.accuracy_m,
+        )
+        for change in changes
+    ]
+    odometer_m, travelled_m, accuracy_m = np.array(values)[index].T
+    distance_m = np.abs(journey.odometer_m - odometer_m)
+    way_m = np.maximum(np.abs(journey.travelled_m - travelled_m), distance_m)
+    return distance_m, accuracy_m + config.odometer_fixed_m + config.odometer_share * way_m
+
+
+def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:
+    """Time since the last linked TVB or accepted VB before this epoch's own validation.
+
+    That is the interval of TVB eq. 7; measured after validation it would hide an outage without epochs.
+    """
+    never = np.iinfo(np.int64).min
+    validated_ns = np.where(system.tvb, journey.t_ns, never)
+    before_ns = np.concatenate(([never], validated_ns[:-1]))[: journey.t_ns.size]
+    for epoch, t_ns in system.accepted_at_ns.items():
+        before_ns[epoch] = max(before_ns[epoch], t_ns)
+    last_ns = np.maximum.accumulate(before_ns)
+    known = last_ns != never
+    exposure_s = np.full(last_ns.size, np.nan)
+    exposure_s[known] = (journey.t_ns[known] - last_ns[known]) * 1e-9
+    return exposure_s
+
+
+def passage_rows(
+    passages: Sequence[Passage], crossings: Sequence[Crossing], journey: Journey, solution: str
+) -> pl.DataFrame:
+    """Passages in order of time, as in the contract, and `t_reckoned`; `crossings` in order of time."""
+    ids = {id(crossing): number for number, crossing in enumerate(crossings)}
+    rows = [_row(passage, ids, journey, solution) for passage in passages]
+    when = [row["t_offered"] or row["t_reckoned"] or passage.t_ns for row, passage in zip(rows, passages, strict=True)]
+    order = sorted(range(len(rows)), key=lambda i: (when[i], passages[i].balise.balise_id))
+    schema = dtypes(Passages) | {"t_reckoned": pl.Datetime("ns", "UTC")}
+    return pl.DataFrame([rows[i] for i in order], schema=schema)
+
+
+def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:
+    balise, window, crossing = passage.balise, passage.window, passage.crossing
+    direction = journey.direction_at(passage.t_ns)
+    return {
+        "solution": solution,
+        "balise_id": balise.balise_id,
+        "kind": balise.kind.value,
+        "netelement_id": balise.netelement_id,
+        "measure_m": balise.measure_m,
+        "path_m": balise.path_m,
+        "direction": (Direction.GROWING if direction > 0 else Direction.FALLING).value,
+        "status": passage.status.value,
+        "t_offered": crossing and crossing.t_ns,
+        "window_open_m": window and window.open_m,
+        "window_close_m": window and window.close_m,
+        "odometer_distance_m": passage.odometer_distance_m,
+        "confidence_m": crossing and crossing.confidence_m,
+        "linking_error": passage.linking_error.value,
+        "reaction": passage.reaction.value,
+        "failure_mode": FailureMode.NONE.value,
+        "cause": Cause.NONE.value,
+        "suspect_after_the_fact": False,
+        "initialising": crossing is not None and crossing.initialising,
+        "location_accuracy_m": balise.accuracy_m,
+        "crossing_id": crossing and ids[id(crossing)],
+        "t_reckoned": _reckoned_ns(passage, journey),
+    }
+
+
+def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
+    """When the odometer last passed the announced place before the passage was settled."""
+    if passage.crossing is not None or passage.announced_odometer_m is None:
+        return None
+    known = np.flatnonzero(np.isfinite(journey.odometer_m) & (journey.t_ns <= passage.t_ns))
+    beyond = (journey.odometer_m[known] - passage.announced_odometer_m) >= 0
+    steps = np.flatnonzero(beyond[1:] != beyond[:-1])
+    if not steps.size:
+        return None
+    i, j = known[steps[-1]], known[steps[-1] + 1]
+    part_m = passage.announced_odometer_m - journey.odometer_m[i]
+    share = float(part_m / (journey.odometer_m[j] - journey.odometer_m[i]))
+    return int(journey.t_ns[i]) + round(share * int(journey.t_ns[j] - journey.t_ns[i]))

@@ -1,0 +1,214 @@
+"""Where each epoch may be: the nearest place on every net element within reach."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipeline.stages.track.geodesy import Points, points_of
+from pipeline.stages.track.network import Network
+from pipeline.stages.track.segments import Feet, Polyline, downhill
+from pipeline.stages.track.survey import Track
+from schemas.arrays import Bools, Floats, Ints
+
+# Every place on an element has a search point within this distance along it. Numerics: it decides how many points are
+# searched, not which elements are within reach.
+PROBE_SPACING_M = 40.0
+# Where two elements meet at a bend, a position lies inside both over so much at most: 40 m aside at 3 degrees.
+BEND_M = 2.0
+
+
+@dataclass(frozen=True)
+class Segments(Polyline):
+    """All segments of the network, element by element; `first[e] : first[e + 1]` are those of element e."""
+
+    element: Ints
+    first: Ints
+    measure_start_m: Floats
+    measure_end_m: Floats
+    height_start_m: Floats
+    height_end_m: Floats
+    heading_rad: Floats
+    sigma_m: Floats
+    tree: cKDTree
+    probe_segment: Ints
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Candidates in order of step, then element; `first[k] : first[k + 1]` are those of step k.
+
+    `along_m` from the element's start and `left_m` to its end, `beyond_m` how far the position lies past the
+    end that `past` names (-1 start, 1 end, 0 neither), `offset_m` left of the element's own sense; `height_m` of the
+    track there (NaN on a 2-D survey); `linked_start`, `linked_end`: whether a relation leads on there.
+    """
+
+    first: Ints
+    step: Ints
+    element: Ints
+    along_m: Floats
+    left_m: Floats
+    beyond_m: Floats
+    offset_m: Floats
+    distance_m: Floats
+    height_m: Floats
+    heading_rad: Floats
+    survey_sigma_m: Floats
+    past: Ints
+    linked_start: Bools
+    linked_end: Bools
+
+    def take(self, rows: Ints, steps: int) -> Candidates:
+        """Some of the candidates, in the same order."""
+        step = self.step[rows]
+        columns = {name: getattr(self, name)[rows] for name in _COLUMNS}
+        return Candidates(first=np.searchsorted(step, np.arange(steps + 1)), **columns)
+
+    def renumbered(self, kept: Bools) -> Candidates:
+        """As before, steps counted among the kept ones only; the others have no candidates."""
+        number = np.cumsum(kept) - 1
+        step = number[self.step]
+        return replace(self, step=step, first=np.searchsorted(step, np.arange(int(kept.sum()) + 1)))
+
+
+_COLUMNS = tuple(column.name for column in fields(Candidates) if column.name != "first")
+
+
+def segments_of(track: Track) -> Segments:
+    """Segments of all elements with probes for the search."""
+    places = points_of(track.latitude_deg, track.longitude_deg)
+    owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
+    head = np.flatnonzero(owner[:-1] == owner[1:])
+    start, end = places.surface[head], places.surface[head + 1]
+    along = end - start
+    east = np.einsum("ij,ij->i", along, places.east[head])
+    north = np.einsum("ij,ij->i", along, places.north[head])
+    probes, probe_segment = _probes(start, end, owner[head])
+    return Segments(
+        start=start,
+        end=end,
+        element=owner[head],
+        first=np.searchsorted(owner[head], np.arange(len(track.ids) + 1)),
+        measure_start_m=track.measure_m[head],
+        measure_end_m=track.measure_m[head + 1],
+        height_start_m=track.height_m[head],
+        height_end_m=track.height_m[head + 1],
+        heading_rad=np.arctan2(east, north),
+        sigma_m=np.fmax(track.sigma_m[head], track.sigma_m[head + 1]),
+        tree=cKDTree(probes, balanced_tree=False, compact_nodes=False),
+        probe_segment=probe_segment,
+    )
+
+
+def candidates_of(points: Points, network: Network, segments: Segments, reach_m: float) -> Candidates:
+    """For every point the nearest place on each element whose distance is within reach [m]."""
+    tree = cKDTree(points.surface)
+    pairs = tree.sparse_distance_matrix(segments.tree, reach_m + PROBE_SPACING_M, output_type="ndarray")
+    step, segment = pairs["i"].astype(np.int64), segments.probe_segment[pairs["j"]]
+    order = np.lexsort((pairs["v"], segments.element[segment], step))
+    step, segment = step[order], segment[order]
+    element = segments.element[segment]
+    fresh = np.ones(len(step), dtype=bool)
+    fresh[1:] = (step[1:] != step[:-1]) | (element[1:] != element[:-1])
+    feet = downhill(points.take(step[fresh]), segments, segment[fresh], segments.element)
+    near = np.flatnonzero(feet.distance_m <= reach_m)
+    return _candidates(len(points), network, segments, step[fresh][near], feet.take(near))
+
+
+def overtaken(found: Candidates, network: Network) -> Bools:
+    """Candidates about an end where the track goes on, whose place is on what it goes on to.
+
+    So every position has one place on a line, however many elements it is cut into. Of the two elements at a joint it
+    is on the one that it lies farther inside of: at a bend it may lie past both their ends, or inside both.
+    """
+    past_m = _past_ends_m(found)
+    one, end = np.nonzero(np.isfinite(past_m))
+    edge_first, edge_to = network.edges
+    leaving = 2 * found.element[one] + 1 - end
+    number = np.diff(edge_first)[leaving]
+    edge = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number - edge_first[leaving], number)
+    one, end, entered = np.repeat(one, number), np.repeat(end, number), edge_to[edge]
+    keys = found.step * network.count + found.element
+    wanted = found.step[one] * network.count + entered // 2
+    other = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    own_m, other_m = past_m[one, end], past_m[other, entered % 2]
+    rival = (keys[other] == wanted) & (other != one)
+    beyond = rival & (own_m > 0.0) & np.isinf(other_m)
+    nearer = rival & ((other_m < own_m) | ((other_m == own_m) & (other < one)))
+    out = np.zeros(len(keys), dtype=bool)
+    while True:
+        # At the joint itself only by one that is not beaten there: at a switch another branch may hold the place.
+        now = np.zeros(len(keys), dtype=bool)
+        now[one[beyond | (nearer & ~out[other])]] = True
+        if (now == out).all():
+            return out
+        out = now
+
+
+def _past_ends_m(found: Candidates) -> Floats:
+    """Per candidate how far it lies past its element's start and end [m], infinite where it is not about them."""
+    columns = []
+    for past, inside_m in ((-1, found.along_m), (1, found.left_m)):
+        inside = np.where((found.past == 0) & (inside_m < BEND_M), -inside_m, np.inf)
+        columns.append(np.where(found.past == past, found.beyond_m, inside))
+    return np.column_stack(columns)
+
+
+def merged(some: Candidates, others: Candidates, step_of_others: Ints) -> Candidates:
+    """Candidates of two searches together; the steps of the second are numbered anew."""
+    steps = len(some.first) - 1
+    others = replace(others, step=step_of_others[others.step])
+    columns = {name: np.concatenate([getattr(some, name), getattr(others, name)]) for name in _COLUMNS}
+    order = np.lexsort((columns["element"], columns["step"]))
+    columns = {name: values[order] for name, values in columns.items()}
+    return Candidates(first=np.searchsorted(columns["step"], np.arange(steps + 1)), **columns)
+
+
+def _candidates(points: int, network: Network, segments: Segments, step: Ints, feet: Feet) -> Candidates:
+    segment = feet.segment
+    element = segments.element[segment]
+    held = np.clip(feet.fraction, 0.0, 1.0)
+    measure = segments.measure_start_m[segment]
+    span = segments.measure_end_m[segment] - measure
+    at_start = (segment == segments.first[element]) & (feet.fraction < 0)
+    at_end = (segment == segments.first[element + 1] - 1) & (feet.fraction > 1)
+    past = np.where(at_start, -1, np.where(at_end, 1, 0))
+    corner = (past == 0) & (held != feet.fraction)
+    side = np.where(feet.offset_m < 0, -1.0, 1.0)
+    track = network.track
+    along = measure + held * span - track.measure_m[track.first[element]]
+    linked = network.linked_ends()
+    return Candidates(
+        first=np.searchsorted(step, np.arange(points + 1)),
+        step=step,
+        element=element,
+        along_m=along,
+        left_m=track.length_m[element] - along,
+        beyond_m=np.abs(feet.fraction - held) * span * (past != 0),
+        offset_m=np.where(corner, side * feet.distance_m, feet.offset_m),
+        distance_m=feet.distance_m,
+        height_m=(1.0 - held) * segments.height_start_m[segment] + held * segments.height_end_m[segment],
+        heading_rad=segments.heading_rad[segment],
+        survey_sigma_m=segments.sigma_m[segment],
+        past=past,
+        linked_start=linked[element, 0],
+        linked_end=linked[element, 1],
+    )
+
+
+def _probes(start: Floats, end: Floats, element: Ints) -> tuple[Floats, Ints]:
+    """Search points: along long segments several, along runs of short ones only some."""
+    lengths = np.linalg.norm(end - start, axis=1)
+    pieces = np.maximum(1, np.ceil(lengths / (0.25 * PROBE_SPACING_M))).astype(np.int64)
+    segment = np.repeat(np.arange(len(start)), pieces)
+    number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    fraction = (number + 0.5) / pieces[segment]
+    place = np.cumsum(lengths)[segment] - lengths[segment] * (1.0 - fraction)
+    bucket = np.floor(place / (0.75 * PROBE_SPACING_M))
+    new = np.ones(len(segment), dtype=bool)
+    new[1:] = (bucket[1:] != bucket[:-1]) | (element[segment[1:]] != element[segment[:-1]])
+    kept = np.flatnonzero(new)
+    chosen = segment[kept]
+    return start[chosen] + fraction[kept][:, None] * (end - start)[chosen], chosen

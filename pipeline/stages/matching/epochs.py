@@ -1,0 +1,164 @@
+"""Every epoch on the travelled path: the `epochs` frame of a match."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.stages.matching.fixes import Fixes
+from pipeline.stages.track.leg import segments_at
+from pipeline.stages.track.path import TravelledPath
+from schemas.arrays import Floats, Ints
+from schemas.config import MatchingConfig, Vehicle
+from schemas.enums import SigmaSource
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What the search found per epoch: leg, a hint at the passage [m], and how sure it is."""
+
+    leg: Ints
+    near_path_m: Floats
+    path_probability: Floats
+    gate_probability: Floats
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The track at places of the path."""
+
+    heading_deg: Floats
+    slope: Floats
+    curvature_per_m: Floats
+    interpolation_error_m: Floats
+    survey_sigma_m: Floats
+
+    @cached_property
+    def direction(self) -> tuple[Floats, Floats]:
+        """East and north part of the track's direction."""
+        heading = np.radians(self.heading_deg)
+        return np.sin(heading), np.cos(heading)
+
+
+def epoch_frame(
+    fixes: Fixes,
+    solution: pl.Series,
+    path: TravelledPath,
+    found: Assignment,
+    vehicle: Vehicle,
+    config: MatchingConfig,
+) -> pl.DataFrame:
+    """The epochs on the path, positions referred to the balise antenna.
+
+    `path_m` is the raw position projected, never smoothed: a jump of the GNSS stays a jump. It is given off
+    track too (`on_track` false), and goes on straight beyond the ends of the path.
+    """
+    feet = path.feet(fixes.points, found.leg, fixes.valid, found.near_path_m)
+    antenna_m, vertical_m = path.places(found.leg, feet, fixes.height_m)
+    path_m = antenna_m - vehicle.gnss_antenna_ahead_m
+    element, measure_m = path.locate_index(found.leg, path_m)
+    # The track's direction counts where the GNSS antenna is, not the balise antenna.
+    shape = shape_at(path, found.leg, antenna_m)
+    sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape)
+    allowed_m = on_track_limit_m(sigma_cross_m, shape.survey_sigma_m, config)
+    distance_m = np.nan_to_num(feet.distance_m, nan=np.inf)
+    on_track = fixes.valid & (distance_m <= np.nan_to_num(allowed_m))
+    source = np.where(fixes.valid, np.where(fixes.from_receiver, 0, 1), -1)
+    columns: dict[str, npt.NDArray[Any] | pl.Series] = {
+        "leg": pl.Series(found.leg, dtype=pl.Int32),
+        "netelement_id": _words(path.track.ids, element, pl.String()),
+        "measure_m": measure_m,
+        "path_m": path_m,
+        "cross_track_m": feet.offset_m,
+        "vertical_m": vertical_m,
+        "on_track": on_track,
+        "near_track": fixes.valid & (distance_m <= config.reach_m),
+        "path_probability": np.where(on_track, found.path_probability, np.nan),
+        "gate_probability": np.where(on_track, found.gate_probability, np.nan),
+        "heading_deg": shape.heading_deg,
+        "slope": shape.slope,
+        "curvature_per_m": shape.curvature_per_m,
+        "interpolation_error_m": shape.interpolation_error_m,
+        "survey_sigma_m": shape.survey_sigma_m,
+        "sigma_along_m": sigma_along_m,
+        "sigma_cross_m": sigma_cross_m,
+        "sigma_up_m": np.sqrt(fixes.cov_uu_m2),
+        "sigma_source": _words(_SOURCES, source, pl.Enum(SigmaSource)),
+        "fix_valid": fixes.valid,
+        "velocity_along_mps": velocity_along_mps(fixes, shape),
+        "hpl_m": fixes.hpl_m,
+    }
+    return _frame(fixes, solution, columns)
+
+
+def shape_at(path: TravelledPath, leg: Ints, path_m: Floats) -> Shape:
+    """Direction, slope, curvature and survey quality of the track at places of the path."""
+    shape = Shape(*(np.full(len(path_m), np.nan) for _ in range(5)))
+    for index, one in enumerate(path.legs):
+        rows = np.flatnonzero((leg == index) & np.isfinite(path_m))
+        segment, fraction = segments_at(one, path_m[rows])
+        held = np.clip(fraction, 0.0, 1.0)
+        length = one.path_end_m - one.path_start_m
+        before = np.concatenate([length[:1], length[:-1]])
+        after = np.concatenate([length[1:], length[-1:]])
+        curve_start = 2.0 * one.turn_start_rad / (before + length)
+        curve_end = 2.0 * one.turn_end_rad / (length + after)
+        bend = 0.5 * (np.abs(one.turn_start_rad) + np.abs(one.turn_end_rad))
+        shape.heading_deg[rows] = one.heading_deg[segment]
+        shape.slope[rows] = _slope(one.height_end_m - one.height_start_m, length)[segment]
+        shape.curvature_per_m[rows] = (curve_start[segment] * (1 - held)) + curve_end[segment] * held
+        # Sagitta of an arc: length times the angle it turns over 8.
+        shape.interpolation_error_m[rows] = (length * bend / 8.0)[segment]
+        shape.survey_sigma_m[rows] = one.sigma_m[segment]
+    return shape
+
+
+def track_sigmas_m(fixes: Fixes, shape: Shape) -> tuple[Floats, Floats]:
+    """The horizontal covariance turned into the track's frame: sigma along and across [m]."""
+    sin, cos = shape.direction
+    ee, en, nn = fixes.cov_ee_m2, fixes.cov_en_m2, fixes.cov_nn_m2
+    along = sin * sin * ee + 2.0 * sin * cos * en + cos * cos * nn
+    cross = cos * cos * ee - 2.0 * sin * cos * en + sin * sin * nn
+    return np.sqrt(np.maximum(along, 0.0)), np.sqrt(np.maximum(cross, 0.0))
+
+
+def on_track_limit_m(sigma_cross_m: Floats, survey_sigma_m: Floats, config: MatchingConfig) -> Floats:
+    """How far beside a track its own sigma, the survey's and the bias allow a position to lie [m]."""
+    survey_m = np.where(np.isfinite(survey_sigma_m), survey_sigma_m, config.survey_sigma_default_m)
+    spread_m = np.sqrt(sigma_cross_m**2 + survey_m**2 + config.on_track_bias_m**2)
+    return np.asarray(np.minimum(config.on_track_sigmas * spread_m, config.reach_m))
+
+
+def velocity_along_mps(fixes: Fixes, shape: Shape) -> Floats:
+    """GNSS velocity along growing path, on the slope where the track has one."""
+    east, north = shape.direction
+    level = fixes.vel_e_mps * east + fixes.vel_n_mps * north
+    return np.asarray(level * np.sqrt(1.0 + np.nan_to_num(shape.slope) ** 2))
+
+
+def _slope(rise_m: Floats, length_m: Floats) -> Floats:
+    """Rise over run, from rise and 3-D length; NaN without heights."""
+    run = np.sqrt(np.maximum(length_m * length_m - rise_m * rise_m, 1e-12))
+    return np.asarray(rise_m / run)
+
+
+_SOURCES = (SigmaSource.RECEIVER.value, SigmaSource.TABLE.value)
+
+
+def _words(words: Sequence[str], number: Ints, kind: pl.DataType) -> pl.Series:
+    """Words by their number, null for -1."""
+    rows = np.where(number < 0, len(words), number)
+    return pl.Series([*words, None], dtype=kind).gather(pl.Series(rows))
+
+
+def _frame(fixes: Fixes, solution: pl.Series, columns: dict[str, npt.NDArray[Any] | pl.Series]) -> pl.DataFrame:
+    """Arrays as a frame: NaN becomes null, and an epoch without a position has no leg."""
+    time = pl.Series("t", fixes.t_ns, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    frame = pl.DataFrame([time, solution.alias("solution"), *(pl.Series(k, v) for k, v in columns.items())])
+    return frame.with_columns(pl.col(pl.Float64).fill_nan(None), leg=pl.when(pl.col("fix_valid")).then(pl.col("leg")))

@@ -1,0 +1,367 @@
+"""Candidates of all steps as states, how a train may get from one to another, and how plausible that is."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.stages.matching.candidates import Candidates
+from pipeline.stages.matching.innovations import Innovations, innovations_of, movements_m
+from pipeline.stages.matching.likelihood import Likelihood, Terms, initial_terms, step_terms, survey_sigmas_m
+from pipeline.stages.matching.steps import Steps
+from pipeline.stages.track.network import Network
+from schemas.arrays import Bools, Floats, Ints
+from schemas.config import MatchingConfig
+
+# Log-probability of a move that the network does not know: only where nothing else is possible.
+BREAK = -200.0
+# Pairs of states that are weighed at once: enough to be quick, few enough to hold.
+_AT_ONCE = 50_000
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """All states of some steps with all of the step before; `first[k] : first[k + 1]` are those of the k-th step.
+
+    In order of the state before, then the one after. `score`: log-probability of the most plausible move; `enters`:
+    by the start (1) or the end (2) of the oriented element, or it stays there (0).
+    """
+
+    steps: Ints
+    first: Ints
+    one: Ints
+    other: Ints
+    score: Floats
+    enters: Ints
+
+
+@dataclass(frozen=True)
+class Trellis:
+    """States in order of step; `first[k] : first[k + 1]` are those of step k.
+
+    `stays`: steps over which no state can change. `pairs`: of all other steps but the first.
+    """
+
+    network: Network
+    steps: Steps
+    ways: Ways
+    like: Likelihood
+    config: MatchingConfig
+    states: States
+    stays: Bools
+    pairs: Pairs
+    innovations: Innovations
+    tolerance_m: Floats
+
+    def __len__(self) -> int:
+        return len(self.first) - 1
+
+    @property
+    def first(self) -> Ints:
+        return self.states.first
+
+    @property
+    def oriented(self) -> Ints:
+        return self.states.oriented
+
+    @property
+    def place_m(self) -> Floats:
+        return self.states.place_m
+
+    @cached_property
+    def initial(self) -> Terms:
+        """Of each state without a step before it."""
+        return initial_terms(self.states.offset_m, self.states.candidate, self.like)
+
+    def moves(self, numbers: slice) -> list[tuple[Terms, Ints]]:
+        """Of some steps of `pairs`: the terms `[coefficient, before, after, scale]`, and by which end moves enter."""
+        part = slice(int(self.pairs.first[numbers.start]), int(self.pairs.first[numbers.stop]))
+        one, other, score = self.pairs.one[part], self.pairs.other[part], self.pairs.score[part]
+        known = np.isfinite(score)
+        terms = np.where(known[:, None], self._terms(one, other), self.initial[:, other])
+        terms[0] += np.where(known, score, BREAK)[:, None]
+        steps, cuts = self.pairs.steps[numbers], self.pairs.first[numbers.start + 1 : numbers.stop] - part.start
+        count = np.diff(self.first)
+        shapes = zip(count[steps - 1].tolist(), count[steps].tolist(), strict=True)
+        split = np.split(terms, cuts, axis=1)
+        enters = np.split(self.pairs.enters[part], cuts)
+        return [
+            (own.reshape(3, *shape, own.shape[2]), by.reshape(shape))
+            for own, by, shape in zip(split, enters, shapes, strict=True)
+        ]
+
+    def batches(self) -> Iterator[slice]:
+        """The steps of `pairs` in parts with so many pairs each."""
+        batch = self.pairs.first[1:] // _AT_ONCE
+        cuts = [0, *(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(batch)]
+        yield from (slice(begin, end) for begin, end in itertools.pairwise(cuts) if end > begin)
+
+    @cached_property
+    def stay(self) -> Terms:
+        """Of each state to go on from its own state of the step before, where steps stay; nothing elsewhere."""
+        count, step = _counted(self.first)
+        rows = np.flatnonzero(self.stays[step])
+        before = rows - count[step[rows]]
+        place_m = self.place_m
+        stay = np.zeros_like(self.initial)
+        stay[:, rows] = self._terms(before, rows)
+        way = self.ways.along(step[rows], self.oriented[rows])
+        moved = distance_scores(place_m[rows] - place_m[before], way, self.config)
+        stay[0, rows] += moved[:, None]
+        return stay
+
+    def _terms(self, one: Ints, other: Ints) -> Terms:
+        offset_m = self.states.offset_m
+        level_m = offset_m[other] - self.innovations.survey_m[other]
+        moved_m = movements_m(self.innovations, offset_m, self.tolerance_m, one, other)
+        return step_terms(moved_m, level_m, self.states.candidate[other], self.like)
+
+
+@dataclass(frozen=True)
+class States:
+    """Candidates in each orientation in use: where on the oriented element, and how far left of it [m]."""
+
+    first: Ints
+    oriented: Ints
+    candidate: Ints
+    place_m: Floats
+    offset_m: Floats
+
+
+def trellis_of(
+    network: Network, steps: Steps, candidates: Candidates, like: Likelihood, config: MatchingConfig
+) -> Trellis:
+    """The candidates as states, every step with at least one, and how a train gets from one to the next."""
+    states = _states(network, candidates, len(steps))
+    ways = _ways(network, steps, states, config)
+    stays = _stays(network, steps, states, config)
+    pairs = _pairs(network, states, np.flatnonzero(~stays)[1:], ways, config)
+    tolerance_m = _tolerances_m(candidates, like, config)[candidates.step[states.candidate]]
+    heading_rad = candidates.heading_rad[states.candidate] + np.pi * (states.oriented % 2)
+    keep = np.exp(-np.nan_to_num(steps.chord_m) / config.survey_mean_m)
+    before = _before(states, stays, pairs)
+    innovations = innovations_of(states.first, states.offset_m, heading_rad, tolerance_m, before, keep)
+    return Trellis(network, steps, ways, like, config, states, stays, pairs, innovations, tolerance_m)
+
+
+def _states(network: Network, candidates: Candidates, steps: int) -> States:
+    usable = np.array(network.usable)
+    both = np.column_stack([2 * candidates.element, 2 * candidates.element + 1])
+    index = np.flatnonzero(usable[both].ravel())
+    oriented, candidate = both.ravel()[index], index // 2
+    backward = (oriented % 2).astype(bool)
+    along = candidates.along_m[candidate]
+    length = network.track.length_m[candidates.element[candidate]]
+    return States(
+        first=np.searchsorted(candidates.step[candidate], np.arange(steps + 1)),
+        oriented=oriented,
+        candidate=candidate,
+        place_m=np.where(backward, length - along, along),
+        offset_m=np.where(backward, -1.0, 1.0) * candidates.offset_m[candidate],
+    )
+
+
+def _tolerances_m(candidates: Candidates, like: Likelihood, config: MatchingConfig) -> Floats:
+    """Per step by how much the distance of tracks may be wrong; how a position off every track moves tells nothing."""
+    begin = candidates.first[:-1]
+    worst_m = np.maximum.reduceat(survey_sigmas_m(candidates, config), begin)
+    lost = np.logical_and.reduceat(like.off, begin)
+    return np.where(lost, np.inf, config.survey_sigmas * np.sqrt(2.0) * worst_m)
+
+
+def _counted(first: Ints) -> tuple[Ints, Ints]:
+    """How many states each step has, and the step of each state."""
+    count = np.diff(first)
+    return count, np.repeat(np.arange(len(count)), count)
+
+
+def _stays(network: Network, steps: Steps, states: States, config: MatchingConfig) -> Bools:
+    """Steps over which no state can change: the same states as before, none linked to another, no long way."""
+    way = np.fmax(np.abs(steps.odometer_m), steps.chord_m)
+    stays = _unchanged(states) & (np.nan_to_num(way, nan=np.inf) <= config.long_step_m)
+    apart: dict[tuple[int, ...], bool] = {}
+    oriented, first = states.oriented.tolist(), states.first.tolist()
+    for step in np.flatnonzero(stays).tolist():
+        group = tuple(oriented[first[step] : first[step + 1]])
+        if group not in apart:
+            apart[group] = not any(network.linked(one, other) for one in group for other in group)
+        stays[step] = apart[group]
+    return stays
+
+
+def _unchanged(states: States) -> Bools:
+    """Steps that have the same states as the one before."""
+    count, step = _counted(states.first)
+    state = np.arange(len(states.oriented))
+    equal = states.oriented == states.oriented[np.maximum(state - count[step], 0)]
+    return np.asarray((np.diff(count, prepend=0) == 0) & np.logical_and.reduceat(equal, states.first[:-1]))
+
+
+def _pairs(network: Network, states: States, steps: Ints, ways: Ways, config: MatchingConfig) -> Pairs:
+    count = np.diff(states.first)
+    sizes = count[steps - 1] * count[steps]
+    begin = np.concatenate([[0], np.cumsum(sizes)])
+    number, width = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes), np.repeat(count[steps], sizes)
+    one = np.repeat(states.first[steps - 1], sizes) + number // width
+    other = np.repeat(states.first[steps], sizes) + number % width
+    places = states.oriented[one], states.place_m[one], states.oriented[other], states.place_m[other]
+    scores = move_scores(network, *places, ways.along(np.repeat(steps, sizes), places[0]), config)
+    return Pairs(steps, begin, one, other, scores.max(axis=0), scores.argmax(axis=0))
+
+
+def _before(states: States, stays: Bools, pairs: Pairs) -> Ints:
+    """The state that each goes on from: its own, else of those followed longest the likeliest that led aside least.
+
+    Where a branch joins a track, the track's own error of the survey goes on. That of the branch is by how much it has
+    come nearer since it was first in reach, which is no error.
+    """
+    count, step = _counted(states.first)
+    before = np.where(stays[step], np.arange(len(step)) - count[step], -1).tolist()
+    possible = np.flatnonzero(np.isfinite(pairs.score))
+    one, other = pairs.one[possible], pairs.other[possible]
+    cost = np.abs(states.offset_m[other] - states.offset_m[one]) - pairs.score[possible]
+    order = np.lexsort((cost, other))
+    leading: dict[int, list[tuple[int, float]]] = {}
+    for origin, state, own in zip(one[order].tolist(), other[order].tolist(), cost[order].tolist(), strict=True):
+        leading.setdefault(state, []).append((origin, own))
+    offset_m = states.offset_m.tolist()
+    begun, aside_m = step.tolist(), [0.0] * len(before)
+    for state, origin in enumerate(before):
+        if state in leading:
+            origin = min(leading[state], key=lambda way: (begun[way[0]], aside_m[way[0]] + way[1]))[0]
+        if origin >= 0:
+            begun[state] = begun[origin]
+            aside_m[state] = aside_m[origin] + abs(offset_m[state] - offset_m[origin])
+        before[state] = origin
+    return np.array(before, dtype=np.int64)
+
+
+def _ways(network: Network, steps: Steps, states: States, config: MatchingConfig) -> Ways:
+    """What each step's length is measured against: the odometer, signed once its sign is known, else GNSS."""
+    chord = np.nan_to_num(steps.chord_m)
+    known = np.isfinite(steps.odometer_m)
+    distance = np.where(known, steps.odometer_m, chord)
+    limit = (1.0 + config.detour_share) * np.maximum(chord, np.abs(distance)) + config.detour_m
+    return Ways(distance, known, limit, _polarity(network, steps, states))
+
+
+def _polarity(network: Network, steps: Steps, states: States) -> Ints:
+    """Sign of the odometer against each oriented element: +1, -1, or 0 where it cannot be told.
+
+    One for each connected part of the network, whose orientation is arbitrary, from the states that stay on one
+    element: the sign is a property of the installation, one for the whole run.
+    """
+    count = len(network.successors)
+    if not network.orientable:
+        return np.zeros(count, dtype=np.int64)
+    part = network.parts
+    _, step = _counted(states.first)
+    keys = step * count + states.oriented
+    before = np.minimum(np.searchsorted(keys, keys - count), len(keys) - 1)
+    stayed = np.flatnonzero((keys[before] == keys - count) & np.isfinite(steps.odometer_m[step]))
+    moved_m = states.place_m[stayed] - states.place_m[before[stayed]]
+    votes = np.sign(moved_m) * steps.odometer_m[step[stayed]]
+    return np.sign(np.bincount(part[states.oriented[stayed]], votes, part.max() + 1)).astype(np.int64)[part]
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How far each step is thought to have led [m]: signed in the odometer's sense where `measured`, else its size.
+
+    `limit_m` is how far to search the network for it; `polarity` the odometer's sign against each oriented element.
+    """
+
+    distance_m: Floats
+    measured: Bools
+    limit_m: Floats
+    polarity: Ints
+
+    def along(self, steps: Ints, oriented: Ints) -> Way:
+        """Of some steps, along the oriented element that each of them begins on."""
+        polarity = self.polarity[oriented]
+        signed = self.measured[steps] & (polarity != 0)
+        return Way(np.where(signed, polarity, 1) * self.distance_m[steps], signed, self.limit_m[steps])
+
+
+class Way(NamedTuple):
+    """As `Ways`, one row for each of some moves: signed along the path where `signed`."""
+
+    distance_m: Floats
+    signed: Bools
+    limit_m: Floats
+
+
+class Move(NamedTuple):
+    """The elements between two places, and how the first is left.
+
+    `sense`: +1 ahead, -1 behind, 0 not at all.
+    """
+
+    between: tuple[int, ...]
+    sense: int
+
+
+def move_scores(
+    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, way: Way, config: MatchingConfig
+) -> Floats:
+    """Log-probability of each move between pairs of places, -inf where there is none: `[sense, pair]`.
+
+    Rows: on the element, ahead, behind. Places are oriented elements and metres from their entries.
+    """
+    ahead_m, ahead_barred, behind_m, behind_barred = _network_distances(network, one, other, way.limit_m)
+    length = network.track.length_m
+    left_m, other_left_m = length[one // 2] - one_m, length[other // 2] - other_m
+    stay = np.where(one == other, distance_scores(other_m - one_m, way, config), -np.inf)
+    ahead = distance_scores(left_m + ahead_m + other_m, way, config) - config.barred_cost * ahead_barred
+    behind = distance_scores(-(one_m + behind_m + other_left_m), way, config) - config.barred_cost * behind_barred
+    ahead[~np.isfinite(ahead_m)] = behind[~np.isfinite(behind_m)] = -np.inf
+    return np.stack([stay, ahead, behind])
+
+
+def distance_scores(displacement_m: Floats, way: Way, config: MatchingConfig) -> Floats:
+    """Exponential in the difference of distances (Newson & Krumm 2009, eq. 2), limited."""
+    plain = np.abs(np.abs(displacement_m) - np.abs(way.distance_m))
+    mismatch = np.where(way.signed, np.abs(displacement_m - way.distance_m), plain)
+    scale = config.transition_scale_m + config.transition_share * np.abs(way.distance_m)
+    return np.asarray(-np.minimum(mismatch / scale, config.mismatch_limit))
+
+
+def best_moves(
+    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, way: Way, config: MatchingConfig
+) -> list[Move | None]:
+    """The most plausible move of each pair of places, none where the network has none."""
+    scores = move_scores(network, one, one_m, other, other_m, way, config)
+    chosen = np.where(np.isfinite(scores.max(axis=0)), scores.argmax(axis=0), -1)
+    rows = zip(chosen.tolist(), one.tolist(), other.tolist(), way.limit_m.tolist(), strict=True)
+    return [_move(network, *row) for row in rows]
+
+
+def _move(network: Network, chosen: int, one: int, other: int, limit_m: float) -> Move | None:
+    """The move of a row of `move_scores`, -1 for none."""
+    if chosen <= 0:
+        return None if chosen else Move((), 0)
+    if chosen == 1:
+        return Move(network.reach(one, limit_m)[other].between, 1)
+    return Move(network.reach(other, limit_m)[one].between[::-1], -1)
+
+
+def _network_distances(network: Network, one: Ints, other: Ints, limit_m: Floats) -> tuple[Floats, ...]:
+    """From exit to entry, ahead and behind, with the relations not navigable that way; inf where none leads."""
+    pairs, inverse = np.unique(one * len(network.successors) + other, return_inverse=True)
+    limit = np.zeros(len(pairs))
+    np.maximum.at(limit, inverse, limit_m)
+    table = np.full((4, len(pairs)), np.inf)
+    for index, (pair, far) in enumerate(zip(pairs.tolist(), limit.tolist(), strict=True)):
+        here, there = divmod(pair, len(network.successors))
+        ahead = network.reach(here, far).get(there)
+        if ahead is not None:
+            table[:2, index] = ahead.distance_m, ahead.barred_forward
+        behind = network.reach(there, far).get(here)
+        if behind is not None:
+            table[2:, index] = behind.distance_m, behind.barred_backward
+    return tuple(table[:, inverse])

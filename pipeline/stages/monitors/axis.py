@@ -1,0 +1,208 @@
+"""One axis of the bank: increments between usable epochs as rates, raw and through EWMAs, with their sigmas.
+
+Errors and steps of every axis are built here, and the increments of GNSS minus odometer (DIAG eq. 1-3), for the bank
+and for learning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pipeline.stages.monitors.recursion import (
+    AxisState,
+    before_steps,
+    ewma_weight,
+    increment_variance,
+    linear_recurrence,
+    noise_of_ewma,
+    variance_of_ewma,
+)
+from pipeline.stages.odometry.odometry import Increments
+from schemas.arrays import Bools, Floats, Ints
+from schemas.config import Configuration, MonitorConfig
+
+# Rows evaluated at once: few after a restart, which may soon be followed by another; never more than the cache holds.
+FIRST_BLOCK, BLOCK = 2048, 8192
+
+
+@dataclass(frozen=True)
+class AxisSeries:
+    """Increments of one axis, one row per usable epoch, in order; all arrays of the same length m.
+
+    `epoch`: index of the row among all epochs. `fresh`: no increment leads here (start, long gap, lost distance).
+    `rate_mps`: increment of GNSS minus odometer or track over `dt_s`. `border`: the increment crosses into another
+    net element, whose survey offset is another (`border_m2`, its variance). `sigma_m`, `sigma_before_m` and
+    `decorrelation` (m, sources): sqrt R_j here and at the row before (see `before_steps`), and
+    1 - phi_j. `white_m2`: odometer noise of
+    the increment. `steady_mps`, `latency_mps`: what one sigma of an error that stays (odometer scale; the position
+    error that a curve turns into this axis) and of the latency makes of the rate, signed.
+    """
+
+    epoch: Ints
+    fresh: Bools
+    border: Bools
+    dt_s: Floats
+    rate_mps: Floats
+    sigma_m: Floats
+    sigma_before_m: Floats
+    decorrelation: Floats
+    white_m2: Floats
+    border_m2: Floats
+    steady_mps: Floats
+    latency_mps: Floats
+
+    def between(self, low: int, high: int) -> AxisSeries:
+        """Rows [low, high)."""
+        return AxisSeries(**{item.name: getattr(self, item.name)[low:high] for item in fields(self)})
+
+
+Source = tuple[Floats, Floats]
+"""An error that positions share from row to row: its deviation [m], and 1 - phi over the step to each row."""
+
+
+def errors_of(sigma_m: Floats, dt_s: Floats, beside: Sequence[Source], config: MonitorConfig) -> dict[str, Floats]:
+    """The error fields of a series: Gauss-Markov errors of positions of this sigma, and what stands beside them.
+
+    In Fortran order, for the recursions go along the rows, one source after the other.
+    """
+    shares, taus_s = error_model(config)
+    model = [(np.sqrt(share) * sigma_m, -np.expm1(-dt_s / tau_s)) for share, tau_s in zip(shares, taus_s, strict=True)]
+    sigmas, decorrelations = (np.vstack(parts).T for parts in zip(*model, *beside, strict=True))
+    before = before_steps(sigmas, decorrelations, config.sigma_step_factor)
+    return {"sigma_m": sigmas, "sigma_before_m": before, "decorrelation": decorrelations}
+
+
+def error_model(config: MonitorConfig) -> tuple[Floats, Floats]:
+    """Shares of the position variance and correlation times [s] of the Gauss-Markov errors (DIAG Table 1)."""
+    shares = [config.ionosphere_share, config.troposphere_share, config.orbit_clock_share, config.user_share]
+    taus = [config.ionosphere_tau_s, config.troposphere_tau_s, config.orbit_clock_tau_s, config.user_tau_s]
+    return np.array(shares), np.array(taus)
+
+
+def time_steps(t_s: Floats, gap_reset_s: float) -> tuple[Floats, Bools]:
+    """Time since the row before [s] (1 s stands in where there is none), and rows that nothing leads to."""
+    dt_s = np.diff(t_s, prepend=t_s[:1] - 1.0)
+    fresh = dt_s > gap_reset_s
+    fresh[:1] = True
+    return dt_s, fresh
+
+
+def run_axis(
+    series: AxisSeries, alphas: Floats, state: AxisState | None = None, noise_m2: Floats | None = None
+) -> tuple[Floats, Floats, AxisState]:
+    """Values and sigmas of the axis [m/s] from `state`, or from a restart, on, and the state to carry on with.
+
+    Shapes (rows, 1 + alphas), of one row at least: raw first, then the EWMAs. `noise_m2`: of the same shape, the fast
+    noise beyond the model (`noise.py`), none by default; where it is not known neither is the sigma.
+    """
+    noise_m2 = np.zeros((series.dt_s.size, 1 + alphas.size)) if noise_m2 is None else noise_m2
+    known_m2 = np.nan_to_num(noise_m2)
+    state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1])
+    moving = ~series.fresh
+    weight = ewma_weight(alphas, series.dt_s) * moving[:, None]
+    keep = (1.0 - weight) * moving[:, None]
+    gain = weight / series.dt_s[:, None]
+    errors = series.sigma_m, series.sigma_before_m, series.decorrelation
+    increment_m2 = increment_variance(*errors) + series.white_m2
+    variance, smooth = variance_of_ewma(keep, gain, *errors, increment_m2, series.white_m2, state)
+    # A step between the surveys of two elements is no motion of the GNSS error: only the raw monitor, with the
+    # survey's sigma, judges it; inside the EWMAs it would ring for long.
+    smooth_rate = np.where(series.border, 0.0, series.rate_mps)
+    ewma = linear_recurrence(keep, weight * smooth_rate[:, None], state.ewma)
+    steady = _response(keep, weight, series.steady_mps, state.steady_response)
+    latency = _response(keep, weight, series.latency_mps, state.latency_response)
+    raw_variance = _raw_variance(series, increment_m2)
+    raw_noise = 2.0 * known_m2[:, 0] / series.dt_s**2
+    noise, fast = noise_of_ewma(keep, gain, known_m2[:, 1:], state)
+    sigma = np.sqrt(np.column_stack([raw_variance + raw_noise, variance + noise + steady**2 + latency**2]))
+    sigma[np.isnan(noise_m2)] = np.nan
+    value = np.column_stack([series.rate_mps, ewma])
+    carried = AxisState(ewma[-1], *smooth, *fast, steady[-1], latency[-1])
+    return value, sigma, carried
+
+
+def _response(keep: Floats, weight: Floats, rate_mps: Floats, before: Floats) -> Floats:
+    """What one sigma of an error that stays has made of the EWMAs [m/s]; most axes know none."""
+    if not (rate_mps.any() or before.any()):
+        return np.zeros_like(keep)
+    return linear_recurrence(keep, weight * rate_mps[:, None], before)
+
+
+def _raw_variance(series: AxisSeries, increment_m2: Floats) -> Floats:
+    """Variance of the raw rate (DIAG eq. 4-7 with correlated GNSS errors) [m^2/s^2]."""
+    border = np.where(series.border, series.border_m2, 0.0)
+    noise: Floats = (increment_m2 + border) / series.dt_s**2
+    return noise + series.steady_mps**2 + series.latency_mps**2
+
+
+@dataclass(frozen=True)
+class AlongEpochs:
+    """Epochs with a position and an odometer, in order, and the errors there; all arrays of one length m.
+
+    `epoch`: row among all epochs; `segment`: the odometer's continuity segment; `sigma_m`: of the Gauss-Markov errors;
+    `digits_m`: how coarsely positions are written down; `jitter_s`: how the stamps scatter about the receiver's clock;
+    `scale_sigma`, `latency_sigma_s`: of the estimates in use; `white_m2_per_s`: what the odometer's distance gathers in
+    a second; `rows_m`: quantisation noise of its rows, `period_s` apart, None where the odometer has none at
+    all: the same over a whole run, for the recursions carry each source on.
+    """
+
+    epoch: Ints
+    t_s: Floats
+    along_m: Floats
+    segment: Ints
+    sigma_m: Floats
+    digits_m: Floats
+    jitter_s: Floats | float
+    scale_sigma: Floats
+    latency_sigma_s: Floats
+    white_m2_per_s: Floats | float
+    rows_m: Floats | None
+    period_s: Floats | float
+
+
+def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuration) -> AxisSeries:
+    """Increments from each epoch to the next, with what scale and latency leave uncertain."""
+    dt, fresh = time_steps(epochs.t_s, config.align.gap_reset_s)
+    zero = np.zeros(dt.size)
+    memoryless_m = np.hypot(epochs.jitter_s * odometer.distance_m / dt, epochs.digits_m)
+    beside = [(np.abs(memoryless_m), np.ones(dt.size))]
+    if epochs.rows_m is not None:
+        beside.append((epochs.rows_m, _rows_decorrelation(dt, epochs.period_s, config.monitors)))
+    return AxisSeries(
+        epoch=epochs.epoch,
+        fresh=fresh | (np.diff(epochs.segment, prepend=epochs.segment[:1]) != 0),
+        border=np.zeros(dt.size, dtype=np.bool_),
+        dt_s=dt,
+        rate_mps=(np.diff(epochs.along_m, prepend=epochs.along_m[:1]) - odometer.distance_m) / dt,
+        **errors_of(epochs.sigma_m, dt, beside, config.monitors),
+        white_m2=epochs.white_m2_per_s * dt,
+        border_m2=zero,
+        steady_mps=epochs.scale_sigma * odometer.distance_m / dt,
+        latency_mps=epochs.latency_sigma_s * odometer.speed_mps / dt,
+    )
+
+
+def _rows_decorrelation(dt_s: Floats, period_s: Floats | float, config: MonitorConfig) -> Floats:
+    """1 - phi of the rows' noise over these steps: none is left from row to row; between them little changes.
+
+    The square is what a step changes on a straight line between two rows. Errors that change so little and at random
+    would last for `period_s`^2 / dt, and averages would follow them: they have none that lasts longer than half of
+    the fastest average's memory. So the variance of all averages is that of rows up to so far apart, or above it.
+    """
+    changed = np.minimum(dt_s / np.maximum(period_s, 1e-9), 1.0) ** 2
+    lasts_s = 0.5 / config.ewma_alphas[0]
+    lost: Floats = np.maximum(changed, np.minimum(dt_s / lasts_s, 1.0))
+    return lost
+
+
+def most_scatter_m(config: Configuration) -> float:
+    """The largest deviation of an odometer's row, or of digits, that the thresholds allow for [m].
+
+    With more, a position that leaves its place by the failure limit would be no more than rows of the odometer, or the
+    digits, make of it. Alarms of a record that scatters by more are its own, but no failure passes.
+    """
+    factor = config.monitors.threshold_factor
+    return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))

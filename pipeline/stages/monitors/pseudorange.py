@@ -1,0 +1,210 @@
+"""Pseudorange monitor: do the ranges agree with a position on the track? (TVB section 6; DOMAIN section 3).
+
+The residuals that the receiver recorded belong to its published position. Here they are moved to the point of
+the track beside it, and only what the track does not know stays free: the error along it, and one clock
+per constellation. The survey's error across and in height enters as a prior of its own sigma. What remains, as
+weighted sum of squares, is chi-square distributed while all ranges are healthy. A slow ramp in one range, which
+no increment shows, stays in it for as long as it lasts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+from scipy.special import chdtri
+
+from pipeline.stages.epochs.clock import met, unambiguous
+from pipeline.stages.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
+from pipeline.stages.monitors.axis import BLOCK
+from pipeline.stages.monitors.sight import line_of_sight_rows, range_variances_m2
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
+from schemas.config import Configuration
+from schemas.enums import NotEvaluated
+
+NO_RANGES = NotEvaluated.NO_RANGES
+NO_RANGES_AT_EPOCH = NotEvaluated.NO_RANGES_AT_EPOCH
+TOO_FEW = NotEvaluated.TOO_FEW_RANGES
+AMBIGUOUS = NotEvaluated.AMBIGUOUS
+_RIDGE = 1e-13
+
+
+def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, config: Configuration) -> pl.DataFrame:
+    """`value, threshold, state, reason`, row for row with the matched epochs of one solution.
+
+    `satellites`: the recorded stream, of this solution. Value: weighted sum of squares [1]; threshold: its
+    chi-square quantile at the configured false-alarm probability for the epoch's degrees of freedom.
+    """
+    if satellites is None or satellites.is_empty():
+        return no_verdicts(epochs.height, NO_RANGES)
+    ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
+    track = _track_of(epochs, config)
+    value, freedom = np.full(epochs.height, np.nan), np.zeros(epochs.height, dtype=np.int64)
+    for part in _chunks(ranges, track):
+        value[part.epoch], freedom[part.epoch] = _left_over(part), part.freedom
+    tested = freedom > 0
+    threshold = np.full(epochs.height, np.nan)
+    threshold[tested] = chdtri(freedom[tested], config.monitors.false_alarm_probability)
+    seen = np.isin(np.arange(epochs.height), ranges.epoch)
+    reasons = first_reason(
+        (~track.matched, NO_POSITION), (~track.usable, AMBIGUOUS), (~seen, NO_RANGES_AT_EPOCH), (~tested, TOO_FEW)
+    )
+    return verdicts(value, threshold, reasons)
+
+
+@dataclass(frozen=True)
+class _Ranges:
+    """Used satellites with a residual, ordered by epoch; `system` numbers the constellations."""
+
+    epoch: Ints
+    system: Ints
+    rows: Floats
+    residual_m: Floats
+    variance_m2: Floats
+
+    @property
+    def systems(self) -> int:
+        return int(self.system.max(initial=-1)) + 1
+
+
+@dataclass(frozen=True)
+class _Track:
+    """The track at each epoch: unit vectors east, north, up and offset of the position from it [m]."""
+
+    along: Floats
+    cross: Floats
+    offset_m: Floats
+    sigma_m: Floats
+    height_known: Bools
+    usable: Bools
+    matched: Bools
+
+
+def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame, apart_s: float) -> _Ranges:
+    at = epochs.select(t_ns=pl.col("t").to_physical()).with_row_index("epoch")
+    kept = (
+        satellites.filter(pl.col("residual_m").is_not_null() & pl.col("used").fill_null(True))
+        .unique(["t", "sv"], keep="first", maintain_order=True)
+        .sort("t", maintain_order=True)
+        .with_columns(t_ns=pl.col("t").to_physical())
+        .join_asof(at, on="t_ns", strategy="nearest", tolerance=round(apart_s * NS_PER_S))
+        .drop_nulls("epoch")
+    )
+    azimuth, elevation, stated = (floats(kept, name) for name in ("azimuth_deg", "elevation_deg", "sigma_m"))
+    _, system = np.unique(kept["sv"].str.slice(0, 1).to_numpy(), return_inverse=True)
+    return _Ranges(
+        kept["epoch"].to_numpy().astype(np.int64),
+        system,
+        line_of_sight_rows(azimuth, elevation),
+        kept["residual_m"].to_numpy(),
+        np.where(np.isfinite(stated), stated**2, range_variances_m2(elevation).sum(axis=-1)),
+    )
+
+
+def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
+    names = ("heading_deg", "slope", "cross_track_m", "vertical_m", "survey_sigma_m", "interpolation_error_m")
+    heading, slope, cross_m, vertical_m, survey_m, chord_m = (floats(epochs, name) for name in names)
+    angle, rise = np.radians(heading), np.arctan(np.nan_to_num(slope))
+    level = np.cos(rise)
+    zero = np.zeros_like(angle)
+    survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
+    survey_m = np.hypot(np.maximum(survey_m, config.matching.offset_floor_m), np.nan_to_num(chord_m))
+    matched = flags(epochs, "on_track") & np.isfinite(cross_m) & np.isfinite(heading)
+    sure = met(epochs, unambiguous(config))
+    known = np.isfinite(vertical_m)
+    left = np.stack([-np.cos(angle), np.sin(angle), zero], axis=-1)
+    offset = cross_m[:, None] * left + np.where(known, vertical_m, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
+    return _Track(
+        along=np.stack([level * np.sin(angle), level * np.cos(angle), np.sin(rise)], axis=-1),
+        cross=left,
+        offset_m=offset,
+        sigma_m=survey_m,
+        height_known=known,
+        usable=matched & sure,
+        matched=matched,
+    )
+
+
+@dataclass(frozen=True)
+class Equations:
+    """The ranges of some epochs against a position on the track; shapes (epochs, satellites, ...).
+
+    `epoch`: which of them. `rows`: change of range per metre east, north, up; `clocks`: whose clock counts. `design`:
+    what may be wrong (along, across, up, clocks) with `prior` as precision. `along` (epochs, 3): the track's direction.
+    """
+
+    epoch: Ints
+    held: Bools
+    rows: Floats
+    clocks: Floats
+    weight: Floats
+    residual_m: Floats
+    design: Floats
+    prior: Floats
+    freedom: Ints
+    along: Floats
+
+
+def equations_of(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configuration) -> Iterator[Equations]:
+    """The equations that the monitor tests, some thousand epochs at once; arguments as of `pseudorange_monitor`."""
+    ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
+    return _chunks(ranges, _track_of(epochs, config))
+
+
+def _chunks(ranges: _Ranges, track: _Track) -> Iterator[Equations]:
+    usable = np.flatnonzero(track.usable)
+    chosen = usable[np.isin(usable, ranges.epoch)]
+    for begin in range(0, chosen.size, BLOCK):
+        yield _equations(ranges, track, chosen[begin : begin + BLOCK])
+
+
+def _equations(ranges: _Ranges, track: _Track, epochs: Ints) -> Equations:
+    """Of these epochs, which all have satellites."""
+    first = np.searchsorted(ranges.epoch, epochs)
+    count = np.searchsorted(ranges.epoch, epochs, side="right") - first
+    slot = np.arange(int(count.max()))
+    held = slot < count[:, None]
+    place = np.where(held, first[:, None] + slot, first[:, None])
+    rows, system = ranges.rows[place], ranges.system[place]
+    weight = np.where(held, 1.0 / ranges.variance_m2[place], 0.0)
+    clocks = (system[:, :, None] == np.arange(ranges.systems)).astype(np.float64)
+    residual = ranges.residual_m[place] + np.einsum("eni,ei->en", rows, track.offset_m[epochs])
+    along = np.einsum("eni,ei->en", rows, track.along[epochs])
+    cross = np.einsum("eni,ei->en", rows, track.cross[epochs])
+    design = np.concatenate([along[..., None], cross[..., None], rows[..., 2:], clocks], axis=-1)
+    prior, free = _priors(track, epochs, (clocks * held[..., None]).any(axis=1))
+    return Equations(epochs, held, rows, clocks, weight, residual, design, prior, count - free, track.along[epochs])
+
+
+def _priors(track: _Track, epochs: Ints, present: Bools) -> tuple[Floats, Ints]:
+    """Prior precision of along, cross, up and clocks [1/m^2], and how many of them are free.
+
+    Nothing is known of the error along the track and of clocks, the survey's sigma holds the others; without
+    heights in the survey the height is free too. A constellation without satellites gets a precision that
+    keeps the equations solvable and changes nothing.
+    """
+    precision = 1.0 / track.sigma_m[epochs] ** 2
+    height = np.where(track.height_known[epochs], precision, 0.0)
+    prior = np.column_stack([np.zeros(epochs.size), precision, height, np.where(present, 0.0, 1.0)])
+    free = 1 + present.sum(axis=1) + ~track.height_known[epochs]
+    return prior, free
+
+
+def _left_over(part: Equations) -> Floats:
+    """Least weighted sum of squares over the unknowns, priors included."""
+    right = np.einsum("eni,en->ei", part.design * part.weight[..., None], part.residual_m)
+    solution = np.linalg.solve(normal_of(part.design, part.weight, part.prior), right[..., None])[..., 0]
+    total = np.einsum("en,en->e", part.weight, part.residual_m**2) - np.einsum("ei,ei->e", solution, right)
+    return np.asarray(np.maximum(total, 0.0))
+
+
+def normal_of(design: Floats, weight: Floats, prior: Floats) -> Floats:
+    """Normal equations of each epoch, priors on the diagonal."""
+    normal = np.einsum("eni,enj->eij", design * weight[..., None], design)
+    index = np.arange(prior.shape[1])
+    normal[:, index, index] += prior
+    # Badly placed satellites may leave a direction open; the ridge is far below any information in a range.
+    normal[:, index, index] += _RIDGE * normal[:, index, index].max(axis=1, keepdims=True)
+    return np.asarray(normal)

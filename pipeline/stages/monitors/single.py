@@ -1,0 +1,164 @@
+"""Monitors that look at one epoch, or at the second before it, without memory: Doppler and channel comparison.
+
+Each yields a frame `value, threshold, state, reason`, row for row with the epochs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.stages.epochs.clock import crossing_gap_ns
+from pipeline.stages.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
+from pipeline.stages.monitors.series import FIRST_EPOCH
+from schemas.arrays import Floats, floats, times_ns
+from schemas.config import Configuration, LdsConfig
+from schemas.enums import NotEvaluated
+
+NO_VELOCITY = NotEvaluated.NO_VELOCITY
+NO_OTHER_SOLUTION = NotEvaluated.NO_OTHER_SOLUTION
+NO_OTHER_EPOCH = NotEvaluated.NO_OTHER_EPOCH
+
+
+def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+    """GNSS velocity along track against odometer speed, both over the second before [m/s].
+
+    Tells an odometer fault (slip, slide, radar on wet ground) from a fault of GNSS positions (DOMAIN section 3).
+    """
+    t_ns = times_ns(epochs)
+    t_s = (t_ns - t_ns[0]) * 1e-9
+    velocity = floats(epochs, "velocity_along_mps")
+    usable = np.isfinite(velocity) & epochs["odometer_reason"].is_null().to_numpy() & epochs["fix_valid"].to_numpy()
+    first, span = _window(t_s, usable, epochs["odometer_segment"].to_numpy(), config)
+    total = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity, np.nan)))])[:-1]
+    by_doppler = (total - total[first]) / span
+    odometer = floats(epochs, "odometer_m")
+    by_odometer = (odometer - odometer[first]) / span
+    speed = np.abs(floats(epochs, "speed_mps"))
+    change = np.abs(velocity - velocity[first])
+    variance = (
+        config.monitors.doppler_sigma_mps**2
+        + floats(epochs, "odometer_white_m2_per_s") / span
+        + 2.0 * (floats(epochs, "odometer_rows_m") / span) ** 2
+        + (floats(epochs, "scale_sigma") * speed) ** 2
+        + ((floats(epochs, "latency_sigma_s") + np.abs(floats(epochs, "latency_s"))) * change / span) ** 2
+    )
+    unknown = epochs["odometer_reason"]
+    reasons = first_reason(
+        (~np.isfinite(velocity), NO_VELOCITY),
+        (unknown.is_not_null(), unknown),
+        (~epochs["fix_valid"], NO_POSITION),
+        (~np.isfinite(span), FIRST_EPOCH),
+    )
+    return verdicts(by_doppler - by_odometer, config.monitors.threshold_factor * np.sqrt(variance), reasons)
+
+
+def channel_monitor(
+    epochs: pl.DataFrame, other: pl.DataFrame | None, config: Configuration, absent: str = NO_OTHER_SOLUTION
+) -> pl.DataFrame:
+    """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
+
+    `other`: `t, path_m, sigma_along_m, fix_valid, on_track` of the other solution, on the same path; at an epoch its
+    last position since the epoch before counts, against this solution's at that time (`paired`). Errors that both share
+    (troposphere) make the threshold larger than it need be. `absent`: the reason where there is none.
+    """
+    if other is None:
+        return no_verdicts(epochs.height, absent)
+    usable = other.filter("fix_valid", "on_track")
+    own_m = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
+    pairs = paired(epochs.select("t", path_m=own_m), usable, config.lds)
+    met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
+    value = floats(pairs, "path_m") - floats(met, "path_m")
+    both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
+    placed = epochs["fix_valid"] & epochs["on_track"] & epochs["sigma_along_m"].is_not_null()
+    reasons = first_reason(
+        (~placed, NO_POSITION), (met["path_m"].is_null() | met["sigma_along_m"].is_null(), NO_OTHER_EPOCH)
+    )
+    return verdicts(value, config.monitors.threshold_factor * both_m, reasons)
+
+
+def _window(
+    t_s: Floats, usable: npt.NDArray[np.bool_], segment: npt.NDArray[np.int64], config: Configuration
+) -> tuple[npt.NDArray[np.int64], Floats]:
+    """Epoch `speed_window_s` before or earlier, and the time since; NaN unless all between are usable and connected."""
+    least_s = config.align.speed_window_s * (1.0 - 1e-6)
+    first = np.maximum(np.searchsorted(t_s, t_s - least_s, side="right") - 1, 0)
+    bad = np.concatenate([[0], np.cumsum(~usable)])
+    clean = bad[np.arange(t_s.size) + 1] == bad[first]
+    span = t_s - t_s[first]
+    connected = clean & (span >= least_s) & (span <= config.monitors.doppler_gap_s)
+    connected &= segment == segment[first]
+    return first, np.where(connected, span, np.nan)
+
+
+def _way(t_s: Floats, velocity: Floats) -> Floats:
+    """Way of each step by trapezoids [m], zero where a velocity is missing; as many as epochs."""
+    steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t_s)
+    return np.concatenate([np.nan_to_num(steps), [0.0]])
+
+
+_PLACE = ("netelement_id", "measure_m", "path_m")
+
+
+def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
+    """The rows of `other` with `path_m` as it counts on the path of `epochs`; null where nothing joins the paths.
+
+    Each solution has its own matched path. Where one of them began later, on another net element or in the other
+    direction, their path positions count from different places.
+    Both in order of time with `t, netelement_id, measure_m, path_m`. On a net element that both are on at one time
+    the measure says how far apart they are; elsewhere the paths stand to each other as they did there before (at
+    the beginning: as they will).
+    """
+    mine, theirs = _with_sense(epochs), _with_sense(other).with_row_index("row")
+    pairs = theirs.join_asof(
+        mine, on="t_ns", strategy="nearest", tolerance=crossing_gap_ns(times_ns(epochs), lds), suffix="_mine"
+    )
+    together = (pl.col("netelement_id") == pl.col("netelement_id_mine")) & (pl.col("sense") * pl.col("sense_mine") != 0)
+    turned = pl.col("sense") * pl.col("sense_mine")
+    here_m = pl.col("path_m_mine") + pl.col("sense_mine") * (pl.col("measure_m") - pl.col("measure_m_mine"))
+    placed = (
+        pairs.with_columns(together=together.fill_null(value=False), turned=turned, here_m=here_m)
+        .with_columns(
+            turned=pl.when("together").then("turned"),
+            start_m=pl.when("together").then(pl.col("here_m") - pl.col("turned") * pl.col("path_m")),
+        )
+        .with_columns(pl.col("turned", "start_m").forward_fill().backward_fill())
+        .select("row", path_m=pl.col("start_m") + pl.col("turned") * pl.col("path_m"))
+    )
+    return other.with_columns(placed.sort("row")["path_m"])
+
+
+def paired(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
+    """For each epoch: `row_other`, the last of `other` since the epoch before, and `path_m`, where the train was then.
+
+    Two receivers need not measure at the same times. Where they do, `path_m` is the epoch's own; else it lies between
+    the positions of this epoch and the one before, if both have one and are no more than `crossing_gap_s` apart.
+    Null where there is nothing to compare. `epochs` with `t, path_m` (null where not usable), `other` with `t`.
+    """
+    stamps = other.select(t_other=_stamp()).with_row_index("row_other")
+    own = epochs.select("path_m", t_ns=_stamp())
+    since = pl.col("t_ns") - pl.col("t_ns").shift(1)
+    early = pl.col("t_ns") - pl.col("t_other")
+    between = (early < since) & (since <= crossing_gap_ns(times_ns(epochs), lds))
+    way = (pl.col("path_m") - pl.col("path_m").shift(1)) * (early / since)
+    return (
+        own.join_asof(stamps, left_on="t_ns", right_on="t_other", strategy="backward")
+        .with_columns(path_m=pl.when(early == 0).then("path_m").when(between).then(pl.col("path_m") - way))
+        .select("path_m", row_other=pl.when(pl.col("path_m").is_not_null()).then("row_other"))
+    )
+
+
+def _stamp() -> pl.Expr:
+    return pl.col("t").to_physical()
+
+
+def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
+    """Places with `sense`: +1 where the path runs with the measure of its net element, -1 against it; 0 where a
+    visit does not tell.
+    """
+    own = [pl.col(name) - pl.col(name).mean().over("visit") for name in ("path_m", "measure_m")]
+    placed = epochs.select(*_PLACE, t_ns=_stamp(), visit=pl.col("netelement_id").rle_id()).with_columns(
+        moved=own[0] * own[1]
+    )
+    return placed.select("t_ns", *_PLACE, sense=pl.col("moved").sum().over("visit").sign().cast(pl.Int8))

@@ -1,0 +1,10 @@
+"""The odometer of a run, made once: distance over time in continuity segments, with its noise.
+
+In: the cleaned odometer stream, vehicle file, configuration. Out: one `Odometry`, handed to every stage.
+Touches no file, and knows no position: only the sign against the path is set from one (`polarity`).
+"""
+
+from pipeline.stages.odometry.odometry import Odometry, Way, odometry_of
+from pipeline.stages.odometry.over_slip import counted_over_slip
+
+__all__ = ["Odometry", "Way", "counted_over_slip", "odometry_of"]

@@ -1,0 +1,326 @@
+"""The odometer of a run, made once and handed to everyone who asks how far, how fast and whether the train moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
+from pipeline.stages.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
+from pipeline.stages.odometry.rows import filled_in, leaps, ways_between
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
+from schemas.config import AlignConfig, Configuration, Vehicle
+
+
+class Way(NamedTuple):
+    """True distance between two instants, signed [m], and its variance [m^2]; NaN where it is not known."""
+
+    distance_m: Floats
+    variance_m2: Floats
+
+
+class Increments(NamedTuple):
+    """Corrected distance [m] and change of speed [m/s] from the instant before; zero at the first."""
+
+    distance_m: Floats
+    speed_mps: Floats
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the distance is off by: it gathers `white_m2_per_s` in a second; single rows have noise beside.
+
+    `counter_m`: the step of a counter [m], 0 where there is none.
+    """
+
+    white_m2_per_s: float
+    quantisation: QuantisationNoise = NO_QUANTISATION
+    counter_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Distance over time in continuity segments, with its noise.
+
+    Instants are int64 nanoseconds. Distances [m] are as recorded, but for `between` and `increments`, and grow with the
+    path once `oriented`. `t_s` and `distance_m` are samples (rows, and what was filled in between), in seconds since
+    `epoch_ns`; `segment` counts sample by sample how often the distance was lost before; `pause[i]` marks a pause of
+    the recording between samples i and i+1, inside which nothing is interpolated; `slip`: as the odometer reports.
+    `counter` numbers segments as `segment` does, but goes on over slip: there the wheel turned and was counted, and
+    `slip_doubt_m` is by how much the count may be off through slip, summed up to each sample [m].
+    `scale` is true over recorded distance, by the vehicle file when that gives its sigma too, else None.
+    `leaps_ns`: rows to which the recorded distance leaps farther than a train can drive.
+    """
+
+    epoch_ns: int
+    t_s: Floats
+    distance_m: Floats
+    segment: Ints
+    pause: Bools
+    slip: Bools
+    counter: Ints
+    slip_doubt_m: Floats
+    noise: Noise
+    deadband_mps: float
+    config: AlignConfig
+    period_s: float = 0.0
+    scale: float | None = None
+    scale_sigma: float | None = None
+    leaps_ns: tuple[int, ...] = ()
+
+    @property
+    def begin_ns(self) -> int:
+        """The first sample."""
+        return self.epoch_ns
+
+    @property
+    def end_ns(self) -> int:
+        """The last row."""
+        return self.epoch_ns + int(np.ceil(self.t_s[-1] * 1e9))
+
+    def oriented(self, sign: int) -> Odometry:
+        """The same odometer, growing with the path; `sign` is +1 or -1."""
+        return self if sign > 0 else replace(self, distance_m=-self.distance_m)
+
+    def seconds(self, t_ns: Ints) -> Floats:
+        """Instants on the odometer's own scale [s]."""
+        return ((t_ns - self.epoch_ns) * 1e-9).astype(np.float64)
+
+    def known_at(self, t_ns: Ints) -> Bools:
+        """Whether the distance is known: between two samples without a pause, none of which reports slip."""
+        return self.known_at_s(self.seconds(t_ns))
+
+    def segment_at(self, t_ns: Ints) -> Ints:
+        """Number of the continuity segment: distances can be compared only where it is the same."""
+        return self.segment_at_s(self.seconds(t_ns))
+
+    def slips_at_s(self, t_s: Floats) -> Bools:
+        """Whether the odometer reports slip at the sample before or after these times, on its own scale [s]."""
+        before, after = self._around(t_s)
+        slips: Bools = self.slip[before] | self.slip[after]
+        return slips
+
+    def counter_at_s(self, t_s: Floats) -> Ints:
+        """Number of the counter's segment at these times; slip does not end it."""
+        counter: Ints = self.counter[self._sample_at(t_s)]
+        return counter
+
+    def slip_doubt_at_s(self, t_s: Floats) -> Floats:
+        """By how much slip may have falsified the count up to these times [m]."""
+        return np.interp(t_s, self.t_s, self.slip_doubt_m)
+
+    def distance_at(self, t_ns: Ints) -> Floats:
+        """Distance at these instants [m], as recorded; NaN where it is not known."""
+        t_s = self.seconds(t_ns)
+        return np.where(self.known_at_s(t_s), self.distance_at_s(t_s), np.nan)
+
+    def travelled_at(self, t_ns: Ints) -> Floats:
+        """Way driven since the first row [m], turns included, as recorded; a best guess where it is not known.
+
+        Quantisation noise is neither way nor turn, and noise at standstill adds up to no more than it leaves the place.
+        """
+        return np.interp(self.seconds(t_ns), self.t_s, self._travelled_m)
+
+    def moving_s_at(self, t_ns: Ints) -> Floats:
+        """Time since the first row in which the train moved [s]."""
+        return np.interp(self.seconds(t_ns), *self._moving_s)
+
+    def moved(self, t_ns: Ints) -> Bools:
+        """Per step from an instant to the next: whether the train moved for more than half of it; shape (n - 1,).
+
+        The one movement test: mean speed beyond the dead band, over a second at least (DOMAIN section 2).
+        """
+        return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
+
+    def between(self, begin_ns: Ints | int, end_ns: Ints) -> Way:
+        """True distance from some instants, or from one, to others, and its variance; the one answer to "how far".
+
+        s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) +
+        (sigma_s D)^2 (DOMAIN section 5.1). NaN where either end is not known or the distance was lost in between.
+        """
+        scale, scale_sigma = self.scale or 1.0, self.scale_sigma or 0.0
+        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
+        same = self.segment_at(begin_ns) == self.segment_at(end_ns)
+        recorded = np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
+        moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))
+        rows_m2 = self.row_sigma_m(self.seconds(begin_ns)) ** 2 + self.row_sigma_m(self.seconds(end_ns)) ** 2
+        variance = scale**2 * (self.noise.white_m2_per_s * moving_s + rows_m2) + (scale_sigma * recorded) ** 2
+        return Way(scale * recorded, variance)
+
+    def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
+        """Along-track increments between consecutive instants, both ends with the estimates in use at the later one.
+
+        `scale`: true over recorded distance; `latency_s`: by how much the position at an instant is older.
+        """
+        before, now = self._steps_s(t_ns, latency_s)
+        distance = scale * (self.distance_at_s(now) - self.distance_at_s(before))
+        return Increments(distance, scale * (self.speed_at_s(now) - self.speed_at_s(before)))
+
+    def driven(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Floats:
+        """The same of the way driven, turns included [m]."""
+        begin_m, end_m = (np.interp(at_s, self.t_s, self._travelled_m) for at_s in self._steps_s(t_ns, latency_s))
+        return np.asarray(scale * (end_m - begin_m))
+
+    def _steps_s(self, t_ns: Ints, latency_s: Floats) -> tuple[Floats, Floats]:
+        """Begin and end of the step to each instant, both less the latency in use at the later one [s]."""
+        t_s = self.seconds(t_ns)
+        now = t_s - latency_s
+        return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
+
+    def known_at_s(self, t_s: Floats) -> Bools:
+        """`known_at` in seconds on the odometer's own scale, as the functions below: for estimates of latency."""
+        before, after = self._around(t_s)
+        paused = (before != after) & self.pause[np.minimum(before, self.pause.size - 1)]
+        inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
+        known: Bools = inside & ~paused & ~self.slips_at_s(t_s)
+        return known
+
+    def segment_at_s(self, t_s: Floats) -> Ints:
+        segment: Ints = self.segment[self._sample_at(t_s)]
+        return segment
+
+    def distance_at_s(self, t_s: Floats) -> Floats:
+        """Distance [m], also where it is not known: the best guess, and outside the recording the end value."""
+        return np.interp(t_s, self.t_s, self.distance_m)
+
+    def speed_at_s(self, t_s: Floats) -> Floats:
+        """Mean speed over the second before [m/s]: causal, and free of the noise of single samples."""
+        start = np.maximum(t_s - self.config.speed_window_s, self.t_s[0])
+        span = np.maximum(np.minimum(t_s, self.t_s[-1]) - start, 1e-9)
+        speed: Floats = (self.distance_at_s(t_s) - self.distance_at_s(start)) / span
+        return speed
+
+    def row_sigma_m(self, t_s: Floats) -> Floats:
+        """Standard deviation of the quantisation noise at these times [m]."""
+        if not self.noise.quantisation:
+            return np.zeros(t_s.size)
+        return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
+
+    def _sample_at(self, t_s: Floats) -> Ints:
+        index: Ints = np.searchsorted(self.t_s, t_s, side="right") - 1
+        return index.clip(0, self.t_s.size - 1)
+
+    def _around(self, t_s: Floats) -> tuple[Ints, Ints]:
+        """Samples before and after each time, twice the same where it is that of a sample."""
+        after = np.searchsorted(self.t_s, t_s, side="left").clip(0, self.t_s.size - 1)
+        before = np.where(self.t_s[after] == t_s, after, np.maximum(after - 1, 0))
+        return before, after
+
+    @cached_property
+    def _moving_s(self) -> tuple[Floats, Floats]:
+        """Times [s], and the time moving up to each [s]."""
+        at_s, at_m = self.t_s, self.distance_m
+        if self.noise.quantisation:
+            at_s, at_m = evenly_driven(at_s, at_m, self.row_sigma_m(at_s), self.deadband_mps, self.config)
+        moving = moving_steps(at_s, at_m, self.deadband_mps, self.config.speed_window_s)
+        return at_s, _sums(np.where(moving, np.diff(at_s), 0.0))
+
+    @cached_property
+    def _travelled_m(self) -> Floats:
+        """Way driven up to each sample."""
+        if self.noise.quantisation:
+            return driven_m(self.distance_m, hysteresis_m(self.row_sigma_m(self.t_s), self.config))
+        moving = moving_steps(self.t_s, self.distance_m, self.deadband_mps, self.config.speed_window_s)
+        return driven_or_left_m(self.distance_m, moving)
+
+
+def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> Odometry | None:
+    """The odometer of a cleaned stream (CONTRACT section 1), as recorded; None without at least two rows.
+
+    Distance from the recorded distance where there is one, else from speed (trapezoids). A pause longer than
+    `odometer_gap_s` (and than `odometer_gap_periods`) loses the way of speed-only odometry: the speeds before and after
+    it give the best guess, but a new continuity segment begins. A cumulative distance carries over it. Slip that the
+    odometer itself reports (`_slips`) loses the way too, and so does a leap of the distance where no speed tells the
+    way.
+    `odometer_sigma_mps` is the white noise at 1 Hz; a larger declared `sigma_speed_mps`, taken as independent from row
+    to row, replaces it.
+    """
+    if stream is None or stream.height < 2:
+        return None
+    align = config.align
+    t_ns, speed = times_ns(stream), floats(stream, "speed_mps")
+    t_s: Floats = ((t_ns - int(t_ns[0])) * 1e-9).astype(np.float64)
+    dt_s = np.diff(t_s)
+    period_s = float(np.median(dt_s))
+    limit_s = max(align.odometer_gap_s, align.odometer_gap_periods * period_s)
+    way_m, counted = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
+    unknown = np.isnan(way_m)
+    pause = unknown | (dt_s > limit_s)
+    slip = _slips(stream, align)
+    silent = pause & ~counted
+    lost = silent | slip[1:]
+    distance_m = _sums(np.where(unknown, 0.0, way_m))
+    segment = _sums(lost.astype(np.float64)).astype(np.int64)
+    counter = _sums(silent.astype(np.float64)).astype(np.int64)
+    doubt_m = _sums(_slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align))
+    white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
+    noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, config) if counted.any() else None
+    apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
+    if apart.size:
+        row_s = t_s
+        t_s, distance_m, row = filled_in(t_s, distance_m, speed, apart, align)
+        segment, pause, slip, counter = segment[row], pause[row[:-1]], slip[row], counter[row]
+        doubt_m = np.interp(t_s, row_s, doubt_m)
+    in_file = vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None
+    return Odometry(
+        epoch_ns=int(t_ns[0]),
+        t_s=t_s,
+        distance_m=distance_m,
+        segment=segment,
+        pause=pause,
+        slip=slip,
+        counter=counter,
+        slip_doubt_m=doubt_m,
+        noise=noise or Noise(white_m2_per_s),
+        deadband_mps=config.matching.deadband_mps,
+        period_s=period_s,
+        scale=vehicle.odometer_scale if in_file else None,
+        scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
+        leaps_ns=_leaps_ns(stream, align),
+        config=align,
+    )
+
+
+def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: Configuration) -> Noise:
+    """Noise of a recorded distance, of whose ways those to the next row are `whole` (rows - 1,)."""
+    counter_m, deadband_mps = count_step_m(distance_m, whole, config.align), config.matching.deadband_mps
+    scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, deadband_mps, config.align)
+    return Noise(white_m2_per_s, scatter, counter_m)
+
+
+def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
+    """Rows at which the odometer itself says that it slips: by its flag, or by a sigma of its speed beyond any use."""
+    slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
+    return slips
+
+
+def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
+    """By how much the count of each way that begins or ends in slip may be off [m].
+
+    By a share of the way, and by no less than the sigma that the odometer gives: an error that lasts while it slips, so
+    that it grows with time and not with its root.
+    """
+    sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
+    doubt_m = np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s)
+    return np.where(slip[1:] | slip[:-1], doubt_m, 0.0)
+
+
+def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
+    """Variance that the distance gathers in a second by the recorded sigma of the speed [m^2/s]; 0 without one."""
+    declared = stream["sigma_speed_mps"].median()
+    return float(declared) ** 2 * period_s if isinstance(declared, float) else 0.0
+
+
+def _leaps_ns(stream: pl.DataFrame, config: AlignConfig) -> tuple[int, ...]:
+    t_ns = times_ns(stream)
+    leap = leaps(np.diff(floats(stream, "distance_m")), np.diff(t_ns) / NS_PER_S, config)
+    return tuple(t_ns[1:][leap].tolist())
+
+
+def _sums(steps: Floats) -> Floats:
+    """Sums of the steps before each row; 0 at the first."""
+    return np.concatenate([[0.0], np.cumsum(steps)])

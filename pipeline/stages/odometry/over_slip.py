@@ -1,0 +1,45 @@
+"""The way over slip as another odometer of the train counted it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.stages.odometry.odometry import Odometry
+from schemas.arrays import Floats, Ints, spans_of
+from schemas.config import AlignConfig
+
+
+def counted_over_slip(odometry: Odometry, others: Sequence[Odometry], config: AlignConfig) -> Odometry:
+    """The odometer, with its way over slip from the first of the others that knew it throughout.
+
+    Slip stays reported: nothing is in use meanwhile. But the re-link after it compares with a way that was counted, in
+    doubt by `other_way_share` of it: nobody has measured the other's scale. Elsewhere the odometer's own count stays.
+    """
+    if not others or not odometry.slip.any():
+        return odometry
+    t_ns: Ints = odometry.epoch_ns + np.round(odometry.t_s * 1e9).astype(np.int64)
+    step_m, doubt_m = np.diff(odometry.distance_m), np.diff(odometry.slip_doubt_m)
+    senses = [_sense(odometry, other, t_ns) for other in others]
+    for first, last in spans_of(odometry.slip):
+        part = slice(max(first - 1, 0), min(last + 1, t_ns.size - 1))
+        at_ns = t_ns[part.start : part.stop + 1]
+        for other, sense in zip(others, senses, strict=True):
+            if other.known_at(at_ns).all() and np.ptp(other.segment_at(at_ns)) == 0:
+                step_m[part] = sense * np.diff(other.distance_at(at_ns)) / (odometry.scale or 1.0)
+                doubt_m[part] = config.other_way_share * np.abs(step_m[part])
+                break
+    distance_m = odometry.distance_m[0] + _sums(step_m)
+    return replace(odometry, distance_m=distance_m, slip_doubt_m=_sums(doubt_m))
+
+
+def _sense(one: Odometry, other: Odometry, t_ns: Ints) -> float:
+    """+1 where both count up alike, -1 where one of them runs backwards."""
+    both = np.diff(one.distance_m) * np.diff(other.distance_at_s(other.seconds(t_ns)))
+    return -1.0 if both.sum() < 0.0 else 1.0
+
+
+def _sums(steps: Floats) -> Floats:
+    return np.concatenate([[0.0], np.cumsum(steps)])

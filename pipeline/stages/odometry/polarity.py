@@ -1,0 +1,59 @@
+"""Which way the path grows, and the odometer's sign against it: by a run's first metres (DOMAIN section 2)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.stages.odometry.odometry import Odometry
+from schemas.arrays import Floats, Ints
+
+
+def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) -> int:
+    """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement.
+
+    `path_m` grows in the direction of that same movement (DOMAIN section 2), so GNSS decides once, over these
+    metres only: starts every metre have a vote each, so that a leap of the
+    position in between does not turn the odometer round. A run that never moves so far is judged by its largest
+    movement.
+    """
+    recorded_m = odometry.distance_at(t_ns)
+    usable = np.flatnonzero(np.isfinite(path_m) & np.isfinite(recorded_m))
+    if usable.size < 2:
+        return 1
+    odometer, path = recorded_m[usable], path_m[usable]
+    way = np.maximum.accumulate(np.abs(odometer - odometer[0]))
+    window = int(np.searchsorted(way, 4.0 * distance_m)) + 1
+    # Starts a metre apart: a long stand before the departure has one vote, not thousands.
+    starts = np.unique(np.searchsorted(way, np.arange(0.0, 2.0 * distance_m)))
+    starts = starts[starts < min(window, way.size)]
+    votes = [_side(odometer[start:window], path[start:window], distance_m) for start in starts]
+    return -1 if sum(votes) < 0 else 1
+
+
+def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distance_m: float) -> bool:
+    """Whether the run's first `distance_m` of net movement went with the given positions (NaN: not known).
+
+    The odometer says when that distance was covered and in which sense, and its `polarity` against the positions which
+    way they went. Without an odometer the positions say both.
+    """
+    known = np.isfinite(position_m)
+    if not known.any():
+        return True
+    position, at_ns = position_m[known], t_ns[known]
+    if odometry is not None:
+        recorded = odometry.distance_at(at_ns)
+        moved = recorded[np.isfinite(recorded)] - recorded[np.isfinite(recorded)][:1]
+        covered = np.flatnonzero(np.abs(moved) >= distance_m)
+        if covered.size:
+            return bool(polarity(odometry, at_ns, position, distance_m) * moved[covered[0]] > 0)
+    away = position - position[0]
+    far = np.flatnonzero(np.abs(away) >= distance_m)
+    return bool(away[far[0]] > 0) if len(far) else bool(away[-1] >= 0)
+
+
+def _side(odometer: Floats, path: Floats, distance_m: float) -> int:
+    """Whether path and odometer go the same way (1), opposite ways (-1) or nowhere (0) over these metres."""
+    moved = odometer - odometer[0]
+    far = np.flatnonzero(np.abs(moved) >= distance_m)
+    end = int(far[0]) if far.size else int(np.argmax(np.abs(moved)))
+    return int(np.sign(moved[end] * (path[end] - path[0])))

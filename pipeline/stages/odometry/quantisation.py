@@ -1,0 +1,126 @@
+"""Quantisation noise: what single rows of an odometer's distance are off by, measured from the rows themselves.
+
+A counter of whole metres, a recorder that stamps on receipt, or noise of the reading: the distance of a row is off by
+some of it, the next by something else, and nothing adds up. At 10 Hz a counter of half metres so seems to change its
+speed by metres per second from epoch to epoch. Only the odometer is looked at, never a position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.stages.odometry.written_steps import step_of
+from schemas.arrays import Bools, Floats, Ints
+from schemas.config import AlignConfig
+
+# Numerics of the fit: so many rows of a piece, and the degree of its curve.
+_MOST_ROWS, _FEWEST_ROWS = 16, 8
+_DEGREE = 3
+# Enough for the median, however long the run is; with fewer it is chance.
+_PIECES, _FEWEST_PIECES = 400, 8
+# Less is rounding of decimal numbers, which are not whole in binary; far below any `counter_step_m`.
+_ROUNDED_M = 1e-3
+
+
+@dataclass(frozen=True)
+class QuantisationNoise:
+    """Variance [m^2] of a row at standstill, and by how much it grows with the square of the speed [s^2]."""
+
+    still_m2: float = 0.0
+    moving_s2: float = 0.0
+
+    def variance_m2(self, speed_mps: Floats) -> Floats:
+        return self.still_m2 + self.moving_s2 * speed_mps**2
+
+    def __bool__(self) -> bool:
+        return self.still_m2 > 0.0 or self.moving_s2 > 0.0
+
+
+NO_QUANTISATION = QuantisationNoise()
+
+
+def quantisation_noise(
+    t_s: Floats,
+    distance_m: Floats,
+    whole: Bools,
+    white_m2_per_s: float,
+    counter_m: float,
+    deadband_mps: float,
+    config: AlignConfig,
+) -> QuantisationNoise:
+    """What rows scatter about smooth curves beyond what white noise of the increments explains.
+
+    `whole` (rows - 1,): ways between rows that are recorded. Medians over pieces in which the train moves (faster than
+    `deadband_mps`), so that slips do not count. Noise of stamps grows with the square of the speed: lower and higher
+    speeds are told apart where their squares differ by `quantisation_factor`, as scatter has to. Noise that is less
+    than what the white noise makes of the same rows counts as none. A counter has the noise of its step (`counter_m`)
+    at least: at a speed at which each row gains as many steps as the last it does not show, until it does.
+    """
+    scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s, deadband_mps, config)
+    return replace(scatter, still_m2=max(scatter.still_m2, counter_m**2 / 12.0))
+
+
+def count_step_m(distance_m: Floats, whole: Bools, config: AlignConfig) -> float:
+    """The step of a counter [m], 0 where there is none, or one finer than `counter_step_m`."""
+    ways = np.abs(np.diff(distance_m)[whole])
+    return step_of(ways, ways, config.counter_step_m, _ROUNDED_M)
+
+
+def _scatter_beyond(
+    t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, deadband_mps: float, config: AlignConfig
+) -> QuantisationNoise:
+    """What the rows show of their noise."""
+    rows = _moving_pieces(t_s, distance_m, whole, deadband_mps, config)
+    if len(rows) < _FEWEST_PIECES:
+        return QuantisationNoise()
+    since_s, ways = t_s[rows] - t_s[rows[:, :1]], distance_m[rows] - distance_m[rows[:, :1]]
+    found, explained = _scatter(since_s, ways, white_m2_per_s)
+    speeds = np.abs(ways[:, -1]) / since_s[:, -1]
+    fast = speeds > np.median(speeds)
+    low_mps, high_mps = (float(np.median(speeds[part])) if part.any() else 0.0 for part in (~fast, fast))
+    if fast.sum() < _FEWEST_PIECES or high_mps**2 < config.quantisation_factor * low_mps**2:
+        return QuantisationNoise(_beyond(found, explained, config))
+    low_m2, high_m2 = (_beyond(found[part], explained[part], config) for part in (~fast, fast))
+    moving_s2 = max(high_m2 - low_m2, 0.0) / (high_mps**2 - low_mps**2)
+    return QuantisationNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
+
+
+def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, deadband_mps: float, config: AlignConfig) -> Ints:
+    """Rows of pieces without a gap in which the train moves, spread over the run; shape (pieces, rows).
+
+    Rows farther apart tell of a train that drives otherwise than a moment ago, not of their noise.
+    """
+    period_s = float(np.median(np.diff(t_s)))
+    if period_s > config.straight_s or period_s <= 0.0:
+        return np.zeros((0, 1), dtype=np.int64)
+    count = int(np.clip(np.ceil(config.quantisation_span_s / period_s) + 1, _FEWEST_ROWS, _MOST_ROWS))
+    stride = max(1, round(config.quantisation_span_s / period_s / (count - 1)))
+    length = (count - 1) * stride
+    starts = np.arange(0, t_s.size - length, max(length, (t_s.size - length) // _PIECES))
+    broken = np.concatenate([[0], np.cumsum(~whole)])
+    way_m, time_s = distance_m[starts + length] - distance_m[starts], t_s[starts + length] - t_s[starts]
+    moves = np.abs(way_m) > deadband_mps * time_s
+    starts = starts[moves & (broken[starts + length] == broken[starts])]
+    chosen: Ints = starts[:, None] + stride * np.arange(count)
+    return chosen
+
+
+def _scatter(since_s: Floats, way_m: Floats, white_m2_per_s: float) -> tuple[Floats, Floats]:
+    """Variance about the curves [m^2] of each piece, and what white noise of the increments makes of it."""
+    count = since_s.shape[1]
+    powers = (2.0 * since_s / since_s[:, -1:] - 1.0)[:, :, None] ** np.arange(_DEGREE + 1)
+    curves, _ = np.linalg.qr(powers)
+    fitted = curves @ (curves.transpose(0, 2, 1) @ way_m[:, :, None])
+    found = ((way_m - fitted[:, :, 0]) ** 2).sum(axis=1)
+    walk = np.minimum(since_s[:, :, None], since_s[:, None, :])
+    left = since_s.sum(axis=1) - (curves * (walk @ curves)).sum(axis=(1, 2))
+    free = count - _DEGREE - 1
+    return found / free, white_m2_per_s * left / free
+
+
+def _beyond(found_m2: Floats, explained_m2: Floats, config: AlignConfig) -> float:
+    """The median of what is found where it is not explained [m^2], else none."""
+    found, explained = float(np.median(found_m2)), float(np.median(explained_m2))
+    return found - explained if found > config.quantisation_factor * explained else 0.0

@@ -1,0 +1,9 @@
+"""The reference on the network, by itself: every track that it may have run along (DOMAIN section 5.1).
+
+In: the reference stream, the survey as a network. Out: stretches of samples with every way that they may have taken.
+Nothing that came from GNSS or the odometer is known here.
+"""
+
+from pipeline.stages.reference.stretches import ReferencePath, Stretch, reference_stretches
+
+__all__ = ["ReferencePath", "Stretch", "reference_stretches"]

@@ -1,0 +1,104 @@
+"""Which net elements lie near which samples, and where on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.stages.track.geodesy import Points, points_of
+from pipeline.stages.track.segments import SAMPLE_SPACING_M, Polyline, on_segments
+from pipeline.stages.track.survey import Track
+from schemas.arrays import Bools, Floats, Ints
+
+# Numerics: so near an end a foot lies at it [m].
+_AT_END_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Foot:
+    """The nearest place of one sample on one net element; `end`: 0 or 1 where it is that end of it, else None."""
+
+    element: int
+    distance_m: float
+    measure_m: float
+    end: int | None
+
+
+@dataclass(frozen=True)
+class Near:
+    """Pairs of sample and net element, by element and within it in order of samples: nearest places within reach."""
+
+    sample: Ints
+    element: Ints
+    distance_m: Floats
+    measure_m: Floats
+    survey_sigma_m: Floats
+    first: Ints
+    any_near: Bools
+    track: Track
+
+    def of(self, element: int, begin: int, end: int) -> slice:
+        """The pairs of an element with samples from `begin` to `end`."""
+        own = slice(int(self.first[element]), int(self.first[element + 1]))
+        low, high = np.searchsorted(self.sample[own], [begin, end + 1]).tolist()
+        return slice(own.start + low, own.start + high)
+
+    def feet(self, samples: Ints) -> list[list[Foot]]:
+        """All feet of some samples, in their order."""
+        position = np.full(self.any_near.size, -1)
+        position[samples] = np.arange(samples.size)
+        found: list[list[Foot]] = [[] for _ in range(samples.size)]
+        for pair in np.flatnonzero(position[self.sample] >= 0).tolist():
+            element, measure_m = int(self.element[pair]), float(self.measure_m[pair])
+            ends = (abs(measure_m - self.track.begin_m[element]), abs(measure_m - self.track.end_m[element]))
+            end = int(np.argmin(ends)) if min(ends) < _AT_END_M else None
+            foot = Foot(element, float(self.distance_m[pair]), measure_m, end)
+            found[position[self.sample[pair]]].append(foot)
+        return found
+
+
+def near_elements(points: Points, sigma_m: Floats, track: Track, factor: float, unstated_m: float) -> Near:
+    """Net elements within `factor` roots of samples' and survey's sigma; `unstated_m`: that of a silent survey."""
+    owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
+    surface = points_of(track.latitude_deg, track.longitude_deg).surface
+    begin = np.flatnonzero(owner[1:] == owner[:-1])
+    line = Polyline(surface[begin], surface[begin + 1])
+    stated_m = np.where(np.isfinite(track.sigma_m), track.sigma_m, unstated_m)
+    segment_sigma_m = np.maximum(stated_m[begin], stated_m[begin + 1])
+    sample, segment = _candidates(points, line, factor * np.hypot(sigma_m, segment_sigma_m.max(initial=0.0)))
+    feet = on_segments(points.take(sample), line, segment)
+    part = np.clip(feet.fraction, 0.0, 1.0)
+    low_m, high_m = track.measure_m[begin[segment]], track.measure_m[begin[segment] + 1]
+    within = feet.distance_m <= factor * np.hypot(sigma_m[sample], segment_sigma_m[segment])
+    element = owner[begin[segment]]
+    order = np.lexsort((feet.distance_m, sample, element))
+    order = order[within[order]]
+    # Of each pair of element and sample the nearest segment.
+    nearest = np.ones(order.size, dtype=np.bool_)
+    nearest[1:] = (np.diff(element[order]) != 0) | (np.diff(sample[order]) != 0)
+    kept = order[nearest]
+    any_near = np.zeros(len(points), dtype=np.bool_)
+    any_near[sample[kept]] = True
+    return Near(
+        sample=sample[kept],
+        element=element[kept],
+        distance_m=feet.distance_m[kept],
+        measure_m=(low_m + part * (high_m - low_m))[kept],
+        survey_sigma_m=segment_sigma_m[segment][kept],
+        first=np.searchsorted(element[kept], np.arange(len(track.ids) + 1)),
+        any_near=any_near,
+        track=track,
+    )
+
+
+def _candidates(points: Points, line: Polyline, reach_m: Floats) -> tuple[Ints, Ints]:
+    """Pairs of sample and segment that may be within reach: each once."""
+    if len(points) == 0 or len(line) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    tree, segment_of = line.samples
+    found = tree.query_ball_point(points.surface, reach_m + 0.5 * SAMPLE_SPACING_M)
+    sample = np.repeat(np.arange(len(points)), [len(one) for one in found])
+    segment = segment_of[np.concatenate([np.asarray(one, dtype=np.int64) for one in found])]
+    pairs = np.unique(sample * len(line) + segment)
+    return pairs // len(line), pairs % len(line)

@@ -1,0 +1,112 @@
+"""What moving time without a valid TVB was lost to, and to which monitor (CONTRACT section 3, `lost_to`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.epochs.clock import Clock, confident, may_move, met, unambiguous, usable
+from schemas.arrays import NS_PER_S, Bools, Ints, times_ns
+from schemas.config import Configuration
+from schemas.enums import LdsMode, LostTo, MonitorState, NotEvaluated, Verdict
+from schemas.tables import MONITORS
+from schemas.words import lost_words
+
+_NOISE = [NotEvaluated.NOISE_UNKNOWN.value, NotEvaluated.NOISE_TOO_LARGE.value]
+
+
+@dataclass(frozen=True)
+class LostTime:
+    """`share` of moving time without a valid TVB, None where the train never moved; `causes`: shares, largest first.
+
+    What no cause explains is initialisation and short losses. `monitor`: failed in most of the time lost to alarms.
+    `unfounded`: most of that time follows alarms that neither the evidence nor a hazard explains.
+    """
+
+    share: float | None = None
+    causes: Mapping[LostTo, float] = field(default_factory=dict)
+    monitor: str | None = None
+    unfounded: bool = False
+
+    @property
+    def words(self) -> str:
+        return lost_words(list(self.causes), list(self.causes.values()), self.monitor, self.share)
+
+    def columns(self) -> dict[str, object]:
+        """As they stand in `runs`."""
+        return {
+            "lost_to": list(self.causes),
+            "lost_to_share": list(self.causes.values()),
+            "lost_to_monitor": self.monitor,
+        }
+
+
+def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, clock: Clock, config: Configuration) -> LostTime:
+    """Shares of the moving time, gaps included; each epoch counts for the first cause that applies.
+
+    `epochs`: monitored and judged, in order of time; `alarms`: of the same solution. A gap is
+    time without a position, as for `availability`.
+    """
+    moving = met(epochs, may_move())
+    steps_s = np.diff(clock.t_ns, append=clock.t_ns[-1:]) / NS_PER_S
+    whole_s = float(steps_s[moving].sum())
+    if whole_s <= 0.0 or not met(epochs, pl.col("moving"))[:-1].any():
+        return LostTime()
+    gap = clock.held_s < steps_s
+    lost = moving & (gap | ~met(epochs, pl.col("tvb") & pl.col("moving").is_not_null()))
+    share, left = float(steps_s[lost].sum()) / whole_s, lost
+    found: dict[LostTo, Bools] = {}
+    for cause, applies in _causes(epochs, gap, clock.t_ns, config).items():
+        found[cause] = left & applies
+        left = left & ~applies
+    parts = {cause: float(steps_s[rows].sum()) / whole_s for cause, rows in found.items()}
+    ranked = sorted((cause for cause, part in parts.items() if part > 0.0), key=lambda cause: -parts[cause])
+    alarmed = found[LostTo.ALARM]
+    unexplained = alarmed & ~_explained(alarms, clock.t_ns, config.lds.recovery_s)
+    unfounded = bool(2.0 * steps_s[unexplained].sum() > steps_s[alarmed].sum())
+    return LostTime(share, {cause: parts[cause] for cause in ranked}, _loudest(epochs.filter(alarmed)), unfounded)
+
+
+def _causes(epochs: pl.DataFrame, gap: Bools, t_ns: Ints, config: Configuration) -> dict[LostTo, Bools]:
+    """Conditions in the order in which they apply."""
+    negated = met(epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.FAIL_SAFE.value)
+    withheld = pl.col("withheld_for").cast(pl.String)
+    noise = (withheld == LostTo.NOISE.value) | pl.col("along_raw_reason").is_in(_NOISE)
+    waiting = met(epochs, withheld == LostTo.RELINK.value)
+    return {
+        LostTo.NO_POSITION: gap | ~met(epochs, usable()),
+        LostTo.CONFIDENCE: ~met(epochs, confident(config)),
+        LostTo.TRACK_AMBIGUOUS: ~met(epochs, unambiguous(config)),
+        LostTo.NOISE: met(epochs, noise),
+        LostTo.SLIP: met(epochs, withheld == LostTo.SLIP.value),
+        LostTo.RELINK: waiting | (negated & ~_alarmed(epochs, t_ns, config.lds.recovery_s)),
+        LostTo.ALARM: negated,
+        LostTo.NO_ODOMETER: met(epochs, pl.col("odometer_reason").is_not_null()),
+    }
+
+
+def _alarmed(epochs: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
+    """A monitor fails, or has failed less than `recovery_s` ago (DOMAIN section 4)."""
+    alarm = met(epochs, pl.col("alarm"))
+    last_ns = np.maximum.accumulate(np.where(alarm, t_ns, np.iinfo(np.int64).min))
+    return np.asarray(last_ns >= t_ns - round(recovery_s * NS_PER_S))
+
+
+def _explained(alarms: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
+    """Epochs of alarm episodes that were due, or that belong to a hazard, and of the recovery after them."""
+    due = alarms.filter((pl.col("verdict") == Verdict.TRUE.value) | pl.col("hazard_id").is_not_null())
+    ends_ns = times_ns(due, "t_end") + round(recovery_s * NS_PER_S)
+    spans = zip(times_ns(due, "t_start"), ends_ns, strict=True)
+    inside = [(t_ns >= start_ns) & (t_ns <= end_ns) for start_ns, end_ns in spans]
+    return np.logical_or.reduce(inside) if inside else np.zeros(t_ns.size, dtype=np.bool_)
+
+
+def _loudest(epochs: pl.DataFrame) -> str | None:
+    """The monitor that failed in most of these epochs."""
+    failing = (pl.col(f"{name}_state").cast(pl.String) == MonitorState.FAIL.value for name in MONITORS)
+    counts = epochs.select(condition.sum().alias(name) for name, condition in zip(MONITORS, failing, strict=True))
+    name, count = max(counts.row(0, named=True).items(), key=lambda item: item[1])
+    return str(name) if count else None

@@ -1,0 +1,164 @@
+"""The verdict of a run (DOMAIN section 5.4), by service level too (TVB eq. 7), and what heads several runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import polars as pl
+
+from pipeline.stages.judge.failures import within_budget
+from schemas.config import Configuration
+from schemas.enums import Judgement, Reason, RunStatus, RunVerdict, ThrVerdict
+
+Row = Mapping[str, Any]
+Failure = tuple[float, float, str]
+"""Hazardous time [s], the same with what is unknown, and the worst judgement of the VBs accepted meanwhile."""
+
+
+_UNSAFE = {Reason.ACCEPTED_WRONG, Reason.FAILURE_BEYOND_BUDGET, Reason.HAZARDOUS_SUM}
+_LASTING = (Reason.EVIDENCE_DISPUTED, Reason.INPUT_DOUBTFUL, Reason.CLOCK_ASSUMED)
+"""Reasons that no count of a `runs` row holds: they stand among its `reasons` from the beginning."""
+
+
+DECISIVE = (
+    *("unsafe_accepted", "unproven_accepted", "balises_accepted", "unknown_in_use_s", "share_undiagnosed"),
+    *("failure_hazardous_s", "failure_hazardous_may_s", "failure_accepted"),
+    *("hazardous_s", "duration_s", "faults_injected", "reasons"),
+)
+"""Columns of `runs` that the reasons are read from."""
+
+
+def reasons_of(run: Row, allowed_s: float, undiagnosed_share: float) -> list[Reason]:
+    """Why a run has its verdict, from the counts of one `runs` row (DOMAIN section 5.4).
+
+    `allowed_s`: allowed T_D; `undiagnosed_share`: of the configuration. Of `run["reasons"]` stays what no count holds.
+    """
+    failures = failures_in(run)
+    within, beyond = level_counts(failures, allowed_s)
+    hours_begun = max(1, math.ceil((run["duration_s"] or 0.0) / 3600.0))
+    too_long = (run["hazardous_s"] or 0.0) > allowed_s * hours_begun
+    applies = {
+        Reason.ACCEPTED_WRONG: run["unsafe_accepted"] > 0,
+        Reason.FAILURE_BEYOND_BUDGET: beyond > 0,
+        # Eq. 7 is of nature's failures: how many were injected is nobody's rate.
+        Reason.HAZARDOUS_SUM: too_long and not run["faults_injected"],
+        Reason.ACCEPTED_UNKNOWN: run["unproven_accepted"] > 0,
+        Reason.BUDGET_UNKNOWN: within + beyond < len(failures),
+        Reason.UNKNOWN_IN_USE: (run["unknown_in_use_s"] or 0.0) > allowed_s,
+        Reason.NOT_DIAGNOSED: (run["share_undiagnosed"] or 0.0) > undiagnosed_share,
+        Reason.NOTHING_ACCEPTED: run["balises_accepted"] == 0,
+        **{reason: reason in (run["reasons"] or ()) for reason in _LASTING},
+    }
+    return [reason for reason in Reason if applies[reason]]
+
+
+def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
+    """The worst that applies; an assumed clock alone changes nothing (DOMAIN section 5.4)."""
+    found = set(reasons) - {Reason.CLOCK_ASSUMED}
+    if found & _UNSAFE:
+        return RunVerdict.UNSAFE
+    return RunVerdict.UNPROVEN if found else RunVerdict.SAFE
+
+
+def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
+    """The verdict that heads several; None stands for one that failed, and proves nothing beside others."""
+    found = {None if verdict is None else RunVerdict(verdict) for verdict in verdicts}
+    if RunVerdict.UNSAFE in found:
+        return RunVerdict.UNSAFE
+    if not found - {None}:
+        return None
+    return RunVerdict.SAFE if found == {RunVerdict.SAFE} else RunVerdict.UNPROVEN
+
+
+@dataclass(frozen=True)
+class CampaignHead:
+    """The verdict of a campaign, and how many runs have which; `failed`: no solution could be replayed."""
+
+    verdict: RunVerdict | None
+    unsafe: int
+    unproven: int
+    safe: int
+    failed: int
+
+    @property
+    def word(self) -> str:
+        return word_of(self.verdict)
+
+    def counts(self) -> dict[str, int]:
+        """Runs by verdict, worst first; failed ones last."""
+        return {"unsafe": self.unsafe, "unproven": self.unproven, "safe": self.safe, "failed": self.failed}
+
+    def __str__(self) -> str:
+        return f"{self.word}: " + ", ".join(f"{count} {name}" for name, count in self.counts().items())
+
+
+def word_of(verdict: RunVerdict | str | None) -> str:
+    """The first word of every report, table and summary."""
+    return RunStatus.FAILED.value if verdict is None else str(verdict)
+
+
+def head_of(verdicts: Iterable[RunVerdict | None]) -> CampaignHead:
+    """The head of a campaign from the verdicts of its runs."""
+    found = list(verdicts)
+    counts = {verdict.value: found.count(verdict) for verdict in RunVerdict}
+    return CampaignHead(worst_verdict(found), **counts, failed=found.count(None))
+
+
+def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
+    """Each run's verdict, the worst of its solutions, from `runs` with `run_id`."""
+    listed = runs.group_by("run_id").agg(pl.col("verdict").cast(pl.String)).sort("run_id")
+    return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}
+
+
+def figures_beside(runs: pl.DataFrame) -> Row:
+    """The figures beside a campaign's verdict: sums, availability by time, and the least margin."""
+    weight_s = pl.col("held_s").filter(pl.col("availability").is_not_null()).sum()
+    available = (pl.col("availability") * pl.col("held_s")).sum() / weight_s
+    figures = runs.select(
+        pl.col("balises_accepted", "balises_on_path").sum(),
+        pl.col("proof_margin_m").min(),
+        availability=pl.when(weight_s > 0.0).then(available),
+    )
+    return figures.row(0, named=True)
+
+
+LEVEL_LISTS = {
+    "service_level": "service_levels",
+    "allowed_s": "level_allowed_s",
+    "within": "level_within",
+    "exceeded": "level_exceeded",
+    "verdict": "level_verdict",
+}
+"""What `level_rows` tells of each service level, and the list of the `runs` table that holds it."""
+
+
+_OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVerdict.UNKNOWN}
+
+
+def level_rows(run: Row, config: Configuration) -> list[dict[str, object]]:
+    """One `runs` row against the allowed T_D of each service level, by the rules of its own verdict."""
+    failures = failures_in(run)
+    in_time = ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
+    rows: list[dict[str, object]] = []
+    for level in config.safety.service_levels:
+        allowed_s = config.safety.allowed_time_to_detect_s(level)
+        within, exceeded = level_counts(failures, allowed_s)
+        verdict = verdict_of(reasons_of(run, allowed_s, config.hazards.undiagnosed_share))
+        values = (level, allowed_s, within, exceeded, _OF_LEVEL.get(verdict, in_time).value)
+        rows.append(dict(zip(LEVEL_LISTS, values, strict=True)))
+    return rows
+
+
+def failures_in(run: Row) -> list[Failure]:
+    """The failures of one `runs` row, in order of time."""
+    lists = ("failure_hazardous_s", "failure_hazardous_may_s", "failure_accepted")
+    return list(zip(*(run[name] or [] for name in lists), strict=True))
+
+
+def level_counts(failures: Sequence[Failure], allowed_s: float) -> tuple[int, int]:
+    """How many failures kept the allowed time whatever is unknown, and how many did not for certain."""
+    kept = [within_budget(spent_s, may_s, Judgement(accepted), allowed_s) for spent_s, may_s, accepted in failures]
+    return kept.count(True), kept.count(False)

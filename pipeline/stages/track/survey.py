@@ -1,0 +1,222 @@
+"""The surveyed track as arrays: net elements with their vertices, measures and lengths; and in pieces.
+
+Elements that turn round come in pieces that do not. A balloon loop whose ends join the same switch, a ring, a ramp that
+crosses itself, a road up and down beside itself: the nearest place on the whole element may be the wrong one of two,
+that on a piece never is.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.track.geodesy import distances_m, points_of
+from schemas.arrays import Floats, Ints, floats, ints
+
+# Both belong to how a site is read, as the limits of its check do: a site is the same for every run and configuration.
+# A gap between linked ends that is more than survey noise [m]; it counts as straight track.
+GAP_COUNTS_M = 0.5
+# A balise this far beyond its element's end is still on it: surveys and balise lists round [m].
+MEASURE_TOLERANCE_M = 0.5
+# An element's direction is taken over so much of it [m]: single vertices may lie a centimetre apart. Numerics: where
+# in a turn of a right angle a piece ends changes no place on it.
+_DIRECTION_OVER_M = 10.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """Net elements, each a run of vertices `first[e] : first[e + 1]`, in the order of the survey.
+
+    Degrees, metres; `height_m` is NaN on a 2-D element (as a whole), `sigma_m` NaN where not known.
+    """
+
+    ids: tuple[str, ...]
+    index: dict[str, int]
+    first: Ints
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    measure_m: Floats
+    sigma_m: Floats
+    length_m: Floats
+
+    @cached_property
+    def begin_m(self) -> Floats:
+        """Measure at which each element begins [m]."""
+        return self.measure_m[self.first[:-1]]
+
+    @cached_property
+    def end_m(self) -> Floats:
+        """Measure at which each element ends [m]."""
+        return self.measure_m[self.first[1:] - 1]
+
+    def along_m(self, oriented: int, measure_m: float) -> float:
+        """Distance of a measure from where the oriented element (`Network`) is entered [m]."""
+        element, against = divmod(oriented, 2)
+        return float(self.end_m[element] - measure_m if against else measure_m - self.begin_m[element])
+
+    def holding(self, balises: pl.DataFrame) -> tuple[Ints, Ints]:
+        """Pairs of balise (its row) and net element: those that lie on it, or but for what lists round.
+
+        Of an element in pieces each piece that holds the balise.
+        """
+        elements = pl.DataFrame(
+            {
+                "netelement_id": pl.Series(self.ids, dtype=pl.String),
+                "_low": self.begin_m - MEASURE_TOLERANCE_M,
+                "_high": self.end_m + MEASURE_TOLERANCE_M,
+            }
+        )
+        pairs = (
+            balises.select("netelement_id", "measure_m")
+            .with_row_index("_balise")
+            .join(elements.with_row_index("_element"), on="netelement_id", maintain_order="left_right")
+            .filter(pl.col("measure_m").is_between("_low", "_high"))
+        )
+        return ints(pairs["_balise"]), ints(pairs["_element"])
+
+    def vertices(self, element: int) -> slice:
+        return slice(int(self.first[element]), int(self.first[element + 1]))
+
+    def end(self, element: int, position: int) -> int:
+        """Vertex at an end of an element: 0 its start, 1 its end."""
+        return int(self.first[element]) if position == 0 else int(self.first[element + 1]) - 1
+
+    def element_at(self, name: str, measure_m: float) -> int | None:
+        """The net element of a name if it holds the measure, as `holding` has it; none where it does not."""
+        if (element := self.index.get(name)) is None:
+            return None
+        low_m, high_m = float(self.begin_m[element]), float(self.end_m[element])
+        return element if low_m - MEASURE_TOLERANCE_M <= measure_m <= high_m + MEASURE_TOLERANCE_M else None
+
+    def elements(self) -> Iterator[tuple[int, str, slice]]:
+        for element, name in enumerate(self.ids):
+            yield element, name, self.vertices(element)
+
+
+def track_of(frame: pl.DataFrame) -> Track:
+    """The track of a site's `track` table; points of an element stay in their order."""
+    names = frame["netelement_id"].unique(maintain_order=True)
+    index = {name: number for number, name in enumerate(names.to_list())}
+    codes = frame["netelement_id"].cast(pl.Enum(names)).to_physical().cast(pl.Int64).to_numpy()
+    order = np.argsort(codes, kind="stable")
+    first = np.searchsorted(codes[order], np.arange(len(index) + 1))
+    columns = {name: floats(frame, name)[order] for name in _NUMBERS}
+    columns["height_m"] = _all_or_none(columns["height_m"], first)
+    length_m = columns["measure_m"][first[1:] - 1] - columns["measure_m"][first[:-1]]
+    return Track(ids=tuple(index), index=index, first=first, length_m=length_m, **columns)
+
+
+@dataclass(frozen=True)
+class Along:
+    """Places along all elements, in order: element number and measure [m] of each, degrees."""
+
+    element: Ints
+    measure_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+
+
+def places_along(track: Track, spacing_m: float) -> Along:
+    """Places about so far apart on every element, its two ends among them."""
+    columns: list[list[Floats]] = [[], [], [], []]
+    for number, _, part in track.elements():
+        low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
+        at_m = np.linspace(low, high, max(2, round((high - low) / spacing_m) + 1))
+        degrees = (np.interp(at_m, track.measure_m[part], of[part]) for of in (track.latitude_deg, track.longitude_deg))
+        for column, values in zip(columns, (np.full(len(at_m), float(number)), at_m, *degrees), strict=True):
+            column.append(values)
+    element, *others = (np.concatenate(column) for column in columns)
+    return Along(element.astype(np.int64), *others)
+
+
+def geometric_measures_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
+    """Distance from the first point along one element [m]: 3-D where every height is known."""
+    flat = np.zeros_like(latitude_deg)
+    heights = flat if np.isnan(height_m).any() else height_m
+    return np.concatenate([[0.0], np.cumsum(distances_m(latitude_deg, longitude_deg, heights))])
+
+
+def end_places(track: Track) -> Floats:
+    """Earth-centred places [m] of the ends of elements at height zero: `[element, 0 start or 1 end]`."""
+    vertices = np.column_stack([track.first[:-1], track.first[1:] - 1]).ravel()
+    places = points_of(track.latitude_deg[vertices], track.longitude_deg[vertices])
+    return places.surface.reshape(-1, 2, 3)
+
+
+def gaps_m(one: Floats, other: Floats) -> Floats:
+    """Lengths of gaps between ends that count as track [m]: 0 where it is only survey noise."""
+    gap = np.linalg.norm(one - other, axis=-1)
+    return np.where(gap > GAP_COUNTS_M, gap, 0.0)
+
+
+_NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "measure_m", "sigma_m")
+
+
+def _all_or_none(height_m: Floats, first: Ints) -> Floats:
+    """Heights of an element only where all of its points have one: half a profile is no profile."""
+    unknown = np.add.reduceat(np.isnan(height_m).astype(np.int64), first[:-1]) > 0
+    return np.where(np.repeat(unknown, np.diff(first)), np.nan, height_m)
+
+
+def in_pieces(track: Track) -> Track:
+    """The track with its elements in pieces, each of its element's name and measures, in order."""
+    pieces = pieces_of(track)
+    if all(len(parts) == 1 for parts in pieces):
+        return track
+    return track_in_parts(track, [(element, part) for element, parts in enumerate(pieces) for part in parts])
+
+
+def pieces_of(track: Track) -> list[list[slice]]:
+    """Per element the vertices of its pieces in order; neighbours share one.
+
+    A piece ends where it has turned by more than a right angle since its start.
+    """
+    owner, vertex = _spaced_vertices(track)
+    along = np.diff(points_of(track.latitude_deg[vertex], track.longitude_deg[vertex]).surface, axis=0)
+    own = owner[:-1] == owner[1:]
+    start = np.searchsorted(owner, np.arange(len(track.ids)))
+    turned = own & (np.einsum("ij,ij->i", along, along[np.minimum(start[owner[:-1]], len(along) - 1)]) < 0.0)
+    cuts: list[list[int]] = [[] for _ in track.ids]
+    for element in np.unique(owner[:-1][turned]).tolist():
+        since = int(start[element])
+        for number in range(since, int(np.searchsorted(owner, element, side="right")) - 1):
+            if along[number] @ along[since] < 0.0:
+                cuts[element].append(int(vertex[number]))
+                since = number
+    pieces = []
+    for element, inside in enumerate(cuts):
+        whole = track.vertices(element)
+        ends = [whole.start, *inside, whole.stop - 1]
+        pieces.append([slice(begin, end + 1) for begin, end in itertools.pairwise(ends)])
+    return pieces
+
+
+def _spaced_vertices(track: Track) -> tuple[Ints, Ints]:
+    """Elements and vertices, the first in every so many metres."""
+    owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
+    number = np.floor((track.measure_m - track.measure_m[track.first[owner]]) / _DIRECTION_OVER_M)
+    kept = np.flatnonzero((np.diff(number, prepend=-1.0) != 0) | (np.diff(owner, prepend=-1) != 0))
+    return owner[kept], kept
+
+
+def track_in_parts(track: Track, parts: Sequence[tuple[int, slice]]) -> Track:
+    """Parts of elements in the given order, as elements; `index` gives the first of each name."""
+    rows = np.concatenate([np.arange(part.start, part.stop) for _, part in parts])
+    names = tuple(track.ids[element] for element, _ in parts)
+    return Track(
+        ids=names,
+        index={name: number for number, name in reversed(list(enumerate(names)))},
+        first=np.concatenate([[0], np.cumsum([part.stop - part.start for _, part in parts])]),
+        latitude_deg=track.latitude_deg[rows],
+        longitude_deg=track.longitude_deg[rows],
+        height_m=track.height_m[rows],
+        measure_m=track.measure_m[rows],
+        sigma_m=track.sigma_m[rows],
+        length_m=np.array([track.measure_m[part.stop - 1] - track.measure_m[part.start] for _, part in parts]),
+    )

@@ -1,0 +1,220 @@
+"""`balise claim`: every requirement of a profile as met, not met or not shown, over all runs of a result."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from typing import Any
+
+import polars as pl
+
+from pipeline.results import store
+from pipeline.storage.address import Address
+from pipeline.studies.claim.front import front_of
+from pipeline.studies.claim.profile import Profile
+from pipeline.studies.claim.requirements import ALL, Requirement, Ride, Tallies, requirements, tallies
+from pipeline.studies.claim.tally import ALWAYS, S_PER_H, Finding, Tally, drawn
+from pipeline.studies.line import distinct
+from schemas.config import Configuration
+from schemas.enums import TRUTH, RunStatus
+from schemas.run import Site
+
+SCHEMA = {
+    **dict.fromkeys(("solution", "requirement", "applies_to", "limit", "demanded", "finding"), pl.String),
+    **dict.fromkeys(("events", "possible_events", "trials", "kept", "broken"), pl.Int64),
+    **dict.fromkeys(("measured", "low", "high", "worst", "hours", "hours_known", "hours_needed"), pl.Float64),
+    **dict.fromkeys(("clause", "reason"), pl.String),
+}
+
+
+@dataclass(frozen=True)
+class Claim:
+    """`table`: one row per solution and requirement; `notes`: what the result as a whole cannot say."""
+
+    profile: Profile
+    table: pl.DataFrame
+    notes: list[str]
+
+
+def claim(
+    out: Address,
+    profile: Profile,
+    site: Site | None = None,
+    areas: pl.DataFrame | None = None,
+    ahead_m: float = 0.0,
+) -> Claim:
+    """Hold all complete runs of a result against a profile; `ahead_m`: front end ahead of the balise antenna."""
+    run_ids = store.complete_runs(out)
+    config = store.read_config(out) or Configuration()
+    for run_id, metadata in store.completed_runs(out).items():
+        store.check_site(site, metadata.get("site_digest"), run_id)
+    runs = store.read_table(out, "runs").collect()
+    done = runs.filter((pl.col("status").cast(pl.String) != RunStatus.FAILED.value) & pl.col("run_id").is_in(run_ids))
+    done, twice = distinct(done)
+    found: dict[str, Tallies] = defaultdict(dict)
+    days: set[tuple[object, ...]] = set()
+    # Which run of a day is its trial is drawn before an error is looked at, and apart from its instant.
+    for run in sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}")):
+        told = _tallies_of(out, run, config, profile, areas, ahead_m)
+        if profile.method.independent == "day" and run["t_start"] is not None:
+            told = _once_a_day(told, (run["solution"], run["t_start"].date()), days)
+        _add(found[run["solution"]], told)
+    outside_h = sum(counts["no_area", ALL].held_s for counts in found.values()) / S_PER_H
+    notes = [*twice, *_notes(runs, outside_h, areas, ahead_m)]
+    if profile.method.independent == "run":
+        notes.append(
+            'Runs of one day count as independent; `method.independent = "day"` of a profile counts one a day.'
+        )
+    return Claim(profile, claim_table(found, profile), notes)
+
+
+def _once_a_day(told: Tallies, day: tuple[object, ...], days: set[tuple[object, ...]]) -> Tallies:
+    """Without the trials of requirements that another run of the day was a trial of; time and events stay."""
+    spent = {key for key, counts in told.items() if counts.trials and (*day, *key) in days}
+    days.update((*day, *key) for key, counts in told.items() if counts.trials)
+    return {
+        key: replace(counts, trials=0, kept=0, broken=0) if key in spent else counts for key, counts in told.items()
+    }
+
+
+def _tallies_of(
+    out: Address,
+    run: dict[str, Any],
+    config: Configuration,
+    profile: Profile,
+    areas: pl.DataFrame | None,
+    ahead_m: float,
+) -> Tallies:
+    of_run = (store.read_table(out, name, run["run_id"]).collect() for name in ("epochs", "passages"))
+    epochs, passages = (frame.filter(pl.col("solution") == run["solution"]) for frame in of_run)
+    front = front_of(epochs, passages, run, config, profile.method, areas, ahead_m)
+    ride = Ride(_name(run), front, epochs, passages, profile)
+    return tallies(ride) | {("no_area", ALL): ride.outside()}
+
+
+def _name(run: dict[str, Any]) -> str:
+    """What draws the trial of a run."""
+    return f"{run['run_id']}\n{run['solution']}"
+
+
+def _add(sums: Tallies, more: Tallies) -> None:
+    for key, counts in more.items():
+        sums[key] = sums.get(key, Tally()) + counts
+
+
+def claim_table(found: dict[str, Tallies], profile: Profile) -> pl.DataFrame:
+    """One row per solution and requirement, those of the profile that nothing was recorded for included."""
+    rows = [
+        _row(solution, one, counts.get(one.key, Tally()))
+        for solution, counts in sorted(found.items())
+        for one in requirements(profile)
+    ]
+    return pl.DataFrame(rows, schema=SCHEMA, orient="row")
+
+
+def _row(solution: str, one: Requirement, counts: Tally) -> dict[str, Any]:
+    shown = one.demand.shown(counts)
+    return {
+        "solution": solution,
+        "requirement": one.name,
+        "applies_to": one.applies_to,
+        "limit": one.limit,
+        "demanded": one.demand.words,
+        "finding": shown.finding.value,
+        "events": counts.events,
+        "possible_events": counts.possible,
+        "trials": counts.trials,
+        "kept": counts.kept,
+        "broken": counts.broken,
+        "measured": shown.measured.value,
+        "low": shown.measured.low,
+        "high": shown.measured.high,
+        "worst": counts.worst,
+        "hours": counts.held_s / S_PER_H,
+        "hours_known": counts.known_s / S_PER_H,
+        "hours_needed": shown.needed_h,
+        "clause": one.clause,
+        "reason": _reason(one, shown.finding, counts),
+    }
+
+
+# What a recording cannot say of a requirement, however long it is.
+_NEVER = {
+    ("start", "last position"): "no recording tells what the unit knew at switch-on; worst: time to a position in use",
+    ("start", "cold movement"): "no recording tells what the unit knew at switch-on",
+    ("start", "nothing known"): "a recording begins after switch-on, so times are too short; worst: time to a TVB or "
+    "an accepted balise",
+    ("cold_movement", ALL): "a train without power records nothing",
+    ("speed_accuracy", ALL): "speed is compared as a mean over a window; what lies within it is not seen",
+    ("availability", ALL): "the confidence of speed is not recorded, and gaps of the log are not counted",
+}
+
+
+def _reason(one: Requirement, finding: Finding, counts: Tally) -> str | None:
+    """Why a requirement is not shown, in words."""
+    if finding is not Finding.NOT_SHOWN:
+        return None
+    if one.key in _NEVER:
+        return _NEVER[one.key]
+    if one.name == "way_without_balise":
+        return "no run is long enough" if not counts.trials else "no event on ways long enough; that is no proof"
+    if not counts.held_s and not counts.trials:
+        return "nothing recorded to which it applies"
+    if not counts.known_s:
+        return "the evidence says nothing of it: too wide, missing, or the position in doubt"
+    if one.demand is ALWAYS:
+        return "no exceedance was seen, and no number of hours proves a maximum that is demanded without a probability"
+    if counts.events == 0 and counts.known_s < counts.held_s:
+        return "too few runs or hours; part of the time the evidence does not say"
+    return "too few runs or hours"
+
+
+def _notes(runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahead_m: float) -> list[str]:
+    """What the reader must know before the rows."""
+    said = []
+    failed = runs.filter(pl.col("status").cast(pl.String) == RunStatus.FAILED.value).height
+    if failed:
+        said.append(f"{failed} of {runs.height} rows of runs failed and are not counted.")
+    if areas is None:
+        said.append("Without areas (`--site` with areas.csv or areas.parquet) nothing is said of limits by area type.")
+    blind = runs.filter(~pl.col("evidence").cast(pl.String).is_in(TRUTH).fill_null(value=False)).height
+    if blind:
+        said.append(
+            f"{blind} of {runs.height} runs have no reference and no balise reads: they can show no error small."
+        )
+    settings = runs["config_digest"].n_unique()
+    if settings > 1:
+        said.append(
+            f"{settings} configurations or vehicle files: trains may differ. Errors do not depend on where the front "
+            "end is, but areas are looked up with one distance for all."
+        )
+    elif not ahead_m:
+        said.append("Areas are looked up at the balise antenna; `--front-ahead` puts the front end ahead of it.")
+    if outside_h and areas is not None:
+        said.append(f"{outside_h:.3g} h lie outside all areas: no limit by area type applied there.")
+    late = runs["latency_sigma_s"].null_count()
+    if late:
+        said.append(f"{late} of {runs.height} runs have no figure of latency: safe front ends are not widened for it.")
+    said.append(
+        "No recording can show maxima demanded without a probability (MAPO, MAPU, MASO, MASU, below 30 km/h, way "
+        "without balise), accuracy of speed, start of mission, cold movement and availability: they can "
+        "only be found broken. `--csv` has the reasons."
+    )
+    said.append("Nothing is said of the rear end: the length of the train is not recorded.")
+    return said
+
+
+def for_reading(table: pl.DataFrame) -> pl.DataFrame:
+    """The rows as they fit a screen: what was found of each requirement, and what it rests on."""
+    drawn = pl.when(pl.col("demanded").str.starts_with("p >=")).then(pl.format("{}/{}", "kept", "trials"))
+    solution = ["solution"] if table["solution"].n_unique() > 1 else []
+    return table.select(
+        *solution,
+        pl.col("requirement"),
+        pl.col("applies_to").alias("of"),
+        pl.col("finding"),
+        pl.col("events"),
+        drawn.alias("runs kept"),
+        pl.col("hours_needed").round_sig_figs(3).alias("hours needed"),
+        pl.col("limit"),
+    )

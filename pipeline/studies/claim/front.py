@@ -1,0 +1,218 @@
+"""Estimated and safe front end of a train at each epoch, and what the judge knows of their errors.
+
+A position in use gives the estimate, with its confidence. Where none is in use it is the report of ETCS: the last
+relevant balise and the odometer's way since then, with its over- and under-reading amounts. Uncertain latency widens
+both at speed. Else there is no estimate. Errors do not depend on where on the train the front end is.
+
+Its speed is compared with the one that the evidence leaves, as means over windows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.epochs.clock import Clock
+from pipeline.studies.claim.areas import Placed, placed
+from pipeline.studies.claim.profile import KMH_PER_MPS, Method
+from pipeline.studies.claim.tally import codes, within
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
+from schemas.config import Configuration
+from schemas.enums import Judgement, PassageStatus, VehicleFigures
+
+
+@dataclass(frozen=True)
+class Front:
+    """Of one solution of one run, per epoch; NaN is not known.
+
+    `path_m`: estimate of the balise antenna, `front_m`: estimated front end, both path positions. `over_m`: estimate
+    minus min safe front end, `under_m`: max safe front end minus estimate. `low_m`, `high_m`: error of the estimate in
+    the direction of travel, as an interval. `proved`: the interval is complete and the track is right; `judged`: it may
+    show an exceedance; `wrong_track`: the track is wrong for certain. `speed_late_s`: speeds are means over so long.
+    """
+
+    clock: Clock
+    path_m: Floats
+    front_m: Floats
+    over_m: Floats
+    under_m: Floats
+    low_m: Floats
+    high_m: Floats
+    proved: Bools
+    judged: Bools
+    wrong_track: Bools
+    speed_mps: Floats
+    speed_late_s: float
+    direction: Floats
+    where: Placed
+
+    @property
+    def output(self) -> Bools:
+        """The unit says where the train is."""
+        return np.isfinite(self.path_m)
+
+    @property
+    def silent_s(self) -> Floats:
+        """How long the log holds nothing after what each epoch holds [s]."""
+        steps = np.diff(self.clock.t_ns, append=self.clock.t_ns[-1:]) / NS_PER_S
+        return np.where(self.clock.held_s > 0, 0.0, steps)
+
+    @property
+    def least_m(self) -> Floats:
+        """The smallest size that the error of the estimate may have."""
+        return np.maximum(np.maximum(self.low_m, -self.high_m), 0.0)
+
+    def within(self, over_m: Floats | float, under_m: Floats | float) -> Ints:
+        """Whether the estimate is at most so far ahead of the train and so far behind it (`codes`)."""
+        inside, beyond = within(self.low_m, self.high_m, over_m, under_m)
+        asked = np.isfinite(over_m) | np.isfinite(under_m)
+        return codes(asked & self.proved & inside, asked & ((self.judged & beyond) | self.wrong_track))
+
+
+def front_of(
+    epochs: pl.DataFrame,
+    passages: pl.DataFrame,
+    run: dict[str, Any],
+    config: Configuration,
+    method: Method,
+    areas: pl.DataFrame | None = None,
+    ahead_m: float = 0.0,
+) -> Front:
+    """From the tables of one solution of one run; `ahead_m`: front end ahead of the balise antenna."""
+    path, direction, speed = (floats(epochs, name) for name in ("path_m", "direction", "speed_mps"))
+    gnss = flags(epochs, "in_use") & np.isfinite(path)
+    reported = _reported_m(epochs, passages)
+    estimate = np.where(gnss, path, reported)
+    over, under = (np.where(gnss, floats(epochs, "confidence_m"), floats(epochs, name)) for name in _DOUBTS)
+    late_over, late_under = _latency_s(epochs, run, config)
+    shift = np.where(gnss, 0.0, direction * (estimate - path))
+    low, high = floats(epochs, "error_low_m") + shift, floats(epochs, "error_high_m") + shift
+    right, wrong, elsewhere = _judged(epochs, config.hazards.failure_limit_m)
+    there, known = np.isfinite(estimate), np.isfinite(low) & np.isfinite(high)
+    # A train that has not moved yet has no direction of travel: its front end is looked up at the antenna.
+    front = estimate + np.nan_to_num(direction) * ahead_m
+    return Front(
+        clock=Clock.of(epochs, config),
+        path_m=estimate,
+        front_m=front,
+        over_m=over + np.abs(speed) * late_over,
+        under_m=under + np.abs(speed) * late_under,
+        low_m=low,
+        high_m=high,
+        proved=there & known & right,
+        judged=there & known & (right | (wrong & ~elsewhere)),
+        wrong_track=gnss & elsewhere,
+        speed_mps=speed,
+        speed_late_s=config.align.speed_window_s,
+        direction=direction,
+        where=_areas_at(front, epochs, areas, method.area_reach_m),
+    )
+
+
+_DOUBTS = ("doubt_over_m", "doubt_under_m")
+
+
+def _judged(epochs: pl.DataFrame, limit_m: float) -> tuple[Bools, Bools, Bools]:
+    """Right; wrong; wrong for the track, since the place along it does not make it so."""
+    judgement = epochs["judgement"].cast(pl.String)
+    right, wrong = ((judgement == word).to_numpy() for word in (Judgement.RIGHT.value, Judgement.WRONG.value))
+    with np.errstate(invalid="ignore"):
+        along = (floats(epochs, "error_low_m") > limit_m) | (floats(epochs, "error_high_m") < -limit_m)
+    return right, wrong, wrong & ~along
+
+
+def _latency_s(epochs: pl.DataFrame, run: dict[str, Any], config: Configuration) -> tuple[Floats, Floats]:
+    """By how much latency widens the interval behind and ahead of the estimate [s]; what is not known widens nothing.
+
+    A learned latency is not taken out of positions (DOMAIN 5.1), so the train may be ahead by it.
+    """
+    spread = config.lds.ci_factor * (run["latency_sigma_s"] or 0.0)
+    learned = run["vehicle"] == VehicleFigures.LEARNED.value
+    late = np.nan_to_num(floats(epochs, "latency_s")) if learned else np.zeros(epochs.height)
+    return np.maximum(spread - late, 0.0), np.maximum(spread + late, 0.0)
+
+
+def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
+    """Path position by the last relevant balise and the odometer's way since then."""
+    accepted = passages.filter(pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value).drop_nulls("path_m")
+    odometer, distance = floats(epochs, "odometer_m"), floats(epochs, "distance_from_lrvb_m")
+    origin_m = odometer - floats(epochs, "direction") * distance
+    path, names = floats(epochs, "path_m"), epochs["lrvb_id"]
+    changed = np.flatnonzero((names.is_not_null() & names.ne_missing(names.shift())).to_numpy())
+    base = np.full(epochs.height, np.nan)
+    for first, last in pairwise([*changed.tolist(), epochs.height]):
+        places = accepted.filter(pl.col("balise_id") == names[first])["path_m"].to_numpy()
+        if places.size:
+            near = places if not np.isfinite(path[first]) else places[[np.abs(places - path[first]).argmin()]]
+            base[first:last] = near[0] - origin_m[first]
+    base[names.is_null().to_numpy()] = np.nan
+    return base + odometer
+
+
+def _areas_at(front_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None, reach_m: float) -> Placed:
+    """The area of each front end: that of the run's epoch that is nearest on the path, none beyond the reach."""
+    known = epochs.select("path_m", "netelement_id", "measure_m").drop_nulls().sort("path_m")
+    fronts = pl.DataFrame({"path_m": front_m}, schema={"path_m": pl.Float64}).fill_nan(None).with_row_index("row")
+    near = fronts.drop_nulls().sort("path_m").join_asof(known, on="path_m", strategy="nearest", tolerance=reach_m)
+    places = fronts.select("row").join(near, on="row", how="left", maintain_order="left")
+    return placed(areas, places["netelement_id"], places["measure_m"])
+
+
+@dataclass(frozen=True)
+class SpeedErrors:
+    """Per window: its end, length, largest estimated speed, and the mean of estimate minus truth as an interval.
+
+    NaN where the evidence does not know it. The mean is beyond the limit at the largest speed only if some instant is
+    beyond the limit at its own speed (limits grow with speed); a mean within says nothing of the instants.
+    """
+
+    t_ns: Ints
+    length_s: Floats
+    fastest_kmh: Floats
+    low_kmh: Floats
+    high_kmh: Floats
+
+    def within(self, over_kmh: Floats | float, under_kmh: Floats | float) -> Ints:
+        """Whether the estimate is at most so much above the train's speed and so much below it (`codes`)."""
+        return codes(*within(self.low_kmh, self.high_kmh, over_kmh, under_kmh))
+
+
+def speed_errors(front: Front, window_s: float) -> SpeedErrors:
+    """One window after the other; none over a gap, a reversal, or epochs without a speed."""
+    clock = front.clock
+    pairs = _windows(front, round(window_s * NS_PER_S))
+    first, last = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    length = (clock.t_ns[last] - clock.t_ns[first]) / NS_PER_S
+    steps = 0.5 * (front.speed_mps[1:] + front.speed_mps[:-1]) * clock.held_s[:-1]
+    way = np.concatenate(([0.0], np.cumsum(np.nan_to_num(steps))))
+    sense = front.direction[first]
+    estimated = sense * (way[last] - way[first])
+    run_m = sense * (front.path_m[last] - front.path_m[first])
+    # The evidence calls the position itself right at both ends, so path less error is where the train was.
+    known = front.proved[first] & front.proved[last]
+    # The estimate is a mean over the time before each epoch: how late that is while the speed changes is not known.
+    late_m = front.speed_late_s * np.abs(front.speed_mps[last] - front.speed_mps[first])
+    least = run_m - (front.high_m[last] - front.low_m[first]) - late_m
+    most = run_m - (front.low_m[last] - front.high_m[first]) + late_m
+    low, high = (np.where(known, (estimated - way_m) / length, np.nan) for way_m in (most, least))
+    fastest = np.array([np.abs(front.speed_mps[begin : end + 1]).max() for begin, end in pairs], dtype=np.float64)
+    return SpeedErrors(clock.t_ns[last], length, *(speed * KMH_PER_MPS for speed in (fastest, low, high)))
+
+
+def _windows(front: Front, window_ns: int) -> list[tuple[int, int]]:
+    held, t_ns, sense = front.clock.held_s, front.clock.t_ns, front.direction
+    usable = np.isfinite(front.speed_mps) & np.isfinite(sense) & (sense != 0)
+    joined = usable[:-1] & usable[1:] & (held[:-1] > 0) & (sense[:-1] == sense[1:])
+    found: list[tuple[int, int]] = []
+    begin = 0
+    for row, together in enumerate(joined, start=1):
+        if not together:
+            begin = row
+        elif t_ns[row] - t_ns[begin] >= window_ns:
+            found.append((begin, row))
+            begin = row
+    return found

@@ -1,0 +1,341 @@
+"""Each requirement of a profile: its words, how it is counted on one solution of one run, what the counts show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import pairwise
+
+import numpy as np
+import polars as pl
+
+from pipeline.studies.claim.areas import AREA_TYPES, NO_AREA
+from pipeline.studies.claim.front import Front, SpeedErrors, speed_errors
+from pipeline.studies.claim.profile import KMH_PER_MPS, AreaLimits, Profile
+from pipeline.studies.claim.tally import (
+    ALWAYS,
+    BROKEN,
+    NOT_KNOWN,
+    S_PER_H,
+    Demand,
+    Tally,
+    at_least,
+    below,
+    codes,
+    of_availability,
+    tally,
+)
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags
+from schemas.enums import AreaType, BaliseKind, PassageStatus
+
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Ride:
+    """One solution of one run: its front end, and the tables that the requirements ask for beside it."""
+
+    name: str
+    front: Front
+    epochs: pl.DataFrame
+    passages: pl.DataFrame
+    profile: Profile
+
+    def tally(self, code: Ints, where: Bools, size: Floats | None = None) -> Tally:
+        """Of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
+        clock, silent = self.front.clock, self.front.silent_s
+        rows = np.flatnonzero(where | ((silent > 0) & np.append(where[1:], False)))
+        here = where[rows]
+        held, told = np.where(here, clock.held_s[rows], 0.0), np.where(here, code[rows], NOT_KNOWN)
+        sizes = None if size is None else np.where(here, size[rows], np.nan)
+        return tally(self.name, clock.t_ns[rows], held, told, self.profile.method.event_gap_s, sizes, silent[rows])
+
+    def inside(self, kind: AreaType) -> Bools:
+        """Epochs with an estimated front end in areas of this type."""
+        inside: Bools = self.front.output & (self.front.where.area == AREA_TYPES.index(kind))
+        return inside
+
+    @cached_property
+    def limit_m(self) -> Floats:
+        """MAPO and MAPU at each epoch; NaN outside all areas."""
+        limits = np.full(self.front.front_m.size, np.nan)
+        for kind, demanded in self.profile.areas.items():
+            here = self.front.where.area == AREA_TYPES.index(kind)
+            limits[here] = demanded.limits_m(self.front.where.track_speed_mps[here])
+        return limits
+
+    @cached_property
+    def beyond(self) -> dict[str, tuple[Ints, Floats]]:
+        """The intervals claimed, and the errors known, against MAPO and MAPU: codes and sizes."""
+        front, limit_m, none = self.front, self.limit_m, np.inf
+        with np.errstate(invalid="ignore"):
+            claimed = [codes(width <= limit_m, width > limit_m) for width in (front.over_m, front.under_m)]
+        return {
+            "mapo_claimed": (claimed[0], front.over_m),
+            "mapu_claimed": (claimed[1], front.under_m),
+            "mapo": (_asked(front.within(limit_m, none), limit_m), front.low_m),
+            "mapu": (_asked(front.within(none, limit_m), limit_m), -front.high_m),
+        }
+
+    @cached_property
+    def speeds(self) -> SpeedErrors:
+        return speed_errors(self.front, self.profile.method.speed_window_s)
+
+    @cached_property
+    def safe(self) -> Ints:
+        """The train between min and max safe front end."""
+        return self.front.within(self.front.over_m, self.front.under_m)
+
+    def outside(self) -> Tally:
+        """Time with an estimated front end outside all areas."""
+        nowhere = self.front.output & (self.front.where.area == NO_AREA)
+        return self.tally(np.full(nowhere.size, NOT_KNOWN), nowhere)
+
+
+Key = tuple[str, str]
+Tallies = dict[Key, Tally]
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One requirement: its limit in words, what is demanded, and how a run counts."""
+
+    name: str
+    applies_to: str
+    limit: str
+    demand: Demand
+    clause: str
+    count: Callable[[Ride], Tally] = lambda _: Tally()
+
+    @property
+    def key(self) -> Key:
+        return self.name, self.applies_to
+
+
+def tallies(ride: Ride) -> Tallies:
+    """Every requirement on one ride."""
+    return {one.key: one.count(ride) for one in requirements(ride.profile)}
+
+
+def requirements(profile: Profile) -> list[Requirement]:
+    """The requirements of a profile in their order."""
+    rate = profile.failure_rate
+    return [
+        *(one for kind, area in profile.areas.items() for one in _of_area(kind, area, profile)),
+        Requirement("safe_front_end", ALL, "own CI", below(rate.aim_per_h), rate.clause, _safe),
+        Requirement("safe_front_end_bound", ALL, "own CI", below(rate.bound_per_h), rate.clause, _safe),
+        *(one for kind in profile.slow.area_types for one in _slow(kind, profile)),
+        *_after_balise(profile),
+        *_speed(profile),
+        *_start(profile),
+        *_operation(profile),
+    ]
+
+
+def _safe(ride: Ride, kind: AreaType | None = None) -> Tally:
+    """The train between min and max safe front end, in areas of one type or wherever it is."""
+    where = ride.front.output if kind is None else ride.inside(kind)
+    return ride.tally(ride.safe, where, ride.front.least_m)
+
+
+def _asked(code: Ints, limit: Floats) -> Ints:
+    return np.where(np.isfinite(limit), code, NOT_KNOWN)
+
+
+def _of_area(kind: AreaType, area: AreaLimits, profile: Profile) -> list[Requirement]:
+    def exceeded(ride: Ride, name: str) -> Tally:
+        code, size = ride.beyond[name]
+        return ride.tally(code, ride.inside(kind), size)
+
+    def close(ride: Ride) -> Tally:
+        code = ride.front.within(area.accuracy_m, area.accuracy_m)
+        return ride.tally(code, ride.inside(kind), ride.front.least_m)
+
+    of, rate = kind.value, profile.failure_rate
+    limit = f"{area.limit_m:g} m" if not area.way_s else f"{area.limit_m:g} m/{area.way_s:g} s"
+    near, often = f"{area.accuracy_m:g} m", at_least(area.accuracy_share)
+    return [
+        *(
+            Requirement(name, of, limit, ALWAYS, area.limit_clause, partial(exceeded, name=name))
+            for name in ("mapo_claimed", "mapu_claimed", "mapo", "mapu")
+        ),
+        Requirement("safe_front_end", of, "own CI", below(rate.aim_per_h), rate.clause, partial(_safe, kind=kind)),
+        Requirement("front_accuracy", of, near, often, area.accuracy_clause, close),
+    ]
+
+
+def _slow(kind: AreaType, profile: Profile) -> list[Requirement]:
+    """Safe and precise operation at low speed: claimed and known."""
+    slow, of = profile.slow, kind.value
+
+    def here(ride: Ride) -> Bools:
+        return ride.inside(kind) & (np.abs(ride.front.speed_mps) * KMH_PER_MPS < slow.below_kmh)
+
+    def claimed(ride: Ride) -> Tally:
+        width = np.maximum(ride.front.over_m, ride.front.under_m)
+        return ride.tally(codes(width <= slow.limit_m, width > slow.limit_m), here(ride), width)
+
+    def known(ride: Ride, limit_m: float) -> Tally:
+        return ride.tally(ride.front.within(limit_m, limit_m), here(ride))
+
+    limit, close = f"{slow.limit_m:g} m", f"{slow.accuracy_m:g} m"
+    safe, accurate = (partial(known, limit_m=one) for one in (slow.limit_m, slow.accuracy_m))
+    return [
+        Requirement("slow_claimed", of, limit, ALWAYS, slow.clause, claimed),
+        Requirement("slow_front_end", of, limit, ALWAYS, slow.clause, safe),
+        Requirement("slow_accuracy", of, close, at_least(slow.accuracy_share), slow.clause, accurate),
+    ]
+
+
+def _after_balise(profile: Profile) -> list[Requirement]:
+    """The first estimate after each balise accepted; physical ones, and virtual ones as if they were.
+
+    Where it comes late or not at all nobody knows what it would have been.
+    """
+    after = profile.after_balise
+
+    def count(ride: Ride, kind: BaliseKind) -> Tally:
+        front, limit = ride.front, after.limit_m(ride.front.speed_mps)
+        code = np.append(_asked(front.within(limit, limit), limit), NOT_KNOWN)
+        faster = np.append(np.abs(front.speed_mps) * KMH_PER_MPS > after.to_kmh, False)
+        at_ns = _passed(ride.passages, kind)
+        rows = _first_after(front, at_ns)
+        at_ns, rows = at_ns[~faster[rows]], rows[~faster[rows]]
+        # Each balise weighs the same, whatever time its epoch holds.
+        counts = tally(ride.name, at_ns, np.zeros(rows.size), code[rows], profile.method.event_gap_s)
+        held, known = np.append(front.clock.held_s, 0.0)[rows], code[rows] != NOT_KNOWN
+        return replace(counts, held_s=float(held.sum()), known_s=float(held[known].sum()))
+
+    near = f"{after.fixed_m:g} m, from {after.below_kmh:g} km/h {after.offset_m:g} m + {after.per_mps_s:g} s·v"
+    often, kinds = at_least(after.share), (BaliseKind.PHYSICAL, BaliseKind.VIRTUAL)
+    return [
+        Requirement("after_balise", kind.value, near, often, after.clause, partial(count, kind=kind)) for kind in kinds
+    ]
+
+
+def _passed(passages: pl.DataFrame, kind: BaliseKind) -> Ints:
+    """When each accepted balise of a kind was passed as far as known [ns], in order."""
+    status, kinds = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
+    accepted = passages.filter((status == PassageStatus.ACCEPTED.value) & (kinds == kind.value))
+    at = accepted.select(t=pl.coalesce("t_offered", "t_true")).drop_nulls()
+    return np.sort(at["t"].dt.timestamp("ns").to_numpy())
+
+
+def _first_after(front: Front, at_ns: Ints) -> Ints:
+    """The epoch at or right after each instant; one beyond the last where there is none, or a gap lies between."""
+    t_ns = front.clock.t_ns
+    row = np.searchsorted(t_ns, at_ns)
+    late = np.append(t_ns, np.iinfo(np.int64).max)[row] - at_ns > front.clock.limit_s * NS_PER_S
+    return np.where(late, t_ns.size, row)
+
+
+def _speed(profile: Profile) -> list[Requirement]:
+    safe, speed = profile.safe_speed, profile.speed
+
+    def count(ride: Ride, limit_kmh: Callable[[Floats], Floats], over: bool = True, under: bool = True) -> Tally:
+        limit = limit_kmh(ride.speeds.fastest_kmh)
+        code = ride.speeds.within(limit if over else np.inf, limit if under else np.inf)
+        return _of_windows(ride, code, np.isfinite(limit))
+
+    margin = f"{safe.low_kmh:g} km/h to {safe.below_kmh:g}, {safe.high_kmh:g} at {safe.at_kmh:g} km/h"
+    near = f"{speed.fixed_kmh:g} km/h to {speed.to_kmh:g} km/h, {speed.above_share:.0%} above"
+    ahead = partial(count, limit_kmh=safe.limit_kmh, under=False)
+    behind = partial(count, limit_kmh=safe.limit_kmh, over=False)
+    close = partial(count, limit_kmh=speed.limit_kmh)
+    return [
+        Requirement("maso", ALL, margin, ALWAYS, safe.clause, ahead),
+        Requirement("masu", ALL, margin, ALWAYS, safe.clause, behind),
+        Requirement("speed_accuracy", ALL, near, at_least(speed.share, by_means=True), speed.clause, close),
+    ]
+
+
+def _of_windows(ride: Ride, code: Ints, where: Bools) -> Tally:
+    """Of windows of speed, and of the gaps of the log between them, in order of time."""
+    found, gaps = ride.speeds, np.flatnonzero(ride.front.silent_s > 0)
+    gap_s, nothing = ride.front.silent_s[gaps], np.zeros(gaps.size)
+    t_ns = np.concatenate((found.t_ns, ride.front.clock.t_ns[gaps]))
+    held_s = np.concatenate((found.length_s, nothing))
+    silent_s = np.concatenate((np.zeros(found.t_ns.size), gap_s))
+    told = np.concatenate((code, np.full(gaps.size, NOT_KNOWN)))
+    order = np.argsort(t_ns, kind="stable")
+    rows = order[np.concatenate((where, gap_s > 0))[order]]
+    gap = ride.profile.method.event_gap_s
+    return tally(ride.name, t_ns[rows], held_s[rows], told[rows], gap, silent_s=silent_s[rows])
+
+
+def _start(profile: Profile) -> list[Requirement]:
+    """Start of mission: times from the log's begin, which is no switch-on."""
+    start = profile.start
+
+    def first(ride: Ride) -> Tally:
+        return Tally(trials=1, worst=_first_s(ride, flags(ride.epochs, "in_use")))
+
+    def nothing(ride: Ride) -> Tally:
+        worst = _first_s(ride, flags(ride.epochs, "tvb") | ride.epochs["lrvb_id"].is_not_null().to_numpy())
+        waited = (ride.front.clock.duration_s or 0.0) if worst is None else worst
+        return replace(_one(broken=waited > start.nothing_s), worst=worst)
+
+    moved = profile.cold_movement
+    return [
+        Requirement("start", "last position", f"{start.last_position_s:g} s", ALWAYS, start.clause, first),
+        Requirement("start", "cold movement", f"{start.cold_movement_s:g} s", ALWAYS, start.clause),
+        Requirement("start", "nothing known", f"{start.nothing_s:g} s", ALWAYS, start.clause, nothing),
+        Requirement("cold_movement", ALL, f"{moved.detected_h:g} h", ALWAYS, moved.clause),
+    ]
+
+
+def _first_s(ride: Ride, there: Bools) -> float | None:
+    t_ns = ride.front.clock.t_ns
+    return float((t_ns[there][0] - t_ns[0]) / NS_PER_S) if there.any() else None
+
+
+def _one(broken: bool) -> Tally:
+    """A run that broke a demand, or of which nobody can say that it kept it."""
+    return Tally(trials=1, broken=int(broken), events=int(broken), possible=1)
+
+
+def _operation(profile: Profile) -> list[Requirement]:
+    """Availability, and ways without physical balises: none is ever proved."""
+    asked, way_m = profile.availability, profile.way.without_balise_m
+    outside = f"{asked.outside_s:g} s in {asked.within_s / S_PER_H:g} h"
+    demand = Demand(f"p >= {asked.share:g}", lambda found: of_availability(found, asked.share, asked.outside_s))
+    return [
+        Requirement("availability", ALL, outside, demand, asked.clause, _availability),
+        Requirement("way_without_balise", ALL, f"{way_m / 1000:g} km", ALWAYS, profile.way.clause, _ways),
+    ]
+
+
+def _availability(ride: Ride) -> Tally:
+    """Time lost once there was an output; broken where so much of it lies within so long.
+
+    Lost is no output, or an interval wider than MAPCI; gaps of the log, where nobody knows, are left out.
+    """
+    front, asked = ride.front, ride.profile.availability
+    with np.errstate(invalid="ignore"):
+        lost: Bools = ~front.output | (front.over_m + front.under_m > 2.0 * ride.limit_m)
+    held = front.clock.held_s * (np.cumsum(front.output) > 0)
+    t_s = (front.clock.t_ns - front.clock.t_ns[:1]) / NS_PER_S
+    until = np.cumsum(np.where(lost, held, 0.0))
+    before = np.concatenate(([0.0], until))[np.searchsorted(t_s, t_s - asked.within_s)]
+    worst_s = float((until - before).max(initial=0.0))
+    return replace(
+        _one(broken=worst_s >= asked.outside_s),
+        held_s=float(held.sum()),
+        known_s=float(held[~lost].sum()),
+        worst=worst_s,
+        longest_s=front.clock.duration_s or 0.0,
+    )
+
+
+def _ways(ride: Ride) -> Tally:
+    """Ways of at least the demanded length between physical balises; broken where MAPO or MAPU was exceeded on one."""
+    odometer = ride.epochs["odometer_m"].cast(pl.Float64).to_numpy()
+    way = np.cumsum(np.abs(np.nan_to_num(np.diff(odometer, prepend=odometer[:1]))))
+    cuts = np.searchsorted(ride.front.clock.t_ns, _passed(ride.passages, BaliseKind.PHYSICAL))
+    bounds = np.unique(np.concatenate(([0], cuts, [way.size])))
+    broken = np.logical_or.reduce([code == BROKEN for code, _ in ride.beyond.values()])
+    lengths = [float(way[min(last, way.size - 1)] - way[first]) for first, last in pairwise(bounds)]
+    long = [number for number, length in enumerate(lengths) if length >= ride.profile.way.without_balise_m]
+    bad = sum(bool(broken[bounds[number] : bounds[number + 1]].any()) for number in long)
+    return Tally(trials=len(long), broken=bad, events=bad, possible=len(long), worst=max(lengths, default=None))

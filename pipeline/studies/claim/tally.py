@@ -1,0 +1,216 @@
+"""Counts of a requirement that add up over runs, and what they show.
+
+A run is one trial of a share: of its time one instant is drawn, without a look at its error, because epochs of a run
+err together. A gap of the log is time of which nobody knows. Weaker evidence turns what is kept or broken into what is
+not known; that counts as broken before anything is called `met`, and as kept before anything is called `not met`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from pipeline.stages.run_row.bounds import (
+    UNKNOWN,
+    Estimate,
+    clopper_pearson,
+    hours_still_needed,
+    poisson_rate,
+    poisson_rate_upper,
+)
+from pipeline.studies.line import trials_needed
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
+
+S_PER_H = 3600.0
+KEPT, NOT_KNOWN, BROKEN = 1, 0, -1
+
+
+_COUNTS = ("trials", "kept", "broken", "events", "possible", "held_s", "known_s")
+
+
+class Finding(StrEnum):
+    """What the data say of a requirement."""
+
+    MET = "met"
+    NOT_MET = "not met"
+    NOT_SHOWN = "not shown"
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Of one run, or of many added up.
+
+    `trials`: independent ones, of which `kept` and `broken` are known. `events`: known exceedances, `possible`: how
+    many there may be at most with all that is not known. `held_s`: time that the requirement applied, `known_s`: of it
+    judged. `worst`: largest size known; `longest_s`: the longest run.
+    """
+
+    trials: int = 0
+    kept: int = 0
+    broken: int = 0
+    events: int = 0
+    possible: int = 0
+    held_s: float = 0.0
+    known_s: float = 0.0
+    worst: float | None = None
+    longest_s: float = 0.0
+
+    def __add__(self, other: Tally) -> Tally:
+        sizes = [size for size in (self.worst, other.worst) if size is not None]
+        counts = {name: getattr(self, name) + getattr(other, name) for name in _COUNTS}
+        return Tally(**counts, worst=max(sizes, default=None), longest_s=max(self.longest_s, other.longest_s))
+
+
+def within(low: Floats, high: Floats, over: Floats | float, under: Floats | float) -> tuple[Bools, Bools]:
+    """Whether an error between `low` and `high` is at most `over` and not below `-under`; whether it is beyond."""
+    with np.errstate(invalid="ignore"):
+        return (high <= over) & (low >= -np.asarray(under)), (low > over) | (high < -np.asarray(under))
+
+
+def codes(kept: Bools, broken: Bools) -> Ints:
+    """One of `KEPT`, `NOT_KNOWN`, `BROKEN` per epoch; what is broken is not kept."""
+    return np.where(broken, BROKEN, np.where(kept, KEPT, NOT_KNOWN)).astype(np.int64)
+
+
+def tally(
+    run: str,
+    t_ns: Ints,
+    held_s: Floats,
+    code: Ints,
+    gap_s: float,
+    size: Floats | None = None,
+    silent_s: Floats | None = None,
+) -> Tally:
+    """Of the epochs of one run to which a requirement applies, in order of time; `run` draws its trial.
+
+    `silent_s`: how long the log holds nothing after each epoch's own time `held_s`; nobody knows what was then.
+    """
+    if code.size == 0:
+        return Tally()
+    silent = np.zeros(code.size) if silent_s is None else silent_s
+    trial = _trial(run, held_s, silent, code)
+    known = code != NOT_KNOWN
+    sizes = size[known & np.isfinite(size)] if size is not None else np.empty(0)
+    doubtful = (code != KEPT) | (silent > 0)
+    until_ns = t_ns + np.where(silent > 0, (held_s + silent) * NS_PER_S, 0).astype(np.int64)
+    return Tally(
+        trials=1,
+        kept=int(trial == KEPT),
+        broken=int(trial == BROKEN),
+        events=len(clusters_s(t_ns[code == BROKEN], t_ns[code == BROKEN], gap_s)),
+        possible=sum(int(span_s // gap_s) + 1 for span_s in clusters_s(t_ns[doubtful], until_ns[doubtful], gap_s)),
+        held_s=float(held_s.sum()),
+        known_s=float(held_s[known].sum()),
+        worst=float(sizes.max()) if sizes.size else None,
+    )
+
+
+def clusters_s(from_ns: Ints, to_ns: Ints, gap_s: float) -> list[float]:
+    """Lengths [s] of the groups of stretches that lie no more than `gap_s` apart; in order of time."""
+    if from_ns.size == 0:
+        return []
+    apart = np.flatnonzero(from_ns[1:] - to_ns[:-1] > gap_s * NS_PER_S)
+    first = from_ns[np.concatenate(([0], apart + 1))]
+    last = to_ns[np.concatenate((apart, [to_ns.size - 1]))]
+    lengths: list[float] = ((last - first) / NS_PER_S).tolist()
+    return lengths
+
+
+def _trial(run: str, held_s: Floats, silent_s: Floats, code: Ints) -> int:
+    """The code of one instant by chance; of one epoch where none of them holds for any time."""
+    # What an epoch holds, then what is silent after it, one after the other.
+    lengths = np.column_stack([held_s, silent_s]).ravel()
+    codes_of = np.column_stack([code, np.full(code.size, NOT_KNOWN)]).ravel()
+    if not lengths.any():
+        lengths, codes_of = np.ones(code.size), code
+    until = np.cumsum(lengths)
+    return int(codes_of[np.searchsorted(until, drawn(run) * until[-1], side="right")])
+
+
+def drawn(run: str) -> float:
+    """A number from 0 to below 1 by chance, always the same for the same run."""
+    return int.from_bytes(hashlib.sha256(run.encode()).digest()[:6], "big") / (1 << 48)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A finding with its bounds; `needed_h`: hours still to be run, without a further event, to show the demand."""
+
+    finding: Finding
+    measured: Estimate = UNKNOWN
+    needed_h: float | None = None
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What is demanded of a requirement in words, and what counts show of it."""
+
+    words: str
+    shown: Callable[[Tally], Shown]
+
+
+def at_least(share: float, by_means: bool = False) -> Demand:
+    """This share of all trials; `by_means`: what is kept as a mean may be exceeded at an instant, so is never met."""
+
+    def shown(found: Tally) -> Shown:
+        told = of_share(found, share)
+        unmet = Finding.NOT_SHOWN if told.finding is Finding.MET else told.finding
+        return replace(told, finding=unmet, needed_h=None) if by_means else told
+
+    return Demand(f"p >= {share:g}", shown)
+
+
+def below(rate_per_h: float) -> Demand:
+    return Demand(f"< {rate_per_h:g} /h", lambda found: of_rate(found, rate_per_h))
+
+
+def of_share(found: Tally, share: float) -> Shown:
+    """At least this share, by exact bounds over runs (Clopper and Pearson)."""
+    measured = clopper_pearson(found.kept, found.kept + found.broken)
+    if found.trials == 0:
+        return Shown(Finding.NOT_SHOWN)
+    least = clopper_pearson(found.kept, found.trials).low or 0.0
+    most = clopper_pearson(found.trials - found.broken, found.trials).high
+    if least >= share:
+        return Shown(Finding.MET, measured, 0.0)
+    finding = Finding.NOT_MET if most is not None and most < share else Finding.NOT_SHOWN
+    hours = found.held_s / found.trials / S_PER_H
+    needed = trials_needed(found.trials - found.kept, found.trials, 1.0 - share)
+    return Shown(finding, measured, needed * hours if hours > 0 and needed is not None else None)
+
+
+def of_rate(found: Tally, rate_per_h: float) -> Shown:
+    """Below this rate [1/h], by exact Poisson bounds on events; the one-sided bound for `met`, as a THR claim needs."""
+    hours = found.held_s / S_PER_H
+    measured = poisson_rate(found.events, found.known_s / S_PER_H)
+    if hours <= 0.0:
+        return Shown(Finding.NOT_SHOWN, needed_h=hours_still_needed(rate_per_h, found.possible, 0.0))
+    low, high = poisson_rate(found.events, hours).low, poisson_rate_upper(found.possible, hours)
+    needed_h = hours_still_needed(rate_per_h, found.possible, hours)
+    if high is not None and high <= rate_per_h:
+        return Shown(Finding.MET, measured, 0.0)
+    return Shown(Finding.NOT_MET if low is not None and low > rate_per_h else Finding.NOT_SHOWN, measured, needed_h)
+
+
+def of_always(found: Tally) -> Shown:
+    """A maximum without a probability: one event breaks it, no number of hours shows it."""
+    measured = poisson_rate(found.events, found.known_s / S_PER_H)
+    return Shown(Finding.NOT_MET if found.events else Finding.NOT_SHOWN, measured)
+
+
+def of_availability(found: Tally, share: float, outside_s: float) -> Shown:
+    """Broken runs were unavailable for `outside_s` at least, so for that part of the longest run at least.
+
+    Never `met`: the result does not hold the confidence of speed, nor what stood in gaps of the log.
+    """
+    broken = clopper_pearson(found.broken, found.trials) if found.trials else UNKNOWN
+    lost = (broken.low or 0.0) * outside_s / found.longest_s if found.longest_s > 0 else 0.0
+    measured = Estimate(found.known_s / found.held_s, None, 1.0 - lost) if found.held_s > 0 else UNKNOWN
+    return Shown(Finding.NOT_MET if lost > 1.0 - share else Finding.NOT_SHOWN, measured)
+
+
+ALWAYS = Demand("always", of_always)

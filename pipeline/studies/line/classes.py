@@ -1,0 +1,165 @@
+"""Classes of pieces by exact bounds over passes."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.run_row.bounds import clopper_pearson
+from pipeline.studies.line.pieces import Pieces
+from pipeline.studies.line.spans import FIRST_LOSS, State
+from pipeline.studies.line.trials import trials_needed
+from schemas.conform import conform
+from schemas.line import LOSSES, SHORT_OF_SATELLITES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
+
+KEYS = ["piece", "growing"]
+_TRIALS = ["bad", "passes", "wrong_in_use", "unjudged"]
+
+
+def piece_classes(
+    passes: pl.DataFrame, undetected: pl.DataFrame, pieces: Pieces, criteria: LineCriteria
+) -> pl.DataFrame:
+    """`LinePieces` of the passes of all runs (with `run_id`); `undetected`: `piece, largest_undetected_m`."""
+    places = pl.DataFrame(
+        {
+            "piece": np.arange(len(pieces.element)),
+            "netelement_id": pieces.names,
+            "from_m": pieces.from_m,
+            "to_m": pieces.to_m,
+        }
+    ).join(pl.DataFrame({"growing": [True, False]}), how="cross")
+    side = pl.when("growing").then(pl.lit(LineDirection.GROWING.value)).otherwise(pl.lit(LineDirection.FALLING.value))
+    counted = (
+        places.join(_counted(passes, criteria), on=KEYS, how="left", maintain_order="left")
+        .join(undetected, on="piece", how="left", maintain_order="left")
+        .with_columns(
+            pl.col(pl.UInt32).cast(pl.Int64).fill_null(0),
+            pl.col("monitors", "hours_of_day").fill_null(""),
+            direction=side,
+        )
+        .with_columns(bad=pl.col("lost") + pl.col("wrong_in_use"))
+        .with_columns(passes=pl.col("right") + pl.col("bad"))
+    )
+    return conform(_judged(counted, criteria), LinePieces)
+
+
+def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
+    """Independent passes: each run, or the worst of a day."""
+    if criteria.independent == "pass":
+        return passes
+    # Loss, then what the evidence should have shown, then right, then what says nothing.
+    state = pl.col("state").replace_strict({int(State.UNKNOWN): 2, int(State.RIGHT): 1}, default=0)
+    dated = passes.with_columns(
+        day=pl.col("t").dt.date(), judged=pl.when(pl.col("state") >= int(FIRST_LOSS)).then(3).otherwise(state)
+    )
+    # Of passes as bad as each other the one with the fewest satellites, those that tell none last.
+    order, falling = ("judged", "state", "cause", "satellites"), [True, True, False, False]
+    worst = dated.sort(order, descending=falling, nulls_last=True).group_by(*KEYS, "day", maintain_order=True)
+    claimed = dated.group_by(*KEYS, "day").agg(pl.col("claimed").any())
+    return worst.first().drop("claimed").join(claimed, on=[*KEYS, "day"])
+
+
+def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
+    """Counts per piece and direction; hours of the day are those of all right passes."""
+    state, cause = pl.col("state"), pl.col("cause")
+    usual = pl.col("satellites").filter(state == int(State.RIGHT)).median().over("run_id")
+    passes = passes.with_columns(few=pl.col("satellites") <= criteria.satellites_share * usual)
+    right, wrong = state == int(State.RIGHT), state == int(State.WRONG_IN_USE)
+    lost = (state >= int(FIRST_LOSS)) & ~wrong
+    hour = pl.col("t").dt.strftime("%H").unique()
+    hours = passes.filter(right).group_by(KEYS).agg(hours=hour.len(), hours_of_day=hour.sort().str.join(" "))
+    return (
+        trials(passes, criteria)
+        .group_by(KEYS)
+        .agg(
+            right=right.sum(),
+            lost=lost.sum(),
+            wrong_in_use=wrong.sum(),
+            claimed_wrongly=pl.col("claimed").sum(),
+            unknown=state.is_between(int(State.UNSEEN), int(State.UNKNOWN)).sum(),
+            unjudged=(state == int(State.UNKNOWN)).sum(),
+            after_alarm=(state == int(State.AFTER_ALARM)).sum(),
+            wrong_track=(cause == LineCause.WRONG_TRACK.value).sum(),
+            unsafe=(cause == LineCause.UNSAFE_ACCEPTANCE.value).sum(),
+            days=pl.col("t").filter(right | lost | wrong).dt.date().n_unique(),
+            few_satellites=(pl.col("few") & lost).sum(),
+            monitors=pl.col("monitor").drop_nulls(),
+            **{f"lost_{one.value}": (cause == one.value).sum() for one in LOSSES},
+        )
+        .with_columns(pl.col("monitors").map_elements(_by_frequency, return_dtype=pl.String))
+        .join(hours, on=KEYS, how="left")
+    )
+
+
+def _by_frequency(names: pl.Series) -> str:
+    return " ".join(name for name, _ in sorted(Counter(names).items(), key=lambda one: (-one[1], one[0])))
+
+
+def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
+    """With bounds, class and cause: what was not judged counts against each bound."""
+    cases = counted.select(_TRIALS).unique()
+    bounds = [_bounds(bad, number, wrong, lost, criteria) for bad, number, wrong, lost in cases.iter_rows()]
+    schema = dict.fromkeys(("loss_share", "loss_low", "loss_high", "unsafe_high"), pl.Float64)
+    told = pl.concat(
+        [cases, pl.DataFrame(bounds, schema=schema | {"passes_needed": pl.Int64}, orient="row")], how="horizontal"
+    )
+    misleading = (pl.col("wrong_in_use") > 0) | (pl.col("claimed_wrongly") > 0)
+    unsuitable = misleading | (pl.col("loss_low") > criteria.loss_limit).fill_null(value=False)
+    shown = (pl.col("loss_high") <= criteria.loss_limit).fill_null(value=False)
+    hours = pl.col("hours") >= criteria.hours_least
+    classed = (
+        pl.when(unsuitable)
+        .then(pl.lit(PieceClass.UNSUITABLE.value))
+        .when(shown & hours)
+        .then(pl.lit(PieceClass.SUITABLE.value))
+        .otherwise(pl.lit(PieceClass.UNKNOWN.value))
+    )
+    return counted.join(told, on=_TRIALS, how="left", maintain_order="left").with_columns(
+        piece_class=classed,
+        cause=_cause(unsuitable, shown, hours),
+        passes_needed=pl.when(~unsuitable).then("passes_needed"),
+    )
+
+
+def _cause(unsuitable: pl.Expr, shown: pl.Expr, hours: pl.Expr) -> pl.Expr:
+    """What speaks most against a piece, the first that applies."""
+    lost = pl.concat_list(f"lost_{one.value}" for one in LOSSES).list.arg_max()
+    named = lost.replace_strict(dict(enumerate(one.value for one in LOSSES)), return_dtype=pl.String)
+    few = named.is_in(SHORT_OF_SATELLITES) & (2 * pl.col("few_satellites") > pl.col("lost"))
+    most_lost = pl.when(few).then(pl.lit(LineCause.FEW_SATELLITES.value)).otherwise(named)
+    some = {
+        name: pl.col(name) > 0 for name in ("unsafe", "wrong_in_use", "wrong_track", "lost", "right", "after_alarm")
+    }
+    order: list[tuple[pl.Expr, LineCause | pl.Expr]] = [
+        (some["unsafe"], LineCause.UNSAFE_ACCEPTANCE),
+        ((pl.col("claimed_wrongly") > 0) & ~some["wrong_in_use"], LineCause.CLAIMED_WRONGLY),
+        (some["wrong_in_use"] & some["wrong_track"], LineCause.WRONG_TRACK),
+        (some["wrong_in_use"], LineCause.WRONG),
+        (unsuitable, most_lost),
+        (shown & hours, LineCause.NONE),
+        (shown, LineCause.FEW_HOURS),
+        (pl.col("unjudged") > pl.col("lost"), LineCause.NOT_JUDGED),
+        (some["lost"], most_lost),
+        (some["right"], LineCause.FEW_PASSES),
+        (some["after_alarm"], LineCause.AFTER_ALARM),
+        (pl.col("unknown") > 0, LineCause.NOT_JUDGED),
+    ]
+    return pl.coalesce(
+        *(pl.when(when).then(cause if isinstance(cause, pl.Expr) else pl.lit(cause.value)) for when, cause in order),
+        pl.lit(LineCause.NO_PASS.value),
+    )
+
+
+def _bounds(
+    bad: int, number: int, wrong: int, unjudged: int, criteria: LineCriteria
+) -> tuple[float | None, float | None, float | None, float | None, int | None]:
+    """Share lost with its bounds, upper bound of the share wrong in use, further right passes needed."""
+    low, high, unsafe = (
+        clopper_pearson(events, number + unjudged, criteria.confidence)
+        for events in (bad, bad + unjudged, wrong + unjudged)
+    )
+    share = bad / number if number else None
+    needed = trials_needed(bad + unjudged, number + unjudged, criteria.loss_limit, criteria.confidence)
+    return share, low.low, high.high, unsafe.high, needed

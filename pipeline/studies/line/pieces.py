@@ -1,0 +1,57 @@
+"""The track in pieces of about one length, element by element."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.show.export.places import Ground, ground_of, origin_of, plane_m
+from pipeline.stages.track.survey import Track, track_of
+from schemas.arrays import Floats, Ints
+from schemas.run import Site
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Pieces of all net elements, numbered in the order of the survey; element e has `first[e] : first[e + 1]`."""
+
+    track: Track
+    first: Ints
+    element: Ints
+    from_m: Floats
+    to_m: Floats
+
+    def at(self, element: int, measure_m: Floats) -> Ints:
+        """The piece that holds each measure; beyond an end the last one there."""
+        last = int(self.first[element + 1]) - 1
+        begin = int(self.first[element])
+        found = begin + np.searchsorted(self.from_m[begin : last + 1], measure_m, side="right") - 1
+        return np.clip(found, begin, last).astype(np.int64)
+
+    @property
+    def names(self) -> list[str]:
+        return [self.track.ids[number] for number in self.element]
+
+
+def pieces_of(site: Site, piece_m: float) -> Pieces:
+    """Each element in equal pieces as near to `piece_m` as can be."""
+    track = track_of(site.track)
+    counts = np.maximum(1, np.rint(track.length_m / piece_m)).astype(np.int64)
+    element = np.repeat(np.arange(len(counts)), counts)
+    first = np.concatenate([[0], np.cumsum(counts)])
+    number = np.arange(len(element)) - first[element]
+    begin_m, step_m = track.measure_m[track.first[:-1]][element], (track.length_m / counts)[element]
+    return Pieces(track, first, element, begin_m + number * step_m, begin_m + (number + 1) * step_m)
+
+
+def middles(site: Site, pieces: Pieces) -> Floats:
+    """East and north of each piece's middle [m], `[piece, 2]`."""
+    middle_m = 0.5 * (pieces.from_m + pieces.to_m)
+    return plane_of(site, ground_of(site.track, pl.Series(pieces.names, dtype=pl.String), middle_m))
+
+
+def plane_of(site: Site, ground: Ground) -> Floats:
+    """Places as rows of east and north [m]."""
+    return np.column_stack(plane_m(ground, origin_of(site)))

@@ -1,0 +1,154 @@
+"""Where the train was from each epoch to the next, by the evidence, and what became of the position there."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.epochs.clock import confident, crossing_gap_ns, met, unambiguous, usable
+from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
+from schemas.config import Configuration
+
+
+class State(IntEnum):
+    """What became of a position, best first: of several the last one counts."""
+
+    RIGHT = 0
+    AFTER_ALARM = 1
+    UNSEEN = 2
+    UNKNOWN = 3
+    ALARM = 4
+    CONFIDENCE = 5
+    AMBIGUOUS = 6
+    OUTAGE = 7
+    WRONG = 8
+    WRONG_TRACK = 9
+    WRONG_IN_USE = 10
+
+
+FIRST_LOSS = State.ALARM
+EPOCH_COLUMNS = (
+    *("t", "solution", "netelement_id", "measure_m", "path_m", "error_low_m", "error_high_m", "direction"),
+    *("true_netelement_ids", "true_measure_low_m", "true_measure_high_m"),
+    *("judgement", "in_use", "on_track", "gate_probability", "confidence_m", "satellites"),
+)
+
+
+def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configuration) -> Ints:
+    """`State` per epoch of one solution. An alarm counts where it begins; what it blocks after that does not."""
+    in_use, wrong = flags(epochs, "in_use"), _is(epochs, "wrong")
+    starts = epochs["t"].is_in(alarm_starts.implode()).to_numpy()
+    conditions = [
+        (wrong & in_use, State.WRONG_IN_USE),
+        (wrong & ~np.isfinite(floats(epochs, "error_low_m")), State.WRONG_TRACK),
+        (wrong, State.WRONG),
+        (~met(epochs, usable() & pl.col("confidence_m").is_not_null()), State.OUTAGE),
+        (~met(epochs, unambiguous(config)), State.AMBIGUOUS),
+        (~met(epochs, confident(config)), State.CONFIDENCE),
+        (starts, State.ALARM),
+        (~in_use, State.AFTER_ALARM),
+        (_is(epochs, "right"), State.RIGHT),
+    ]
+    states = np.select([one for one, _ in conditions], [int(state) for _, state in conditions], int(State.UNKNOWN))
+    return states.astype(np.int64)
+
+
+def _is(epochs: pl.DataFrame, judgement: str) -> Bools:
+    return (epochs["judgement"].cast(pl.String) == judgement).fill_null(value=False).to_numpy()
+
+
+def true_path_m(epochs: pl.DataFrame, legs: pl.DataFrame) -> tuple[Floats, Floats]:
+    """Least and largest path position of the train: its place by the evidence, laid on the way that was travelled.
+
+    NaN where the evidence leaves several net elements or none, or one that the way does not lead over. Of several
+    visits to a net element the one counts that is nearest to the position, or to the last one before.
+    """
+    places = epochs.select(
+        netelement_id=pl.when(pl.col("true_netelement_ids").list.len() == 1).then(
+            pl.col("true_netelement_ids").list.first()
+        ),
+        low="true_measure_low_m",
+        high="true_measure_high_m",
+        near=pl.col("path_m").fill_nan(None).forward_fill().backward_fill(),
+    ).with_row_index("row")
+    on_path = (pl.col("offset_m") + pl.col("sign") * pl.col(name) for name in ("low", "high"))
+    visits = (
+        places.drop_nulls(["netelement_id", "low", "high"])
+        .join(legs.select("netelement_id", "sign", "offset_m"), on="netelement_id")
+        .with_columns(*(place.alias(end) for place, end in zip(on_path, ("one", "other"), strict=True)))
+        .with_columns(away=(0.5 * (pl.col("one") + pl.col("other")) - pl.col("near")).abs())
+        .sort("row", "away")
+        .unique("row", keep="first", maintain_order=True)
+    )
+    low, high = np.full((2, epochs.height), np.nan)
+    rows = visits["row"].to_numpy()
+    low[rows] = visits.select(pl.min_horizontal("one", "other")).to_series().to_numpy()
+    high[rows] = visits.select(pl.max_horizontal("one", "other")).to_series().to_numpy()
+    return low, high
+
+
+def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+    """One row per pair of epochs: `low_m, high_m` where the train may have been, `from_m, to_m` where it was most
+    likely, `direction, state, t, elements` (net elements of the train there), `satellites` (the fewer of the two).
+
+    Between two places that are known the worst is told of what lies between where that is a pure outage, or the
+    evidence leaves only net elements of this way (at a joint both of them): else it is unknown, for nobody knows on
+    which piece it was. So is a place known less closely than the failure limit on both sides. What
+    was wrong at an end of such a way, or of an outage, was wrong there and not along it: a row of its own.
+    """
+    low, high = true_path_m(epochs, legs)
+    placed = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
+    t_ns, satellites = times_ns(epochs), floats(epochs, "satellites")
+    possible = epochs["true_netelement_ids"].to_list()
+    here, there = placed[:-1], placed[1:]
+    state = np.maximum(states[here], states[there])
+    silent = (t_ns[there] - t_ns[here] > crossing_gap_ns(t_ns, config.lds)) & (there == here + 1)
+    between = np.flatnonzero(there > here + 1)
+    state[silent] = State.OUTAGE
+    for row in between:
+        inner = slice(here[row] + 1, there[row])
+        way = _way(legs, min(low[here[row]], low[there[row]]), max(high[here[row]], high[there[row]]))
+        state[row] = _between(state[row], states[inner], possible[inner], way)
+    apart = silent | (there > here + 1)
+    ends = np.unique(np.concatenate([here[apart], there[apart]]))
+    ends = ends[states[ends] >= State.WRONG]
+    here, there, state = (np.concatenate(pair) for pair in ((here, ends), (there, ends), (state, states[ends])))
+    wide = np.maximum((high - low)[here], (high - low)[there]) > 2.0 * config.hazards.failure_limit_m
+    state = np.where(wide & (state < State.WRONG), int(State.UNKNOWN), state)
+    middle = 0.5 * (low + high)
+    return pl.DataFrame(
+        {
+            "low_m": np.minimum(low[here], low[there]),
+            "high_m": np.maximum(high[here], high[there]),
+            "from_m": np.minimum(middle[here], middle[there]),
+            "to_m": np.maximum(middle[here], middle[there]),
+            "direction": epochs["direction"].gather(there),
+            "state": state,
+            "t": epochs["t"].gather(here),
+            "elements": _elements(possible, here, there),
+            "satellites": pl.Series(np.fmin(satellites[here], satellites[there]), nan_to_null=True),
+        }
+    )
+
+
+def _way(legs: pl.DataFrame, begin_m: float, end_m: float) -> set[str]:
+    """Net elements that the way leads over between two path positions."""
+    return set(legs.filter((pl.col("last_m") >= begin_m) & (pl.col("first_m") <= end_m))["netelement_id"])
+
+
+def _between(ends: int, inner: Ints, possible: list[list[str] | None], way: set[str]) -> int:
+    """What is known of a way whose inner epochs have no known place; `ends`: the worse of its two ends."""
+    if (inner == State.OUTAGE).all():
+        return int(State.OUTAGE)
+    if all(names and way.issuperset(names) for names in possible):
+        return int(max(ends, inner.max()))
+    return int(State.UNKNOWN)
+
+
+def _elements(possible: list[list[str] | None], here: Ints, there: Ints) -> pl.Series:
+    """Net elements on which the train may have been from one epoch to the other."""
+    pairs = zip(here.tolist(), there.tolist(), strict=True)
+    found = [sorted({name for names in possible[begin : end + 1] for name in names or ()}) for begin, end in pairs]
+    return pl.Series(found, dtype=pl.List(pl.String))

@@ -1,0 +1,183 @@
+"""`balise line`: results of runs over a site to tables, GeoJSON and a page."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from pipeline.results.store import check_site, complete_runs, completed_runs, read_config, read_table
+from pipeline.show.export.places import ground_of
+from pipeline.storage import write_bytes
+from pipeline.studies.line.classes import piece_classes
+from pipeline.studies.line.page import line_page
+from pipeline.studies.line.passes import Ground, passes_of
+from pipeline.studies.line.pieces import Pieces, middles, pieces_of
+from pipeline.studies.line.proposals import Line, proposals, site_balises
+from pipeline.studies.line.remarks import remarks
+from pipeline.studies.line.spans import EPOCH_COLUMNS, State
+from pipeline.studies.line.trials import distinct
+from schemas.arrays import floats
+from schemas.config import Configuration, to_toml
+from schemas.enums import Evidence
+from schemas.errors import InputError, UsageError
+from schemas.line import LineCriteria
+from schemas.run import Site
+
+POINT_COLUMNS = {"name": pl.String, "netelement_id": pl.String, "measure_m": pl.Float64}
+
+
+@dataclass(frozen=True)
+class LineResult:
+    """What `balise line` found, and the files that it wrote, the page first."""
+
+    pieces: pl.DataFrame
+    proposals: pl.DataFrame
+    balises: pl.DataFrame
+    remarks: tuple[str, ...]
+    files: tuple[Path, ...]
+
+    @property
+    def summary(self) -> pl.DataFrame:
+        """Length by direction, class and cause."""
+        length_km = (pl.col("to_m") - pl.col("from_m")).sum() / 1000.0
+        keys = ["direction", "piece_class", "cause"]
+        return self.pieces.group_by(keys).agg(pieces=pl.len(), length_km=length_km).sort(keys)
+
+
+def write_line(
+    out: Path,
+    site: Site,
+    criteria: LineCriteria,
+    solution: str | None = None,
+    points: pl.DataFrame | None = None,
+    to: Path | None = None,
+) -> LineResult:
+    """Classes and proposals from all complete runs of `out`, written to `to` (by default `OUT/line`).
+
+    `points`: stations and signals (`name, netelement_id, measure_m`). Raises `UsageError` for results of another site.
+    """
+    runs, twice = distinct(_runs(out, site, solution))
+    pieces = pieces_of(site, criteria.piece_m)
+    ground = Ground.of(site, pieces, middles(site, pieces))
+    passes, undetected = passes_of_runs(out, runs, ground, criteria)
+    table = piece_classes(passes, undetected, pieces, criteria)
+    lds = (read_config(out) or Configuration()).lds
+    line = Line(site, pieces, table, passes, _known_points(points, pieces), criteria, lds)
+    figures, balises = proposals(line)
+    told = (*twice, *remarks(runs, passes, table, figures, criteria))
+    found = LineResult(table, figures, balises, told, ())
+    return LineResult(table, figures, balises, tuple(told), tuple(_write(found, to or out / "line", line)))
+
+
+def read_points(path: Path) -> pl.DataFrame:
+    """Stations and signals from a CSV with `name, netelement_id, measure_m`."""
+    try:
+        frame = pl.read_csv(path, infer_schema=False)
+        return frame.select(pl.col(name).cast(dtype) for name, dtype in POINT_COLUMNS.items()).drop_nulls()
+    except (pl.exceptions.PolarsError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"cannot be read: {reason}", place=str(path), expected=f"CSV with {', '.join(POINT_COLUMNS)}"
+        ) from None
+
+
+def _runs(out: Path, site: Site, solution: str | None) -> pl.DataFrame:
+    """Rows of `runs` of the solution asked for, those that did not fail; every run is of this site."""
+    names = complete_runs(out)
+    for run, metadata in completed_runs(out).items():
+        check_site(site, metadata.get("site_digest"), run)
+    rows = read_table(out, "runs").collect().filter(pl.col("status") != "failed")
+    known = sorted(rows["solution"].unique().to_list())
+    if not known:
+        raise UsageError("holds no run that could be replayed", place=str(out), found=f"{len(names)} failed runs")
+    chosen = solution or ("primary" if "primary" in known or len(known) > 1 else known[0])
+    if chosen not in known:
+        raise UsageError("is no solution of these runs", place=chosen, found=", ".join(known), remedy="Use --solution.")
+    return rows.filter(pl.col("solution") == chosen).sort("run_id")
+
+
+def passes_of_runs(
+    out: Path, runs: pl.DataFrame, ground: Ground, criteria: LineCriteria
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """The passes of all runs with `run_id`; and the largest undetected error by piece, where the tables have it."""
+    config = read_config(out) or Configuration()
+    parts, errors = [], []
+    for run, solution, evidence in runs.select("run_id", "solution", "evidence").iter_rows():
+        own = pl.col("solution") == solution
+        epochs = read_table(out, "epochs", run).select(EPOCH_COLUMNS).filter(own).collect()
+        passages, alarms = (read_table(out, name, run).filter(own).collect() for name in ("passages", "alarms"))
+        found = passes_of(epochs, passages, alarms, ground, criteria, config)
+        if evidence != Evidence.REFERENCE.value:
+            # Reads and odometers tell by where they are, not by how good positions are: what they miss hides nothing.
+            found = found.with_columns(pl.col("state").replace(int(State.UNKNOWN), int(State.UNSEEN)))
+        parts.append(found.with_columns(run_id=pl.lit(run)))
+        errors.append(_undetected(passages, ground.pieces))
+    return pl.concat(parts), pl.concat(errors).group_by("piece").agg(pl.col("largest_undetected_m").max())
+
+
+def _undetected(passages: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
+    """Largest undetected error at balises, by piece; empty where these tables do not tell it."""
+    columns = [name for name in ("undetected_ahead_m", "undetected_behind_m") if name in passages.columns]
+    empty = pl.DataFrame(schema={"piece": pl.Int64, "largest_undetected_m": pl.Float64})
+    if not columns:
+        return empty
+    known = passages.filter(pl.col("netelement_id").is_in(list(pieces.track.index))).with_columns(
+        largest_undetected_m=pl.max_horizontal(pl.col(name).abs() for name in columns)
+    )
+    places = zip(known["netelement_id"].to_list(), floats(known, "measure_m").tolist(), strict=True)
+    piece = [int(pieces.at(pieces.track.index[name], np.array([at]))[0]) for name, at in places]
+    return known.with_columns(piece=pl.Series(piece, dtype=pl.Int64)).select(empty.columns).drop_nulls()
+
+
+def _known_points(points: pl.DataFrame | None, pieces: Pieces) -> pl.DataFrame:
+    if points is None:
+        return pl.DataFrame(schema=POINT_COLUMNS)
+    if strange := sorted(set(points["netelement_id"]) - set(pieces.track.index)):
+        raise UsageError("are no net elements of the site", place="stations and signals", found=", ".join(strange[:5]))
+    return points
+
+
+def _write(found: LineResult, to: Path, line: Line) -> list[Path]:
+    files = {
+        "index.html": line_page(found.pieces, found.proposals, found.balises, found.remarks, line.criteria).encode(),
+        "pieces.csv": found.pieces.write_csv().encode(),
+        "proposals.csv": found.proposals.write_csv().encode(),
+        "proposed_balises.csv": found.balises.write_csv().encode(),
+        "line.geojson": line_geojson(found, line).encode(),
+        "criteria.toml": to_toml(line.criteria).encode(),
+    }
+    for (name,), balises in found.balises.group_by("proposal", maintain_order=True):
+        files[f"{name}/balises.csv"] = site_balises(balises, line.criteria).write_csv().encode()
+    for name, content in files.items():
+        write_bytes(to / name, content)
+    return [to / name for name in files]
+
+
+def line_geojson(found: LineResult, line: Line) -> str:
+    """Pieces as lines and proposed balises as points (RFC 7946)."""
+    names, pieces = line.pieces.names, line.pieces
+    steps = np.linspace(0.0, 1.0, 6)
+    measures = pieces.from_m[:, None] + (pieces.to_m - pieces.from_m)[:, None] * steps
+    ground = ground_of(line.site.track, pl.Series(np.repeat(names, steps.size), dtype=pl.String), measures.ravel())
+    places = (
+        np.round(np.column_stack([ground.longitude_deg, ground.latitude_deg]), 8).reshape(-1, steps.size, 2).tolist()
+    )
+    features = [
+        _feature("LineString", places[row["piece"]], {"kind": "piece", **row})
+        for row in found.pieces.iter_rows(named=True)
+    ]
+    at = ground_of(line.site.track, found.balises["netelement_id"], floats(found.balises, "measure_m"))
+    spots = np.round(np.column_stack([at.longitude_deg, at.latitude_deg]), 8).tolist()
+    features += [
+        _feature("Point", spot, {**row, "kind": "balise", "kind_of_balise": row["kind"]})
+        for spot, row in zip(spots, found.balises.iter_rows(named=True), strict=True)
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), allow_nan=False)
+
+
+def _feature(kind: str, coordinates: list[object], properties: dict[str, object]) -> dict[str, object]:
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}

@@ -1,0 +1,117 @@
+"""Whether the reference is a copy of the solution under test: then every position would be judged by itself.
+
+A copy has the solution's own errors. An independent record, however good, is off by the solution's errors, so it writes
+the same digits as seldom as these errors are smaller than one of the digits. No place is fitted for this, only the one
+difference of the stamps at which most places come back.
+
+Positions without errors (drawn by a program, to test the replay) equal a true reference. Only the survey tells: they
+lie on the track far nearer than their sigma. There a copy and the truth are the same, and nothing is told.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M, points_of
+from pipeline.studies.plausibility.check import Cause, Check, State
+from pipeline.studies.plausibility.recording import Recording
+from pipeline.studies.plausibility.robust import LEAST
+from pipeline.studies.plausibility.shifts import fit_survey
+from schemas.arrays import Bools, Floats, floats
+from schemas.config import FixSigma
+from schemas.enums import Fix, MisfitCause
+
+_WHAT = "reference against the positions"
+# Fewer moving places in common tell nothing.
+_FEWEST = 3 * LEAST
+# Degrees, minutes and seconds of an angle are written with so many decimals; finer is rounding of the computer [deg].
+_UNITS_DEG, _DECIMALS, _LEAST_DEG = (1.0, 1.0 / 60.0, 1.0 / 3600.0), range(2, 10), 1e-9
+# Rows of the reference that are looked at.
+_ROWS = 4_000
+
+
+class _Track(NamedTuple):
+    """Stamps [s], and latitude and longitude [deg] in rows."""
+
+    t_s: Floats
+    degrees: Floats
+
+    def take(self, rows: Bools) -> _Track:
+        return _Track(self.t_s[rows], self.degrees[rows])
+
+
+def copy_check(of: Recording) -> Check | None:
+    """`impossible` where the reference is a copy of the solution; None where it is none, or nothing tells.
+
+    An exact, a rounded or a thinned copy is told, and one with other stamps.
+    """
+    config, fixes, reference = of.config, of.fixes, of.run.reference
+    if reference is None or of.reference is None:
+        return None
+    own, other = _track(fixes, of.seconds(fixes)), _track(reference, of.seconds(reference))
+    other = other.take(of.reference.moves(other.t_s))
+    other = other.take(np.arange(other.t_s.size) % max(1, other.t_s.size // _ROWS) == 0)
+    if min(own.t_s.size, other.t_s.size) < _FEWEST:
+        return None
+    digit_deg = max(_digit_deg(own.degrees), _digit_deg(other.degrees), _LEAST_DEG)
+    to_m = np.radians(1.0) * SEMI_MAJOR_AXIS_M * np.array([1.0, np.cos(np.radians(own.degrees[0, 0]))])
+    digit_m, sigma_m = digit_deg * to_m, _sigma_m(fixes)
+    # Of a normal error, so much lies within a digit on either side.
+    chance = float(np.prod(np.minimum(1.0, 2.0 * digit_m / (np.sqrt(2.0 * np.pi) * sigma_m))))
+    lag_s = _lag_s(own, other, 2.0 * float(digit_m[0]), config.same_stamp_s) if chance <= config.copy_chance else None
+    if lag_s is None:
+        return None
+    row = np.clip(np.searchsorted(own.t_s, other.t_s - lag_s), 1, own.t_s.size - 1)
+    row -= other.t_s - lag_s - own.t_s[row - 1] < own.t_s[row] - (other.t_s - lag_s)
+    common = np.abs(own.t_s[row] - (other.t_s - lag_s)) <= config.same_stamp_s
+    equal = np.all(np.abs(own.degrees[row] - other.degrees) <= 1.001 * digit_deg, axis=1)[common]
+    if equal.size < _FEWEST or equal.mean() < config.copy_share:
+        return None
+    exact_m = config.without_error * float(sigma_m.min())
+    if of.line is not None and fit_survey(of.gnss, of.line).aside_m < exact_m:
+        return None
+    stamps = f", at stamps {lag_s:+.2f} s from them" if abs(lag_s) > config.same_stamp_s else ""
+    found = (
+        f"{equal.sum()} of {equal.size} places are those of the positions to the last digit ({digit_m[0]:.1g} m)"
+        f"{stamps}; an independent one would be so near in {chance:.1g} of all cases, for the positions have sigma "
+        f"{sigma_m.max():.2g} m"
+    )
+    advice = "Leave the reference out of the run, or record one with another, better instrument."
+    return Check(_WHAT, State.IMPOSSIBLE, found, (Cause(MisfitCause.COPY),), advice=advice, of_evidence=True)
+
+
+def _track(frame: pl.DataFrame, t_s: Floats) -> _Track:
+    degrees = np.column_stack([floats(frame, name) for name in ("latitude_deg", "longitude_deg")])
+    return _Track(t_s, degrees).take(np.all(np.isfinite(degrees), axis=1))
+
+
+def _lag_s(own: _Track, other: _Track, reach_m: float, same_stamp_s: float) -> float | None:
+    """The difference of stamps that most places of the other record have which are in the own one too."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points_of(*own.degrees.T).surface)
+    away_m, row = tree.query(points_of(*other.degrees.T).surface, distance_upper_bound=reach_m)
+    near = np.isfinite(away_m)
+    if near.sum() < _FEWEST:
+        return None
+    lags_s = np.sort(other.t_s[near] - own.t_s[row[near]])
+    alike = np.searchsorted(lags_s, lags_s + same_stamp_s, "right") - np.arange(lags_s.size)
+    first = int(alike.argmax())
+    return float(np.median(lags_s[first : first + alike[first]]))
+
+
+def _digit_deg(degrees: Floats) -> float:
+    """The coarsest last digit that all coordinates of a record have; 0 where they have none."""
+    digits = sorted((unit / 10.0**decimals for unit in _UNITS_DEG for decimals in _DECIMALS), reverse=True)
+    return next((digit for digit in digits if np.abs(degrees / digit - np.rint(degrees / digit)).max() < 1e-3), 0.0)
+
+
+def _sigma_m(fixes: pl.DataFrame) -> Floats:
+    """How far off the positions may be, north and east: as they state, else as their kind of fix usually is."""
+    usual_m = pl.col("fix").cast(pl.String).replace_strict({kind.value: FixSigma().horizontal_m(kind) for kind in Fix})
+    stated = (pl.when(pl.col(name) > 0.0).then(pl.col(name).sqrt()) for name in ("cov_nn_m2", "cov_ee_m2"))
+    told = fixes.select(pl.coalesce(one, usual_m).median().alias(name) for one, name in zip(stated, "ne", strict=True))
+    return np.array(told.row(0), dtype=np.float64)

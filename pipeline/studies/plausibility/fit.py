@@ -1,0 +1,101 @@
+"""The one fit of a run: every check of units, clocks, axes and shifts, for `inspect`, `replay`, `calibrate`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipeline.studies.plausibility.axes import velocity_checks
+from pipeline.studies.plausibility.check import Check, State, not_checked
+from pipeline.studies.plausibility.odometer import odometer_checks
+from pipeline.studies.plausibility.places import read_stamp_checks, reads_lag, reference_checks, survey_checks
+from pipeline.studies.plausibility.recording import recording_of
+from pipeline.studies.plausibility.witnesses import Lag, clock_checks
+from pipeline.studies.plausibility.written import reference_elsewhere, written_checks
+from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
+from schemas.enums import MisfitCause
+from schemas.errors import InputError
+from schemas.run import RunLog, Site
+
+
+@dataclass(frozen=True)
+class Fit:
+    """All checks of one solution."""
+
+    checks: tuple[Check, ...]
+
+    @property
+    def impossible(self) -> tuple[Check, ...]:
+        """What no train can have, and a known cause explains."""
+        return tuple(check for check in self.checks if check.state is State.IMPOSSIBLE)
+
+    @property
+    def unproving(self) -> tuple[Check, ...]:
+        """Evidence that contradicts itself, or is none: nothing is proved by it (DOMAIN section 5.4)."""
+        return tuple(check for check in self.checks if check.of_evidence)
+
+    @property
+    def misfits(self) -> tuple[Check, ...]:
+        """What does not fit, the impossible first."""
+        return (*self.impossible, *(check for check in self.checks if check.state is State.MISFIT))
+
+
+def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityConfig, site: Site | None = None) -> Fit:
+    """Compare the streams of a cleaned run with one solution, the site and the vehicle file where there are any."""
+    of = recording_of(run, solution, config, vehicle, site)
+    if of is None:
+        return Fit((not_checked("positions", "hardly any is valid"),))
+    # Positions that lie on another continent fit nothing else.
+    if written := written_checks(of):
+        return Fit(tuple(written))
+    checks = reference_elsewhere(of)
+    lags: list[Lag] = []
+    beside_reference = False
+    if not checks and run.reference is not None and run.reference.height:
+        of_reference, checks, beside_reference = reference_checks(of)
+        lags.append(of_reference)
+    of_odometer, odometer_lags = odometer_checks(of, lags[0] if lags else None)
+    checks, lags = [*of_odometer, *checks], [*odometer_lags, *lags]
+    if run.balise_reads is not None and run.balise_reads.height and site is not None:
+        lags.append(reads_lag(of, run.balise_reads, site))
+        checks += read_stamp_checks(of, run.balise_reads)
+    if of.line is not None:
+        checks = survey_checks(of, of.line, beside_reference) + checks
+    if of.fixes["vel_e_mps"].null_count() < of.fixes.height:
+        checks += velocity_checks(of.velocity, of.gnss)
+    doubted = any(cause.code is MisfitCause.LATENCY_OF_FILE for check in checks for cause in check.causes)
+    return Fit((*checks, *clock_checks(of, lags, 0.0 if doubted else vehicle.gnss_latency_s or 0.0)))
+
+
+def refuse_impossible(fit: Fit, place: str, config: IngestConfig) -> None:
+    """One error for a run that cannot be as recorded, unless the configuration lets it pass."""
+    found = fit.impossible
+    if not found or config.plausibility == "warn":
+        return
+    raise InputError(
+        "does not fit: " + "; ".join(check.sentence for check in found),
+        place=place,
+        expected="streams of one journey, in the units and times of the contract",
+        remedy='To replay it all the same: [ingest] plausibility = "warn". ' + remedy_of(found),
+    )
+
+
+def lines_of(checks: Sequence[Check]) -> dict[str, str]:
+    """The lines that mend these, by what to do with them."""
+    files = dict.fromkeys(check.into for check in checks if check.lines)
+    return {into: "\n".join(dict.fromkeys(one.lines for one in checks if one.into == into)) for into in files}
+
+
+def remedy_of(checks: Sequence[Check]) -> str:
+    """What mends all of these in one line: advice, then what to write into which file."""
+    advice = list(dict.fromkeys(check.advice for check in checks if check.advice))
+    return " ".join([*advice, *(f"{_inline(into, lines)}." for into, lines in lines_of(checks).items())])
+
+
+def _inline(into: str, lines: str) -> str:
+    """The same lines as they can stand on one line of a message, valid TOML all the same."""
+    head, *tables = lines.split("[[ingest.correct]]\n")
+    if not tables:
+        return f"{into[0].upper()}{into[1:]}: {'; '.join(filter(None, head.splitlines()))}"
+    entries = [f"{{ {', '.join(filter(None, table.splitlines()))} }}" for table in tables]
+    return f"First line of the configuration file: ingest.correct = [{', '.join(entries)}]"

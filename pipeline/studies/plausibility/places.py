@@ -1,0 +1,177 @@
+"""Checks of places: the reference, balise reads and the survey against the positions."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.track.geodesy import points_of
+from pipeline.stages.track.survey import track_of
+from pipeline.studies.plausibility.causes import Datum, datums_at, explain_factor
+from pipeline.studies.plausibility.check import Cause, Check, State, correction, fits, not_checked
+from pipeline.studies.plausibility.copies import copy_check
+from pipeline.studies.plausibility.recording import Recording
+from pipeline.studies.plausibility.records import Places
+from pipeline.studies.plausibility.robust import explains, steady_median
+from pipeline.studies.plausibility.shifts import Line, SurveyFit, common_lag, fit_places, fit_survey, passes
+from pipeline.studies.plausibility.witnesses import Lag
+from schemas.arrays import NS_PER_S, Floats, times_ns
+from schemas.config import PlausibilityConfig
+from schemas.enums import MisfitCause
+from schemas.run import Site
+
+_REFERENCE = "places of the reference against the positions"
+_SURVEY = "positions against the survey"
+# The geoid lies up to so far from the ellipsoid.
+_GEOID_M = 107.0
+# Fewer tell nothing of the clock that stamps them.
+_FEWEST_READS = 3
+_HEIGHT_UNITS = ("feet", "cm", "mm")
+
+
+def reference_checks(of: Recording) -> tuple[Lag, list[Check], bool]:
+    """Clock, place and heights of the reference; and whether it lies where the positions do. A copy tells nothing."""
+    config = of.config
+    if of.reference is None:
+        return Lag("reference", reason="hardly any place"), [], False
+    if copied := copy_check(of):
+        return Lag("reference", reason="a copy of the positions"), [copied], False
+    found = fit_places(of.gnss, of.reference)
+    if found.reason:
+        return Lag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False
+    told = abs(found.lag_s) > max(config.lag_told_s, config.told_sigmas * found.lag_sigma_s)
+    agrees = explains(found.agreeing, 0.0)
+    small = abs(found.lag_s) <= config.lag_limit_s and agrees
+    sure = told and found.lag_is_steady and (small or explains(found.agreeing, found.as_recorded))
+    lag = Lag("reference", found.lag_s, found.lag_sigma_s, sure=sure)
+    if not agrees:
+        words = "no one lag or shift explains them; the positions may be wrong"
+        return lag, [not_checked(_REFERENCE, words)], False
+    near, words = found.shift_m <= config.shift_told_m, f"{found.towards} of them"
+    # No lines: the judge believes the reference, and nobody should shift it to where the positions want it.
+    causes, advice = (Cause(MisfitCause.OFFSET_OF_REFERENCE),), "Find out which of the two is off."
+    beside = Check(_REFERENCE, State.MISFIT, words, causes, advice=advice)
+    beside = fits(_REFERENCE, words) if near or not found.shift_is_steady else beside
+    return lag, [beside, *_reference_heights(of.gnss, of.reference, found.lag_s)], near
+
+
+def _reference_heights(gnss: Places, record: Places, lag_s: float) -> list[Check]:
+    known, t_s = np.isfinite(record.height_m), gnss.t_s + lag_s
+    if known.sum() < 2 or not np.isfinite(gnss.height_m).any():
+        return []
+    height_m = np.where(record.known(t_s), np.interp(t_s, record.t_s[known], record.height_m[known]), np.nan)
+    return _heights("reference", height_m - gnss.height_m, gnss.height_m, 0.0, gnss.config)
+
+
+def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> Lag:
+    """The clock of the balise reads: where the positions pass a balise that was read."""
+    config, places = of.config, _balise_places(site)
+    names = reads["balise_id"].to_list()
+    known = np.array([name in places for name in names], dtype=np.bool_)
+    if known.sum() < _FEWEST_READS:
+        return Lag("balise_reads", reason="fewer than three reads of balises of the site")
+    at_deg = np.array([places[name] for name in names if name in places])
+    number, passed_s = passes(of.gnss, points_of(*at_deg.T), config.read_m)
+    t_s = of.seconds(reads)[known]
+    lag_s, sigma_s = common_lag(t_s[number] - passed_s, int(known.sum()), config)
+    if lag_s is None:
+        return Lag("balise_reads", reason="no one lag explains the reads")
+    # Antennas far from each other pass a balise at other times: what a train can have may be theirs.
+    return Lag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * config.lag_limit_s)
+
+
+def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
+    """Reads of a recorder that keeps whole seconds: the train may be a second of its way farther.
+
+    Where there is a reference it is what the judge looks at.
+    """
+    if of.reference is not None or reads.height < _FEWEST_READS or (times_ns(reads) % NS_PER_S).any():
+        return []
+    return [
+        Check(
+            "stamps of the balise reads",
+            State.MISFIT,
+            f"all {reads.height} are whole seconds",
+            (Cause(MisfitCause.WHOLE_SECONDS),),
+            advice="Record the reads with finer stamps: until then nothing is proved.",
+            of_evidence=True,
+        )
+    ]
+
+
+def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:
+    """Latitude and longitude of the balises on their net elements [deg]."""
+    track, places = track_of(site.track), {}
+    rows = () if site.balises is None else site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
+    for name, element, measure_m in rows:
+        if (number := track.element_at(element, measure_m)) is not None:
+            part = track.vertices(number)
+            degrees = (track.latitude_deg[part], track.longitude_deg[part])
+            places[name] = tuple(float(np.interp(measure_m, track.measure_m[part], axis)) for axis in degrees)
+    return places
+
+
+def survey_checks(of: Recording, line: Line, beside_reference: bool) -> list[Check]:
+    """Positions and heights against the survey; `beside_reference`: the reference lies where the positions do."""
+    found, datum = _by_datum(fit_survey(of.gnss, line), of.gnss, line)
+    heights = _heights("survey", found.up_m, found.height_m, of.vehicle.antenna_height_m, of.config)
+    streams = ("gnss", "reference") if beside_reference else ("gnss",)
+    return [_beside(found, datum, of.config, streams), *heights]
+
+
+def _by_datum(found: SurveyFit, gnss: Places, line: Line) -> tuple[SurveyFit, Datum | None]:
+    """The datum that the survey may be in; between curves a large shift is found only from near it."""
+    if found.aside_m < gnss.config.shift_told_m:
+        return found, None
+    datums = datums_at(float(np.median(gnss.latitude_deg)), float(np.median(gnss.longitude_deg)))
+    fitted = [(found if found.constant else fit_survey(gnss, line, (one.east_m, one.north_m)), one) for one in datums]
+    named = [
+        (fit, datum) for fit, datum in fitted if fit.constant and datum.explains(fit, fit.one_heading, gnss.config)
+    ]
+    return min(named, key=lambda item: item[1].off_m(item[0]), default=(found, None))
+
+
+def _beside(found: SurveyFit, datum: Datum | None, config: PlausibilityConfig, streams: tuple[str, ...]) -> Check:
+    unknown = " (along the track not known: one heading)" if found.one_heading else ""
+    words = f"the survey lies {found.towards} of them{unknown}"
+    told = found.shift_m > config.shift_told_m and found.aside_m > 0.4 * config.shift_told_m
+    if not told or not found.constant:
+        if found.aside_m > config.shift_told_m:
+            return Check(_SURVEY, State.MISFIT, f"they lie {found.aside_m:.0f} m beside the track, not by one shift")
+        return fits(_SURVEY, f"{found.aside_m:.1f} m beside the track usually")
+    if datum is not None:
+        code = MisfitCause.DATUM_LIKELY if found.one_heading else MisfitCause.DATUM
+        causes = (Cause(code, (datum.name, datum.epsg)),)
+        advice = "Name the code in the site's track: first line of track.csv, a column epsg, or crs of GeoJSON."
+        lines = f"# epsg: {datum.epsg}\n"
+        return Check(_SURVEY, State.MISFIT, words, causes, lines, "write as first line of track.csv", advice)
+    shift_m = {"east": round(found.east_m, 1), "north": round(found.north_m, 1)}
+    lines = "".join(correction(stream, shift_m=shift_m) for stream in streams)
+    advice = "Name the survey's EPSG code or mend the survey; only where the shift is known to be the map's:"
+    code = MisfitCause.MAP_SHIFT_BY_REFERENCE if len(streams) > 1 else MisfitCause.MAP_SHIFT
+    return Check(_SURVEY, State.MISFIT, words, (Cause(code),), lines, advice=advice)
+
+
+def _heights(other: str, up_m: Floats, height_m: Floats, offset_m: float, config: PlausibilityConfig) -> list[Check]:
+    """Heights of the survey or reference, which lie `up_m` above those of the positions; `offset_m`: as they should."""
+    what = f"heights against the {other}"
+    apart_m, is_steady = steady_median(up_m + offset_m)
+    if not np.isfinite(apart_m):
+        return []
+    words = f"the {other} lies {apart_m:.0f} m above them"
+    if abs(apart_m) <= 1.5 * config.shift_told_m or not is_steady:
+        return [fits(what, words)]
+    ratio, _ = steady_median(height_m / (height_m + up_m + offset_m))
+    for stream, factor in (("gnss", ratio), (other, 1.0 / ratio)):
+        unit = explain_factor(factor, False, config)
+        name = "" if unit is None else unit.causes[0].figures[0]
+        if unit is not None and name in _HEIGHT_UNITS:
+            causes = (Cause(MisfitCause.HEIGHT_UNIT, ("positions" if stream == "gnss" else other, name)),)
+            lines = "" if stream == "survey" else correction(stream, {"height_m": 1.0 / unit.exact})
+            advice = "Write the survey's heights in metres." if stream == "survey" else ""
+            return [Check(what, State.MISFIT, words, causes, lines, advice=advice)]
+    if abs(apart_m) > _GEOID_M:
+        return [Check(what, State.MISFIT, words, (Cause(MisfitCause.HEIGHT_UNKNOWN),))]
+    # The judge believes the reference: where it has the other zero, somebody has to say which is right.
+    lines = correction("gnss", shift_m={"up": round(apart_m, 1)}) if other == "survey" else ""
+    return [Check(what, State.MISFIT, words, (Cause(MisfitCause.HEIGHT_ZERO),), lines)]

@@ -1,0 +1,131 @@
+"""Streams as records over time: what is compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.track.geodesy import Points, earth_centred_m, points_of
+from schemas.arrays import Bools, Floats, Ints, floats, times_ns
+from schemas.config import PlausibilityConfig
+from schemas.enums import Fix
+
+
+@dataclass(frozen=True)
+class Record:
+    """Values over time [s]: what a counter has counted, in any unit, or places (n, 3) in earth-centred metres."""
+
+    t_s: Floats
+    values: Floats
+    config: PlausibilityConfig
+
+    @cached_property
+    def limit_s(self) -> float:
+        """A longer pause is not bridged."""
+        return max(self.config.speed_s, self.config.bridged_periods * float(np.median(np.diff(self.t_s))))
+
+    def known(self, t_s: Floats) -> Bools:
+        """Whether instants lie between two rows that are no farther apart than the limit."""
+        after = np.searchsorted(self.t_s, t_s, side="left")
+        inside = (after < self.t_s.size) & (t_s >= self.t_s[0])
+        after = np.clip(after, 1, self.t_s.size - 1)
+        known: Bools = inside & (self.t_s[after] - self.t_s[after - 1] <= self.limit_s)
+        return known
+
+    def at(self, t_s: Floats) -> Floats:
+        """Values by straight lines."""
+        axes = [np.interp(t_s, self.t_s, axis) for axis in np.atleast_2d(self.values.T)]
+        return axes[0] if self.values.ndim == 1 else np.column_stack(axes)
+
+    def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
+        """Signed way, or displacement, from some instants to others; NaN where it is not known."""
+        gained, known = self.at(end_s) - self.at(begin_s), self.known(begin_s) & self.known(end_s)
+        return np.where(known if gained.ndim == 1 else known[:, None], gained, np.nan)
+
+    def speed(self, t_s: Floats, over_s: float | None = None) -> Floats:
+        """Signed speed of a counter in its units per second, of positions over ground; NaN where it is not known."""
+        over_s = self.config.speed_s if over_s is None else over_s
+        gained = self.gained(t_s - over_s / 2, t_s + over_s / 2)
+        if gained.ndim == 1:
+            return gained / over_s
+        return np.where(self.known(t_s), np.linalg.norm(gained, axis=1) / over_s, np.nan)
+
+
+@dataclass(frozen=True)
+class Places(Record):
+    """Positions over time, their coordinates at the stream's median height."""
+
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+
+    @cached_property
+    def points(self) -> Points:
+        return points_of(self.latitude_deg, self.longitude_deg)
+
+    @cached_property
+    def moving(self) -> Bools:
+        """Rows at which the train moves for certain."""
+        return self.moves(self.t_s)
+
+    def moves(self, t_s: Floats) -> Bools:
+        """Instants at which the train moves for certain."""
+        moves: Bools = np.nan_to_num(self.speed(t_s)) > self.config.moving_mps
+        return moves
+
+    def way(self, begin_s: Floats, end_s: Floats) -> Floats:
+        """Way from some instants to others [m]: the chord, and by half of it what a curve adds; NaN where unknown."""
+        middle_s = (begin_s + end_s) / 2
+        parts = (begin_s, end_s), (begin_s, middle_s), (middle_s, end_s)
+        chord, first, second = (np.linalg.norm(self.gained(*part), axis=1) for part in parts)
+        return np.asarray(first + second + (first + second - chord) / 3.0)
+
+
+def places_of(frame: pl.DataFrame, epoch_ns: int, config: PlausibilityConfig) -> Places | None:
+    """Valid positions of a cleaned stream, thinned to two a second; None below ten of them."""
+    latitude, longitude = floats(frame, "latitude_deg"), floats(frame, "longitude_deg")
+    valid = np.isfinite(latitude) & np.isfinite(longitude)
+    if "fix" in frame.columns:
+        valid &= (frame["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
+    t_s = seconds_since(epoch_ns, frame)
+    rows = _thinned(t_s, np.flatnonzero(valid))
+    if rows.size < 10:
+        return None
+    t_s, latitude, longitude = t_s[rows], latitude[rows], longitude[rows]
+    height = floats(frame, "height_m")[rows] if "height_m" in frame.columns else np.full(rows.size, np.nan)
+    level_m = float(np.nanmedian(height)) if np.isfinite(height).any() else 0.0
+    flat = np.full(rows.size, level_m if abs(level_m) < 9000.0 else 0.0)
+    return Places(t_s, earth_centred_m(latitude, longitude, flat), config, latitude, longitude, height)
+
+
+def counters_of(odometer: pl.DataFrame, epoch_ns: int, config: PlausibilityConfig) -> dict[str, Record]:
+    """`distance`, and `speed` summed up, of an odometer, each where enough rows have it."""
+    found: dict[str, Record] = {}
+    for name, column in ("distance", "distance_m"), ("speed", "speed_mps"):
+        t_s, values = seconds_since(epoch_ns, odometer), floats(odometer, column)
+        rows = np.flatnonzero(np.isfinite(values))
+        t_s, way = t_s[rows], values[rows]
+        if name == "speed" and rows.size:
+            way = np.concatenate([[0.0], np.cumsum(0.5 * (way[1:] + way[:-1]) * np.diff(t_s))])
+        kept = _thinned(t_s, np.arange(rows.size))
+        if kept.size >= 10:
+            found[name] = Record(t_s[kept], way[kept], config)
+    return found
+
+
+def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
+    """Times of a stream from an instant on [s]."""
+    return np.asarray((times_ns(frame) - epoch_ns) * 1e-9, dtype=np.float64)
+
+
+def _thinned(t_s: Floats, rows: Ints) -> Ints:
+    """Of these rows some two a second, which tell all that is asked here."""
+    t_s = t_s[rows]
+    if t_s.size < 2 or np.median(np.diff(t_s)) >= 0.45:
+        return rows
+    slot = np.floor((t_s - t_s[0]) / 0.5 + 1e-6)
+    kept: Ints = rows[np.diff(slot, prepend=-1.0) > 0]
+    return kept

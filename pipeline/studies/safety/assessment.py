@@ -1,0 +1,166 @@
+"""What a result measured, for an assessor: figures with their bounds, and what they do and do not show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.results import catalogue, store
+from pipeline.results.figures.campaign_figures import derived_tables
+from pipeline.results.figures.map_errors import map_suspects
+from pipeline.show.terminal import show_tables, tall, to_json
+from pipeline.storage.address import Address
+from pipeline.studies.safety.reading import figures_for_reading, some_of, source_files
+from pipeline.studies.safety.sensitivity import Replay, sensitivity
+from pipeline.studies.safety.sentences import (
+    level_statements,
+    plain_statements,
+    reservations,
+    slow_receivers,
+    verdict_statement,
+)
+from pipeline.studies.safety.side_by_side import EPOCH_COLUMNS, side_by_side
+from pipeline.studies.safety.tally import added, architecture_figures
+from schemas.config import Configuration
+from schemas.enums import TRUTH, RunStatus, ThrVerdict
+from schemas.errors import visible
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """`statements` in words, the verdict first; `tables` by name."""
+
+    statements: list[str]
+    tables: dict[str, pl.DataFrame]
+
+
+def show(found: Assessment, as_json: bool) -> None:
+    """Print it: the verdict, each table, what it means; or all of it as JSON."""
+    if as_json:
+        print(to_json({"statements": found.statements, **found.tables}))
+        return
+    print(visible(found.statements[0]) + "\n")
+    show_tables(for_reading(found.tables))
+    print(visible("\n".join(found.statements[1:])))
+
+
+def assess(out: Address, config: Configuration | None = None, replay: Replay | None = None) -> Assessment:
+    """Everything that `balise safety OUT` says, from the tables of all complete runs.
+
+    `config`: its safety budget instead of the result's own, to judge it by other service levels. All else stays as the
+    tables were made with it: limits and the time of a negation are in them. `replay`: as `sensitivity` takes it.
+    """
+    store.complete_runs(out)
+    settings = store.read_config(out) or Configuration()
+    if config is not None:
+        settings = settings.model_copy(update={"safety": config.safety})
+    names = ("runs", "hazards", "passages", "alarms")
+    runs, hazards, passages, alarms = (catalogue.scan(out, name).collect() for name in names)
+    derived = derived_tables(runs, hazards, passages, alarms, settings)
+    of_runs = compare_architectures(out, runs, hazards, alarms, settings)
+    tables = {
+        "sources": source_files(out),
+        "sensitivity": sensitivity(runs, settings, replay),
+        "figures": derived["figures"],
+        "time_to_detect": derived["detection"],
+        "levels": levels_summary(derived["levels"]),
+        "levels_of_runs": derived["levels"],
+        "accuracy": derived["accuracy"],
+        "side_by_side": architecture_figures(added(of_runs.values())),
+        "side_by_side_of_runs": by_run(of_runs),
+        "alarms": alarm_causes(alarms, settings.hazards.map_reach_m),
+        "map": derived["map"],
+    }
+    said = [
+        verdict_statement(runs),
+        *reservations(runs, alarms),
+        *slow_receivers(derived["levels"]),
+        *plain_statements(derived["figures"]),
+        *level_statements(derived["detection"]),
+    ]
+    return Assessment(said, tables)
+
+
+def compare_architectures(
+    out: Address, runs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
+) -> dict[str, pl.DataFrame]:
+    """`side_by_side` of every run that holds several solutions; one run's epochs in memory at a time."""
+    done = runs.filter(pl.col("status") != RunStatus.FAILED)
+    several = done.group_by("run_id").len().filter(pl.col("len") > 1)["run_id"].sort()
+    found = {}
+    for run_id in several.to_list():
+        epochs = store.read_table(out, "epochs", run_id).select(EPOCH_COLUMNS).collect()
+        of_hazards, of_alarms, of_runs = (frame.filter(pl.col("run_id") == run_id) for frame in (hazards, alarms, done))
+        found[run_id] = side_by_side(epochs, of_hazards, of_alarms, of_runs, config)
+    return found
+
+
+def by_run(found: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    """The architectures of each run, one run below the other."""
+    parts = [
+        architecture_figures(counts).insert_column(0, pl.lit(run).alias("run_id")) for run, counts in found.items()
+    ]
+    return pl.concat(parts) if parts else pl.DataFrame()
+
+
+def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
+    """Runs by verdict, per solution and service level; `no_truth`: of how many neither a reference nor balise
+    reads judged, so that no failure means little.
+    """
+    no_truth = (~pl.col("evidence").is_in(TRUTH).fill_null(value=False)).sum().cast(pl.Int64)
+    too_slow = (~pl.col("receiver_quick_enough")).sum().cast(pl.Int64)
+    counts: dict[str, pl.Expr] = {
+        verdict.value: (pl.col("verdict") == verdict.value).sum().cast(pl.Int64) for verdict in ThrVerdict
+    }
+    return (
+        levels.filter(pl.col("solution") != "")
+        .group_by("solution", "service_level", "allowed_s", maintain_order=True)
+        .agg(**counts, no_truth=no_truth, receiver_too_slow=too_slow)
+        .sort("solution", maintain_order=True)
+    )
+
+
+def alarm_causes(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
+    """Alarms by verdict and suspect, the map held to be at fault where several runs agree on a place."""
+    named = map_suspects(alarms, reach_m).with_columns(pl.col("verdict", "suspect").cast(pl.String))
+    keys = ("solution", "verdict", "suspect")
+    counts = {"alarms": pl.len().cast(pl.Int64), "runs": pl.col("run_id").n_unique().cast(pl.Int64)}
+    return named.group_by(keys).agg(**counts).sort(keys)
+
+
+_SHORT = {
+    "time_to_detect": (
+        *("solution", "service_level", "allowed_s", "failures", "within", "exceeded", "failures_judged"),
+        *("within_judged", "within_share_low", "within_share_high"),
+        *("hazardous_median_s", "hazardous_p95_s", "hazardous_max_s", "hazardous_may_max_s"),
+        *("time_to_detect_median_s", "time_to_detect_p95_s", "time_to_detect_max_s"),
+    ),
+    "accuracy": (
+        *("solution", "grouped_by", "group", "location_error_count", "location_error_mean_m"),
+        "location_error_sigma_m",
+        *("location_error_p95_m", "location_error_max_m", "location_accuracy_m", "within_location_accuracy_share_low"),
+        *("within_location_accuracy", "within_ci_limit"),
+    ),
+}
+
+
+def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
+    """The tables as they fit a screen: without those of single runs, wide ones in fewer columns or turned."""
+    figures = figures_for_reading(tables["figures"])
+    shown = {
+        "what this result was made from": some_of(tables["sources"]),
+        "how much the verdict depends on what was chosen": tables["sensitivity"],
+        **{f"figures of {name}, with exact 95 % bounds": table for name, table in figures.items()},
+        "time to detect and hazardous time": tables["time_to_detect"].select(_SHORT["time_to_detect"]),
+        "runs by verdict per service level": tables["levels"],
+        "location error of accepted virtual balises": tables["accuracy"].select(_SHORT["accuracy"]),
+        "composite and reactive fail-safety side by side": tables["side_by_side"],
+        "alarms by verdict and suspect": tables["alarms"],
+        "places where the map is in doubt": tables["map"],
+    }
+    side = "composite and reactive fail-safety side by side"
+    if shown[side].height:
+        shown[side] = tall(shown[side], ("architecture", "solution", "other"))
+    return {name: table for name, table in shown.items() if table.height}

@@ -1,0 +1,117 @@
+"""Faults of one solution, or of a pair: what a diagnosis made of them, and whether its alarms were due."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog
+from pipeline.stages.judge.alarms import verdict_within
+from pipeline.stages.judge.judgement import margins_m
+from pipeline.stages.run_row.independent import missed_detection, since_when_at_most
+from schemas.arrays import NS_PER_S, floats
+from schemas.config import HazardConfig
+from schemas.enums import Verdict
+
+_OPEN_END_NS = 2**63 - 1
+
+
+def faults_of_pair(one: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
+    """Faults of either solution, as from `independent_episodes`; those that overlap are one fault of the pair.
+
+    `common`: a failure of each solution at the same time.
+    """
+    both = pl.concat([_beside(one, other), _beside(other, one)]).sort("begin")
+    end_ns, begin_ns = pl.col("t_end").to_physical().fill_null(_OPEN_END_NS), pl.col("begin").to_physical()
+    apart = begin_ns > end_ns.cum_max().shift(1)
+    return both.group_by(fault=apart.fill_null(value=False).cum_sum(), maintain_order=True).agg(
+        pl.col("begin", "t_failure").min(),
+        t_failure_may=since_when_at_most(),
+        t_end=pl.when(pl.col("t_end").null_count() == 0).then(pl.col("t_end").max()),
+        budget_s=pl.col("budget_s").min(),
+        failed=pl.col("failed").any(),
+        with_truth=pl.col("with_truth").all(),
+        common=pl.col("common").any(),
+    )
+
+
+def _beside(faults: pl.DataFrame, others: pl.DataFrame) -> pl.DataFrame:
+    """`faults`, `common` where both they and one of the others at the same time are failures."""
+    spans = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(_OPEN_END_NS)).rows()
+    met = pl.Series([_overlaps(others, *span) for span in spans], dtype=pl.Boolean)
+    return faults.with_columns(common=pl.col("failed") & met)
+
+
+def _overlaps(faults: pl.DataFrame, begin_ns: int, last_ns: int) -> bool:
+    end = pl.col("t_end").to_physical()
+    meets = (pl.col("begin").to_physical() <= last_ns) & (end.is_null() | (end >= begin_ns))
+    return faults.filter(pl.col("failed") & meets).height > 0
+
+
+def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
+    """Counts of `pipeline.studies.safety.tally`; those of common faults only where `faults` has `common`."""
+    last, kind = int(fails.t_ns[-1]), faults.schema["begin"]
+    ends = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(last)).rows()
+    found = [_detected_ns(fails, *span) for span in ends]
+    failed, missed, judged = pl.col("failed"), pl.col("missed"), pl.col("with_truth")
+    seen = faults.with_columns(t_detected=pl.Series(found, dtype=pl.Int64).cast(kind))
+    seen = seen.with_columns(missed=missed_detection())
+    counts = {
+        "hazards": pl.len(),
+        "failures": failed.sum(),
+        "missed": missed.sum(),
+        "failures_judged": (missed.is_not_null() & judged).sum(),
+        "missed_judged": (missed & judged).sum(),
+    }
+    if "common" in faults.columns:
+        counts |= {"common_failures": pl.col("common").sum(), "common_missed": (pl.col("common") & missed).sum()}
+    delays = [(moment - begin) / 1e9 for moment, (begin, _) in zip(found, ends, strict=True) if moment is not None]
+    return seen.select(**counts).row(0, named=True) | {"delays_s": delays}
+
+
+def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
+    """An alarm that stands at the onset detects at once, else the first fail until the fault's end."""
+    if fails.standing_at(begin) is not None:
+        return begin
+    first = fails.first_in(begin, last + 1)
+    return None if first is None else first[0]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Tables of one solution of a run; `faults` one row per fault; `with_truth`: judged by a reference or reads."""
+
+    epochs: pl.DataFrame
+    faults: pl.DataFrame
+    alarms: pl.DataFrame
+    with_truth: bool
+
+
+def verdict_of_both(alarm: AlarmEpisode, sides: tuple[Solution, Solution], config: HazardConfig) -> Verdict:
+    """True where a solution was wrong, false where both were right all along, unknown where the evidence does not say.
+
+    The rule of the `alarms` table (DOMAIN section 5.3), asked of both solutions.
+    """
+    found = {_of_side(alarm, side, config) for side in sides}
+    return next(verdict for verdict in (Verdict.TRUE, Verdict.UNKNOWN, Verdict.FALSE) if verdict in found)
+
+
+def _of_side(alarm: AlarmEpisode, side: Solution, config: HazardConfig) -> Verdict:
+    since_ns = alarm.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
+    part = side.epochs.filter(pl.col("t").to_physical().is_between(since_ns, alarm.end_ns))
+    known = part.filter(pl.col("path_m").is_not_null())
+    low_m, high_m, sigma_m = (floats(known, name) for name in ("error_low_m", "error_high_m", "sigma_along_m"))
+    if _known_wrong(alarm, side):
+        return Verdict.TRUE
+    return verdict_within(low_m, high_m, margins_m(sigma_m, config), np.full(known.height, side.with_truth))
+
+
+def _known_wrong(alarm: AlarmEpisode, side: Solution) -> bool:
+    """The replay found a fault at that time, or called an alarm then true."""
+    fault = side.faults.select(begin=pl.col("begin").to_physical(), end=pl.col("t_end").to_physical())
+    true = side.alarms.filter(pl.col("verdict").cast(pl.String) == Verdict.TRUE.value)
+    spans = pl.concat([fault, true.select(begin=pl.col("t_start").to_physical(), end=pl.col("t_end").to_physical())])
+    meets = (pl.col("begin") <= alarm.end_ns) & (pl.col("end").is_null() | (pl.col("end") >= alarm.start_ns))
+    return spans.filter(meets).height > 0

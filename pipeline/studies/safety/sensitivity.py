@@ -1,0 +1,98 @@
+"""How much the verdict depends on what was chosen: failure limit, service level, width of the evidence.
+
+Service levels need no new replay: how long each failure was in use stands in the `runs` table. The failure limit and
+the width of the evidence decide what a failure is, and the limit also when a blocked position may return, so that these
+need the logs again.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import polars as pl
+
+from pipeline.campaign import make_plan, run_campaign
+from pipeline.results import store
+from pipeline.stages.run_row.verdict import failures_in, head_of, level_counts, reasons_of, run_verdicts, verdict_of
+from schemas.config import Configuration, Vehicle
+from schemas.enums import RunStatus
+from schemas.errors import UsageError
+
+# Shares of the configured value: a half and half as much again; two to five sigma round the usual three.
+_VARIED = {"failure_limit_m": (0.5, 1.5), "evidence_factor": (2.0 / 3.0, 4.0 / 3.0, 5.0 / 3.0)}
+_TABLES, _REPLAYED, _NEEDED = "from tables", "replayed", "needs --logs"
+
+Row = dict[str, Any]
+Replay = Callable[[Configuration, str], object]
+
+
+def replayed(logs: Sequence[str], site: str | None, vehicle: Vehicle, jobs: int) -> Replay | None:
+    """How to replay these logs with another configuration; none without logs. Raises `UsageError` without a site."""
+    if not logs:
+        return None
+    if site is None:
+        raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
+    return lambda settings, to: run_campaign(make_plan(logs, site, to, settings, vehicle), jobs=jobs)
+
+
+def sensitivity(runs: pl.DataFrame, config: Configuration, replay: Replay | None = None) -> pl.DataFrame:
+    """One row per key of `[hazards]` and value: runs by verdict, wrong acceptances, failures beyond the time allowed.
+
+    `how` says where a row comes from. `replay` replays the logs with a configuration into a folder; without it the rows
+    that need it have no figures.
+    """
+    used = config.hazards.service_level
+    rows: list[Row] = []
+    for level in config.safety.service_levels:
+        allowed_s = config.safety.allowed_time_to_detect_s(level)
+        name = f"{level} ({allowed_s:.4g} s)" + (", configured" if level == used else "")
+        rows.append(_row("service_level", name, at_level(runs, allowed_s, config), _TABLES))
+    for key, shares in _VARIED.items():
+        for value in sorted(round(share * getattr(config.hazards, key), 6) for share in (*shares, 1.0)):
+            rows.append(_varied(runs, config, key, value, replay))
+    return pl.DataFrame(rows, schema=_SCHEMA)
+
+
+def at_level(runs: pl.DataFrame, allowed_s: float, config: Configuration) -> pl.DataFrame:
+    """The `runs` rows as they would be with another allowed time: failures within and beyond it, and the verdict."""
+    return pl.DataFrame(
+        [_with_allowed(row, allowed_s, config) for row in runs.iter_rows(named=True)],
+        schema=runs.schema,
+    )
+
+
+def _with_allowed(row: Row, allowed_s: float, config: Configuration) -> Row:
+    if row["status"] == RunStatus.FAILED:
+        return row
+    within, beyond = level_counts(failures_in(row), allowed_s)
+    counted = {**row, "failures_within_budget": within, "failures_beyond_budget": beyond}
+    reasons = reasons_of(counted, allowed_s, config.hazards.undiagnosed_share)
+    return {**counted, "reasons": reasons, "verdict": verdict_of(reasons).value}
+
+
+def _varied(runs: pl.DataFrame, config: Configuration, key: str, value: float, replay: Replay | None) -> Row:
+    """One key of `[hazards]` at one value."""
+    if value == getattr(config.hazards, key):
+        return _row(key, f"{value:g}, configured", runs, _TABLES)
+    if replay is None:
+        return {"key": key, "value": f"{value:g}", "how": _NEEDED}
+    changed = config.model_copy(update={"hazards": config.hazards.model_copy(update={key: value})})
+    with tempfile.TemporaryDirectory(prefix="balise-safety-") as folder:
+        replay(changed, folder)
+        again = store.read_table(folder, "runs").collect()
+    return _row(key, f"{value:g}", again, _REPLAYED)
+
+
+def _row(key: str, value: str, runs: pl.DataFrame, how: str) -> Row:
+    head = head_of(run_verdicts(runs).values())
+    counts = {name: int(runs[name].sum()) for name in _COUNTS}
+    return {"key": key, "value": value, "how": how, "verdict": head.word, **head.counts(), **counts}
+
+
+_COUNTS = ("unsafe_accepted", "unproven_accepted", "failures", "failures_beyond_budget")
+_SCHEMA = {
+    **dict.fromkeys(("key", "value", "how", "verdict"), pl.String),
+    **dict.fromkeys(("unsafe", "unproven", "safe", "failed", *_COUNTS), pl.Int64),
+}

@@ -1,0 +1,211 @@
+"""Reactive and composite fail-safety on the same run (LOC section III, Fig. 3 and 4), and redundant channels.
+
+Reactive 1oo1: one solution, diagnosed by all monitors but the comparison of channels. Composite 2oo2: the
+comparison of two solutions alone, both of which are needed. Reactive 1oo2: two reactive channels, one of which is
+enough (LOC eq. 11). All are judged after the fact on the same faults, whatever the replay itself compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import polars as pl
+
+from pipeline.stages.epochs.clock import Clock, held_s, may_move, met, nominal_period_s, position_ns, trusted, uptime
+from pipeline.stages.epochs.failure_log import FailureLog, failure_log
+from pipeline.stages.monitors.single import channel_monitor, on_path_of, paired
+from pipeline.stages.run_row.independent import independent_episodes
+from pipeline.stages.run_row.run_figures import judged as judged_epoch
+from pipeline.studies.safety.fault_counts import Solution, fault_counts, faults_of_pair, verdict_of_both
+from pipeline.studies.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
+from schemas.arrays import NS_PER_S, Bools
+from schemas.config import Configuration
+from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
+from schemas.tables import MONITORS, SCALES
+
+Row = dict[str, object]
+
+COMPARISON = "channel"
+_DIAGNOSIS = tuple(name for name in MONITORS if name != COMPARISON)
+_STATES = pl.col("trusted", "known", "wrong")
+_ALONG = tuple(f"along_{scale}" for scale in SCALES)
+EPOCH_COLUMNS = (
+    *("t", "solution", "netelement_id", "measure_m", "path_m", "on_track", "gate_probability", "confidence_m"),
+    *("sigma_along_m", "error_low_m", "error_high_m", "judgement", "moving"),
+    *(f"{name}_{part}" for name in _DIAGNOSIS for part in ("state", "value", "threshold")),
+)
+"""Columns of the epochs that the comparison takes."""
+
+
+@dataclass(frozen=True)
+class _Channel:
+    """Epochs under one kind of diagnosis: its fails, where it worked, and where a truth judged."""
+
+    clock: Clock
+    fails: FailureLog
+    working: Bools
+    known: Bools
+    wrong: Bools
+    moving: Bools
+
+
+def side_by_side(
+    epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame, config: Configuration
+) -> pl.DataFrame:
+    """What each architecture made of one run (`COUNTS`), from its tables with all solutions.
+
+    `epochs` with `EPOCH_COLUMNS`. Working is: a valid, confident, unambiguous position (of both solutions where both
+    are needed), a diagnosis that judges, and no fail now nor in the recovery time before. T_D counts from the
+    fault's onset to the first fail. A false alarm of the comparison is one while both solutions were right. A pair has
+    one row, and the time of all rows is that of the run.
+    """
+    names = sorted(runs.filter(pl.col("status") != RunStatus.FAILED)["solution"].to_list())
+    solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
+    channels = {name: _reactive(one, config) for name, one in solutions.items()}
+    rows: list[Row] = []
+    for name, channel in channels.items():
+        one = solutions[name]
+        verdicts = _verdicts_in_table(channel.fails, one.alarms)
+        found = fault_counts(one.faults, channel.fails) | _alarms(channel, verdicts) | _working(channel)
+        rows.append({"architecture": REACTIVE, "solution": name, **found})
+    for name, other in combinations(names, 2):
+        pair = {"solution": name, "other": other}
+        rows.append({"architecture": COMPOSITE, **pair, **_composite(solutions[name], solutions[other], config)})
+        rows.append({"architecture": REDUNDANT, **pair, **_redundant(channels[name], channels[other])})
+    moving_s = _moving_s(epochs.filter(pl.col("solution").is_in(names)))
+    return pl.DataFrame(rows, schema=COUNTS).with_columns(moving_s=pl.lit(moving_s, pl.Float64))
+
+
+def _moving_s(epochs: pl.DataFrame) -> float | None:
+    """Time in which the train moved or nobody knows whether it did [s], gaps included, from the first epoch of any
+    solution to the last; None where it is never known to have moved (as `runs.availability`).
+    """
+    steps = epochs.group_by("t").agg(may=may_move().any(), known=pl.col("moving").any()).sort("t")
+    steps = steps.with_columns(step_s=(pl.col("t").shift(-1) - pl.col("t")).dt.total_nanoseconds() / NS_PER_S)[:-1]
+    return float(steps.filter("may")["step_s"].sum()) if steps["known"].any() else None
+
+
+def _solution(
+    name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame
+) -> Solution:
+    own = pl.col("solution") == name
+    evidence = runs.filter(own)["evidence"].cast(pl.String).to_list()
+    return Solution(
+        epochs=epochs.filter(own).sort("t"),
+        faults=independent_episodes(hazards.filter(own)),
+        alarms=alarms.filter(own),
+        with_truth=len(evidence) == 1 and evidence[0] in TRUTH,
+    )
+
+
+def _reactive(one: Solution, config: Configuration) -> _Channel:
+    judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
+    epochs = one.epochs.drop("moving", "path_m").hstack(_states(one, trusted(config)).drop("t"))
+    return _channel(epochs, _DIAGNOSIS, judged, config)
+
+
+def _evaluated(monitor: str) -> pl.Expr:
+    return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
+
+
+def _composite(first: Solution, second: Solution, config: Configuration) -> Row:
+    """Compared at the epochs of the solution that measures less often."""
+    one, other = (first, second) if _period_s(first) >= _period_s(second) else (second, first)
+    placed = on_path_of(one.epochs, other.epochs, config.lds).with_columns(fix_valid=pl.col("path_m").is_not_null())
+    positioned = one.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
+    compared = channel_monitor(positioned, placed, config).select(
+        pl.col("value", "threshold", "state").name.prefix(f"{COMPARISON}_")
+    )
+    row_other = paired(one.epochs, other.epochs, config.lds)["row_other"]
+    theirs = _states(other, trusted(config)).select(_STATES.gather(row_other).fill_null(value=False))
+    own = _states(one, trusted(config))
+    wrong = own["wrong"] | theirs["wrong"]
+    both = own.with_columns(
+        trusted=own["trusted"] & theirs["trusted"], known=(own["known"] & theirs["known"]) | wrong, wrong=wrong
+    )
+    channel = _channel(both.hstack(compared), (COMPARISON,), _evaluated(COMPARISON), config)
+    verdicts = [verdict_of_both(alarm, (one, other), config.hazards) for alarm in channel.fails.alarms]
+    faults = fault_counts(faults_of_pair(one.faults, other.faults), channel.fails)
+    return faults | _alarms(channel, verdicts) | _working(channel)
+
+
+def _period_s(one: Solution) -> float:
+    return nominal_period_s(position_ns(one.epochs)) or 0.0
+
+
+def _states(one: Solution, position: pl.Expr) -> pl.DataFrame:
+    """`position` may be relied on, a truth judged it, and judged it wrong."""
+    known = judged_epoch() & pl.lit(one.with_truth)
+    return one.epochs.select(
+        "t",
+        "moving",
+        "path_m",
+        trusted=position.fill_null(value=False),
+        known=known.fill_null(value=False),
+        wrong=(known & (pl.col("judgement") == Judgement.WRONG)).fill_null(value=False),
+    )
+
+
+def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, config: Configuration) -> _Channel:
+    """`epochs`: `_states`, with the columns of `monitors` and those that `judged` takes."""
+    columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
+    fails = failure_log(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
+    clock = Clock.of(epochs, config)
+    seen = met(epochs, judged)
+    working = seen & met(epochs, pl.col("trusted"))
+    for span in fails.alarms:
+        until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
+        working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
+    known, wrong, moving = (met(epochs, pl.col(name)) for name in ("known", "wrong", "moving"))
+    return _Channel(clock, fails, working, known, known & wrong, moving)
+
+
+def _alarms(channel: _Channel, verdicts: list[Verdict]) -> Row:
+    return {
+        "alarms": len(verdicts),
+        "false_alarms": verdicts.count(Verdict.FALSE),
+        "open_alarms": verdicts.count(Verdict.UNKNOWN),
+        "judged_s": _at_risk_s(channel),
+    }
+
+
+def _at_risk_s(channel: _Channel) -> float:
+    """Time in work that a truth judged [s]: what rates count (DOMAIN section 6)."""
+    return float(channel.clock.held_s[channel.known & channel.working].sum())
+
+
+def _working(channel: _Channel) -> Row:
+    clock, held = channel.clock, channel.clock.held_s
+    up = uptime(clock.t_ns, channel.working, clock.limit_s)
+    return {
+        "working_s": float(held[channel.working & channel.moving].sum()),
+        "up_s": up.up_s,
+        "losses": up.losses,
+        "truth_s": _at_risk_s(channel),
+        "wrong_s": float(held[channel.wrong & channel.working].sum()),
+    }
+
+
+def _redundant(one: _Channel, other: _Channel) -> Row:
+    """Time in which at least one of two reactive channels works; an epoch counts at its own time (LOC eq. 11)."""
+    parts = [
+        pl.DataFrame({"t_ns": channel.clock.t_ns, "working": channel.working, "moving": channel.moving})
+        for channel in (one, other)
+    ]
+    merged = pl.concat(parts).group_by("t_ns").agg(pl.col("working", "moving").any()).sort("t_ns")
+    t_ns, working, moving = (merged[name].to_numpy() for name in ("t_ns", "working", "moving"))
+    limit_s = max(one.clock.limit_s, other.clock.limit_s)
+    up = uptime(t_ns, working, limit_s)
+    # Held from one working epoch to the next: between them may lie epochs of the channel that does not work.
+    working_s = float(held_s(t_ns[working], limit_s)[moving[working]].sum())
+    return {"working_s": working_s, "up_s": up.up_s, "losses": up.losses}
+
+
+def _verdicts_in_table(fails: FailureLog, alarms: pl.DataFrame) -> list[Verdict]:
+    """Each alarm of the architecture has the verdict of the alarm of the replay that it began in."""
+    spans = alarms.select(pl.col("t_start", "t_end").to_physical(), pl.col("verdict").cast(pl.String)).rows()
+    return [
+        next((Verdict(verdict) for start, end, verdict in spans if start <= span.start_ns <= end), Verdict.UNKNOWN)
+        for span in fails.alarms
+    ]

@@ -1,0 +1,125 @@
+"""The largest error ahead at every row since the last independent fix, over resets, re-links and tests of the position.
+
+Growth over stretches adds up. Where the bank began anew the fault may have changed unseen; a re-link bounds it against
+its anchor; a monitor without memory bounds it outright, there and, with the growth since, for a while after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.studies.undetected.shares import Growth, best_shares, growth_of, horizons
+from pipeline.studies.undetected.stretch import Stretch, stretch_after
+from pipeline.studies.undetected.watched import NO_ROW, Watched
+from schemas.arrays import Bools, Floats, Ints
+from schemas.config import UndetectedConfig
+
+Grow = Callable[[Stretch], Growth]
+# How many rows to look back over, and the split of these rows.
+After = list[tuple[int, Floats]]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The largest error ahead at each row [m], and what bounds it: `paid_m` (rows, 1 + averages), or `outright`."""
+
+    most_m: Floats
+    paid_m: Floats
+    outright: Bools
+
+
+def largest_errors(
+    window: Watched, config: UndetectedConfig, grow: Grow = growth_of, after: After | None = None
+) -> Errors:
+    """The largest error ahead at all rows but the first, of a fault that began after the first (`Watched.since`).
+
+    `after`: splits to look back at tests of the position with, by default the best ones here; any of them is a bound.
+    """
+    most = np.zeros(window.rows)
+    paid = np.zeros((window.rows, 1 + window.weight.shape[1]))
+    outright = np.zeros(window.rows, dtype=np.bool_)
+    after_level = _after_levels(window, splits_after(window, config) if after is None else after)
+    begins = [0, *(1 + np.flatnonzero(window.fresh[1:] | window.free[1:])).tolist()]
+    for begin, beyond in zip(begins, [*begins[1:], window.rows], strict=True):
+        if begin:
+            most[begin] = min(_across(window, begin, most), after_level[begin])
+            outright[begin] = after_level[begin] == most[begin]
+        if begin + 1 < beyond:
+            found = grow(stretch_after(window, begin, beyond - 1, known=begin == 0))
+            part = slice(begin + 1, beyond)
+            learned = np.cumsum(window.learned_m[part]) + window.learned_late_m[part]
+            grown = most[begin] + (window.learned_late_m[begin] if begin else 0.0) + found.most_m + learned
+            paid[part] = found.paid_m
+            outright[part] = after_level[part] < grown
+            most[part] = np.minimum(grown, after_level[part])
+    return Errors(most[1:], paid[1:], outright[1:])
+
+
+def _across(window: Watched, row: int, most_m: Floats) -> float:
+    """The fault at a row to which the bank did not see the way, or at a re-link inside one."""
+    if window.fresh[row]:
+        unseen = float(window.fastest_m[row])
+    else:
+        stretch = stretch_after(window, row - 1, row, known=row == 1)
+        unseen = float(growth_of(stretch).most_m[0]) + _learned_m(window, row)
+    anchor = window.anchor[row]
+    at_anchor = float(most_m[anchor]) if anchor != NO_ROW else 0.0
+    return min(float(most_m[row - 1]) + unseen, at_anchor + float(window.held_high_m[row]))
+
+
+def _learned_m(window: Watched, row: int) -> float:
+    late_m = window.learned_late_m[row] + (window.learned_late_m[row - 1] if row > 1 else 0.0)
+    return float(window.learned_m[row] + late_m)
+
+
+def _after_levels(window: Watched, splits: After) -> Floats:
+    """What tests of the position itself leave at each row [m]: their own bound, or one before and the growth since."""
+    best = window.high_m.copy()
+    best[0] = np.inf
+    for lag, shares in splits:
+        begins = np.flatnonzero(np.isfinite(window.high_m[:-lag]))
+        begins = begins[(begins > 0) & _unbroken(window, begins, lag)]
+        if begins.size:
+            grown = _growth_at(window, begins, lag, shares)
+            np.minimum.at(best, begins + lag, window.high_m[begins] + grown)
+    return best
+
+
+def _unbroken(window: Watched, begins: Ints, lag: int) -> Bools:
+    broken = np.cumsum(window.fresh)
+    unbroken: Bools = broken[begins + lag] == broken[begins]
+    return unbroken
+
+
+def splits_after(window: Watched, config: UndetectedConfig) -> After:
+    """Splits for stretches whose averages at the start are not known, as a longest stretch in the middle has them."""
+    if not np.isfinite(window.high_m[1:]).any():
+        return []
+    first, last = window.longest
+    period_s = max(float(np.median(np.diff(window.t_s[first : last + 1]))) if last > first else 1.0, 1e-3)
+    most = min(last - first - 1, int(config.look_back_s / period_s))
+    middle = (first + last - most) // 2
+    lags = [1, *horizons(most)] if most > 0 else []
+    return [(lag, best_shares(stretch_after(window, middle, middle + lag, known=False))) for lag in lags]
+
+
+def _growth_at(window: Watched, begins: Ints, lag: int, shares: Floats) -> Floats:
+    """Growth from each of these rows over `lag` rows, its averages at the start not known, with one split for all."""
+    total = np.zeros(begins.size)
+    threshold = np.where(window.fresh[begins, None], 0.0, window.threshold_mps[begins])
+    carried = np.zeros_like(threshold)  # part of the row after, as it falls to the averages here
+    for row in range(lag, 0, -1):
+        at = begins + row
+        way, weight = window.way_s[at], window.weight[at]
+        raw = shares[row - 1, 0]
+        total += way * raw * (window.most_mps[at] if raw > 0.0 else window.least_mps[at])
+        part = shares[row - 1, 1:] * way[:, None] / weight
+        total += (np.abs(part - carried) * window.threshold_mps[at]).sum(axis=1)
+        carried = part * (1.0 - weight)
+        total -= way * window.rate_mps[at]
+        total += window.learned_m[at]
+    total += (np.abs(carried) * threshold).sum(axis=1)
+    return total + window.learned_late_m[begins] + window.learned_late_m[begins + lag]

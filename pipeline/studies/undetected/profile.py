@@ -1,0 +1,89 @@
+"""One fault of the largest kind, as a profile that can be injected into the same run: the proof anyone can repeat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.studies.undetected.columns import Diagnosis, rows_of, rows_of_passages
+from pipeline.studies.undetected.error import largest_errors
+from pipeline.studies.undetected.exact import MARGIN, largest_profile
+from pipeline.studies.undetected.shapes import largest_of_shape
+from pipeline.studies.undetected.watched import windows
+from schemas.arrays import NS_PER_S, ints, times_ns
+from schemas.config import Configuration, Vehicle
+from schemas.errors import UsageError
+from schemas.tables import SCALES
+
+
+@dataclass(frozen=True)
+class Profile:
+    """`fault`: `t_s` after the first epoch and `size_m` along growing path; `t`: stamps of where it begins and ends.
+
+    `error_m`: its size at the end, as the linear program finds it; `bound_m`: as the tables have it; `step_m` and
+    `ramp_m`: what a step and a ramp could have become there. `monitors`: those whose thresholds the profile reaches,
+    the most often reached first.
+    """
+
+    fault: pl.DataFrame
+    t: pl.Series
+    error_m: float
+    bound_m: float
+    step_m: float
+    ramp_m: float
+    monitors: tuple[str, ...]
+
+
+def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle, config: Configuration) -> Profile:
+    """The largest unnoticed fault at an epoch, ahead or behind in the direction of travel there."""
+    rows, t_ns = rows_of(diagnosis, vehicle, config), times_ns(diagnosis.epochs)
+    row = int(np.searchsorted(rows.epoch, epoch))
+    window = next((one for one in windows(rows, t_ns, diagnosis.fixes_ns) if one.start < row <= one.end), None)
+    if window is None or row >= rows.rows or rows.epoch[row] != epoch:
+        raise UsageError(
+            "has no fault to look for",
+            place=f"epoch {epoch}",
+            expected="an epoch with a position and an odometer, not negated, after the last independent fix",
+        )
+    against = behind != bool(ints(diagnosis.epochs["direction"], unknown=1)[epoch] < 0)
+    part = rows.since(window.start, row, window.since_s)
+    seen = part.mirrored() if against else part
+    found = largest_profile(seen, MARGIN)
+    names = [name for name, on in zip(SCALES, diagnosis.bank.enabled, strict=True) if on or name == "raw"]
+    return Profile(
+        fault=pl.DataFrame(
+            {"t_s": [window.since_s, *part.t_s[1:]], "size_m": -found.fault_m if against else found.fault_m}
+        ),
+        t=pl.Series("t", [window.since_ns, int(t_ns[epoch])]).cast(pl.Datetime("ns", "UTC")),
+        error_m=found.error_m,
+        bound_m=float(largest_errors(seen, config.undetected).most_m[-1]),
+        step_m=largest_of_shape(seen, "step"),
+        ramp_m=largest_of_shape(seen, "ramp"),
+        monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in found.binding),
+    )
+
+
+def epoch_of(
+    diagnosis: Diagnosis,
+    passages: pl.DataFrame,
+    crossings: pl.DataFrame,
+    vehicle: Vehicle,
+    config: Configuration,
+    balise: str | None,
+    at_s: float | None,
+) -> int:
+    """The epoch that is asked for: of the first passage of a balise, the last one up to a time, or the last one."""
+    rows, t_ns = rows_of(diagnosis, vehicle, config), times_ns(diagnosis.epochs)
+    if balise is None:
+        stamps = t_ns[rows.epoch]
+        latest = stamps[-1:].sum() if at_s is None else t_ns[0] + round(at_s * NS_PER_S)
+        row = int(np.searchsorted(stamps, latest, side="right")) - 1
+        return int(rows.epoch[row]) if row >= 0 else 0
+    at = rows_of_passages(passages, crossings, rows, t_ns, config)
+    own = (passages["balise_id"] == balise).to_numpy() & (at >= 0)
+    if not own.any():
+        known = ", ".join(passages["balise_id"].unique(maintain_order=True).to_list())
+        raise UsageError("is no balise that a watched position passed", place=balise, expected=known)
+    return int(rows.epoch[at[own][0]])

@@ -1,0 +1,168 @@
+"""By how much a fault can have grown over a stretch: the best split among the monitors, and what it lets pass.
+
+The split is found on blocks of rows that grow with the time since the start.
+
+Thresholds change slowly, and so do the best shares: within a block they are straight lines. The bound that they give is
+evaluated on every row (`paid_m`), so blocks cost closeness, never validity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.studies.undetected.stretch import Stretch, paid_m
+from schemas.arrays import Floats, Ints
+
+# Blocks are so much longer than the stretch before them; so much farther on lies the next row with a split of its own.
+GROWTH = 0.3
+# Nothing is infinite in a program: a monitor that is not evaluated costs so many times the dearest that is.
+_NOT_TESTED = 1e3
+
+
+class _Blocks(NamedTuple):
+    """First and last row of each block, and which block each row is in."""
+
+    first: Ints
+    last: Ints
+    of_row: Ints
+
+    @classmethod
+    def over(cls, rows: int) -> _Blocks:
+        edges = [0]
+        while edges[-1] < rows:
+            edges.append(min(edges[-1] + max(1, int(GROWTH * edges[-1])), rows))
+        first, end = np.array(edges[:-1]), np.array(edges[1:])
+        return cls(first, end - 1, np.repeat(np.arange(first.size), end - first))
+
+    def lines(self, row: Ints) -> Floats:
+        """What the shares at both ends of the blocks, two columns each, are at these rows: straight lines between."""
+        block, each = self.of_row[row], np.arange(row.size)
+        along = (row - self.first[block]) / np.maximum(self.last[block] - self.first[block], 1)
+        found = np.zeros((row.size, 2 * self.first.size))
+        found[each, 2 * block], found[each, 2 * block + 1] = 1.0 - along, along
+        return found
+
+
+def best_shares(stretch: Stretch) -> Floats:
+    """Shares of raw and averages in each row, shape (rows, 1 + averages), that give the least bound at the last row."""
+    from scipy.linalg import block_diag  # most replays solve nothing
+    from scipy.optimize import linprog
+
+    blocks, monitors = _Blocks.over(stretch.rows), 1 + stretch.seen.weight.shape[1]
+    ends = 2 * blocks.first.size
+    parts = [_raw(stretch, blocks), *(_average(stretch, blocks, one) for one in range(monitors - 1))]
+    costs, linear = np.concatenate([part.cost for part in parts]), np.concatenate([part.linear for part in parts])
+    gauge, each = max(float(costs.max()), 1e-12), np.eye(costs.size)
+    # Each term is what it has above zero less what it has below; shares add up to one at both ends of each block.
+    whole, nothing = np.tile(np.eye(ends), monitors), np.zeros((ends, 2 * costs.size))
+    found = linprog(
+        np.concatenate([linear, costs, costs]) / gauge,
+        A_eq=np.block([[block_diag(*(part.terms for part in parts)), -each, each], [whole, nothing]]),
+        b_eq=np.concatenate([np.zeros(costs.size), np.ones(ends)]),
+        bounds=np.array([(-np.inf, np.inf)] * (monitors * ends) + [(0.0, np.inf)] * (2 * costs.size)),
+        method="highs-ds",
+    )
+    knots = found.x[: monitors * ends].reshape(monitors, ends) if found.status == 0 else np.zeros((monitors, ends))
+    shares: Floats = blocks.lines(np.arange(stretch.rows)) @ knots.T
+    # They add up to one, to the last digit.
+    shares[:, 0] += 1.0 - shares.sum(axis=1)
+    return shares
+
+
+class _Part(NamedTuple):
+    """Of one monitor: what is paid for, over its shares at both ends of the blocks; the cost of each; the start's."""
+
+    terms: Floats
+    cost: Floats
+    linear: Floats
+
+
+def _raw(stretch: Stretch, blocks: _Blocks) -> _Part:
+    raw_mps = np.maximum(np.abs(stretch.seen.most_mps), np.abs(stretch.seen.least_mps))
+    raw_m = np.add.reduceat(stretch.seen.way_s * _tested(raw_mps), blocks.first)
+    single = blocks.first == blocks.last
+    cost = np.column_stack([np.where(single, raw_m, 0.5 * raw_m), np.where(single, 0.0, 0.5 * raw_m)]).ravel()
+    return _Part(np.eye(cost.size), cost, np.zeros(cost.size))
+
+
+def _average(stretch: Stretch, blocks: _Blocks, average: int) -> _Part:
+    weight = stretch.seen.weight[:, average]
+    part = stretch.seen.way_s / weight
+    # What a row gives to the average, its row before has to pay for in part; the last row has none after it.
+    after = np.append((part * (1.0 - weight))[1:], 0.0)
+    at, cost = _paid_at(blocks, _tested(stretch.seen.threshold_mps[:, average]))
+    following = np.minimum(at + 1, stretch.rows - 1)
+    terms = part[at, None] * blocks.lines(at) - after[at, None] * blocks.lines(following)
+    start, linear = np.eye(1, terms.shape[1]) * part[0] * (1.0 - weight[0]), np.zeros(terms.shape[1])
+    linear -= start[0] * stretch.start_mps[average]
+    if (free := stretch.start_free_mps[average]) > 0.0:
+        terms, cost = np.vstack([terms, start]), np.append(cost, free)
+    return _Part(terms, cost, linear)
+
+
+def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
+    """Rows whose payment stands for those of their block, and how much: its first, its last but one, its last.
+
+    Payments inside a block run along a straight line: the mean of both ends stands for them.
+    """
+    inner = blocks.last > blocks.first
+    first, last = blocks.first[inner], blocks.last[inner]
+    half = 0.5 * (np.add.reduceat(threshold, blocks.first)[inner] - threshold[last])
+    return np.concatenate([first, last - 1, blocks.last]), np.concatenate([half, half, threshold[blocks.last]])
+
+
+def _tested(threshold: Floats) -> Floats:
+    tested = np.isfinite(threshold)
+    if tested.all():
+        return threshold
+    dearest = float(threshold[tested].max(initial=1.0))
+    return np.where(tested, threshold, _NOT_TESTED * dearest)
+
+
+@dataclass(frozen=True)
+class Growth:
+    """`most_m` (rows,): the fault's growth since the start, at most; `paid_m` (rows, 1 + averages): what bounds it."""
+
+    most_m: Floats
+    paid_m: Floats
+
+
+def growth_of(stretch: Stretch) -> Growth:
+    """The growth that no monitor would have noticed, from above, at every row of a stretch."""
+    return growth_with(stretch, splits_of(stretch))
+
+
+def growth_with(stretch: Stretch, splits: Iterable[Floats]) -> Growth:
+    """The same with given splits, each of shape (some rows, 1 + averages); any of them bounds the growth."""
+    most = np.full(stretch.rows, np.inf)
+    monitors = 1 + stretch.seen.weight.shape[1]
+    paid = np.zeros((stretch.rows, monitors))
+    # All to one monitor, and the splits.
+    for shares in (*(np.tile(one, (stretch.rows, 1)) for one in np.eye(monitors)), *splits):
+        part = stretch.first(len(shares))
+        bills = paid_m(part, shares[: part.rows])
+        total = bills.sum(axis=1)
+        better = np.flatnonzero(total < most[: total.size])
+        most[better], paid[better] = total[better], bills[better]
+    return Growth(most - stretch.recorded_m, paid)
+
+
+def splits_of(stretch: Stretch) -> Iterator[Floats]:
+    """The best up to rows that lie farther and farther on."""
+    for rows in horizons(stretch.rows):
+        yield best_shares(stretch.first(rows))
+
+
+def horizons(rows: int) -> list[int]:
+    """Numbers of rows up to which the best split is sought, the last one all of them; one row needs none.
+
+    The best split up to one row is good up to the rows around it too.
+    """
+    found = [2]
+    while found[-1] < rows:
+        found.append(min(max(found[-1] + 1, int((1.0 + GROWTH) * found[-1])), rows))
+    return found if rows > 1 else []

@@ -1,0 +1,93 @@
+"""How far apart physical balises may be: the way on which no unnoticed fault can have reached the failure limit.
+
+A fault that begins after a later instant is also one that begins after an earlier one. So what the run allows from one
+start on is as much as from any later start, and the starts that are tried bound all those between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from pipeline.stages.run_row.undetected import Spacing
+from pipeline.studies.undetected.error import Errors, largest_errors, splits_after
+from pipeline.studies.undetected.shares import growth_with, splits_of
+from pipeline.studies.undetected.stretch import stretch_after
+from pipeline.studies.undetected.watched import Watched
+from schemas.arrays import Floats
+from schemas.config import Configuration
+
+
+def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tuple[Spacing, Floats]:
+    """The spacing of the run, and of each row how far before it a physical balise may lie [m].
+
+    `way_m`: way driven at each row. Never too large; the second is NaN where no balise of this run is too far before.
+    """
+    if rows.rows < 2:
+        return Spacing(), np.full(rows.rows, np.nan)
+    step_s = config.undetected.spacing_step_s
+    both, grow = (rows, rows.mirrored()), partial(growth_with, splits=splits_anywhere(rows))
+    errors = partial(largest_errors, config=config.undetected, grow=grow, after=splits_after(rows, config.undetected))
+    search = partial(_first_beyond, both, errors=errors, limit_m=config.hazards.failure_limit_m, ahead_s=step_s)
+    starts = np.unique(np.searchsorted(rows.t_s, np.arange(rows.t_s[0], rows.t_s[-1], step_s))).tolist()
+    found = {start: search(start) for start in starts if start + 1 < rows.rows}
+    close = 1.0 - config.undetected.spacing_close_share
+    ways, times = (_shortest(found, place, close, search) for place in (way_m, rows.t_s))
+    reached = sum(row < rows.rows for row in found.values())
+    return Spacing(ways, times, len(found), reached), _before(found, way_m)
+
+
+def _shortest(found: dict[int, int], place: Floats, close: float, search: Callable[[int], int]) -> float | None:
+    """The shortest way (or time) from any row to the last one within the limit; `found`: first row beyond, by start.
+
+    From between two starts it is no shorter than from the second one to where the first reaches the limit. More starts
+    are tried until the two agree to the share `close`.
+    """
+    while True:
+        starts = sorted(found)
+        pairs = zip(starts, [*starts[1:], place.size - 1], strict=True)
+        sure = [(float(place[found[one] - 1] - place[after]), one, after) for one, after in pairs]
+        least, one, after = min((item for item in sure if found[item[1]] < place.size), default=(None, 0, 0))
+        if least is None:
+            return None
+        if after <= one + 1 or least >= close * (place[found[one] - 1] - place[one]):
+            return max(least, 0.0)
+        found[(one + after) // 2] = search((one + after) // 2)
+
+
+def _before(found: dict[int, int], way_m: Floats) -> Floats:
+    """How far before each row a balise keeps it within the limit: the first start that does, NaN where all do."""
+    starts = np.array(sorted(found))
+    beyond = np.maximum.accumulate([found[start] for start in starts])
+    rows = np.arange(way_m.size)
+    first = np.searchsorted(beyond, rows, side="right")
+    at = np.minimum(starts[np.minimum(first, starts.size - 1)], rows)
+    return np.where(first == 0, np.nan, way_m - way_m[np.where(first < starts.size, at, rows)])
+
+
+def _first_beyond(
+    both: tuple[Watched, Watched], start: int, errors: Callable[[Watched], Errors], limit_m: float, ahead_s: float
+) -> int:
+    """The first row after `start` at which the error may be beyond the limit, in either direction; else their number.
+
+    `ahead_s`: first end of the search; it goes on twice as far as long as the limit is not reached.
+    """
+    rows = both[0]
+    while True:
+        end = min(int(np.searchsorted(rows.t_s, rows.t_s[start] + ahead_s)), rows.rows - 1)
+        end = max(end, start + 1)
+        most = np.maximum(*(errors(one.since(start, end)).most_m for one in both))
+        beyond = np.flatnonzero(most > limit_m)
+        if beyond.size:
+            return start + 1 + int(beyond[0])
+        if end == rows.rows - 1:
+            return rows.rows
+        ahead_s *= 2.0
+
+
+def splits_anywhere(rows: Watched) -> list[Floats]:
+    """Best splits of a long stretch, for any start: what is best hangs on thresholds, and these change little."""
+    first, last = rows.longest
+    return list(splits_of(stretch_after(rows, first + (last - first) // 8, last, known=True)))

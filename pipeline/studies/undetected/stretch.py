@@ -1,0 +1,78 @@
+"""A stretch: increments that the bank saw one after the other, and the bound that a way of paying for them gives.
+
+The fault's growth over a stretch is the sum of way_s (y - u). Split each row's way_s among the monitors, in any way:
+what falls to an average is, by the average's own recursion, a sum over that average's values, and each of these is
+within its threshold. So *every* split bounds the growth from above (weak duality), and the best split gives the largest
+growth itself.
+
+With q_i the part of row i that falls to an average A_i = (1 - w_i) A_(i-1) + w_i y_i:
+
+    sum q_i y_i = sum A_i (q_i / w_i - q_(i+1) (1 - w_(i+1)) / w_(i+1))  -  A_0 q_1 (1 - w_1) / w_1
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.studies.undetected.watched import Watched
+from schemas.arrays import Floats
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """`seen`: the rows after a start, to be bounded one by one.
+
+    `start_mps` (averages,): the averages at the start; `start_free_mps`: how far they may be from that.
+    """
+
+    seen: Watched
+    start_mps: Floats
+    start_free_mps: Floats
+
+    @property
+    def rows(self) -> int:
+        return self.seen.rows
+
+    def first(self, rows: int) -> Stretch:
+        return replace(self, seen=self.seen.between(0, rows))
+
+    @property
+    def recorded_m(self) -> Floats:
+        """What the increments recorded have gathered up to each row."""
+        return np.cumsum(self.seen.way_s * self.seen.rate_mps)
+
+
+def stretch_after(rows: Watched, start: int, end: int, known: bool) -> Stretch:
+    """The rows (start, end]; without `known` the averages at the start are only known to have been silent."""
+    averages, silent = rows.average_mps[start], rows.threshold_mps[start]
+    nothing, seen = np.zeros_like(averages), rows.between(start + 1, end + 1)
+    if known or rows.fresh[start]:
+        return Stretch(seen, averages, nothing)
+    return Stretch(seen, nothing, silent)
+
+
+def paid_m(stretch: Stretch, shares: Floats) -> Floats:
+    """What raw (first) and each average pay for the sum of way_s y up to each row; shapes (rows, 1 + averages).
+
+    `shares`: of each row, raw first; they add up to one. The sum up to a row ends there: what the last row gives to an
+    average is paid by its value there.
+    """
+    seen = stretch.seen
+    raw = seen.way_s * np.where(shares[:, 0] > 0.0, seen.most_mps, seen.least_mps) * shares[:, 0]
+    part = shares[:, 1:] * (seen.way_s[:, None] / seen.weight)
+    before = part * (1.0 - seen.weight)
+    inside = part.copy()
+    inside[:-1] -= before[1:]
+    inner = _cost(inside, seen.threshold_mps)
+    paid = _cost(part, seen.threshold_mps)
+    paid[1:] += np.cumsum(inner[:-1], axis=0)
+    paid += np.abs(before[0]) * stretch.start_free_mps - before[0] * stretch.start_mps
+    return np.column_stack([np.cumsum(raw), paid])
+
+
+def _cost(part: Floats, threshold: Floats) -> Floats:
+    """|part| times the threshold; what falls to no one costs nothing, even where nothing is tested."""
+    cost: Floats = np.abs(part) * np.where(part == 0.0, 0.0, threshold)
+    return cost

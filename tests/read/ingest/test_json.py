@@ -1,0 +1,106 @@
+"""JSON of many messages at once against JSON message by message."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.read.ingest.generic import UndecodableError, decode_columns, parse_json
+from pipeline.read.ingest.json_columns import JsonDecoder
+from pipeline.read.ingest.mcap_block import Messages
+from pipeline.read.ingest.mcap_model import Channel
+from schemas.errors import InputError
+
+CHANNEL = Channel(1, "/x", "json", None, "x.mcap")
+TYPES = {
+    "a": pl.Float64(), "t.sec": pl.Int64(), "name": pl.String(), "ok": pl.Boolean(), "c[1]": pl.Float64(),
+}  # fmt: skip
+
+texts = st.text(max_size=8)
+numbers = st.one_of(st.integers(-(2**70), 2**70), st.floats(allow_nan=False, allow_infinity=False), st.integers(-9, 9))
+scalars = st.one_of(numbers, st.none(), st.booleans(), texts)
+documents = st.fixed_dictionaries(
+    {},
+    optional={
+        "a": st.one_of(numbers, st.none(), scalars),
+        "t": st.one_of(st.fixed_dictionaries({"sec": st.integers(0, 2**40)}), scalars),
+        "name": st.one_of(texts, st.none()),
+        "ok": st.one_of(st.booleans(), st.none()),
+        "c": st.lists(numbers, max_size=3),
+        "other": scalars,
+        "more": st.dictionaries(texts, scalars, max_size=2),
+    },
+)
+styles = st.sampled_from([{}, {"separators": (",", ":")}, {"indent": 1}, {"ensure_ascii": False}])
+damage = st.one_of(
+    st.none(),
+    st.none(),
+    st.tuples(st.integers(0, 200), st.sampled_from([*'{}[]:,"0-.eE+ \\\n', "NaN", "null", "", "\t"])),
+)
+payloads = st.lists(st.tuples(documents, styles, damage), min_size=1, max_size=12)
+
+
+def messages_of(contents: list[bytes]) -> Messages:
+    lengths = np.array([len(content) for content in contents], dtype=np.int64)
+    starts = np.concatenate([[0], np.cumsum(lengths[:-1])]).astype(np.int64)
+    data = np.frombuffer(b"".join(contents) + b" ", dtype=np.uint8)
+    return Messages([data], np.zeros(1, dtype=np.int64), starts, lengths, starts)
+
+
+def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:
+    content = json.dumps(document, **style)
+    if harm is not None:
+        at = harm[0] % (len(content) + 1)
+        content = content[:at] + harm[1] + content[at + 1 :]
+    return content.encode("utf-8", "surrogatepass")
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(payloads)
+def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
+    contents = [written(*one) for one in drawn]
+    for some in ([content] for content in contents):
+        parts, left = JsonDecoder(TYPES).decode(messages_of(some))
+        assert sum(len(found) for found, _ in parts) + sum(map(len, left)) == len(some)
+        for found, columns in parts:
+            expected, _ = decode_columns(CHANNEL, found, TYPES)
+            for path, values in columns.items():
+                assert values.to_list() == expected[path].to_list()
+
+
+def test_good_messages_are_taken_at_once():
+    contents = [
+        json.dumps({"a": number / 7, "name": "Info NaN null", "t": {"sec": number}}).encode() for number in range(50)
+    ]
+    parts, left = JsonDecoder(TYPES).decode(messages_of(contents))
+    assert (len(parts), left) == (1, [])
+    assert parts[0][1]["a"].to_list() == [number / 7 for number in range(50)]
+    assert parts[0][1]["t.sec"].to_list() == list(range(50))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b'{"a": NaN}', b'{"a": -Infinity}', b'{"a": 1, "a": 2}', b'{"a": 01}', b'{"a": 1}{}', b"[1", b"\xff"),
+        *(b"{", b'{"a"', b'{"a":', b'{"a": 0', b'{"a": 0,', b'{"a": 0, ', b'{"b": [', b'{"b": [1,', b'{"b": {', b"["),
+    ],
+)
+def test_what_is_no_json_is_refused(content):
+    with pytest.raises(UndecodableError):
+        parse_json(content)
+    with pytest.raises(InputError):
+        decode_columns(CHANNEL, messages_of([content]), TYPES)
+    several = [b'{"a": 1.5}', content, b'{"a": 2.5}']
+    parts, left = JsonDecoder(TYPES).decode(messages_of(several))
+    assert (parts, [len(rest) for rest in left]) == ([], [len(several)])
+
+
+def test_two_halves_of_a_document_are_not_one():
+    halves = [b'{"a": 1.5}{"a": 2.5}', b'{"a": 3.5, "c": {}', b"}", b"{}"]
+    for several in (halves[1:3], halves[:3], [*halves, b'{"a": 1}null{}']):
+        assert JsonDecoder(TYPES).decode(messages_of(several))[0] == []

@@ -1,0 +1,70 @@
+"""Which tracks of a site positions alone can never tell apart, and what would."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.read.site.alike import most_claimed, parallel_findings
+from schemas.config import MatchingConfig
+from tests.stages.matching.builders import line, matched, run, site
+from tests.stages.matching.ladder import ladder
+
+
+def found(spacing_m: float, **options: float) -> list[str]:
+    place = site({"a": line((0, 0), (2000, 0)), "b": line((0, spacing_m), (2000, spacing_m))}, **options)
+    return [f"{one.place}: {one.message}" for one in parallel_findings(place, MatchingConfig())]
+
+
+def test_double_track_is_named_once_with_its_extent_and_what_a_run_can_claim() -> None:
+    (text,) = found(4.0)
+    assert text.startswith("element a: 0 to 2000 m: b lies 4.0 m beside it")
+    # 4.0² / (2 · 1.5²) = 3.556; 1 / (1 + e^-3.556) = 0.972.
+    assert "a probability of 0.97 at most" in text
+
+
+@pytest.mark.parametrize(("spacing_m", "named"), [(3.4, True), (4.5, True), (4.6, False), (20.0, False)])
+def test_tracks_far_enough_apart_are_not(spacing_m: float, named: bool) -> None:
+    """1.5 · sqrt(2 ln 99) = 4.55 m."""
+    assert bool(found(spacing_m)) == named
+
+
+def test_a_poor_survey_widens_it() -> None:
+    assert found(5.0, sigma_m=1.0)
+    assert not found(5.0, sigma_m=0.05)
+
+
+def test_tracks_that_cross_or_part_are_none() -> None:
+    crossing = site({"a": line((0, 0), (2000, 0)), "b": line((900, -500), (1100, 500))})
+    assert parallel_findings(crossing, MatchingConfig()) == []
+
+
+def test_what_would_tell_is_named() -> None:
+    place = ladder()
+    balises = pl.DataFrame({"balise_id": ["p7"], "netelement_id": ["B1"], "kind": ["physical"]})
+    remedies = {one.place: one.remedy for one in parallel_findings(replace(place, balises=balises), MatchingConfig())}
+    assert "route" in remedies["element A2"]
+    assert "p7" in remedies["element A1"]
+    assert "switch" in remedies["element A1"]
+    assert "p7" not in remedies["element A2"]
+
+
+def test_with_a_route_nothing_is_in_doubt() -> None:
+    route = pl.DataFrame({"netelement_id": ["A1", "A2"], "direction": ["AB", "AB"]})
+    assert parallel_findings(replace(ladder(), route=route), MatchingConfig()) == []
+
+
+def test_how_long_tracks_have_to_be_beside_each_other_is_configuration() -> None:
+    place = site({"a": line((0, 0), (2000, 0)), "b": line((0, 4), (2000, 4))})
+    assert len(parallel_findings(place, MatchingConfig(parallel_least_m=1900.0))) == 1
+    assert parallel_findings(place, MatchingConfig(parallel_least_m=2100.0)) == []
+
+
+def test_no_run_right_on_its_track_claims_more_than_that() -> None:
+    x = np.arange(0.0, 2000.0, 10.0)
+    place = site({"a": line((0, 0), (2000, 0)), "b": line((0, 4), (2000, 4))})
+    claim = matched(run(x, 0.0 * x, sigma_m=0.02), place).epochs["path_probability"].max()
+    assert claim == pytest.approx(most_claimed(4.0, 0.02, MatchingConfig()), abs=0.03)

@@ -1,0 +1,120 @@
+"""Slip that the odometer reports costs its own time, not the run (DOMAIN sections 4 and 5.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.one_run import replay
+from schemas.config import Configuration, MonitorConfig, Vehicle
+from schemas.run import RunTables
+from tests.replay.slip.world import BALISES, LEG_S, READ_M, STAND_S, VEHICLE, Fault, Slip, ride, site, times, way_m
+
+SECOND_START_S = LEG_S + STAND_S
+SITE = site()
+NONE = (0.0, 0.0, 0.0, 0.0)
+# Else nothing would be in use before the run has shown it.
+KNOWN = Configuration(monitors=MonitorConfig(noise_along_m=NONE, noise_cross_m=NONE, noise_up_m=NONE))
+
+
+def accepted(tables: RunTables) -> list[str]:
+    return tables.passages.filter(status="accepted", kind="virtual")["balise_id"].to_list()
+
+
+def replayed(
+    slip: Slip | None = None,
+    fault: Fault | None = None,
+    vehicle: Vehicle = VEHICLE,
+    *,
+    read: bool = False,
+    radar: Slip | None = None,
+) -> RunTables:
+    return replay(ride(slip, fault, read=read, radar=radar), SITE, vehicle, KNOWN)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.08, -0.08])
+@pytest.mark.parametrize("said", [Slip(), Slip(flag=False, sigma_mps=0.4)], ids=["flag", "sigma"])
+def test_the_rest_of_the_run_stands(share: float, said: Slip) -> None:
+    """Three starts with 12 s of slip or slide; 4.6 m are lost at 8 %, more than the positions' noise explains."""
+    tables = replayed(Slip(share, flag=said.flag, sigma_mps=said.sigma_mps))
+    run = tables.runs.row(0, named=True)
+    assert (run["verdict"], run["unsafe_accepted"], run["alarms"]) == ("safe", 0, 0)
+    assert accepted(tables) == list(BALISES)
+    reasons = dict(tables.epochs["withheld_for"].value_counts().rows())
+    assert reasons["slip"] == pytest.approx(360, abs=6)
+    # The first epoch of the run, and the first after each slip.
+    assert reasons["relink"] == 4
+
+
+def test_slip_that_nobody_reports_is_the_monitors() -> None:
+    tables = replayed(Slip(0.08, flag=False))
+    assert tables.runs["alarms"].item() >= 1
+    assert "slip" not in set(tables.epochs["withheld_for"])
+
+
+@pytest.mark.parametrize("size_m", [16.0, -16.0, 30.0, -30.0, 60.0])
+def test_a_fault_during_slip_does_not_get_through(size_m: float) -> None:
+    """From 5 s into the second start to the end: no balise after it, no TVB that is wrong, no alarm to see it by."""
+    tables = replayed(Slip(0.08), Fault(SECOND_START_S + 5.0, size_m))
+    assert accepted(tables) == ["V0", "V1", "V2", "V3"]
+    assert tables.runs["unsafe_accepted"].item() == 0
+    tvb_m = tables.epochs["error_along_m"].filter(tables.epochs["tvb"]).abs().max()
+    assert isinstance(tvb_m, float)
+    assert tvb_m < 10.0
+
+
+@pytest.mark.parametrize("after_s", [0.1, 0.4, 5.0])
+def test_a_fault_right_after_slip_is_found_at_once(after_s: float) -> None:
+    """The bank begins with the first epoch after the slip, 12.1 s after the start."""
+    tables = replayed(Slip(0.08), Fault(SECOND_START_S + 12.1 + after_s, 25.0))
+    # V4 lies 100 m after the station, where the train is after 15.8 s.
+    assert accepted(tables) == ["V0", "V1", "V2", "V3", *(["V4"] if after_s > 3.7 else [])]
+    seen_s = (tables.alarms["t_start"][0] - tables.epochs["t"][0]).total_seconds()
+    assert seen_s == pytest.approx(SECOND_START_S + 12.1 + after_s, abs=0.15)
+
+
+def test_after_too_much_slip_only_a_telegram_links_again() -> None:
+    """25 s and 250 m of slip at each start: 25 m in doubt, more than half the failure limit."""
+    assert accepted(replayed(Slip(0.02, lasts_s=25.0))) == []
+    tables = replayed(Slip(0.02, lasts_s=25.0), read=True)
+    # From the read in the second leg to the next start.
+    fast = [name for name, at_m in BALISES.items() if READ_M < at_m < 3250.0]
+    assert accepted(tables) == fast
+    assert tables.runs["verdict"].item() == "safe"
+
+
+LONG = Slip(0.08, lasts_s=25.0)
+DRY = Slip(0.0, lasts_s=0.0)
+
+
+def test_a_second_odometer_counts_the_way_over_long_slip() -> None:
+    """250 m of slip at each start, 20 m counted too much. V4 lies in the second, V8 at 100 m in the third."""
+    tables = replayed(LONG, radar=DRY)
+    assert tables.runs["verdict"].item() == "safe"
+    in_slip = {name for name, at_m in BALISES.items() if (at_m - 50.0) % 1600.0 <= 250.0}
+    assert accepted(tables) == [name for name in BALISES if name not in in_slip]
+    assert accepted(replayed(LONG, Fault(SECOND_START_S + 5.0, 20.0), radar=DRY)) == ["V1", "V2", "V3"]
+
+
+def test_a_second_odometer_that_slips_too_counts_nothing() -> None:
+    assert accepted(replayed(LONG, radar=LONG)) == []
+
+
+def test_without_a_vehicle_file_only_a_telegram_links_again() -> None:
+    assert accepted(replayed(Slip(0.02), vehicle=Vehicle())) == []
+    assert accepted(replayed(Slip(0.02), vehicle=Vehicle(), read=True)) != []
+
+
+def test_the_world_is_as_described() -> None:
+    t_s = times()
+    true_m = way_m(t_s)
+    assert np.diff(true_m).min() >= 0.0
+    assert true_m[-1] == pytest.approx(50.0 + 3 * 1600.0)
+    odometer = ride(Slip(0.08)).odometer
+    assert odometer is not None
+    counted_m = odometer["distance_m"].to_numpy()
+    # 8 % of 57.6 m at each of three starts; the noise is 0.02 m per root second.
+    assert counted_m[-1] - (true_m[-1] - true_m[0]) == pytest.approx(3 * 0.08 * 57.6, abs=2.0)
+    assert odometer.filter("slip").height == pytest.approx(360, abs=3)
+    assert isinstance(SITE.balises, pl.DataFrame)

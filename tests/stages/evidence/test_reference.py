@@ -1,0 +1,135 @@
+"""The tracks of a reference: a set by distance that knows no favourite and no cut."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.stages.evidence.evidence import NOTHING
+from pipeline.stages.reference import ReferencePath, reference_stretches
+from pipeline.stages.track.network import network_in_pieces, site_network
+from schemas.arrays import Floats
+from schemas.config import Configuration
+from schemas.run import Site
+from tests.stages.evidence.worlds import known
+from tests.stages.matching.builders import Link, line, site, times
+from tests.stages.matching.ladder import degrees
+
+X_M = np.linspace(20.0, 2980.0, 1500)
+
+
+def samples(x_m: Floats, y_m: Floats, sigma_m: float | None = 0.05, seed: int = 0) -> pl.DataFrame:
+    """A reference at 10 Hz whose noise is that of 5 cm, whatever it states."""
+    noise = 0.05 * np.random.default_rng(seed).standard_normal((2, x_m.size))
+    latitude, longitude = degrees(x_m + noise[0], y_m + noise[1])
+    columns = {"latitude_deg": latitude, "longitude_deg": longitude}
+    unknown = pl.Series("height_m", [None] * x_m.size, dtype=pl.Float64)
+    sigma = pl.Series("sigma_m", [sigma_m] * x_m.size, dtype=pl.Float64)
+    return pl.DataFrame({"t": times(x_m.size, 10.0), **columns}).with_columns(unknown, sigma)
+
+
+def tracks(place: Site, frame: pl.DataFrame) -> list[set[tuple[str, ...]]]:
+    """Per stretch the net elements of each way, along it."""
+    network = site_network(place)
+    found, _ = reference_stretches(frame, network_in_pieces(place), network.track.index, Configuration())
+
+    def names(path: ReferencePath) -> tuple[str, ...]:
+        named = [network.track.ids[one] for route in path.legs for one in route.element.tolist()]
+        return min(tuple(named), tuple(named[::-1]))
+
+    return [{names(path) for path in stretch.paths} for stretch in found]
+
+
+def double(pieces: int, sigma_m: float | None, turnouts: bool = False, turned: bool = False) -> Site:
+    """Track a along y = 0 in so many pieces, b 4 m beside it in one; turnouts lead away from a."""
+    ends = np.linspace(0.0, 3000.0, pieces + 1)
+    elements = {f"a{n}": line((ends[n], 0.0), (ends[n + 1], 0.0)) for n in range(pieces)}
+    links: list[Link] = []
+    for n in range(pieces - 1):
+        links.append((f"a{n}", 1, f"a{n + 1}", 0, "both"))
+        if turnouts:
+            x_m = np.arange(0.0, 301.0, 10.0)
+            elements[f"t{n}"] = np.column_stack([ends[n + 1] + x_m, -x_m * x_m / 600.0])
+            links.append((f"a{n}", 1, f"t{n}", 0, "both"))
+    if turned:
+        elements["a0"] = elements["a0"][::-1]
+        links = [(a, 0 if a == "a0" else p, b, q, way) for a, p, b, q, way in links]
+    return site({**elements, "b": line((0.0, 4.0), (3000.0, 4.0))}, links, sigma_m=sigma_m)
+
+
+@pytest.mark.parametrize("sigma_m", [0.3, 1.0, None])
+@pytest.mark.parametrize(("pieces", "turnouts", "turned"), [(1, False, False), (9, False, False), (7, True, True)])
+def test_a_reference_nearer_to_one_track_is_on_it_however_that_is_cut(
+    sigma_m: float | None, pieces: int, turnouts: bool, turned: bool
+) -> None:
+    """0.42 m from a, 3.58 m from b: with a survey of 1 m the neighbour is out at 3 sigma, whatever the joints."""
+    ways = tracks(double(pieces, sigma_m, turnouts, turned), samples(X_M, np.full(X_M.size, 0.42)))
+    assert ways == [{tuple(f"a{n}" for n in range(pieces))}]
+
+
+@pytest.mark.parametrize(("pieces", "turnouts"), [(1, False), (9, False), (7, True)])
+def test_where_the_survey_lets_both_be_both_are(pieces: int, turnouts: bool) -> None:
+    """1.5 m from a and 2.5 m from b, surveyed to 1 m: neither has more claim."""
+    ways = tracks(double(pieces, 1.0, turnouts), samples(X_M, np.full(X_M.size, 1.5)))
+    assert ways == [{tuple(f"a{n}" for n in range(pieces)), ("b",)}]
+
+
+def test_beside_every_track_is_silence_and_nothing_is_known() -> None:
+    place = double(1, 0.3)
+    assert tracks(place, samples(X_M, np.full(X_M.size, -1.2))) == []
+    found = known(place, of_reference=samples(X_M, np.full(X_M.size, -1.2)))
+    assert set(found.at(found.reads_ns).kind.tolist()) == set()
+    assert found.stretches == ()
+    assert len(found.silent) == 1
+
+
+def test_a_median_is_not_a_sample() -> None:
+    """A tenth of the samples 1.3 m beside the track, where three roots of 0.3 m are 0.91 m."""
+    aside = np.where(np.arange(X_M.size) % 10 == 0, 1.3, 0.0)
+    assert tracks(double(3, 0.3), samples(X_M, aside)) == [{("a0", "a1", "a2")}]
+
+
+SWITCH = site(
+    {
+        "s": line((0.0, 0.0), (500.0, 0.0)),
+        "a": line((500.0, 0.0), (1000.0, 0.0)),
+        "b": np.array([[500.0, 0.0], [550.0, 2.0], [600.0, 8.0], [1000.0, 100.0]]),
+    },
+    [("s", 1, "a", 0, "both"), ("s", 1, "b", 0, "both")],
+)
+
+
+@pytest.mark.parametrize("turn_m", [400.0, 495.0])
+def test_a_train_that_turns_before_a_switch_comes_back_on_the_other_branch(turn_m: float) -> None:
+    x_m = np.concatenate([np.linspace(900.0, turn_m, 500), np.linspace(turn_m, 900.0, 500)])
+    y_m = np.concatenate([np.zeros(500), np.interp(x_m[500:], [0, 500, 550, 600, 1000], [0, 0, 2, 8, 100])])
+    assert tracks(SWITCH, samples(x_m, y_m)) == [{("b", "s", "a", "s")}]
+
+
+def test_a_way_against_a_relation_is_none() -> None:
+    """From a to b over the switch without turning: no train does that; the longer part stays, the rest is silence."""
+    x_m = np.concatenate([np.linspace(900.0, 510.0, 400), np.linspace(510.0, 700.0, 190)])
+    y_m = np.concatenate([np.zeros(400), np.interp(x_m[400:], [500, 550, 600, 1000], [0, 2, 8, 100]) + 20.0])
+    assert tracks(SWITCH, samples(x_m, y_m)) == [{("a",)}]
+
+
+def test_a_route_limits_the_elements() -> None:
+    place = double(1, 0.3)
+    given = Site(place.track, place.links, route=pl.DataFrame({"netelement_id": ["b"], "direction": ["AB"]}))
+    assert tracks(given, samples(X_M, np.full(X_M.size, 3.9))) == [{("b",)}]
+    assert tracks(given, samples(X_M, np.full(X_M.size, 0.1))) == []
+
+
+def test_pauses_part_stretches_and_lost_samples_are_silence() -> None:
+    """A second each; none from 3 to 6 s, and one at 8 s far beside the track."""
+    frame = samples(100.0 + 10.0 * np.arange(20.0), np.zeros(20)).with_columns(t=times(20, 1.0))
+    frame = frame.with_row_index().filter(~pl.col("index").is_in([4, 5])).drop("index")
+    latitude, _ = degrees(np.zeros(1), np.full(1, 300.0))
+    eight = pl.col("t").dt.epoch("s") == 8
+    frame = frame.with_columns(latitude_deg=pl.when(eight).then(latitude[0]).otherwise("latitude_deg"))
+    found = known(double(1, 0.3), of_reference=frame)
+    assert [one.t_ns.size for one in found.stretches] == [4, 2, 11]
+    at_s = np.array([2.5, 4.5, 7.0, 7.5, 8.5, 9.0])
+    kinds = found.at((at_s * 1e9).astype(np.int64)).kind
+    assert (kinds != NOTHING).tolist() == [True, False, True, False, False, True]

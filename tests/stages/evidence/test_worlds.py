@@ -1,0 +1,266 @@
+"""The interval of the evidence holds the truth wherever one is given, and weaker evidence leaves no less."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.stages.evidence.evidence import KINDS, NOTHING
+from schemas.config import Vehicle
+from schemas.enums import Evidence as Kind
+from tests.stages.evidence.worlds import (
+    KNOWN,
+    Ride,
+    bounds,
+    known,
+    ns,
+    odometer,
+    reads,
+    reference,
+    stamps,
+    straight,
+    wavy,
+)
+
+GROUND = straight()
+# Without a vehicle file the GNSS is on the reference's clock, or on the odometer's: nobody says on which.
+FILES = {"file": KNOWN, "none": Vehicle()}
+
+
+@pytest.mark.parametrize("top_mps", [10.0, 40.0, 80.0])
+@pytest.mark.parametrize("late_s", [-0.5, 0.05, 0.28])
+@pytest.mark.parametrize("file", FILES)
+def test_clocks_that_are_off_leave_the_truth_inside(top_mps: float, late_s: float, file: str) -> None:
+    """By the odometer's clock: a lag is taken off with a vehicle file, and widens the interval without one."""
+    rng = np.random.default_rng(1)
+    ride = wavy(top_mps)
+    found = known(GROUND, odometer(ride, rng), of_reference=reference(ride, rng, late_s=late_s), vehicle=FILES[file])
+    at_s = np.arange(5.0, 390.0, 1.7)
+    low, high, holds = bounds(found.at(ns(at_s)), ride.at(at_s))
+    assert holds.all()
+    (clock,) = found.clocks
+    assert clock.lag.lag_s == pytest.approx(late_s, abs=3.0 * clock.lag.sigma_s)
+    assert not clock.assumed
+    widest_m = 2.0 * (0.15 + top_mps * (abs(late_s) + 0.02) + 0.5)
+    assert (high - low).max() < (2.0 if file == "file" else widest_m)
+
+
+@pytest.mark.parametrize("late_s", [0.05, 0.3])
+@pytest.mark.parametrize("file", FILES)
+def test_reads_with_a_clock_of_their_own_leave_the_truth_inside(late_s: float, file: str) -> None:
+    rng = np.random.default_rng(2)
+    ride = wavy(60.0)
+    found = known(GROUND, odometer(ride, rng), of_reads=reads(ride, GROUND, rng, late_s=late_s), vehicle=FILES[file])
+    at_s = np.arange(12.0, 380.0, 1.7)
+    low, _, holds = bounds(found.at(ns(at_s)), ride.at(at_s))
+    assert holds.all()
+    assert np.isfinite(low).all()
+
+
+def test_a_clock_that_cannot_be_measured_is_taken_as_a_tenth_of_a_second_and_said() -> None:
+    """At constant speed a lag and a shift look alike."""
+    rng = np.random.default_rng(3)
+    ride = Ride((0.0, 300.0), (30.0, 30.0))
+    at_s = np.arange(5.0, 290.0, 2.0)
+    found = known(GROUND, odometer(ride, rng), of_reference=reference(ride, rng, late_s=0.08))
+    assert found.clock_assumed
+    low, high, holds = bounds(found.at(ns(at_s)), ride.at(at_s))
+    assert holds.all()
+    assert high - low == pytest.approx(2.0 * (0.15 + 3.0), abs=0.2)
+    assert known(GROUND, of_reference=reference(ride, rng)).clock_assumed
+
+
+@pytest.mark.parametrize("late_s", [-0.09, 0.05, 0.09])
+@pytest.mark.parametrize("file", FILES)
+def test_a_recording_that_begins_and_ends_at_speed_is_no_change_of_speed(late_s: float, file: str) -> None:
+    """Half a second beyond the odometer's recording looked like a stop, and a late clock was measured as none."""
+    rng = np.random.default_rng(6)
+    ride = Ride((0.0, 220.0), (70.0, 70.0))
+    found = known(
+        GROUND,
+        odometer(ride, rng),
+        of_reference=reference(ride, rng, sigma_m=0.02, late_s=late_s),
+        vehicle=FILES[file],
+    )
+    assert found.clock_assumed
+    at_s = np.arange(2.0, 215.0, 1.3)
+    assert bounds(found.at(ns(at_s)), ride.at(at_s))[2].all()
+
+
+def test_a_reset_of_the_odometer_is_no_change_of_speed() -> None:
+    """At constant speed nothing tells the lag, whatever the counter does in between."""
+    rng = np.random.default_rng(7)
+    ride = Ride((0.0, 220.0), (70.0, 70.0))
+    counted = (
+        odometer(ride, rng)
+        .with_row_index("row")
+        .with_columns(distance_m=pl.col("distance_m") - pl.when(pl.col("row") >= 1003).then(5000.0).otherwise(0.0))
+    )
+    found = known(GROUND, counted.drop("row"), of_reference=reference(ride, rng, sigma_m=0.02, late_s=0.05))
+    assert found.clock_assumed
+
+
+def test_a_lag_of_seconds_is_found() -> None:
+    rng = np.random.default_rng(4)
+    ride = wavy(40.0)
+    (clock,) = known(GROUND, odometer(ride, rng), of_reference=reference(ride, rng, late_s=17.0)).clocks
+    assert clock.shift_s == pytest.approx(17.0, abs=0.1)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_slip_inside_the_closing_tolerance_widens_the_interval(file: str) -> None:
+    """14.6 m lost at one place of 5 km: with or without a vehicle file the truth is inside all the same."""
+    rng = np.random.default_rng(5)
+    ride = wavy(40.0)
+    lost_m = 14.6 * np.clip((ride.t_s - 150.0) / 5.0, 0.0, 1.0)
+    kept = reads(ride, GROUND, rng)[::10]
+    vehicle = FILES[file].model_copy(update={"odometer_scale_sigma": 1e-3} if file == "file" else {})
+    found = known(GROUND, odometer(ride, rng, lost_m), of_reads=kept, vehicle=vehicle)
+    first_s, last_s = ((kept["t"].cast(pl.Int64).to_numpy()[[0, -1]] - ns([0.0])[0]) / 1e9).tolist()
+    at_s = np.arange(first_s, last_s, 0.9)
+    low, high, holds = bounds(found.at(ns(at_s)), ride.at(at_s))
+    assert holds.all()
+    assert (high - low).max() > 14.6
+
+
+def test_of_two_odometers_of_which_one_slips_the_hull_holds_the_truth() -> None:
+    """30 m lost by the sensor of the LDS behind the last read, where one side holds it alone."""
+    rng = np.random.default_rng(6)
+    ride = wavy(30.0)
+    slipping = odometer(ride, rng, 60.0 * np.clip((ride.t_s - 300.0) / 5.0, 0.0, 1.0))
+    kept = reads(ride, GROUND, rng).filter(pl.col("t") < stamps(np.array([290.0]))[0])
+    at_s = np.arange(310.0, 380.0, 1.0)
+    alone = bounds(known(GROUND, slipping, of_reads=kept).at(ns(at_s)), ride.at(at_s))
+    both = bounds(known(GROUND, slipping, odometer(ride, rng), of_reads=kept).at(ns(at_s)), ride.at(at_s))
+    assert not alone[2].all()  # the assumption of DOMAIN 5.1: on one side an odometer is within 5 m + 5 %
+    assert both[2].all()
+    assert (both[0] <= alone[0]).all()
+    assert (both[1] >= alone[1]).all()
+
+
+def test_a_reference_that_steps_ahead_leaves_both_sides_until_it_steps_back() -> None:
+    """25 m along the track from 100 to 140 s."""
+    rng = np.random.default_rng(7)
+    ride = wavy(30.0)
+    ahead = np.where((np.arange(4000) / 10.0 >= 100.0) & (np.arange(4000) / 10.0 < 140.0), 25.0, 0.0)
+    found = known(GROUND, odometer(ride, rng), of_reference=reference(ride, rng, ahead_m=ahead))
+    at_s = np.arange(5.05, 390.0, 0.5)
+    low, high, holds = bounds(found.at(ns(at_s)), ride.at(at_s))
+    assert holds.all()
+    stepped = (at_s > 100.0) & (at_s < 140.0)
+    assert (high - low)[stepped].min() > 25.0
+    assert (high - low)[~stepped].max() < 2.0
+
+
+def test_the_last_sample_of_a_slow_reference_has_the_speed_of_the_train() -> None:
+    """At 1 Hz its clock was worth nothing there, and what was carried on from it left the truth outside."""
+    rng = np.random.default_rng(11)
+    ride = Ride((0.0, 50.0, 100.0, 150.0, 200.0), (70.0, 30.0, 70.0, 30.0, 70.0))
+    slow = reference(ride, rng, rate_hz=1.0, late_s=0.28)
+    found = known(GROUND, odometer(ride, rng), of_reference=slow)
+    (stretch,) = found.stretches
+    assert not found.clock_assumed
+    assert stretch.clock_m[-1] == pytest.approx(stretch.clock_m[-2], rel=0.05)
+
+
+def test_between_the_samples_of_a_step_no_straight_line_is_evidence() -> None:
+    """A reference of 1 Hz steps back after a read: the line in between crossed what the reads say, beside the train."""
+    rng = np.random.default_rng(7)
+    ride = wavy(30.0)
+    ahead = np.where((np.arange(400) >= 100) & (np.arange(400) < 140), 25.0, 0.0)
+    stepping = reference(ride, rng, rate_hz=1.0, ahead_m=ahead)
+    found = known(GROUND, odometer(ride, rng), of_reference=stepping, of_reads=reads(ride, GROUND, rng))
+    at_s = np.arange(95.0, 145.0, 0.05)
+    assert bounds(found.at(ns(at_s)), ride.at(at_s))[2].all()
+
+
+def test_a_read_says_which_side_of_a_step_is_right() -> None:
+    """The reference stays 25 m ahead: its step stays open, and the reads say on which side of it the train is."""
+    rng = np.random.default_rng(8)
+    ride = wavy(30.0)
+    ahead = np.where(np.arange(4000) / 10.0 >= 100.0, 25.0, 0.0)
+    found = known(
+        GROUND, odometer(ride, rng), of_reference=reference(ride, rng, ahead_m=ahead), of_reads=reads(ride, GROUND, rng)
+    )
+    at_s = np.arange(5.05, 390.0, 0.5)
+    evidence = found.at(ns(at_s))
+    low, high, holds = bounds(evidence, ride.at(at_s))
+    assert holds.all()
+    assert np.median((high - low)[at_s > 120.0]) < 25.0
+    assert found.disputed == 0
+
+
+def test_an_odometer_that_stands_is_no_step_of_the_reference() -> None:
+    rng = np.random.default_rng(9)
+    ride = wavy(30.0)
+    stood = np.interp(ride.t_s, ride.t_s, ride.x_m)
+    lost = np.clip(stood - ride.at(np.array([200.0])), 0.0, ride.at(np.array([215.0])) - ride.at(np.array([200.0])))
+    found = known(GROUND, odometer(ride, rng, lost), of_reference=reference(ride, rng))
+    at_s = np.arange(5.05, 390.0, 0.5)
+    low, high, holds = bounds(found.at(ns(at_s)), ride.at(at_s))
+    assert holds.all()
+    assert (high - low).max() < 3.0
+
+
+def test_a_first_read_with_a_wrong_name_carries_nothing_outward() -> None:
+    """P1 instead of P0 with the odometer of a vehicle file: before it nothing is known, behind it both sides are."""
+    rng = np.random.default_rng(10)
+    ride = wavy(30.0)
+    true = reads(ride, GROUND, rng)
+    wrong = pl.concat([true[:1].with_columns(balise_id=pl.lit("P2")), true[3:]])
+    found = known(GROUND, odometer(ride, rng), of_reads=wrong)
+    first_s = (true["t"].cast(pl.Int64)[0] - int(ns([0.0])[0])) / 1e9
+    before_s, between_s = np.arange(1.0, first_s - 0.1, 0.5), np.arange(first_s + 0.1, first_s + 40.0, 0.5)
+    assert set(found.at(ns(before_s)).kind.tolist()) == {NOTHING}
+    low, _, holds = bounds(found.at(ns(between_s)), ride.at(between_s))
+    assert (holds | ~np.isfinite(low)).all()
+
+
+@pytest.mark.parametrize("fault", ["reset", "silent"])
+def test_nothing_is_carried_over_a_counter_that_was_reset_or_silent(fault: str) -> None:
+    rng = np.random.default_rng(11)
+    ride = wavy(30.0)
+    counted = odometer(ride, rng)
+    late = pl.col("t") >= stamps(np.array([200.0]))[0]
+    if fault == "reset":
+        counted = counted.with_columns(
+            distance_m=pl.when(late).then(pl.col("distance_m") - 2000.0).otherwise("distance_m")
+        )
+    else:
+        counted = counted.filter(~late | (pl.col("t") >= stamps(np.array([206.0]))[0]))
+    kept = reads(ride, GROUND, rng)[:2]
+    found = known(GROUND, counted, of_reads=kept).at(ns([150.0, 199.0, 207.0, 300.0]))
+    assert found.kind.tolist() == [KINDS.index(Kind.BALISE)] * 2 + [NOTHING] * 2
+
+
+def test_nothing_is_carried_over_a_stand_of_a_counter_without_sign() -> None:
+    """To and fro: the counter grows both ways, and the last read is behind the turn."""
+    rng = np.random.default_rng(12)
+    knots_s = (0.0, 20.0, 150.0, 170.0, 180.0, 200.0, 300.0, 320.0, 330.0, 350.0, 400.0)
+    ride = Ride(knots_s, (0.0, 25.0, 25.0, 0.0, 0.0, -25.0, -25.0, 0.0, 0.0, 25.0, 25.0))
+    counted = odometer(ride, rng)
+    grown = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(counted["distance_m"].to_numpy())))])
+    without = counted.with_columns(distance_m=pl.Series(grown))
+    truth = reference(ride, rng).filter(pl.col("t") < stamps(np.array([310.0]))[0])
+    at_s = np.array([315.0, 340.0, 390.0])
+    signed = known(GROUND, counted, of_reference=truth).at(ns(at_s))
+    assert bounds(signed, ride.at(at_s))[2].all()
+    found = known(GROUND, without, of_reference=truth).at(ns(at_s))
+    assert found.kind.tolist() == [KINDS.index(Kind.REFERENCE), NOTHING, NOTHING]
+
+
+def test_less_evidence_leaves_no_less() -> None:
+    """Reference and reads, the reference alone, the reads alone: each interval holds that of both, where they agree."""
+    rng = np.random.default_rng(13)
+    ride = wavy(40.0)
+    counted, truth, read = odometer(ride, rng), reference(ride, rng, sigma_m=1.0), reads(ride, GROUND, rng)
+    at_s = np.arange(15.0, 380.0, 0.7)
+    full = known(GROUND, counted, of_reference=truth, of_reads=read).at(ns(at_s))
+    assert full.disputed.size == 0
+    low, high, holds = bounds(full, ride.at(at_s))
+    assert holds.all()
+    for less in ({"of_reference": truth}, {"of_reads": read}):
+        weaker = bounds(known(GROUND, counted, **less).at(ns(at_s)), ride.at(at_s))
+        assert (weaker[0] <= low + 1e-6).all()
+        assert (weaker[1] >= high - 1e-6).all()

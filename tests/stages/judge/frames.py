@@ -1,0 +1,65 @@
+"""Epochs and offers as the judge has judged them, on a handful of rows: what a test does not say is in good order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.judge.failures import Course, course_of
+from pipeline.stages.judge.jumps import Jump
+from schemas.config import HazardConfig
+from schemas.conform import dtypes
+from schemas.stages import JudgedEpochs, JudgedOffers
+
+NS = 1_000_000_000
+CONFIG = HazardConfig()
+
+
+def positions(t_s: Sequence[float], error_m: Sequence[float] | float = 0.0, half_m: float = 1.0, **columns: Any) -> Any:
+    """Positions of a train at 10 m/s, all in use; wrong where the whole interval is beyond 20 m, else right."""
+    size = len(t_s)
+    error = np.broadcast_to(np.array(error_m, dtype=np.float64), size)
+    wrong = np.abs(error) - half_m > 20.0
+    within = np.abs(error) + half_m <= 20.0
+    judgement = np.where(wrong, "wrong", np.where(within, "right", "unknown")).tolist()
+    step_s = np.diff(np.array(t_s), prepend=t_s[0] - (t_s[1] - t_s[0]))
+    nanoseconds = [round(t * NS) for t in t_s]
+    values: dict[str, Any] = {
+        "epoch": list(range(size)), "t": nanoseconds, "at": nanoseconds, "direction": 1, "judgement": judgement,
+        "error_low_m": error - half_m, "error_high_m": error + half_m, "evidence": "reference", "wrong_track": False,
+        "path_m": 10.0 * np.array(t_s) + error, "sigma_along_m": 1.0, "leg": 0, "used_s": step_s,
+    } | columns  # fmt: skip
+    values.setdefault("wrong_s", np.where([word == "wrong" for word in values["judgement"]], values["used_s"], 0.0))
+    for name in ("train_m", "reference_m"):
+        values.setdefault(name, 10.0 * np.array(t_s))
+    recorded = {"t": pl.Datetime("ns", "UTC"), "path_m": pl.Float64, "sigma_along_m": pl.Float64, "leg": pl.Int32}
+    return _frame(size, values, dtypes(JudgedEpochs) | recorded)
+
+
+def offers(epochs: Sequence[int], **columns: Any) -> pl.DataFrame:
+    """Virtual balises offered at these epochs and accepted, right unless said otherwise."""
+    size = len(epochs)
+    values: dict[str, Any] = {
+        "crossing_id": list(range(size)), "balise_id": [f"V{k}" for k in range(size)], "epoch": list(epochs),
+        "t": [k * NS for k in epochs], "path_m": [10.0 * k for k in epochs], "virtual": True, "offered": True,
+        "accepted": True, "beyond_window": False, "judgement": "right", "error_low_m": -1.0, "error_high_m": 1.0,
+        "evidence": "reference", "wrong_track": False,
+    } | columns  # fmt: skip
+    return _frame(size, values, dtypes(JudgedOffers))
+
+
+def course(frame: pl.DataFrame, *jumps: Jump) -> Course:
+    return course_of(frame, jumps, CONFIG)
+
+
+def _frame(size: int, values: dict[str, Any], kinds: Any) -> pl.DataFrame:
+    columns = [
+        pl.Series(name, value if isinstance(value, list | np.ndarray) else [value] * size, nan_to_null=True).cast(
+            kinds[name]
+        )
+        for name, value in values.items()
+    ]
+    return pl.DataFrame(columns)

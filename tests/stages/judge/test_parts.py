@@ -1,0 +1,585 @@
+"""Single rules of the judge on a handful of rows, worked out by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.stages.epochs.failure_log import FailureLog
+from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
+from pipeline.stages.judge.across import errors_across
+from pipeline.stages.judge.alarms import verdict_within
+from pipeline.stages.judge.case import Case, between_far_epochs
+from pipeline.stages.judge.episodes import Episode, _failure, _failure_may_ns, _is_back, _named_onset_ns, find_episodes
+from pipeline.stages.judge.failures import Course, accepted_in, find_failures, within_budget
+from pipeline.stages.judge.hazards import HazardRow, Offers, crossed_by, hazard_rows, instants, rate_mps, size_m
+from pipeline.stages.judge.judgement import (
+    RIGHT,
+    UNKNOWN,
+    WRONG,
+    Judgements,
+    Positions,
+    judge_positions,
+    margins_m,
+    with_own_anchors,
+)
+from pipeline.stages.judge.jumps import Jump, find_jumps, steps_of
+from pipeline.stages.judge.movement import Counted, moving, travel_direction
+from pipeline.stages.judge.suspect import suspect_of
+from pipeline.stages.judge.true_crossings import TrueCrossing, true_crossings
+from pipeline.stages.judge.use import lds_states, odometer_beyond_confidence, time_in_use
+from pipeline.stages.track.path import Place, Route
+from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
+from schemas.enums import Evidence, Hazard, Judgement, Suspect, Verdict
+from tests.stages.judge.frames import NS, course, offers, positions
+
+EPISODE = Episode(
+    mark=0, onset=0, end=1, onset_ns=0, end_ns=1, step=None, jump_back=None, begin_ns=0, failure_number=None,
+    t_failure_ns=None, t_failure_may_ns=None, detected_ns=None, monitor=None, alarm_before_onset=False, failure=None,
+)  # fmt: skip
+DEG_PER_M = np.degrees(1.0 / 6378137.0)  # east along the equator
+
+
+def seconds(*t_s: float) -> Any:
+    return np.array([round(t * NS) for t in t_s], dtype=np.int64)
+
+
+def ns(t_s: float | None) -> int | None:
+    return None if t_s is None else round(t_s * NS)
+
+
+def episodes(of: Course) -> list[Episode]:
+    """Where no monitor fails and nothing was offered."""
+    quiet = FailureLog(of.t_ns, np.zeros(of.size, dtype=bool), np.zeros(0, dtype=np.int64), (), ())
+    return find_episodes(of, offers([]), find_failures(of, offers([]), Configuration()), quiet, None, HazardConfig())
+
+
+@pytest.mark.parametrize(
+    ("judged", "accepted", "epoch", "may_s", "kept"),
+    [
+        ("wrong", True, 1, 0.2, True),  # accepted before the failure
+        ("wrong", False, 3, 0.2, True),  # offered in it, not accepted
+        ("wrong", True, 3, 0.2, False),
+        ("unknown", True, 3, 0.2, None),
+        ("right", True, 3, 0.7, None),  # 0.2 s wrong for sure, 0.7 s at most, 0.5 s allowed
+    ],
+)
+def test_a_budget_is_kept_where_nothing_wrong_was_accepted_in_the_failure(
+    judged: str, accepted: bool, epoch: int, may_s: float, kept: bool | None
+) -> None:
+    """From the third of eight positions on."""
+    offered = offers([epoch], judgement=judged, accepted=accepted)
+    worst = accepted_in(offered, positions(range(8)), 2, 8)
+    assert within_budget(0.2, may_s, worst, 0.5) is kept
+
+
+def test_the_distance_counts_from_the_last_accepted_balise() -> None:
+    """The odometer misses 30 m between 1 s and 2 s; a balise accepted at 3 s is a new begin."""
+    t_ns, odometer_m = seconds(0, 1, 2, 3, 4), np.linspace(0.0, 40.0, 5)
+    train_m = odometer_m + np.array([0.0, 0.0, 30.0, 30.0, 30.0])
+    beyond = odometer_beyond_confidence(t_ns, odometer_m, train_m, np.zeros(5), seconds(1, 3), LdsConfig())
+    assert beyond.tolist() == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize(("detected_ns", "until_ns"), [(None, 30), (20, 20)])
+def test_a_fault_is_undetected_until_a_monitor_fails_or_to_its_end(detected_ns: int | None, until_ns: int) -> None:
+    episode = replace(EPISODE, begin_ns=1, end_ns=30, detected_ns=detected_ns)
+    assert episode.undetected_ns == (1, until_ns)
+
+
+def test_what_a_step_offers_on_its_way_lies_before_its_first_position() -> None:
+    """A step from the second to the third position: it begins right after the second."""
+    frame = positions(range(30), [0.0, 0.0] + [30.0] * 5 + [0.0] * 23)
+    (episode,) = episodes(course(frame, Jump(2, 2, 30.0)))
+    assert (episode.onset_ns, episode.begin_ns) == (2 * NS, NS + 1)
+
+
+@pytest.mark.parametrize(
+    ("low_m", "high_m", "told", "verdict"),
+    [
+        ([-1.0, 4.0], [1.0, 9.0], [True, True], Verdict.UNKNOWN),  # 4 to 9 m against 5 m
+        ([-1.0, 6.0], [1.0, 9.0], [False, False], Verdict.TRUE),
+        ([-9.0, 0.0], [-6.0, 1.0], [True, True], Verdict.TRUE),
+        ([-1.0, -5.0], [1.0, 5.0], [True, True], Verdict.FALSE),
+        ([-1.0, -5.0], [1.0, 5.0], [True, False], Verdict.UNKNOWN),
+        ([-1.0, np.nan], [1.0, np.nan], [True, True], Verdict.UNKNOWN),
+        ([], [], [], Verdict.UNKNOWN),
+    ],
+)
+def test_an_alarm_is_false_only_where_all_of_its_positions_were_well(
+    low_m: list[float], high_m: list[float], told: list[bool], verdict: Verdict
+) -> None:
+    margin_m = np.full(len(told), 5.0)
+    assert verdict_within(np.array(low_m), np.array(high_m), margin_m, np.array(told, dtype=bool)) is verdict
+
+
+def test_errors_across_are_left_of_growing_path_and_upwards() -> None:
+    """Two samples of a reference on the equator, 2 s and 20 m east apart; positions 1 m north and 3 m above."""
+    stamps = pl.Series("t", [0, 2 * NS], dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    reference = pl.DataFrame(
+        {"t": stamps, "latitude_deg": [0.0, 0.0], "longitude_deg": [0.0, 20.0 * DEG_PER_M], "height_m": [50.0, 52.0]}
+    )
+    at_s, east_m = [0.0, 1.0, 1.0, 2.0, 2.5], np.array([0.0, 10.0, 35.0, 20.0, 25.0])
+    north_deg = np.degrees(1.0 / 6335439.3)  # radius of curvature of the meridian at the equator, WGS 84
+    fixes = pl.DataFrame({"latitude_deg": [north_deg] * 5, "longitude_deg": east_m * DEG_PER_M, "height_m": [54.0] * 5})
+    for heading_deg, left_m in ((90.0, 1.0), (270.0, -1.0)):
+        across, up = errors_across(fixes, np.full(5, heading_deg), seconds(*at_s), reference, 2.0, 20.0)
+        # The third is 25 m ahead, the last after the reference ended.
+        assert across == pytest.approx([left_m, left_m, np.nan, left_m, np.nan], abs=1e-3, nan_ok=True)
+        assert up == pytest.approx([4.0, 3.0, np.nan, 2.0, np.nan], abs=1e-3, nan_ok=True)
+    nothing = errors_across(fixes, np.full(5, 90.0), seconds(*at_s), reference.head(1), 2.0, 20.0)
+    assert all(np.isnan(values).all() for values in nothing)
+
+
+def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of() -> None:
+    """On element 0 alone up to 98 m at 2 s, from 106 m at 3 s on over element 1, which begins at 100 m."""
+    before = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
+    after = Route(
+        np.array([0, 1]), np.array([True, True]), np.array([0.0, 100.0]), np.array([0.0, 0.0]), np.array([100.0, 100.0])
+    )
+    alternatives = tuple(
+        Alternative(np.array(rows), route, np.array(at_m) - 1.0, np.array(at_m) + 1.0)
+        for rows, route, at_m in (
+            ([0, 1, 2], before, [80.0, 90.0, 98.0]),
+            ([3, 4, 5], after, [106.0, 114.0, 122.0]),
+        )
+    )
+    evidence = EvidenceSet(np.zeros(6, dtype=np.int64), alternatives)
+    places = {"V1": Place(1, 2.0), "V2": Place(1, 60.0)}
+    found = true_crossings(seconds(0, 1, 2, 3, 4, 5), evidence, places, 5.0, 3.0)
+    # 102 m lies in the middle between 98 m and 106 m; 160 m was not reached.
+    assert found == {"V1": [TrueCrossing(round(2.5 * NS), 1, True)], "V2": []}
+    # Where the place is known to 0.5 m only, evidence of 1 m to both sides tells of no passing.
+    assert true_crossings(seconds(0, 1, 2, 3, 4, 5), evidence, places, 0.5, 3.0) == {"V1": [], "V2": []}
+
+
+def test_the_margin_of_a_healthy_position() -> None:
+    """max(5 m, min(3 sigma, 20 m)); 20 m where no sigma is known."""
+    assert margins_m(np.array([0.5, 3.0, 20.0, np.nan]), HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0]
+
+
+def test_what_an_episode_hit() -> None:
+    """Of ten offers: 20 m and less are no shift, nor is what was not offered, not wrong, or outside numbers 2 to 7."""
+    least_m = np.array([30.0, 30.0, 30.0, 10.0, 30.0, 30.0, 0.0, 30.0, 20.0, 20.1])
+    code = ["wrong"] * 4 + ["right", "unknown"] + ["wrong"] * 4
+    epoch = [1, 2, 3, 4, 5, 6, 7, 8, 3, 4]
+    offered = offers(
+        epoch, judgement=code, error_low_m=least_m, error_high_m=least_m + 2.0,
+        offered=[k != 2 for k in range(10)], wrong_track=[number == 7 for number in epoch],
+    )  # fmt: skip
+    told = course(positions(range(10)))
+    found = hazard_rows([replace(EPISODE, onset=2, end=8)], told, Offers.of(offered, told.positions), HazardConfig())
+    assert [(row.hazard, row.hits) for row in found] == [(Hazard.VB_SHIFT, [1, 9]), (Hazard.VB_WRONG_TRACK, [6])]
+
+
+@pytest.mark.parametrize(
+    ("before_m", "step_m", "after_m", "code", "back"),
+    [
+        (30.0, -30.0, 0.0, RIGHT, True),
+        (-30.0, 30.0, 0.0, RIGHT, True),
+        (30.0, 30.0, 0.0, RIGHT, False),  # farther away
+        (0.1, 8.0, 8.1, RIGHT, False),  # on from a place that was hardly wrong
+        (30.0, -30.0, 20.0, UNKNOWN, True),
+        (30.0, -30.0, 20.1, UNKNOWN, False),  # still beyond the limit
+        (30.0, -30.0, 0.0, WRONG, False),  # on another track
+    ],
+)
+def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
+    before_m: float, step_m: float, after_m: float, code: int, back: bool
+) -> None:
+    middle_m, size_m = np.array([before_m, 0.0]), np.array([0.0, after_m])
+    low_m = np.where(np.arange(2) == 0, middle_m, size_m)
+    kind, track = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=bool)
+    judged = Judgements(np.array([WRONG, code]), low_m, low_m, kind, track)
+    assert bool(_is_back(judged, Jump(1, 1, step_m), HazardConfig())) is back
+
+
+@pytest.mark.parametrize(("may_s", "detected_s"), [(104.5, 107.0), (None, 107.0), (104.5, None)])
+def test_the_times_of_a_hazard(may_s: float | None, detected_s: float | None) -> None:
+    """Onset at 103 s, a VB hit at 104 s, failure at 105 s or a little before, alarm at 107 s, end at 109 s."""
+    told = course(positions([100.0 + k for k in range(10)]))
+    offered = Offers.of(offers([1, 4], t=[101 * NS, 104 * NS]), told.positions)
+    episode = replace(
+        EPISODE, onset_ns=103 * NS, end_ns=109 * NS, t_failure_ns=105 * NS, t_failure_may_ns=ns(may_s),
+        detected_ns=ns(detected_s),
+    )  # fmt: skip
+    found = instants(HazardRow(Hazard.VB_SHIFT, episode, None, [1]), told, offered, Configuration())
+    times = [found[name] for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
+    assert times == seconds(103, 104, 105, 109).tolist()
+    seen = detected_s is not None
+    assert (found["detected"], found["t_negated"]) == (seen, 108 * NS if seen else None)  # one epoch to react
+    assert found["time_to_detect_s"] == (4.0 if seen else None)
+    assert found["time_since_failure_s"] == (2.0 if seen else None)
+    assert found["time_since_failure_may_s"] == (2.5 if seen and may_s is not None else None)
+
+
+@pytest.mark.parametrize(
+    ("kind", "error_m", "stood", "counted_wrong", "sure", "suspect"),
+    [
+        (Evidence.REFERENCE, 9.0, False, True, True, Suspect.GNSS),
+        (Evidence.ODOMETER, 9.0, True, False, True, Suspect.ODOMETER),
+        (Evidence.ODOMETER, 9.0, False, True, True, Suspect.ODOMETER),
+        (Evidence.ODOMETER, 9.0, False, False, False, Suspect.GNSS),
+        (Evidence.REFERENCE, 5.0, False, False, False, Suspect.TRACK),  # 5 m is the margin
+        (Evidence.REFERENCE, 0.0, False, False, True, Suspect.UNKNOWN),
+    ],
+)
+def test_who_is_suspected(
+    kind: Evidence, error_m: float, stood: bool, counted_wrong: bool, sure: bool, suspect: Suspect
+) -> None:
+    """Ten epochs, of which the sixth tells; an alarm at 6 s. The odometer and the Doppler are silent."""
+    told = np.arange(10) == 5
+    silent = pl.lit(None, pl.Float64)
+    epochs = positions(
+        range(10), np.where(told, error_m, 0.0), 0.0, evidence=kind.value, stood=told & stood,
+        odometer_wrong=told & counted_wrong, unambiguous=~told | sure,
+    ).with_columns(odometer_m=silent, velocity_along_mps=silent)  # fmt: skip
+    assert suspect_of(epochs, 6 * NS, 6 * NS, Configuration()) is suspect
+    # What was before the time looked back on does not count.
+    late = 70 * NS
+    assert suspect_of(epochs, 6 * NS + late, 6 * NS + late, Configuration()) is Suspect.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("wrong", "step", "failure"),
+    [
+        ([0, 1, 2, 4, 5, 6], None, 4),  # 2 s at the begin lie before the onset
+        ([3, 5], None, 3),  # none lasts a second: the first
+        ([3, 5], (5, 5), 5),  # a step counts at once
+        ([0, 1], None, None),
+    ],
+)
+def test_a_failure_is_a_second_of_wrong_from_the_onset_on(
+    wrong: list[int], step: tuple[int, int] | None, failure: int | None
+) -> None:
+    """Positions each 0.5 s, the onset is the third."""
+    frame = positions(0.5 * np.arange(8), [30.0 if k in wrong else 0.0 for k in range(8)])
+    jump = None if step is None else Jump(*step, 30.0)
+    assert _failure(course(frame), 2, 8, jump, HazardConfig()) == failure
+
+
+@pytest.mark.parametrize(
+    ("evidence", "judgement", "may_s"),
+    [
+        (["reference"] * 6, ["right", "unknown", "unknown", "unknown", "unknown", "wrong"], 3),
+        (["reference"] * 6, ["right", "unknown", "unknown", "unknown", "right", "wrong"], 5),
+        (["reference", None, *["reference"] * 4], ["right", "unknown", "unknown", "unknown", "unknown", "wrong"], None),
+        ([None, *["reference"] * 5], ["unknown", "right", "unknown", "unknown", "unknown", "wrong"], 3),
+    ],
+)
+def test_since_when_a_drift_may_have_failed(
+    evidence: list[str | None], judgement: list[str], may_s: int | None
+) -> None:
+    """6 m more each second, known to 5 m: beyond 20 m for certain at 5 s, and possibly from 3 s on."""
+    frame = positions(range(6), 6.0 * np.arange(6), 5.0, judgement=judgement, evidence=evidence)
+    assert _failure_may_ns(course(frame), 5, HazardConfig()) == ns(may_s)
+
+
+def placed(path_m: list[float], element: int = 0) -> Positions:
+    """Positions on one element, whose measure is the path position."""
+    at_m, size = np.array(path_m), len(path_m)
+    of_element = np.where(np.isnan(at_m), -1, element)
+    leg = np.zeros(size, dtype=np.int64)
+    return Positions(of_element, at_m, leg, at_m, np.ones(size, dtype=bool))
+
+
+def test_each_alternative_is_weighed_however_few_instants_it_tells_of() -> None:
+    """On element 0 the train is at 50 m; at 2 s it is there or at 90 m, and at 3 s the position is not known."""
+    route = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
+    told = [Alternative(np.array(rows), route, np.array(low), np.array(low) + 2.0) for rows, low in (
+        ([0, 1, 2, 3], [49.0] * 4), ([2], [89.0]), ([3], [89.0]))]  # fmt: skip
+    evidence = EvidenceSet(np.full(4, KINDS.index(Evidence.BALISE)), tuple(told))
+    found = judge_positions(placed([50.0, 80.0, 50.0, np.nan]), evidence, [route], HazardConfig())
+    assert found.code.tolist() == [RIGHT, WRONG, UNKNOWN, UNKNOWN]
+    assert found.low_m == pytest.approx([-1.0, 29.0, -41.0, np.nan], nan_ok=True)
+    assert found.high_m == pytest.approx([1.0, 31.0, 1.0, np.nan], nan_ok=True)
+    assert found.kind.tolist() == [KINDS.index(Evidence.BALISE)] * 3 + [NOTHING]
+
+
+def test_the_odometer_since_a_balise_shows_only_what_was_wrong() -> None:
+    """20 m is the limit: 15 to 25 m off is unknown, 21 to 31 m wrong; nothing without a position, interval or need."""
+    given = placed([115.0, 121.0, 121.0, np.nan, 121.0, 79.0])
+    nothing, balise = NOTHING, KINDS.index(Evidence.BALISE)
+    before = np.array([nothing, nothing, balise, nothing, nothing, nothing])
+    unknown = np.full(6, np.nan)
+    judged = Judgements(np.full(6, UNKNOWN), unknown, unknown, before, np.zeros(6, dtype=bool))
+    low_m = np.array([90.0, 90.0, 90.0, 90.0, np.nan, 100.0])
+    found = with_own_anchors(judged, given, (low_m, low_m + 10.0), HazardConfig())
+    assert found.code.tolist() == [UNKNOWN, WRONG, UNKNOWN, UNKNOWN, UNKNOWN, WRONG]
+    odometer = KINDS.index(Evidence.ODOMETER)
+    assert found.kind.tolist() == [odometer, odometer, balise, nothing, nothing, odometer]
+    assert found.low_m[[0, 1, 5]].tolist() == [15.0, 21.0, -31.0]
+    assert found.high_m[[0, 1, 5]].tolist() == [25.0, 31.0, -21.0]
+    # In the direction of travel: against growing path what is ahead is behind.
+    turned = found.turned(np.array([1, -1, 1, 1, 1, -1]))
+    assert turned.low_m[[0, 1, 5]].tolist() == [15.0, -31.0, 21.0]
+    assert turned.high_m[[0, 1, 5]].tolist() == [25.0, -21.0, 31.0]
+
+
+def used(t_s: Sequence[float], code: Sequence[int] | int, **columns: Any) -> pl.DataFrame:
+    """Time in use of good positions at these times."""
+    size = len(t_s)
+    plain = {"path_m": 1.0, "on_track": True, "gate_probability": 1.0, "confidence_m": 5.0}
+    plain |= {"negated": False, "withheld": False}
+    values = {name: value if isinstance(value, list) else [value] * size for name, value in (plain | columns).items()}
+    stamps = pl.Series("t", [round(t * NS) for t in t_s], dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    return time_in_use(pl.DataFrame({"t": stamps, **values}), np.broadcast_to(code, size), Configuration())
+
+
+def test_a_position_is_in_use_since_the_one_before_it_until_it_is_negated() -> None:
+    """At 1 Hz with a gap of 5 s; the alarm at 9 s takes one epoch to negate, until 12 s; the last is not confident."""
+    t_s = [0, 1, 2, 7, 8, 9, 10, 11, 12, 13]
+    given = {"confidence_m": [5.0] * 9 + [500.0], "negated": [t in (9, 10, 11) for t in t_s]}
+    found = used(t_s, RIGHT, **given)
+    # Each second counts for the position at its end; of the gap one period, for nothing was in use in it.
+    assert found["used_s"].to_list() == [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    assert found["in_use"].to_list() == [True] * 7 + [False] * 3
+    assert found["counted_s"].to_list() == [1.0] * 10
+    assert used(t_s, WRONG, **given)["wrong_s"].to_list() == [1.0, 1.0, 1.0, 5.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    assert used([0.0], WRONG)["wrong_s"].to_list() == [0.0]
+
+
+def test_a_wrong_position_after_a_gap_counts_one_period_and_an_unknown_one_too() -> None:
+    """At 10 Hz with 0.9 s of gap: right before it, wrong behind it; then unknown and wrong, 0.9 s later."""
+    t_s = [0.0, 0.1, 1.0, 1.1, 2.0, 2.1, 2.2]
+    found = used(t_s, [RIGHT, RIGHT, WRONG, WRONG, UNKNOWN, WRONG, WRONG])
+    assert found["wrong_s"].to_numpy() == pytest.approx([0.0, 0.0, 0.1, 0.1, 0.0, 0.1, 0.1])
+    # What may be wrong counts whole since what was wrong or may have been.
+    assert found["used_s"].to_numpy() == pytest.approx([0.1, 0.1, 0.1, 0.1, 0.9, 0.1, 0.1])
+
+
+def test_a_withheld_position_is_not_in_use_nor_what_follows_upon_its_alarm() -> None:
+    """The bank restarts at 2 s, and fails at once: nothing was in use in its reaction. Back at 5 s."""
+    negated = [t in (2, 3, 4) for t in range(7)]
+    found = used(range(7), WRONG, negated=negated, withheld=[t == 2 for t in range(7)])
+    assert found["in_use"].to_list() == [True, True, False, False, False, False, True]
+    assert used(range(7), WRONG, negated=negated)["in_use"].to_list() == [True, True, True, True, False, False, True]
+
+
+def test_rows_without_a_position_stand_for_no_time_between_near_positions() -> None:
+    """Positions each second, rows each 0.5 s; from 2 s on none for 5 s."""
+    t_s = 0.5 * np.arange(15)
+    path_m = [1.0 if t in (0.0, 1.0, 2.0, 7.0) else None for t in t_s]
+    found = used(t_s, RIGHT, path_m=path_m)
+    assert found["used_s"].to_numpy() == pytest.approx([float(p is not None) for p in path_m])
+    assert found["counted_s"].sum() == pytest.approx(3 * 1.0 + 9 * 0.5 + 1.0)
+
+
+@pytest.mark.parametrize(
+    ("code", "in_use", "negated", "blind", "state"),
+    [
+        (WRONG, True, True, True, "P1"),  # wrong in use until it is negated
+        (WRONG, False, True, True, "P2"),
+        (RIGHT, True, False, True, "P3"),
+        (RIGHT, True, False, False, "P0"),
+        (UNKNOWN, True, False, False, None),
+        (WRONG, False, False, False, None),
+    ],
+)
+def test_the_first_state_that_applies(code: int, in_use: bool, negated: bool, blind: bool, state: str | None) -> None:
+    epochs = pl.DataFrame({"negated": [negated]})
+    assert lds_states(epochs, np.array([code]), np.array([in_use]), np.array([blind])).to_list() == [state]
+
+
+def test_a_train_moves_farther_in_a_second_than_the_noise_of_its_places() -> None:
+    """Places each 0.5 s, known to 0.1 m: 0.4 m in a second are less than 0.3 m and both noises, 0.6 m are more."""
+    at_m = np.array([0.0, 0.2, 0.4, 0.8, 1.2, 1.6, np.nan, np.nan, np.nan, np.nan])
+    moves = np.array([True] * 8 + [False] * 2)
+    counted = np.array([False] * 6 + [True] * 3 + [False])
+    odometer = Counted(moves, counted, [(round(3.5 * NS), 4 * NS)])
+    moved, sure = moving(seconds(*(0.5 * np.arange(10))), at_m, np.full(10, 0.1), odometer, Configuration())
+    # By the reference up to 1.5 s, as far as it goes; then by the odometer from 3 s on, but for what it stood.
+    assert sure.tolist() == [True, True, True, True, False, False, True, False, True, True]
+    assert moved[sure].tolist() == [False, True, True, True, True, False, False]
+
+
+def along(error_m: Any, half_m: float, kind: Evidence) -> Judgements:
+    """Errors along growing path."""
+    size = len(error_m)
+    number, track = np.full(size, KINDS.index(kind)), np.zeros(size, dtype=bool)
+    return Judgements(np.full(size, RIGHT), error_m - half_m, error_m + half_m, number, track)
+
+
+def test_without_an_odometer_the_train_turns_where_its_own_place_does() -> None:
+    """10 m forward each second, back from 6 s on; the position jumps back by 40 m from 3 s on, which turns nothing."""
+    train_m = 10.0 * np.array([0, 1, 2, 3, 4, 5, 6, 5, 4, 3, 2, 1], dtype=np.float64)
+    error_m = np.where(np.arange(12) >= 3, -40.0, 0.0)
+    judged = along(error_m, 1.0, Evidence.REFERENCE)
+    given = np.ones(12, dtype=np.int64)
+    found = travel_direction(given, judged, seconds(*range(12)), train_m + error_m, False, HazardConfig())
+    assert found.tolist() == [1] * 6 + [-1] * 6
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_an_odometer_without_a_sign_is_corrected_by_the_reference_but_not_over_a_turn(turns: bool) -> None:
+    """Back from 6 s on. An odometer that knows it is left alone, also while it turns; one that counts up is not."""
+    train_m = 10.0 * np.array([0, 1, 2, 3, 4, 5, 6, 5, 4, 3, 2, 1], dtype=np.float64)
+    given = np.where((np.arange(12) >= 7) & turns, -1, 1)
+    judged = along(np.zeros(12), 1.0, Evidence.REFERENCE)
+    found = travel_direction(given, judged, seconds(*range(12)), train_m, True, HazardConfig())
+    # Two seconds ahead are seen: the odometer's own turn stays where it says, the other's comes by the reference.
+    assert found.tolist() == ([1] * 7 + [-1] * 5 if turns else [1] * 6 + [-1] * 6)
+    by_reads = along(np.zeros(12), 1.0, Evidence.BALISE)
+    kept = travel_direction(given, by_reads, seconds(*range(12)), train_m, True, HazardConfig())
+    assert kept.tolist() == given.tolist()
+
+
+@pytest.mark.parametrize(("latency_s", "at_s"), [(0.3, 9.7), (None, 10.0), (-0.2, 10.2)])
+def test_a_position_is_judged_at_its_stamp_less_the_latency(latency_s: float | None, at_s: float) -> None:
+    case = Case(cast(Any, None), cast(Any, None), None, Vehicle(gnss_latency_s=latency_s), Configuration())
+    assert case.instants(seconds(10)).tolist() == [round(at_s * NS)]
+
+
+def test_what_an_interval_of_errors_says() -> None:
+    """From 4 m late to 6 m early; from 2 to 4 m early; from 9 to 5 m late, by the odometer alone."""
+    kinds = np.array([KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER)])
+    low_m, high_m = np.array([-4.0, 2.0, -9.0]), np.array([6.0, 4.0, -5.0])
+    judged = Judgements(np.full(3, UNKNOWN), low_m, high_m, kinds, np.zeros(3, dtype=bool))
+    assert judged.middle_m.tolist() == [1.0, 3.0, -7.0]
+    assert judged.half_m.tolist() == [5.0, 1.0, 2.0]
+    assert judged.least_m.tolist() == [0.0, 2.0, 5.0]
+    assert judged.largest_m.tolist() == [6.0, 4.0, 9.0]
+    assert judged.known_m(4.9) == pytest.approx([np.nan, 3.0, np.nan], nan_ok=True)
+    assert judged.known_m(5.0) == pytest.approx([1.0, 3.0, np.nan], nan_ok=True)
+
+
+@pytest.mark.parametrize(("onward", "code"), [([0], RIGHT), ([0, 2], WRONG), ([0, 1], RIGHT)])
+def test_where_the_evidence_ends_the_position_is_held_to_it_by_its_own_path(onward: list[int], code: int) -> None:
+    """The train at 95 to 97 m of element 0, the position 10 m on, on element 1; the evidence may go on elsewhere."""
+
+    def route(elements: list[int]) -> Route:
+        size = len(elements)
+        entry_m = 100.0 * np.arange(size)
+        return Route(np.array(elements), np.full(size, True), entry_m, np.zeros(size), np.full(size, 100.0))
+
+    at_m, leg, sure = np.array([110.0]), np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool)
+    given = Positions(np.array([1]), at_m - 100.0, leg, at_m, sure)
+    told = Alternative(np.array([0]), route(onward), np.array([95.0]), np.array([97.0]))
+    evidence = EvidenceSet(np.array([KINDS.index(Evidence.BALISE)]), (told,))
+    found = judge_positions(given, evidence, [route([0, 1])], HazardConfig())
+    assert found.code.tolist() == [code]
+    assert found.wrong_track.tolist() == [code == WRONG]
+    if code == RIGHT:
+        assert (found.low_m[0], found.high_m[0]) == pytest.approx((13.0, 15.0))
+
+
+@pytest.mark.parametrize(
+    ("by_odometer", "gap_s", "direction", "jumps"),
+    [
+        (True, 1.0, 1, [(3, 4, 30.0), (8, 8, -30.0)]),
+        (False, 1.0, 1, [(3, 4, 30.0), (8, 8, -30.0)]),
+        (True, 1.0, -1, [(3, 4, -30.0), (8, 8, 30.0)]),
+        (True, 0.4, 1, []),  # no movement is interpolated over such a step
+    ],
+)
+def test_a_jump_is_what_gathers_within_a_second(
+    by_odometer: bool, gap_s: float, direction: int, jumps: list[tuple[int, int, float]]
+) -> None:
+    """10 m each 0.5 s; 15 m too far at the fourth and again at the fifth position, back at the ninth."""
+    error_m = np.array([0.0, 0.0, 0.0, 15.0, 30.0, 30.0, 30.0, 30.0, 0.0, 0.0])
+    train_m, t_ns = 10.0 * np.arange(10), seconds(*(0.5 * np.arange(10)))
+    unknown = np.full(10, np.nan)
+    told = (unknown, np.full(9, 10.0)) if by_odometer else (train_m, unknown[:9])
+    steps = steps_of(t_ns, train_m + error_m, *told, round(gap_s * NS))
+    found = find_jumps(steps, np.full(10, direction), HazardConfig())
+    assert [(one.first, one.last, one.step_m) for one in found] == jumps
+
+
+@pytest.mark.parametrize(("train_m", "crossed"), [(120.0, [2, 3]), (np.nan, [1, 2, 3]), (128.0, [1, 3])])
+def test_a_jump_crosses_what_the_train_itself_did_not(train_m: float, crossed: list[int]) -> None:
+    """From 100 m to 140 m by a jump of 30 m: the train's own 10 m cross what lies in them, from where it is known."""
+    path_m, virtual = [99.0, 125.0, 135.0, 111.0, 138.0, 145.0], [True, True, True, True, False, True]
+    offered = offers([2, 3, 3, 3, 3, 4], path_m=path_m, virtual=virtual)
+    told = course(positions(range(5), path_m=[80.0, 90.0, 100.0, 140.0, 150.0], train_m=np.full(5, train_m)))
+    assert crossed_by(Jump(3, 3, 30.0), Offers.of(offered, told.positions), told) == crossed
+
+
+@pytest.mark.parametrize(
+    ("onset_s", "mark_s", "named_s"),
+    [
+        (12, 20, 11),  # the last fault that had begun, of those that lasted
+        (5, 20, 8),  # else the first one after
+        (5, 7, None),
+        (40, 50, 35),  # without an end it lasts
+        (25, 27, None),  # all of the positions' have ended, and the odometer's is none
+    ],
+)
+def test_the_onset_is_that_of_a_fault_of_the_positions_that_lasted(
+    onset_s: int, mark_s: int, named_s: int | None
+) -> None:
+    begins, ends = [8, 11, 21, 35], [15, 14, 60, None]
+    faults = pl.DataFrame(
+        {
+            "t_start": pl.Series(begins, dtype=pl.Int64) * NS,
+            "t_end": pl.Series(ends, dtype=pl.Int64) * NS,
+            "target": ["position", "along", "odometer", "G08"],
+        }
+    ).with_columns(pl.col("t_start", "t_end").cast(pl.Datetime("ns", "UTC")))
+    found = _named_onset_ns(faults, onset_s * NS, mark_s * NS)
+    assert found == (None if named_s is None else named_s * NS)
+    assert _named_onset_ns(faults.clear(), onset_s * NS, mark_s * NS) is None
+    assert _named_onset_ns(None, onset_s * NS, mark_s * NS) is None
+
+
+def test_evidence_is_looked_at_between_positions_that_are_far_apart() -> None:
+    """A look each second at least; a step of 1.5 s is none to fill."""
+    found = between_far_epochs(seconds(0, 0.5, 2.0, 5.0, 6.0), 1.0)
+    assert (found / NS).tolist() == [0.0, 0.5, 2.0, 3.0, 4.0, 5.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ("half_m", "jump", "back", "size", "rate"),
+    [
+        (1.0, None, False, -25.0, -2.5),  # the largest error, and its slope from the onset on
+        (6.0, None, False, -25.0, -2.5),  # by the interval's centre at any width
+        (np.nan, Jump(3, 3, 30.0), False, 30.0, None),  # no place along the track: the step
+        (1.0, Jump(3, 3, 30.0), False, -25.0, None),
+        (1.0, Jump(3, 3, 30.0), True, 30.0, None),  # of a jump back its step
+    ],
+)
+def test_the_size_and_slope_of_a_hazard(
+    half_m: float, jump: Jump | None, back: bool, size: float, rate: float | None
+) -> None:
+    """2.5 m more each second; the third position is the onset, and the failure the one after it."""
+    told = course(positions(range(12), -2.5 * np.arange(12.0) + 2.5, half_m))
+    episode = replace(
+        EPISODE, onset=2, end=12, mark=10, failure_number=3, onset_ns=2 * NS, jump_back=jump if back else None
+    )
+    row = HazardRow(Hazard.VB_SHIFT, episode, jump, [0])
+    offered = Offers.of(offers([9], error_low_m=np.nan, error_high_m=np.nan), told.positions)
+    assert size_m(row, told, offered) == pytest.approx(size)
+    found = rate_mps(row, told)
+    assert found == (None if rate is None else pytest.approx(rate))
+
+
+def test_pulses_are_one_failure_and_a_calm_half_minute_ends_it() -> None:
+    """60 m for 0.3 s in each of ten seconds at 10 Hz, right for 45 s, one pulse more: 3.0 s and 0.3 s wrong in use."""
+    t_s = 0.1 * np.arange(600)
+    pulse = ((t_s % 1.0) < 0.25) & (t_s < 9.95) | ((t_s > 54.95) & (t_s < 55.25))
+    told = course(positions(t_s, np.where(pulse, 60.0, 0.0)))
+    found = find_failures(told, offers([]), Configuration())
+    assert [one.hazardous_s for one in found] == pytest.approx([3.0, 0.3])
+    assert [one.within_budget for one in found] == [False, True]
+
+
+@pytest.mark.parametrize(("apart_s", "between_m", "failures"), [(29, 0.0, 1), (31, 0.0, 2), (31, 12.0, 1)])
+def test_a_failure_goes_on_until_it_is_calm_for_long_enough(apart_s: int, between_m: float, failures: int) -> None:
+    """Two wrong seconds; between them right, or within the limit and never within half of it."""
+    error_m = np.full(60, 0.0)
+    error_m[10 : 10 + apart_s] = between_m
+    error_m[[10, 10 + apart_s]] = 60.0
+    assert len(find_failures(course(positions(range(60), error_m)), offers([]), Configuration())) == failures
+
+
+def test_unknown_time_in_use_counts_to_the_failure_that_it_belongs_to() -> None:
+    """Wrong for a second, then nobody knows for 3 s, then right: 1 s for certain, 4 s at most, and one VB accepted."""
+    error_m = np.full(30, 0.0)
+    error_m[5:9] = [60.0, np.nan, np.nan, np.nan]
+    frame = positions(range(30), error_m, path_m=10.0 * np.arange(30))
+    (found,) = find_failures(course(frame), offers([7], judgement="unknown"), Configuration())
+    assert (found.hazardous_s, found.hazardous_may_s, found.accepted) == (1.0, 4.0, Judgement.UNKNOWN)

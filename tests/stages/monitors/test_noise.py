@@ -1,0 +1,201 @@
+"""The fast noise measured in the run: by hand, against receivers of an own simulation, and what must never enter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+
+from benchmarks.noise import Receiver, epochs_of, first_alarm
+from pipeline.stages.monitors.axis import AxisSeries, errors_of
+from pipeline.stages.monitors.bank import NOISE_TOO_LARGE, NOISE_UNKNOWN, MonitorBank
+from pipeline.stages.monitors.noise import NoiseMeter
+from schemas.arrays import Floats
+from schemas.config import Configuration
+from schemas.enums import MonitorState
+
+CONFIG = Configuration()
+
+
+def series_of(offset_m: Floats, period_s: float = 1.0, sigma_m: float = 0.0) -> AxisSeries:
+    """An axis whose offset is this, epoch by epoch, with smooth errors of this sigma stated."""
+    count = offset_m.size
+    dt_s = np.full(count, period_s)
+    nothing, never = np.zeros(count), np.zeros(count, dtype=np.bool_)
+    return AxisSeries(
+        epoch=np.arange(count),
+        fresh=np.arange(count) == 0,
+        border=never,
+        dt_s=dt_s,
+        rate_mps=np.diff(offset_m, prepend=offset_m[:1]) / dt_s,
+        **errors_of(np.full(count, sigma_m), dt_s, [], CONFIG.monitors),
+        white_m2=nothing,
+        border_m2=nothing,
+        steady_mps=nothing,
+        latency_mps=nothing,
+    )
+
+
+def meter_of(series: AxisSeries, config: Configuration = CONFIG) -> NoiseMeter:
+    return NoiseMeter(series, np.ones(series.epoch.size, dtype=np.bool_), None, config)
+
+
+def noise_m(offset_m: Floats, row: int, **settings: float) -> list[float]:
+    config = Configuration.model_validate({"monitors": {"noise_doubt": 0.0, **settings}})
+    return np.sqrt(meter_of(series_of(offset_m), config).variance_m2(row, row + 1)[0]).tolist()
+
+
+def test_by_hand_an_offset_that_alternates() -> None:
+    """+-1 cm from epoch to epoch: second differences of 4 cm at one epoch, none at 10 s, which counts as no less.
+
+    All quantiles are 4 cm; the smallest Gaussian value, 0.674, makes the most of it: 4 / 0.674 / 2 = 2.97 cm.
+    """
+    raw, fast, *_ = noise_m(0.01 * (-1.0) ** np.arange(200), 199)
+    assert raw == pytest.approx(0.0297, rel=0.045)
+    assert fast == raw
+
+
+def test_a_drift_is_no_noise() -> None:
+    assert noise_m(0.5 * np.arange(1000.0), 999) == [0.0] * 4
+
+
+def test_white_noise_is_taken_for_half_as_much_again() -> None:
+    """Its second differences have six times its variance, and four are reckoned with: sqrt(1.5) at every lag."""
+    white = np.random.default_rng(1).normal(0.0, 0.05, 20_000)
+    np.testing.assert_allclose(noise_m(white, 19_999)[:3], 0.05 * np.sqrt(1.5), rtol=0.15)
+
+
+def test_what_the_model_knows_is_not_counted_twice() -> None:
+    smooth = epochs_of(Receiver(), 1.0, np.random.default_rng(3))
+    bank = MonitorBank(smooth, {}, CONFIG)
+    thresholds = pl.DataFrame(bank.columns())["along_raw_threshold"].drop_nulls()
+    assert thresholds.max() < 1.3 * thresholds.min()
+
+
+def test_unknown_for_thirty_seconds_and_said_so() -> None:
+    bank = MonitorBank(epochs_of(Receiver(), 0.1, np.random.default_rng(1)), {}, CONFIG)
+    known = bank.noise_known
+    assert known.tolist() == [False] * 30 + [True] * 330
+    reasons = pl.DataFrame(bank.columns())["along_raw_reason"]
+    assert reasons.to_list() == [NOISE_UNKNOWN] * 30 + [None] * 330
+
+
+def test_no_verdict_where_noise_hides_a_failure() -> None:
+    bank = MonitorBank(epochs_of(Receiver(white_m=3.0), 0.1, np.random.default_rng(1)), {}, CONFIG)
+    assert pl.DataFrame(bank.columns())["along_raw_reason"][40:].unique().to_list() == [NOISE_TOO_LARGE]
+    assert not bank.noise_known.any()
+
+
+def test_given_noise_holds_from_the_first_epoch_and_replaces_what_is_measured() -> None:
+    given = Configuration.model_validate({"monitors": {"noise_along_m": (0.1, 0.0, 0.0, 0.0)}})
+    quiet = epochs_of(Receiver(), 0.1, np.random.default_rng(1))
+    thresholds = pl.DataFrame(MonitorBank(quiet, {}, given).columns())["along_raw_threshold"]
+    none = Configuration.model_validate({"monitors": {"noise_along_m": (0.0, 0.0, 0.0, 0.0)}})
+    without = pl.DataFrame(MonitorBank(quiet, {}, none).columns())["along_raw_threshold"]
+    factor = CONFIG.monitors.threshold_factor
+    more = (thresholds[1:] / factor) ** 2 - (without[1:] / factor) ** 2
+    np.testing.assert_allclose(more, 2.0 * 0.1**2, rtol=1e-9)
+
+
+def test_causal_whatever_comes_later_changes_nothing_before() -> None:
+    offset_m = np.random.default_rng(2).normal(0.0, 0.05, 2_000)
+    later = offset_m.copy()
+    later[1_200:] *= 40.0
+    one, other = (meter_of(series_of(offsets, 0.5)).variance_m2(0, 1_200) for offsets in (offset_m, later))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_what_is_under_alarm_never_enters_also_not_later() -> None:
+    """Noise ten times as loud from 500 to 700: frozen there, it is as if those rows had never been."""
+    offset_m = np.random.default_rng(2).normal(0.0, 0.05, 1_500)
+    loud = offset_m.copy()
+    loud[500:700] *= 10.0
+    meters = [meter_of(series_of(offsets)) for offsets in (offset_m, loud)]
+    for meter in meters:
+        meter.freeze(500)
+    frozen = meters[1].variance_m2(500, 700)
+    assert np.isfinite(frozen).all()
+    assert (np.ptp(frozen[60:], axis=0) == 0.0).all()
+    for meter in meters:
+        meter.restart(700)
+    np.testing.assert_array_equal(*(meter.variance_m2(0, 1_500) for meter in meters))
+
+
+def test_a_bank_frozen_late_is_one_that_was_frozen_at_once() -> None:
+    """The bank looks ahead; what it said of epochs behind the alarm is made anew, what it said before stays."""
+    epochs = epochs_of(Receiver(white_m=0.1), 0.4, np.random.default_rng(4))
+    ahead, stepwise = MonitorBank(epochs, {}, CONFIG), MonitorBank(epochs, {}, CONFIG)
+    ahead.failed(epochs.height - 1)
+    for bank in (ahead, stepwise):
+        bank.failed(600)
+        bank.freeze(600)
+        bank.failed(640)
+        bank.restart(640)
+    for one, other in zip(ahead.columns(), stepwise.columns(), strict=True):
+        assert one.equals(other, null_equal=True), one.name
+
+
+def test_an_alarm_before_the_noise_is_known_freezes_nothing() -> None:
+    bank = MonitorBank(epochs_of(Receiver(white_m=0.1), 0.1, np.random.default_rng(4)), {}, CONFIG)
+    bank.failed(5)
+    bank.freeze(5)
+    assert bank.noise_known[30:].all()
+
+
+def test_a_stand_is_no_sample() -> None:
+    offset_m = np.random.default_rng(2).normal(0.0, 0.05, 900)
+    offset_m[300:600] = offset_m[299]
+    moving = np.ones(900, dtype=np.bool_)
+    moving[300:600] = False
+    before, after = (
+        np.sqrt(NoiseMeter(series_of(offset_m), moving, None, CONFIG).variance_m2(row, row + 1)[0, 0])
+        for row in (299, 602)
+    )
+    assert after == pytest.approx(before, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "receiver",
+    [
+        Receiver(rate_hz=10.0, white_m=0.05),
+        Receiver(rate_hz=10.0, sigma_m=0.02, white_m=0.005),
+        Receiver(rate_hz=5.0, white_m=0.12, digits_m=0.11),
+        Receiver(tau_s=20.0),
+        Receiver(rate_hz=5.0, true_over_stated=2.0, gaps=True, uneven=True, sigma_varies=True),
+    ],
+)
+def test_real_receivers_raise_no_alarm(receiver: Receiver) -> None:
+    """Each of them failed the raw monitors at once and for ever (issue 35)."""
+    known = dict.fromkeys(("noise_along_m", "noise_cross_m", "noise_up_m"), (0.0, 0.0, 0.0, 0.0))
+    epochs = epochs_of(receiver, 0.5, np.random.default_rng(5))
+    assert first_alarm(epochs, CONFIG, 0.0) is None
+    assert first_alarm(epochs, Configuration.model_validate({"monitors": known}), 0.0) is not None
+
+
+@pytest.mark.parametrize(("rate_mps", "latest_s"), [(0.03, 600.0), (0.1, 180.0), (1.0, 10.0)])
+def test_a_drift_is_found_before_it_is_a_failure(rate_mps: float, latest_s: float) -> None:
+    receiver = Receiver(white_m=0.05)
+    fault_m = rate_mps * np.maximum(np.arange(0.0, 2_600.0, 0.1) - 1_500.0, 0.0)
+    found = first_alarm(epochs_of(receiver, 0.7, np.random.default_rng(2), fault_m), CONFIG, 60.0)
+    assert found is not None
+    assert 1_500.0 < found[1] <= 1_500.0 + latest_s
+
+
+def test_a_step_is_found_within_one_epoch() -> None:
+    fault_m = np.where(np.arange(0.0, 1_000.0, 0.1) >= 800.0, 20.0, 0.0)
+    for receiver in (Receiver(white_m=0.3), Receiver(rate_hz=10.0, white_m=0.3), Receiver(tau_s=20.0)):
+        columns = MonitorBank(
+            epochs_of(replace(receiver), 0.25, np.random.default_rng(6), fault_m), {}, CONFIG
+        ).columns()
+        raw = next(column for column in columns if column.name == "along_raw_state")
+        assert raw.to_list()[round(800.0 * receiver.rate_hz)] == MonitorState.FAIL.value
+
+
+def test_white_noise_of_the_run() -> None:
+    bank = MonitorBank(epochs_of(Receiver(white_m=0.2), 0.5, np.random.default_rng(8)), {}, CONFIG)
+    bank.columns()
+    found = bank.white_noise()
+    assert found["white_noise_along_m"] == pytest.approx(0.2, rel=0.25)
+    assert found["white_noise_up_m"] == pytest.approx(0.3, rel=0.25)

@@ -1,0 +1,282 @@
+"""The odometer as a function of time: hand-worked tables."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.stages.odometry.driven import turns_of
+from pipeline.stages.odometry.odometry import Noise
+from pipeline.stages.odometry.odometry import odometry_of as odometry_of_stream
+from pipeline.stages.odometry.polarity import grows_with, polarity
+from pipeline.stages.odometry.quantisation import QuantisationNoise
+from pipeline.stages.odometry.rows import ways_between
+from schemas.config import AlignConfig, Configuration, Vehicle
+from tests.stages.alignment.straight import odometer_of, odometry_from
+
+
+def test_distance_is_interpolated_and_never_extrapolated():
+    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=[100.0, 110.0, 130.0]))
+    at = np.array([-0.1, 0.0, 0.5, 1.5, 2.0, 2.1])
+    assert odometry.known_at_s(at).tolist() == [False, True, True, True, True, False]
+    np.testing.assert_allclose(odometry.distance_at_s(at)[1:5], [0.0, 5.0, 20.0, 30.0])
+
+
+def test_speed_alone_is_integrated_and_guessed_over_a_pause():
+    frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], speed_mps=[10.0, 12.0, 10.0, 10.0, 10.0])
+    odometry = odometry_from(frame)
+    np.testing.assert_allclose(odometry.distance_m, [0.0, 5.5, 11.0, 51.0, 56.0])
+    assert odometry.segment.tolist() == [0, 0, 0, 1, 1]
+    assert odometry.known_at_s(np.array([0.7, 1.0, 3.0, 5.0])).tolist() == [True, True, False, True]
+
+
+def test_a_cumulative_distance_carries_over_a_pause_but_not_inside_it():
+    frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], distance_m=[0.0, 5.0, 10.0, 50.0, 55.0])
+    odometry = odometry_from(frame)
+    assert odometry.segment.tolist() == [0, 0, 0, 0, 0]
+    assert odometry.known_at_s(np.array([1.0, 3.0, 5.0])).tolist() == [True, False, True]
+    np.testing.assert_allclose(odometry.distance_at_s(np.array([5.0])), 50.0)
+
+
+def test_distance_and_speed_by_turns_are_carried_between_their_own_rows():
+    nan = np.nan
+    t = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+    distance = [0.0, nan, 10.0, nan, 22.0, nan, 36.0]
+    speed = [nan, 11.0, nan, 12.0, nan, 13.0, nan]
+    odometry = odometry_from(odometer_of(t, distance_m=distance, speed_mps=speed))
+    np.testing.assert_allclose(odometry.distance_m, [0.0, 5.0, 10.0, 16.0, 22.0, 29.0, 36.0])
+    assert odometry.known_at_s(np.array(t)).all()
+
+
+def test_where_distance_and_speed_by_turns_pause_the_way_is_lost():
+    """The counter's next row stands after a speed's: nobody knows whether it went on counting in between."""
+    nan = np.nan
+    t = [0.0, 0.5, 1.0, 1.5, 8.0, 8.5, 9.0]
+    distance = [0.0, nan, 10.0, nan, nan, 80.0, nan]
+    speed = [nan, 10.0, nan, 10.0, 12.0, nan, 12.0]
+    odometry = odometry_from(odometer_of(t, distance_m=distance, speed_mps=speed))
+    assert odometry.segment[3] < odometry.segment[4]
+    assert odometry.known_at_s(np.array([1.5, 4.0, 8.0])).tolist() == [True, False, True]
+
+
+def test_rows_too_far_apart_are_not_carried():
+    nan = np.nan
+    frame = odometer_of(np.arange(5.0), distance_m=[0.0, nan, nan, nan, 40.0], speed_mps=[nan, 10.0, nan, 12.0, nan])
+    odometry = odometry_from(frame)
+    assert odometry.known_at_s(np.array([0.5, 1.5, 2.5, 3.5])).tolist() == [False, True, True, False]
+    np.testing.assert_allclose(np.diff(odometry.distance_m)[1:3], [10.5, 11.5])
+
+
+def test_a_missing_distance_beside_a_speed_is_driven():
+    """The counter was set to zero in the second that it does not report: no way was run backwards."""
+    frame = odometer_of([0.0, 0.5, 1.0, 1.5, 2.0], distance_m=[100.0, 105.0, np.nan, 0.0, 5.0], speed_mps=[10.0] * 5)
+    np.testing.assert_allclose(odometry_from(frame).distance_m, [0.0, 5.0, 10.0, 15.0, 20.0])
+
+
+def test_reported_slip_is_no_distance():
+    frame = odometer_of([0.0, 0.5, 1.0, 1.5], distance_m=[0.0, 5.0, 20.0, 25.0], slip=[False, False, True, False])
+    odometry = odometry_from(frame)
+    assert odometry.known_at_s(np.array([0.2, 0.7, 1.2, 1.5])).tolist() == [True, False, False, True]
+    assert odometry.segment[0] != odometry.segment[3]
+
+
+def test_a_noisier_odometer_than_configured_counts():
+    frame = odometer_of([0.0, 0.5, 1.0], speed_mps=[10.0, 10.0, 10.0]).with_columns(sigma_speed_mps=0.4)
+    assert odometry_from(frame).noise.white_m2_per_s == pytest.approx(0.4**2 * 0.5)
+    assert odometry_from(frame.with_columns(sigma_speed_mps=0.01)).noise.white_m2_per_s == 0.05**2
+
+
+@pytest.mark.parametrize(
+    ("reads", "expected"), [([0.0, 15.0, 30.0], 1), ([0.0, -15.0, -30.0], -1), ([0.0, 0.0, 0.0], 1)]
+)
+def test_polarity_comes_from_the_first_twenty_metres(reads, expected):
+    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=reads))
+    t = np.array([0.0, 1.0, 2.0])
+    assert polarity(odometry, np.round(1e9 * t).astype(np.int64), np.array([500.0, 515.0, 530.0]), 20.0) == expected
+
+
+def test_speed_is_the_mean_over_the_second_before():
+    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=[0.0, 10.0, 30.0]))
+    np.testing.assert_allclose(odometry.speed_at_s(np.array([0.5, 1.0, 2.0, 1.5])), [10.0, 10.0, 20.0, 15.0])
+
+
+def test_a_leap_in_the_first_metres_does_not_turn_the_odometer_round():
+    t = np.arange(0.0, 10.0, 0.1)
+    odometry = odometry_from(odometer_of(t, distance_m=5.0 * t))
+    path = 5.0 * t - np.where((t > 3.9) & (t < 4.2), 300.0, 0.0)
+    assert polarity(odometry, np.round(1e9 * t).astype(np.int64), path, 20.0) == 1
+
+
+@pytest.mark.parametrize("counts", [1.0, -1.0])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_the_first_movement_went_as_positions_say_along_which_the_odometer_says_how_far(way, counts):
+    """Forwards or backwards, counted up or down; a leap just when 20 m are covered misleads positions alone."""
+    t = np.arange(0.0, 10.0, 0.1)
+    path = 500.0 + way * (5.0 * t - np.where((t > 3.95) & (t < 4.25), 300.0, 0.0))
+    t_ns, odometry = (
+        np.round(1e9 * t).astype(np.int64),
+        odometry_from(odometer_of(t, distance_m=counts * way * 5.0 * t)),
+    )
+    assert grows_with(path, t_ns, odometry, 20.0) == (way > 0.0)
+    assert grows_with(path, t_ns, None, 20.0) == (way < 0.0)
+
+
+@pytest.mark.parametrize("speed", [None, 10.0])
+@pytest.mark.parametrize(
+    ("reads", "leap"),
+    [
+        ([1000.0, 1005.0, 1010.0, 0.0, 5.0, 10.0], 3),  # reset
+        ([4085.0, 4090.0, 4095.0, 4.0, 9.0, 14.0], 3),  # run over
+        ([0.0, -5.0, -10.0, 985.0, 980.0, 975.0], 3),  # reset in reverse
+    ],
+)
+def test_a_counter_that_is_reset_or_runs_over_drives_nowhere(reads, leap, speed):
+    forth = 1.0 if reads[1] > reads[0] else -1.0
+    t = 0.5 * np.arange(6.0)
+    speeds = None if speed is None else [forth * speed] * 6
+    odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=speeds))
+    known = odometry.known_at_s(t[:-1] + 0.25)
+    if speed is None:
+        assert odometry.segment.tolist() == [0] * leap + [1] * (6 - leap)
+        assert known.tolist() == [index != leap - 1 for index in range(5)]
+    else:
+        np.testing.assert_allclose(odometry.distance_m, forth * 5.0 * np.arange(6.0))
+        assert (odometry.segment == 0).all()
+        assert known.all()
+
+
+@pytest.mark.parametrize("speed", [None, "by turns", "always"])
+def test_a_counter_that_is_reset_in_a_pause_loses_the_way(speed):
+    t = np.concatenate([np.arange(0.0, 10.0, 0.5), np.arange(15.0, 25.0, 0.5)])
+    reads = np.where(t < 12.0, 5000.0 + 10.0 * t, 10.0 * (t - 15.0))
+    turns = np.arange(t.size) % 2 == 1
+    speeds = np.full(t.size, 10.0) if speed else None
+    if speed == "by turns":
+        reads, speeds = np.where(turns, np.nan, reads), np.where(turns, speeds, np.nan)
+    odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=speeds))
+    assert odometry.segment.tolist() == [0] * 20 + [1] * 20
+    assert np.diff(odometry.distance_m).min() >= 0.0
+
+
+def test_a_spike_of_the_counter_is_passed_over():
+    t = 0.5 * np.arange(7.0)
+    reads = np.arange(7.0) ** 2
+    for row in (1, 3, 5):
+        spiked = 1e5 + reads + 500.0 * (np.arange(7) == row)  # of a counter that has run for 100 km
+        odometry = odometry_from(odometer_of(t, distance_m=spiked))
+        # Between its neighbours by a straight line; all other rows count.
+        np.testing.assert_allclose(odometry.distance_m, reads + 1.0 * (np.arange(7) == row))
+        assert (odometry.segment == 0).all()
+        assert odometry.known_at_s(t).all()
+
+
+def test_what_a_fast_train_drives_over_gaps_and_bunched_stamps_is_no_leap():
+    t = np.array([0.0, 0.5, 0.501, 0.502, 1.5, 21.5, 22.0])
+    reads = np.array([0.0, 50.0, 60.0, 70.0, 150.0, 2150.0, 2200.0])
+    odometry = odometry_from(odometer_of(t, distance_m=reads))
+    np.testing.assert_allclose(odometry.distance_m, reads)
+    assert (odometry.segment == 0).all()
+
+
+@pytest.mark.parametrize("with_speed", [False, True])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_between_rows_far_apart_the_way_follows_the_speeds(sign, with_speed):
+    """A train that gathers 1 m/s2 from standstill, then runs on at 20 m/s, with a row every 4 s."""
+
+    def way(at):
+        return sign * np.where(at < 20.0, 0.5 * at**2, 200.0 + 20.0 * (at - 20.0))
+
+    t = np.arange(0.0, 41.0, 4.0)
+    speeds = sign * np.minimum(t, 20.0) if with_speed else None
+    odometry = odometry_from(odometer_of(t, distance_m=way(t), speed_mps=speeds))
+    at = np.arange(0.0, 40.0, 0.1)
+    assert odometry.known_at_s(at).all()
+    np.testing.assert_allclose(odometry.distance_at_s(t), way(t), atol=1e-9)
+    off = np.abs(odometry.distance_at_s(at) - way(at)).max()
+    straight = np.abs(np.interp(at, t, way(t)) - way(at)).max()
+    assert straight == pytest.approx(2.0, abs=0.01)
+    assert off < (0.05 if with_speed else 0.7)
+    assert (np.diff(sign * odometry.distance_m) >= 0.0).all()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [lambda speeds: 3.6 * speeds, np.abs, np.zeros_like, np.negative, lambda speeds: np.full_like(speeds, 20.0)],
+    ids=["km/h", "unsigned", "stuck at zero", "turned round", "stuck at speed"],
+)
+@pytest.mark.parametrize("period_s", [2.0, 5.0])
+def test_speeds_that_contradict_the_way_fill_in_nothing(period_s, wrong):
+    """A train that drives 300 m ahead, stands, and drives back."""
+    fine = np.arange(0.0, 100.0, 0.01)
+    speed = np.interp(
+        fine, [0.0, 20.0, 30.0, 45.0, 60.0, 75.0, 85.0, 100.0], [0.0, 15.0, 15.0, 0.0, 0.0, -12.0, -12.0, 0.0]
+    )
+    way = np.cumsum(speed) * 0.01
+    t = np.arange(0.0, 99.0, period_s)
+    reads, speeds = np.interp(t, fine, way), np.interp(t, fine, speed)
+    frames = (odometer_of(t, distance_m=reads, speed_mps=given) for given in (None, speeds, wrong(speeds)))
+    inside = fine <= t[-1]
+    without, right, misled = (np.abs(odometry_from(frame).distance_at_s(fine) - way)[inside].max() for frame in frames)
+    straight = np.abs(np.interp(fine, t, reads) - way)[inside].max()
+    assert right < without < straight
+    assert misled < straight
+
+
+@pytest.mark.parametrize("factor", [3.6, 0.0, -1.0])
+def test_a_speed_of_another_unit_or_sign_tells_no_way_over_a_leap(factor):
+    t = 0.5 * np.arange(40.0)
+    reads = np.where(t < 10.0, 1000.0 + 10.0 * t, 10.0 * (t - 10.0))
+    for noisy, lost in ((1.1, 0), (factor, 1)):
+        odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=[10.0 * noisy] * 40))
+        assert odometry.segment[-1] == lost
+
+
+def test_a_standstill_between_rows_far_apart_stays_one():
+    odometry = odometry_from(
+        odometer_of([0.0, 4.0, 8.0, 12.0], distance_m=[0.0, 30.0, 30.0, 60.0], speed_mps=[9.0, 2.0, 2.0, 9.0]),
+    )
+    np.testing.assert_allclose(odometry.distance_at_s(np.arange(4.0, 8.1, 0.25)), 30.0)
+
+
+def test_nothing_is_filled_in_where_the_way_is_lost():
+    frame = odometer_of(
+        [0.0, 2.0, 4.0, 6.0, 26.0, 28.0], speed_mps=[10.0] * 6, slip=[False, False, True, False, False, False]
+    )
+    odometry = odometry_from(frame)
+    assert odometry.known_at_s(np.array([1.0, 3.0, 5.0, 16.0, 27.0])).tolist() == [True, False, False, False, True]
+    assert odometry.segment_at_s(np.array([1.0, 5.0, 27.0])).tolist() == [0, 1, 2]
+
+
+def test_the_variance_between_two_instants_has_the_noise_of_both_rows():
+    """Rows off by 0.5 m at a stand: 0.25 m2 at each end; under way white noise of 0.05 m per second beside."""
+    t_s = np.arange(0.0, 40.0, 0.5)
+    still = odometry_from(odometer_of(t_s, distance_m=np.maximum(20.0 * (t_s - 20.0), 0.0)))
+    noisy = replace(still, noise=Noise(still.noise.white_m2_per_s, QuantisationNoise(0.25, 0.0)))
+    begin, end = (still.epoch_ns + np.array([round(at * 1e9) for at in pair]) for pair in ((2.0, 22.0), (18.0, 32.0)))
+    standing, driving = noisy.between(begin, end).variance_m2
+    assert standing == pytest.approx(2.0 * 0.25, abs=1e-9)
+    assert driving == pytest.approx(2.0 * 0.25 + 10.0 * 0.05**2, abs=1e-6)
+
+
+def test_turns_show_once_the_train_came_back_so_far():
+    """Back by 4 m is none, by 6 m is one, and so is going on by 6 m: with 5 m."""
+    distance_m = np.array([0.0, 10.0, 6.0, 20.0, 17.0, 14.0, 10.0, 13.0, 16.0])
+    assert turns_of(distance_m, 5.0) == [(3, 5, -1), (6, 8, 1)]
+    assert turns_of(np.array([0.0, -3.0, -6.0, -20.0]), 5.0) == [(0, 2, -1)]
+    assert turns_of(np.zeros(0), 5.0) == []
+
+
+@pytest.mark.parametrize(("last_m", "way_m"), [(420.0, [210.0, 210.0]), (430.0, [np.nan, np.nan])])
+def test_a_row_is_a_spike_only_where_a_train_could_have_driven_on_without_it(last_m, way_m):
+    """1000 s into a run: in two seconds at most 2 * 200 m and 20 m; half of the way, 215 m, would be no leap."""
+    t, reads = np.array([1000.0, 1001.0, 1002.0]), np.array([0.0, 900.0, last_m])
+    found = ways_between(t, reads, np.full(3, np.nan), 5.0, AlignConfig())
+    np.testing.assert_array_equal(found.way_m, way_m)
+
+
+def test_one_row_or_none_is_no_odometry() -> None:
+    one_row = odometer_of(np.array([0.0]), np.array([5.0]), np.array([1.0]))
+    assert odometry_of_stream(one_row, Vehicle(), Configuration()) is None
+    assert odometry_of_stream(None, Vehicle(), Configuration()) is None

@@ -1,0 +1,178 @@
+"""What moving time was lost to, and what would mend it, from ten-row tables worked by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from pipeline.stages.epochs.clock import Clock
+from pipeline.stages.run_row.lost_time import LostTime, lost_time
+from pipeline.stages.run_row.remedies import Unknown, remedies, unknown_parts
+from schemas.config import Configuration
+from schemas.enums import LostTo, Remedy
+from tests.tables import NS, alarms, epochs
+
+CONFIG = Configuration()
+TEN_S = [float(k) for k in range(10)]
+NO_ALARMS = alarms()
+
+
+def lost(t_s: list[float] = TEN_S, found: Any = NO_ALARMS, **columns: Any) -> LostTime:
+    frame = epochs(t_s, **columns)
+    return lost_time(frame, found, Clock.of(frame, CONFIG), CONFIG)
+
+
+def test_each_epoch_counts_for_the_first_cause_that_applies() -> None:
+    """Nine seconds: two without a position, of which one is ambiguous too, one ambiguous, one without a TVB."""
+    path: list[float | None] = [20.0 * t for t in TEN_S]
+    path[2:4] = [None, None]
+    gate = [1.0, 1.0, 1.0, 0.5, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0]
+    tvb = [True, True, False, False, False, False, True, True, True, True]
+    found = lost(path_m=path, gate_probability=gate, tvb=tvb)
+    assert found.share == pytest.approx(4 / 9)
+    assert found.causes == pytest.approx({LostTo.NO_POSITION: 2 / 9, LostTo.TRACK_AMBIGUOUS: 1 / 9})
+    assert found.words.startswith(
+        "22% no position on the track, 11% positions that fit more than one track, 11% not validated"
+    )
+
+
+def test_a_gap_is_time_without_a_position() -> None:
+    """Eight epochs over 27 s, of which 20 s and 3 s without any."""
+    found = lost([0, 1, 2, 5, 6, 7, 27, 28])
+    assert found.causes == pytest.approx({LostTo.NO_POSITION: 23 / 28})
+
+
+def test_after_an_alarm_the_recovery_is_the_alarms_and_the_wait_is_the_re_links() -> None:
+    """Alarm at 1 s; 30 s of recovery; negated until the end at 60 s."""
+    times = [float(k) for k in range(61)]
+    alarm = [k == 1 for k in range(61)]
+    fails = ["fail" if k == 1 else "pass" for k in range(61)]
+    negated: dict[str, Any] = {"lds_mode": "fail_safe", "tvb": False, "alarm": alarm, "along_raw_state": fails}
+    negated["lds_mode"] = ["linked", *["fail_safe"] * 60]
+    negated["tvb"] = [True, *[False] * 60]
+    found = lost(times, **negated)
+    assert found.causes == pytest.approx({LostTo.ALARM: 31 / 60, LostTo.RELINK: 28 / 60})
+    assert (found.monitor, found.unfounded) == ("along_raw", True)
+    due = {"solution": "primary", "t_start": [NS], "t_end": [NS], "verdict": "true", "hazard_id": None}
+    assert not lost(times, alarms(1, **due), **negated).unfounded
+    assert not lost(times, alarms(1, **due | {"verdict": "unknown", "hazard_id": [0]}), **negated).unfounded
+    assert lost(times, alarms(1, **due | {"verdict": "false"}), **negated).unfounded
+
+
+@pytest.mark.parametrize(
+    ("columns", "cause"),
+    [
+        ({"confidence_m": 20.0}, LostTo.CONFIDENCE),
+        ({"along_raw_reason": "no position", "withheld_for": "noise"}, LostTo.NOISE),
+        ({"along_raw_reason": "noise too large"}, LostTo.NOISE),
+        ({"withheld_for": "slip"}, LostTo.SLIP),
+        ({"odometer_reason": "no odometer"}, LostTo.NO_ODOMETER),
+        ({"lds_mode": "fail_safe"}, LostTo.RELINK),
+        ({"lds_mode": "fail_safe", "alarm": True}, LostTo.ALARM),
+        ({"lds_mode": "fail_safe", "alarm": True, "withheld_for": "relink"}, LostTo.RELINK),
+    ],
+)
+def test_one_cause(columns: dict[str, Any], cause: LostTo) -> None:
+    assert lost(tvb=False, **columns).causes == {cause: 1.0}
+
+
+def test_a_train_that_never_moves_loses_nothing() -> None:
+    assert lost(moving=False, tvb=False) == LostTime()
+
+
+RUN: dict[str, Any] = {
+    "verdict": "unproven",
+    "evidence": "reference",
+    "vehicle": "file",
+    "availability": 0.5,
+    "failures": 0,
+    "failures_within_budget": 0,
+    "failures_beyond_budget": 0,
+    "share_unknown": 0.0,
+    "unproven_accepted": 0,
+    "gnss_rate_hz": 10.0,
+    "faults_injected": False,
+    "failure_hazardous_may_s": [],
+    "failure_accepted": [],
+}
+ONE_LATE = {
+    "failures": 1,
+    "failures_beyond_budget": 1,
+    "failure_hazardous_may_s": [2.0],
+    "failure_accepted": ["right"],
+}
+CHECKED_LITTLE = {"evidence": "balise", "reasons": ["unknown_in_use"]}
+NOTHING = Unknown(at_ends=False, between=False)
+
+
+def cures(
+    run: dict[str, Any] | None = None,
+    causes: dict[LostTo, float] | None = None,
+    unknown: Unknown = NOTHING,
+    monitor: str = "along_raw",
+    unfounded: bool = True,
+    stated: bool = True,
+) -> list[Remedy]:
+    lost = LostTime(0.5, causes or {}, monitor, unfounded)
+    return remedies(RUN | (run or {}), lost, unknown, stated, CONFIG)
+
+
+def test_alarms_that_nothing_explains_are_mended_by_calibration_and_not_by_more_evidence() -> None:
+    """The NMEA log of issue 35: availability 0, raw monitors fail, no evidence at all."""
+    noisy = {LostTo.ALARM: 0.5}
+    blind = {"evidence": None, "share_unknown": None, "availability": 0.0}
+    assert cures(blind, noisy) == [Remedy.CALIBRATE]
+    assert cures({}, noisy, monitor="up_ewma_0p1") == [Remedy.CALIBRATE]
+    assert cures({"vehicle": "learned"}, noisy) == [Remedy.CALIBRATE], "which measures the odometer too"
+    assert cures({}, {LostTo.RELINK: 0.5}) == [Remedy.CALIBRATE]
+    assert cures({}, {LostTo.NOISE: 0.5}) == [Remedy.CALIBRATE]
+    assert cures({}, {LostTo.NOISE: 0.08, LostTo.CONFIDENCE: 0.42}) == [], "the begin of a short run"
+    done = Configuration.model_validate({"calibration": {"runs": ["b", "c"]}})
+    assert Remedy.CALIBRATE not in remedies(RUN, LostTime(0.5, noisy, "along_raw", True), NOTHING, True, done)
+    assert cures({}, noisy, unfounded=False) == []
+    assert cures({"faults_injected": True}, noisy) == []
+    assert cures({}, noisy, monitor="along_ewma_0p001") == []
+    assert cures({}, {LostTo.ALARM: 0.01}) == []
+    assert cures({"availability": 0.95}, noisy) == []
+
+
+@pytest.mark.parametrize(
+    ("run", "unknown", "cure"),
+    [
+        ({"evidence": "odometer", "reasons": ["unknown_in_use"]}, NOTHING, [Remedy.REFERENCE]),
+        ({"evidence": None, "reasons": ["accepted_unknown"]}, NOTHING, [Remedy.REFERENCE]),
+        (CHECKED_LITTLE, Unknown(at_ends=True, between=False), [Remedy.READS_AT_ENDS]),
+        (CHECKED_LITTLE, Unknown(at_ends=False, between=True), [Remedy.READS_CLOSER]),
+        ({"evidence": "balise", "reasons": []}, Unknown(at_ends=True, between=True), []),
+        ({"vehicle": "learned"}, NOTHING, [Remedy.VEHICLE_FILE]),
+        ({"vehicle": "none"}, NOTHING, [Remedy.ODOMETER]),
+        ({"reasons": ["clock_assumed"]}, NOTHING, [Remedy.CLOCK]),
+        (ONE_LATE | {"gnss_rate_hz": 1.0}, NOTHING, [Remedy.FASTER_LOG]),
+        (ONE_LATE, NOTHING, []),
+        (ONE_LATE | {"gnss_rate_hz": 1.0, "failure_hazardous_may_s": [2.1]}, NOTHING, []),
+        (ONE_LATE | {"gnss_rate_hz": 1.0, "failure_accepted": ["wrong"]}, NOTHING, []),
+    ],
+)
+def test_a_verdict_names_its_cure(run: dict[str, Any], unknown: Unknown, cure: list[Remedy]) -> None:
+    assert cures(run, unknown=unknown) == cure
+
+
+def test_an_ambiguous_track_needs_a_route_and_a_survey_that_states_its_accuracy() -> None:
+    twin = {LostTo.TRACK_AMBIGUOUS: 0.4}
+    assert cures({}, twin) == [Remedy.ROUTE]
+    assert cures({}, twin, stated=False) == [Remedy.ROUTE, Remedy.SURVEY_SIGMA]
+
+
+def test_where_the_unknown_lies() -> None:
+    """Of ten epochs the first two and the last are unknown, then one in the middle."""
+    word = {True: "right", False: "unknown"}
+
+    def parts(known: list[bool], **columns: Any) -> Unknown:
+        return unknown_parts(epochs(TEN_S, judgement=[word[k] for k in known], **columns), CONFIG)
+
+    ends = [False, False, True, True, True, True, True, True, True, False]
+    assert parts(ends) == Unknown(at_ends=True, between=False)
+    assert parts([True, True, True, False, True, True, True, True, True, True]) == Unknown(at_ends=False, between=True)
+    assert parts([False] * 10) == Unknown(at_ends=True, between=False)
+    assert parts(ends, in_use=False) == NOTHING
