@@ -72,7 +72,7 @@ def reference_stretches(
     samples = Samples(times_ns(reference), points, stated)
     # A sample beyond k_T roots of every track is no sample of the track.
     factor = config.align.sure_sigmas
-    near = near_elements(samples.points, samples.sigma_m, network.track, factor, config.hazards.survey_sigma_m)
+    near = near_elements(samples.points, samples.sigma_m, network, factor, config.hazards.survey_sigma_m)
     placed = np.flatnonzero(near.any_near)
     found: list[Stretch] = []
     used = np.zeros(samples.t_ns.size, dtype=np.bool_)
