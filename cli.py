@@ -351,7 +351,9 @@ def convert(
     name="site",
 )
 def make_a_site(
-    surveys: Annotated[list[Path], _place(help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK.")],
+    surveys: Annotated[
+        list[Path], _place(help="Maps (GPX, KML, GeoJSON, GeoPackage, Shapefile), CSV, or recorded runs.")
+    ],
     out: OutFolder,
     balises: Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")] = None,
     direction: Annotated[
