@@ -30,9 +30,6 @@ _WRONG_WAYS = {
     "pipeline.campaign.watch -> show",
     "pipeline.show.report.write -> campaign",
     "pipeline.studies.line.page -> show",
-    "pipeline.studies.line.passes -> show",
-    "pipeline.studies.line.pieces -> show",
-    "pipeline.studies.line.write -> show",
     "pipeline.studies.safety.assessment -> show",
     "pipeline.studies.safety.sensitivity -> campaign",
 }

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from pipeline.results.places import ground_of
 from pipeline.results.store import check_site, complete_runs, completed_runs, read_config, read_table
-from pipeline.show.export.places import ground_of
 from pipeline.storage import write_bytes
 from pipeline.studies.line.classes import piece_classes
 from pipeline.studies.line.page import line_page

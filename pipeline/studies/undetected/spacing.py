@@ -47,6 +47,8 @@ def _shortest(found: dict[int, int], place: Floats, close: float, search: Callab
     """
     while True:
         starts = sorted(found)
+        if any(row < place.size and place[row - 1] <= place[start] for start, row in found.items()):
+            return 0.0
         pairs = zip(starts, [*starts[1:], place.size - 1], strict=True)
         sure = [(float(place[found[one] - 1] - place[after]), one, after) for one, after in pairs]
         least, one, after = min((item for item in sure if found[item[1]] < place.size), default=(None, 0, 0))
