@@ -34,8 +34,6 @@ _WRONG_WAYS = {
     "pipeline.campaign.progress -> show",
     "pipeline.campaign.watch -> show",
     "pipeline.show.report.write -> campaign",
-    "pipeline.studies.line.passes -> show",
-    "pipeline.studies.line.pieces -> show",
 }
 DRAWERS = {"utils", "util", "tools", "common", "helpers", "helper", "misc"}
 

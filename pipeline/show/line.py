@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.show.export.places import ground_of
+from pipeline.results.places import ground_of
 from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import page, pairs, script_json, section, tiles
 from pipeline.storage import write_bytes
