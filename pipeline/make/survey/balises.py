@@ -105,8 +105,13 @@ class _Placer:
     """Where on the track a row of a list is."""
 
     def __init__(self, place: str, network: Network, track: Track, survey: Survey, config: SurveyConfig) -> None:
-        self.place, self.network, self.track, self.survey, self.config = place, network, track, survey, config
-        self.ground, self.segments = network_of(track, network.links), segments_of(track)
+        self.place = place
+        self.network = network
+        self.track = track
+        self.survey = survey
+        self.config = config
+        self.ground = network_of(track, network.links)
+        self.segments = segments_of(track)
 
     def placed(self, row: dict[str, Any]) -> tuple[str, float]:
         given = {key for key, value in row.items() if value is not None}
@@ -145,7 +150,8 @@ class _Placer:
                 self.survey.report("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
 
     def _at_kilometre(self, row: dict[str, Any]) -> tuple[str, float]:
-        wanted, km = row.get("netelement_id"), float(row["line_km"])
+        wanted = row.get("netelement_id")
+        km = float(row["line_km"])
         found = [
             (element.name, measure)
             for number, element in enumerate(self.network.elements)

@@ -87,7 +87,8 @@ def _kilometres(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
     known, off_m, jumps = kilometre_spans(element.line_km, way, config)
     if jumps.any():
         row = int(np.argmax(np.where(jumps, off_m, 0.0)))
-        first, last = known[row], known[row + 1]
+        first = known[row]
+        last = known[row + 1]
         text = (
             f"line kilometre goes from {element.line_km[first]:.3f} to {element.line_km[last]:.3f} "
             f"over {way[last] - way[first]:.0f} m of track ({jumps.sum()} such places)"
@@ -97,14 +98,19 @@ def _kilometres(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
 
 def _scattered(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
     """Points that lie aside of a smooth line through their neighbours make the element longer than the track is."""
-    flat, solid = replace(element, height_m=np.zeros(len(element))).solid, element.solid
+    flat = replace(element, height_m=np.zeros(len(element))).solid
+    solid = element.solid
     way = way_m(flat)
     by_plan = _longer_m(flat, way, config.uneven_steps)
     by_height = max(0.0, min(_longer_m(solid, way, config.uneven_steps) - by_plan, float(way_m(solid)[-1] - way[-1])))
     if by_plan + by_height > max(config.shape_m, config.longer_share * way[-1]):
-        what, longer_m, remedy = "positions", by_plan, "Export all decimals; do not draw by hand."
+        what = "positions"
+        longer_m = by_plan
+        remedy = "Export all decimals; do not draw by hand."
         if by_height > by_plan:
-            what, longer_m, remedy = "heights", by_height, "Mend them, or leave them out with --flat."
+            what = "heights"
+            longer_m = by_height
+            remedy = "Mend them, or leave them out with --flat."
         text = f"{what} scatter: they make the element about {longer_m:.1f} m longer than the track is"
         yield Finding("warning", f"track: {element.name}", text, remedy)
 
@@ -133,7 +139,8 @@ def _doubled(ground: Ground, config: SurveyConfig) -> Iterator[Finding]:
     """Tracks that lie on each other; an element that turns back is in pieces, which are compared like others."""
     track = ground.track
     along = places_along(track, SAMPLE_SPACING_M)
-    segments, both = segments_of(track), []
+    segments = segments_of(track)
+    both = []
     # So many at once as can be held.
     for rows in np.array_split(np.arange(len(along.element)), 1 + len(along.element) // 100_000):
         points = points_of(along.latitude_deg[rows], along.longitude_deg[rows])
@@ -158,7 +165,8 @@ def _open_ends(ground: Ground, same_track_m: float, near_ends_m: float) -> Itera
     found = candidates_of(points, ground, segments_of(track), 2 * same_track_m)
     middle = np.minimum(found.along_m, found.left_m) > near_ends_m
     for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
-        end, other = int(found.step[near]), track.ids[int(found.element[near])]
+        end = int(found.step[near])
+        other = track.ids[int(found.element[near])]
         beside = f"{found.distance_m[near]:.1f} m from the middle of {other}"
         text = f"end {position[end]} lies {beside} and is not joined to it"
         remedy = "Give both lines a point in common there, if it is a switch."

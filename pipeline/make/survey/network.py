@@ -123,7 +123,8 @@ def _near_ends(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> It
 def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> tuple[list[Piece], list[Ints]]:
     """Each stretch between two nodes once: the first line that has it keeps it."""
     seen: set[tuple[int, int]] = set()
-    kept, kept_nodes = [], []
+    kept = []
+    kept_nodes = []
     for piece, own in zip(pieces, nodes, strict=True):
         edges = [(min(a, b), max(a, b)) for a, b in zip(own[:-1].tolist(), own[1:].tolist(), strict=True)]
         new = np.array([edge not in seen and edge[0] != edge[1] for edge in edges])
@@ -200,7 +201,8 @@ def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[l
         parts[piece.name] = parts.get(piece.name, 0) + len(cuts) - 1
         for first, last in itertools.pairwise(cuts):
             found.append((piece.take(np.arange(first, last + 1)), int(own[first]), int(own[last])))
-    elements, ends = [], []
+    elements = []
+    ends = []
     for piece, first, last in found:
         number[piece.name] = number.get(piece.name, 0) + 1
         name = piece.name if parts[piece.name] == 1 else f"{piece.name}.{number[piece.name]}"
@@ -237,9 +239,11 @@ def _links(
     By angle a pair is navigable in both directions where a train can go that way, else not at all.
     """
     track = track_of(table)
-    directions, names = outward(track), track.ids
+    directions = outward(track)
+    names = track.ids
     named = {end for a, a_end, b, b_end, _ in given for end in ((a, a_end), (b, b_end))}
-    rows, guessed = list(given), []
+    rows = list(given)
+    guessed = []
     for node, meeting in arms_of(ends).items():
         here = [(names[element], position) for element, position in meeting]
         unsaid = [pair for pair in itertools.combinations(range(len(here)), 2) if not {here[k] for k in pair} <= named]

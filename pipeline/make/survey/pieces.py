@@ -107,7 +107,8 @@ def piece_of(
     known = {key: np.array(list(values), dtype=np.float64) for key, values in columns.items()}
     count = len(known["latitude_deg"])
     arrays = {key: known.get(key, np.full(count, np.nan)) for key in COLUMNS}
-    latitude, longitude = arrays["latitude_deg"], arrays["longitude_deg"]
+    latitude = arrays["latitude_deg"]
+    longitude = arrays["longitude_deg"]
     height = arrays["height_m"]
     unknown = (latitude == 0) & (longitude == 0)
     wrong = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)) | (height < -1_000) | (height > 10_000) | unknown
@@ -130,7 +131,8 @@ def with_own_names(pieces: list[Piece]) -> list[Piece]:
     taken: set[str] = set()
     named = []
     for piece in pieces:
-        name, number = piece.name, 1
+        name = piece.name
+        number = 1
         while name in taken or (name in reserved and not piece.whole):
             number += 1
             name = f"{piece.name}#{number}"
@@ -142,7 +144,8 @@ def with_own_names(pieces: list[Piece]) -> list[Piece]:
 def kilometre_spans(line_km: Floats, way_m: Floats, config: SurveyConfig) -> tuple[Ints, Floats, np.ndarray]:
     """Points with a kilometre; how far [m] the kilometres stray from the way to the next of them; where they jump."""
     known = np.flatnonzero(np.isfinite(line_km))
-    by_km, by_way = np.diff(line_km[known]) * 1000.0, np.diff(way_m[known])
+    by_km = np.diff(line_km[known]) * 1000.0
+    by_way = np.diff(way_m[known])
     sign = 1.0 if by_km.sum() >= 0 else -1.0
     off_m = np.abs(sign * by_km - by_way)
     return known, off_m, off_m > np.maximum(config.kilometre_m, config.kilometre_share * by_way)
@@ -153,7 +156,8 @@ def measures_at(line_km: Floats, measure_m: Floats, km: float, config: SurveyCon
     known, _, jumps = kilometre_spans(line_km, measure_m, config)
     found = []
     for low, high in zip(known[:-1][~jumps].tolist(), known[1:][~jumps].tolist(), strict=True):
-        a, b = line_km[low], line_km[high]
+        a = line_km[low]
+        b = line_km[high]
         if min(a, b) <= km <= max(a, b) and a != b:
             found.append(float(measure_m[low] + (km - a) / (b - a) * (measure_m[high] - measure_m[low])))
     # A kilometre at a point ends one span and begins the next.

@@ -156,7 +156,8 @@ def _dense(places: Floats) -> Floats:
 
 def _thinned(piece: Piece, held: Bools, shape_m: float) -> Piece:
     """Without points whose leaving out moves the line by less than `shape_m`; those held stay."""
-    places, kept = piece.solid, held.copy()
+    places = piece.solid
+    kept = held.copy()
     kept[[*range(0, len(places), _BLOCK), len(places) - 1]] = True
     spans = [tuple(pair) for pair in zip(np.flatnonzero(kept)[:-1], np.flatnonzero(kept)[1:], strict=True)]
     while spans:

@@ -55,12 +55,15 @@ class _Reader:
     """What expat meets, gathered to pieces of line."""
 
     def __init__(self, place: str, stem: str) -> None:
-        self.place, self.stem = place, stem
+        self.place = place
+        self.stem = stem
         self.survey = Survey()
         self.root = ""
         self.path: list[str] = []
         self.text: list[str] = []
-        self.name, self.mode, self.recorded = "", _CLAMPED, False
+        self.name = ""
+        self.mode = _CLAMPED
+        self.recorded = False
         self.points: list[list[float | None]] = []
         self.parser = expat.ParserCreate(namespace_separator=" ")
         self.parser.buffer_text = True
@@ -84,7 +87,9 @@ class _Reader:
         if local in ("trk", "rte", "Placemark"):
             self.name = attributes.get("id", "")
         if local in _ENDS_OF_LINE:
-            self.points, self.mode, self.recorded = [], _CLAMPED, False
+            self.points = []
+            self.mode = _CLAMPED
+            self.recorded = False
         if local in ("trkpt", "rtept"):
             self.points.append([self._number(attributes.get(key)) for key in ("lat", "lon")] + [None])
 

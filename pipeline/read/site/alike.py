@@ -97,7 +97,8 @@ def _ahead(
 
 
 def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Finding | None:
-    (expected, distance_m), (later, later_m) = near, far
+    (expected, distance_m) = near
+    (later, later_m) = far
     close_m = window_m(distance_m, expected.accuracy_m, reference.accuracy_m, config).close_m
     open_m = window_m(later_m, later.accuracy_m, reference.accuracy_m, config).open_m
     if open_m > close_m:
@@ -149,7 +150,8 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
     """Per pair of elements the parts of the first that lie too near the second."""
     track = network.track
     along = places_along(track, SAMPLE_SPACING_M)
-    element, measure_m = along.element, along.measure_m
+    element = along.element
+    measure_m = along.measure_m
     survey_m = _survey_m(track, config)
     odds = np.log(config.ambiguity_probability / (1.0 - config.ambiguity_probability))
     limit_m = np.sqrt(2.0 * odds * (config.cross_bias_sigma_m**2 + survey_m**2))
@@ -159,10 +161,13 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
     # Two surveys never end at the same place.
     near = (found.beyond_m <= config.survey_sigma_default_m) & (own < found.element)
     near &= found.distance_m < limit_m[own]
-    pairs, row = own[near] * network.count + found.element[near], found.step[near]
+    pairs = own[near] * network.count + found.element[near]
+    row = found.step[near]
     apart_m = found.distance_m[near]
     order = np.lexsort((row, pairs))
-    pairs, row, apart_m = pairs[order], row[order], apart_m[order]
+    pairs = pairs[order]
+    row = row[order]
+    apart_m = apart_m[order]
     cuts = np.flatnonzero((np.diff(pairs) != 0) | (np.diff(row) > 1)) + 1
     for part in np.split(np.arange(len(row)), cuts):
         if len(part):
@@ -172,7 +177,8 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
 
 
 def _finding(site: Site, network: Network, stretch: _Stretch, config: MatchingConfig) -> Finding:
-    name, other = network.track.ids[stretch.element], network.track.ids[stretch.other]
+    name = network.track.ids[stretch.element]
+    other = network.track.ids[stretch.other]
     claim = most_claimed(stretch.apart_m, float(_survey_m(network.track, config)[stretch.element]), config)
     text = (
         f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {other} lies {stretch.apart_m:.1f} m beside it; positions "

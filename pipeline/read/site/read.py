@@ -196,7 +196,8 @@ def _transformed(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breache
 
     try:
         turn = pyproj.Transformer.from_crs(raw.epsg, EPSG_WGS84, always_xy=True)
-        x, y = frame["longitude_deg"].to_numpy(), frame["latitude_deg"].to_numpy()
+        x = frame["longitude_deg"].to_numpy()
+        y = frame["latitude_deg"].to_numpy()
         longitude, latitude = turn.transform(x, y, errcheck=True)
     except pyproj.exceptions.ProjError as error:
         breaches.append(f"{raw.file}: EPSG:{raw.epsg}: {str(error).splitlines()[0]}")
@@ -226,7 +227,8 @@ def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.Da
     """Declared measures where an element has them at every point, geometric where at none."""
     parts = []
     for part in frame.partition_by("netelement_id", maintain_order=True):
-        name, missing = part["netelement_id"][0], part["measure_m"].null_count()
+        name = part["netelement_id"][0]
+        missing = part["measure_m"].null_count()
         if missing == part.height:
             track = track_of(part.with_columns(pl.lit(0.0).alias("measure_m")))
             geometric = geometric_measures_m(track.latitude_deg, track.longitude_deg, track.height_m)
