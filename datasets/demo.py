@@ -9,7 +9,7 @@ from pathlib import Path
 
 import polars as pl
 
-from datasets.comparison import Check, checks_table, compare
+from datasets.comparison import ComparisonRow, checks_table, compare
 from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline.campaign.finish import write_campaign
@@ -60,10 +60,10 @@ class DemoResult:
     def lines(self) -> pl.DataFrame:
         """One line per run, `run_id, injected, verdict, hazards, checks`, as short as a terminal is wide."""
         of_runs = self.checks.group_by("run_id", maintain_order=True)
-        told = of_runs.agg(pl.col("injected").first(), pl.col("agrees").sum(), pl.len()).rows()
+        counts = of_runs.agg(pl.col("injected").first(), pl.col("agrees").sum(), pl.len()).rows()
         rows = [
             (run_id, _in_short(injected), _verdict(one), _classes(one.hazards), f"{agreeing}/{of}")
-            for (run_id, injected, agreeing, of), one in zip(told, self.tables, strict=True)
+            for (run_id, injected, agreeing, of), one in zip(counts, self.tables, strict=True)
         ]
         names = ("run_id", "injected", "verdict", "hazards", "checks")
         return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")
@@ -98,7 +98,7 @@ def demo(
     """Write the trial under `out` (`site/`, `runs/`, `vehicle.toml`), replay every run from its files, and compare.
 
     Another `seed` than the scenario's own draws other errors; what has to be found is the same.
-    `progress` is told of each run written and replayed.
+    `progress` hears of each run written and replayed.
     """
     scenario = demo_scenario(seed)
     paths = write_trial(scenario, out, _ended(progress, "written"))
@@ -117,7 +117,7 @@ def replay_trial(
     scenario: Scenario, site: Site, paths: list[Path], config: Configuration, progress: Progress | None = None
 ) -> DemoResult:
     """Replay the runs of a trial that was written and compare each with what its scenario expects."""
-    checks: list[Check] = []
+    checks: list[ComparisonRow] = []
     tables = []
     done = _ended(progress, "replayed")
     for spec, path in zip(scenario.runs, paths, strict=True):

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from pipeline.make.survey.network import Network, arms_of
-from pipeline.make.survey.pieces import Piece, kilometre_spans
+from pipeline.make.survey.network import SurveyNetwork, arms_of
+from pipeline.make.survey.pieces import LinePiece, kilometre_spans
 from pipeline.stages.matching.candidates import candidates_of, segments_of
 from pipeline.stages.track.geodesy import points_of, way_m
-from pipeline.stages.track.network import Network as Ground
-from pipeline.stages.track.network import network_of
+from pipeline.stages.track.network import Network, network_of
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import in_pieces, places_along, track_of
 from schemas.arrays import Floats
@@ -22,7 +21,7 @@ from schemas.enums import Navigability
 from schemas.run import Finding
 
 
-def doubts(network: Network, config: SurveyConfig, site: SiteConfig) -> list[Finding]:
+def doubts(network: SurveyNetwork, config: SurveyConfig, site: SiteConfig) -> list[Finding]:
     """Kinks, tracks that were surveyed twice, open ends beside other track, heights and kilometres that do not fit."""
     track = track_of(network.track)
     in_parts = network_of(in_pieces(track), network.links)
@@ -33,7 +32,7 @@ def doubts(network: Network, config: SurveyConfig, site: SiteConfig) -> list[Fin
     return [*found, *_corners(network, config)]
 
 
-def _heights(elements: list[Piece]) -> Iterator[Finding]:
+def _heights(elements: list[LinePiece]) -> Iterator[Finding]:
     flat = [np.isnan(element.height_m).all() for element in elements]
     if all(flat):
         text = "no point has a height: the site is 2-D, and nothing is diagnosed in height"
@@ -48,7 +47,7 @@ def _heights(elements: list[Piece]) -> Iterator[Finding]:
     yield Finding("note", "track: column height_m", text, "Leave them out with --flat if you are not sure.")
 
 
-def _kinks(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
+def _kinks(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
     steps = np.diff(element.surface, axis=0)
     length = np.linalg.norm(steps, axis=1)
     unit = steps / length[:, None]
@@ -65,7 +64,7 @@ def _kinks(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
         yield Finding("warning", f"track: {element.name}", text, "Look whether a point is wrong or out of order.")
 
 
-def _corners(network: Network, config: SurveyConfig) -> Iterator[Finding]:
+def _corners(network: SurveyNetwork, config: SurveyConfig) -> Iterator[Finding]:
     """Kinks where two elements meet that a train runs over."""
     used = network.links.filter(pl.col("navigability").cast(pl.String) != Navigability.NONE.value)
     passed = set(used.select("netelement_a", "position_a").iter_rows())
@@ -77,12 +76,12 @@ def _corners(network: Network, config: SurveyConfig) -> Iterator[Finding]:
             yield from _kinks(corner, config)
 
 
-def _last_step(element: Piece, position: int) -> Piece:
+def _last_step(element: LinePiece, position: int) -> LinePiece:
     """The last two points before an end, the end last."""
     return element.take([1, 0] if position == 0 else [-2, -1])
 
 
-def _kilometres(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
+def _kilometres(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
     way = way_m(element.surface)
     known, off_m, jumps = kilometre_spans(element.line_km, way, config)
     if jumps.any():
@@ -96,7 +95,7 @@ def _kilometres(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
         yield Finding("warning", f"track: {element.name}", text, "A jump of the kilometres, or points out of order.")
 
 
-def _scattered(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
+def _scattered(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
     """Points that lie aside of a smooth line through their neighbours make the element longer than the track is."""
     flat = replace(element, height_m=np.zeros(len(element))).solid
     solid = element.solid
@@ -135,7 +134,7 @@ def _longer_m(places: Floats, way: Floats, uneven_steps: float) -> float:
     return float((variance_m2 / step.mean(axis=0))[even].sum())
 
 
-def _doubled(ground: Ground, config: SurveyConfig) -> Iterator[Finding]:
+def _doubled(ground: Network, config: SurveyConfig) -> Iterator[Finding]:
     """Tracks that lie on each other; an element that turns back is in pieces, which are compared like others."""
     track = ground.track
     along = places_along(track, SAMPLE_SPACING_M)
@@ -155,7 +154,7 @@ def _doubled(ground: Ground, config: SurveyConfig) -> Iterator[Finding]:
             yield Finding("warning", f"track: {track.ids[one]}", text, "Look whether one track was surveyed twice.")
 
 
-def _open_ends(ground: Ground, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
+def _open_ends(ground: Network, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
     """Ends that lie beside the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
     track = ground.track
     element, position = np.nonzero(~ground.linked_ends())

@@ -19,7 +19,7 @@ MOST_BYTES = 100_000_000
 
 
 @dataclass(frozen=True)
-class Piece:
+class LinePiece:
     """Points in order along one line: degrees, metres, kilometres of the line; NaN where not known.
 
     `name` is the source's own id. `recorded`: by a vehicle that stood, came back or passed twice. `whole`: a net
@@ -53,11 +53,11 @@ class Piece:
         """A point in words."""
         return f"{self.latitude_deg[row]:.6f}, {self.longitude_deg[row]:.6f}"
 
-    def take(self, rows: Ints | list[int]) -> Piece:
+    def take(self, rows: Ints | list[int]) -> LinePiece:
         """Some of the points."""
         return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
 
-    def followed_by(self, other: Piece) -> Piece:
+    def followed_by(self, other: LinePiece) -> LinePiece:
         """Its points and those of another."""
         both: dict[str, Any] = {name: np.append(getattr(self, name), getattr(other, name)) for name in COLUMNS}
         return replace(self, **both)
@@ -74,7 +74,7 @@ class Survey:
     elements as declared.
     """
 
-    pieces: list[Piece] = field(default_factory=list)
+    pieces: list[LinePiece] = field(default_factory=list)
     relations: list[Relation] = field(default_factory=list)
     declared_m: dict[str, float] = field(default_factory=dict)
     crossings_deg: list[tuple[float, float]] = field(default_factory=list)
@@ -99,7 +99,7 @@ def piece_of(
     columns: Mapping[str, Iterable[float | None]],
     recorded: bool = False,
     whole: bool = False,
-) -> Piece:
+) -> LinePiece:
     """A piece whose positions are places on earth, without points that repeat the one before.
 
     Raises `SiteError` where a position is none.
@@ -122,10 +122,10 @@ def piece_of(
             remedy="Look whether latitude and longitude are exchanged, or 0, 0 stands for a place that is not known.",
         )
     moved = np.append(True, (np.diff(latitude) != 0) | (np.diff(longitude) != 0)) if count else np.zeros(0, bool)
-    return Piece(name, **arrays, recorded=recorded, whole=whole).take(np.flatnonzero(moved))
+    return LinePiece(name, **arrays, recorded=recorded, whole=whole).take(np.flatnonzero(moved))
 
 
-def with_own_names(pieces: list[Piece]) -> list[Piece]:
+def with_own_names(pieces: list[LinePiece]) -> list[LinePiece]:
     """Each name once: the second of a name gets `#2`, in the order of the files; relations name net elements."""
     reserved = {piece.name for piece in pieces if piece.whole}
     taken: set[str] = set()

@@ -24,7 +24,7 @@ def read_xml(place: str, stem: str, data: bytes) -> Survey:
     Heights of KML count only where its altitude mode is `absolute`. Points with a time were recorded by a vehicle.
     Raises `SiteError`.
     """
-    reader = _Reader(place, stem)
+    reader = _XmlLines(place, stem)
     try:
         reader.parser.Parse(data, True)
     except (expat.ExpatError, LookupError, ValueError) as error:
@@ -51,7 +51,7 @@ def read_kmz(place: str, stem: str, data: bytes) -> Survey:
     return read_xml(f"{place}: {name}", stem, content)
 
 
-class _Reader:
+class _XmlLines:
     """What expat meets, gathered to pieces of line."""
 
     def __init__(self, place: str, stem: str) -> None:

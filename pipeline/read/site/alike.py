@@ -114,7 +114,7 @@ def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Findi
 
 
 @dataclass(frozen=True)
-class _Stretch:
+class _ParallelStretch:
     """A part of an element beside another one, by measure."""
 
     element: int
@@ -146,7 +146,7 @@ def most_claimed(apart_m: float, survey_m: float, config: MatchingConfig) -> flo
     return float(1.0 / (1.0 + np.exp(-(apart_m**2) / (2.0 * variance_m2))))
 
 
-def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
+def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelStretch]:
     """Per pair of elements the parts of the first that lie too near the second."""
     track = network.track
     along = places_along(track, SAMPLE_SPACING_M)
@@ -173,10 +173,10 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
         if len(part):
             one, other = divmod(int(pairs[part[0]]), network.count)
             at_m = measure_m[row[part]]
-            yield _Stretch(one, other, float(at_m[0]), float(at_m[-1]), float(np.median(apart_m[part])))
+            yield _ParallelStretch(one, other, float(at_m[0]), float(at_m[-1]), float(np.median(apart_m[part])))
 
 
-def _finding(site: Site, network: Network, stretch: _Stretch, config: MatchingConfig) -> Finding:
+def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: MatchingConfig) -> Finding:
     name = network.track.ids[stretch.element]
     other = network.track.ids[stretch.other]
     claim = most_claimed(stretch.apart_m, float(_survey_m(network.track, config)[stretch.element]), config)
@@ -187,7 +187,7 @@ def _finding(site: Site, network: Network, stretch: _Stretch, config: MatchingCo
     return Finding("warning", f"element {name}", text, _remedy(site, network, stretch))
 
 
-def _remedy(site: Site, network: Network, stretch: _Stretch) -> str:
+def _remedy(site: Site, network: Network, stretch: _ParallelStretch) -> str:
     """What would tell: a route always, reads and switches where there are some."""
     ways = ["a route (`balise replay --write-route`, `--route`)"]
     names = [network.track.ids[stretch.element], network.track.ids[stretch.other]]

@@ -48,7 +48,7 @@ _LINK_COLUMNS = {
 
 
 @dataclass
-class Network:
+class GeoJsonNetwork:
     """What one GeoJSON file holds; `declared_length_m` where elements state their length."""
 
     track: RawTable
@@ -57,7 +57,7 @@ class Network:
     ignored: int
 
 
-def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
+def read_network(file: str, data: bytes, breaches: list[str]) -> GeoJsonNetwork | None:
     """Net elements and net relations of a FeatureCollection, or breaches."""
     try:
         document = json.loads(data)
@@ -78,7 +78,7 @@ def _is_relation(keys: Mapping[str, Any]) -> bool:
     return any(key in keys for key in (*_A_KEYS, *_B_KEYS))
 
 
-def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> Network:
+def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> GeoJsonNetwork:
     points: list[tuple[Any, ...]] = []
     relations: list[tuple[Any, ...]] = []
     lengths: dict[str, float] = {}
@@ -97,7 +97,7 @@ def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> 
             breaches.append(f"{file}: feature {number}: {error}")
     track = RawTable(file, pl.DataFrame(points, schema=_TRACK_COLUMNS, orient="row"), epsg)
     links = RawTable(file, pl.DataFrame(relations, schema=_LINK_COLUMNS, orient="row")) if relations else None
-    return Network(track, links, lengths, ignored)
+    return GeoJsonNetwork(track, links, lengths, ignored)
 
 
 def parts_of(feature: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.read.site.checks import drop_repeated_points, remarks
-from pipeline.read.site.geojson import Network, read_network
+from pipeline.read.site.geojson import GeoJsonNetwork, read_network
 from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
 from pipeline.stages.track.survey import geometric_measures_m, track_of
@@ -136,8 +136,8 @@ def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable 
 
 def _read_track(
     files: dict[str, bytes], config: SiteConfig, breaches: list[str]
-) -> tuple[pl.DataFrame | None, Network | None, list[Finding]]:
-    network: Network | None = None
+) -> tuple[pl.DataFrame | None, GeoJsonNetwork | None, list[Finding]]:
+    network: GeoJsonNetwork | None = None
     if "track.geojson" in files:
         network = read_network("track.geojson", files["track.geojson"], breaches)
         raw = network.track if network else None
@@ -157,7 +157,7 @@ def _read_track(
     return (None if breaches else _with_measures(raw.file, frame, breaches)), network, notes
 
 
-def _read_links(files: dict[str, bytes], network: Network | None, breaches: list[str]) -> pl.DataFrame | None:
+def _read_links(files: dict[str, bytes], network: GeoJsonNetwork | None, breaches: list[str]) -> pl.DataFrame | None:
     """Links from their own table, else from the GeoJSON; a site of one element needs none."""
     raw = _load(files, "links", breaches)
     if raw is None and network is not None:
