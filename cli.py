@@ -187,14 +187,12 @@ def demo(
 ) -> None:
     """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
     from datasets.demo import demo as run_demo
-    from datasets.demo import write_demo
 
-    result = run_demo(out, seed=seed, progress=None if quiet else _say)
-    page = write_demo(result, out / "tables")
+    result = run_demo(out, seed, None if quiet else _say)
     if not quiet:
         if not result.agrees:
             _show(result.differing, "What was found differs from what was expected")
-        print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {page}\n")
+        print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {result.page}\n")
         _show(result.lines)
         print(result.sentence)
     raise Exit(OK if result.agrees else RUNS_NOT_OK)
