@@ -317,7 +317,7 @@ def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
 
 def _leaps_ns(stream: pl.DataFrame, config: AlignConfig) -> tuple[int, ...]:
     t_ns = times_ns(stream)
-    leap = leaps(np.diff(floats(stream, "distance_m")), np.diff(t_ns) / NS_PER_S, config)
+    leap = leaps((t_ns - t_ns[0]) / NS_PER_S, floats(stream, "distance_m"), config)
     return tuple(t_ns[1:][leap].tolist())
 
 
