@@ -41,8 +41,8 @@ class Candidates:
     """Candidates in order of step, then element; `first[k] : first[k + 1]` are those of step k.
 
     `along_m` from the element's start and `left_m` to its end; `beyond_m` how far the position lies past the end that
-    `past` names (-1 start, 1 end, 0 neither); `offset_m` left of the element's own sense; `height_m` of the track (NaN on
-    a 2-D survey); `vertex` at which the segment begins; `linked_start`, `linked_end`: a relation leads on there.
+    `past` names (-1 start, 1 end, 0 neither); `offset_m` left of its own sense; `height_m` of the track (NaN
+    on a 2-D survey); `vertex` at which the segment begins; `linked_start`, `linked_end`: a relation leads on there.
     """
 
     first: Ints
