@@ -50,8 +50,8 @@ def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats,
     """What of the movements that differ from the shared one has been taken for an error of the survey [m].
 
     What is common to all errors nobody can tell from an error of the position: only differences count. So each step all
-    are shifted to their median, by no more than it takes: a track that leads aside on its own moves no other one, whereas
-    by the smallest error a crossover became the measure of both tracks and lifted them by as much as it led aside.
+    are shifted to their median, by no more than it takes: a track that leads aside on its own moves no other. By the
+    smallest error a crossover became the measure of both tracks, and lifted them by as much as it led aside.
     """
     parted, limit, side, origin = parted_m.tolist(), tolerance_m.tolist(), sense.tolist(), before.tolist()
     errors = [0.0] * len(parted)
