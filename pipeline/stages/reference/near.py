@@ -13,7 +13,7 @@ from pipeline.stages.track.survey import Track
 from schemas.arrays import Bools, Floats, Ints
 
 # Numerics: so near an end a foot lies at it [m].
-_AT_END_M = 1e-6
+AT_END_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Near:
         for pair in np.flatnonzero(position[self.sample] >= 0).tolist():
             element, measure_m = int(self.element[pair]), float(self.measure_m[pair])
             ends = (abs(measure_m - self.track.begin_m[element]), abs(measure_m - self.track.end_m[element]))
-            end = int(np.argmin(ends)) if min(ends) < _AT_END_M else None
+            end = int(np.argmin(ends)) if min(ends) < AT_END_M else None
             foot = Foot(element, float(self.distance_m[pair]), measure_m, end)
             found[position[self.sample[pair]]].append(foot)
         return found
