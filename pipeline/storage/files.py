@@ -5,6 +5,7 @@ All that ingest reads goes through here, so that both kinds behave alike. Raises
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -38,13 +39,26 @@ def list_dir(path: Address) -> list[str]:
 def open_binary(path: Address) -> IO[bytes]:
     """A seekable binary file; of an address a copy on this machine, whose room is free again once it is closed."""
     with local_copy(path) as file:
-        return _local(file, lambda present: present.open("rb", buffering=0))
+        return _local(file, lambda present: _regular(present).open("rb", buffering=0))
 
 
 def read_bytes(path: Address) -> bytes:
     """The whole content."""
     with local_copy(path) as file:
-        return _local(file, Path.read_bytes)
+        return _local(file, lambda present: _regular(present).read_bytes())
+
+
+def require_regular(path: Address) -> None:
+    """Refuse pipes and devices on this machine: reading these may never end."""
+    if not is_url(path):
+        _local(path, _regular)
+
+
+def _regular(path: Path) -> Path:
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise InputError("is a pipe or a device", place=str(path), expected="a file")
+    return path
 
 
 def size_of(path: Address) -> int:

@@ -108,8 +108,8 @@ def with_points(log: LogTable) -> pl.DataFrame:
 
 def _fits(column: pl.Series, mark: str) -> bool:
     """Whether every cell is a number with this decimal mark."""
-    whole = rf"(?:\d{{1,3}}(?:{_MARKS[mark]}\d{{3}})+|\d+)"
-    number = rf"^\s*[+\-\u2212]?(?:{whole}(?:[{mark}]\d+)?|[{mark}]\d+)(?:[eE][+-]?\d+)?\s*$"
+    whole = rf"(?:[0-9]{{1,3}}(?:{_MARKS[mark]}[0-9]{{3}})+|[0-9]+)"
+    number = rf"^\s*[+\-\u2212]?(?:{whole}(?:[{mark}][0-9]+)?|[{mark}][0-9]+)(?:[eE][+-]?[0-9]+)?\s*$"
     return column.null_count() < len(column) and bool(column.drop_nulls().str.contains(number).all())
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.stamps import time_source
+from pipeline.read.ingest.stamps import time_source, within
 from pipeline.read.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
 from schemas.config import StreamMapping
 from schemas.errors import InputError
@@ -20,9 +20,9 @@ _LEAST_WEEK, _MOST_WEEK = 1024, 9999
 # Days of Excel in the years 1954 and 2119.
 LEAST_DAY, MOST_DAY = 20_000, 80_000
 _TEXT = (
-    r"^(?:(?P<y>\d{4})[-/.](?P<ym>\d{1,2})[-/.](?P<yd>\d{1,2})|(?P<a>\d{1,2})[-/.](?P<b>\d{1,2})[-/.](?P<c>\d{4}|\d{2}))"
-    r"[T ,]+(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,](?P<f>\d{1,9})\d*)?)?"
-    r" ?(?P<half>[AaPp][Mm])? ?(?P<zone>Z|[+-]\d{2}:?\d{2})?$"
+    r"^(?:(?P<y>[0-9]{4})[-/.](?P<ym>[0-9]{1,2})[-/.](?P<yd>[0-9]{1,2})|(?P<a>[0-9]{1,2})[-/.](?P<b>[0-9]{1,2})[-/.](?P<c>[0-9]{4}|[0-9]{2}))"
+    r"[T ,]+(?P<h>[0-9]{1,2}):(?P<m>[0-9]{2})(?::(?P<s>[0-9]{2})(?:[.,](?P<f>[0-9]{1,9})[0-9]*)?)?"
+    r" ?(?P<half>[AaPp][Mm])? ?(?P<zone>Z|[+-][0-9]{2}:?[0-9]{2})?$"
 )
 FORMS = "2025-06-01T12:00:00.25, 01.06.2025 12:00:00, 6/1/2025 1:00 PM, or numbers"
 
@@ -120,7 +120,7 @@ def _texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
             pl.coalesce("y", year), pl.coalesce("ym", month), pl.coalesce("yd", day), hour, "m",
             pl.col("s").fill_null(0), time_unit="us",
         )  # fmt: skip
-        whole = number.select(civil.dt.timestamp("us") * 1000).to_series()
+        whole = within(number.select(civil.dt.timestamp("us")).to_series(), 1000) * 1000
     except pl.exceptions.PolarsError as error:
         raise InputError(f"holds no times: {str(error).splitlines()[0]}", place=place, expected=FORMS) from None
     _refuse(whole.is_null() & texts.is_not_null(), texts, place, "holds no times", FORMS)
@@ -129,7 +129,7 @@ def _texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
 
 
 def _offset_ns(zone: pl.Series) -> pl.Series:
-    digits = zone.str.replace_all("[Z:]", "").str.extract(r"(\d{4})").fill_null("0000")
+    digits = zone.str.replace_all("[Z:]", "").str.extract(r"([0-9]{4})").fill_null("0000")
     minutes = digits.str.slice(0, 2).cast(pl.Int64) * 60 + digits.str.slice(2, 2).cast(pl.Int64)
     sign = pl.Series(np.where(zone.str.starts_with("-").fill_null(False).to_numpy(), -1, 1))
     return sign * minutes * 60_000_000_000
@@ -165,7 +165,7 @@ def fitting_orders(first: pl.Series, second: pl.Series) -> list[str]:
 
 def orders_of(texts: pl.Series) -> list[str]:
     """`fitting_orders` of texts, none where they begin with the year or are no dates."""
-    parts = texts.str.extract_groups(r"^(\d{1,2})[-/.](\d{1,2})[-/.]\d").struct.unnest().cast(pl.Int64)
+    parts = texts.str.extract_groups(r"^([0-9]{1,2})[-/.]([0-9]{1,2})[-/.][0-9]").struct.unnest().cast(pl.Int64)
     return [] if parts.to_series(0).drop_nulls().is_empty() else fitting_orders(parts.to_series(0), parts.to_series(1))
 
 

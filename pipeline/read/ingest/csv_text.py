@@ -15,6 +15,7 @@ from typing import NamedTuple
 import polars as pl
 import polars.selectors as cs
 
+from pipeline.storage import files
 from schemas.errors import InputError
 
 _SEPARATORS = (",", ";", "\t")
@@ -54,9 +55,7 @@ def read_log_table(log: Path, infer: bool) -> LogTable:
     `InputError` where the file cannot be read or holds no table.
     """
     try:
-        return _whole_rows(log.read_bytes(), infer)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", place=str(log)) from None
+        return _whole_rows(files.read_bytes(log), infer)
     except (ValueError, csv.Error, pl.exceptions.PolarsError) as error:
         if isinstance(error, pl.exceptions.ComputeError):
             with suppress(csv.Error):
@@ -105,7 +104,7 @@ def _without_units(lines: list[str], separator: str) -> tuple[list[str], tuple[s
 
 
 def _has_number(cell: str) -> bool:
-    return re.match(r"\s*[+-]?[.,]?\d", cell) is not None
+    return re.match(r"\s*[+-]?[.,]?[0-9]", cell) is not None
 
 
 def _lines(data: bytes) -> list[str]:

@@ -13,7 +13,7 @@ from pipeline.read.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
 from schemas.arrays import NS_PER_S
 from schemas.config import StreamMapping
 
-_LATEST_NS = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * NS_PER_S  # leaves room in 64 bits for the GPS epoch
+LATEST_NS = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * NS_PER_S  # leaves room in 64 bits for the GPS epoch
 # Spreadsheets count days from 1899-12-30.
 _DAY_S = 86_400
 _EXCEL_TO_UNIX_NS = 25_569 * _DAY_S * NS_PER_S
@@ -64,22 +64,22 @@ class TimeSource:
             if wrong.any():
                 row = int(wrong.arg_max() or 0)
                 raise ValueError(f"{rest[row]} nanoseconds beside whole seconds in message {row} of the topic")
-            return _within(first, NS_PER_S) * NS_PER_S + rest
+            return within(first, NS_PER_S) * NS_PER_S + rest
         dtype = self.types.get(self.fields[0], pl.Int64())
         if dtype == pl.String:
             # Beyond 64 bits polars goes round without a word, so the date is read in microseconds before.
             date = first.str.to_datetime("%+", time_unit="us", time_zone="UTC", strict=True).to_physical()
             t = first.str.to_datetime("%+", time_unit="ns", time_zone="UTC", strict=True).to_physical()
-            return t.set(_within(date, 1000).is_null(), None)
+            return t.set(within(date, 1000).is_null(), None)
         if dtype == pl.Int64:
             unit_ns = 1 if self.unit_s is None else round(self.unit_s * 1e9)
-            return _within(first, unit_ns) * unit_ns
-        return _within((first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round(), 1).cast(pl.Int64)
+            return within(first, unit_ns) * unit_ns
+        return within((first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round(), 1).cast(pl.Int64)
 
 
-def _within(counts: pl.Series, unit_ns: int) -> pl.Series:
-    """The counts of a unit since an epoch, null before it and after `_LATEST_NS`: nothing then overflows 64 bits."""
-    return counts.set(~counts.is_between(0, _LATEST_NS // max(unit_ns, 1)), None)
+def within(counts: pl.Series, unit_ns: int) -> pl.Series:
+    """The counts of a unit since an epoch, null before it and after `LATEST_NS`: nothing then overflows 64 bits."""
+    return counts.set(~counts.is_between(0, LATEST_NS // max(unit_ns, 1)), None)
 
 
 def stamp_parts(fields: Mapping[str, str], path: str) -> tuple[str, ...]:
