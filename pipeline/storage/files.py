@@ -5,7 +5,6 @@ All that ingest reads goes through here, so that both kinds behave alike. Raises
 
 from __future__ import annotations
 
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -49,15 +48,15 @@ def read_bytes(path: Address) -> bytes:
 
 
 def require_regular(path: Address) -> None:
-    """Refuse pipes and devices on this machine: reading these may never end."""
+    """Refuse pipes and devices on this machine."""
     if not is_url(path):
         _local(path, _regular)
 
 
 def _regular(path: Path) -> Path:
-    mode = path.stat().st_mode
-    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        raise InputError("is a pipe or a device", place=str(path), expected="a file")
+    """The file, unless it is a pipe or a device: reading one can last for ever."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError("is no regular file", place=str(path), expected="a file or folder")
     return path
 
 

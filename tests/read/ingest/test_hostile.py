@@ -19,12 +19,12 @@ from pydantic import ValidationError
 
 from pipeline.make.receivers import gather
 from pipeline.read.ingest import mcap_block, read_run
-from pipeline.read.ingest.clean import clean, of_the_journey
 from pipeline.read.ingest.correct import corrected
 from pipeline.read.ingest.describe import describe_log
 from pipeline.read.ingest.layout import LayoutDecoder, UnfitError, constant, fixed, layout_of
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
+from pipeline.stages.clean.clean import clean, of_the_journey
 from pipeline.storage.parquet import parquet_bytes
 from schemas.config import IngestConfig, StreamCorrection
 from schemas.errors import InputError
@@ -218,7 +218,7 @@ def test_a_protobuf_tag_has_32_bits(tag: bytes) -> None:
 def test_a_pipe_is_refused_before_it_blocks(tmp_path: Path) -> None:
     for name in ("run.mcap", "run.ubx", "run.csv"):
         os.mkfifo(tmp_path / name)
-        with pytest.raises(InputError, match="is a pipe or a device"):
+        with pytest.raises(InputError, match="is no regular file"):
             read_run(tmp_path / name) if name.endswith(".mcap") else gather([tmp_path / name])
 
 
