@@ -16,7 +16,8 @@ BETWEEN = "; "
 """What stands between the notes of a run; no note holds it itself."""
 
 # How many losses a sentence names; from which share on.
-_NAMED, _LEAST_SHARE = 3, 0.005
+_NAMED = 3
+_LEAST_SHARE = 0.005
 _CENTIMETRE_M = 0.01
 
 NOTES: dict[Note, str] = {
