@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from schemas.arrays import Floats
 
 
-def numbers_of(texts: Sequence[str]) -> Floats:
+def numbers_of(texts: Sequence[str] | npt.NDArray[np.str_]) -> Floats:
     """Decimal numbers; raises ValueError for what is none.
 
     Python and numpy also read `1_0` as 10, and Arabic-Indic digits: one such typing error makes a line of 8,700 km.

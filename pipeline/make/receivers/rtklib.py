@@ -15,8 +15,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.make.receivers.earth_fixed import earth_fixed, east_north_up, geodetic
-from pipeline.read.ingest.stamps import within
-from pipeline.read.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
+from pipeline.read.ingest.csv_text import CUT_ROW
+from pipeline.read.ingest.stamps import gps_ns_of_weeks, utc_of, within
 from pipeline.read.numbers import numbers_of
 from schemas.arrays import NS_PER_S, Floats
 from schemas.enums import Fix
@@ -36,7 +36,6 @@ _TOGETHER = (
 )  # fmt: skip
 _DATE = re.compile(r"[0-9]{4}/[0-9]{1,2}/[0-9]{1,2}")
 _GEOID = "height over the geoid: left empty, since the file has no separation"
-CUT_ROW = "row that breaks off at the end of the file"
 
 
 @dataclass(frozen=True)
@@ -134,24 +133,19 @@ def _times(words: Any, layout: _Layout, path: Path) -> pl.Series:
         text = pl.Series(np.char.add(np.char.add(words[:, 0], "T"), words[:, 1]))
         date_us = text.str.to_datetime("%Y/%m/%dT%H:%M:%S%.f", time_unit="us", strict=False).to_physical()
         exact = text.str.to_datetime("%Y/%m/%dT%H:%M:%S%.f", time_unit="ns", strict=False).to_physical()
-        told = exact.set(within(date_us, 1000).is_null(), None)
+        t_ns = exact.set(within(date_us, 1000).is_null(), None)
     else:
         week = pl.Series(words[:, 0]).cast(pl.Int64, strict=False)
-        tow = pl.Series(words[:, 1]).cast(pl.Float64, strict=False)
-        in_week_us = (tow.set(~tow.is_between(0, WEEK_NS / NS_PER_S), None) * 1e6).round()
-        in_week = in_week_us.cast(pl.Int64) * 1000  # RTKLIB writes microseconds at most
-        told = GPS_EPOCH_NS + week.set(~week.is_between(0, 9999), None) * WEEK_NS + in_week
-    if told.null_count():
-        row = int(told.is_null().arg_max() or 0)
+        t_ns = gps_ns_of_weeks(week, pl.Series(words[:, 1]).cast(pl.Float64, strict=False))
+    if t_ns.null_count():
+        row = int(t_ns.is_null().arg_max() or 0)
         raise InputError(
             "is no time",
             place=f"{path}: row {row + 1} of the epochs",
             found=" ".join(words[row, :2]),
             expected=f"y/m/d h:m:s, or week and seconds, in {layout.scale}",
         )
-    t_ns = told.to_numpy()
-    utc = utc_from_gps(t_ns) if layout.scale == "GPST" else t_ns - _AHEAD_NS[layout.scale]
-    return pl.Series(utc).cast(pl.Datetime("ns", "UTC"))
+    return utc_of(t_ns - _AHEAD_NS[layout.scale], "gps" if layout.scale == "GPST" else "utc")
 
 
 def _numbers(words: Any, layout: _Layout, path: Path) -> dict[str, Floats]:
