@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.clean import clean
-from pipeline.stages.matching import match
-from pipeline.stages.odometry import odometry_of
+from pipeline.stages.prepare import prepare
 from pipeline.stages.track.geodesy import curvature_radii_m, distances_m, moved_deg
 from schemas.arrays import Floats, Ints, floats
-from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
@@ -93,10 +91,8 @@ def _own_way(run: RunLog, solution: str) -> _Way:
 
 def _site_way(run: RunLog, solution: str, site: Site) -> _Way:
     """From the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
-    ordered, _ = clean(run)
-    fixes = ordered.gnss.filter(pl.col("solution") == solution)
-    odometry = odometry_of(ordered.odometer, Vehicle(), Configuration())
-    found = match(fixes, odometry, site, Vehicle(), MatchingConfig(), FixSigma(), ordered.balise_reads)
+    prepared = prepare(run, site, Vehicle(), Configuration())
+    fixes, found = prepared.fixes(solution), prepared.match(solution)
     epochs = found.epochs.filter(pl.col("path_m").is_not_null())
     if epochs["leg"].n_unique() != 1:
         raise InputError("the path changes direction at a switch", place=run.run_id, remedy="Inject without --site.")

@@ -143,7 +143,12 @@ def watches(quiet: bool, as_json: bool = False) -> list[Watch]:
         return [LogWatch()]
     if as_json:
         return [JsonWatch(), LogWatch()]
-    return [BarWatch() if sys.stderr.isatty() else LineWatch(), LogWatch()]
+    return [progress_watch(), LogWatch()]
+
+
+def progress_watch() -> Watch:
+    """A bar on a terminal, lines in a pipe."""
+    return BarWatch() if sys.stderr.isatty() else LineWatch()
 
 
 def show_summary(summary: Summary, out: str, quiet: bool, as_json: bool, **places: str) -> None:

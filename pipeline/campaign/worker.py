@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 
-import polars as pl
-
 from pipeline import storage
 from pipeline.campaign import lock
 from pipeline.campaign.interruption import ENDING
@@ -144,17 +142,12 @@ def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
 def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
     """The route by the run's `primary` solution, or the first by name: all of them were on the same train."""
     # Imported here for the same reason.
-    from pipeline.read.ingest.clean import clean
-    from pipeline.stages.matching import match
     from pipeline.stages.matching.found_route import found_route
-    from pipeline.stages.odometry import odometry_of
+    from pipeline.stages.prepare import prepare
 
-    cleaned, _ = clean(run, job.config)
-    matching = job.config.matching
-    fixes = cleaned.gnss.filter(pl.col("solution") == cleaned.main_solution())
-    odometry = odometry_of(cleaned.odometer, job.vehicle, job.config)
-    found = match(fixes, odometry, site, job.vehicle, matching, job.config.fix_sigma, cleaned.balise_reads)
-    route = found_route(found, matching.ambiguity_probability)
+    prepared = prepare(run, site, job.vehicle, job.config)
+    match = prepared.match(prepared.run.main_solution())
+    route = found_route(match, job.config.matching.ambiguity_probability)
     storage.write_bytes(job.write_route, route.write_csv().encode())
 
 

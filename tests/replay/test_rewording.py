@@ -16,8 +16,8 @@ import pytest
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.one_run import replay
-from pipeline.results.inspection import inspect_result
 from pipeline.results.store import write_run
+from pipeline.show.inspection import inspect_result
 from pipeline.studies.line.passes import Ground, passes_of
 from pipeline.studies.line.pieces import middles, pieces_of
 from pipeline.studies.safety.assessment import assess

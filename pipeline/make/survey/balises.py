@@ -119,8 +119,8 @@ class _Placer:
         expected = "latitude_deg and longitude_deg (or x_m and y_m), line_km, or netelement_id and measure_m"
         raise self._refusal(row, "has no place", expected=expected)
 
-    def _refusal(self, row: dict[str, Any], message: str, **told: str) -> SiteError:
-        return SiteError(message, place=f"{self.place}: balise {row['balise_id']}", **told)
+    def _refusal(self, row: dict[str, Any], message: str, **details: str) -> SiteError:
+        return SiteError(message, place=f"{self.place}: balise {row['balise_id']}", **details)
 
     def _at_coordinates(self, row: dict[str, Any]) -> tuple[str, float]:
         point = points_of(np.array([row["latitude_deg"]]), np.array([row["longitude_deg"]]))
@@ -133,16 +133,16 @@ class _Placer:
         if not ranked or ranked[0][0] > far_m:
             found = f"{ranked[0][0]:.1f} m" if ranked else f"none within {2 * far_m:g} m"
             raise self._refusal(row, "lies beside the track", found=found, expected=f"at most {far_m:g} m")
-        self._tell_rival(row, ranked)
+        self._report_rival(row, ranked)
         return self.track.ids[ranked[0][1]], ranked[0][2]
 
-    def _tell_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
+    def _report_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
         near = [one for one in ranked[1:] if one[0] < ranked[0][0] + self.config.same_track_m]
         nodes = set(self.network.ends[ranked[0][1]].tolist())
         for _, other, _ in near:
             if not nodes & set(self.network.ends[other].tolist()):
                 text = f"may as well lie on {self.track.ids[other]} as on {self.track.ids[ranked[0][1]]}"
-                self.survey.told("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
+                self.survey.report("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
 
     def _at_kilometre(self, row: dict[str, Any]) -> tuple[str, float]:
         wanted, km = row.get("netelement_id"), float(row["line_km"])

@@ -39,6 +39,9 @@ class Network:
     track: pl.DataFrame
 
 
+_NOTHING = Network([], np.zeros((0, 2), dtype=np.int64), Links.create_empty(), pl.DataFrame())
+
+
 def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> Network:
     """Net elements of all pieces; ends within `join_m` (else: in one place) of a vertex of another piece meet it.
 
@@ -47,11 +50,13 @@ def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> 
     """
     pieces = [piece for piece in survey.pieces if len(piece) > 1]
     if (short := len(survey.pieces) - len(pieces)) > 0:
-        survey.told("note", "survey", f"{short} lines with fewer than two points are left out")
+        survey.report("note", "survey", f"{short} lines with fewer than two points are left out")
     if not pieces:
-        return Network([], np.zeros((0, 2), dtype=np.int64), Links.create_empty(), pl.DataFrame())
+        return _NOTHING
     nodes = _nodes(pieces, config.same_place_m if join_m is None else join_m, survey.relations)
     pieces, nodes = _without_doubles(pieces, nodes, survey)
+    if not pieces:
+        return _NOTHING
     switches = _nodes_at(pieces, nodes, survey.switches_deg, config)
     crossings = _crossings(pieces, nodes, switches, survey, config)
     elements, ends = _cut(pieces, nodes, crossings)
@@ -127,7 +132,7 @@ def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> 
         seen.update(edges)
         if doubled:
             text = f"{doubled} of its {len(edges)} segments stand in the survey already and are left out"
-            survey.told("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")
+            survey.report("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")
         for first, last in spans_of(new):
             kept.append(piece.take(np.arange(first, last + 2)))
             kept_nodes.append(own[first : last + 2])
@@ -145,15 +150,15 @@ def _crossings(
     inner = np.concatenate([own[1:-1] for own in nodes])
     at_ends = np.unique(np.concatenate([own[[0, -1]] for own in nodes]))
     through, count = np.unique(inner, return_counts=True)
-    told = _nodes_at(pieces, nodes, survey.crossings_deg, config)
+    named = _nodes_at(pieces, nodes, survey.crossings_deg, config)
     lines = [own[1:-1] for piece, own in zip(pieces, nodes, strict=True) if not piece.whole]
     unnamed = np.intersect1d(through[count == 2], np.concatenate([np.zeros(0, dtype=np.int64), *lines]))
     by_form = set(np.setdiff1d(unnamed, at_ends).tolist()) - switches
-    _tell_of_crossings(pieces, nodes, by_form - told, survey)
-    return told | by_form
+    _report_crossings(pieces, nodes, by_form - named, survey)
+    return named | by_form
 
 
-def _tell_of_crossings(pieces: list[Piece], nodes: list[Ints], unnamed: set[int], survey: Survey) -> None:
+def _report_crossings(pieces: list[Piece], nodes: list[Ints], unnamed: set[int], survey: Survey) -> None:
     """One note for each pair of lines that cross."""
     names: dict[int, set[str]] = {node: set() for node in unnamed}
     for piece, own in zip(pieces, nodes, strict=True):
@@ -163,7 +168,7 @@ def _tell_of_crossings(pieces: list[Piece], nodes: list[Ints], unnamed: set[int]
         times = f" ({count} times)" if count > 1 else ""
         text = f"cross where neither ends{times}: taken as a crossing without a switch"
         remedy = "Where trains turn off (a slip), name the node `railway=switch`, or end the lines there."
-        survey.told("note", f"track: {', '.join(pair)}", text, remedy)
+        survey.report("note", f"track: {', '.join(pair)}", text, remedy)
 
 
 def _nodes_at(
@@ -248,22 +253,22 @@ def _links(
             rows.append((*one, *other, way.value))
         guessed += [here] * bool(unsaid)
         if node not in crossings | switches:
-            _tell_of_node([name for name, _ in here], pairs, survey)
-    _tell_of_guesses(guessed, len(rows) - len(given), bool(given), survey)
+            _report_node([name for name, _ in here], pairs, survey)
+    _report_guesses(guessed, len(rows) - len(given), bool(given), survey)
     links = Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
     known, findings = relations_to_nowhere(track, links)
     survey.findings += findings
     return known
 
 
-def _tell_of_guesses(nodes: list[list[tuple[str, int]]], pairs: int, some_given: bool, survey: Survey) -> None:
+def _report_guesses(nodes: list[list[tuple[str, int]]], pairs: int, some_given: bool, survey: Survey) -> None:
     """A finding where relations are made by angle; a warning where the survey gives relations elsewhere."""
     if not nodes:
         return
     first = " and ".join(f"end {position} of {name}" for name, position in nodes[0])
     text = f"the survey gives no relation at {len(nodes)} nodes ({first}{', ...' if len(nodes) > 1 else ''})"
     text += f": {pairs} relations are by the angles between the lines"
-    survey.told("warning" if some_given else "note", "links", text, "Look whether trains can run so.")
+    survey.report("warning" if some_given else "note", "links", text, "Look whether trains can run so.")
 
 
 def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: float) -> set[tuple[int, int]]:
@@ -290,13 +295,13 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: fl
     return straight
 
 
-def _tell_of_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
+def _report_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
     place = f"links: {', '.join(names)}"
     lonely = [name for arm, name in enumerate(names) if len(names) > 1 and not any(arm in pair for pair in pairs)]
     if lonely:
         text = f"no train gets from {', '.join(lonely)} to another of these: the corner is too sharp"
-        survey.told("warning", place, text, "Mend the survey there, or the relation.")
+        survey.report("warning", place, text, "Mend the survey there, or the relation.")
     if len(names) > 3:
         kind = "a crossing without a switch" if len(pairs) == len(names) / 2 else "switches, by their angles"
         text = f"{len(names)} ends meet at one node, which the survey does not name: taken as {kind}"
-        survey.told("note", place, text, "Name the node `railway=switch` or `railway=railway_crossing`.")
+        survey.report("note", place, text, "Name the node `railway=switch` or `railway=railway_crossing`.")

@@ -89,7 +89,7 @@ class Survey:
         self.switches_deg += other.switches_deg
         self.findings += other.findings
 
-    def told(self, severity: str, place: str, message: str, remedy: str = "") -> None:
+    def report(self, severity: str, place: str, message: str, remedy: str = "") -> None:
         self.findings.append(Finding(severity, place, message, remedy))  # type: ignore[arg-type]
 
 

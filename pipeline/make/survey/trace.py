@@ -62,7 +62,7 @@ def _gapless(piece: Piece, survey: Survey, config: SurveyConfig) -> Iterator[Pie
     gaps = np.flatnonzero(steps > max(config.gap_m, config.gap_steps * usual_m))
     for gap in gaps:
         text = f"nothing was recorded for {steps[gap]:.0f} m from {piece.place(int(gap))}"
-        survey.told("warning", f"track: {piece.name}", text, "Survey the missing piece.")
+        survey.report("warning", f"track: {piece.name}", text, "Survey the missing piece.")
     for rows in np.split(np.arange(len(piece)), gaps + 1):
         yield piece.take(rows)
 
@@ -80,7 +80,7 @@ def _new_track(piece: Piece, name: str, survey: Survey, config: SurveyConfig) ->
         known = [*survey.pieces, *parts]
         if covered.any():
             share = float(np.mean(covered))
-            survey.told("note", f"track: {name}", f"{share:.0%} of a pass lies on track that is known: not doubled")
+            survey.report("note", f"track: {name}", f"{share:.0%} of a pass lies on track that is known: not doubled")
     named = [f"{name}-{number}" if number > 1 else name for number in range(1, len(parts) + 1)]
     return [replace(part, name=own, recorded=False) for part, own in zip(parts, named, strict=True)]
 

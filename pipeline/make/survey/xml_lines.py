@@ -11,6 +11,7 @@ import zipfile
 from xml.parsers import expat
 
 from pipeline.make.survey.pieces import MOST_BYTES, Survey, piece_of
+from pipeline.read.site.geojson import number_of
 from schemas.errors import SiteError
 
 _ENDS_OF_LINE = ("trkseg", "rte", "LineString", "Track")
@@ -26,7 +27,8 @@ def read_xml(place: str, stem: str, data: bytes) -> Survey:
     reader = _Reader(place, stem)
     try:
         reader.parser.Parse(data, True)
-    except expat.ExpatError as error:
+    except (expat.ExpatError, LookupError, ValueError) as error:
+        # An encoding that expat does not know is a ValueError or a LookupError.
         raise SiteError(f"is not well-formed XML ({error})", place=place, expected="GPX or KML") from None
     if reader.root not in ("gpx", "kml"):
         raise SiteError("is neither GPX nor KML", place=place, found=f"<{reader.root}>")
@@ -114,7 +116,7 @@ class _Reader:
 
     def _number(self, text: str | None) -> float:
         try:
-            return float(text or "")
+            return number_of(text or "")
         except ValueError:
             where = f"{self.place}: line {self.parser.CurrentLineNumber}"
             raise SiteError("a coordinate cannot be read", place=where, found=repr(text)) from None

@@ -1,4 +1,4 @@
-"""What cannot be told apart: balises by linking (LOC section III), and tracks by positions alone (DOMAIN section 2)."""
+"""What looks alike: balises to linking (LOC section III), and tracks to positions alone (DOMAIN section 2)."""
 
 from __future__ import annotations
 
@@ -183,16 +183,16 @@ def _finding(site: Site, network: Network, stretch: _Stretch, config: MatchingCo
 
 def _remedy(site: Site, network: Network, stretch: _Stretch) -> str:
     """What would tell: a route always, reads and switches where there are some."""
-    told = ["a route (`balise replay --write-route`, `--route`)"]
+    ways = ["a route (`balise replay --write-route`, `--route`)"]
     names = [network.track.ids[stretch.element], network.track.ids[stretch.other]]
     balises = [] if site.balises is None else site.balises.select("balise_id", "netelement_id", "kind").rows()
     reads = [balise for balise, name, kind in balises if name in names and str(kind) == BaliseKind.PHYSICAL.value]
     if reads:
-        told.append(f"a read of {', '.join(reads[:3])}")
+        ways.append(f"a read of {', '.join(reads[:3])}")
     oriented = [2 * element + sense for element in (stretch.element, stretch.other) for sense in (0, 1)]
     if any(len(network.successors[one]) > 1 for one in oriented):
-        told.append("a switch taken at its end")
-    return f"To tell the two apart: {', '.join(told)}."
+        ways.append("a switch taken at its end")
+    return f"To tell the two apart: {', '.join(ways)}."
 
 
 def _survey_m(track: Track, config: MatchingConfig) -> Floats:

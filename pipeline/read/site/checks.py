@@ -23,10 +23,7 @@ from pipeline.stages.track.survey import (
 from schemas.arrays import Bools, Floats
 from schemas.config import SiteConfig
 from schemas.enums import Navigability
-from schemas.run import Finding
-
-# Of a finding about one balise: this and its id.
-BALISE_PLACE = "balises: "
+from schemas.run import BALISE_PLACE, Finding
 
 
 @dataclass

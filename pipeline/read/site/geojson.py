@@ -110,9 +110,17 @@ def triple(point: Any) -> tuple[float, float, float | None]:
     """Longitude, latitude and height (none where there is none). Raises `ValueError`."""
     try:
         longitude, latitude, *height = point
-        return float(longitude), float(latitude), float(height[0]) if height and height[0] is not None else None
+        height_m = number_of(height[0]) if height and height[0] is not None else None
+        return number_of(longitude), number_of(latitude), height_m
     except _MALFORMED:
         raise ValueError("coordinates are not numbers [longitude, latitude(, height)]") from None
+
+
+def number_of(value: Any) -> float:
+    """A coordinate, as a number or text; `1_0` and digits of other scripts are typing errors. Raises `ValueError`."""
+    if isinstance(value, str) and ("_" in value or not value.isascii()):
+        raise ValueError(value)
+    return float(value)
 
 
 def _plain_keys(own_id: Any, properties: Mapping[str, Any]) -> dict[str, Any]:

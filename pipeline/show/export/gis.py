@@ -10,8 +10,9 @@ from xml.sax.saxutils import escape, quoteattr
 
 import polars as pl
 
+from pipeline.results.places import Ground, ground_of
 from pipeline.show.export.events import hazard_text
-from pipeline.show.export.places import Ground, ground_of, positions_of
+from pipeline.show.export.positions import positions_of
 from schemas.arrays import Floats
 from schemas.run import RunTables, Site
 

@@ -15,8 +15,8 @@ import polars as pl
 from pipeline.show.export.events import alarm_entries, hazard_entries, passage_entries
 from pipeline.show.export.gis import balises_geojson, track_geojson
 from pipeline.show.export.messages import Encoding, Topic, geojson_topic, log_topic, rows_topic
-from pipeline.show.export.places import as_gnss, positions_of
 from pipeline.show.export.position_messages import location_fix_topic, navsatfix_topic
+from pipeline.show.export.positions import as_gnss, positions_of
 from pipeline.storage import whole_file
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import MONITORS

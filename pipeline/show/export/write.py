@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.results.provenance import input_digest
 from pipeline.results.store import check_site, metadata_of, read_run, table_address
 from pipeline.show.export.gis import run_geojson, run_gpx
 from pipeline.show.export.mcap_file import PositionMessage, run_topics, write_topics
+from pipeline.stages.provenance import input_digest
 from pipeline.storage import write_bytes
 from schemas.errors import UsageError
 from schemas.run import RunLog, RunTables, Site

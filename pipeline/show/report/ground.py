@@ -11,7 +11,7 @@ from math import ceil
 import numpy as np
 import polars as pl
 
-from pipeline.show.export.places import (
+from pipeline.results.places import (
     beside,
     element_lines_m,
     ground_at,

@@ -7,8 +7,8 @@ from html import escape
 
 import polars as pl
 
+from pipeline.results.places import stretches_of
 from pipeline.results.store import file_name
-from pipeline.show.export.places import stretches_of
 from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import link, section
 from pipeline.show.report.words import some_of

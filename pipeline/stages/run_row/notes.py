@@ -6,8 +6,6 @@ from datetime import UTC, datetime
 
 import polars as pl
 
-from pipeline.read.ingest.clean import StreamCounts
-from pipeline.read.site.checks import BALISE_PLACE
 from pipeline.stages.epochs.clock import Clock, met
 from pipeline.stages.evidence import Evidence as TrainEvidence
 from pipeline.stages.lds.run import LdsResult
@@ -15,12 +13,12 @@ from pipeline.stages.matching import Match
 from pipeline.stages.matching.fixes import contradictory_covariances
 from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.odometry import Odometry
+from pipeline.stages.ride import Ride
 from pipeline.stages.run_row.lost_time import LostTime
-from pipeline.studies.plausibility.fit import Fit
 from schemas.arrays import NS_PER_S, times_ns
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration
 from schemas.enums import NO_RELINK, BaliseKind, Evidence, LostTo, Note, NotEvaluated, PassageStatus, VehicleFigures
-from schemas.run import IngestNotes, RunLog, Site
+from schemas.run import IngestNotes, RunLog
 from schemas.words import Remark, remarks
 
 # How much a note says, no figure: so many names stand in one, and a scatter of less than the positions themselves have
@@ -42,51 +40,31 @@ def ingest_notes(ingest: IngestNotes) -> list[Remark]:
     )
 
 
-def ride_notes(
-    run: RunLog,
-    site: Site,
-    counts: StreamCounts,
-    fixes: pl.DataFrame,
-    found: Match,
-    aligned: pl.DataFrame,
-    lds: LdsResult,
-    vehicle: Vehicle,
-    odometry: Odometry | None,
-    fit: Fit,
-    evidence: TrainEvidence,
-    config: Configuration,
-) -> list[Remark]:
-    """What went in, and what matching, alignment and the LDS made of it.
-
-    `counts`, `fixes`: the GNSS of this solution; `evidence`: what is known of where the train was.
-    """
-    off_the_track = [item.place.removeprefix(BALISE_PLACE) for item in site.findings if item.severity == "error"]
-    telegrams = sorted(set(lds.unknown_reads["balise_id"].to_list()))
-    reverses = found.odometer_sign < 0 and vehicle.gnss_antenna_ahead_m
-    return _misfits(fit) + remarks(
+def ride_notes(ride: Ride, evidence: TrainEvidence) -> list[Remark]:
+    """What went in, and what matching, alignment and the LDS made of it."""
+    prepared = ride.prepared
+    run, config, counts = prepared.run, prepared.config, prepared.counts.solutions[ride.solution.name]
+    telegrams = sorted(set(ride.lds.unknown_reads["balise_id"].to_list()))
+    reverses = ride.match.odometer_sign < 0 and prepared.vehicle.gnss_antenna_ahead_m
+    return remarks(
         {
             Note.FAULTS_INJECTED: "" if run.faults is None else ", ".join(sorted(set(run.faults["kind"]))),
-            Note.BALISES_OFF: _few(off_the_track),
+            Note.BALISES_OFF: _few(prepared.site.balises_off()),
             Note.FAR_OFF: counts.far_off,
             Note.PLACEHOLDERS: counts.placeholders,
             Note.CONTRADICTING: counts.contradicting,
             **_extents(run),
-            **_of_odometer(odometry, config.align.straight_s),
+            **_of_odometer(prepared.odometry, config.align.straight_s),
             Note.ODOMETER_REVERSED: reverses,
-            Note.COVARIANCE: contradictory_covariances(fixes),
-            Note.AMBIGUOUS: _ambiguous(found),
-            Note.UNLINKED: _unlinked(lds),
+            Note.COVARIANCE: contradictory_covariances(ride.solution.fixes),
+            Note.AMBIGUOUS: _ambiguous(ride.match),
+            Note.UNLINKED: _unlinked(ride.lds),
             Note.UNKNOWN_TELEGRAMS: ", ".join(telegrams),
-            **_scatter(aligned, config),
+            **_scatter(ride.aligned, config),
             Note.READS_DISPUTED: evidence.disputed,
             Note.READS_UNREACHABLE: evidence.unreachable,
         }
     )
-
-
-def _misfits(fit: Fit) -> list[Remark]:
-    """What of the run does not fit, the impossible first."""
-    return [Remark(Note.MISFIT_MENDED if check.lines else Note.MISFIT, (check.sentence,)) for check in fit.misfits]
 
 
 def _few(names: list[str]) -> str:

@@ -10,13 +10,13 @@ import polars as pl
 import tomli_w
 
 from pipeline.one_run import replay
-from pipeline.read.ingest.clean import clean
 from pipeline.stages.alignment.align import align
-from pipeline.stages.matching import match
+from pipeline.stages.matching import Match
 from pipeline.stages.monitors.axis import error_model
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.monitors.single import doppler_monitor
-from pipeline.stages.odometry import Odometry, odometry_of
+from pipeline.stages.odometry import Odometry
+from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.studies.calibration.noise import beyond_noise
 from pipeline.studies.calibration.sigmas import (
     COMPARED,
@@ -27,7 +27,7 @@ from pipeline.studies.calibration.sigmas import (
     worst_fit,
 )
 from pipeline.studies.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
-from pipeline.studies.plausibility.fit import fit_run, refuse_impossible
+from pipeline.studies.plausibility.fit import clock_advice, fit_run, refuse_impossible
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
@@ -93,34 +93,32 @@ def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, so
 
     Raises `InputError` where its streams do not fit each other.
     """
-    run, _ = clean(log, config)
-    fixes = run.gnss.filter(pl.col("solution") == solution)
-    if fixes.is_empty():
+    prepared = prepare(log, site, vehicle, config, clock_advice)
+    if solution not in prepared.run.solutions():
         return Observed(log.run_id, None, {}, None, ())
-    _refuse_what_does_not_fit(run, site, vehicle, config, solution)
-    odometry = odometry_of(run.odometer, vehicle, config)
-    placed = match(fixes, odometry, site, vehicle, config.matching, config.fix_sigma, run.balise_reads)
-    oriented = None if odometry is None else odometry.oriented(placed.odometer_sign)
-    estimate = None if oriented is None else _estimate(placed.epochs, oriented, config)
+    _refuse_what_does_not_fit(prepared, solution)
+    match = prepared.match(solution)
+    odometry = None if prepared.odometry is None else prepared.odometry.oriented(match.odometer_sign)
+    estimate = None if odometry is None else _estimate(match, odometry, config)
     own = vehicle if estimate is None else _vehicle(vehicle, [estimate], config.align.latency_prior_sigma_s)
-    noise_m, epochs = _monitored(placed.epochs, oriented, own, config)
+    noise_m, epochs = _monitored(match, odometry, own, config)
     return Observed(log.run_id, estimate, noise_m, epochs, _alarms(log, site, own, config, solution))
 
 
-def _estimate(positions: pl.DataFrame, odometry: Odometry, config: Configuration) -> RunEstimate | None:
-    epochs = positions.filter("fix_valid", "on_track")
+def _estimate(match: Match, odometry: Odometry, config: Configuration) -> RunEstimate | None:
+    epochs = match.epochs.filter("fix_valid", "on_track")
     t_s = odometry.seconds(times_ns(epochs))
     seen = Observations(t_s, floats(epochs, "path_m"), floats(epochs, "sigma_along_m"))
     return estimate_run(seen, odometry, *error_model(config.monitors), config.calibration)
 
 
 def _monitored(
-    positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
+    match: Match, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
 ) -> tuple[dict[str, tuple[float, ...]], pl.DataFrame]:
     """The fast noise that the bank measures, and what the monitors show with this noise given."""
     # Without the margin of a single run: the loudest of several counts.
     stated = _with_monitors(config, {**_AS_STATED, **dict.fromkeys(_NO_NOISE), "noise_doubt": 0.0})
-    aligned = align(positions, odometry, vehicle, stated)
+    aligned = align(match.epochs, odometry, vehicle, stated)
     noise_m = MonitorBank(aligned, {}, stated).median_noise_m()
     given = _with_monitors(stated, noise_m)
     bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, given)}, given)
@@ -212,9 +210,11 @@ def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: flo
     return base.model_copy(update=measured)
 
 
-def _refuse_what_does_not_fit(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> None:
+def _refuse_what_does_not_fit(prepared: PreparedRun, solution: str) -> None:
     """A run with a wrong unit or clock would teach its error to every other run."""
-    fit = fit_run(run, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m), config.plausibility, site)
+    run, config = prepared.recorded, prepared.config
+    mounted = Vehicle(antenna_height_m=prepared.vehicle.antenna_height_m)
+    fit = fit_run(run, solution, mounted, config.plausibility, prepared.site)
     refuse_impossible(fit, run.run_id, config.ingest)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial import cKDTree
 
-from pipeline.show.export.places import ground_of, stretches_of
+from pipeline.results.places import ground_of, stretches_of
 from pipeline.studies.line.pieces import Pieces, plane_of
 from pipeline.studies.line.spans import FIRST_LOSS, State, spans_of, states_of
 from schemas.arrays import Floats, Ints, floats

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.show.export.places import Ground, ground_of, origin_of, plane_m
+from pipeline.results.places import Ground, ground_of, origin_of, plane_m
 from pipeline.stages.track.survey import Track, track_of
 from schemas.arrays import Floats, Ints
 from schemas.run import Site

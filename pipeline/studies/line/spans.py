@@ -7,8 +7,9 @@ from enum import IntEnum
 import numpy as np
 import polars as pl
 
+from pipeline.results.places import train_path_m
 from pipeline.stages.epochs.clock import confident, crossing_gap_ns, met, unambiguous, usable
-from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
+from schemas.arrays import Bools, Ints, flags, floats, times_ns
 from schemas.config import Configuration
 
 
@@ -59,36 +60,6 @@ def _is(epochs: pl.DataFrame, judgement: str) -> Bools:
     return (epochs["judgement"].cast(pl.String) == judgement).fill_null(value=False).to_numpy()
 
 
-def true_path_m(epochs: pl.DataFrame, legs: pl.DataFrame) -> tuple[Floats, Floats]:
-    """Least and largest path position of the train: its place by the evidence, laid on the way that was travelled.
-
-    NaN where the evidence leaves several net elements or none, or one that the way does not lead over. Of several
-    visits to a net element the one counts that is nearest to the position, or to the last one before.
-    """
-    places = epochs.select(
-        netelement_id=pl.when(pl.col("true_netelement_ids").list.len() == 1).then(
-            pl.col("true_netelement_ids").list.first()
-        ),
-        low="true_measure_low_m",
-        high="true_measure_high_m",
-        near=pl.col("path_m").fill_nan(None).forward_fill().backward_fill(),
-    ).with_row_index("row")
-    on_path = (pl.col("offset_m") + pl.col("sign") * pl.col(name) for name in ("low", "high"))
-    visits = (
-        places.drop_nulls(["netelement_id", "low", "high"])
-        .join(legs.select("netelement_id", "sign", "offset_m"), on="netelement_id")
-        .with_columns(*(place.alias(end) for place, end in zip(on_path, ("one", "other"), strict=True)))
-        .with_columns(away=(0.5 * (pl.col("one") + pl.col("other")) - pl.col("near")).abs())
-        .sort("row", "away")
-        .unique("row", keep="first", maintain_order=True)
-    )
-    low, high = np.full((2, epochs.height), np.nan)
-    rows = visits["row"].to_numpy()
-    low[rows] = visits.select(pl.min_horizontal("one", "other")).to_series().to_numpy()
-    high[rows] = visits.select(pl.max_horizontal("one", "other")).to_series().to_numpy()
-    return low, high
-
-
 def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """One row per pair of epochs: `low_m, high_m` where the train may have been, `from_m, to_m` where it was most
     likely, `direction, state, t, elements` (net elements of the train there), `satellites` (the fewer of the two).
@@ -98,7 +69,7 @@ def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Con
     which piece it was. So is a place known less closely than the failure limit on both sides. What
     was wrong at an end of such a way, or of an outage, was wrong there and not along it: a row of its own.
     """
-    low, high = true_path_m(epochs, legs)
+    low, high = train_path_m(epochs, legs)
     placed = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
     t_ns, satellites = times_ns(epochs), floats(epochs, "satellites")
     possible = epochs["true_netelement_ids"].to_list()

@@ -11,8 +11,8 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.stages.run_row.undetected import Spacing
 from pipeline.studies.undetected.error import Errors, largest_errors, splits_after
+from pipeline.studies.undetected.figures import Spacing
 from pipeline.studies.undetected.shares import growth_with, splits_of
 from pipeline.studies.undetected.stretch import stretch_after
 from pipeline.studies.undetected.watched import Watched
@@ -47,6 +47,8 @@ def _shortest(found: dict[int, int], place: Floats, close: float, search: Callab
     """
     while True:
         starts = sorted(found)
+        if any(row < place.size and place[row - 1] <= place[start] for start, row in found.items()):
+            return 0.0
         pairs = zip(starts, [*starts[1:], place.size - 1], strict=True)
         sure = [(float(place[found[one] - 1] - place[after]), one, after) for one, after in pairs]
         least, one, after = min((item for item in sure if found[item[1]] < place.size), default=(None, 0, 0))

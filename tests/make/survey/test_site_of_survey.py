@@ -329,6 +329,16 @@ BAD = {
     "entity.gpx": ('<!DOCTYPE gpx [<!ENTITY a "b">]><gpx>&a;</gpx>', "line 1: declares a document type"),
     "half.gpx": ("<gpx><trk>", "not well-formed XML"),
     "nowhere.gpx": ('<gpx><trk><trkseg><trkpt lat="50"/></trkseg></trk></gpx>', "line 1: a coordinate cannot be read"),
+    "tiny.gpx": (
+        '<gpx><trk><trkseg><trkpt lat="50" lon="4"/><trkpt lat="50.000000000001" lon="4"/></trkseg></trk></gpx>',
+        "nothing is left of the survey",
+    ),
+    "utf7.gpx": ('<?xml version="1.0" encoding="UTF-7"?><gpx/>', "not well-formed XML"),
+    "digits.gpx": ('<gpx><rte><rtept lat="5_0" lon="4"/></rte></gpx>', "a coordinate cannot be read; found '5_0'"),
+    "script.geojson": (
+        '{"features": [{"geometry": {"type": "LineString", "coordinates": [["\\u0665", 50], [4, 51]]}}]}',
+        "a coordinate cannot be read",
+    ),
     "page.kml": ("<html/>", "neither GPX nor KML"),
     "text.kmz": ("text", "cannot be unpacked"),
     "overpass.json": ('{"elements": []}', "Overpass exports GeoJSON"),

@@ -6,7 +6,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.show.export.places import beside, ground_at, ground_of, plane_m, positions_of, stretches_of
+from pipeline.results.places import beside, ground_at, ground_of, plane_m, stretches_of
+from pipeline.show.export.positions import positions_of
 from pipeline.stages.track.geodesy import distance_m
 from tests.show.export.conftest import Result
 
@@ -77,6 +78,12 @@ def test_truth_is_the_reference_of_the_log(result: Result) -> None:
     away = np.array([distance_m(*pair) for pair in pairs])
     moving_delay_m = 0.05 * 41.0
     assert away.max() < 2.5 + moving_delay_m + 1.0
+
+
+def test_truth_needs_no_position(result: Result) -> None:
+    epochs = result.tables.epochs
+    silent = epochs.with_columns(pl.lit(None, pl.Float64).alias(name) for name in ("path_m", "error_along_m"))
+    assert positions_of(silent, result.site).truth.equals(positions_of(epochs, result.site).truth)
 
 
 def test_matched_less_truth_is_the_error(result: Result) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.show.export.places import stretches_of
-from pipeline.studies.line.spans import State, spans_of, states_of, true_path_m
+from pipeline.results.places import stretches_of, train_path_m
+from pipeline.studies.line.spans import State, spans_of, states_of
 from tests.studies.line.tables import CONFIG, SPLIT_M, alarms_of, epochs_of, nowhere
 
 
@@ -20,7 +20,7 @@ def test_the_place_is_that_of_the_evidence_whatever_the_error_says(falling: bool
     epochs = epochs_of(0, (), falling=falling)
     train_m = epochs["path_m"] + (1.0 if falling else -1.0)
     silent = epochs.with_columns(pl.lit(None, pl.Float64).alias(name) for name in ("error_low_m", "error_high_m"))
-    low_m, high_m = true_path_m(silent, stretches_of(epochs))
+    low_m, high_m = train_path_m(silent, stretches_of(epochs))
     known = epochs["true_measure_low_m"].is_not_null().to_numpy()
     assert low_m[known] == pytest.approx((train_m - 2.0).to_numpy()[known])
     assert high_m[known] == pytest.approx((train_m + 2.0).to_numpy()[known])

@@ -1,4 +1,4 @@
-"""Where results are on the ground: net element and measure back to WGS 84, by the surveyed track, and of a solution."""
+"""Where a result lies: on the path of its solution, on the rails in WGS 84, and in a plane for drawings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.stages.track.geodesy import moved_deg, points_of
 from pipeline.stages.track.survey import Track, track_of
-from schemas.arrays import Floats, floats
+from schemas.arrays import Floats
 from schemas.run import Site
 
 _POINTS = 3000
@@ -79,6 +79,34 @@ def stretches_of(epochs: pl.DataFrame) -> pl.DataFrame:
         .agg(pl.col("offset_m").median(), pl.col("first_m").min(), pl.col("last_m").max())
         .drop("about")
     )
+
+
+def train_path_m(epochs: pl.DataFrame, stretches: pl.DataFrame) -> tuple[Floats, Floats]:
+    """Least and largest path position of the train per epoch [m], by the evidence; NaN where it is not known.
+
+    It is known where the evidence leaves one net element and the path leads over it (`stretches_of`). Of several
+    visits to the element the one nearest to the position counts, without a position to the last one before.
+    """
+    names, position = pl.col("true_netelement_ids"), pl.col("path_m").fill_nan(None)
+    ends = [
+        pl.col("offset_m") + pl.col("sign") * pl.col(name) for name in ("true_measure_low_m", "true_measure_high_m")
+    ]
+    visits = (
+        epochs.with_row_index("row")
+        .select(
+            *("row", "true_measure_low_m", "true_measure_high_m"),
+            netelement_id=pl.when(names.list.len() == 1).then(names.list.first()),
+            near=position.forward_fill().backward_fill(),
+        )
+        .drop_nulls(["netelement_id", "true_measure_low_m", "true_measure_high_m"])
+        .join(stretches.select("netelement_id", "sign", "offset_m"), on="netelement_id")
+        .select("row", "near", low=pl.min_horizontal(*ends), high=pl.max_horizontal(*ends))
+        .sort("row", (0.5 * (pl.col("low") + pl.col("high")) - pl.col("near")).abs())
+        .unique("row", keep="first", maintain_order=True)
+    )
+    low, high = np.full((2, epochs.height), np.nan)
+    low[visits["row"]], high[visits["row"]] = visits["low"], visits["high"]
+    return low, high
 
 
 def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, margin_m: float = 50.0) -> Ground:
@@ -154,51 +182,3 @@ def _on_element(track: Track, number: int, measure_m: Floats) -> tuple[Floats, F
     heading = np.degrees(np.arctan2(east, np.diff(latitude))) % 360.0
     along = (column[segment] + share * np.diff(column)[segment] for column in (latitude, longitude, height))
     return (*along, heading[segment])  # type: ignore[return-value]
-
-
-_COVARIANCE = ("ee", "en", "eu", "nn", "nu", "uu")
-
-
-@dataclass(frozen=True)
-class Positions:
-    """Frames of `t, latitude_deg, longitude_deg, height_m`, rows without a position left out.
-
-    `gnss` is the corrected position that was matched (of the balise antenna, at its time of validity), `matched`
-    its foot on the rails, `truth` where the evidence puts the train on the rails. Heights are those of the survey,
-    null on a 2-D one.
-    """
-
-    gnss: pl.DataFrame
-    matched: pl.DataFrame
-    truth: pl.DataFrame
-
-
-def positions_of(epochs: pl.DataFrame, site: Site) -> Positions:
-    """Positions of one solution's epochs. Truth is the path position less the error along it (CONTRACT section 3)."""
-    column = {name: floats(epochs, name) for name in _NEEDED}
-    rails = ground_of(site.track, epochs["netelement_id"], column["measure_m"])
-    stretches = stretches_of(epochs)
-    sign = sign_of(epochs, stretches)
-    gnss = beside(rails, sign, column["cross_track_m"], column["vertical_m"])
-    true_path = column["path_m"] - column["direction"] * column["error_along_m"]
-    truth = ground_at(site.track, stretches, true_path)
-    return Positions(_frame(epochs["t"], gnss), _frame(epochs["t"], rails), _frame(epochs["t"], truth))
-
-
-_NEEDED = ("measure_m", "path_m", "cross_track_m", "vertical_m", "direction", "error_along_m")
-
-
-def as_gnss(frame: pl.DataFrame) -> pl.DataFrame:
-    """Positions in the columns of the `gnss` stream that position messages are made of; covariance not known."""
-    unknown = [pl.lit(None, dtype=pl.Float64).alias(f"cov_{axes}_m2") for axes in _COVARIANCE]
-    return frame.with_columns(*unknown, fix=pl.lit("estimated"))
-
-
-def _frame(t: pl.Series, ground: Ground) -> pl.DataFrame:
-    columns = {
-        "latitude_deg": ground.latitude_deg,
-        "longitude_deg": ground.longitude_deg,
-        "height_m": ground.height_m,
-    }
-    frame = pl.DataFrame({"t": t, **columns}).with_columns(pl.col(pl.Float64).fill_nan(None))
-    return frame.filter(pl.col("latitude_deg").is_not_null() & pl.col("longitude_deg").is_not_null())
