@@ -179,6 +179,7 @@ class MonitorBank:
         self._single = {
             name: no_verdicts(count, DISABLED) if name in disabled else frame for name, frame in single.items()
         }
+        self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in config.monitors.ewma_alphas)])
         self._single_fails = np.zeros(count, dtype=np.bool_)
         for frame in self._single.values():
             self._single_fails |= (frame["state"] == MonitorState.FAIL.value).to_numpy()
@@ -216,6 +217,12 @@ class MonitorBank:
         """
         self._look(epoch)
         return bool(self._fast[epoch])
+
+    def failing_memory_s(self, epoch: int) -> float:
+        """Memory of the slowest average that fails at this epoch [s], for so long the fault may have gone on; else 0."""
+        self._look(epoch)
+        failing = np.any([axis.state[epoch] == FAIL for axis in self._axes], axis=0)
+        return float(np.max(self._memories_s * failing))
 
     def along_evaluated(self, epoch: int) -> bool:
         """`along_raw` has a verdict (pass or fail) at this epoch; an average alone says nothing of a step."""
