@@ -261,8 +261,8 @@ def claim(
     if as_json or str(csv) != "-":
         head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
         title = f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}"
-        told = {**head, "notes": found.notes, "requirements": found.table}
-        _tell(as_json, told, {title: for_reading(found.table)}, "", *found.notes)
+        answer = {**head, "notes": found.notes, "requirements": found.table}
+        _tell(as_json, answer, {title: for_reading(found.table)}, "", *found.notes)
 
 
 @_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12")
@@ -313,12 +313,13 @@ def undetected(
     behind: Annotated[bool, Option("--behind", help="An error behind the train instead of ahead.")] = False,
 ) -> None:
     """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
-    from datasets.undetected import largest_fault, told, write_fault
+    from datasets.undetected import largest_fault, sentence_of, write_fault
 
     settings, train = _configuration(config), _vehicle(vehicle)
     found = largest_fault(_log(run, settings), _ground(site, settings), train, settings, solution, balise, at_s, behind)
     file = write_fault(found, solution if settings.undetected.solutions_at_fault == "one" else None, out)
-    print(f"{told(found)}\nTo check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
+    print(sentence_of(found))
+    print(f"To check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 
 
 @_command(

@@ -13,7 +13,8 @@ from schemas.config import Configuration, Vehicle
 from schemas.errors import OutputError
 from schemas.run import RunLog, Site
 
-FAULT, PROFILE = "fault.toml", "profile.csv"
+FAULT = "fault.toml"
+PROFILE = "profile.csv"
 
 
 def largest_fault(
@@ -33,7 +34,7 @@ def largest_fault(
     return profile_at(diagnosis, epoch, behind, vehicle, config)
 
 
-def told(found: Profile) -> str:
+def sentence_of(found: Profile) -> str:
     """The fault in words: how large, since when, and what a ramp and a step would have reached."""
     began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
     return (

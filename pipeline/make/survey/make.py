@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.make.survey.balises import balises_every, balises_of_list
 from pipeline.make.survey.doubts import doubts
-from pipeline.make.survey.network import Network, make_network
+from pipeline.make.survey.network import SurveyNetwork, make_network
 from pipeline.make.survey.pieces import Survey
 from pipeline.make.survey.sources import read_surveys
 from pipeline.make.survey.trace import clean_traces
@@ -98,7 +98,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     return Site(track, network.links, balises, None, findings)
 
 
-def _balises(wish: Wish, network: Network, survey: Survey, config: Configuration) -> pl.DataFrame | None:
+def _balises(wish: Wish, network: SurveyNetwork, survey: Survey, config: Configuration) -> pl.DataFrame | None:
     if wish.spacing_m is not None:
         table = balises_every(network, wish.spacing_m, wish.travel)
         return table if table.height else None

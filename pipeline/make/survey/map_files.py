@@ -26,7 +26,8 @@ def read_map(path: Path, data: bytes) -> Survey:
     try:
         import pyogrio
     except ImportError:
-        place, remedy = str(path), "Install the extra `maps`, or export the lines as GeoJSON."
+        place = str(path)
+        remedy = "Install the extra `maps`, or export the lines as GeoJSON."
         raise SiteError("cannot be read without the package pyogrio", place=place, remedy=remedy) from None
     if not data.startswith(_BEGINNINGS[path.suffix.lower()]):
         raise SiteError(f"is no {path.suffix} file", place=str(path), found=repr(data[:16]))
@@ -83,7 +84,8 @@ def lines_of_wkb(shape: bytes) -> list[npt.NDArray[np.float64]]:
     if kind != _MULTI_LINE_STRING:
         return []
     # Each of them is a LineString with a head of its own, 9 bytes.
-    lines, start = [], 9
+    lines = []
+    start = 9
     for _ in range(count):
         lines += lines_of_wkb(shape[start:])
         start += 9 + lines[-1].nbytes

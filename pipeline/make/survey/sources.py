@@ -39,7 +39,8 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
     suffix = path.suffix.lower()
     if path.is_dir() or suffix == ".mcap":
         return read_recorded(path, vehicle, config)
-    place, data = str(path), content_of_survey(path)
+    place = str(path)
+    data = content_of_survey(path)
     match suffix:
         case ".gpx" | ".kml":
             return read_xml(place, path.stem, data)

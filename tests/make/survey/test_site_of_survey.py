@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.make.survey.make import make_site, wish_of, write_made
 from pipeline.make.survey.network import make_network
-from pipeline.make.survey.pieces import Piece, Survey
+from pipeline.make.survey.pieces import LinePiece, Survey
 from pipeline.make.survey.trace import clean_traces
 from pipeline.read.site.read import read_site
 from pipeline.show.report.site_page import site_page
@@ -267,11 +267,11 @@ def test_gpx_kml_and_kmz_give_the_same_line_and_the_same_ids_each_time(tmp_path:
         write_made(sites[0], "", tmp_path / "one", force=False)
 
 
-def recorded(name: str, east_m: np.ndarray, north_m: np.ndarray, rng: np.random.Generator) -> Piece:
+def recorded(name: str, east_m: np.ndarray, north_m: np.ndarray, rng: np.random.Generator) -> LinePiece:
     scatter = rng.normal(0.0, 0.02, (2, len(east_m)))
     latitude, longitude = degrees(east_m + scatter[0], north_m + scatter[1])
     unknown = np.full(len(east_m), np.nan)
-    return Piece(name, latitude, longitude, unknown, unknown, np.full(len(east_m), 0.02), recorded=True)
+    return LinePiece(name, latitude, longitude, unknown, unknown, np.full(len(east_m), 0.02), recorded=True)
 
 
 def test_recorded_passes_make_one_line_and_a_branch_meets_it_at_a_switch() -> None:
