@@ -219,7 +219,7 @@ class MonitorBank:
         return bool(self._fast[epoch])
 
     def failing_memory_s(self, epoch: int) -> float:
-        """Memory of the slowest average that fails at this epoch [s], for so long the fault may have gone on; else 0."""
+        """Memory of the slowest average that fails here [s], over which its fault may have gone on; 0 without one."""
         self._look(epoch)
         failing = np.any([axis.state[epoch] == FAIL for axis in self._axes], axis=0)
         return float(np.max(self._memories_s * failing))
