@@ -72,7 +72,12 @@ def tables_of(out: Path) -> dict[str, pl.DataFrame]:
 
 
 def dictionaries() -> Iterator[dict[Any, str]]:
-    """Every dictionary of words for an enum in `schemas/words.py`."""
+    """Every dictionary of words for an enum in `schemas/words.py`, and every section of phrases in its file."""
+    yield from (words.WORDS[section] for section in ("hazards", "verdicts", "noise_axes"))
+    yield from of_enums()
+
+
+def of_enums() -> Iterator[dict[Any, str]]:
     for name, value in vars(words).items():
         if name.isupper() and isinstance(value, dict) and all(isinstance(code, Enum) for code in value):
             yield value
@@ -103,7 +108,7 @@ def test_rewording_every_message_changes_no_figure(more: str, tmp_path: Path, mo
 
 
 def test_every_code_has_its_words() -> None:
-    for sentences in dictionaries():
+    for sentences in of_enums():
         kind = type(next(iter(sentences)))
         assert set(sentences) == set(kind), kind
         assert not any(words.BETWEEN in text for text in sentences.values()), kind

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 
 import polars as pl
@@ -15,16 +16,18 @@ from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.ride import Ride
 from pipeline.stages.run_row.lost_time import LostTime
+from pipeline.stages.run_row.noise import widened_by_noise
 from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import Configuration
 from schemas.enums import NO_RELINK, BaliseKind, Evidence, LostTo, Note, NotEvaluated, PassageStatus, VehicleFigures
 from schemas.run import IngestNotes, RunLog
-from schemas.words import Remark, remarks
+from schemas.words import Remark, noise_words, remarks
 
-# How much a note says, no figure: so many names stand in one, and a scatter of less than the positions themselves have
-# is not worth a word.
+# How much a note says, no figure: so many names stand in one, and neither a scatter of less than the positions
+# themselves have nor thresholds wider by less than this are worth a word.
 _NAMED = 5
 _WORTH_M = 0.1
+_WORTH_RATIO = 1.05
 _WITHOUT_ODOMETER = (NotEvaluated.NO_ODOMETER, NotEvaluated.BEYOND_SPAN, NotEvaluated.INTERRUPTED)
 
 
@@ -170,6 +173,13 @@ def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> list[Rema
     return [Remark(Note.UNDIAGNOSED, (count, reason.value)) for reason, count in counts.items() if count]
 
 
+def noise_notes(epochs: pl.DataFrame, white_noise: Mapping[str, float | None], config: Configuration) -> list[Remark]:
+    """By how much measured noise widens the thresholds, where that is worth a word."""
+    widened = widened_by_noise(epochs, white_noise, config)
+    worth = {axis: figures for axis, figures in widened.items() if figures[0] >= _WORTH_RATIO}
+    return remarks({Note.WHITE_NOISE: noise_words(worth)})
+
+
 def time_notes(epochs: pl.DataFrame, clock: Clock, lost: LostTime, config: Configuration) -> list[Remark]:
     """For how long nobody knows whether the train moved, and what the moving time without a valid TVB was lost to.
 
@@ -178,11 +188,13 @@ def time_notes(epochs: pl.DataFrame, clock: Clock, lost: LostTime, config: Confi
     unknown_s = float(clock.held_s[met(epochs, pl.col("moving").is_null())].sum())
     low = lost.share is not None and 1.0 - lost.share < config.advice.low_availability
     aside = lost.causes.get(LostTo.NO_POSITION, 0.0) >= config.advice.lost_share
+    poor = lost.causes.get(LostTo.CONFIDENCE, 0.0)
     aside_m = epochs.filter(~pl.col("on_track"))["cross_track_m"].abs().median()
     return remarks(
         {
             Note.MOVING_UNKNOWN: unknown_s if round(unknown_s) > 0 else None,
             Note.AVAILABLE: (1.0 - lost.share, lost.words) if low and lost.share is not None else None,
+            Note.POOR_POSITIONS: poor if low and poor >= config.advice.lost_share else None,
             Note.OFF_TRACK: aside_m if low and aside else None,
         }
     )
