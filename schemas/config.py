@@ -353,8 +353,8 @@ class MonitorConfig(Settings):
     noise_renewal_s: Positive = 10.0
     noise_window_s: Positive = 300.0
     noise_window_lags: Positive = 20.0
-    # Samples of the short lags are no closer: at 10 Hz three times as many would cost much and tell little more.
-    noise_spacing_s: Positive = 0.3
+    # Samples of the short lags are no closer: 300 in the window are enough for the last quantile.
+    noise_spacing_s: Positive = 1.0
     # A lag counts after so many of itself. Longer ones than this take longer than a run lets them: they are expected
     # by how the noise grows over the shorter ones.
     noise_ready_lags: Annotated[Number, Field(gt=2)] = 7.0
