@@ -19,7 +19,7 @@ _NONE = -1e6
 
 
 @dataclass(frozen=True)
-class Found:
+class Beliefs:
     """Per state: probability from the steps up to its own, and from all; per step the best path's state."""
 
     forward: Floats
@@ -27,7 +27,7 @@ class Found:
     best: Ints
 
 
-def search(trellis: Trellis) -> Found:
+def search(trellis: Trellis) -> Beliefs:
     """How probable each state is at each step, and the most probable sequence.
 
     `forward` is causal: it uses nothing that a train would not know at that step.
@@ -47,7 +47,7 @@ def search(trellis: Trellis) -> Found:
         if origin is not None:
             place = int(origin[:, place].argmax())
             probability = origin @ probability
-    return Found(forward, posterior, best)
+    return Beliefs(forward, posterior, best)
 
 
 def _forward(trellis: Trellis, begins: Ints, ends: Ints) -> tuple[Floats, list[Floats]]:

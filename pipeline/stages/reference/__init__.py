@@ -4,6 +4,6 @@ In: the reference stream, the survey as a network. Out: stretches of samples wit
 Nothing that came from GNSS or the odometer is known here.
 """
 
-from pipeline.stages.reference.stretches import ReferencePath, Stretch, reference_stretches
+from pipeline.stages.reference.stretches import ReferencePath, ReferenceStretch, reference_stretches
 
-__all__ = ["ReferencePath", "Stretch", "reference_stretches"]
+__all__ = ["ReferencePath", "ReferenceStretch", "reference_stretches"]

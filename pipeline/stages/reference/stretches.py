@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.stages.reference.near import Foot, Near, near_elements
 from pipeline.stages.reference.open_ends import off_the_survey
-from pipeline.stages.reference.visits import Move, Node, Stay, nodes_of, pieces_of, ways_over
+from pipeline.stages.reference.visits import ElementStay, Node, Transition, nodes_of, pieces_of, ways_over
 from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import MIN_REACH_M, Network
@@ -37,7 +37,7 @@ class ReferencePath:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class ReferenceStretch:
     """Reference samples from gap to gap, and every way that they may have taken: the train was on one of them."""
 
     t_ns: Ints
@@ -59,7 +59,7 @@ class Samples:
 
 def reference_stretches(
     reference: pl.DataFrame | None, network: Network, numbers: dict[str, int], config: Configuration
-) -> tuple[list[Stretch], list[tuple[int, int]]]:
+) -> tuple[list[ReferenceStretch], list[tuple[int, int]]]:
     """Stretches of the reference with their ways, and the times at which it was heard and lay nowhere [ns].
 
     `network`: with elements that turn round in pieces; `numbers`: net elements as the caller counts them. An element is
@@ -76,7 +76,7 @@ def reference_stretches(
     near = near_elements(samples.points, samples.sigma_m, network, factor, config.hazards.survey_sigma_m)
     off = off_the_survey(samples.points, samples.sigma_m, near, network, config.hazards)
     placed = np.flatnonzero(near.any_near & ~off)
-    found: list[Stretch] = []
+    found: list[ReferenceStretch] = []
     used = np.zeros(samples.t_ns.size, dtype=np.bool_)
     for rows in _between_gaps(samples.t_ns, placed, config.hazards.reference_gap_s):
         for stretch in _placed(samples, near, rows, network, numbers, config):
@@ -111,11 +111,11 @@ def _silent_spans(t_ns: Ints, used: Bools, gap_s: float) -> list[tuple[int, int]
 
 def _placed(
     samples: Samples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
-) -> list[Stretch]:
+) -> list[ReferenceStretch]:
     """The ways of samples without a gap among them: nothing where no way passes, or more do than can be weighed."""
     own = samples.take(rows)
     all_steps = _steps(own)
-    found: list[Stretch] = []
+    found: list[ReferenceStretch] = []
     for part in _connected(list(_parts(own, near.feet(rows[all_steps]), all_steps, network))):
         steps, last = all_steps[part.first : part.last + 1], len(part.layers)
         nodes = nodes_of(part.starts, part.layers)
@@ -124,7 +124,7 @@ def _placed(
         if ways:
             paths = tuple(_path(way.stays(last), near, rows, steps, network, numbers) for way in ways)
             inside = slice(int(steps[0]), int(steps[-1]) + 1)
-            found.append(Stretch(own.t_ns[inside], own.sigma_m[inside], paths))
+            found.append(ReferenceStretch(own.t_ns[inside], own.sigma_m[inside], paths))
     return found
 
 
@@ -157,7 +157,7 @@ class _Part:
 
     first: int
     starts: set[int]
-    layers: list[list[Move]]
+    layers: list[list[Transition]]
     onward: Callable[[int, int], bool]
 
     @property
@@ -180,7 +180,7 @@ def _parts(samples: Samples, feet: Sequence[Sequence[Foot]], steps: Ints, networ
         limit = limit_m(step, other)
         return any(any(network_moves.moves(one, places[step], places[other], limit)) for one in both)
 
-    first, layers = 0, list[list[Move]]()
+    first, layers = 0, list[list[Transition]]()
     alive = starts = {2 * element for element in places[0]}
     for step in range(len(places) - 1):
         here, there, limit = places[step], places[step + 1], limit_m(step, step + 1)
@@ -226,16 +226,18 @@ class _Onward:
         self.network = network
         self.known: dict[int, tuple[float, list[tuple[int, float, tuple[int, ...]]]]] = {}
 
-    def moves(self, start: int, here: dict[int, float], there: dict[int, float], limit_m: float) -> Iterator[Move]:
+    def moves(
+        self, start: int, here: dict[int, float], there: dict[int, float], limit_m: float
+    ) -> Iterator[Transition]:
         """From an oriented element at one step to those near the next, forward or back."""
         element, along_m = start // 2, self.network.track.along_m
         if element in there and abs(there[element] - here[element]) <= limit_m:
-            yield Move(start, start)
+            yield Transition(start, start)
         for back in (0, 1):
             left_m = self.network.length_m(start) - along_m(start ^ back, here[element])
             for to, gap_m, between in self._from(start ^ back, limit_m - left_m) if left_m <= limit_m else ():
                 if to // 2 in there and left_m + gap_m + along_m(to, there[to // 2]) <= limit_m:
-                    yield Move(start, to ^ back, tuple(one ^ back for one in between), bool(back))
+                    yield Transition(start, to ^ back, tuple(one ^ back for one in between), bool(back))
 
     def _from(self, side: int, limit_m: float) -> list[tuple[int, float, tuple[int, ...]]]:
         """What can be entered beyond the end of an oriented element, how far beyond, and over which elements."""
@@ -285,7 +287,7 @@ def _failed(
 
 
 def _path(
-    stays: Sequence[Stay], near: Near, rows: Ints, steps: Ints, network: Network, numbers: dict[str, int]
+    stays: Sequence[ElementStay], near: Near, rows: Ints, steps: Ints, network: Network, numbers: dict[str, int]
 ) -> ReferencePath:
     """A way with coordinates: each sample on the nearest of the elements that the way visits about then."""
     begin, count = int(steps[0]), int(steps[-1] - steps[0]) + 1
@@ -309,7 +311,7 @@ def _path(
     return ReferencePath(leg, np.interp(every, known, at_m[known]), routes)
 
 
-def _legs(stays: Sequence[Stay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
+def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
     """The way as chains of one coordinate, and of each visit its chain and where it is entered [m].
 
     A new chain begins where the train, having turned, takes another branch than that which it came from.
