@@ -12,8 +12,8 @@ from pipeline.results.provenance import Provenance, provenance
 from pipeline.stages.alignment.align import align, odometer_at
 from pipeline.stages.evidence import Evidence, evidence_of
 from pipeline.stages.judge.case import Case, Solution
+from pipeline.stages.judge.epochs import direction_by_evidence
 from pipeline.stages.judge.judge import Judged, judge
-from pipeline.stages.judge.judged import direction_by_evidence
 from pipeline.stages.lds.run import LdsResult, run_lds
 from pipeline.stages.matching import Match, match
 from pipeline.stages.monitors.bank import MonitorBank
