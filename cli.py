@@ -121,8 +121,8 @@ def replay(
 ) -> None:
     """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
-    from pipeline.campaign.progress import show_summary, watches
     from pipeline.results.manifest import settings_files
+    from pipeline.show.progress import show_summary, watches
 
     settings, given = _configuration(config), settings_files(config, vehicle)
     if undetected:
@@ -149,7 +149,7 @@ def replay(
 
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
     from pipeline.campaign.calibrated import calibrated
-    from pipeline.campaign.workers import watched
+    from pipeline.results.workers import watched
     from pipeline.show.terminal import how_far
 
     with watched(None if quiet else how_far("runs looked at to calibrate")):
@@ -187,14 +187,12 @@ def demo(
 ) -> None:
     """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
     from datasets.demo import demo as run_demo
-    from datasets.demo import write_demo
 
-    result = run_demo(out, seed=seed, progress=None if quiet else _say)
-    page = write_demo(result, out / "tables")
+    result = run_demo(out, seed, None if quiet else _say)
     if not quiet:
         if not result.agrees:
             _show(result.differing, "What was found differs from what was expected")
-        print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {page}\n")
+        print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {result.page}\n")
         _show(result.lines)
         print(result.sentence)
     raise Exit(OK if result.agrees else RUNS_NOT_OK)
@@ -227,10 +225,12 @@ def safety(
     once per value of `failure_limit_m` and `evidence_factor`, to show how the verdict depends on these.
     """
     if out is not None:
-        from pipeline.studies.safety.assessment import assess, show
-        from pipeline.studies.safety.sensitivity import replayed
+        from pipeline.campaign.again import replay_again
+        from pipeline.show.assessment import show
+        from pipeline.show.progress import progress_watch
+        from pipeline.studies.safety.assessment import assess
 
-        again = replayed(logs or [], site, _vehicle(vehicle), jobs)
+        again = replay_again(logs or [], site, _vehicle(vehicle), jobs, progress_watch)
         show(assess(out, None if config is None else _configuration(config), again), as_json)
         return
     from pipeline.show.terminal import show_tables
@@ -262,8 +262,8 @@ def claim(
     if as_json or str(csv) != "-":
         head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
         title = f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}"
-        told = {**head, "notes": found.notes, "requirements": found.table}
-        _tell(as_json, told, {title: for_reading(found.table)}, "", *found.notes)
+        answer = {**head, "notes": found.notes, "requirements": found.table}
+        _tell(as_json, answer, {title: for_reading(found.table)}, "", *found.notes)
 
 
 @_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12")
@@ -276,7 +276,7 @@ def inspect(
     as_json: Json = False,
 ) -> None:
     """Describe a log, a site or a result, and list what needs attention."""
-    from pipeline.results.inspection import inspect_path, show
+    from pipeline.show.inspection import inspect_path, show
 
     settings = _configuration(config)
     tables = inspect_path(path, settings, result, site, _vehicle(vehicle))
@@ -314,12 +314,13 @@ def undetected(
     behind: Annotated[bool, Option("--behind", help="An error behind the train instead of ahead.")] = False,
 ) -> None:
     """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
-    from datasets.undetected import largest_fault, told, write_fault
+    from datasets.undetected import largest_fault, sentence_of, write_fault
 
     settings, train = _configuration(config), _vehicle(vehicle)
     found = largest_fault(_log(run, settings), _ground(site, settings), train, settings, solution, balise, at_s, behind)
     file = write_fault(found, solution if settings.undetected.solutions_at_fault == "one" else None, out)
-    print(f"{told(found)}\nTo check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
+    print(sentence_of(found))
+    print(f"To check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 
 
 @_command(
@@ -351,7 +352,9 @@ def convert(
     name="site",
 )
 def make_a_site(
-    surveys: Annotated[list[Path], _place(help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK.")],
+    surveys: Annotated[
+        list[Path], _place(help="Maps (GPX, KML, GeoJSON, GeoPackage, Shapefile), CSV, or recorded runs.")
+    ],
     out: OutFolder,
     balises: Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")] = None,
     direction: Annotated[
@@ -371,7 +374,7 @@ def make_a_site(
     """Make a site of a survey of the line: net elements, links, balises, and a page to look at."""
     from pipeline.make.survey.make import make_site, wish_of, write_made
     from pipeline.read.site.describe import elements_table
-    from pipeline.results.inspection import findings_table
+    from pipeline.show.inspection import findings_table
     from pipeline.show.report.site_page import site_page
     from schemas.enums import TravelAlong
 
@@ -431,7 +434,7 @@ def experiment(
         print("\n".join(EXPERIMENTS))
         return
     wanted = experiment_of(name)
-    from pipeline.campaign.workers import watched
+    from pipeline.results.workers import watched
     from pipeline.show.terminal import how_far
 
     bank = None if config is None else _configuration(config)
@@ -502,18 +505,18 @@ def line(
     as_json: Json = False,
 ) -> None:
     """Say of each piece of track whether virtual balises may be placed there, and propose some."""
-    from pipeline.studies.line import write_line
-    from pipeline.studies.line.write import read_points
+    from pipeline.show.line import write_line
+    from pipeline.studies.line import read_points, study_line
     from schemas.config import read_toml, settings_from
     from schemas.line import LineCriteria
 
     given, keys = None if points is None else read_points(points), "docs/line.md lists every key."
     decided = settings_from({} if criteria is None else read_toml(criteria), LineCriteria, str(criteria), keys)
-    found = write_line(out, _ground(site, _used(out)), decided, solution, given, to)
-    told = {"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)}
-    tables = {"Pieces of track": found.summary, "Proposals": found.proposals}
-    files = f"{len(found.files)} files; begin with {found.files[0]}"
-    _tell(as_json, told, tables, "\n".join(found.remarks), files)
+    result = study_line(out, _ground(site, _used(out)), decided, solution, given)
+    files = write_line(result, to or out / "line")
+    shown = {"pieces": result.pieces, "proposals": result.proposals, "remarks": list(result.remarks)}
+    tables = {"Pieces of track": result.summary, "Proposals": result.proposals}
+    _tell(as_json, shown, tables, "\n".join(result.remarks), f"{len(files)} files; begin with {files[0]}")
 
 
 @_command(

@@ -23,6 +23,7 @@ MODULES = (
     "interruptions",
     "experiment",
     "relink",
+    "growth",
     "plausibility",
     "line",
     "undetected",

@@ -20,12 +20,12 @@ from datasets.experiment.diagnostics import REPETITIONS, run_diagnostics
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
 from datasets.experiment.linear_bank import BankSpec, linear_bank
 from datasets.experiment.passage import BLOCK_EPOCHS, first_passages
-from datasets.experiment.plan import Plan, bank_forms, failure_forms
+from datasets.experiment.plan import ExperimentPlan, bank_forms, failure_forms
 from datasets.experiment.ranges import RangePlan, run_ranges
 from datasets.experiment.rare import Probability, missed_detection_probability
 from datasets.experiment.rare_ranges import range_system
 from datasets.experiment.workers import generator
-from pipeline.campaign.workers import mapped
+from pipeline.results.workers import mapped
 
 _NORMALS = 15
 _CHUNK = 256
@@ -98,7 +98,7 @@ def _rare(name: str, rare: Probability, seconds: float) -> list[Figure]:
 
 def _one_chunk(constellation: Constellation) -> tuple[float, float]:
     """Seconds to draw the normals of a chunk of runs, and to answer the whole grid for as many."""
-    plan = Plan(default_geometry(constellation))
+    plan = ExperimentPlan(default_geometry(constellation))
     banks, failures = bank_forms(plan), failure_forms(plan)
     numbers = np.empty((BLOCK_EPOCHS, _NORMALS, _CHUNK))
     rng = generator(1)

@@ -15,7 +15,7 @@ from pipeline.results.store import read_table
 from pipeline.studies.line.classes import piece_classes
 from pipeline.studies.line.passes import Ground
 from pipeline.studies.line.pieces import middles, pieces_of
-from pipeline.studies.line.write import passes_of_runs, write_line
+from pipeline.studies.line.study import passes_of_runs, study_line
 from schemas.config import Configuration, settings_from
 from schemas.line import LineCriteria
 
@@ -117,7 +117,7 @@ def measure(out: Path, runs: int = RUNS) -> list[Figure]:
         [str(out / "trial" / "runs")], str(out / "trial" / "site"), str(out / "tables"), Configuration(), vehicle
     )
     run_campaign(plan, jobs=2)
-    found = write_line(out / "tables", read_site(out / "trial" / "site"), LineCriteria(loss_limit=0.15))
+    found = study_line(out / "tables", read_site(out / "trial" / "site"), LineCriteria(loss_limit=0.15))
     table = found.pieces.filter(pl.col("passes") > 0).with_columns(chainage=_chainage())
     return [*_found(table), _invented(table), _predicted(out)]
 

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.plausibility_trips import Trip, trip
 from benchmarks.plausibility_wrongs import WRONGS, Wrong
 from benchmarks.results import Figure
-from pipeline.read.ingest.clean import clean
+from pipeline.stages.clean.clean import clean
 from pipeline.studies.plausibility.check import Check, State
 from pipeline.studies.plausibility.fit import Fit, fit_run
 from schemas.config import Configuration, Vehicle

@@ -25,9 +25,10 @@ from datasets.inject import inject
 from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
-from pipeline.one_run import diagnosed, replay
+from pipeline.one_run import replay, ride_alone
 from pipeline.studies.undetected.columns import Diagnosis, rows_of
 from pipeline.studies.undetected.profile import Profile, profile_at
+from pipeline.studies.undetected.ride import diagnosis_of
 from pipeline.studies.undetected.watched import windows
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
@@ -169,7 +170,7 @@ def proof(seed: int, curved: bool, folder: Path) -> Outcome | None:
     """
     trial, config = trial_of(seed, curved), _NOISE_GIVEN
     rng = np.random.default_rng([250, seed])
-    diagnosis, _, _ = diagnosed(trial.run, trial.site, trial.vehicle, config, "primary")
+    diagnosis = diagnosis_of(ride_alone(trial.run, trial.site, trial.vehicle, config, "primary"))
     epoch = _some_epoch(diagnosis, trial, config, rng)
     if epoch is None:
         return None

@@ -55,7 +55,8 @@ def comma2k19_run(segment: Path, balises_at_m: Sequence[float] = ()) -> tuple[Ru
 def _log(segment: Path, name: str, columns: int) -> tuple[Floats, Floats]:
     """Times and values of as many columns, without rows of no time."""
     folder = segment / "processed_log" / name
-    t_s, value = _array(folder / "t", 1), _array(folder / "value", 2)
+    t_s = _array(folder / "t", 1)
+    value = _array(folder / "value", 2)
     if len(value) != len(t_s) or value.shape[1] < columns:
         raise InputError(
             "is not as comma2k19 has it",
@@ -73,7 +74,8 @@ def _array(path: Path, dimensions: int) -> Floats:
     except (OSError, ValueError) as error:
         raise InputError(f"cannot be read: {error}", place=str(path), expected="a comma2k19 segment") from None
     if values.ndim != dimensions or values.dtype.kind not in "iuf":
-        found, expected = f"{values.dtype} of shape {values.shape}", f"numbers in {dimensions} dimensions"
+        found = f"{values.dtype} of shape {values.shape}"
+        expected = f"numbers in {dimensions} dimensions"
         raise InputError("is not as comma2k19 has it", place=str(path), found=found, expected=expected)
     return values.astype(np.float64, copy=False)
 
@@ -81,7 +83,8 @@ def _array(path: Path, dimensions: int) -> Floats:
 def _poses(segment: Path) -> tuple[Floats, dict[str, Floats]]:
     """Times on the device's clock, and positions in WGS 84, of the poses that are known."""
     folder = segment / "global_pose"
-    times_s, places_m = _array(folder / "frame_times", 1), _array(folder / "frame_positions", 2)
+    times_s = _array(folder / "frame_times", 1)
+    places_m = _array(folder / "frame_positions", 2)
     if places_m.shape[1] != 3 or len(times_s) != len(places_m):
         found = f"frame_times of shape {times_s.shape}, frame_positions of shape {places_m.shape}"
         raise InputError("is not as comma2k19 has it", place=str(folder), found=found)
@@ -97,7 +100,8 @@ def _poses(segment: Path) -> tuple[Floats, dict[str, Floats]]:
 def _utc_offset_s(segment: Path) -> float:
     """What is added to the device's clock: both are known for the first frame that has a GPS time."""
     folder = segment / "global_pose"
-    gps, boot_s = _array(folder / "frame_gps_times", 2), _array(folder / "frame_times", 1)
+    gps = _array(folder / "frame_gps_times", 2)
+    boot_s = _array(folder / "frame_times", 1)
     if gps.shape[1] != 2:  # week and second
         found = f"shape {gps.shape}"
         raise InputError("is not as comma2k19 has it", place=str(folder / "frame_gps_times"), found=found)

@@ -20,7 +20,7 @@ _UNITS = {"latency": " s", "scale": ""}
 
 
 @dataclass(frozen=True)
-class Check:
+class ComparisonRow:
     """One line of the comparison."""
 
     run_id: str
@@ -35,7 +35,7 @@ class Check:
         return self.expected == self.found
 
 
-def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[Check]:
+def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[ComparisonRow]:
     """Each expectation of a run against its tables, its verdict first: hazards, onset, balises, alarms, scale."""
     if spec.expected is None:
         raise ConfigError("does not say what has to be found", place=f"scenario: run {spec.id}")
@@ -49,10 +49,10 @@ def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[Check]:
         *_alarms(spec.expected, tables.alarms),
         *_scale(spec.expected, tables.runs),
     ]
-    return [Check(spec.id, spec.title, injected, *pair) for pair in pairs]
+    return [ComparisonRow(spec.id, spec.title, injected, *pair) for pair in pairs]
 
 
-def checks_table(checks: Iterable[Check]) -> pl.DataFrame:
+def checks_table(checks: Iterable[ComparisonRow]) -> pl.DataFrame:
     """The comparison as a table: `run_id, title, injected, check, expected, found, agrees`."""
     names = ("run_id", "title", "injected", "check", "expected", "found", "agrees")
     schema = {name: pl.Boolean if name == "agrees" else pl.String for name in names}
@@ -108,7 +108,8 @@ def _row_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
     names = ("hazard", "failure_mode", "timing", "balise_ids", "accepted_ids", "detected")
     text = _words(*(row[name] for name in names))
     if expected is not None and expected.before_failure is not None:
-        detected, failure = row["t_detected"], row["t_failure"]
+        detected = row["t_detected"]
+        failure = row["t_failure"]
         known = isinstance(detected, datetime) and isinstance(failure, datetime)
         text += ", before the failure" if known and detected < failure else ", behind the failure"  # type: ignore[operator]
     return text if row["caused_by"] is None else f"{text}, caused by {row['caused_by']}"

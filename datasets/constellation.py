@@ -25,7 +25,7 @@ _J2 = 1.08262982e-3
 
 
 @dataclass(frozen=True)
-class Slot:
+class Orbit:
     """A circular orbit: `raan_deg` and `argument_deg` (of latitude) hold at `epoch_ns`, rates are secular."""
 
     sv: str
@@ -42,7 +42,7 @@ def _instant_ns(year: int, month: int, day: int) -> int:
     return int(datetime(year, month, day, tzinfo=UTC).timestamp()) * 1_000_000_000
 
 
-def _gps_slots() -> tuple[Slot, ...]:
+def _gps_slots() -> tuple[Orbit, ...]:
     """SPS PS Table A.2-1, epoch 1993-07-01T00:00 UTC; slots A1..F4 are named G01..G24 in that order.
 
     Two revolutions per turn of the Earth against the node: the ground track repeats.
@@ -62,7 +62,7 @@ def _gps_slots() -> tuple[Slot, ...]:
     turn = 2.0 * (_EARTH_RATE_RAD_PER_S - node)
     to_deg_per_day = _DAY_S / _DEG
     return tuple(
-        Slot(
+        Orbit(
             f"G{4 * plane + place + 1:02d}",
             _instant_ns(1993, 7, 1),
             axis_m,
@@ -77,10 +77,10 @@ def _gps_slots() -> tuple[Slot, ...]:
     )
 
 
-def _galileo_slots() -> tuple[Slot, ...]:
+def _galileo_slots() -> tuple[Orbit, ...]:
     """OS SDD reference constellation, epoch 2016-11-21T00:00 UTC; slots A1..C8 are E01..E24 in that order."""
     return tuple(
-        Slot(
+        Orbit(
             f"E{8 * plane + place + 1:02d}",
             _instant_ns(2016, 11, 21),
             29_599_800.0,
@@ -95,12 +95,12 @@ def _galileo_slots() -> tuple[Slot, ...]:
     )
 
 
-GPS: tuple[Slot, ...] = _gps_slots()
-GALILEO: tuple[Slot, ...] = _galileo_slots()
+GPS: tuple[Orbit, ...] = _gps_slots()
+GALILEO: tuple[Orbit, ...] = _galileo_slots()
 SIDEREAL_DAY_S = 2.0 * np.pi / _EARTH_RATE_RAD_PER_S
 
 
-def satellite_positions(slots: Sequence[Slot], t_ns: Ints) -> Floats:
+def satellite_positions(slots: Sequence[Orbit], t_ns: Ints) -> Floats:
     """Earth-fixed positions [m] at UTC instants, shape (times, slots, 3)."""
     epoch_ns = np.array([slot.epoch_ns for slot in slots])
     days = (t_ns[:, None] - epoch_ns[None, :]) * 1e-9 / _DAY_S
@@ -126,7 +126,7 @@ def satellite_positions(slots: Sequence[Slot], t_ns: Ints) -> Floats:
 
 
 def look_angles(
-    slots: Sequence[Slot], t_ns: Ints, latitude_deg: float, longitude_deg: float, height_m: float = 0.0
+    slots: Sequence[Orbit], t_ns: Ints, latitude_deg: float, longitude_deg: float, height_m: float = 0.0
 ) -> tuple[Floats, Floats]:
     """Azimuth (clockwise from north, [0, 360)) and elevation [deg], each of shape (times, slots)."""
     frame = _east_north_up(latitude_deg, longitude_deg)
@@ -138,7 +138,7 @@ def look_angles(
 
 
 def visible(
-    slots: Sequence[Slot],
+    slots: Sequence[Orbit],
     t_ns: Ints,
     latitude_deg: float,
     longitude_deg: float,
@@ -170,8 +170,10 @@ def _sidereal_angle(t_ns: Ints) -> Floats:
 
 
 def _east_north_up(latitude_deg: float, longitude_deg: float) -> Floats:
-    sin_b, cos_b = np.sin(latitude_deg * _DEG), np.cos(latitude_deg * _DEG)
-    sin_l, cos_l = np.sin(longitude_deg * _DEG), np.cos(longitude_deg * _DEG)
+    sin_b = np.sin(latitude_deg * _DEG)
+    cos_b = np.cos(latitude_deg * _DEG)
+    sin_l = np.sin(longitude_deg * _DEG)
+    cos_l = np.cos(longitude_deg * _DEG)
     return np.array(
         [
             [-sin_l, cos_l, 0.0],

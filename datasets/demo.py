@@ -9,38 +9,31 @@ from pathlib import Path
 
 import polars as pl
 
-from datasets.comparison import Check, checks_table, compare
+from datasets.comparison import checks_table, compare
 from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
-from pipeline.campaign.finish import write_campaign
-from pipeline.campaign.plan import software_digest
-from pipeline.one_run import replay
-from pipeline.read.ingest.run import read_run
+from pipeline.campaign import RunOutcome, make_plan, run_campaign
+from pipeline.read.ingest.run import read_run as read_log
 from pipeline.read.site.read import read_site
-from pipeline.results.manifest import listing
-from pipeline.results.store import write_config, write_run
+from pipeline.results.manifest import settings_files
+from pipeline.results.store import read_run
+from pipeline.show.progress import CampaignWatch
 from pipeline.show.report import write_report
 from pipeline.stages.run_row.verdict import CampaignHead, head_of, word_of, worst_verdict
-from pipeline.storage import file_digests
 from schemas.config import Configuration, Vehicle
-from schemas.run import RunLog, RunTables, Site
-from schemas.version import SOFTWARE
+from schemas.run import RunTables
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """`checks`: one row per thing expected, as `comparison.checks_table`; `tables`: the replay of each run.
-
-    `paths`: its log.
-    """
+    """`checks`: one row per thing expected, as `comparison.checks_table`; `tables`: the replay of each run."""
 
     scenario: Scenario
-    site: Site
     checks: pl.DataFrame
     tables: tuple[RunTables, ...]
-    paths: tuple[Path, ...] = ()
+    page: Path
 
     @property
     def head(self) -> CampaignHead:
@@ -92,18 +85,46 @@ def _classes(hazards: pl.DataFrame) -> str:
     return " ".join(hazards["hazard"].cast(pl.String).unique(maintain_order=True)) or "none"
 
 
-def demo(
-    out: Path, config: Configuration | None = None, seed: int | None = None, progress: Progress | None = None
-) -> DemoResult:
-    """Write the trial under `out` (`site/`, `runs/`, `vehicle.toml`), replay every run from its files, and compare.
+def demo(out: Path, seed: int | None = None, progress: Progress | None = None, jobs: int = 1) -> DemoResult:
+    """Write the trial under `out` (`site/`, `runs/`, `vehicle.toml`), replay it to `tables/`, compare, and write pages.
 
     Another `seed` than the scenario's own draws other errors; what has to be found is the same.
-    `progress` is told of each run written and replayed.
+    `progress` receives a line for each run written and replayed.
     """
     scenario = demo_scenario(seed)
-    paths = write_trial(scenario, out, _ended(progress, "written"))
-    config = config or Configuration()
-    return replay_trial(scenario, read_site(out / "site", config.site), paths, config, progress)
+    paths = write_trial(scenario, out, None if progress is None else lambda run_id: progress(f"{run_id}: written"))
+    _replay_trial(scenario, paths, out, progress, jobs)
+    tables = tuple(read_run(out / "tables", spec.id) for spec in scenario.runs)
+    config = Configuration()
+    logs = (read_log(path, config.ingest) for path in paths)
+    checks = [check for case in zip(scenario.runs, logs, tables, strict=True) for check in compare(*case)]
+    site = read_site(out / "site", config.site)
+    return DemoResult(scenario, checks_table(checks), tables, write_report(out / "tables", site, jobs)[0])
+
+
+def _replay_trial(scenario: Scenario, paths: list[Path], out: Path, progress: Progress | None, jobs: int) -> None:
+    """As `balise replay` would, first the runs without vehicle file."""
+    watches = [] if progress is None else [_Replayed(progress)]
+    for has_vehicle in (False, True):
+        logs = [str(path) for spec, path in zip(scenario.runs, paths, strict=True) if spec.vehicle is has_vehicle]
+        vehicle = scenario.vehicle if has_vehicle and scenario.vehicle else Vehicle()
+        given = settings_files(None, out / "vehicle.toml" if has_vehicle and scenario.vehicle else None)
+        if logs:
+            plan = make_plan(logs, out / "site", out / "tables", vehicle=vehicle, given=given)
+            run_campaign(plan, jobs=jobs, force=True, watches=watches)
+
+
+class _Replayed(CampaignWatch):
+    """Passes each run on that was replayed."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+
+    def told(self, outcome: RunOutcome) -> None:
+        self._progress(f"{outcome.run_id}: replayed")
+
+    def noted(self, text: str) -> None:
+        self._progress(text)
 
 
 def demo_scenario(seed: int | None = None) -> Scenario:
@@ -111,39 +132,3 @@ def demo_scenario(seed: int | None = None) -> Scenario:
     with as_file(files("datasets") / "scenarios" / "demo.toml") as path:
         scenario = load_scenario(path)
     return scenario if seed is None else with_seed(scenario, seed)
-
-
-def replay_trial(
-    scenario: Scenario, site: Site, paths: list[Path], config: Configuration, progress: Progress | None = None
-) -> DemoResult:
-    """Replay the runs of a trial that was written and compare each with what its scenario expects."""
-    checks: list[Check] = []
-    tables = []
-    done = _ended(progress, "replayed")
-    for spec, path in zip(scenario.runs, paths, strict=True):
-        run: RunLog = read_run(path, config.ingest)
-        vehicle = scenario.vehicle if spec.vehicle and scenario.vehicle else Vehicle()
-        tables.append(replay(run, site, vehicle, config))
-        checks += compare(spec, run, tables[-1])
-        if done is not None:
-            done(spec.id)
-    return DemoResult(scenario, site, checks_table(checks), tuple(tables), tuple(paths))
-
-
-def _ended(progress: Progress | None, what: str) -> Progress | None:
-    """Tells of a run what has been done to it."""
-    return None if progress is None else lambda run_id: progress(f"{run_id}: {what}")
-
-
-def write_demo(result: DemoResult, out: Path) -> Path:
-    """The demo's tables as a campaign would leave them, and the report; returns the report's first page."""
-    config = Configuration()
-    made = {"software": SOFTWARE, "software_digest": software_digest(), "site_digest": result.site.digest}
-    for tables, path in zip(result.tables, result.paths, strict=True):
-        row = tables.runs.row(0, named=True)
-        digests = {name: row[name] for name in ("config_digest", "input_digest")}
-        listed = {"log_files": listing(file_digests(path)), "site_files": listing(result.site.files)}
-        write_run(tables, out, {**made, **digests, **listed, "status": row["status"]})
-    write_config(out, config)
-    write_campaign(out, config)
-    return write_report(out, result.site)[0]

@@ -32,7 +32,7 @@ def expected_hazards(scenario: Scenario, spec: RunSpec) -> tuple[ExpectedRow, ..
     if not position:
         return ()
     world = _world(scenario, spec, position[0])
-    found = _Found()
+    found = _ExpectedRows()
     moves = np.flatnonzero((np.diff(world.error_m) != 0.0) | (np.abs(world.error_m[1:]) > LIMIT_M / 2.0)) + 1
     for k in moves.tolist():
         if not _look(world, k, found):
@@ -52,7 +52,8 @@ class _World:
     margin_m: float
 
     def passed(self, a_m: float, b_m: float) -> frozenset[str]:
-        low, high = min(a_m, b_m), max(a_m, b_m)
+        low = min(a_m, b_m)
+        high = max(a_m, b_m)
         return frozenset(n for n, at in zip(self.names, self.places_m, strict=True) if low < at <= high)
 
     def near(self, at_m: float) -> bool:
@@ -71,7 +72,7 @@ def _world(scenario: Scenario, spec: RunSpec, fault: PlacedFault) -> _World:
     return _World(t_s, way_m, error_m, names, places_m, 6.0 * spec.gnss.sigma_east_m + 2.0)
 
 
-class _Found:
+class _ExpectedRows:
     """Jumps and early or late offers in time, sorted into rows."""
 
     def __init__(self) -> None:
@@ -99,9 +100,10 @@ def _class_of(ids: frozenset[str]) -> str:
     return "VB_JUMP_1A" if len(ids) > 1 else "VB_JUMP_1B"
 
 
-def _look(world: _World, k: int, found: _Found) -> bool:
+def _look(world: _World, k: int, found: _ExpectedRows) -> bool:
     """Take the movement that leads to epoch `k`; false where it is too close to call."""
-    a_m, b_m = world.way_m[k - 1] + world.error_m[k - 1], world.way_m[k] + world.error_m[k]
+    a_m = world.way_m[k - 1] + world.error_m[k - 1]
+    b_m = world.way_m[k] + world.error_m[k]
     step_m = world.error_m[k] - world.error_m[k - 1]
     t_s = float(world.t_s[k])
     if abs(step_m) > LIMIT_M:

@@ -150,7 +150,8 @@ class PositionEffect:
 def position_effect(faults: Sequence[FaultSpec], t_s: Floats, rng: np.random.Generator) -> PositionEffect:
     """Sum the position faults over epochs `t_s` (seconds after the first epoch)."""
     offsets = {axis: np.zeros(t_s.size) for axis in ("along", "cross", "up", "east", "north")}
-    latency, lost = np.zeros(t_s.size), np.zeros(t_s.size, dtype=np.bool_)
+    latency = np.zeros(t_s.size)
+    lost = np.zeros(t_s.size, dtype=np.bool_)
     for fault in faults:
         if fault.target in offsets:
             offsets[fault.target] += offset_m(fault, t_s, rng)
@@ -193,7 +194,8 @@ def read_profile(path: str) -> tuple[Floats, Floats]:
 
 def active(fault: FaultSpec, t_s: Floats) -> Bools:
     """From the start of the fault on, its end excluded."""
-    t_ns, begin_ns = np.round(t_s * NS_PER_S), round(fault.begins_s() * NS_PER_S)
+    t_ns = np.round(t_s * NS_PER_S)
+    begin_ns = round(fault.begins_s() * NS_PER_S)
     end_ns = np.inf if fault.duration_s is None else begin_ns + round(fault.duration_s * NS_PER_S)
     now: Bools = (t_ns >= begin_ns) & (t_ns < end_ns)
     return now

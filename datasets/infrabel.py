@@ -41,7 +41,8 @@ def infrabel_recording(log: Path) -> Converted:
     without a computed solution, or without a type, there is none. Half a row at the end is left out.
     """
     whole = read_log_table(log, infer=False)
-    table, cut = whole.table, whole.cut
+    table = whole.table
+    cut = whole.cut
     missing = set(COLUMNS) - set(table.columns)
     if missing:
         raise InputError("lacks columns of an Infrabel log", place=str(log), found=f"no {', '.join(sorted(missing))}")
@@ -84,7 +85,8 @@ def infrabel_site(network: Path, path: Path | None = None, balises: Sequence[tup
     with tempfile.TemporaryDirectory() as folder:
         shutil.copyfile(network, Path(folder) / "track.geojson")
         site = read_site(Path(folder))
-    track, links = site.track, site.links
+    track = site.track
+    links = site.links
     if path is not None:
         features = json.loads(path.read_text(encoding="utf-8"))["features"]
         kept = [f["properties"]["netelement_id"] for f in features if "netelement_id" in f["properties"]]

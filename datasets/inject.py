@@ -21,7 +21,7 @@ from datasets.faults import (
     offset_m,
 )
 from datasets.inject_ranges import inject_ranges
-from datasets.line import Places, shifted
+from datasets.line import RailPlaces, shifted
 from datasets.run_path import displacement_m
 from datasets.trial import write_run_as
 from pipeline.read.ingest import read_run
@@ -94,10 +94,10 @@ def inject(run: RunLog, fault: FaultSpec, site: Site | None = None) -> RunLog:
         changed = inject_ranges(run, fault, first_ns, rng)
     else:
         changed = run.with_streams(gnss=_positions(run, fault, first_ns, rng, site))
-    told = faults_table([fault], first_ns, last_ns)
+    faults = faults_table([fault], first_ns, last_ns)
     if run.faults is not None:
-        told = pl.concat([run.faults, told]).sort("t_start", maintain_order=True)
-    return changed.with_streams(faults=told)
+        faults = pl.concat([run.faults, faults]).sort("t_start", maintain_order=True)
+    return changed.with_streams(faults=faults)
 
 
 def _span_ns(run: RunLog) -> tuple[int, int]:
@@ -156,7 +156,7 @@ def _moved(part: pl.DataFrame, vectors_m: Floats) -> pl.DataFrame:
     """Positions moved; a height that is not known stays so."""
     latitude, longitude, height = (part[name].to_numpy().astype(np.float64) for name in _PLACE)
     nothing = np.zeros(0)
-    places = shifted(Places(latitude, longitude, np.nan_to_num(height), nothing, nothing), *vectors_m.T)
+    places = shifted(RailPlaces(latitude, longitude, np.nan_to_num(height), nothing, nothing), *vectors_m.T)
     moved = (places.latitude_deg, places.longitude_deg, height + vectors_m[:, 2])
     return part.with_columns(
         pl.Series(name, values, nan_to_null=True) for name, values in zip(_PLACE, moved, strict=True)
@@ -194,7 +194,8 @@ def _faulty_sensor(odometer: pl.DataFrame, fault: FaultSpec, first_ns: int) -> p
     t_s = _seconds(odometer, first_ns)
     if fault.kind is FaultKind.OUTAGE:
         return odometer.filter(pl.Series(~active(fault, t_s)))
-    distance, speed = odometer["distance_m"].to_numpy().copy(), odometer["speed_mps"].to_numpy().copy()
+    distance = odometer["distance_m"].to_numpy().copy()
+    speed = odometer["speed_mps"].to_numpy().copy()
     rows = np.flatnonzero(np.isfinite(distance))
     if rows.size:
         steps = np.diff(distance[rows], prepend=distance[rows[0]])

@@ -13,8 +13,8 @@ import numpy.typing as npt
 import polars as pl
 
 from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, in_sector, offset_m
-from datasets.line import Places, shifted
-from datasets.solution import Solution, protection_levels, solve
+from datasets.line import RailPlaces, shifted
+from datasets.solution import PositionSolution, protection_levels, solve
 from schemas.arrays import Bools, Floats
 from schemas.errors import InputError
 from schemas.run import RunLog
@@ -23,7 +23,7 @@ _COVARIANCE = (("ee", 0, 0), ("en", 0, 1), ("eu", 0, 2), ("nn", 1, 1), ("nu", 1,
 
 
 @dataclass(frozen=True)
-class _Ranges:
+class _RecordedRanges:
     """The recorded satellites of one solution as arrays of shape (epochs, satellites); NaN: not recorded."""
 
     t_ns: npt.NDArray[np.int64]
@@ -35,7 +35,7 @@ class _Ranges:
     recorded: Bools
     used: Bools
 
-    def solved(self, range_error_m: Floats, usable: Bools) -> Solution:
+    def solved(self, range_error_m: Floats, usable: Bools) -> PositionSolution:
         angles = (np.nan_to_num(self.azimuth_deg), np.nan_to_num(self.elevation_deg))
         return solve(self.svs, *angles, self.sigma_m, range_error_m, usable, self.recorded)
 
@@ -44,7 +44,9 @@ def inject_ranges(run: RunLog, fault: FaultSpec, first_ns: int, rng: np.random.G
     """The run with a step, bias, ramp or noise in ranges, or without satellites (outage)."""
     if run.satellites is None or run.satellites.is_empty():
         raise InputError("has no satellites stream for this fault", place=run.run_id, expected="a satellites stream")
-    gnss, satellites, hit_any = [], [], False
+    gnss = []
+    satellites = []
+    hit_any = False
     for solution in run.gnss["solution"].unique(maintain_order=True):
         fixes = run.gnss.with_row_index("row").filter(pl.col("solution") == solution)
         rows = run.satellites.with_row_index("row").filter(pl.col("solution") == solution)
@@ -91,7 +93,7 @@ def _profile(fault: FaultSpec, t_s: Floats, shape: tuple[int, ...], rng: np.rand
     return np.broadcast_to(offset_m(fault, t_s, rng)[:, None], shape)
 
 
-def _arrays(rows: pl.DataFrame) -> _Ranges:
+def _arrays(rows: pl.DataFrame) -> _RecordedRanges:
     t_ns, epoch = np.unique(rows["t"].to_physical().to_numpy(), return_inverse=True)
     svs = sorted(rows["sv"].unique().to_list())
     satellite = np.searchsorted(svs, rows["sv"].to_list())
@@ -108,10 +110,10 @@ def _arrays(rows: pl.DataFrame) -> _Ranges:
     sigma = np.where(unweighted[:, None] | ~np.isfinite(sigma), 1.0, sigma)
     recorded = np.isfinite(matrix("azimuth_deg", np.nan))
     angles = (matrix("azimuth_deg", np.nan), matrix("elevation_deg", np.nan))
-    return _Ranges(t_ns, svs, *angles, sigma, matrix("residual_m", np.nan), recorded, used)
+    return _RecordedRanges(t_ns, svs, *angles, sigma, matrix("residual_m", np.nan), recorded, used)
 
 
-def _refuse_unsolved(fixes: pl.DataFrame, ranges: _Ranges, unsolved: Bools) -> None:
+def _refuse_unsolved(fixes: pl.DataFrame, ranges: _RecordedRanges, unsolved: Bools) -> None:
     """A position whose recorded satellites are too few cannot be moved by one of them."""
     stamps = ranges.t_ns[unsolved]
     known = fixes.filter(pl.col("latitude_deg").is_not_null())["t"].to_physical().to_numpy()
@@ -125,7 +127,9 @@ def _refuse_unsolved(fixes: pl.DataFrame, ranges: _Ranges, unsolved: Bools) -> N
         )
 
 
-def _moved(fixes: pl.DataFrame, ranges: _Ranges, before: Solution, after: Solution, touched: Bools) -> pl.DataFrame:
+def _moved(
+    fixes: pl.DataFrame, ranges: _RecordedRanges, before: PositionSolution, after: PositionSolution, touched: Bools
+) -> pl.DataFrame:
     """Positions, covariances, protection levels and satellites used of touched epochs; those without solution go."""
     stamps = fixes["t"].to_physical().to_numpy()
     place = np.searchsorted(ranges.t_ns, stamps).clip(max=ranges.t_ns.size - 1)
@@ -137,7 +141,7 @@ def _moved(fixes: pl.DataFrame, ranges: _Ranges, before: Solution, after: Soluti
         fixes[name].to_numpy().astype(np.float64) for name in ("latitude_deg", "longitude_deg", "height_m")
     )
     nothing = np.zeros(0)
-    places = shifted(Places(latitude, longitude, np.nan_to_num(height), nothing, nothing), *step.T)
+    places = shifted(RailPlaces(latitude, longitude, np.nan_to_num(height), nothing, nothing), *step.T)
     columns = {
         "latitude_deg": places.latitude_deg,
         "longitude_deg": places.longitude_deg,
@@ -151,10 +155,11 @@ def _moved(fixes: pl.DataFrame, ranges: _Ranges, before: Solution, after: Soluti
 
 
 def _levels(
-    fixes: pl.DataFrame, before: Solution, after: Solution, place: npt.NDArray[np.int64], here: Bools
+    fixes: pl.DataFrame, before: PositionSolution, after: PositionSolution, place: npt.NDArray[np.int64], here: Bools
 ) -> dict[str, Floats]:
     """Recorded protection levels grow as those of the geometry do."""
-    old, new = protection_levels(before.covariance_m2[place]), protection_levels(after.covariance_m2[place])
+    old = protection_levels(before.covariance_m2[place])
+    new = protection_levels(after.covariance_m2[place])
     horizontal = np.where(here & after.solved[place], new.hpl_npa_m / old.hpl_npa_m, 1.0)
     vertical = np.where(here & after.solved[place], new.vpl_m / old.vpl_m, 1.0)
     return {
@@ -163,7 +168,7 @@ def _levels(
     }
 
 
-def _rows_with(rows: pl.DataFrame, ranges: _Ranges, residual_m: Floats, lost: Bools) -> pl.DataFrame:
+def _rows_with(rows: pl.DataFrame, ranges: _RecordedRanges, residual_m: Floats, lost: Bools) -> pl.DataFrame:
     epoch = np.searchsorted(ranges.t_ns, rows["t"].to_physical().to_numpy())
     satellite = np.searchsorted(ranges.svs, rows["sv"].to_list())
     new = pl.Series("residual_m", residual_m[epoch, satellite], nan_to_null=True)

@@ -23,7 +23,7 @@ _STEP_M = 1.0
 
 
 @dataclass(frozen=True)
-class Places:
+class RailPlaces:
     """Places on the rail: heading clockwise from north, in the sense of growing chainage; slope is rise over run."""
 
     latitude_deg: Floats
@@ -34,18 +34,18 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Line:
+class LineAxis:
     """The axis of the line, sampled every metre, so that reading between samples errs by less than a millimetre."""
 
     spec: LineSpec
     chainage_m: Floats
-    samples: Places
+    samples: RailPlaces
 
     @property
     def length_m(self) -> float:
         return float(self.chainage_m[-1])
 
-    def at(self, s_m: Floats) -> Places:
+    def at(self, s_m: Floats) -> RailPlaces:
         """Places at chainages; a chainage beyond the line is an error in the scenario."""
         if s_m.size and (s_m.min() < 0.0 or s_m.max() > self.length_m):
             raise ConfigError(
@@ -59,10 +59,10 @@ class Line:
             name: np.interp(s_m, self.chainage_m, getattr(self.samples, name))
             for name in ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "slope")
         }
-        return Places(**read)
+        return RailPlaces(**read)
 
 
-def build_line(spec: LineSpec) -> Line:
+def build_line(spec: LineSpec) -> LineAxis:
     """Integrate curvature and grade into positions on the ellipsoid.
 
     The sections repeat until all net elements are laid. Curvature and grade change linearly over
@@ -75,22 +75,22 @@ def build_line(spec: LineSpec) -> Line:
     heading = np.radians(spec.heading_deg) - _integral(curvature, step)
     slope_angle = np.arctan(grade)
     samples = _walk(spec, heading, slope_angle, step)
-    return Line(spec, chainage, samples)
+    return LineAxis(spec, chainage, samples)
 
 
-def offset_places(places: Places, left_m: Floats | float) -> Places:
+def offset_places(places: RailPlaces, left_m: Floats | float) -> RailPlaces:
     """The same places moved to the left of growing chainage."""
     heading = np.radians(places.heading_deg)
     return shifted(places, -np.cos(heading) * left_m, np.sin(heading) * left_m, np.zeros_like(heading))
 
 
-def shifted(places: Places, east_m: Floats, north_m: Floats, up_m: Floats) -> Places:
+def shifted(places: RailPlaces, east_m: Floats, north_m: Floats, up_m: Floats) -> RailPlaces:
     """Places moved by a vector of the local horizon, small against the radius of the Earth."""
     latitude_deg, longitude_deg = moved_deg(places.latitude_deg, places.longitude_deg, places.height_m, east_m, north_m)
-    return Places(latitude_deg, longitude_deg, places.height_m + up_m, places.heading_deg, places.slope)
+    return RailPlaces(latitude_deg, longitude_deg, places.height_m + up_m, places.heading_deg, places.slope)
 
 
-def track_table(line: Line, rng: np.random.Generator) -> pl.DataFrame:
+def track_table(line: LineAxis, rng: np.random.Generator) -> pl.DataFrame:
     """The survey of all net elements, with the errors that the scenario gives it (constant in place)."""
     parts = []
     for element, begin_m in zip(line.spec.elements, _element_starts(line.spec), strict=True):
@@ -101,7 +101,7 @@ def track_table(line: Line, rng: np.random.Generator) -> pl.DataFrame:
     table = pl.concat(parts)
     noise = _survey_noise(table, survey, rng)
     moved = shifted(
-        Places(**{name: table[name].to_numpy() for name in _PLACE}, heading_deg=np.zeros(0), slope=np.zeros(0)),
+        RailPlaces(**{name: table[name].to_numpy() for name in _PLACE}, heading_deg=np.zeros(0), slope=np.zeros(0)),
         survey.bias_east_m + noise[0],
         survey.bias_north_m + noise[1],
         survey.bias_up_m + noise[2],
@@ -168,10 +168,11 @@ def _integral(values: Floats, step: float) -> Floats:
     return np.concatenate(([0.0], np.cumsum(0.5 * (values[1:] + values[:-1])) * step))
 
 
-def _walk(spec: LineSpec, heading: Floats, slope_angle: Floats, step: float) -> Places:
+def _walk(spec: LineSpec, heading: Floats, slope_angle: Floats, step: float) -> RailPlaces:
     """Positions from heading and slope; the radii depend on latitude, so latitude is iterated (converges at once)."""
     run = np.cos(slope_angle)
-    north, east = _integral(run * np.cos(heading), step), _integral(run * np.sin(heading), step)
+    north = _integral(run * np.cos(heading), step)
+    east = _integral(run * np.sin(heading), step)
     height = spec.height_m + _integral(np.sin(slope_angle), step)
     latitude = np.full(heading.size, np.radians(spec.latitude_deg))
     for _ in range(4):
@@ -181,11 +182,11 @@ def _walk(spec: LineSpec, heading: Floats, slope_angle: Floats, step: float) -> 
         latitude = np.radians(spec.latitude_deg) + np.concatenate(([0.0], np.cumsum(rise)))
     turn = np.diff(east) / ((normal_m + height[:-1]) * np.cos(middle))
     longitude = np.radians(spec.longitude_deg) + np.concatenate(([0.0], np.cumsum(turn)))
-    return Places(np.degrees(latitude), np.degrees(longitude), height, np.degrees(heading), np.tan(slope_angle))
+    return RailPlaces(np.degrees(latitude), np.degrees(longitude), height, np.degrees(heading), np.tan(slope_angle))
 
 
 def _surveyed(
-    line: Line, element_id: str, begin_m: float, length_m: float, left_m: float, reverse: bool
+    line: LineAxis, element_id: str, begin_m: float, length_m: float, left_m: float, reverse: bool
 ) -> pl.DataFrame:
     points = int(np.ceil(length_m / line.spec.survey.spacing_m)) + 1
     measure = np.linspace(0.0, length_m, points)

@@ -30,7 +30,8 @@ _PARTS = {
     "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
     "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
 }
-_TWIST_PARTS, _TWIST_COVARIANCE_PARTS = list(_PARTS)[:4], list(_PARTS)[:5]
+_TWIST_PARTS = list(_PARTS)[:4]
+_TWIST_COVARIANCE_PARTS = list(_PARTS)[:5]
 
 
 def _definition(members: str, parts: list[str]) -> str:
@@ -54,7 +55,8 @@ DEFINITIONS: dict[str, str] = {
 def json_topic(stream: Stream, frame: pl.DataFrame) -> Topic:
     """This project's own JSON: one object per row."""
     times = _times_ns(frame)
-    name, messages = OWN_SCHEMAS[stream], _json_payloads(frame)
+    name = OWN_SCHEMAS[stream]
+    messages = _json_payloads(frame)
     return Topic(f"/{stream}", "json", name, "jsonschema", _json_schema(stream), times, messages)
 
 
@@ -114,7 +116,8 @@ def _odometer_topic(name: str, frame: pl.DataFrame, texts: tuple[str, ...], valu
         head += bytes(-len(head) % 4) + (len(text) + 1).to_bytes(4, "little") + text.encode() + b"\0"
     head += bytes(-(len(head) - 4) % 8)
     rows = np.zeros(frame.height, dtype=[("head", f"V{len(head)}"), ("values", "<f8", values.shape[1])])
-    rows["head"], rows["values"] = np.void(head), values
+    rows["head"] = np.void(head)
+    rows["values"] = values
     stamps = np.column_stack(np.divmod(times_ns(frame), SECOND_NS)).astype("<u4")
     content = rows.view(np.uint8).reshape(frame.height, -1)
     content[:, 4:12] = stamps.view(np.uint8)

@@ -99,7 +99,7 @@ class Motion:
 def build_motion(spec: MotionSpec) -> Motion:
     """Lay the phases end to end; the journey ends with the last one."""
     sign = 1 if spec.direction is Direction.GROWING else -1
-    pieces = _Pieces(spec.start_m, sign)
+    pieces = _MotionPieces(spec.start_m, sign)
     pieces.add(spec.stand_s, 0.0)
     for phase in spec.phases:
         if phase.stop_at_m is not None:
@@ -111,11 +111,12 @@ def build_motion(spec: MotionSpec) -> Motion:
     return pieces.motion()
 
 
-class _Pieces:
+class _MotionPieces:
     """The journey so far."""
 
     def __init__(self, start_m: float, sign: int) -> None:
-        self.start_m, self.sign = start_m, sign
+        self.start_m = start_m
+        self.sign = sign
         self.time, self.distance, self.speed = 0.0, 0.0, 0.0
         self.rows: list[tuple[float, float, float, float]] = []
 

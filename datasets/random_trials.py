@@ -46,14 +46,16 @@ def random_trial(seed: int) -> RandomTrial:
         rows = expected_hazards(scenario, spec)
         if rows is not None:
             vehicle = scenario.vehicle if spec.vehicle else None
-            site, run = build_site(scenario), build_run(scenario, spec)
+            site = build_site(scenario)
+            run = build_run(scenario, spec)
             return RandomTrial(seed, kind, site, run, vehicle, rows, spec.gnss.sigma_east_m)
     raise AssertionError(f"no clear trial of kind {kind!r} in {_DRAWS} draws")
 
 
 def _scenario(seed: int, rng: np.random.Generator, kind: str) -> Scenario:
     sigma_m = float(rng.choice([0.5, 1.0, 1.5]))
-    scale, latency_s = float(rng.choice([1.0, 1.003, 0.996])), float(rng.choice([0.0, 0.08]))
+    scale = float(rng.choice([1.0, 1.003, 0.996]))
+    latency_s = float(rng.choice([0.0, 0.08]))
     places_m = 500.0 + np.cumsum(rng.uniform(400.0, 1500.0, 9))
     forward = bool(rng.random() < 0.5)
     motion = _motion(rng, forward)

@@ -11,11 +11,11 @@ import polars as pl
 
 from datasets.faults import NS_PER_S, FaultSpec, PositionEffect, position_effect
 from datasets.gnss_errors import position_errors
-from datasets.line import Line, Places, offset_places, shifted
+from datasets.line import LineAxis, RailPlaces, offset_places, shifted
 from datasets.motion import Motion
 from datasets.odometer import sample_times_ns
 from datasets.scenario import GnssSpec, ReferenceSpec
-from datasets.sky import Observed, observe_sky
+from datasets.sky import ObservedSky, observe_sky
 from datasets.solution import protection_levels
 from schemas.arrays import Floats
 from schemas.config import Vehicle
@@ -40,14 +40,14 @@ _LEVELS = ("hpl_m", "vpl_m")
 
 
 @dataclass(frozen=True)
-class Journey:
+class TrainOnLine:
     """One train on its line: where its GNSS antenna is at any time."""
 
-    line: Line
+    line: LineAxis
     motion: Motion
     vehicle: Vehicle
 
-    def antenna(self, t_s: Floats, ahead_m: Floats | float = 0.0, left_m: Floats | float = 0.0) -> Places:
+    def antenna(self, t_s: Floats, ahead_m: Floats | float = 0.0, left_m: Floats | float = 0.0) -> RailPlaces:
         """Antenna places; `ahead_m` follows the track towards the leading end, `left_m` is left of that end."""
         lever_m = self.vehicle.gnss_antenna_ahead_m + ahead_m
         rail = self.line.at(self.motion.chainage_m(t_s) + self.motion.sign * lever_m)
@@ -57,12 +57,13 @@ class Journey:
 
 
 def gnss_streams(
-    spec: GnssSpec, journey: Journey, faults: Sequence[FaultSpec], first_ns: int, rng: np.random.Generator
+    spec: GnssSpec, journey: TrainOnLine, faults: Sequence[FaultSpec], first_ns: int, rng: np.random.Generator
 ) -> tuple[pl.DataFrame, pl.DataFrame | None]:
     """The `gnss` stream, and `satellites` where the errors come from geometry; displaced and thinned by faults."""
     t_ns = sample_times_ns(journey.motion.duration_s, spec.rate_hz)
     if spec.sky is None:
-        observed, ranges = [_without_sky(spec, t_ns.size, rng)], None
+        observed = [_without_sky(spec, t_ns.size, rng)]
+        ranges = None
     else:
         start = journey.antenna(np.zeros(1))
         place = (float(start.latitude_deg[0]), float(start.longitude_deg[0]), float(start.height_m[0]))
@@ -72,24 +73,24 @@ def gnss_streams(
     return pl.concat(tables).sort("t", "solution", maintain_order=True), ranges
 
 
-def _without_sky(spec: GnssSpec, epochs: int, rng: np.random.Generator) -> Observed:
+def _without_sky(spec: GnssSpec, epochs: int, rng: np.random.Generator) -> ObservedSky:
     sigmas = (spec.sigma_east_m, spec.sigma_north_m, spec.sigma_up_m)
     covariance = np.broadcast_to(np.diag(np.square(sigmas)), (epochs, 3, 3))
     satellites = None if spec.satellites is None else np.full(epochs, spec.satellites)
     errors = position_errors(sigmas, epochs, 1.0 / spec.rate_hz, rng)
     levels = protection_levels(covariance)
-    return Observed(
+    return ObservedSky(
         "primary", errors, covariance, levels.hpl_npa_m, levels.vpl_m, satellites, np.zeros(epochs, dtype=np.bool_)
     )
 
 
 def _solution_table(
     spec: GnssSpec,
-    journey: Journey,
+    journey: TrainOnLine,
     faults: Sequence[FaultSpec],
     first_ns: int,
     t_ns: npt.NDArray[np.int64],
-    observed: Observed,
+    observed: ObservedSky,
     rng: np.random.Generator,
     velocity_rng: np.random.Generator,
 ) -> pl.DataFrame:
@@ -104,13 +105,15 @@ def _solution_table(
     return _table(spec, first_ns + t_ns, places, velocity, observed, effect.lost | observed.lost)
 
 
-def displaced(places: Places, effect: PositionEffect, errors_m: Floats) -> Places:
+def displaced(places: RailPlaces, effect: PositionEffect, errors_m: Floats) -> RailPlaces:
     """Places with errors and the part of the faults that does not follow the track."""
     east, north, up = errors_m.T
     return shifted(places, east + effect.east_m, north + effect.north_m, up + effect.up_m)
 
 
-def reference_stream(spec: ReferenceSpec, journey: Journey, first_ns: int, rng: np.random.Generator) -> pl.DataFrame:
+def reference_stream(
+    spec: ReferenceSpec, journey: TrainOnLine, first_ns: int, rng: np.random.Generator
+) -> pl.DataFrame:
     """The truth, at its own rate and with its own small noise.
 
     It begins and ends a second beyond the receiver's recording: late positions are of times before their stamps.
@@ -129,16 +132,17 @@ def reference_stream(spec: ReferenceSpec, journey: Journey, first_ns: int, rng: 
     return conform(table, Reference)
 
 
-def true_velocity(journey: Journey, t_s: Floats) -> Floats:
+def true_velocity(journey: TrainOnLine, t_s: Floats) -> Floats:
     """Velocity east, north, up [m/s], shape (epochs, 3)."""
     places = journey.antenna(t_s)
     speed = journey.motion.sign * journey.motion.speed_mps(t_s)
-    heading, angle = np.radians(places.heading_deg), np.arctan(places.slope)
+    heading = np.radians(places.heading_deg)
+    angle = np.arctan(places.slope)
     level = speed * np.cos(angle)
     return np.column_stack([level * np.sin(heading), level * np.cos(heading), speed * np.sin(angle)])
 
 
-def _velocity(spec: GnssSpec, journey: Journey, t_s: Floats, rng: np.random.Generator) -> Floats | None:
+def _velocity(spec: GnssSpec, journey: TrainOnLine, t_s: Floats, rng: np.random.Generator) -> Floats | None:
     noise = spec.velocity_sigma_mps * rng.standard_normal((t_s.size, 3))
     return true_velocity(journey, t_s) + noise if spec.velocity else None
 
@@ -146,9 +150,9 @@ def _velocity(spec: GnssSpec, journey: Journey, t_s: Floats, rng: np.random.Gene
 def _table(
     spec: GnssSpec,
     t_ns: npt.NDArray[np.int64],
-    places: Places,
+    places: RailPlaces,
     velocity: Floats | None,
-    observed: Observed,
+    observed: ObservedSky,
     lost: npt.NDArray[np.bool_],
 ) -> pl.DataFrame:
     unknown = np.full(t_ns.size, np.nan)

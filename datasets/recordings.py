@@ -10,7 +10,7 @@ from datasets.comma2k19 import comma2k19_run
 from datasets.trial import write_run_as
 from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather
 from pipeline.read.ingest import read_run
-from pipeline.results.fit_report import fit_report
+from pipeline.studies.plausibility.report import fit_report
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import visible
 

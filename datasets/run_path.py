@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.clean import clean
-from pipeline.stages.matching import match
-from pipeline.stages.odometry import odometry_of
+from pipeline.stages.prepare import prepare
 from pipeline.stages.track.geodesy import curvature_radii_m, distances_m, moved_deg
 from schemas.arrays import Floats, Ints, floats
-from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
@@ -22,7 +20,7 @@ _OUTER_CELLS = 3
 
 
 @dataclass(frozen=True)
-class _Way:
+class _DrivenWay:
     """Where positions were along their own way and left of it at some instants, and the way by the distance along it.
 
     `own_height_m`: of the positions. `course_m`: over so much of it, to both sides, its course is taken.
@@ -54,9 +52,11 @@ def displacement_m(
     what the run's own positions show, averaged over 10 m.
     """
     way = _own_way(run, solution) if site is None else _site_way(run, solution, site)
-    now, known = t_ns.astype(np.float64), way.t_ns.astype(np.float64)
+    now = t_ns.astype(np.float64)
+    known = way.t_ns.astype(np.float64)
     s_m, beside_m, own_m = (np.interp(now, known, at) for at in (way.s_m, way.left_m, way.own_height_m))
-    here, there = way.places(s_m), way.places(s_m + ahead_m)
+    here = way.places(s_m)
+    there = way.places(s_m + ahead_m)
     east_here, north_here = _left_of(way, s_m)
     # A position beside the track stays as far beside it where the track has turned.
     begin = moved_deg(*here, beside_m * east_here, beside_m * north_here)
@@ -66,14 +66,14 @@ def displacement_m(
     return np.column_stack([east + left_m * east_here, north + left_m * north_here, there[2] - here[2]])
 
 
-def _left_of(way: _Way, s_m: Floats) -> tuple[Floats, Floats]:
+def _left_of(way: _DrivenWay, s_m: Floats) -> tuple[Floats, Floats]:
     """East and north of the unit vector to the left of the way at these distances."""
     course_e, course_n, _ = _local_m(way.places(s_m - way.course_m), way.places(s_m + way.course_m))
     norm = np.hypot(course_e, course_n)
     return -course_n / norm, course_e / norm
 
 
-def _own_way(run: RunLog, solution: str) -> _Way:
+def _own_way(run: RunLog, solution: str) -> _DrivenWay:
     """From the run's own positions, by odometer distance where recorded, else by the way the positions make."""
     fixes = _fixes(run, solution)
     t_ns = fixes["t"].to_physical().to_numpy()
@@ -88,15 +88,14 @@ def _own_way(run: RunLog, solution: str) -> _Way:
         raise InputError("the train moves too little to know its track", place=run.run_id, expected="30 m or more")
     count = np.bincount(of_epoch)
     means = [np.bincount(of_epoch, weights=values) / count for values in (s_m, *places)]
-    return _Way(t_ns, s_m, np.zeros_like(s_m), places[2], _BIN_M, *means)
+    return _DrivenWay(t_ns, s_m, np.zeros_like(s_m), places[2], _BIN_M, *means)
 
 
-def _site_way(run: RunLog, solution: str, site: Site) -> _Way:
+def _site_way(run: RunLog, solution: str, site: Site) -> _DrivenWay:
     """From the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
-    ordered, _ = clean(run)
-    fixes = ordered.gnss.filter(pl.col("solution") == solution)
-    odometry = odometry_of(ordered.odometer, Vehicle(), Configuration())
-    found = match(fixes, odometry, site, Vehicle(), MatchingConfig(), FixSigma(), ordered.balise_reads)
+    prepared = prepare(run, site, Vehicle(), Configuration())
+    fixes = prepared.fixes(solution)
+    found = prepared.match(solution)
     epochs = found.epochs.filter(pl.col("path_m").is_not_null())
     if epochs["leg"].n_unique() != 1:
         raise InputError("the path changes direction at a switch", place=run.run_id, remedy="Inject without --site.")
@@ -109,7 +108,7 @@ def _site_way(run: RunLog, solution: str, site: Site) -> _Way:
     left_m = epochs["cross_track_m"].to_numpy()
     own = fixes.join(epochs.select("t"), on="t", how="right", maintain_order="right")
     own_m = np.nan_to_num(floats(own, "height_m"))
-    return _Way(epochs["t"].to_physical().to_numpy(), s_m, left_m, own_m, _AT_POINT_M, axis, *places)
+    return _DrivenWay(epochs["t"].to_physical().to_numpy(), s_m, left_m, own_m, _AT_POINT_M, axis, *places)
 
 
 # The survey is straight from point to point, so its course at a place is that of the segment there.
@@ -173,7 +172,8 @@ def _way_of_positions_m(latitude_deg: Floats, longitude_deg: Floats, height_m: F
 def _interpolated(x: Floats, at: Floats, values: Floats) -> Floats:
     """Linear interpolation that goes on beyond the ends with the mean slope of the outer cells."""
     order = np.argsort(at, kind="stable")
-    at, values = at[order], values[order]
+    at = at[order]
+    values = values[order]
     inside = np.interp(x, at, values)
     some = min(_OUTER_CELLS, at.size - 1)
     first = (values[some] - values[0]) / (at[some] - at[0])

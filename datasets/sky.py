@@ -12,7 +12,7 @@ from datasets.constellation import GALILEO, GPS, look_angles
 from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, in_sector, offset_m
 from datasets.range_errors import range_errors_m, range_sigma_m
 from datasets.scenario import SkySpec
-from datasets.solution import Solution, protection_levels, solve
+from datasets.solution import PositionSolution, protection_levels, solve
 from schemas.arrays import Bools, Floats, Ints
 from schemas.conform import conform
 from schemas.inputs import Satellites
@@ -21,7 +21,7 @@ _SLOTS = {"gps": GPS, "galileo": GALILEO}
 
 
 @dataclass(frozen=True)
-class Observed:
+class ObservedSky:
     """One solution per epoch: error east, north, up with the covariance and protection levels stated for it."""
 
     solution: str
@@ -34,7 +34,7 @@ class Observed:
 
 
 @dataclass(frozen=True)
-class Ranges:
+class SimulatedRanges:
     """All satellites of the constellations in use, per epoch; `range_error_m` includes the faults."""
 
     svs: tuple[str, ...]
@@ -53,7 +53,7 @@ def observe_sky(
     step_s: float,
     faults: Sequence[FaultSpec],
     rng: np.random.Generator,
-) -> tuple[list[Observed], pl.DataFrame | None]:
+) -> tuple[list[ObservedSky], pl.DataFrame | None]:
     """Solutions of the same ranges, and the `satellites` stream.
 
     The sky is that of `place` (latitude, longitude, height) all along: over a line of 30 km directions change
@@ -62,7 +62,8 @@ def observe_sky(
     monitors may see that as the step it is.
     """
     ranges = track_satellites(spec, place, first_ns, t_ns, step_s, faults, rng)
-    observed, tables = [], []
+    observed = []
+    tables = []
     for name, constellations in spec.solutions.items():
         initials = {_SLOTS[constellation][0].sv[0] for constellation in constellations}
         usable = ranges.tracked & np.array([sv[0] in initials for sv in ranges.svs])
@@ -82,7 +83,7 @@ def track_satellites(
     step_s: float,
     faults: Sequence[FaultSpec],
     rng: np.random.Generator,
-) -> Ranges:
+) -> SimulatedRanges:
     """Directions and range errors of all satellites, with the faults that hit ranges."""
     used = sorted({name for names in spec.solutions.values() for name in names}, reverse=True)
     slots = [slot for name in used for slot in _SLOTS[name]]
@@ -103,18 +104,18 @@ def track_satellites(
         else:
             errors = errors + np.where(hit, offset_m(fault, t_s, rng)[:, None], 0.0)
     sigma = range_sigma_m(spec.ranges, elevation)
-    return Ranges(svs, azimuth, elevation, sigma, errors, tracked)
+    return SimulatedRanges(svs, azimuth, elevation, sigma, errors, tracked)
 
 
-def _observed(spec: SkySpec, name: str, solution: Solution) -> Observed:
+def _observed(spec: SkySpec, name: str, solution: PositionSolution) -> ObservedSky:
     levels = protection_levels(solution.covariance_m2)
     horizontal = levels.hpl_pa_m if spec.protection == "pa" else levels.hpl_npa_m
     count = solution.used.sum(axis=1)
     error = np.where(solution.solved[:, None], solution.error_m, 0.0)
-    return Observed(name, error, solution.covariance_m2, horizontal, levels.vpl_m, count, ~solution.solved)
+    return ObservedSky(name, error, solution.covariance_m2, horizontal, levels.vpl_m, count, ~solution.solved)
 
 
-def _satellites_table(name: str, t_ns: Ints, ranges: Ranges, solution: Solution) -> pl.DataFrame:
+def _satellites_table(name: str, t_ns: Ints, ranges: SimulatedRanges, solution: PositionSolution) -> pl.DataFrame:
     epoch, satellite = np.nonzero(ranges.tracked & np.isfinite(solution.residual_m))
     svs = np.array(ranges.svs)
     table = pl.DataFrame(

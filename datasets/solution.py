@@ -21,7 +21,7 @@ K_V = 5.33
 
 
 @dataclass(frozen=True)
-class Solution:
+class PositionSolution:
     """Per epoch: error east, north, up [m], its covariance, residuals [m] (NaN: not in view), used, and solved."""
 
     error_m: Floats
@@ -45,7 +45,8 @@ def protection_levels(covariance_m2: Floats) -> ProtectionLevels:
 
     HPL = K_H d_major, d_major^2 = (d_E^2 + d_N^2)/2 + sqrt(((d_E^2 - d_N^2)/2)^2 + d_EN^2), VPL = K_V d_U.
     """
-    east, north = covariance_m2[..., 0, 0], covariance_m2[..., 1, 1]
+    east = covariance_m2[..., 0, 0]
+    north = covariance_m2[..., 1, 1]
     mixed = covariance_m2[..., 0, 1]
     major = np.sqrt((east + north) / 2.0 + np.hypot((east - north) / 2.0, mixed))
     return ProtectionLevels(K_H_PA * major, K_H_NPA * major, K_V * np.sqrt(covariance_m2[..., 2, 2]))
@@ -74,18 +75,21 @@ def solve(
     range_error_m: Floats,
     usable: Bools,
     visible: Bools,
-) -> Solution:
+) -> PositionSolution:
     """Positions of all epochs, arrays of shape (epochs, satellites).
 
     An epoch is solved when its usable satellites are at least as many as the unknowns; visible satellites that
     are not used get residuals too, where their constellation has a clock in the solution.
     """
     epochs = usable.shape[0]
-    error, covariance = np.full((epochs, 3), np.nan), np.full((epochs, 3, 3), np.nan)
-    residual, solved = np.full(usable.shape, np.nan), np.zeros(epochs, dtype=np.bool_)
+    error = np.full((epochs, 3), np.nan)
+    covariance = np.full((epochs, 3, 3), np.nan)
+    residual = np.full(usable.shape, np.nan)
+    solved = np.zeros(epochs, dtype=np.bool_)
     patterns, of_epoch = _patterns(usable, visible)
     for number, first in enumerate(patterns):
-        taken, shown = np.flatnonzero(usable[first]), np.flatnonzero(visible[first])
+        taken = np.flatnonzero(usable[first])
+        shown = np.flatnonzero(visible[first])
         names = [svs[int(i)] for i in taken]
         systems = {sv[:1] for sv in names}
         if taken.size < 3 + len(systems):
@@ -99,8 +103,10 @@ def solve(
         cells = np.ix_(rows, seen)
         all_rows = design_rows([svs[int(i)] for i in seen], azimuth_deg[cells], elevation_deg[cells])
         residual[cells] = range_error_m[cells] - np.einsum("tij,tj->ti", all_rows, state)
-        error[rows], covariance[rows], solved[rows] = state[:, :3], variance[:, :3, :3], True
-    return Solution(error, covariance, residual, usable & solved[:, None], solved)
+        error[rows] = state[:, :3]
+        covariance[rows] = variance[:, :3, :3]
+        solved[rows] = True
+    return PositionSolution(error, covariance, residual, usable & solved[:, None], solved)
 
 
 def _patterns(usable: Bools, visible: Bools) -> tuple[Ints, Ints]:

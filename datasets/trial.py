@@ -15,11 +15,11 @@ import numpy as np
 import polars as pl
 
 from datasets.faults import FaultSpec, PlacedFault, faults_table
-from datasets.line import Line, balises_table, build_line, links_table, track_table
+from datasets.line import LineAxis, balises_table, build_line, links_table, track_table
 from datasets.mcap_log import write_mcap
 from datasets.motion import Motion, build_motion
 from datasets.odometer import odometer_stream
-from datasets.receiver import Journey, gnss_streams, reference_stream
+from datasets.receiver import TrainOnLine, gnss_streams, reference_stream
 from datasets.scenario import LogKind, RunSpec, Scenario
 from pipeline.storage import replace_files
 from pipeline.storage.parquet import parquet_bytes
@@ -31,16 +31,16 @@ from schemas.run import STREAMS, RunLog, Site
 _RUN_SPACING = timedelta(hours=1)
 
 
-def build_site(scenario: Scenario, line: Line | None = None) -> Site:
+def build_site(scenario: Scenario, line: LineAxis | None = None) -> Site:
     """The surveyed site of a scenario."""
     line = line or build_line(scenario.line)
     balises = balises_table(scenario.line) if scenario.line.balises else None
     return Site(track_table(line, _rng(scenario, "site", "survey")), links_table(scenario.line), balises)
 
 
-def build_run(scenario: Scenario, spec: RunSpec, line: Line | None = None) -> RunLog:
+def build_run(scenario: Scenario, spec: RunSpec, line: LineAxis | None = None) -> RunLog:
     """Simulate one run."""
-    journey = Journey(line or build_line(scenario.line), build_motion(spec.motion), scenario.vehicle or Vehicle())
+    journey = TrainOnLine(line or build_line(scenario.line), build_motion(spec.motion), scenario.vehicle or Vehicle())
     first_ns = _start_ns(scenario, spec)
     faults = [placed(fault, journey.motion, spec.gnss.rate_hz) for fault in spec.faults]
 
@@ -75,7 +75,7 @@ def placed(fault: PlacedFault, motion: Motion, rate_hz: float) -> FaultSpec:
 def write_trial(scenario: Scenario, out: Path, done: Callable[[str], None] | None = None) -> list[Path]:
     """Write `site/`, `runs/`, `vehicle.toml` and the resolved `scenario.toml`; returns the runs' paths.
 
-    One scenario always gives the same bytes. `done` is told the name of each run written.
+    One scenario always gives the same bytes. `done` gets the name of each run written.
     """
     line = build_line(scenario.line)
     try:

@@ -6,13 +6,15 @@ from pathlib import Path
 
 import tomli_w
 
-from pipeline.one_run import diagnosed
+from pipeline.one_run import ride_alone
 from pipeline.studies.undetected.profile import Profile, epoch_of, profile_at
+from pipeline.studies.undetected.ride import diagnosis_of
 from schemas.config import Configuration, Vehicle
 from schemas.errors import OutputError
 from schemas.run import RunLog, Site
 
-FAULT, PROFILE = "fault.toml", "profile.csv"
+FAULT = "fault.toml"
+PROFILE = "profile.csv"
 
 
 def largest_fault(
@@ -26,12 +28,13 @@ def largest_fault(
     behind: bool = False,
 ) -> Profile:
     """The largest fault that no monitor would have noticed, at a balise, a time after the first epoch, or the end."""
-    diagnosis, passages, crossings = diagnosed(run, site, vehicle, config, solution)
-    epoch = epoch_of(diagnosis, passages, crossings, vehicle, config, balise, at_s)
+    ride = ride_alone(run, site, vehicle, config, solution)
+    diagnosis = diagnosis_of(ride)
+    epoch = epoch_of(diagnosis, ride.lds.passages, ride.lds.crossings, vehicle, config, balise, at_s)
     return profile_at(diagnosis, epoch, behind, vehicle, config)
 
 
-def told(found: Profile) -> str:
+def sentence_of(found: Profile) -> str:
     """The fault in words: how large, since when, and what a ramp and a step would have reached."""
     began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
     return (

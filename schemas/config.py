@@ -319,6 +319,7 @@ class AlignConfig(Settings):
     # in bunches seem to gain some metres in no time.
     fastest_mps: Positive = 200.0
     bunched_stamps_m: NonNegative = 20.0
+    reset_back_m: NonNegative = 5.0
     # Speeds give the distance over such a jump if, over the whole run, they differ from it by a smaller share:
     # another unit or sign differs by more than a half, slip and scale by some percent.
     speed_agreement: Probability = 0.2

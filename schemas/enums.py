@@ -149,7 +149,7 @@ class LostTo(StrEnum):
 
 
 class MisfitCause(StrEnum):
-    """Why streams of a run do not fit each other; the words are in `schemas/words.py`."""
+    """Why streams of a run do not fit each other; the words are in `schemas/words.toml`."""
 
     UNIT = "unit"
     WHEEL = "wheel"
@@ -207,7 +207,7 @@ class MisfitPlace(StrEnum):
 
 
 class Note(StrEnum):
-    """What the notes of a run say; their words are in `schemas/words.py`."""
+    """What the notes of a run say; their words are in `schemas/words.toml`."""
 
     CORRECTED = "corrected"
     CHUNKS_WITHOUT_CRC = "chunks_without_crc"
@@ -231,6 +231,7 @@ class Note(StrEnum):
     AMBIGUOUS = "ambiguous"
     UNLINKED = "unlinked"
     UNKNOWN_TELEGRAMS = "unknown_telegrams"
+    WHITE_NOISE = "white_noise"
     ROWS_SCATTER = "rows_scatter"
     ROWS_SCATTER_TOO_MUCH = "rows_scatter_too_much"
     DIGITS = "digits"
@@ -245,6 +246,7 @@ class Note(StrEnum):
     UNDIAGNOSED = "undiagnosed"
     MOVING_UNKNOWN = "moving_unknown"
     AVAILABLE = "available"
+    POOR_POSITIONS = "poor_positions"
     OFF_TRACK = "off_track"
     REMEDY = "remedy"
 

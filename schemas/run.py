@@ -80,6 +80,10 @@ class Finding:
     remedy: str = ""
 
 
+BALISE_PLACE = "balises: "
+"""What the place of a finding on a balise begins with."""
+
+
 @dataclass(frozen=True)
 class Site:
     """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`.
@@ -94,6 +98,10 @@ class Site:
     findings: tuple[Finding, ...] = ()
     digest: str = ""
     files: tuple[tuple[str, int, str], ...] = ()
+
+    def balises_off(self) -> list[str]:
+        """Balises that lie off their net element."""
+        return [item.place.removeprefix(BALISE_PLACE) for item in self.findings if item.severity == "error"]
 
 
 @dataclass(frozen=True)

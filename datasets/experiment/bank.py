@@ -21,7 +21,7 @@ from datasets.experiment.plan import SENSORS
 from datasets.experiment.rare import false_alarm_probability
 from datasets.experiment.tables import Contents, Row, share, table
 from datasets.experiment.workers import generator
-from pipeline.campaign.workers import mapped
+from pipeline.results.workers import mapped
 from schemas.arrays import Ints
 from schemas.config import Configuration, MonitorConfig
 
@@ -134,7 +134,9 @@ def _first_fails(
 
 def _row(bank: LinearBank, fault: Fault, first: Ints, by: Ints, budget_s: float, horizon_s: float) -> Row:
     # A fault is in the data one epoch after it began at the earliest; the negation takes one epoch more.
-    epoch_s, runs, seen = 1.0 / bank.spec.rate_hz, first.size, first >= 0
+    epoch_s = 1.0 / bank.spec.rate_hz
+    runs = first.size
+    seen = first >= 0
     detected_s = np.where(seen, (first + 1) / bank.spec.rate_hz, np.inf)
     failed_s = failure_s(fault, default_geometry("gps"))
     # Nothing is judged of a fault that makes no failure within the horizon.

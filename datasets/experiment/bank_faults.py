@@ -107,7 +107,9 @@ class WhiteNoise:
 
     def __init__(self, bank: LinearBank, faults: Sequence[Fault], runs: int, rng: np.random.Generator) -> None:
         axes = bank.along_error.size
-        self._rng, self._runs, self._keep = rng, runs, (1.0 - bank.alpha)[:, None]
+        self._rng = rng
+        self._runs = runs
+        self._keep = (1.0 - bank.alpha)[:, None]
         self._gain = (bank.alpha * bank.spec.rate_hz)[:, None]
         sizes = np.zeros((len(faults), axes))
         for row, fault in zip(sizes, faults, strict=True):

@@ -17,8 +17,8 @@ from datasets.experiment.catalogue_text import catalogue_page
 from datasets.experiment.catalogue_trial import JOURNEYS, Stage, stage, with_fault
 from datasets.experiment.tables import Contents, Row
 from datasets.motion import build_motion
-from pipeline.campaign.workers import mapped
 from pipeline.one_run import replay
+from pipeline.results.workers import mapped
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import MONITORS
@@ -26,13 +26,15 @@ from schemas.tables import MONITORS
 REPETITIONS = 40
 RATE_HZ = 1.0
 SETTINGS = {"rate_hz": RATE_HZ}
-_SOLUTION, _OTHER = "primary", "dual"
+_SOLUTION = "primary"
+_OTHER = "dual"
 
 
 def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
     """`catalogue` by fault, `monitors` by fault and monitor, `runs`, and `catalogue.md`."""
     runs = run_catalogue(repetitions, seed, jobs, config, catalogue())
-    faults, monitors = faults_table(runs), monitors_table(runs)
+    faults = faults_table(runs)
+    monitors = monitors_table(runs)
     page = catalogue_page(faults, monitors)
     return {"catalogue": faults, "monitors": monitors, "runs": runs, "catalogue.md": page}
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from datasets.line import Places, offset_places
+from datasets.line import RailPlaces, offset_places
 from schemas.run import RunLog, Site
 
 _SECOND_NS = 1_000_000_000
@@ -69,9 +69,10 @@ def map_left(run: RunLog, site: Site, onset_ns: int, size_m: float) -> tuple[Run
 
 def _moved_left(points: pl.DataFrame, size_m: float) -> pl.DataFrame:
     latitude, longitude, height = (points[name].to_numpy() for name in _PLACE)
-    north, east = np.gradient(latitude), np.gradient(longitude) * np.cos(np.radians(latitude))
+    north = np.gradient(latitude)
+    east = np.gradient(longitude) * np.cos(np.radians(latitude))
     heading_deg = np.degrees(np.arctan2(east, north))
-    moved = offset_places(Places(latitude, longitude, height, heading_deg, np.zeros(height.size)), size_m)
+    moved = offset_places(RailPlaces(latitude, longitude, height, heading_deg, np.zeros(height.size)), size_m)
     return points.with_columns(latitude_deg=pl.Series(moved.latitude_deg), longitude_deg=pl.Series(moved.longitude_deg))
 
 

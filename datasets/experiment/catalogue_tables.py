@@ -66,7 +66,10 @@ def monitors_table(runs: pl.DataFrame) -> pl.DataFrame:
 
 def _monitor_row(monitor: str, place: int, runs: list[list[float | None]]) -> Row | None:
     """`runs`: by run the seconds to the first failure of each monitor."""
-    own, leads, first, alone = [], [], 0, 0
+    own = []
+    leads = []
+    first = 0
+    alone = 0
     for seen in runs:
         mine = seen[place]
         if mine is None:

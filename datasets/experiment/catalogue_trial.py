@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from datasets.experiment.catalogue_faults import CatalogueFault, Journey
-from datasets.line import Line, build_line
+from datasets.line import LineAxis, build_line
 from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
@@ -54,7 +54,7 @@ class Stage:
 
     plan: JourneyPlan
     scenario: Scenario
-    line: Line
+    line: LineAxis
 
     @property
     def vehicle(self) -> Vehicle:
@@ -131,7 +131,8 @@ def with_fault(ready: Stage, fault: CatalogueFault) -> tuple[RunLog, Site]:
     run_spec = ready.scenario.runs[0]
     spec = type(run_spec).model_validate({**run_spec.model_dump(exclude={"faults"}), "faults": placed})
     scenario = ready.scenario.model_copy(update={"runs": (spec,)})
-    run, site = build_run(scenario, spec, ready.line), build_site(scenario, ready.line)
+    run = build_run(scenario, spec, ready.line)
+    site = build_site(scenario, ready.line)
     if ready.plan.physical_every:
         run = run.with_streams(balise_reads=_reads(ready))
     if fault.change is None:

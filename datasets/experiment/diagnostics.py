@@ -16,8 +16,8 @@ import numpy as np
 import polars as pl
 
 from datasets.experiment.geometry import CONSTELLATIONS, Geometry, default_geometry
-from datasets.experiment.passage import NEVER, Passages, first_passages, joined
-from datasets.experiment.plan import Plan, bank_forms, failure_forms
+from datasets.experiment.passage import NEVER, FirstPassages, first_passages, joined
+from datasets.experiment.plan import ExperimentPlan, bank_forms, failure_forms
 from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
 from schemas.arrays import Bools, Ints
@@ -42,7 +42,7 @@ def run_diagnostics(repetitions: int = REPETITIONS, seed: int = 1, jobs: int = 1
 
     `pmd`: Fig. 5; `detection`: Fig. 6 and 7 and the shares at the moment of failure; `geometry`: the skies.
     """
-    plans = tuple(Plan(default_geometry(constellation)) for constellation in CONSTELLATIONS)
+    plans = tuple(ExperimentPlan(default_geometry(constellation)) for constellation in CONSTELLATIONS)
     pairs = list(zip(plans, simulate(plans, repetitions, seed, jobs), strict=True))
     return {
         "pmd": table([row for plan, found in pairs for cell in _cells(plan, found) for row in _pmd_rows(plan, cell)]),
@@ -51,7 +51,7 @@ def run_diagnostics(repetitions: int = REPETITIONS, seed: int = 1, jobs: int = 1
     }
 
 
-def simulate(plans: tuple[Plan, ...], repetitions: int, seed: int, jobs: int) -> list[Passages]:
+def simulate(plans: tuple[ExperimentPlan, ...], repetitions: int, seed: int, jobs: int) -> list[FirstPassages]:
     """First passages of every plan; the same for any number of jobs."""
     return [
         joined(in_pieces(partial(passages_of, plan), repetitions, _BLOCK_REPETITIONS, (seed, number), jobs))
@@ -59,18 +59,18 @@ def simulate(plans: tuple[Plan, ...], repetitions: int, seed: int, jobs: int) ->
     ]
 
 
-def passages_of(plan: Plan, repetitions: int, rng: np.random.Generator) -> Passages:
+def passages_of(plan: ExperimentPlan, repetitions: int, rng: np.random.Generator) -> FirstPassages:
     """First passages of the plan's own bank and failures."""
     return first_passages(plan, bank_forms(plan), failure_forms(plan), repetitions, rng)
 
 
-def detection_times(plan: Plan, passages: Passages) -> pl.DataFrame:
+def detection_times(plan: ExperimentPlan, passages: FirstPassages) -> pl.DataFrame:
     """Expected times of detection by question and rate (Fig. 6 and 7), shares detected and missed at failure."""
     return table([_detection_row(plan, cell) for cell in _cells(plan, passages)])
 
 
 @dataclass(frozen=True)
-class _Cell:
+class _RateAnswers:
     """One question at one rate: seconds from onset, the span where it never came."""
 
     labels: Row
@@ -81,14 +81,14 @@ class _Cell:
     alarmed_before: int
 
 
-def _cells(plan: Plan, passages: Passages) -> Iterator[_Cell]:
+def _cells(plan: ExperimentPlan, passages: FirstPassages) -> Iterator[_RateAnswers]:
     end_s = plan.span_s - plan.onset_s
     for index, (reading, heading, sensors) in enumerate(plan.questions):
         for rate, rate_mps in enumerate(plan.rates_mps):
             labels: Row = {"constellation": plan.geometry.constellation, "reading": reading, "sensors": sensors}
             detected = passages.detected_s[index, rate].astype(np.int64)
             failed = passages.failed_s[plan.headings_deg.index(heading), rate].astype(np.int64)
-            yield _Cell(
+            yield _RateAnswers(
                 labels | {"heading_deg": heading, "rate_mps": rate_mps},
                 np.where(detected == NEVER, end_s, detected),
                 detected != NEVER,
@@ -98,7 +98,7 @@ def _cells(plan: Plan, passages: Passages) -> Iterator[_Cell]:
             )
 
 
-def _pmd_rows(plan: Plan, cell: _Cell) -> Iterator[Row]:
+def _pmd_rows(plan: ExperimentPlan, cell: _RateAnswers) -> Iterator[Row]:
     """Share of failed runs not yet detected at a time since failure, with exact bounds (Fig. 5)."""
     trials = int(cell.failed.sum())
     if trials == 0:
@@ -115,9 +115,11 @@ def _pmd_rows(plan: Plan, cell: _Cell) -> Iterator[Row]:
         yield cell.labels | counts | share("pmd", missed, trials)
 
 
-def _detection_row(plan: Plan, cell: _Cell) -> Row:
+def _detection_row(plan: ExperimentPlan, cell: _RateAnswers) -> Row:
     end_s = float(plan.span_s - plan.onset_s)
-    repetitions, trials, detected = cell.detected.size, int(cell.failed.sum()), int(cell.detected.sum())
+    repetitions = cell.detected.size
+    trials = int(cell.failed.sum())
+    detected = int(cell.detected.sum())
     since = (cell.detected_s - cell.failed_s)[cell.failed]
     missed = int((~cell.detected[cell.failed] | (since > 0)).sum())
     return {

@@ -10,7 +10,7 @@ import polars as pl
 from datasets.experiment.geometry import Geometry, default_geometry
 from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
 from datasets.experiment.passage import BLOCK_EPOCHS, NoisePaths
-from datasets.experiment.plan import Plan, Sensors, bank_forms
+from datasets.experiment.plan import ExperimentPlan, Sensors, bank_forms
 from datasets.experiment.range_alarms import range_alarms
 from datasets.experiment.rare import false_alarm_probability
 from datasets.experiment.tables import Contents, Row, share, table
@@ -39,7 +39,8 @@ _TWO_SIDED_FACTOR = 1.959963984540054
 
 def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
     """`regression`, `verification`, `pseudorange` and `alarms_per_hour`."""
-    rare, counted = min(_RARE_RUNS, repetitions), min(_COUNTED_RUNS, repetitions)
+    rare = min(_RARE_RUNS, repetitions)
+    counted = min(_COUNTED_RUNS, repetitions)
     return {
         "regression": regression_table(),
         "verification": verification_table(repetitions, seed, jobs),
@@ -48,13 +49,13 @@ def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = 
     }
 
 
-def verification_plan(geometry: Geometry) -> Plan:
+def verification_plan(geometry: Geometry) -> ExperimentPlan:
     """Fault-free runs of the default sky, heading 0, all monitors of both readings."""
     span = _VERIFIED_AT_S + 1
-    return Plan(geometry, headings_deg=(0.0,), rates_mps=(1.0,), span_s=span, onset_s=span)
+    return ExperimentPlan(geometry, headings_deg=(0.0,), rates_mps=(1.0,), span_s=span, onset_s=span)
 
 
-def _exceedances(plan: Plan, limits: Floats, repetitions: int, rng: np.random.Generator) -> Ints:
+def _exceedances(plan: ExperimentPlan, limits: Floats, repetitions: int, rng: np.random.Generator) -> Ints:
     """How many runs exceed each limit (ways, probabilities, monitors) at the last epoch: one look per run."""
     paths = NoisePaths(plan, repetitions, rng)
     left = _VERIFIED_AT_S

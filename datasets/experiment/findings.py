@@ -13,10 +13,10 @@ import polars as pl
 
 from datasets.experiment.diagnostics import detection_times, passages_of
 from datasets.experiment.geometry import Geometry, skies_of_day
-from datasets.experiment.plan import Plan
+from datasets.experiment.plan import ExperimentPlan
 from datasets.experiment.tables import Contents, share
 from datasets.experiment.workers import generator
-from pipeline.campaign.workers import mapped
+from pipeline.results.workers import mapped
 from schemas.config import Configuration
 
 EPOCHS_PER_PLACE = 40
@@ -66,7 +66,7 @@ def shares(by_geometry: pl.DataFrame) -> pl.DataFrame:
 def _judge_sky(seed: int, repetitions: int, sky: tuple[int, tuple[Geometry, ...]]) -> pl.DataFrame:
     """`place, t, elevation_deg, constellation, reading, finding, holds`, one row per statement."""
     number, geometries = sky
-    plans = [Plan(geometry) for geometry in geometries]
+    plans = [ExperimentPlan(geometry) for geometry in geometries]
     frames = [
         detection_times(plan, passages_of(plan, repetitions, generator(seed, number, index, 0)))
         for index, plan in enumerate(plans)
@@ -84,7 +84,8 @@ def judge(detection: pl.DataFrame) -> pl.DataFrame:
     """`constellation, reading, finding, holds` from the table of detection times of one sky."""
     odometer_only = detection.filter(sensors="odometer")
     ahead = odometer_only.filter(heading_deg=0.0)
-    pmd, time_s = pl.col("pmd_at_failure"), pl.col("time_to_detect_s")
+    pmd = pl.col("pmd_at_failure")
+    time_s = pl.col("time_to_detect_s")
     # 0.10 m/s is the middle of the rates; faster ramps are seen within seconds whatever the heading.
     turned = odometer_only.filter(pl.col("heading_deg").is_in([0.0, 75.0]), rate_mps=0.1).sort("heading_deg")
     with_track = detection.filter(pl.col("rate_mps") >= _SLOWEST_COVERED_MPS, sensors="odometer_and_track")

@@ -26,16 +26,16 @@ SOURCES: tuple[str, ...] = ("ionosphere", "troposphere", "orbit_clock", "user")
 TAUS_S = np.array([360.0, 1800.0, 3600.0, 100.0])
 
 
-class Place(NamedTuple):
+class NamedPlace(NamedTuple):
     name: str
     latitude_deg: float
     longitude_deg: float
     height_m: float
 
 
-BRUSSELS = Place("brussels", 50.85, 4.35, 100.0)
-MADRID = Place("madrid", 40.42, -3.70, 650.0)
-PLACES: tuple[Place, ...] = (BRUSSELS, MADRID)
+BRUSSELS = NamedPlace("brussels", 50.85, 4.35, 100.0)
+MADRID = NamedPlace("madrid", 40.42, -3.70, 650.0)
+PLACES: tuple[NamedPlace, ...] = (BRUSSELS, MADRID)
 _DAY_NS = int(datetime(2024, 3, 20, tzinfo=UTC).timestamp()) * 1_000_000_000
 # 06:27 UTC: satellite 8 at 9 degrees in the south-west, 8 GPS and 16 GPS + Galileo satellites. One of the skies in
 # which all findings of the paper hold with odometer noise on position; `findings` gives the shares over the day.
@@ -77,11 +77,12 @@ class Geometry:
     def axes(self, heading_deg: float) -> Floats:
         """Unit vectors along, cross (left) and up, rows; heading 0 is towards the faulty satellite."""
         course = np.radians(self.azimuth_deg[self.faulty] + heading_deg)
-        east, north = np.sin(course), np.cos(course)
+        east = np.sin(course)
+        north = np.cos(course)
         return np.array([[east, north, 0.0], [-north, east, 0.0], [0.0, 0.0, 1.0]])
 
 
-def geometry_at(place: Place, t_ns: int, constellation: Constellation, mask_deg: float = MASK_DEG) -> Geometry:
+def geometry_at(place: NamedPlace, t_ns: int, constellation: Constellation, mask_deg: float = MASK_DEG) -> Geometry:
     """The sky of a place; the faulty satellite must stand in it."""
     slots = GPS if constellation == "gps" else GPS + GALILEO
     azimuth, elevation = look_angles(slots, np.array([t_ns]), place.latitude_deg, place.longitude_deg, place.height_m)
@@ -101,7 +102,7 @@ def geometry_at(place: Place, t_ns: int, constellation: Constellation, mask_deg:
     )
 
 
-def epochs_of_day(place: Place, count: int, mask_deg: float = MASK_DEG) -> list[int]:
+def epochs_of_day(place: NamedPlace, count: int, mask_deg: float = MASK_DEG) -> list[int]:
     """`count` epochs, evenly over that part of a sidereal day in which the faulty satellite is visible."""
     minutes = _DAY_NS + (np.arange(0.0, SIDEREAL_DAY_S, 60.0) * 1e9).astype(np.int64)
     faulty = [slot for slot in GPS if slot.sv == FAULTY_SATELLITE]

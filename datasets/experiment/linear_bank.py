@@ -156,7 +156,9 @@ class LinearBank:
 
         `covariances` (n + 1, states, states): those of the state, as above.
         """
-        P, A, epochs = covariances, self.advance, len(covariances) - 1
+        P = covariances
+        A = self.advance
+        epochs = len(covariances) - 1
         result = np.empty((epochs, self.size))
         place = self.sources + monitor
         later = P[epoch, :, place].copy()
@@ -183,7 +185,8 @@ class LinearBank:
 
     def forced(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
         """A monitor drawn at random beyond its threshold; the tail in logarithms does not underflow at 1e-15."""
-        runs, sigma = len(values), self.sigma
+        runs = len(values)
+        sigma = self.sigma
         monitor = rng.integers(0, self.size, runs)
         log_tail = float(log_ndtr(-self.threshold[0] / sigma[0]))
         target = -ndtri_exp(log_tail + np.log(rng.random(runs))) * sigma[monitor]
@@ -229,7 +232,8 @@ def linear_bank(geometry: Geometry, heading_deg: float, spec: BankSpec) -> Linea
 
 
 def _assemble(spec: BankSpec, axes: tuple[str, ...], covariances: Floats, phi: Floats, slope: Floats) -> LinearBank:
-    count, gauss_markov = len(axes), len(SOURCES) * len(axes)
+    count = len(axes)
+    gauss_markov = len(SOURCES) * len(axes)
     position_white = np.full(count, spec.map_m)
     position_white[0] = spec.odometer_m if spec.reading == "position" else 0.0
     sources = gauss_markov + count
@@ -237,7 +241,8 @@ def _assemble(spec: BankSpec, axes: tuple[str, ...], covariances: Floats, phi: F
     alpha = np.tile(alphas, count)
     axis = np.repeat(np.arange(count), alphas.size)
     states = sources + alpha.size
-    A, B = np.zeros((states, states)), np.zeros((states, sources + 1))
+    A = np.zeros((states, states))
+    B = np.zeros((states, sources + 1))
     decay = np.concatenate([np.repeat(phi, count), np.zeros(count)])
     A[:sources, :sources] = np.diag(decay)
     colour = np.linalg.cholesky(covariances + 1e-18 * np.eye(count))

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from datasets.experiment.geometry import SOURCES, TAUS_S
-from datasets.experiment.plan import SIGNALS, Forms, Plan
+from datasets.experiment.plan import SIGNALS, ExperimentPlan, Forms
 from schemas.arrays import Bools, Floats
 from schemas.arrays import Ints as Index
 
@@ -35,7 +35,7 @@ _TINY = 1e-12
 _OPEN = np.iinfo(np.int32).max
 
 
-class Passages(NamedTuple):
+class FirstPassages(NamedTuple):
     """Seconds from onset to the first passage, `NEVER` where there was none within the span.
 
     `detected_s` (questions, rates, repetitions), `failed_s` (headings, rates, repetitions);
@@ -63,7 +63,7 @@ class NoisePaths:
     weight, which saves a multiplication; `weights` restores it.
     """
 
-    def __init__(self, plan: Plan, repetitions: int, rng: np.random.Generator) -> None:
+    def __init__(self, plan: ExperimentPlan, repetitions: int, rng: np.random.Generator) -> None:
         self._plan = plan
         self._rng = rng
         self._phi = np.repeat(np.exp(-1.0 / TAUS_S), 3)[:, None]
@@ -112,7 +112,8 @@ class NoisePaths:
         basis[1:, _UP] -= self._plan.map_m * (white[1:, 2] - white[:-1, 2])
         basis[0, _UP] -= self._plan.map_m * (white[0, 2] - self._white[2])
         basis[:, -2:] = position[:, :2]
-        self._position, self._white = position[-1].copy(), white[-1].copy()
+        self._position = position[-1].copy()
+        self._white = white[-1].copy()
 
     def _filter(self, basis: Floats) -> None:
         signals = basis[:, : len(SIGNALS)]
@@ -124,10 +125,10 @@ class NoisePaths:
         self._ewma = before.copy()
 
 
-class Watch:
+class FirstAnswers:
     """Keeps, for every question, rate and repetition, when it was first answered."""
 
-    def __init__(self, plan: Plan, banks: Forms, failures: Forms, weights: Floats, repetitions: int) -> None:
+    def __init__(self, plan: ExperimentPlan, banks: Forms, failures: Forms, weights: Floats, repetitions: int) -> None:
         self._plan = plan
         self._rates = np.array(plan.rates_mps)
         self._banks = banks
@@ -174,7 +175,8 @@ class Watch:
 
     def after_onset(self, basis: Floats, begin: int) -> None:
         end = begin + len(basis)
-        threshold, response = self.thresholds(begin, end), self.responses(begin, end)
+        threshold = self.thresholds(begin, end)
+        response = self.responses(begin, end)
         high, low = self._envelope(basis)
         least = threshold.min(axis=0)[:, None]
         reach = np.subtract(least, high, out=high)
@@ -193,7 +195,8 @@ class Watch:
 
     def _envelope(self, basis: Floats) -> tuple[Floats, Floats]:
         """Upper and lower bound of every form over the block."""
-        top, bottom = basis.max(axis=0), basis.min(axis=0)
+        top = basis.max(axis=0)
+        bottom = basis.min(axis=0)
         return self._bounds @ np.vstack([top, bottom]), self._bounds @ np.vstack([bottom, top])
 
     def _values(self, basis: Floats, form: Index, run: Index) -> Floats:
@@ -222,22 +225,25 @@ class Watch:
             return
         when = (series[:, pair] < limits[rate]).argmax(axis=0) + begin + 1 - self._plan.onset_s
         hit, place = np.nonzero(self._asks[form[pair]])
-        question, chosen = self._asked[form[pair[hit]], place], run[pair[hit]]
+        question = self._asked[form[pair[hit]], place]
+        chosen = run[pair[hit]]
         np.minimum.at(self._first, (question, rate[hit], chosen), when[hit].astype(np.int32))
         still_open = np.where(self._first[question, :, chosen] == _OPEN, self._rates, -np.inf)
         self._largest_open[question, chosen] = still_open.max(axis=1)
 
 
-def first_passages(plan: Plan, banks: Forms, failures: Forms, repetitions: int, rng: np.random.Generator) -> Passages:
+def first_passages(
+    plan: ExperimentPlan, banks: Forms, failures: Forms, repetitions: int, rng: np.random.Generator
+) -> FirstPassages:
     """Simulate `repetitions` runs of the plan and answer all of its questions."""
     paths = NoisePaths(plan, repetitions, rng)
-    watch = Watch(plan, banks, failures, paths.weights, repetitions)
+    watch = FirstAnswers(plan, banks, failures, paths.weights, repetitions)
     for begin, end in _blocks(0, plan.onset_s):
         watch.before_onset(paths.advance(end - begin), begin)
     for begin, end in _blocks(plan.onset_s, plan.span_s, _FIRST_BLOCK):
         watch.after_onset(paths.advance(end - begin), begin)
     questions = banks.members.shape[0]
-    return Passages(watch.first[:questions], watch.first[questions:], watch.alarmed)
+    return FirstPassages(watch.first[:questions], watch.first[questions:], watch.alarmed)
 
 
 def _blocks(begin: int, end: int, shortest: int = BLOCK_EPOCHS) -> Iterator[tuple[int, int]]:

@@ -35,7 +35,7 @@ SIGNALS: tuple[str, ...] = ("east", "north", "up", "map_cross", "odometer_increm
 
 
 @dataclass(frozen=True)
-class Plan:
+class ExperimentPlan:
     """The grid. `span_s` epochs at 1 Hz, ramp from `onset_s`, failure beyond `failure_limit_m` along the track."""
 
     geometry: Geometry
@@ -83,7 +83,7 @@ class Forms:
     names: tuple[str, ...]
 
 
-def bank_forms(plan: Plan) -> Forms:
+def bank_forms(plan: ExperimentPlan) -> Forms:
     """All monitors of all headings and readings (DIAG eq. 1-3, 8, 10-16)."""
     forms = []
     for heading in plan.headings_deg:
@@ -106,7 +106,7 @@ def bank_forms(plan: Plan) -> Forms:
     )
 
 
-def failure_forms(plan: Plan) -> Forms:
+def failure_forms(plan: ExperimentPlan) -> Forms:
     """The along-track error itself, by heading, in units of the failure limit."""
     count = len(plan.headings_deg)
     rows = np.zeros((count, plan.basis_size))
@@ -134,7 +134,7 @@ def _towards(slope: float) -> float:
 _Form = tuple[Floats, int, Floats, float, list[bool], str]
 
 
-def _along(plan: Plan, heading: float, reading: Reading) -> list[_Form]:
+def _along(plan: ExperimentPlan, heading: float, reading: Reading) -> list[_Form]:
     axis = plan.geometry.axes(heading)[0]
     white = (plan.odometer_m, 0.0) if reading == "increments" else (0.0, plan.odometer_m)
     signals = {"east": axis[0], "north": axis[1], f"odometer_{reading}": -plan.odometer_m}
@@ -143,19 +143,21 @@ def _along(plan: Plan, heading: float, reading: Reading) -> list[_Form]:
     return [_form(plan, name, axis, alpha, signals, white, members) for alpha in plan.banks[reading]]
 
 
-def _beside(plan: Plan, name: str, axis: Floats, signals: dict[str, float], heading: float | None) -> list[_Form]:
+def _beside(
+    plan: ExperimentPlan, name: str, axis: Floats, signals: dict[str, float], heading: float | None
+) -> list[_Form]:
     """Across the track, or in height at any heading: against the map."""
     white = (0.0, plan.map_m)
     return [_form(plan, name, axis, alpha, signals, white, _with_track(plan, alpha, heading)) for alpha in plan.alphas]
 
 
-def _with_track(plan: Plan, alpha: float, heading: float | None) -> list[bool]:
+def _with_track(plan: ExperimentPlan, alpha: float, heading: float | None) -> list[bool]:
     """The questions with track, of this heading or all, whose bank has the weight."""
     return [s == "odometer_and_track" and alpha in plan.banks[r] and heading in (None, h) for r, h, s in plan.questions]
 
 
 def _form(
-    plan: Plan,
+    plan: ExperimentPlan,
     name: str,
     axis: Floats,
     alpha: float,

@@ -31,7 +31,9 @@ def range_alarms(probabilities: tuple[float, ...], epochs: int, seed: int, jobs:
         counts = np.sum(in_pieces(count, epochs, _BLOCK, (seed, 53, number), jobs), axis=0)
         plan = RangePlan(default_geometry(constellation))
         for h, s, p in np.ndindex(counts.shape):
-            heading, survey, probability = HEADINGS_DEG[h], SURVEYS[s], probabilities[p]
+            heading = HEADINGS_DEG[h]
+            survey = SURVEYS[s]
+            probability = probabilities[p]
             one = statistic(plan, heading)
             rows.append(
                 {
@@ -59,7 +61,8 @@ def _counted(
     drawn = plan.survey_m * rng.standard_normal((2, epochs))
     counts = np.zeros((len(HEADINGS_DEG), len(SURVEYS), len(probabilities)), dtype=np.int64)
     for h, heading in enumerate(HEADINGS_DEG):
-        one, held = statistic(plan, heading), held_rows(plan, heading)
+        one = statistic(plan, heading)
+        held = held_rows(plan, heading)
         limits = chdtri(one.project.shape[0], np.array(probabilities))
         z = one.project @ errors
         for s, survey in enumerate(SURVEYS):

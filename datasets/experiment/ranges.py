@@ -101,7 +101,8 @@ def _range_errors(plan: RangePlan, repetitions: int, rng: np.random.Generator) -
 
 def range_passages(plan: RangePlan, repetitions: int, rng: np.random.Generator) -> RangePassages:
     """Ramps from 0 s on, until every run is detected at every heading and rate, or the span is over."""
-    geometry, rates = plan.geometry, np.array(plan.rates_mps)
+    geometry = plan.geometry
+    rates = np.array(plan.rates_mps)
     statistics = [statistic(plan, heading) for heading in plan.headings_deg]
     along = np.stack([geometry.axes(heading)[0] @ geometry.gain for heading in plan.headings_deg])
     survey = rng.standard_normal((2, repetitions)) * plan.survey_m
@@ -129,8 +130,10 @@ def _judge(
     |z + c l|^2 = |z|^2 + 2 c (l.z) + c^2 |l|^2 with z of the noise and l of the faulty satellite.
     """
     faulty = plan.geometry.faulty
-    noise, ramp = one.project @ (error - offset), one.project[:, faulty]
-    square, mixed = np.einsum("dr,dr->r", noise, noise), ramp @ noise
+    noise = one.project @ (error - offset)
+    ramp = one.project[:, faulty]
+    square = np.einsum("dr,dr->r", noise, noise)
+    mixed = ramp @ noise
     value = square + 2.0 * ramps_m[:, None] * mixed + ramps_m[:, None] ** 2 * (ramp @ ramp)
     position = along @ error + ramps_m[:, None] * along[faulty]
     return value > one.threshold, np.abs(position) > plan.failure_limit_m
@@ -166,7 +169,8 @@ def run_ranges(
 
 
 def _row(plan: RangePlan, heading: float, rate: float, detected_s: Floats, failed_first: Bools) -> Row:
-    found, failed = detected_s != _UNDETECTED, int(failed_first.sum())
+    found = detected_s != _UNDETECTED
+    failed = int(failed_first.sum())
     time = time_columns("time_to_detect", np.where(found, detected_s, plan.span_s), 0.0, plan.span_s)
     mean_failure_s = plan.mean_failure_s(heading, rate)
     return {

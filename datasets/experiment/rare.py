@@ -26,7 +26,7 @@ _POPULATIONS = 20
 _SMALLEST_POPULATION, _LARGEST_POPULATION = 250, 1_000
 _CLOSE_ENOUGH = 0.02
 SMALLEST = 1e-12
-"""No probability smaller than this is told, only that it is below."""
+"""No probability smaller than this is given, only that it is below."""
 
 
 class Probability(NamedTuple):
@@ -95,14 +95,14 @@ def _alarms(system: System, epochs: int, runs: int, rng: np.random.Generator) ->
 def figures(result: Probability) -> Row:
     """The estimate as it stands in a table; nulls where no run came through, which says nothing of the probability.
 
-    Below `SMALLEST` it is not told: the model of the noise does not hold so far out. `below` says so in its place.
+    Below `SMALLEST` it is not given: the model of the noise does not hold so far out. `below` says so in its place.
     """
-    told = result.value >= SMALLEST
+    shown = result.value >= SMALLEST
     return {
-        "probability": result.value if told else None,
+        "probability": result.value if shown else None,
         "below": SMALLEST if 0.0 < result.value < SMALLEST else None,
-        "relative_error": result.relative_error if told and isfinite(result.relative_error) else None,
-        "variance_reduction": result.variance_reduction if told and isfinite(result.variance_reduction) else None,
+        "relative_error": result.relative_error if shown and isfinite(result.relative_error) else None,
+        "variance_reduction": result.variance_reduction if shown and isfinite(result.variance_reduction) else None,
         "runs": result.runs,
     }
 
@@ -128,7 +128,8 @@ def _bisected(below: Callable[[int, float], bool], target: float, most_epochs: i
     while not below(high, target):
         if high >= most_epochs:
             return None
-        low, high = high, min(2 * high, most_epochs)
+        low = high
+        high = min(2 * high, most_epochs)
     while high - low > max(1, _CLOSE_ENOUGH * high):
         middle = (low + high) // 2
         low, high = (low, middle) if below(middle, target) else (middle, high)

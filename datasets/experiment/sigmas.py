@@ -28,7 +28,8 @@ def bank_sigmas(
     keep = np.broadcast_to((1.0 - alphas) ** (1.0 / rate_hz), (epochs, alphas.size))
     white_m2 = np.full(epochs, white_m**2 / rate_hz)
     increment_m2 = increment_variance(sigma_m, sigma_m, loss) + white_m2
-    errors, restart = (sigma_m, sigma_m, loss), AxisState.at_restart(alphas.size, sigma_m.shape[1])
+    errors = (sigma_m, sigma_m, loss)
+    restart = AxisState.at_restart(alphas.size, sigma_m.shape[1])
     variance, _ = variance_of_ewma(keep, (1.0 - keep) * rate_hz, *errors, increment_m2, white_m2, restart)
     return np.sqrt(variance)
 

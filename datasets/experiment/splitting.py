@@ -28,7 +28,7 @@ _LEAST_HALF_SQUARE = 2.0
 _LEAST_EFFECTIVE = 0.5
 
 
-class Shift(NamedTuple):
+class MeanShift(NamedTuple):
     """Constraints (epoch, limit) on the noise, their multipliers, and the shifted mean path of the values."""
 
     epoch: Ints
@@ -100,7 +100,7 @@ class System(Protocol):
         """Fails of one run, (epochs, values)."""
 
 
-def most_probable_miss(system: System, epochs: int, rate_mps: float) -> Shift:
+def most_probable_miss(system: System, epochs: int, rate_mps: float) -> MeanShift:
     """Least-norm noise that keeps the values within every limit on the side that the ramp pushes to.
 
     Constraints are added one by one where the path still exceeds; with multipliers l and covariance C of the
@@ -115,7 +115,7 @@ def most_probable_miss(system: System, epochs: int, rate_mps: float) -> Shift:
     return shift
 
 
-def _shift(system: System, limits: Limits, margin: float, towards_limit: Callable[[int, int], Floats]) -> Shift:
+def _shift(system: System, limits: Limits, margin: float, towards_limit: Callable[[int, int], Floats]) -> MeanShift:
     ramp, threshold, sigma, towards = limits
     epoch: list[int] = []
     limit: list[int] = []
@@ -131,14 +131,15 @@ def _shift(system: System, limits: Limits, margin: float, towards_limit: Callabl
         epoch.append(int(worst[0]) + 1)
         limit.append(int(worst[1]))
         columns.append(towards[worst[1]] * towards_limit(limit[-1], epoch[-1]))
-        at, which = np.array(epoch) - 1, np.array(limit)
+        at = np.array(epoch) - 1
+        which = np.array(limit)
         gram = np.array([(towards[which] * system.seen(column)[at, which]) for column in columns])
         needed = towards[which] * ramp[at, which] - threshold[at, which] + margin * sigma[at, which]
         multiplier = least_norm(gram, needed)
         mean = -np.einsum("c,ckm->km", multiplier, np.array(columns))
     signed = multiplier * towards[np.array(limit, dtype=np.int64)] if limit else multiplier
     half = 0.5 * float(multiplier @ gram @ multiplier) if limit else 0.0
-    return Shift(np.array(epoch, dtype=np.int64), np.array(limit, dtype=np.int64), signed, mean, half)
+    return MeanShift(np.array(epoch, dtype=np.int64), np.array(limit, dtype=np.int64), signed, mean, half)
 
 
 def least_norm(gram: Floats, needed: Floats) -> Floats:
@@ -150,10 +151,11 @@ def least_norm(gram: Floats, needed: Floats) -> Floats:
 
 
 def miss_estimate(
-    system: System, epochs: int, rate_mps: float, shift: Shift, runs: int, rng: np.random.Generator
+    system: System, epochs: int, rate_mps: float, shift: MeanShift, runs: int, rng: np.random.Generator
 ) -> float:
     """Unbiased estimate of the probability that no monitor fails at epochs 1 .. n, of one population of `runs`."""
-    moved, passing = shift.mean + system.ramp(epochs, rate_mps), system.passing(epochs)
+    moved = shift.mean + system.ramp(epochs, rate_mps)
+    passing = system.passing(epochs)
 
     def step(k: int, state: Floats) -> tuple[Floats, Floats]:
         following = system.following(state, rng)
@@ -174,7 +176,8 @@ def log_survival(state: Floats, step: Step, epochs: int, rng: np.random.Generato
     weights there.
     """
     runs = state.shape[1]
-    total, weight = 0.0, np.zeros(runs)
+    total = 0.0
+    weight = np.zeros(runs)
     for k in range(epochs):
         state, change = step(k, state)
         if not change.any():
@@ -186,7 +189,8 @@ def log_survival(state: Floats, step: Step, epochs: int, rng: np.random.Generato
         shares = np.exp(weight - greatest)
         if shares.sum() ** 2 < _LEAST_EFFECTIVE * runs * (shares @ shares):
             total += greatest + float(np.log(shares.mean()))
-            state, weight = state[:, _copies(shares, rng)], np.zeros(runs)
+            state = state[:, _copies(shares, rng)]
+            weight = np.zeros(runs)
     greatest = float(weight.max())
     return total + greatest + float(np.log(np.exp(weight - greatest).mean()))
 

@@ -49,7 +49,8 @@ def expected(values: Floats, least: float, greatest: float, confidence: float = 
     n = values.size
     if n < 2:
         return None
-    mean, variance = float(values.mean()), float(values.var(ddof=1))
+    mean = float(values.mean())
+    variance = float(values.var(ddof=1))
     log = float(np.log(4.0 / (1.0 - confidence)))
     half = np.sqrt(2.0 * variance * log / n) + 7.0 * (greatest - least) * log / (3.0 * (n - 1))
     ordered = np.sort(values)

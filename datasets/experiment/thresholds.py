@@ -20,7 +20,7 @@ from scipy.special import ndtr
 
 from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, skies_of_day
 from datasets.experiment.passage import BLOCK_EPOCHS, NoisePaths
-from datasets.experiment.plan import BANKS, HEADINGS_DEG, READINGS, Plan, Reading, bank_forms
+from datasets.experiment.plan import BANKS, HEADINGS_DEG, READINGS, ExperimentPlan, Reading, bank_forms
 from datasets.experiment.sigmas import limit_sigmas
 from datasets.experiment.tables import table
 from datasets.experiment.workers import generator
@@ -44,7 +44,7 @@ class SkySigmas(NamedTuple):
     sigma_mps: Floats
 
 
-class Line(NamedTuple):
+class FittedLine(NamedTuple):
     """sigma_monitor = intercept + slope sigma_x."""
 
     intercept_mps: float
@@ -87,13 +87,13 @@ def _white_noise(reading: Reading, axis: int) -> tuple[float, float]:
     return (0.05, 0.0) if reading == "increments" else (0.0, 0.05)
 
 
-def regression_lines(skies: dict[str, SkySigmas]) -> dict[tuple[str, int], Line]:
+def regression_lines(skies: dict[str, SkySigmas]) -> dict[tuple[str, int], FittedLine]:
     """One line per axis and alpha, least squares over all skies and headings (DIAG eq. 17 and below)."""
     lines = {}
     for axis, (sigma_x, sigmas) in skies.items():
         for index in range(sigmas.shape[1]):
             slope, intercept = np.polyfit(sigma_x, sigmas[:, index], 1)
-            lines[axis, index] = Line(float(intercept), float(slope))
+            lines[axis, index] = FittedLine(float(intercept), float(slope))
     return lines
 
 
@@ -129,7 +129,7 @@ def two_sided(factor: Floats) -> Floats:
     return np.asarray(2.0 * ndtr(-factor))
 
 
-def calibrated_ratios(plan: Plan, seed: int, runs: int = _CALIBRATION_RUNS) -> Floats:
+def calibrated_ratios(plan: ExperimentPlan, seed: int, runs: int = _CALIBRATION_RUNS) -> Floats:
     """Measured over modelled sigma of each monitor on fault-free runs of an hour."""
     long = replace(plan, span_s=_CALIBRATION_S, onset_s=_CALIBRATION_S)
     forms = bank_forms(long)
@@ -144,7 +144,7 @@ def calibrated_ratios(plan: Plan, seed: int, runs: int = _CALIBRATION_RUNS) -> F
     return np.array([overall_ratio(ratios[:, form]) for form in range(values.shape[1])])
 
 
-def regressed_ratios(plan: Plan) -> Floats:
+def regressed_ratios(plan: ExperimentPlan) -> Floats:
     """Regressed over exact long-term sigma of each monitor of the plan, from the lines over all skies."""
     forms = bank_forms(plan)
     variances = _variances(plan.geometry, 0.0)

@@ -1,26 +1,56 @@
-"""What a campaign adds to its runs: the tables over all of them (CONTRACT section 3)."""
+"""What a campaign adds to its runs: the tables over all of them (CONTRACT section 3), and the manifest."""
 
 from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
 
 import polars as pl
 
 from pipeline import storage
-from pipeline.results import catalogue, store
+from pipeline.results import catalogue, manifest, store
 from pipeline.results.figures.campaign_figures import derived_tables
-from pipeline.results.manifest import write_manifest
+from pipeline.results.software import software_digest
 from pipeline.storage.address import Address, join
+from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import Configuration, digest_of
 from schemas.tables import CONTRACT_VERSION
 from schemas.version import SOFTWARE
 
+_MADE_FROM = "made_from"
 
-def write_campaign(out: Address, config: Configuration) -> dict[str, pl.DataFrame]:
+
+def write_campaign(out: Address, config: Configuration) -> None:
     """Derive the tables of `OUT/campaign/` from all complete runs of the result, and write its manifest."""
-    found = catalogue.gather(out)
+    key = campaign_key(out, config)
+    if not _is_current(out, key):
+        for name, content in campaign_files(catalogue.gather(out), config, key):
+            storage.write_bytes(join(out, name), content)
+    manifest.write_manifest(out)
+
+
+def campaign_files(found: Mapping[str, pl.DataFrame], config: Configuration, key: str) -> Iterator[tuple[str, bytes]]:
+    """Name and content of each of these tables, from the small tables of all runs."""
     tables = derived_tables(found["runs"], found["hazards"], found["passages"], found["alarms"], config)
-    metadata = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config)}
+    made = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config), _MADE_FROM: key}
     for name, table in tables.items():
-        content = store.parquet_bytes(table, {"table": f"campaign/{name}", **metadata})
-        storage.write_bytes(join(join(out, "campaign"), f"{name}.parquet"), content)
-    write_manifest(out)
-    return tables
+        yield f"campaign/{name}.parquet", store.parquet_bytes(table, {"table": f"campaign/{name}", **made})
+
+
+def _is_current(out: Address, key: str) -> bool:
+    """Whether all of these tables are there, made from these runs, and as the manifest has them."""
+    names = [f"campaign/{name.removeprefix('campaign_')}.parquet" for name in CAMPAIGN_TABLES]
+    contents = {name: storage.content_of(join(out, name)) for name in names}
+    expected = manifest.earlier(out)["files"]
+    return all(
+        content is not None
+        and store.metadata_of(content).get(_MADE_FROM) == key
+        and expected.get(name, {}).get("sha256") == manifest.sha256(content)
+        for name, content in contents.items()
+    )
+
+
+def campaign_key(out: Address, config: Configuration) -> str:
+    """The digest of all that decides these tables: program, configuration and every marker, which names its tables."""
+    runs = [(run, manifest.sha256(content)) for run, content in manifest.markers(out)]
+    return hashlib.sha256(repr((software_digest(), digest_of(config), runs)).encode()).hexdigest()

@@ -13,8 +13,8 @@ from pipeline import storage
 from pipeline.campaign.outcome import changed
 from pipeline.campaign.plan import RunJob
 from pipeline.read.ingest import read_run
-from pipeline.results import manifest
-from pipeline.storage.address import Address, is_url, join, redacted
+from pipeline.results import catalogue, manifest
+from pipeline.storage.address import is_url, redacted
 from schemas.errors import BaliseError, InputError
 from schemas.run import RunLog
 
@@ -40,16 +40,14 @@ class RecordedLog:
         self._version = self._stored_version()
         if self._version is None or self._job.previous is None:
             return ""
-        name, _, digest = (storage.content_of(self._note()) or b"").decode().partition(" ")
-        return digest if name == self._name() else ""
+        return (catalogue.kept(self._job.out, self._note(), self._key()) or b"").decode()
 
-    def _note(self) -> Address:
-        """Where the digest of this log is kept."""
-        own = f"{hashlib.sha256(self._job.run_id.encode()).hexdigest()}.txt"
-        return join(join(join(self._job.out, ".catalogue"), "inputs"), own)
+    def _note(self) -> str:
+        """The name under which the digest of this log is kept."""
+        return f"inputs/{hashlib.sha256(self._job.run_id.encode()).hexdigest()}.txt"
 
-    def _name(self) -> str:
-        """One name for address and version: the address itself may hold what is nobody's business."""
+    def _key(self) -> str:
+        """One key for address and version: the address itself may hold what is nobody's business."""
         return hashlib.sha256(f"{self._job.address}\n{self._version}".encode()).hexdigest()
 
     @contextlib.contextmanager
@@ -87,7 +85,7 @@ class RecordedLog:
                 listed = storage.file_digests(path, known)
             self.digest, self.files = storage.digest_of_files(listed), manifest.listing(listed)
             if self._version is not None:
-                storage.write_bytes(self._note(), f"{self._name()} {self.digest}".encode())
+                catalogue.keep(self._job.out, self._note(), self._key(), self.digest.encode())
         return self.digest
 
     def _stored_version(self) -> str | None:

@@ -17,14 +17,16 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from pipeline import storage
-from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan, RunJob, digests
 from pipeline.campaign.waits import WAITS
-from pipeline.results import store
-from pipeline.storage.address import is_url, join
+from pipeline.results import catalogue, store
+from pipeline.results.outcome import RunOutcome
+from pipeline.results.software import software_digest
+from pipeline.storage.address import is_url
 from schemas.arrays import NS_PER_S
 from schemas.errors import OutputError
 
+_NAME = "complete"
 _OUTCOMES = TypeAdapter(list[RunOutcome])
 
 
@@ -42,8 +44,8 @@ def proof_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
 
 def unchanged(plan: Plan) -> list[RunOutcome]:
     """The outcomes of the runs of a plan that are complete, and whose log nobody has touched since."""
-    kept = _kept(plan.out)
-    found = ((job, kept[job.run_id]) for job in plan.jobs if job.run_id in kept)
+    known = kept(plan.out)
+    found = ((job, known[job.run_id]) for job in plan.jobs if job.run_id in known)
     return [replace(outcome, skipped=True) for job, outcome in found if _holds(job, outcome)]
 
 
@@ -52,20 +54,19 @@ def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
     if is_url(plan.out):
         return
     named = {job.run_id for job in plan.jobs}
-    others = [outcome for run_id, outcome in _kept(plan.out).items() if run_id not in named]
+    others = [outcome for run_id, outcome in kept(plan.out).items() if run_id not in named]
     rows = [replace(outcome, attempts=1) for outcome in (*others, *outcomes) if outcome.proof]
     # It can be done without, and so must not hide why a campaign ends.
     with contextlib.suppress(OutputError):
-        storage.write_bytes(_place(plan.out), _OUTCOMES.dump_json(rows))
+        catalogue.keep(plan.out, _NAME, software_digest(), _OUTCOMES.dump_json(rows))
 
 
-def _kept(out: str) -> dict[str, RunOutcome]:
-    if is_url(out):
-        return {}
+def kept(out: str) -> dict[str, RunOutcome]:
+    """The outcomes that this build of the program kept, by run id."""
+    content = None if is_url(out) else catalogue.kept(out, _NAME, software_digest())
     try:
-        outcomes = _OUTCOMES.validate_json(storage.content_of(_place(out)) or b"[]")
-    except (ValueError, OutputError):
-        # Of another build, or damaged: a copy that is not needed.
+        outcomes = _OUTCOMES.validate_json(content or b"[]")
+    except ValueError:
         return {}
     return {outcome.run_id: replace(outcome, seconds=0.0) for outcome in outcomes}
 
@@ -82,7 +83,3 @@ def _holds(job: RunJob, outcome: RunOutcome) -> bool:
 def _digest(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
     marker = storage.signature(Path(store.table_address(job.out, "runs", job.run_id)))
     return hashlib.sha256(repr((job.address, log, marker, digests(job, ""))).encode()).hexdigest()
-
-
-def _place(out: str) -> str:
-    return str(join(join(out, ".catalogue"), "complete"))

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import polars as pl
 
 from pipeline import storage
-from pipeline.campaign.plan import make_plan
+from pipeline.campaign import lock, resume
+from pipeline.campaign.finish import campaign_files, campaign_key
+from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
-from pipeline.results import store
-from pipeline.results.manifest import NAME, Manifest, contents_of, own_file_names, read_manifest, write_manifest
+from pipeline.results import catalogue, store
+from pipeline.results.manifest import NAME, Manifest, contents_of, earlier, gathered, read_manifest, sha256
+from pipeline.results.software import software_digest
+from pipeline.stages.run_row.verdict import word_of, worst_verdict
 from pipeline.storage.address import Address, join, redacted
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, Vehicle, digest_of
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
 Progress = Callable[[int, int], None]
+Problem = tuple[str, str, str]
 _RUNS_AT_ONCE = 50
 _COLUMNS = ("what", "found", "expected")
+# What a campaign leaves beside the files that the manifest names.
+_OWN_FILES = (NAME, lock.NAME, lock.HELD, "replay.log")
 
 
 @dataclass(frozen=True)
@@ -30,7 +36,7 @@ class Verification:
     """What was compared and what differs: `what, found, expected`, digests shortened."""
 
     compared: str
-    problems: tuple[tuple[str, str, str], ...]
+    problems: tuple[Problem, ...]
 
     @property
     def table(self) -> pl.DataFrame:
@@ -44,23 +50,36 @@ class Verification:
 
 
 def verify(out: Address, progress: Progress | None = None) -> Verification:
-    """Hold every table of a result, its configuration and its campaign's tables against `OUT/manifest.json`.
+    """Hold every file of a result against `OUT/manifest.json`, and the manifest against the runs' own metadata.
 
-    Raises `UsageError` where there is no manifest.
+    Provenance is read from the markers again, the catalogue and the campaign's tables are made again from the runs'
+    tables, and files that the manifest does not name are listed. Raises `UsageError` where there is no manifest.
     """
     manifest = _manifest(out)
-    problems = list(_other_runs(store.run_ids(out), manifest))
-    own = manifest["files"]
-    for name in sorted({*own, *own_file_names(out)}):
-        problems += _difference(name, _sha256(storage.content_of(join(out, name))), own.get(name, {}).get("sha256"))
-    runs = [run for run in store.run_ids(out) if run in manifest["runs"]]
+    again = gathered(out, manifest)
+    there, named = again["runs"], manifest["runs"]
+    problems = [_only_in_one(run, run in there) for run in sorted(there.keys() ^ named.keys())]
+    problems += _differences("", *(_digests(of["files"]) for of in (again, manifest)))
+    problems += _differences("page ", _pages(out), _digests(manifest.get("pages", {})))
+    problems += _differences(
+        "site ", *({key: str(of["sites"][key]) for key in of["sites"]} for of in (again, manifest))
+    )
+    runs = sorted(there.keys() & named.keys())
     for first in range(0, len(runs), _RUNS_AT_ONCE):
-        for name, found, expected in _tables(out, runs[first : first + _RUNS_AT_ONCE], manifest):
-            problems += _difference(name, found, expected)
+        some = runs[first : first + _RUNS_AT_ONCE]
+        contents = _tables(out, some)
+        for run in some:
+            found, expected = _parts(there[run]) | contents[run], _parts(named[run]) | named[run]["tables"]
+            problems += _differences(f"run {run}, ", found, expected)
+            problems += _differences(f"marker of run {run}, ", there[run]["tables"], named[run]["tables"])
         if progress is not None:
             progress(min(first + _RUNS_AT_ONCE, len(runs)), len(runs))
-    files = len(own) + len(TABLES) * len(runs)
-    return Verification(f"{files} files of {len(runs)} runs against {NAME}", tuple(problems))
+    known = {*manifest["files"], *again["files"], *_OWN_FILES}
+    problems += [(name, "there", "not in the manifest") for name in _other_files(out, {*there, *named}, known)]
+    if not problems:
+        problems = _made_again(out, {run["software_digest"] for run in there.values()})
+    files = len(manifest["files"]) + len(manifest.get("pages", {})) + len(TABLES) * len(runs)
+    return Verification(f"{files} files of {len(runs)} runs against {NAME}", tuple(dict.fromkeys(problems)))
 
 
 def recompute(
@@ -74,34 +93,54 @@ def recompute(
 ) -> Verification:
     """Replay logs again, in a folder of their own, and hold logs, site and tables against the manifest.
 
-    Without a configuration, with that of the result. What the manifest does not name is a problem; runs of it whose
-    logs are not given are counted.
+    Without a configuration, with that of the result; a run that was made without vehicle file is replayed without.
+    What the manifest does not name is a problem, and so are runs made with settings that are not given: these are not
+    replayed. Runs whose logs are not given are counted.
     """
-    manifest = _manifest(out)
+    named = _manifest(out)["runs"]
     if site is None:
         raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
     with tempfile.TemporaryDirectory(prefix="balise-verify-") as folder:
         plan = make_plan(logs, site, folder, config or store.read_config(out), vehicle, routes)
-        known = tuple(job for job in plan.jobs if job.run_id in manifest["runs"])
-        if known:
-            run_campaign(replace(plan, jobs=known), jobs=jobs)
-        again = write_manifest(folder)["runs"]
-    problems = [(f"run {job.run_id}", "a log", "not in the manifest") for job in plan.jobs if job not in known]
-    for run_id, found in again.items():
-        expected = manifest["runs"][run_id]
-        if found["config_digest"] != expected["config_digest"]:
-            problems.append((f"run {run_id}, settings", "others", _settings(expected["config_digest"], manifest)))
-        made, named = _parts(found), _parts(expected)
-        for what in dict.fromkeys([*made, *named]):
-            problems += _difference(f"run {run_id}, {what}", made.get(what), named.get(what))
-    return Verification(f"{len(again)} of {len(manifest['runs'])} runs replayed again", tuple(problems))
+        known = [_as_made(job, named[job.run_id]["config_digest"]) for job in plan.jobs if job.run_id in named]
+        ready = tuple(job for job in known if job.config_digest == named[job.run_id]["config_digest"])
+        if ready:
+            run_campaign(replace(plan, jobs=ready), jobs=jobs)
+        again = gathered(folder, earlier(folder))["runs"]
+    others = [named[job.run_id]["config_digest"] for job in known if job not in ready]
+    problems = [
+        (f"settings of {_runs(others.count(digest))}", "others", _settings(digest, _manifest(out)))
+        for digest in dict.fromkeys(others)
+    ]
+    problems += [(f"run {job.run_id}", "a log", "not in the manifest") for job in plan.jobs if job.run_id not in named]
+    for run, made in again.items():
+        problems += _differences(f"run {run}, ", *(_parts(of) | of["tables"] for of in (made, named[run])))
+    return Verification(f"{len(again)} of {len(named)} runs replayed again", tuple(problems))
+
+
+def _runs(count: int) -> str:
+    return "1 run" if count == 1 else f"{count} runs"
+
+
+def _as_made(job: RunJob, config_digest: str) -> RunJob:
+    """The job without vehicle file, where the run was made without."""
+    bare = digest_of(job.config, Vehicle())
+    return replace(job, vehicle=Vehicle(), config_digest=bare) if bare == config_digest else job
 
 
 def _parts(run: dict[str, Any]) -> dict[str, str | None]:
-    """The digest of everything that made a run but its settings, and of its tables."""
-    made = {"site": run["site"], "route": run["route_sha256"], "program": run["software_digest"]}
-    logs = {f"log {file['name']}": file["sha256"] for file in sorted(run["log"], key=lambda file: file["name"])}
-    return {**made, **logs, **run["tables"]}
+    """All that made a run."""
+    made = {"site": run["site"], "route": run["route_sha256"], "status": run["status"], "software": run["software"]}
+    made |= {"program": run["software_digest"], "settings": run["config_digest"]}
+    return made | {f"log {file['name']}": file["sha256"] for file in run["log"]}
+
+
+def _sites(sites: dict[str, Any]) -> dict[str, str]:
+    return {f"{site[:12]}, {file['name']}": file["sha256"] for site, files in sites.items() for file in files}
+
+
+def _digests(files: dict[str, Any]) -> dict[str, str]:
+    return {name: file["sha256"] for name, file in files.items()}
 
 
 def _manifest(out: Address) -> Manifest:
@@ -113,22 +152,56 @@ def _manifest(out: Address) -> Manifest:
     return found
 
 
-def _other_runs(there: Sequence[str], manifest: Manifest) -> Iterator[tuple[str, str, str]]:
-    """Runs that only one of the two has; a call that was ended leaves some that the manifest does not name yet."""
-    named = manifest["runs"]
-    for run in sorted({*there, *named}):
-        if run not in named:
-            yield f"run {run}", "complete", "not in the manifest: the call may have been interrupted. Repeat it."
-        elif run not in there:
-            yield f"run {run}", "missing", "complete"
+def _only_in_one(run: str, is_there: bool) -> Problem:
+    """A run that only one of the two has; a call that was ended leaves some that the manifest does not name yet."""
+    if is_there:
+        return f"run {run}", "complete", "not in the manifest: the call may have been interrupted. Repeat it."
+    return f"run {run}", "missing", "complete"
 
 
-def _tables(out: Address, runs: Sequence[str], manifest: Manifest) -> Iterator[tuple[str, str, str]]:
-    """Name, digest found and digest expected of each table of some runs."""
-    places = {(run, table): str(store.table_address(out, table, run)) for run in runs for table in TABLES}
-    found = contents_of(list(places.values()))
-    for (run, table), place in places.items():
-        yield f"run {run}, {table}", _sha256(found.get(place)), manifest["runs"][run]["tables"][table]
+def _tables(out: Address, runs: Sequence[str]) -> dict[str, dict[str, str]]:
+    """The digest of each table of some runs as it lies there."""
+    places = {run: {table: str(store.table_address(out, table, run)) for table in TABLES} for run in runs}
+    found = contents_of([place for tables in places.values() for place in tables.values()])
+    return {run: {table: sha256(found.get(place)) for table, place in places[run].items()} for run in runs}
+
+
+def _pages(out: Address) -> dict[str, str]:
+    folder = join(out, "report")
+    return {name: sha256(storage.content_of(join(folder, name))) for name in storage.files_below(folder)}
+
+
+def _other_files(out: Address, runs: set[str], known: set[str]) -> Iterator[str]:
+    """Files that are neither known nor of a run; pages and catalogue are looked at elsewhere."""
+    of_runs = {f"{table}/run_id={store.file_name(run)}/{table}.parquet" for table in TABLES for run in runs}
+    expected = of_runs | known
+    for name in storage.files_below(out):
+        if name not in expected and not name.startswith((f"{catalogue.FOLDER}/", "report/")):
+            yield name
+
+
+def _made_again(out: Address, software: set[str]) -> list[Problem]:
+    """The catalogue and the campaign's tables against the runs' own tables, which agree with the manifest.
+
+    The campaign's tables can be made again by the build that made them, with the configuration that lies there.
+    """
+    try:
+        own = {table: store.read_table(out, table).collect() for table in catalogue.CATALOGUED}
+    except UsageError:
+        return []  # written by another build of the program, which alone can read them
+    copies = {table: catalogue.fresh(out, table) for table in own}
+    stale = [table for table, copy in copies.items() if copy is not None and not copy.equals(own[table])]
+    problems = [(f"{catalogue.FOLDER}/{table}", "other rows", "those of the runs' tables") for table in stale]
+    verdicts = own["runs"].group_by("run_id").agg(pl.col("verdict").cast(pl.String)).rows()
+    worst = {run: worst_verdict(words) for run, words in verdicts}
+    for run, outcome in resume.kept(str(out)).items():
+        if outcome.verdict != worst.get(run, outcome.verdict):
+            problems.append((f"{catalogue.FOLDER}/complete, {run}", word_of(outcome.verdict), word_of(worst[run])))
+    config = store.read_config(out)
+    if config is not None and software == {software_digest()}:
+        for name, content in campaign_files(own, config, campaign_key(out, config)):
+            problems += _differences("", {name: sha256(content)}, {name: sha256(storage.content_of(join(out, name)))})
+    return problems
 
 
 def _settings(config_digest: str, manifest: Manifest) -> str:
@@ -140,13 +213,14 @@ def _settings(config_digest: str, manifest: Manifest) -> str:
     return _short(config_digest)
 
 
-def _difference(what: str, found: str | None, expected: str | None) -> list[tuple[str, str, str]]:
-    return [] if found == expected else [(what, _short(found), _short(expected))]
+def _differences(what: str, found: Mapping[str, str | None], expected: Mapping[str, str | None]) -> list[Problem]:
+    names = dict.fromkeys([*expected, *found])
+    return [
+        (f"{what}{name}", _short(found.get(name)), _short(expected.get(name)))
+        for name in names
+        if (found.get(name) or "") != (expected.get(name) or "")
+    ]
 
 
 def _short(digest: str | None) -> str:
     return "nothing" if not digest else digest[:12]
-
-
-def _sha256(content: bytes | None) -> str:
-    return "" if content is None else hashlib.sha256(content).hexdigest()

@@ -7,25 +7,24 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 
-import polars as pl
-
 from pipeline import storage
 from pipeline.campaign import lock
 from pipeline.campaign.interruption import ENDING
 from pipeline.campaign.outcome import (
     Failure,
-    RunOutcome,
     failed_tables,
     failure_of,
     outcome_of,
     worst,
 )
-from pipeline.campaign.plan import RunJob, digests, software_digest
+from pipeline.campaign.plan import RunJob, digests
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
 from pipeline.read.site.read import read_site
 from pipeline.read.site.route import with_route
 from pipeline.results import store
+from pipeline.results.outcome import RunOutcome
+from pipeline.results.software import software_digest
 from pipeline.storage import files
 from pipeline.storage.address import redacted
 from schemas.config import SiteConfig
@@ -144,17 +143,12 @@ def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
 def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
     """The route by the run's `primary` solution, or the first by name: all of them were on the same train."""
     # Imported here for the same reason.
-    from pipeline.read.ingest.clean import clean
-    from pipeline.stages.matching import match
     from pipeline.stages.matching.found_route import found_route
-    from pipeline.stages.odometry import odometry_of
+    from pipeline.stages.prepare import prepare
 
-    cleaned, _ = clean(run, job.config)
-    matching = job.config.matching
-    fixes = cleaned.gnss.filter(pl.col("solution") == cleaned.main_solution())
-    odometry = odometry_of(cleaned.odometer, job.vehicle, job.config)
-    found = match(fixes, odometry, site, job.vehicle, matching, job.config.fix_sigma, cleaned.balise_reads)
-    route = found_route(found, matching.ambiguity_probability)
+    prepared = prepare(run, site, job.vehicle, job.config)
+    match = prepared.match(prepared.run.main_solution())
+    route = found_route(match, job.config.matching.ambiguity_probability)
     storage.write_bytes(job.write_route, route.write_csv().encode())
 
 

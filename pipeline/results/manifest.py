@@ -1,8 +1,8 @@
-"""`OUT/manifest.json`: which files made a result, by which program, and the digest of every table.
+"""`OUT/manifest.json`: which files made a result, by which program, and the digest of every file of it.
 
-What a run was made from stands in the metadata of its `runs` table, written together with it, and so do the digests of
-its other tables. The manifest gathers that, so that it is whole after any number of calls, whoever ended them. Names of
-configuration and vehicle files are no part of a result: the manifest alone keeps them, from call to call.
+What a run was made from stands in the metadata of its `runs` table (its marker), written together with it, and so do
+the digests of its other tables. The manifest gathers that, so that it is whole after any number of calls, whoever ended
+them. The names of configuration and vehicle files, and the digests of pages, are kept by the manifest alone.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ import hashlib
 import json
 import platform
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal, TypeVar
 
-import polars as pl
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from pipeline import storage
-from pipeline.results import catalogue, store
+from pipeline.results import store
 from pipeline.storage import FileDigest, files
 from pipeline.storage.address import Address, is_url, join, redacted
 from schemas.errors import UsageError
@@ -32,11 +32,47 @@ NAME = "manifest.json"
 FORMAT = 1
 _AT_ONCE = 500
 
+T = TypeVar("T")
 Manifest = dict[str, Any]
-
+_DIGESTS = TypeAdapter(dict[str, str])
+_LISTING = TypeAdapter(list[tuple[str, int, str]])
 
 SettingsFiles = Mapping[str, Any]
 """The `configuration` and the `vehicle` file of a call; None where the defaults served."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class _File(_Strict):
+    name: str = ""
+    bytes: int
+    sha256: str
+
+
+class _Run(_Strict):
+    status: str | None
+    software: str | None
+    software_digest: str | None
+    config_digest: str | None
+    log: list[_File]
+    site: str
+    route_sha256: str | None
+    tables: dict[str, str | None]
+
+
+class _Form(_Strict):
+    """What a manifest looks like."""
+
+    manifest: Literal[1]
+    program: dict[str, Any]
+    platform: dict[str, str]
+    settings: dict[str, list[dict[Literal["configuration", "vehicle"], _File | None]]]
+    files: dict[str, _File]
+    sites: dict[str, list[_File]]
+    runs: dict[str, _Run]
+    pages: dict[str, _File] = {}
 
 
 def settings_files(configuration: Path | None = None, vehicle: Path | None = None) -> SettingsFiles:
@@ -52,45 +88,43 @@ def listing(listed: Iterable[tuple[str, int, str]]) -> str:
 
 def note_settings(out: Address, config_digest: str, given: SettingsFiles) -> None:
     """Keep the names of this call's settings files, before any run is made with them."""
-    found = _earlier(out)
+    found = earlier(out)
     known = found["settings"].setdefault(config_digest, [])
     if given not in known:
         known.append(given)
         _write(out, found)
 
 
-def write_manifest(out: Address) -> Manifest:
-    """Gather the manifest from all complete runs and write it; those that did not change since are not read again."""
-    states = catalogue.states(out) or {}
-    earlier = _earlier(out)
-    runs = _unchanged(out, earlier, states)
-    sites = {run["site"]: earlier["sites"].get(run["site"], []) for run in runs.values()}
-    for run_id, content in _markers(out, [run for run in store.run_ids(out) if run not in runs]):
+def note_pages(out: Address, pages: Mapping[str, bytes]) -> None:
+    """Keep the digests of the pages of this result, by their names in `OUT/report`."""
+    found = earlier(out)
+    _write(out, found | {"pages": {name: _digested(content) for name, content in sorted(pages.items())}})
+
+
+def write_manifest(out: Address) -> None:
+    """Gather the manifest from all complete runs and write it."""
+    _write(out, gathered(out, earlier(out)))
+
+
+def gathered(out: Address, before: Manifest) -> Manifest:
+    """The manifest as the files of the result say; of the one before what no file says."""
+    runs: dict[str, Any] = {}
+    sites: dict[str, Any] = {}
+    for run_id, content in markers(out):
         metadata = store.metadata_of(content)
         site = metadata.get("site_digest", "").partition(" ")[0]
         sites[site] = _files(metadata.get("site_files"))
         runs[run_id] = _run(metadata, content)
     used = {run["config_digest"] for run in runs.values()}
-    manifest = {
+    pages = {"pages": before["pages"]} if before.get("pages") else {}
+    return {
         **_frame(),
-        "settings": {digest: files for digest, files in sorted(earlier["settings"].items()) if digest in used},
+        "settings": {digest: files for digest, files in sorted(before["settings"].items()) if digest in used},
         "files": _own_files(out),
         "sites": dict(sorted(sites.items())),
-        "runs": dict(sorted(runs.items())),
+        "runs": runs,
+        **pages,
     }
-    _write(out, manifest)
-    # Runs that changed while they were read must not pass for what was read.
-    if states and states == catalogue.states(out):
-        catalogue.keep(out, NAME, pl.DataFrame({"of": [_sha256(_content(manifest))]}), states)
-    return manifest
-
-
-def _unchanged(out: Address, earlier: Manifest, states: Mapping[str, str]) -> dict[str, Any]:
-    """The runs of the manifest as it was gathered last whose files are as they were then."""
-    kept, known = catalogue.kept(out, NAME)
-    if kept.rows() != [(_sha256(storage.content_of(join(out, NAME)) or b""),)]:
-        return {}
-    return {run: earlier["runs"][run] for run, state in states.items() if known.get(run) == state}
 
 
 def read_manifest(out: Address) -> Manifest | None:
@@ -100,19 +134,20 @@ def read_manifest(out: Address) -> Manifest | None:
     if content is None:
         return None
     try:
-        found = json.loads(content)
-        known = isinstance(found, dict) and found["manifest"] == FORMAT
-    except (ValueError, KeyError):
-        known = False
-    if not known:
+        _Form.model_validate_json(content)
+    except ValidationError as error:
+        first = error.errors()[0]
         raise UsageError(
-            "is not a manifest of this program", place=redacted(str(address)), remedy="`balise replay` writes one."
-        )
-    return dict(found)
+            "is not a manifest of this program",
+            place=redacted(str(address)),
+            found=": ".join([".".join(map(str, first["loc"])), first["msg"]]).lstrip(": "),
+            remedy="`balise replay` writes one.",
+        ) from None
+    return dict(json.loads(content))
 
 
-def _earlier(out: Address) -> Manifest:
-    """The manifest as earlier calls left it; one that cannot be read tells nothing and is written anew."""
+def earlier(out: Address) -> Manifest:
+    """The manifest as earlier calls left it; one that cannot be read is written anew."""
     try:
         return read_manifest(out) or _frame()
     except UsageError:
@@ -164,7 +199,7 @@ def _packages() -> Mapping[str, str]:
 
 def _run(metadata: Mapping[str, str], marker: bytes) -> dict[str, Any]:
     """What one run was made from, and the digests of its tables."""
-    digests = {**json.loads(metadata.get("tables", "{}")), "runs": _sha256(marker)}
+    digests = _parsed(_DIGESTS, metadata.get("tables"), {}) | {"runs": sha256(marker)}
     site, _, route = metadata.get("site_digest", "").partition(" ")
     return {
         "status": metadata.get("status"),
@@ -179,7 +214,15 @@ def _run(metadata: Mapping[str, str], marker: bytes) -> dict[str, Any]:
 
 
 def _files(listed: str | None) -> list[dict[str, Any]]:
-    return [_file(FileDigest(*file)) for file in json.loads(listed or "[]")]
+    return [_file(FileDigest(*file)) for file in _parsed(_LISTING, listed, [])]
+
+
+def _parsed(kind: TypeAdapter[T], text: str | None, default: T) -> T:
+    """What stands in the metadata of a run; the default for text that this program did not write."""
+    try:
+        return default if text is None else kind.validate_json(text)
+    except ValidationError:
+        return default
 
 
 def _file(file: FileDigest) -> dict[str, Any]:
@@ -187,16 +230,17 @@ def _file(file: FileDigest) -> dict[str, Any]:
 
 
 def _own_files(out: Address) -> dict[str, dict[str, Any]]:
-    found = {}
-    for name in own_file_names(out):
-        content = storage.content_of(join(out, name))
-        if content is not None:
-            found[name] = {"bytes": len(content), "sha256": _sha256(content)}
-    return found
+    contents = {name: storage.content_of(join(out, name)) for name in own_file_names(out)}
+    return {name: _digested(content) for name, content in contents.items() if content is not None}
 
 
-def _markers(out: Address, runs: Sequence[str]) -> Iterable[tuple[str, bytes]]:
-    """The `runs` table of each of these runs as it lies there, some at a time."""
+def _digested(content: bytes) -> dict[str, Any]:
+    return {"bytes": len(content), "sha256": sha256(content)}
+
+
+def markers(out: Address) -> Iterable[tuple[str, bytes]]:
+    """The `runs` table of each complete run as it lies there."""
+    runs = store.run_ids(out)
     for first in range(0, len(runs), _AT_ONCE):
         some = {str(store.table_address(out, "runs", run)): run for run in runs[first : first + _AT_ONCE]}
         contents = contents_of(list(some))
@@ -204,14 +248,11 @@ def _markers(out: Address, runs: Sequence[str]) -> Iterable[tuple[str, bytes]]:
 
 
 def _write(out: Address, manifest: Manifest) -> None:
-    content = _content(manifest)
+    content = (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode()
     if storage.content_of(join(out, NAME)) != content:
         storage.write_bytes(join(out, NAME), content)
 
 
-def _content(manifest: Manifest) -> bytes:
-    return (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode()
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
+def sha256(content: bytes | None) -> str:
+    """The digest of a file's content; empty for a file that is not there."""
+    return "" if content is None else hashlib.sha256(content).hexdigest()

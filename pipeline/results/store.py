@@ -225,7 +225,7 @@ def metadata_of(source: Path | bytes) -> dict[str, str]:
     """What `write_run` was told about the run; nothing for a file that cannot be read."""
     try:
         found = pl.read_parquet_metadata(source)
-    except (pl.exceptions.PolarsError, OSError):
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError):
         return {}
     return {key.removeprefix(PREFIX): value for key, value in found.items() if key.startswith(PREFIX)}
 

@@ -8,7 +8,7 @@ whole or not at all; `identity` tells whether content is still the same; `object
 patience with those that fail; `objects` is what they say of an object, and whether what came is that.
 """
 
-from pipeline.storage.fetching import content_of, folders_in, glob_remote, local_copy, reach, read_many
+from pipeline.storage.fetching import content_of, files_below, folders_in, glob_remote, local_copy, reach, read_many
 from pipeline.storage.identity import (
     FileDigest,
     FileState,
@@ -46,6 +46,7 @@ __all__ = [
     "digest_of_files",
     "discard",
     "file_digests",
+    "files_below",
     "folders_in",
     "glob_remote",
     "local_copy",

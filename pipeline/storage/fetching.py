@@ -37,6 +37,23 @@ def folders_in(address: Address) -> list[str]:
     return sorted(name_of(entry["name"]) for entry in found if entry["type"] == "directory")
 
 
+def files_below(address: Address) -> list[str]:
+    """Every file in a folder and in those below, from that folder on, with slashes; sorted."""
+    if not is_url(address):
+        found = (Path(folder, name) for folder, _, names in os.walk(address) for name in names)
+        return sorted(file.relative_to(address).as_posix() for file in found)
+    return on_store(address, lambda store, path: sorted(_names_below(store, path.rstrip("/"), "")))
+
+
+def _names_below(store: Any, place: str, before: str) -> Iterator[str]:
+    for entry in entries_of(store, place):
+        name = f"{before}{name_of(entry['name'])}"
+        if entry["type"] == "directory":
+            yield from _names_below(store, entry["name"].rstrip("/"), f"{name}/")
+        else:
+            yield name
+
+
 def glob_remote(pattern: str) -> list[Address]:
     """Addresses that match a glob in an object store, sorted."""
     return on_store(

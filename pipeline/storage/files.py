@@ -38,13 +38,20 @@ def list_dir(path: Address) -> list[str]:
 def open_binary(path: Address) -> IO[bytes]:
     """A seekable binary file; of an address a copy on this machine, whose room is free again once it is closed."""
     with local_copy(path) as file:
-        return _local(file, lambda present: present.open("rb", buffering=0))
+        return _local(file, lambda present: _regular(present).open("rb", buffering=0))
 
 
 def read_bytes(path: Address) -> bytes:
     """The whole content."""
     with local_copy(path) as file:
-        return _local(file, Path.read_bytes)
+        return _local(file, lambda present: _regular(present).read_bytes())
+
+
+def _regular(path: Path) -> Path:
+    """The file, unless it is a pipe or a device: reading one can last for ever."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError("is no regular file", place=str(path), expected="a file or folder")
+    return path
 
 
 def size_of(path: Address) -> int:

@@ -19,6 +19,12 @@ from tests.conftest import SmallTrial
 ROOT = Path(__file__).parents[2]
 
 
+def endless(log: Path) -> None:
+    """A log that takes hours to read: nothing but a hole of a terabyte, which takes no room."""
+    log.touch()
+    os.truncate(log, 2**40)
+
+
 def result_bytes(out: Path) -> dict[str, bytes]:
     """Every table of a result by its place; neither log nor configuration."""
     return {

@@ -12,11 +12,15 @@ from polars.testing import assert_frame_equal
 
 from pipeline import storage
 from pipeline.campaign import run_campaign
+from pipeline.campaign.finish import write_campaign
+from pipeline.campaign.verify import verify
 from pipeline.results import catalogue, store
 from pipeline.results.query import run_sql
+from pipeline.storage import parquet
 from pipeline.storage.objects import version_of
+from schemas.config import Configuration
 from schemas.errors import UsageError
-from tests.campaign.compare import plan_of
+from tests.campaign.compare import campaign_bytes, plan_of
 from tests.conftest import SmallTrial
 
 QUERIES = (
@@ -48,11 +52,59 @@ def test_same_answers_with_and_without(out: Path, query: str) -> None:
     assert_frame_equal(with_it, run_sql(out, query))
 
 
-def test_it_is_what_answers(out: Path) -> None:
-    """Told apart by a catalogue that holds something else of the right files."""
-    frame, states = catalogue.kept(out, "passages")
-    catalogue.keep(out, "passages", frame.head(1), states)
-    assert run_sql(out, "SELECT COUNT(*) AS n FROM passages")["n"].to_list() == [1]
+def poison(out: Path, digest: bool = True) -> None:
+    """Say `safe` of every run in the catalogue; with `digest` as somebody does who knows the format."""
+    entry = catalogue.address_of(out, "runs")
+    _, key, _ = Path(entry).read_bytes().split(b"\n", 2)
+    frame = catalogue.fresh(out, "runs")
+    assert frame is not None
+    lie = frame.with_columns(verdict=pl.lit("safe", dtype=frame.schema["verdict"]))
+    assert not lie.equals(frame)
+    if digest:
+        catalogue.keep(out, "runs", key.decode(), parquet.parquet_bytes(lie))
+    else:
+        first, _ = Path(entry).read_bytes().split(b"\n", 1)
+        Path(entry).write_bytes(b"\n".join((first, key, parquet.parquet_bytes(lie))))
+
+
+VERDICTS = "SELECT run_id, verdict FROM runs ORDER BY run_id, solution"
+
+
+def test_an_entry_that_was_changed_does_not_answer(out: Path) -> None:
+    before = run_sql(out, VERDICTS)
+    poison(out, digest=False)
+    assert is_fresh(out) == [False, True, True, True]
+    assert_frame_equal(run_sql(out, VERDICTS), before)
+
+
+def test_campaign_tables_come_from_the_runs_and_verify_sees_a_false_entry(out: Path) -> None:
+    write_campaign(out, Configuration())
+    assert verify(out).problems == ()
+    before = campaign_bytes(out)
+    poison(out)
+    assert [what for what, _, _ in verify(out).problems] == [".catalogue/runs"]
+    (out / "campaign/runs.parquet").unlink()
+    write_campaign(out, Configuration())
+    assert campaign_bytes(out) == before
+    assert verify(out).problems == ()
+
+
+@pytest.mark.parametrize("entry", ["runs", "complete", "pages"])
+def test_one_damaged_byte_means_not_there(out: Path, entry: str) -> None:
+    file = out / ".catalogue" / entry
+    if not file.exists():
+        catalogue.keep(out, entry, "key", b"content")
+    content = file.read_bytes()
+    key = content.split(b"\n")[1].decode()
+    assert catalogue.kept(out, entry, key) is not None
+    for at in range(0, len(content), max(1, len(content) // 97)):
+        damaged = bytearray(content)
+        damaged[at] ^= 0x10
+        file.write_bytes(damaged)
+        assert catalogue.kept(out, entry, key) is None
+    file.unlink()
+    file.mkdir()
+    assert catalogue.kept(out, entry, key) is None
 
 
 def test_campaigns_keep_it(small_trial: SmallTrial, tmp_path: Path) -> None:
@@ -100,15 +152,15 @@ def test_damaged_catalogue_is_none(out: Path) -> None:
 
 def test_what_changes_while_it_is_read_is_not_kept(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.rmtree(out / ".catalogue")
-    read = store.scan_runs
+    read = store.read_table
 
-    def read_and_touch(place: Path, table: str, runs: list[str]) -> pl.LazyFrame:
-        frame = read(place, table, runs)
+    def read_and_touch(place: Path, table: str) -> pl.LazyFrame:
+        frame = read(place, table)
         file = Path(store.table_address(out, "hazards", "run0"))
         file.write_bytes(file.read_bytes())
         return frame
 
-    monkeypatch.setattr(store, "scan_runs", read_and_touch)
+    monkeypatch.setattr(store, "read_table", read_and_touch)
     catalogue.gather(out)
     assert is_fresh(out) == [True, False, True, True]
 

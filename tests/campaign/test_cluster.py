@@ -20,7 +20,7 @@ from pipeline.campaign.waits import WAITS
 from pipeline.results import store
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
-from tests.campaign.compare import ROOT, Hurried, by_run, plan_of, result_bytes, wait_for
+from tests.campaign.compare import ROOT, Hurried, by_run, endless, plan_of, result_bytes, wait_for
 from tests.campaign.compare import command as replay_command
 from tests.campaign.test_local import Spy
 from tests.conftest import SmallTrial
@@ -68,7 +68,7 @@ def test_whatever_becomes_of_other_runs_the_bytes_are_the_same(
     allow(failures, cluster)
     (tmp_path / "bad.mcap").write_bytes(b"not a log")
     for name in dying:
-        os.mkfifo(tmp_path / f"{name}.mcap")
+        endless(tmp_path / f"{name}.mcap")
     deaths: dict[str, list[int]] = {name: [] for name in dying}
 
     def kill(run_id: str, age_s: float) -> None:
@@ -175,7 +175,7 @@ def test_hanging_worker_is_given_up(
     small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stopped: bool
 ) -> None:
     """Also one that cannot end itself, since the whole process stands still."""
-    os.mkfifo(tmp_path / "hanging.mcap")
+    endless(tmp_path / "hanging.mcap")
     seen: list[int] = []
     clock = Hurried(monkeypatch, "loop")
 

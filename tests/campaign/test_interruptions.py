@@ -25,7 +25,7 @@ from pipeline.results import store
 from pipeline.storage.address import Address
 from schemas.enums import RunStatus
 from schemas.errors import OutputError
-from tests.campaign.compare import ROOT, campaign_bytes, command, plan_of, result_bytes, start, wait_for
+from tests.campaign.compare import ROOT, campaign_bytes, command, endless, plan_of, result_bytes, start, wait_for
 from tests.conftest import SmallTrial
 
 
@@ -47,7 +47,7 @@ def tmpfs(folder: Path, options: str) -> Iterator[Path]:
 @pytest.mark.usefixtures("in_process")
 @pytest.mark.parametrize(("signum", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path, signum: int, status: int) -> None:
-    os.mkfifo(tmp_path / "never.mcap")
+    endless(tmp_path / "never.mcap")
     out = tmp_path / "out"
     process = start(command(small_trial, out, "--jobs", "2", runs=[tmp_path / "never.mcap", *small_trial.paths]))
     wait_for(lambda: len(store.run_ids(out)) >= 2)
@@ -172,7 +172,7 @@ def test_swept_files_are_written_again(
 def test_one_campaign_at_a_time_and_orphaned_workers_go(
     small_trial: SmallTrial, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    os.mkfifo(tmp_path / "never.mcap")
+    endless(tmp_path / "never.mcap")
     out = tmp_path / "out"
     process = start(command(small_trial, out, "--jobs", "2", runs=[tmp_path / "never.mcap", *small_trial.paths]))
     try:

@@ -16,16 +16,16 @@ import pytest
 
 from datasets.mcap_log import write_mcap
 from pipeline import storage
-from pipeline.campaign import Plan, RunOutcome, Summary, make_plan, recorded_log, run_campaign
+from pipeline.campaign import RunOutcome, Summary, make_plan, recorded_log, run_campaign
 from pipeline.campaign.outcome import lost
-from pipeline.campaign.progress import LogWatch
 from pipeline.read.ingest import read_run
 from pipeline.results import store
+from pipeline.show.progress import LogWatch
 from schemas.config import Configuration, IngestConfig, LdsConfig
 from schemas.enums import RunStatus
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunLog
-from tests.campaign.compare import Hurried, by_run, campaign_bytes, plan_of, result_bytes
+from tests.campaign.compare import Hurried, by_run, campaign_bytes, endless, plan_of, result_bytes
 from tests.conftest import SmallTrial
 
 
@@ -38,7 +38,7 @@ class Spy:
         self.losses: list[tuple[str, int]] = []
         self.notes: list[str] = []
 
-    def begin(self, plan: Plan) -> None:
+    def begin(self, runs: int, out: str) -> None:
         self.seen.clear()
 
     def look(self, under_way: Sequence[tuple[str, float]]) -> None:
@@ -239,7 +239,7 @@ def test_killed_worker_is_tried_once_more(small_trial: SmallTrial, undisturbed: 
 
 
 def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "deadly.mcap")
+    endless(tmp_path / "deadly.mcap")
     deaths: set[int] = set()
 
     def kill_it(run_id: str, _: float) -> None:
@@ -258,7 +258,7 @@ def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_p
 
 
 def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    os.mkfifo(tmp_path / "hanging.mcap")
+    endless(tmp_path / "hanging.mcap")
     clock = Hurried(monkeypatch, "loop")
 
     def hurry(run_id: str, age_s: float) -> None:
@@ -274,7 +274,7 @@ def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path, monkey
 
 
 def test_single_run_is_given_up_too(tmp_path: Path, small_trial: SmallTrial) -> None:
-    os.mkfifo(tmp_path / "hanging.mcap")
+    endless(tmp_path / "hanging.mcap")
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap"])
     outcome = by_run(run_campaign(plan, time_limit_s=0.5))["hanging"]
     assert (outcome.status, outcome.defect) == (RunStatus.FAILED, False)

@@ -12,13 +12,26 @@ import pytest
 from datasets.comparison import checks_table, compare, describe_faults
 from datasets.demo import DemoResult, demo, demo_scenario
 from datasets.trial import build_run
+from pipeline.campaign.verify import recompute, verify
 from pipeline.show.terminal import table_lines
+from schemas.config import Vehicle, load_settings
 from schemas.run import RunTables
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
     return demo(tmp_path_factory.mktemp("demo"))
+
+
+def test_the_demo_verifies(result: DemoResult) -> None:
+    """Its own files, and every log replayed again as `balise verify --logs` does it."""
+    tables = result.page.parents[1]
+    folder = tables.parent
+    assert verify(tables).problems == ()
+    vehicle = load_settings(folder / "vehicle.toml", Vehicle)
+    logs = [str(folder / "runs" / run) for run in ("clean.mcap", "odometer_scale")]
+    again = recompute(tables, logs, folder / "site", None, vehicle)
+    assert (again.problems, again.compared) == ((), f"2 of {len(result.tables)} runs replayed again")
 
 
 def test_the_replay_finds_what_was_injected(result: DemoResult) -> None:

@@ -49,7 +49,7 @@ def test_the_judge_imports_nothing_of_the_accused(room: str) -> None:
 
 
 def test_imports_of_rooms_are_seen() -> None:
-    assert {"matching", "lds", "evidence", "judge"} <= imported_rooms(ROOT / "pipeline")
+    assert {"matching", "lds", "evidence", "judge"} <= imported_rooms(STAGES)
 
 
 def test_files_that_the_page_names_exist() -> None:

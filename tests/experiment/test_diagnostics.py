@@ -18,7 +18,7 @@ from datasets.experiment.geometry import (
     geometry_at,
 )
 from datasets.experiment.passage import NEVER, NoisePaths, first_passages
-from datasets.experiment.plan import SIGNALS, Plan, bank_forms, failure_forms
+from datasets.experiment.plan import SIGNALS, ExperimentPlan, bank_forms, failure_forms
 from datasets.experiment.sigmas import bank_sigmas, limit_sigmas
 from datasets.experiment.tables import expected
 from datasets.experiment.workers import generator
@@ -27,8 +27,8 @@ from pipeline.stages.monitors.sight import range_variances_m2
 SMALL = {"span_s": 700, "onset_s": 100, "rates_mps": (0.05, 0.5, 5.0), "headings_deg": (0.0, 45.0)}
 
 
-def small_plan(**changes: object) -> Plan:
-    return replace(Plan(default_geometry("gps")), **(SMALL | changes))  # type: ignore[arg-type]
+def small_plan(**changes: object) -> ExperimentPlan:
+    return replace(ExperimentPlan(default_geometry("gps")), **(SMALL | changes))  # type: ignore[arg-type]
 
 
 def test_variances_at_45_degrees_give_the_shares_of_table_1() -> None:
@@ -54,7 +54,7 @@ def test_position_covariance_is_the_inverse_of_the_weighted_normal_matrix() -> N
     assert total == pytest.approx(np.linalg.inv(design.T @ weight @ design)[:3, :3], rel=1e-9)
 
 
-def naive_first(plan: Plan, basis: np.ndarray, weights: np.ndarray, rate: float, question: int) -> np.ndarray:
+def naive_first(plan: ExperimentPlan, basis: np.ndarray, weights: np.ndarray, rate: float, question: int) -> np.ndarray:
     """First epoch after onset at which any monitor of the question fails, one monitor and epoch at a time."""
     forms = bank_forms(plan)
     elapsed = np.arange(1, plan.span_s + 1) - plan.onset_s
@@ -82,7 +82,7 @@ def test_first_passages_equal_those_of_naive_evaluation(probability: float) -> N
             assert fast[question, index].tolist() == slow.tolist()
 
 
-def first_passages_from(plan: Plan, basis: np.ndarray) -> np.ndarray:
+def first_passages_from(plan: ExperimentPlan, basis: np.ndarray) -> np.ndarray:
     """The fast evaluation on a given path."""
     weights = NoisePaths(plan, 1, generator(0)).weights
     watch = passage.Watch(plan, bank_forms(plan), failure_forms(plan), weights, basis.shape[2])
@@ -157,7 +157,7 @@ def test_signals_and_basis_agree_in_size() -> None:
 
 @pytest.mark.usefixtures("in_process")
 def test_results_do_not_depend_on_the_number_of_jobs() -> None:
-    plans = tuple(replace(Plan(default_geometry(name)), **SMALL) for name in CONSTELLATIONS)  # type: ignore[arg-type]
+    plans = tuple(replace(ExperimentPlan(default_geometry(name)), **SMALL) for name in CONSTELLATIONS)  # type: ignore[arg-type]
     one, two = (simulate(plans, 300, seed=3, jobs=jobs) for jobs in (1, 2))
     for a, b in zip(one, two, strict=True):
         assert (a.detected_s == b.detected_s).all()

@@ -9,7 +9,7 @@ from datasets.experiment.geometry import default_geometry
 from datasets.experiment.linear_bank import BankSpec
 from datasets.experiment.range_alarms import range_alarms
 from datasets.experiment.thresholds import (
-    Line,
+    FittedLine,
     SkySigmas,
     calibrated_ratios,
     regressed_ratios,
@@ -26,7 +26,7 @@ def test_two_sided_tail_is_that_of_the_printed_table() -> None:
 def test_a_line_is_recovered() -> None:
     x = np.array([0.8, 1.0, 1.7])
     lines = regression_lines({"cross": SkySigmas(x, np.column_stack([0.1 + 0.2 * x, 0.01 + 0.03 * x]))})
-    assert lines["cross", 1] == Line(pytest.approx(0.01), pytest.approx(0.03))  # type: ignore[arg-type]
+    assert lines["cross", 1] == FittedLine(pytest.approx(0.01), pytest.approx(0.03))  # type: ignore[arg-type]
 
 
 def test_regression_serves_the_along_axis_and_no_other() -> None:

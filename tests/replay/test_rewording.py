@@ -16,8 +16,8 @@ import pytest
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.one_run import replay
-from pipeline.results.inspection import inspect_result
 from pipeline.results.store import write_run
+from pipeline.show.inspection import inspect_result
 from pipeline.studies.line.passes import Ground, passes_of
 from pipeline.studies.line.pieces import middles, pieces_of
 from pipeline.studies.safety.assessment import assess
@@ -72,7 +72,12 @@ def tables_of(out: Path) -> dict[str, pl.DataFrame]:
 
 
 def dictionaries() -> Iterator[dict[Any, str]]:
-    """Every dictionary of words for an enum in `schemas/words.py`."""
+    """Every dictionary of words for an enum in `schemas/words.py`, and every section of phrases in its file."""
+    yield from (words.WORDS[section] for section in ("hazards", "verdicts", "noise_axes"))
+    yield from of_enums()
+
+
+def of_enums() -> Iterator[dict[Any, str]]:
     for name, value in vars(words).items():
         if name.isupper() and isinstance(value, dict) and all(isinstance(code, Enum) for code in value):
             yield value
@@ -103,7 +108,7 @@ def test_rewording_every_message_changes_no_figure(more: str, tmp_path: Path, mo
 
 
 def test_every_code_has_its_words() -> None:
-    for sentences in dictionaries():
+    for sentences in of_enums():
         kind = type(next(iter(sentences)))
         assert set(sentences) == set(kind), kind
         assert not any(words.BETWEEN in text for text in sentences.values()), kind

@@ -11,10 +11,12 @@ from typing import Any
 import pytest
 
 from pipeline.campaign import make_plan, run_campaign
+from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.verify import recompute, verify
 from pipeline.results.manifest import settings_files
 from pipeline.results.store import table_address
-from schemas.config import Vehicle, load_settings
+from pipeline.show.report import write_report
+from schemas.config import Configuration, Vehicle, load_settings
 from schemas.errors import UsageError
 from tests.conftest import SmallTrial
 
@@ -93,8 +95,76 @@ def test_verify_sees_what_changed(out: Path, tmp_path: Path) -> None:
     (copy / "config.toml").write_text("")
     (copy / "campaign" / "map.parquet").unlink()
     assert [what for what, _, _ in verify(copy).problems] == [
-        *("run run1", "campaign/map.parquet", "config.toml", "run run0, hazards"),
+        *("run run1", "config.toml", "campaign/map.parquet", "run run0, hazards"),
     ]
+
+
+def test_verify_reads_provenance_from_the_runs(out: Path, tmp_path: Path) -> None:
+    """What the manifest says of a run beside the digests of its tables."""
+    copy = shutil.copytree(out, tmp_path / "copy")
+    manifest = manifest_of(copy)
+    run = manifest["runs"]["run0"]
+    run["log"][0]["sha256"] = "0" * 64
+    run |= {"site": "elsewhere", "config_digest": "other", "status": "failed", "software": "other 1.0"}
+    run["software_digest"] = "1" * 64
+    next(iter(manifest["sites"].values()))[0]["sha256"] = "2" * 64
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    found = {what for what, _, _ in verify(copy).problems}
+    parts = ("site", "status", "software", "program", "settings", f"log {run['log'][0]['name']}")
+    assert found >= {f"run run0, {part}" for part in parts}
+    assert any(what.startswith("site ") for what in found)
+
+
+def test_a_table_and_its_digest_changed_together_disagree_with_the_marker(out: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    hazards = Path(table_address(copy, "hazards", "run0"))
+    shutil.copyfile(table_address(copy, "hazards", "bad"), hazards)
+    manifest = manifest_of(copy)
+    manifest["runs"]["run0"]["tables"]["hazards"] = sha256(hazards)
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    assert [what for what, _, _ in verify(copy).problems] == ["marker of run run0, hazards"]
+
+
+def test_verify_lists_what_the_manifest_does_not_name(out: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    shutil.copytree(copy / "hazards/run_id=run0", copy / "hazards/run_id=zz")
+    (copy / "campaign/more.csv").write_text("")
+    (copy / "campaign/runs2.parquet").write_bytes((copy / "campaign/runs.parquet").read_bytes())
+    assert sorted(what for what, _, _ in verify(copy).problems) == [
+        *("campaign/more.csv", "campaign/runs2.parquet", "hazards/run_id=zz/hazards.parquet")
+    ]
+
+
+def test_pages_are_part_of_the_manifest(out: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    write_report(copy, jobs=1)
+    assert verify(copy).problems == ()
+    assert sorted(manifest_of(copy)["pages"]) == ["index.html", "runs/bad.html", "runs/run0.html", "runs/run1.html"]
+    page = copy / "report/runs/run0.html"
+    page.write_text(page.read_text().replace("unproven", "safe"))
+    assert [what for what, _, _ in verify(copy).problems] == ["page runs/run0.html"]
+    write_report(copy, jobs=1)
+    assert verify(copy).problems == ()
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "{", "[]", '{"manifest": 1}', '{"manifest": 2}', '{"manifest": 1, "runs": 5}', "\x00\xff", "null", "1e999"],
+)
+def test_a_manifest_of_any_content_stops_nothing(out: Path, tmp_path: Path, content: str) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    expected = manifest_of(copy)["runs"]
+    (copy / "manifest.json").write_text(content)
+    with pytest.raises(UsageError, match="is not a manifest"):
+        verify(copy)
+    write_campaign(copy, Configuration())
+    assert manifest_of(copy)["runs"] == expected
+
+
+def test_a_run_made_without_vehicle_file_is_replayed_without(out: Path, small_trial: SmallTrial, train: Path) -> None:
+    logs = [str(path) for path in small_trial.paths[:2]]
+    again = recompute(out, logs, small_trial.site, None, load_settings(train, Vehicle))
+    assert (again.problems, again.compared) == ((), "2 of 3 runs replayed again")
 
 
 def test_a_run_of_an_interrupted_call_is_named(out: Path, tmp_path: Path) -> None:
@@ -122,6 +192,7 @@ def test_logs_are_replayed_again_and_compared(out: Path, small_trial: SmallTrial
     assert (same.problems, same.compared) == ((), "1 of 3 runs replayed again")
     other = shutil.copytree(small_trial.paths[2], tmp_path / "run1")
     wrong = recompute(out, [str(other)], small_trial.site, None, Vehicle())
-    found = {what: expected for what, _, expected in wrong.problems}
-    assert found["run run1, settings"] == "--vehicle train7.toml"
-    assert {"run run1, log gnss.parquet", "run run1, epochs", "run run1, runs"} <= set(found)
+    assert wrong.problems == (("settings of 1 run", "others", "--vehicle train7.toml"),)
+    changed = shutil.copytree(small_trial.paths[2], tmp_path / "run0")
+    named = {what for what, _, _ in recompute(out, [str(changed)], small_trial.site, None, Vehicle()).problems}
+    assert {"run run0, log gnss.parquet", "run run0, epochs", "run run0, runs"} <= named

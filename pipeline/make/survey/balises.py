@@ -10,7 +10,7 @@ import polars as pl
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from pipeline.make.survey.network import Network
+from pipeline.make.survey.network import SurveyNetwork
 from pipeline.make.survey.pieces import Survey, measures_at
 from pipeline.make.survey.sources import content_of_survey
 from pipeline.make.survey.tables import placed_table
@@ -25,7 +25,7 @@ from schemas.errors import SiteError
 from schemas.inputs import Balises
 
 
-def balises_every(network: Network, spacing_m: float, travel: TravelAlong) -> pl.DataFrame:
+def balises_every(network: SurveyNetwork, spacing_m: float, travel: TravelAlong) -> pl.DataFrame:
     """Virtual balises at whole multiples of the spacing, counted along the shortest way from the survey's start.
 
     So the spacing holds over joints and switches; where two ways meet again it begins anew. `travel`: for trains away
@@ -81,7 +81,7 @@ def _from_start_m(ends: np.ndarray, length_m: np.ndarray) -> np.ndarray:
 
 
 def balises_of_list(
-    path: Path, network: Network, epsg: int | None, survey: Survey, config: Configuration
+    path: Path, network: SurveyNetwork, epsg: int | None, survey: Survey, config: Configuration
 ) -> pl.DataFrame:
     """The balises of a table, each at its net element and measure, its coordinates, or its line kilometre.
 
@@ -104,9 +104,14 @@ def balises_of_list(
 class _Placer:
     """Where on the track a row of a list is."""
 
-    def __init__(self, place: str, network: Network, track: Track, survey: Survey, config: SurveyConfig) -> None:
-        self.place, self.network, self.track, self.survey, self.config = place, network, track, survey, config
-        self.ground, self.segments = network_of(track, network.links), segments_of(track)
+    def __init__(self, place: str, network: SurveyNetwork, track: Track, survey: Survey, config: SurveyConfig) -> None:
+        self.place = place
+        self.network = network
+        self.track = track
+        self.survey = survey
+        self.config = config
+        self.ground = network_of(track, network.links)
+        self.segments = segments_of(track)
 
     def placed(self, row: dict[str, Any]) -> tuple[str, float]:
         given = {key for key, value in row.items() if value is not None}
@@ -119,8 +124,8 @@ class _Placer:
         expected = "latitude_deg and longitude_deg (or x_m and y_m), line_km, or netelement_id and measure_m"
         raise self._refusal(row, "has no place", expected=expected)
 
-    def _refusal(self, row: dict[str, Any], message: str, **told: str) -> SiteError:
-        return SiteError(message, place=f"{self.place}: balise {row['balise_id']}", **told)
+    def _refusal(self, row: dict[str, Any], message: str, **details: str) -> SiteError:
+        return SiteError(message, place=f"{self.place}: balise {row['balise_id']}", **details)
 
     def _at_coordinates(self, row: dict[str, Any]) -> tuple[str, float]:
         point = points_of(np.array([row["latitude_deg"]]), np.array([row["longitude_deg"]]))
@@ -133,19 +138,20 @@ class _Placer:
         if not ranked or ranked[0][0] > far_m:
             found = f"{ranked[0][0]:.1f} m" if ranked else f"none within {2 * far_m:g} m"
             raise self._refusal(row, "lies beside the track", found=found, expected=f"at most {far_m:g} m")
-        self._tell_rival(row, ranked)
+        self._report_rival(row, ranked)
         return self.track.ids[ranked[0][1]], ranked[0][2]
 
-    def _tell_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
+    def _report_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
         near = [one for one in ranked[1:] if one[0] < ranked[0][0] + self.config.same_track_m]
         nodes = set(self.network.ends[ranked[0][1]].tolist())
         for _, other, _ in near:
             if not nodes & set(self.network.ends[other].tolist()):
                 text = f"may as well lie on {self.track.ids[other]} as on {self.track.ids[ranked[0][1]]}"
-                self.survey.told("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
+                self.survey.report("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
 
     def _at_kilometre(self, row: dict[str, Any]) -> tuple[str, float]:
-        wanted, km = row.get("netelement_id"), float(row["line_km"])
+        wanted = row.get("netelement_id")
+        km = float(row["line_km"])
         found = [
             (element.name, measure)
             for number, element in enumerate(self.network.elements)

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from pipeline.make.survey.network import Network, arms_of
-from pipeline.make.survey.pieces import Piece, kilometre_spans
+from pipeline.make.survey.network import SurveyNetwork, arms_of
+from pipeline.make.survey.pieces import LinePiece, kilometre_spans
 from pipeline.stages.matching.candidates import candidates_of, segments_of
 from pipeline.stages.track.geodesy import points_of, way_m
-from pipeline.stages.track.network import Network as Ground
-from pipeline.stages.track.network import network_of
+from pipeline.stages.track.network import Network, network_of
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import in_pieces, places_along, track_of
 from schemas.arrays import Floats
@@ -22,7 +21,7 @@ from schemas.enums import Navigability
 from schemas.run import Finding
 
 
-def doubts(network: Network, config: SurveyConfig, site: SiteConfig) -> list[Finding]:
+def doubts(network: SurveyNetwork, config: SurveyConfig, site: SiteConfig) -> list[Finding]:
     """Kinks, tracks that were surveyed twice, open ends beside other track, heights and kilometres that do not fit."""
     track = track_of(network.track)
     in_parts = network_of(in_pieces(track), network.links)
@@ -33,7 +32,7 @@ def doubts(network: Network, config: SurveyConfig, site: SiteConfig) -> list[Fin
     return [*found, *_corners(network, config)]
 
 
-def _heights(elements: list[Piece]) -> Iterator[Finding]:
+def _heights(elements: list[LinePiece]) -> Iterator[Finding]:
     flat = [np.isnan(element.height_m).all() for element in elements]
     if all(flat):
         text = "no point has a height: the site is 2-D, and nothing is diagnosed in height"
@@ -48,7 +47,7 @@ def _heights(elements: list[Piece]) -> Iterator[Finding]:
     yield Finding("note", "track: column height_m", text, "Leave them out with --flat if you are not sure.")
 
 
-def _kinks(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
+def _kinks(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
     steps = np.diff(element.surface, axis=0)
     length = np.linalg.norm(steps, axis=1)
     unit = steps / length[:, None]
@@ -65,7 +64,7 @@ def _kinks(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
         yield Finding("warning", f"track: {element.name}", text, "Look whether a point is wrong or out of order.")
 
 
-def _corners(network: Network, config: SurveyConfig) -> Iterator[Finding]:
+def _corners(network: SurveyNetwork, config: SurveyConfig) -> Iterator[Finding]:
     """Kinks where two elements meet that a train runs over."""
     used = network.links.filter(pl.col("navigability").cast(pl.String) != Navigability.NONE.value)
     passed = set(used.select("netelement_a", "position_a").iter_rows())
@@ -77,17 +76,18 @@ def _corners(network: Network, config: SurveyConfig) -> Iterator[Finding]:
             yield from _kinks(corner, config)
 
 
-def _last_step(element: Piece, position: int) -> Piece:
+def _last_step(element: LinePiece, position: int) -> LinePiece:
     """The last two points before an end, the end last."""
     return element.take([1, 0] if position == 0 else [-2, -1])
 
 
-def _kilometres(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
+def _kilometres(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
     way = way_m(element.surface)
     known, off_m, jumps = kilometre_spans(element.line_km, way, config)
     if jumps.any():
         row = int(np.argmax(np.where(jumps, off_m, 0.0)))
-        first, last = known[row], known[row + 1]
+        first = known[row]
+        last = known[row + 1]
         text = (
             f"line kilometre goes from {element.line_km[first]:.3f} to {element.line_km[last]:.3f} "
             f"over {way[last] - way[first]:.0f} m of track ({jumps.sum()} such places)"
@@ -95,16 +95,21 @@ def _kilometres(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
         yield Finding("warning", f"track: {element.name}", text, "A jump of the kilometres, or points out of order.")
 
 
-def _scattered(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
+def _scattered(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
     """Points that lie aside of a smooth line through their neighbours make the element longer than the track is."""
-    flat, solid = replace(element, height_m=np.zeros(len(element))).solid, element.solid
+    flat = replace(element, height_m=np.zeros(len(element))).solid
+    solid = element.solid
     way = way_m(flat)
     by_plan = _longer_m(flat, way, config.uneven_steps)
     by_height = max(0.0, min(_longer_m(solid, way, config.uneven_steps) - by_plan, float(way_m(solid)[-1] - way[-1])))
     if by_plan + by_height > max(config.shape_m, config.longer_share * way[-1]):
-        what, longer_m, remedy = "positions", by_plan, "Export all decimals; do not draw by hand."
+        what = "positions"
+        longer_m = by_plan
+        remedy = "Export all decimals; do not draw by hand."
         if by_height > by_plan:
-            what, longer_m, remedy = "heights", by_height, "Mend them, or leave them out with --flat."
+            what = "heights"
+            longer_m = by_height
+            remedy = "Mend them, or leave them out with --flat."
         text = f"{what} scatter: they make the element about {longer_m:.1f} m longer than the track is"
         yield Finding("warning", f"track: {element.name}", text, remedy)
 
@@ -129,11 +134,12 @@ def _longer_m(places: Floats, way: Floats, uneven_steps: float) -> float:
     return float((variance_m2 / step.mean(axis=0))[even].sum())
 
 
-def _doubled(ground: Ground, config: SurveyConfig) -> Iterator[Finding]:
+def _doubled(ground: Network, config: SurveyConfig) -> Iterator[Finding]:
     """Tracks that lie on each other; an element that turns back is in pieces, which are compared like others."""
     track = ground.track
     along = places_along(track, SAMPLE_SPACING_M)
-    segments, both = segments_of(track), []
+    segments = segments_of(track)
+    both = []
     # So many at once as can be held.
     for rows in np.array_split(np.arange(len(along.element)), 1 + len(along.element) // 100_000):
         points = points_of(along.latitude_deg[rows], along.longitude_deg[rows])
@@ -148,7 +154,7 @@ def _doubled(ground: Ground, config: SurveyConfig) -> Iterator[Finding]:
             yield Finding("warning", f"track: {track.ids[one]}", text, "Look whether one track was surveyed twice.")
 
 
-def _open_ends(ground: Ground, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
+def _open_ends(ground: Network, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
     """Ends that lie beside the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
     track = ground.track
     element, position = np.nonzero(~ground.linked_ends())
@@ -158,7 +164,8 @@ def _open_ends(ground: Ground, same_track_m: float, near_ends_m: float) -> Itera
     found = candidates_of(points, ground, segments_of(track), 2 * same_track_m)
     middle = np.minimum(found.along_m, found.left_m) > near_ends_m
     for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
-        end, other = int(found.step[near]), track.ids[int(found.element[near])]
+        end = int(found.step[near])
+        other = track.ids[int(found.element[near])]
         beside = f"{found.distance_m[near]:.1f} m from the middle of {other}"
         text = f"end {position[end]} lies {beside} and is not joined to it"
         remedy = "Give both lines a point in common there, if it is a switch."

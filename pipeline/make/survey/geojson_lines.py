@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -18,6 +19,10 @@ _CROSSINGS = ("railway_crossing", "tram_crossing_railway")
 _IDS = ("@id", "id", "netelement_id", "osm_id", "full_id", "name")
 
 
+Feature = tuple[dict[str, Any], Mapping[str, Any]]
+"""Tags and GeoJSON geometry."""
+
+
 def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig) -> Survey:
     """Each LineString a piece, named by its own id. Where features have a `railway`, only those in use are taken.
 
@@ -29,12 +34,16 @@ def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig) -> Surv
             return _of_network(place, data, config)
         features = [_feature(item) for item in items]
     except (KeyError, TypeError, ValueError, RecursionError) as error:
-        remedy = "Overpass exports GeoJSON under Export; its own JSON and .osm are not read."
-        told = f"is not a GeoJSON FeatureCollection ({type(error).__name__}: {error})"
-        raise SiteError(told, place=place, remedy=remedy) from None
+        message = f"is not a GeoJSON FeatureCollection ({type(error).__name__}: {error})"
+        raise SiteError(message, place=place, remedy="Overpass exports GeoJSON under Export.") from None
+    return survey_of_features(place, stem, features)
+
+
+def survey_of_features(place: str, stem: str, features: list[Feature]) -> Survey:
+    """A piece of each line, without railways that no train runs on. Raises `SiteError`."""
     survey = Survey()
-    railways = any("railway" in tags for tags, _ in features)
-    left: dict[str, int] = {}
+    railways = any(tags.get("railway") is not None for tags, _ in features)
+    left_out: Counter[str] = Counter()
     for number, (tags, geometry) in enumerate(features):
         kind = _kind(tags) if railways else "line"
         lines = list(_lines(geometry))
@@ -43,12 +52,11 @@ def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig) -> Surv
             (survey.switches_deg if kind == "switch" else survey.crossings_deg).append((latitude, longitude))
         elif lines and (not railways or kind in _IN_USE):
             name = next((str(tags[key]).strip() for key in _IDS if tags.get(key) not in (None, "")), stem)
-            for line in lines:
-                survey.pieces.append(_piece(f"{place}: feature {number}", name, line))
+            survey.pieces += [_piece(f"{place}: feature {number}", name, line) for line in lines]
         elif lines:
-            left[kind] = left.get(kind, 0) + 1
-    for kind, count in sorted(left.items()):
-        survey.told("note", place, f"{count} lines with railway={kind} are left out: no train runs there")
+            left_out[kind] += 1
+    for kind, count in sorted(left_out.items()):
+        survey.report("note", place, f"{count} lines with railway={kind} are left out: no train runs there")
     return survey
 
 
@@ -68,7 +76,7 @@ def _of_network(place: str, data: bytes, config: SiteConfig) -> Survey:
         survey.relations += network.links.frame.rows()
     if network.ignored:
         text = f"{network.ignored} features are not used: they are neither net element nor relation"
-        survey.told("note", place, text)
+        survey.report("note", place, text)
     return survey
 
 
@@ -77,7 +85,7 @@ def _kind(tags: Mapping[str, Any]) -> str:
     return next((key for key in ("disused", "abandoned") if tags.get(key) == "yes"), str(tags.get("railway")))
 
 
-def _feature(item: Any) -> tuple[dict[str, Any], Mapping[str, Any]]:
+def _feature(item: Any) -> Feature:
     """Tags and geometry; some programs put tags into a property of their own."""
     properties, geometry = parts_of(item)
     nested = properties.get("tags")

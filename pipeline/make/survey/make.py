@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.make.survey.balises import balises_every, balises_of_list
 from pipeline.make.survey.doubts import doubts
-from pipeline.make.survey.network import Network, make_network
+from pipeline.make.survey.network import SurveyNetwork, make_network
 from pipeline.make.survey.pieces import Survey
 from pipeline.make.survey.sources import read_surveys
 from pipeline.make.survey.trace import clean_traces
@@ -62,7 +62,7 @@ def wish_of(
         if spacing is None or not 1.0 <= spacing <= 1e6:
             raise UsageError("is no spacing", place=f"--balises {balises}", expected="every 1000 (metres)")
     if not surveys:
-        raise UsageError("no survey is named", expected="GPX, KML, GeoJSON, CSV or a run")
+        raise UsageError("no survey is named", expected="a map, a table of points, or a run")
     if spacing is None and travel is not TravelAlong.BOTH:
         remedy = "In a list of balises the column `direction` says it, one by one."
         raise UsageError("needs --balises every N", place=f"--direction {travel.value}", remedy=remedy)
@@ -98,7 +98,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     return Site(track, network.links, balises, None, findings)
 
 
-def _balises(wish: Wish, network: Network, survey: Survey, config: Configuration) -> pl.DataFrame | None:
+def _balises(wish: Wish, network: SurveyNetwork, survey: Survey, config: Configuration) -> pl.DataFrame | None:
     if wish.spacing_m is not None:
         table = balises_every(network, wish.spacing_m, wish.travel)
         return table if table.height else None
@@ -113,8 +113,8 @@ def write_made(site: Site, page: str, out: Path, force: bool) -> None:
     contents = {f"{name}.{suffix}": None for name in _FILES for suffix in ("csv", "geojson", "parquet")}
     tables = {"track": site.track, "links": site.links, "balises": site.balises}
     written = {f"{name}.parquet": parquet_bytes(table) for name, table in tables.items() if table is not None}
-    told = pl.DataFrame([asdict(one) for one in site.findings], schema=list(Finding.__dataclass_fields__))
-    beside = {"findings.csv": told.write_csv().encode(), "site.html": page.encode()}
+    findings = pl.DataFrame([asdict(one) for one in site.findings], schema=list(Finding.__dataclass_fields__))
+    beside = {"findings.csv": findings.write_csv().encode(), "site.html": page.encode()}
     replace_files(out, {**contents, **written, **beside}, marker="track.parquet")
 
 

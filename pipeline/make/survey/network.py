@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from pipeline.make.survey.pieces import COLUMNS, Piece, Relation, Survey
+from pipeline.make.survey.pieces import COLUMNS, LinePiece, Relation, Survey
 from pipeline.read.site.checks import outward, relations_to_nowhere
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.survey import geometric_measures_m, track_of
@@ -27,19 +27,22 @@ _NODE_DEG = 1e-7
 
 
 @dataclass(frozen=True)
-class Network:
+class SurveyNetwork:
     """Net elements with the nodes at their two ends, and the links between ends.
 
     `track`: the table of their points, with `line_km` beside the contract's columns.
     """
 
-    elements: list[Piece]
+    elements: list[LinePiece]
     ends: Ints
     links: pl.DataFrame
     track: pl.DataFrame
 
 
-def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> Network:
+_NOTHING = SurveyNetwork([], np.zeros((0, 2), dtype=np.int64), Links.create_empty(), pl.DataFrame())
+
+
+def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> SurveyNetwork:
     """Net elements of all pieces; ends within `join_m` (else: in one place) of a vertex of another piece meet it.
 
     Net elements of a network with relations stay as they are, and meet where it says. What is doubtful about it is
@@ -47,20 +50,22 @@ def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> 
     """
     pieces = [piece for piece in survey.pieces if len(piece) > 1]
     if (short := len(survey.pieces) - len(pieces)) > 0:
-        survey.told("note", "survey", f"{short} lines with fewer than two points are left out")
+        survey.report("note", "survey", f"{short} lines with fewer than two points are left out")
     if not pieces:
-        return Network([], np.zeros((0, 2), dtype=np.int64), Links.create_empty(), pl.DataFrame())
+        return _NOTHING
     nodes = _nodes(pieces, config.same_place_m if join_m is None else join_m, survey.relations)
     pieces, nodes = _without_doubles(pieces, nodes, survey)
+    if not pieces:
+        return _NOTHING
     switches = _nodes_at(pieces, nodes, survey.switches_deg, config)
     crossings = _crossings(pieces, nodes, switches, survey, config)
     elements, ends = _cut(pieces, nodes, crossings)
     track = _track_table(elements)
     given = _of_parts(survey.relations, elements)
-    return Network(elements, ends, _links(track, ends, given, crossings, switches, survey, config), track)
+    return SurveyNetwork(elements, ends, _links(track, ends, given, crossings, switches, survey, config), track)
 
 
-def _of_parts(relations: list[Relation], elements: list[Piece]) -> list[Relation]:
+def _of_parts(relations: list[Relation], elements: list[LinePiece]) -> list[Relation]:
     """The relations given, between the parts of net elements that other surveys cut."""
     parts = Counter(element.name.rpartition(".")[0] for element in elements if element.whole)
     names = {element.name for element in elements}
@@ -71,7 +76,7 @@ def _of_parts(relations: list[Relation], elements: list[Piece]) -> list[Relation
     return [(part(a, a_end), a_end, part(b, b_end), b_end, way) for a, a_end, b, b_end, way in relations]
 
 
-def _track_table(elements: list[Piece]) -> pl.DataFrame:
+def _track_table(elements: list[LinePiece]) -> pl.DataFrame:
     """Points of the elements in order, measures along their geometry; null for what is not known."""
     measures = [geometric_measures_m(one.latitude_deg, one.longitude_deg, one.height_m) for one in elements]
     columns = {name: np.concatenate([getattr(one, name) for one in elements]) for name in COLUMNS}
@@ -79,7 +84,7 @@ def _track_table(elements: list[Piece]) -> pl.DataFrame:
     return pl.DataFrame({"netelement_id": names, "measure_m": np.concatenate(measures), **columns}, nan_to_null=True)
 
 
-def _nodes(pieces: list[Piece], join_m: float, relations: list[Relation]) -> list[Ints]:
+def _nodes(pieces: list[LinePiece], join_m: float, relations: list[Relation]) -> list[Ints]:
     """A number per point; points that are one node have the same: near each other, or joined by a relation."""
     latitude = np.concatenate([piece.latitude_deg for piece in pieces])
     longitude = np.concatenate([piece.longitude_deg for piece in pieces])
@@ -115,10 +120,11 @@ def _near_ends(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> It
             yield int(end), others[int(np.argmin(way))]
 
 
-def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> tuple[list[Piece], list[Ints]]:
+def _without_doubles(pieces: list[LinePiece], nodes: list[Ints], survey: Survey) -> tuple[list[LinePiece], list[Ints]]:
     """Each stretch between two nodes once: the first line that has it keeps it."""
     seen: set[tuple[int, int]] = set()
-    kept, kept_nodes = [], []
+    kept = []
+    kept_nodes = []
     for piece, own in zip(pieces, nodes, strict=True):
         edges = [(min(a, b), max(a, b)) for a, b in zip(own[:-1].tolist(), own[1:].tolist(), strict=True)]
         new = np.array([edge not in seen and edge[0] != edge[1] for edge in edges])
@@ -127,7 +133,7 @@ def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> 
         seen.update(edges)
         if doubled:
             text = f"{doubled} of its {len(edges)} segments stand in the survey already and are left out"
-            survey.told("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")
+            survey.report("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")
         for first, last in spans_of(new):
             kept.append(piece.take(np.arange(first, last + 2)))
             kept_nodes.append(own[first : last + 2])
@@ -135,7 +141,7 @@ def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> 
 
 
 def _crossings(
-    pieces: list[Piece], nodes: list[Ints], switches: set[int], survey: Survey, config: SurveyConfig
+    pieces: list[LinePiece], nodes: list[Ints], switches: set[int], survey: Survey, config: SurveyConfig
 ) -> set[int]:
     """Nodes where tracks cross without a switch: those named so, and those where two lines just run through.
 
@@ -145,15 +151,15 @@ def _crossings(
     inner = np.concatenate([own[1:-1] for own in nodes])
     at_ends = np.unique(np.concatenate([own[[0, -1]] for own in nodes]))
     through, count = np.unique(inner, return_counts=True)
-    told = _nodes_at(pieces, nodes, survey.crossings_deg, config)
+    named = _nodes_at(pieces, nodes, survey.crossings_deg, config)
     lines = [own[1:-1] for piece, own in zip(pieces, nodes, strict=True) if not piece.whole]
     unnamed = np.intersect1d(through[count == 2], np.concatenate([np.zeros(0, dtype=np.int64), *lines]))
     by_form = set(np.setdiff1d(unnamed, at_ends).tolist()) - switches
-    _tell_of_crossings(pieces, nodes, by_form - told, survey)
-    return told | by_form
+    _report_crossings(pieces, nodes, by_form - named, survey)
+    return named | by_form
 
 
-def _tell_of_crossings(pieces: list[Piece], nodes: list[Ints], unnamed: set[int], survey: Survey) -> None:
+def _report_crossings(pieces: list[LinePiece], nodes: list[Ints], unnamed: set[int], survey: Survey) -> None:
     """One note for each pair of lines that cross."""
     names: dict[int, set[str]] = {node: set() for node in unnamed}
     for piece, own in zip(pieces, nodes, strict=True):
@@ -163,11 +169,11 @@ def _tell_of_crossings(pieces: list[Piece], nodes: list[Ints], unnamed: set[int]
         times = f" ({count} times)" if count > 1 else ""
         text = f"cross where neither ends{times}: taken as a crossing without a switch"
         remedy = "Where trains turn off (a slip), name the node `railway=switch`, or end the lines there."
-        survey.told("note", f"track: {', '.join(pair)}", text, remedy)
+        survey.report("note", f"track: {', '.join(pair)}", text, remedy)
 
 
 def _nodes_at(
-    pieces: list[Piece], nodes: list[Ints], places_deg: list[tuple[float, float]], config: SurveyConfig
+    pieces: list[LinePiece], nodes: list[Ints], places_deg: list[tuple[float, float]], config: SurveyConfig
 ) -> set[int]:
     """The nodes at places (latitude, longitude)."""
     if not places_deg:
@@ -178,7 +184,7 @@ def _nodes_at(
     return set(np.concatenate(nodes)[row[row < tree.n]].tolist())
 
 
-def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[list[Piece], Ints]:
+def _cut(pieces: list[LinePiece], nodes: list[Ints], crossings: set[int]) -> tuple[list[LinePiece], Ints]:
     """Elements from node to node; the parts of a piece are named `id.1`, `id.2` along it.
 
     A net element that is whole is cut by lines of other surveys only, not by net elements.
@@ -187,7 +193,7 @@ def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[l
     of_lines = _occurrences([own for piece, own in zip(pieces, nodes, strict=True) if not piece.whole], nodes)
     number: dict[str, int] = {}
     parts: dict[str, int] = {}
-    found: list[tuple[Piece, int, int]] = []
+    found: list[tuple[LinePiece, int, int]] = []
     for piece, own in zip(pieces, nodes, strict=True):
         meets = of_lines[own] > 0 if piece.whole else passing[own] > 1
         inner = [row for row in range(1, len(own) - 1) if meets[row] and int(own[row]) not in crossings]
@@ -195,7 +201,8 @@ def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[l
         parts[piece.name] = parts.get(piece.name, 0) + len(cuts) - 1
         for first, last in itertools.pairwise(cuts):
             found.append((piece.take(np.arange(first, last + 1)), int(own[first]), int(own[last])))
-    elements, ends = [], []
+    elements = []
+    ends = []
     for piece, first, last in found:
         number[piece.name] = number.get(piece.name, 0) + 1
         name = piece.name if parts[piece.name] == 1 else f"{piece.name}.{number[piece.name]}"
@@ -232,9 +239,11 @@ def _links(
     By angle a pair is navigable in both directions where a train can go that way, else not at all.
     """
     track = track_of(table)
-    directions, names = outward(track), track.ids
+    directions = outward(track)
+    names = track.ids
     named = {end for a, a_end, b, b_end, _ in given for end in ((a, a_end), (b, b_end))}
-    rows, guessed = list(given), []
+    rows = list(given)
+    guessed = []
     for node, meeting in arms_of(ends).items():
         here = [(names[element], position) for element, position in meeting]
         unsaid = [pair for pair in itertools.combinations(range(len(here)), 2) if not {here[k] for k in pair} <= named]
@@ -248,22 +257,22 @@ def _links(
             rows.append((*one, *other, way.value))
         guessed += [here] * bool(unsaid)
         if node not in crossings | switches:
-            _tell_of_node([name for name, _ in here], pairs, survey)
-    _tell_of_guesses(guessed, len(rows) - len(given), bool(given), survey)
+            _report_node([name for name, _ in here], pairs, survey)
+    _report_guesses(guessed, len(rows) - len(given), bool(given), survey)
     links = Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
     known, findings = relations_to_nowhere(track, links)
     survey.findings += findings
     return known
 
 
-def _tell_of_guesses(nodes: list[list[tuple[str, int]]], pairs: int, some_given: bool, survey: Survey) -> None:
+def _report_guesses(nodes: list[list[tuple[str, int]]], pairs: int, some_given: bool, survey: Survey) -> None:
     """A finding where relations are made by angle; a warning where the survey gives relations elsewhere."""
     if not nodes:
         return
     first = " and ".join(f"end {position} of {name}" for name, position in nodes[0])
     text = f"the survey gives no relation at {len(nodes)} nodes ({first}{', ...' if len(nodes) > 1 else ''})"
     text += f": {pairs} relations are by the angles between the lines"
-    survey.told("warning" if some_given else "note", "links", text, "Look whether trains can run so.")
+    survey.report("warning" if some_given else "note", "links", text, "Look whether trains can run so.")
 
 
 def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: float) -> set[tuple[int, int]]:
@@ -290,13 +299,13 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: fl
     return straight
 
 
-def _tell_of_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
+def _report_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
     place = f"links: {', '.join(names)}"
     lonely = [name for arm, name in enumerate(names) if len(names) > 1 and not any(arm in pair for pair in pairs)]
     if lonely:
         text = f"no train gets from {', '.join(lonely)} to another of these: the corner is too sharp"
-        survey.told("warning", place, text, "Mend the survey there, or the relation.")
+        survey.report("warning", place, text, "Mend the survey there, or the relation.")
     if len(names) > 3:
         kind = "a crossing without a switch" if len(pairs) == len(names) / 2 else "switches, by their angles"
         text = f"{len(names)} ends meet at one node, which the survey does not name: taken as {kind}"
-        survey.told("note", place, text, "Name the node `railway=switch` or `railway=railway_crossing`.")
+        survey.report("note", place, text, "Name the node `railway=switch` or `railway=railway_crossing`.")

@@ -19,7 +19,7 @@ MOST_BYTES = 100_000_000
 
 
 @dataclass(frozen=True)
-class Piece:
+class LinePiece:
     """Points in order along one line: degrees, metres, kilometres of the line; NaN where not known.
 
     `name` is the source's own id. `recorded`: by a vehicle that stood, came back or passed twice. `whole`: a net
@@ -53,11 +53,11 @@ class Piece:
         """A point in words."""
         return f"{self.latitude_deg[row]:.6f}, {self.longitude_deg[row]:.6f}"
 
-    def take(self, rows: Ints | list[int]) -> Piece:
+    def take(self, rows: Ints | list[int]) -> LinePiece:
         """Some of the points."""
         return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
 
-    def followed_by(self, other: Piece) -> Piece:
+    def followed_by(self, other: LinePiece) -> LinePiece:
         """Its points and those of another."""
         both: dict[str, Any] = {name: np.append(getattr(self, name), getattr(other, name)) for name in COLUMNS}
         return replace(self, **both)
@@ -74,7 +74,7 @@ class Survey:
     elements as declared.
     """
 
-    pieces: list[Piece] = field(default_factory=list)
+    pieces: list[LinePiece] = field(default_factory=list)
     relations: list[Relation] = field(default_factory=list)
     declared_m: dict[str, float] = field(default_factory=dict)
     crossings_deg: list[tuple[float, float]] = field(default_factory=list)
@@ -89,7 +89,7 @@ class Survey:
         self.switches_deg += other.switches_deg
         self.findings += other.findings
 
-    def told(self, severity: str, place: str, message: str, remedy: str = "") -> None:
+    def report(self, severity: str, place: str, message: str, remedy: str = "") -> None:
         self.findings.append(Finding(severity, place, message, remedy))  # type: ignore[arg-type]
 
 
@@ -99,7 +99,7 @@ def piece_of(
     columns: Mapping[str, Iterable[float | None]],
     recorded: bool = False,
     whole: bool = False,
-) -> Piece:
+) -> LinePiece:
     """A piece whose positions are places on earth, without points that repeat the one before.
 
     Raises `SiteError` where a position is none.
@@ -107,7 +107,8 @@ def piece_of(
     known = {key: np.array(list(values), dtype=np.float64) for key, values in columns.items()}
     count = len(known["latitude_deg"])
     arrays = {key: known.get(key, np.full(count, np.nan)) for key in COLUMNS}
-    latitude, longitude = arrays["latitude_deg"], arrays["longitude_deg"]
+    latitude = arrays["latitude_deg"]
+    longitude = arrays["longitude_deg"]
     height = arrays["height_m"]
     unknown = (latitude == 0) & (longitude == 0)
     wrong = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)) | (height < -1_000) | (height > 10_000) | unknown
@@ -121,16 +122,17 @@ def piece_of(
             remedy="Look whether latitude and longitude are exchanged, or 0, 0 stands for a place that is not known.",
         )
     moved = np.append(True, (np.diff(latitude) != 0) | (np.diff(longitude) != 0)) if count else np.zeros(0, bool)
-    return Piece(name, **arrays, recorded=recorded, whole=whole).take(np.flatnonzero(moved))
+    return LinePiece(name, **arrays, recorded=recorded, whole=whole).take(np.flatnonzero(moved))
 
 
-def with_own_names(pieces: list[Piece]) -> list[Piece]:
+def with_own_names(pieces: list[LinePiece]) -> list[LinePiece]:
     """Each name once: the second of a name gets `#2`, in the order of the files; relations name net elements."""
     reserved = {piece.name for piece in pieces if piece.whole}
     taken: set[str] = set()
     named = []
     for piece in pieces:
-        name, number = piece.name, 1
+        name = piece.name
+        number = 1
         while name in taken or (name in reserved and not piece.whole):
             number += 1
             name = f"{piece.name}#{number}"
@@ -142,7 +144,8 @@ def with_own_names(pieces: list[Piece]) -> list[Piece]:
 def kilometre_spans(line_km: Floats, way_m: Floats, config: SurveyConfig) -> tuple[Ints, Floats, np.ndarray]:
     """Points with a kilometre; how far [m] the kilometres stray from the way to the next of them; where they jump."""
     known = np.flatnonzero(np.isfinite(line_km))
-    by_km, by_way = np.diff(line_km[known]) * 1000.0, np.diff(way_m[known])
+    by_km = np.diff(line_km[known]) * 1000.0
+    by_way = np.diff(way_m[known])
     sign = 1.0 if by_km.sum() >= 0 else -1.0
     off_m = np.abs(sign * by_km - by_way)
     return known, off_m, off_m > np.maximum(config.kilometre_m, config.kilometre_share * by_way)
@@ -153,7 +156,8 @@ def measures_at(line_km: Floats, measure_m: Floats, km: float, config: SurveyCon
     known, _, jumps = kilometre_spans(line_km, measure_m, config)
     found = []
     for low, high in zip(known[:-1][~jumps].tolist(), known[1:][~jumps].tolist(), strict=True):
-        a, b = line_km[low], line_km[high]
+        a = line_km[low]
+        b = line_km[high]
         if min(a, b) <= km <= max(a, b) and a != b:
             found.append(float(measure_m[low] + (km - a) / (b - a) * (measure_m[high] - measure_m[low])))
     # A kilometre at a point ends one span and begins the next.

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.make.survey.geojson_lines import read_geojson
+from pipeline.make.survey.map_files import MAP_SUFFIXES, read_map
 from pipeline.make.survey.pieces import MOST_BYTES, Survey, piece_of, with_own_names
 from pipeline.make.survey.tables import read_points
 from pipeline.make.survey.xml_lines import read_kmz, read_xml
@@ -20,7 +21,7 @@ from schemas.errors import SiteError
 
 # A variance of zero means "not known" in a `gnss` stream.
 _LEAST_SIGMA_M = 1e-3
-_KINDS = "GPX, KML, KMZ, GeoJSON, CSV, Parquet, or a run (folder or .mcap) with a reference"
+_KINDS = "GPX, KML, KMZ, GeoJSON, GeoPackage, Shapefile, FlatGeobuf, CSV, Parquet, or a run with a reference"
 
 
 def read_surveys(paths: list[Path], epsg: int | None, vehicle: Vehicle, config: Configuration) -> Survey:
@@ -38,7 +39,8 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
     suffix = path.suffix.lower()
     if path.is_dir() or suffix == ".mcap":
         return read_recorded(path, vehicle, config)
-    place, data = str(path), content_of_survey(path)
+    place = str(path)
+    data = content_of_survey(path)
     match suffix:
         case ".gpx" | ".kml":
             return read_xml(place, path.stem, data)
@@ -48,12 +50,16 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
             return read_geojson(place, path.stem, data, config.site)
         case ".csv" | ".txt" | ".parquet":
             return read_points(place, path.stem, data, epsg, config.site)
+        case _ if suffix in MAP_SUFFIXES:
+            return read_map(path, data)
     raise SiteError("is no survey that is known", place=place, found=suffix or "no suffix", expected=_KINDS)
 
 
 def content_of_survey(path: Path) -> bytes:
     """The file, unless it is too large to be one."""
     try:
+        if not path.is_file():
+            raise SiteError("is no regular file", place=str(path))
         if path.stat().st_size > MOST_BYTES:
             raise SiteError("is too large", place=str(path), expected=f"at most {MOST_BYTES // 1_000_000} MB")
         return path.read_bytes()
@@ -82,14 +88,14 @@ def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey
     reached = believable(fixes, fixes.valid, travelled(fixes, None), config.matching)
     if (jumped := points.height - len(reached)) > 0:
         text = f"{jumped} positions to which no train can have come are left out"
-        survey.told("warning", f"track: {run.run_id}", text, "Look at the recording there.")
+        survey.report("warning", f"track: {run.run_id}", text, "Look at the recording there.")
     points = points[reached]
     height = points["height_m"].fill_null(np.nan) - vehicle.antenna_height_m
     columns = {"latitude_deg": points["latitude_deg"], "longitude_deg": points["longitude_deg"], "height_m": height}
     survey.pieces.append(piece_of(str(path), run.run_id, {**columns, "sigma_m": points["sigma_m"]}, recorded=True))
     if "antenna_height_m" not in vehicle.model_fields_set and points["height_m"].null_count() < points.height:
         text = "heights are those of the antenna: the vehicle file does not say how high it is over the rail"
-        survey.told("warning", f"track: {run.run_id}", text, "Give --vehicle with antenna_height_m.")
+        survey.report("warning", f"track: {run.run_id}", text, "Give --vehicle with antenna_height_m.")
     return survey
 
 

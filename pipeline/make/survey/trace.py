@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.make.survey.pieces import Piece, Survey
+from pipeline.make.survey.pieces import LinePiece, Survey
 from pipeline.stages.track.geodesy import way_m
 from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import SurveyConfig
@@ -32,7 +32,7 @@ def clean_traces(survey: Survey, config: SurveyConfig) -> Survey:
     return cleaned
 
 
-def _all_thinned(pieces: list[Piece], given: int, shape_m: float) -> list[Piece]:
+def _all_thinned(pieces: list[LinePiece], given: int, shape_m: float) -> list[LinePiece]:
     """All but the first `given` thinned; where a branch leaves another piece, both keep the point."""
     counts = Counter(place for piece in pieces for place in _places(piece))
     shared = [np.array([counts[place] > 1 for place in _places(piece)], dtype=np.bool_) for piece in pieces]
@@ -40,11 +40,11 @@ def _all_thinned(pieces: list[Piece], given: int, shape_m: float) -> list[Piece]
     return [*pieces[:given], *thinned]
 
 
-def _places(piece: Piece) -> list[tuple[float, float]]:
+def _places(piece: LinePiece) -> list[tuple[float, float]]:
     return list(zip(piece.latitude_deg.tolist(), piece.longitude_deg.tolist(), strict=True))
 
 
-def _moving(piece: Piece, config: SurveyConfig) -> Ints:
+def _moving(piece: LinePiece, config: SurveyConfig) -> Ints:
     """Rows that are a step away from the one kept before."""
     places = piece.surface
     sigma_m = piece.sigma_m[np.isfinite(piece.sigma_m)]
@@ -56,20 +56,20 @@ def _moving(piece: Piece, config: SurveyConfig) -> Ints:
     return np.array(kept, dtype=np.int64)
 
 
-def _gapless(piece: Piece, survey: Survey, config: SurveyConfig) -> Iterator[Piece]:
+def _gapless(piece: LinePiece, survey: Survey, config: SurveyConfig) -> Iterator[LinePiece]:
     steps = np.linalg.norm(np.diff(piece.surface, axis=0), axis=1)
     usual_m = float(np.median(steps)) if len(steps) else 0.0
     gaps = np.flatnonzero(steps > max(config.gap_m, config.gap_steps * usual_m))
     for gap in gaps:
         text = f"nothing was recorded for {steps[gap]:.0f} m from {piece.place(int(gap))}"
-        survey.told("warning", f"track: {piece.name}", text, "Survey the missing piece.")
+        survey.report("warning", f"track: {piece.name}", text, "Survey the missing piece.")
     for rows in np.split(np.arange(len(piece)), gaps + 1):
         yield piece.take(rows)
 
 
-def _new_track(piece: Piece, name: str, survey: Survey, config: SurveyConfig) -> list[Piece]:
+def _new_track(piece: LinePiece, name: str, survey: Survey, config: SurveyConfig) -> list[LinePiece]:
     """The stretches of a pass that no earlier one covers, itself included, thinned, each with the toe of its switch."""
-    parts: list[Piece] = []
+    parts: list[LinePiece] = []
     known = list(survey.pieces)
     for lap in _laps(piece, config):
         covered = _covered(lap.surface, known, config.same_track_m)
@@ -80,12 +80,12 @@ def _new_track(piece: Piece, name: str, survey: Survey, config: SurveyConfig) ->
         known = [*survey.pieces, *parts]
         if covered.any():
             share = float(np.mean(covered))
-            survey.told("note", f"track: {name}", f"{share:.0%} of a pass lies on track that is known: not doubled")
+            survey.report("note", f"track: {name}", f"{share:.0%} of a pass lies on track that is known: not doubled")
     named = [f"{name}-{number}" if number > 1 else name for number in range(1, len(parts) + 1)]
     return [replace(part, name=own, recorded=False) for part, own in zip(parts, named, strict=True)]
 
 
-def _laps(piece: Piece, config: SurveyConfig) -> Iterator[Piece]:
+def _laps(piece: LinePiece, config: SurveyConfig) -> Iterator[LinePiece]:
     """A pass cut where it turns back or comes to where it was, so that each lap covers a place once."""
     places = piece.surface
     way = way_m(places)
@@ -104,7 +104,7 @@ def _laps(piece: Piece, config: SurveyConfig) -> Iterator[Piece]:
         yield piece.take(np.arange(low, int(part[-1]) + 1))
 
 
-def _covered(places: Floats, known: list[Piece], same_track_m: float) -> np.ndarray:
+def _covered(places: Floats, known: list[LinePiece], same_track_m: float) -> np.ndarray:
     """Which places lie on track that is known."""
     if not known:
         return np.zeros(len(places), dtype=bool)
@@ -112,7 +112,7 @@ def _covered(places: Floats, known: list[Piece], same_track_m: float) -> np.ndar
     return np.asarray(tree.query(places)[0] <= same_track_m)
 
 
-def _with_toes(lap: Piece, first: int, last: int, known: list[Piece], toe_m: float) -> Piece:
+def _with_toes(lap: LinePiece, first: int, last: int, known: list[LinePiece], toe_m: float) -> LinePiece:
     """The stretch, led back over the pass to where the branch left what is known, and on to where it comes back."""
     part = lap.take(np.arange(first, last + 1))
     if first > 0 and (toe := _toe(lap, first, -1, known, toe_m)) is not None:
@@ -122,7 +122,7 @@ def _with_toes(lap: Piece, first: int, last: int, known: list[Piece], toe_m: flo
     return part
 
 
-def _toe(lap: Piece, row: int, step: int, known: list[Piece], toe_m: float) -> Piece | None:
+def _toe(lap: LinePiece, row: int, step: int, known: list[LinePiece], toe_m: float) -> LinePiece | None:
     """The end of known track that the row goes on from; else the known vertex nearest to where the train was a toe's
     length before (-1) or after (1) the row.
     """
@@ -137,7 +137,7 @@ def _toe(lap: Piece, row: int, step: int, known: list[Piece], toe_m: float) -> P
     other = row
     while 0 <= other + step < len(lap) and np.linalg.norm(places[other] - places[row]) < toe_m:
         other += step
-    best: tuple[float, Piece | None] = (toe_m, None)
+    best: tuple[float, LinePiece | None] = (toe_m, None)
     for piece in known:
         way = np.linalg.norm(piece.surface - places[other], axis=1)
         if len(way) and way.min() < best[0]:
@@ -154,9 +154,10 @@ def _dense(places: Floats) -> Floats:
     return np.column_stack([np.interp(at, way, places[:, axis]) for axis in range(3)])
 
 
-def _thinned(piece: Piece, held: Bools, shape_m: float) -> Piece:
+def _thinned(piece: LinePiece, held: Bools, shape_m: float) -> LinePiece:
     """Without points whose leaving out moves the line by less than `shape_m`; those held stay."""
-    places, kept = piece.solid, held.copy()
+    places = piece.solid
+    kept = held.copy()
     kept[[*range(0, len(places), _BLOCK), len(places) - 1]] = True
     spans = [tuple(pair) for pair in zip(np.flatnonzero(kept)[:-1], np.flatnonzero(kept)[1:], strict=True)]
     while spans:

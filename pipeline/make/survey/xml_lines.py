@@ -11,6 +11,7 @@ import zipfile
 from xml.parsers import expat
 
 from pipeline.make.survey.pieces import MOST_BYTES, Survey, piece_of
+from pipeline.read.site.geojson import number_of
 from schemas.errors import SiteError
 
 _ENDS_OF_LINE = ("trkseg", "rte", "LineString", "Track")
@@ -23,10 +24,11 @@ def read_xml(place: str, stem: str, data: bytes) -> Survey:
     Heights of KML count only where its altitude mode is `absolute`. Points with a time were recorded by a vehicle.
     Raises `SiteError`.
     """
-    reader = _Reader(place, stem)
+    reader = _XmlLines(place, stem)
     try:
         reader.parser.Parse(data, True)
-    except expat.ExpatError as error:
+    except (expat.ExpatError, LookupError, ValueError) as error:
+        # An encoding that expat does not know is a ValueError or a LookupError.
         raise SiteError(f"is not well-formed XML ({error})", place=place, expected="GPX or KML") from None
     if reader.root not in ("gpx", "kml"):
         raise SiteError("is neither GPX nor KML", place=place, found=f"<{reader.root}>")
@@ -49,16 +51,19 @@ def read_kmz(place: str, stem: str, data: bytes) -> Survey:
     return read_xml(f"{place}: {name}", stem, content)
 
 
-class _Reader:
+class _XmlLines:
     """What expat meets, gathered to pieces of line."""
 
     def __init__(self, place: str, stem: str) -> None:
-        self.place, self.stem = place, stem
+        self.place = place
+        self.stem = stem
         self.survey = Survey()
         self.root = ""
         self.path: list[str] = []
         self.text: list[str] = []
-        self.name, self.mode, self.recorded = "", _CLAMPED, False
+        self.name = ""
+        self.mode = _CLAMPED
+        self.recorded = False
         self.points: list[list[float | None]] = []
         self.parser = expat.ParserCreate(namespace_separator=" ")
         self.parser.buffer_text = True
@@ -82,7 +87,9 @@ class _Reader:
         if local in ("trk", "rte", "Placemark"):
             self.name = attributes.get("id", "")
         if local in _ENDS_OF_LINE:
-            self.points, self.mode, self.recorded = [], _CLAMPED, False
+            self.points = []
+            self.mode = _CLAMPED
+            self.recorded = False
         if local in ("trkpt", "rtept"):
             self.points.append([self._number(attributes.get(key)) for key in ("lat", "lon")] + [None])
 
@@ -114,7 +121,7 @@ class _Reader:
 
     def _number(self, text: str | None) -> float:
         try:
-            return float(text or "")
+            return number_of(text or "")
         except ValueError:
             where = f"{self.place}: line {self.parser.CurrentLineNumber}"
             raise SiteError("a coordinate cannot be read", place=where, found=repr(text)) from None

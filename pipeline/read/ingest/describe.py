@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.clean import StreamCounts, stamp_counts
 from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of
 from pipeline.read.ingest.guesses import NAMES, columns_in, mapping_lines, word_of
 from pipeline.read.ingest.mcap_block import Block, Messages
@@ -16,6 +15,7 @@ from pipeline.read.ingest.mcap_model import Channel
 from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
 from pipeline.read.ingest.plan import Sample, sources_of
 from pipeline.read.ingest.run import read_run
+from pipeline.stages.clean.clean import StreamCounts, stamp_counts
 from pipeline.stages.epochs.clock import GAP_PERIODS
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, name_of

@@ -1,4 +1,4 @@
-"""What cannot be told apart: balises by linking (LOC section III), and tracks by positions alone (DOMAIN section 2)."""
+"""What looks alike: balises to linking (LOC section III), and tracks to positions alone (DOMAIN section 2)."""
 
 from __future__ import annotations
 
@@ -97,7 +97,8 @@ def _ahead(
 
 
 def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Finding | None:
-    (expected, distance_m), (later, later_m) = near, far
+    (expected, distance_m) = near
+    (later, later_m) = far
     close_m = window_m(distance_m, expected.accuracy_m, reference.accuracy_m, config).close_m
     open_m = window_m(later_m, later.accuracy_m, reference.accuracy_m, config).open_m
     if open_m > close_m:
@@ -113,7 +114,7 @@ def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Findi
 
 
 @dataclass(frozen=True)
-class _Stretch:
+class _ParallelStretch:
     """A part of an element beside another one, by measure."""
 
     element: int
@@ -145,11 +146,12 @@ def most_claimed(apart_m: float, survey_m: float, config: MatchingConfig) -> flo
     return float(1.0 / (1.0 + np.exp(-(apart_m**2) / (2.0 * variance_m2))))
 
 
-def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
+def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelStretch]:
     """Per pair of elements the parts of the first that lie too near the second."""
     track = network.track
     along = places_along(track, SAMPLE_SPACING_M)
-    element, measure_m = along.element, along.measure_m
+    element = along.element
+    measure_m = along.measure_m
     survey_m = _survey_m(track, config)
     odds = np.log(config.ambiguity_probability / (1.0 - config.ambiguity_probability))
     limit_m = np.sqrt(2.0 * odds * (config.cross_bias_sigma_m**2 + survey_m**2))
@@ -159,20 +161,24 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
     # Two surveys never end at the same place.
     near = (found.beyond_m <= config.survey_sigma_default_m) & (own < found.element)
     near &= found.distance_m < limit_m[own]
-    pairs, row = own[near] * network.count + found.element[near], found.step[near]
+    pairs = own[near] * network.count + found.element[near]
+    row = found.step[near]
     apart_m = found.distance_m[near]
     order = np.lexsort((row, pairs))
-    pairs, row, apart_m = pairs[order], row[order], apart_m[order]
+    pairs = pairs[order]
+    row = row[order]
+    apart_m = apart_m[order]
     cuts = np.flatnonzero((np.diff(pairs) != 0) | (np.diff(row) > 1)) + 1
     for part in np.split(np.arange(len(row)), cuts):
         if len(part):
             one, other = divmod(int(pairs[part[0]]), network.count)
             at_m = measure_m[row[part]]
-            yield _Stretch(one, other, float(at_m[0]), float(at_m[-1]), float(np.median(apart_m[part])))
+            yield _ParallelStretch(one, other, float(at_m[0]), float(at_m[-1]), float(np.median(apart_m[part])))
 
 
-def _finding(site: Site, network: Network, stretch: _Stretch, config: MatchingConfig) -> Finding:
-    name, other = network.track.ids[stretch.element], network.track.ids[stretch.other]
+def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: MatchingConfig) -> Finding:
+    name = network.track.ids[stretch.element]
+    other = network.track.ids[stretch.other]
     claim = most_claimed(stretch.apart_m, float(_survey_m(network.track, config)[stretch.element]), config)
     text = (
         f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {other} lies {stretch.apart_m:.1f} m beside it; positions "
@@ -181,18 +187,18 @@ def _finding(site: Site, network: Network, stretch: _Stretch, config: MatchingCo
     return Finding("warning", f"element {name}", text, _remedy(site, network, stretch))
 
 
-def _remedy(site: Site, network: Network, stretch: _Stretch) -> str:
+def _remedy(site: Site, network: Network, stretch: _ParallelStretch) -> str:
     """What would tell: a route always, reads and switches where there are some."""
-    told = ["a route (`balise replay --write-route`, `--route`)"]
+    ways = ["a route (`balise replay --write-route`, `--route`)"]
     names = [network.track.ids[stretch.element], network.track.ids[stretch.other]]
     balises = [] if site.balises is None else site.balises.select("balise_id", "netelement_id", "kind").rows()
     reads = [balise for balise, name, kind in balises if name in names and str(kind) == BaliseKind.PHYSICAL.value]
     if reads:
-        told.append(f"a read of {', '.join(reads[:3])}")
+        ways.append(f"a read of {', '.join(reads[:3])}")
     oriented = [2 * element + sense for element in (stretch.element, stretch.other) for sense in (0, 1)]
     if any(len(network.successors[one]) > 1 for one in oriented):
-        told.append("a switch taken at its end")
-    return f"To tell the two apart: {', '.join(told)}."
+        ways.append("a switch taken at its end")
+    return f"To tell the two apart: {', '.join(ways)}."
 
 
 def _survey_m(track: Track, config: MatchingConfig) -> Floats:

@@ -23,10 +23,7 @@ from pipeline.stages.track.survey import (
 from schemas.arrays import Bools, Floats
 from schemas.config import SiteConfig
 from schemas.enums import Navigability
-from schemas.run import Finding
-
-# Of a finding about one balise: this and its id.
-BALISE_PLACE = "balises: "
+from schemas.run import BALISE_PLACE, Finding
 
 
 @dataclass
@@ -98,7 +95,8 @@ def _relations_that_differ(links: pl.DataFrame) -> Iterator[Finding]:
     """Two ends that are related more than once, and not alike: `network_of` allows what either allows."""
     said: dict[tuple[tuple[str, int], tuple[str, int]], list[str]] = {}
     for a, a_end, b, b_end, way in links.iter_rows():
-        one, other = (a, a_end), (b, b_end)
+        one = (a, a_end)
+        other = (b, b_end)
         from_other = {Navigability.AB.value: Navigability.BA.value, Navigability.BA.value: Navigability.AB.value}
         pair, word = ((one, other), way) if one <= other else ((other, one), from_other.get(way, way))
         said.setdefault(pair, []).append(word)
@@ -149,11 +147,9 @@ def _check_elements(track: Track, declared_length_m: dict[str, float], found: Re
     """Length, declared length, height and vertex spacing of each element."""
     for element, name, part in track.elements():
         place = f"track: element {name}"
-        latitude, longitude, height = (
-            track.latitude_deg[part],
-            track.longitude_deg[part],
-            track.height_m[part],
-        )
+        latitude = track.latitude_deg[part]
+        longitude = track.longitude_deg[part]
+        height = track.height_m[part]
         geometric = geometric_measures_m(latitude, longitude, height)
         length = float(geometric[-1])
         if length < GAP_COUNTS_M:
@@ -198,7 +194,8 @@ def _check_gaps(track: Track, found: Remarks) -> None:
     """Ends that a relation joins must meet, in place and, where both have one, in height."""
     places = end_places(track)
     for a, position_a, b, position_b, navigability in found.links.iter_rows():
-        one, other = places[track.index[a], position_a], places[track.index[b], position_b]
+        one = places[track.index[a], position_a]
+        other = places[track.index[b], position_b]
         gap = float(np.linalg.norm(one - other))
         text = f"end {position_a} of {a} and end {position_b} of {b} are linked but {gap:.1f} m apart"
         if gap > found.config.joined_m and navigability != Navigability.NONE.value:
@@ -222,7 +219,8 @@ def _near_misses(track: Track, links: pl.DataFrame, config: SiteConfig) -> Itera
     inward = outward(track).reshape(-1, 3)
     inward /= np.maximum(np.linalg.norm(inward, axis=1), 1e-9)[:, None]
     for one, other, gap in _nearly_met(places, inward, free, config):
-        (a, position_a), (b, position_b) = ends[one], ends[other]
+        (a, position_a) = ends[one]
+        (b, position_b) = ends[other]
         if a != b:
             text = f"end {position_a} of {a} and end {position_b} of {b} are {gap:.2f} m apart and not linked"
             remedy = "Survey the missing piece, or add the relation, if trains run there."
@@ -282,7 +280,8 @@ def _off_the_track(track: Track, element: str, measure_m: float) -> tuple[str, s
     if track.element_at(element, measure_m) is not None:
         return None
     number = track.index[element]
-    low, high = float(track.begin_m[number]), float(track.end_m[number])
+    low = float(track.begin_m[number])
+    high = float(track.end_m[number])
     text = f"measure {measure_m:.1f} m is off element {element} ({low:.1f} to {high:.1f} m): no run will pass it"
     return text, "Correct measure_m."
 

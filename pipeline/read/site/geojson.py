@@ -28,7 +28,8 @@ _A_KEYS, _B_KEYS = (
     )
     for side in "ab"
 )
-_START, _END = ("0", "0.0", "start", "begin", "origin"), ("1", "1.0", "end")
+_START = ("0", "0.0", "start", "begin", "origin")
+_END = ("1", "1.0", "end")
 _POSITIONS_A = (("positionona", "positiona"), "isonoriginofelementa")
 _POSITIONS_B = (("positiononb", "positionb"), "isonoriginofelementb")
 
@@ -47,7 +48,7 @@ _LINK_COLUMNS = {
 
 
 @dataclass
-class Network:
+class GeoJsonNetwork:
     """What one GeoJSON file holds; `declared_length_m` where elements state their length."""
 
     track: RawTable
@@ -56,11 +57,12 @@ class Network:
     ignored: int
 
 
-def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
+def read_network(file: str, data: bytes, breaches: list[str]) -> GeoJsonNetwork | None:
     """Net elements and net relations of a FeatureCollection, or breaches."""
     try:
         document = json.loads(data)
-        features, epsg = list(document["features"]), _epsg(document)
+        features = list(document["features"])
+        epsg = _epsg(document)
     except _MALFORMED as error:
         breaches.append(f"{file}: is not a GeoJSON FeatureCollection ({error})")
         return None
@@ -76,7 +78,7 @@ def _is_relation(keys: Mapping[str, Any]) -> bool:
     return any(key in keys for key in (*_A_KEYS, *_B_KEYS))
 
 
-def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> Network:
+def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> GeoJsonNetwork:
     points: list[tuple[Any, ...]] = []
     relations: list[tuple[Any, ...]] = []
     lengths: dict[str, float] = {}
@@ -95,7 +97,7 @@ def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> 
             breaches.append(f"{file}: feature {number}: {error}")
     track = RawTable(file, pl.DataFrame(points, schema=_TRACK_COLUMNS, orient="row"), epsg)
     links = RawTable(file, pl.DataFrame(relations, schema=_LINK_COLUMNS, orient="row")) if relations else None
-    return Network(track, links, lengths, ignored)
+    return GeoJsonNetwork(track, links, lengths, ignored)
 
 
 def parts_of(feature: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
@@ -110,9 +112,17 @@ def triple(point: Any) -> tuple[float, float, float | None]:
     """Longitude, latitude and height (none where there is none). Raises `ValueError`."""
     try:
         longitude, latitude, *height = point
-        return float(longitude), float(latitude), float(height[0]) if height and height[0] is not None else None
+        height_m = number_of(height[0]) if height and height[0] is not None else None
+        return number_of(longitude), number_of(latitude), height_m
     except _MALFORMED:
         raise ValueError("coordinates are not numbers [longitude, latitude(, height)]") from None
+
+
+def number_of(value: Any) -> float:
+    """A coordinate, as a number or text; `1_0` and digits of other scripts are typing errors. Raises `ValueError`."""
+    if isinstance(value, str) and ("_" in value or not value.isascii()):
+        raise ValueError(value)
+    return float(value)
 
 
 def _plain_keys(own_id: Any, properties: Mapping[str, Any]) -> dict[str, Any]:
@@ -176,7 +186,8 @@ def _relation(keys: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def _position(keys: Mapping[str, Any], names: tuple[str, ...], origin: str) -> int | None:
     """End 0 or 1 of an element, or whether it is its origin (ERA vocabulary); none where neither is said."""
-    said, at_origin = _first(keys, names), keys.get(origin)
+    said = _first(keys, names)
+    at_origin = keys.get(origin)
     if said is None and isinstance(at_origin, bool):
         return 0 if at_origin else 1
     word = str(said).strip().lower()

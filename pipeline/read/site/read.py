@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.read.site.checks import drop_repeated_points, remarks
-from pipeline.read.site.geojson import Network, read_network
+from pipeline.read.site.geojson import GeoJsonNetwork, read_network
 from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
 from pipeline.stages.track.survey import geometric_measures_m, track_of
@@ -136,8 +136,8 @@ def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable 
 
 def _read_track(
     files: dict[str, bytes], config: SiteConfig, breaches: list[str]
-) -> tuple[pl.DataFrame | None, Network | None, list[Finding]]:
-    network: Network | None = None
+) -> tuple[pl.DataFrame | None, GeoJsonNetwork | None, list[Finding]]:
+    network: GeoJsonNetwork | None = None
     if "track.geojson" in files:
         network = read_network("track.geojson", files["track.geojson"], breaches)
         raw = network.track if network else None
@@ -157,7 +157,7 @@ def _read_track(
     return (None if breaches else _with_measures(raw.file, frame, breaches)), network, notes
 
 
-def _read_links(files: dict[str, bytes], network: Network | None, breaches: list[str]) -> pl.DataFrame | None:
+def _read_links(files: dict[str, bytes], network: GeoJsonNetwork | None, breaches: list[str]) -> pl.DataFrame | None:
     """Links from their own table, else from the GeoJSON; a site of one element needs none."""
     raw = _load(files, "links", breaches)
     if raw is None and network is not None:
@@ -196,7 +196,8 @@ def _transformed(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breache
 
     try:
         turn = pyproj.Transformer.from_crs(raw.epsg, EPSG_WGS84, always_xy=True)
-        x, y = frame["longitude_deg"].to_numpy(), frame["latitude_deg"].to_numpy()
+        x = frame["longitude_deg"].to_numpy()
+        y = frame["latitude_deg"].to_numpy()
         longitude, latitude = turn.transform(x, y, errcheck=True)
     except pyproj.exceptions.ProjError as error:
         breaches.append(f"{raw.file}: EPSG:{raw.epsg}: {str(error).splitlines()[0]}")
@@ -226,7 +227,8 @@ def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.Da
     """Declared measures where an element has them at every point, geometric where at none."""
     parts = []
     for part in frame.partition_by("netelement_id", maintain_order=True):
-        name, missing = part["netelement_id"][0], part["measure_m"].null_count()
+        name = part["netelement_id"][0]
+        missing = part["measure_m"].null_count()
         if missing == part.height:
             track = track_of(part.with_columns(pl.lit(0.0).alias("measure_m")))
             geometric = geometric_measures_m(track.latitude_deg, track.longitude_deg, track.height_m)

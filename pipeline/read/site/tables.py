@@ -102,7 +102,8 @@ def _read(raw: RawTable, name: str, column: dy.Column, breaches: list[InputError
     unreadable = series.is_null() & found.is_not_null()
     if not unreadable.any():
         return series
-    place, value = f"{raw.file}: column {name}", found.filter(unreadable)[0]
+    place = f"{raw.file}: column {name}"
+    value = found.filter(unreadable)[0]
     where = f"{value!r} in {rows_text(unreadable)}"
     breaches.append(InputError("cannot be read", place=place, found=where, expected=type_name(column)))
     return None

@@ -16,6 +16,7 @@ from pipeline.results.figures.campaign_tables import (
     with_truth,
 )
 from pipeline.results.figures.map_errors import map_places
+from pipeline.results.figures.undetected import spacing_of_runs
 from pipeline.stages.run_row.bounds import (
     Estimator,
     clopper_pearson,
@@ -28,7 +29,6 @@ from pipeline.stages.run_row.bounds import (
     with_estimates,
 )
 from pipeline.stages.run_row.independent import DETECTION_TIMES, independent_episodes, without_copies
-from pipeline.stages.run_row.undetected import spacing_of_runs
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform, dtypes

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import polars as pl
 
 from schemas.arrays import NS_PER_S
 from schemas.enums import Hazard, Judgement, PassageStatus, Timing
+from schemas.words import say
 
 Row = Mapping[str, Any]
+_say = partial(say, "hazards")
 
 
 def hazard_words(hazards: pl.DataFrame, passages: pl.DataFrame) -> list[str]:
@@ -21,43 +24,26 @@ def hazard_words(hazards: pl.DataFrame, passages: pl.DataFrame) -> list[str]:
     faults = hazards.filter(pl.col("caused_by").is_null())
     wrong = _wrong_acceptances(passages)
     ranked = sorted(faults.iter_rows(named=True), key=_badness)
-    return [hazard_phrase(row, wrong.get((row["solution"], row["hazard_id"]))) for row in ranked]
-
-
-def hazard_phrase(row: Row, accepted: Row | None = None) -> str:
-    """`VB_JUMP_1B: VB04 accepted 303.6 m early; no monitor saw it`, or `VB_SHIFT: VB03 40 m late, not accepted; ...`.
-
-    `accepted`: the worst of the wrong acceptances of the row; a balise is as far off as its own location error says,
-    not as the fault at its largest.
-    """
-    what = f"{_what(row)}, {_accepted(row)}" if accepted is None else _wrongly_accepted(row, accepted)
-    return f"{row['hazard']}: {what}; {_seen(row)}{_in_use(row)}"
+    return [_phrase(row, wrong.get((row["solution"], row["hazard_id"]))) for row in ranked]
 
 
 def withstood(hazards: pl.DataFrame) -> str:
     """`2 jumps negated within 0.2 s, 1 shift seen by no monitor and not in use`: what a safe run came through."""
     faults = hazards.filter(pl.col("caused_by").is_null())
+    kinds = pl.col("hazard").cast(pl.String).replace_strict({kind.value: _say(kind.value) for kind in Hazard})
     parts = []
-    for (kind,), rows in faults.group_by(pl.col("hazard").replace_strict(_KINDS), maintain_order=True):
+    for (kind,), rows in faults.group_by(kinds, maintain_order=True):
         for (detected,), part in rows.group_by("detected", maintain_order=True):
             parts.append(f"{part.height} {kind}{'s' * (part.height > 1)} {_met(part, detected=bool(detected))}")
     return ", ".join(parts)
 
 
-_KINDS = {
-    Hazard.VB_JUMP_1A.value: "jump",
-    Hazard.VB_JUMP_1B.value: "jump",
-    Hazard.VB_SHIFT.value: "shift",
-    Hazard.VB_WRONG_TRACK.value: "wrong track",
-}
-
-
 def _met(rows: pl.DataFrame, *, detected: bool) -> str:
     """How the LDS met these faults: from the begin of the fault to the block."""
     if not detected:
-        return "that no monitor saw, none accepted"
-    took_s = (rows["t_negated"] - rows["t_onset"]).dt.total_nanoseconds().max()
-    return "negated" if took_s is None else f"negated within {float(str(took_s)) / NS_PER_S:.3g} s"
+        return _say("withstood")
+    took_ns = (rows["t_negated"] - rows["t_onset"]).dt.total_nanoseconds().drop_nulls().to_list()
+    return _say("negated_within", max(took_ns) / NS_PER_S) if took_ns else _say("negated")
 
 
 def _wrong_acceptances(passages: pl.DataFrame) -> dict[tuple[str, int], Row]:
@@ -70,23 +56,34 @@ def _wrong_acceptances(passages: pl.DataFrame) -> dict[tuple[str, int], Row]:
     return {(row["solution"], row["hazard_id"]): row for row in rows.iter_rows(named=True)}
 
 
-def _wrongly_accepted(row: Row, accepted: Row) -> str:
-    error_m, others = accepted["location_error_m"], len(row["accepted_ids"] or []) - 1
-    side = "" if error_m is None else " early" if error_m > 0 else " late"
-    off = " at a wrong place" if error_m is None else f" {abs(error_m):.1f} m{side}"
-    return f"{accepted['balise_id']} accepted{off}" + (f", and {others} more" if others > 0 else "")
-
-
 def _badness(row: Row) -> tuple[Any, ...]:
     """Accepted ones first, then those that no monitor saw, those too late, the larger ones."""
     late = {False: 0, None: 1, True: 2}[row["within_budget"]]
     return (not row["accepted_ids"], row["detected"], late, -abs(row["size_m"] or 0.0), row["hazard_id"])
 
 
-def _what(row: Row) -> str:
+def _phrase(row: Row, wrong: Row | None) -> str:
+    """`VB_JUMP_1B: VB04 accepted 303.6 m early; no monitor saw it`, or `VB_SHIFT: VB03 40 m late, not accepted; ...`.
+
+    `wrong`: the worst of the wrong acceptances of the row; a balise is as far off as its own location error says,
+    not as the fault at its largest.
+    """
+    what = f"{_hit(row)}, {_accepted(row)}" if wrong is None else _wrongly_accepted(row, wrong)
+    return f"{row['hazard']}: {what}; {_seen(row)}{_in_use(row)}"
+
+
+def _wrongly_accepted(row: Row, wrong: Row) -> str:
+    error_m, others = wrong["location_error_m"], len(row["accepted_ids"] or []) - 1
+    more = _say("more", others) if others > 0 else ""
+    if error_m is None:
+        return _say("wrongly_accepted", wrong["balise_id"]) + more
+    return _say("accepted_early" if error_m > 0 else "accepted_late", wrong["balise_id"], abs(error_m)) + more
+
+
+def _hit(row: Row) -> str:
     """The balises that it hit, how far off and to which side."""
     off = _off(row["size_m"], row["timing"])
-    return " ".join(text for text in (_some(row["balise_ids"]) or "no balise", off) if text)
+    return " ".join(text for text in (_some(row["balise_ids"]) or _say("no_balise"), off) if text)
 
 
 def _off(size_m: float | None, timing: Timing | str | None) -> str:
@@ -99,27 +96,25 @@ def _off(size_m: float | None, timing: Timing | str | None) -> str:
 def _accepted(row: Row) -> str:
     accepted, hit = row["accepted_ids"] or [], row["balise_ids"] or []
     if not accepted:
-        return "not accepted"
-    return "accepted" if set(accepted) == set(hit) else f"{_some(accepted)} accepted"
+        return _say("not_accepted")
+    return _say("accepted") if set(accepted) == set(hit) else f"{_some(accepted)} {_say('accepted')}"
 
 
 def _seen(row: Row) -> str:
     """Which monitor saw it, and how late; a drift against its failure, since its onset may be the alarm itself."""
     if not row["detected"]:
-        return "no monitor saw it"
+        return _say("unseen")
     since_failure_s = row["time_since_failure_s"]
     if row["rate_mps"] is not None and since_failure_s is not None:
-        side = "before" if since_failure_s < 0.0 else "after"
-        return f"{row['monitor']} saw it {abs(since_failure_s):.3g} s {side} the position failed"
+        side = "seen_before_failure" if since_failure_s < 0.0 else "seen_after_failure"
+        return _say(side, row["monitor"], abs(since_failure_s))
     late_s = row["time_to_detect_s"]
-    return f"{row['monitor']} saw it" + ("" if late_s is None else f" {late_s:.3g} s after the fault began")
+    return _say("seen", row["monitor"]) if late_s is None else _say("seen_after_onset", row["monitor"], late_s)
 
 
 def _in_use(row: Row) -> str:
     """How long its position was in use, where that was too long."""
-    if row["within_budget"] is not False:
-        return ""
-    return f", {row['hazardous_s']:.3g} s in use against {row['budget_s']:.3g} s allowed"
+    return _say("in_use", row["hazardous_s"], row["budget_s"]) if row["within_budget"] is False else ""
 
 
 def _some(names: Iterable[str] | None) -> str:

@@ -57,7 +57,8 @@ def passage_entries(passages: pl.DataFrame) -> list[Entry]:
         t_ns = row["t_offered"] if row["t_offered"] is not None else row["t_true"]
         if t_ns is None:
             continue
-        accepted, wrong = row["status"] == PassageStatus.ACCEPTED, row["judgement"] == Judgement.WRONG
+        accepted = row["status"] == PassageStatus.ACCEPTED
+        wrong = row["judgement"] == Judgement.WRONG
         level = Level.WARNING if not accepted else Level.ERROR if wrong else Level.INFO
         error = "" if row["location_error_m"] is None else f", location error {row['location_error_m']:.2f} m"
         judged = "" if row["judgement"] is None else f", position {row['judgement']}"

@@ -87,7 +87,8 @@ def write_topics(
             for topic in topics
         ]
         for _, number, row in heapq.merge(*(_instants(number, topic) for number, topic in enumerate(topics))):
-            t_ns, data = topics[number].times_ns[row], next(topics[number].messages)
+            t_ns = topics[number].times_ns[row]
+            data = next(topics[number].messages)
             writer.add_message(channels[number], log_time=t_ns, publish_time=t_ns, sequence=row, data=data)
         writer.finish()  # type: ignore[no-untyped-call]
 
@@ -130,7 +131,8 @@ def _monitors(epochs: pl.DataFrame) -> pl.DataFrame:
     """Values, thresholds and states, and the ratio that viewers draw: beyond ±1 the monitor fails."""
     columns: list[pl.Expr] = [pl.col("t")]
     for name in MONITORS:
-        value, threshold = pl.col(f"{name}_value"), pl.col(f"{name}_threshold")
+        value = pl.col(f"{name}_value")
+        threshold = pl.col(f"{name}_threshold")
         ratio = pl.when(threshold > 0.0).then(value / threshold).alias(f"{name}_ratio")
         columns += [value, threshold, ratio, pl.col(f"{name}_state").cast(pl.String)]
     return epochs.select(columns)

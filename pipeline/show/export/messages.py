@@ -132,7 +132,8 @@ def _add_field(message: Any, name: str, number: int, field: str, kind: str) -> N
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto
 
     def add(kind: str, **more: Any) -> None:
-        label, of_type = more.pop("label", "OPTIONAL"), FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
+        label = more.pop("label", "OPTIONAL")
+        of_type = FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
         of_label = FieldDescriptorProto.Label.Value(f"LABEL_{label}")
         message.field.add(name=field, number=number, type=of_type, label=of_label, **more)
 

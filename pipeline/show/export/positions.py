@@ -35,7 +35,8 @@ def positions_of(epochs: pl.DataFrame, site: Site) -> Positions:
     rails = ground_of(site.track, epochs["netelement_id"], column["measure_m"])
     sign = sign_of(epochs, stretches_of(epochs))
     gnss = beside(rails, sign, column["cross_track_m"], column["vertical_m"])
-    low_m, high_m = column["true_measure_low_m"], column["true_measure_high_m"]
+    low_m = column["true_measure_low_m"]
+    high_m = column["true_measure_high_m"]
     middle_m = np.where(high_m - low_m <= 2.0 * HazardConfig().known_error_m, 0.5 * (low_m + high_m), np.nan)
     truth = ground_of(site.track, epochs["true_netelement_ids"].list.first(), middle_m)
     return Positions(_frame(epochs["t"], gnss), _frame(epochs["t"], rails), _frame(epochs["t"], truth))

@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.results.provenance import input_digest
 from pipeline.results.store import check_site, metadata_of, read_run, table_address
 from pipeline.show.export.gis import run_geojson, run_gpx
 from pipeline.show.export.mcap_file import PositionMessage, run_topics, write_topics
+from pipeline.stages.provenance import input_digest
 from pipeline.storage import write_bytes
 from schemas.errors import UsageError
 from schemas.run import RunLog, RunTables, Site
@@ -52,7 +52,8 @@ def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) 
     check_site(site, known, tables.run_id)
     digest = site.digest if site is not None else known
     if log is not None and log.input_digest and digest:
-        found, expected = input_digest(log, digest), str(tables.runs["input_digest"].first())
+        found = input_digest(log, digest)
+        expected = str(tables.runs["input_digest"].first())
         if found != expected:
             raise UsageError("was replayed from another log", place=tables.run_id, found=found, expected=expected)
     if tables.epochs.is_empty():

@@ -31,14 +31,13 @@ from pipeline.show.report.markup import (
 from pipeline.show.report.route_found import route_section
 from pipeline.show.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
 from pipeline.show.report.words import WORDS, plots_of
-from pipeline.stages.run_row.noise import widened_by_noise
 from pipeline.stages.run_row.verdict import LEVEL_LISTS
 from schemas.campaign import CampaignLevels
 from schemas.config import Configuration
 from schemas.enums import TRUTH
 from schemas.run import RunTables, Site
 from schemas.tables import Alarms, Hazards, Passages, Runs
-from schemas.words import noise_words, notes_apart
+from schemas.words import notes_apart
 
 _HAZARDS = (
     *("hazard_id", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "time_since_failure_s"),
@@ -207,15 +206,13 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
     def rows(part_name: str, caption: str, frame: pl.DataFrame, *given: Any) -> str:
         return frame_table(f"table-{part_name}-{key}", caption, frame, *given)
 
-    noise = noise_words(widened_by_noise(epochs, row, made.config))
-    noise = f"<p>{escape(noise.capitalize())}.</p>" if noise else ""
     in_order = "Passages of balises, in order of time"
     shown = tiles(tile_figures(known, balises))
     parts = [
         part("figures", f"Summary of {name}" if several else "Summary", shown, notes),
         part("hazards", "Hazards", _hazards(key, row, hazards)),
         part("balises", "Balises", balise_table(f"table-balises-{key}", "Balises, the worst first", balises)),
-        part("drawings", "Drawings", noise, *(figure(f"{key}-{plot}", *told) for plot, *told in plots_of("run"))),
+        part("drawings", "Drawings", *(figure(f"{key}-{plot}", *told) for plot, *told in plots_of("run"))),
         part("passages", "Passages", rows("passages", in_order, passages, _PASSAGES, Passages, {"status": _status})),
         part("levels", "Service levels", rows("levels", ALLOWED, levels, (), CampaignLevels)),
         part("alarms", "Alarms", rows("alarms", "Alarm episodes", alarms, _ALARMS, Alarms)),

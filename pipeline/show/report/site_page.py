@@ -8,8 +8,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.read.site.describe import elements_table
-from pipeline.results.inspection import findings_table
 from pipeline.results.places import element_lines_m, ground_of, origin_of, plane_m
+from pipeline.show.inspection import findings_table
 from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import Json, figure, packed_line, page, script_json, section, tiles
 from schemas.arrays import floats

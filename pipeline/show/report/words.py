@@ -1,21 +1,19 @@
-"""The words of the pages (`words.toml`): titles of columns, what values are called for people, drawings."""
+"""The words of the pages (`schemas/words.toml`): titles of columns, what values are called for people, drawings."""
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
-from importlib.resources import files
-from typing import Any
 
-_FILE: dict[str, Any] = tomllib.loads((files("pipeline.show.report") / "words.toml").read_text(encoding="utf-8"))
-TITLES: dict[str, str] = _FILE["titles"]
-WORDS: dict[str, str] = _FILE["values"]
-OPINIONS: dict[str, str] = _FILE["opinions"]
+from schemas import words
+
+TITLES: dict[str, str] = words.WORDS["titles"]
+WORDS: dict[str, str] = words.WORDS["values"]
+OPINIONS: dict[str, str] = words.WORDS["opinions"]
 
 
 def plots_of(page: str) -> list[tuple[str, str, str]]:
     """Name, title and explanation of the drawings of a page (`run`, `campaign`), in their order."""
-    return [(name, plot["title"], plot["told"]) for name, plot in _FILE["plots"][page].items()]
+    return [(name, plot["title"], plot["text"]) for name, plot in words.WORDS["plots"][page].items()]
 
 
 def plural(count: int, one: str) -> str:

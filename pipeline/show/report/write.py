@@ -12,10 +12,10 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline import storage
-from pipeline.campaign.plan import software_digest
-from pipeline.campaign.workers import each
 from pipeline.results import catalogue
 from pipeline.results.figures.campaign_figures import derived_tables
+from pipeline.results.manifest import note_pages, sha256
+from pipeline.results.software import software_digest
 from pipeline.results.store import (
     check_site,
     complete_runs,
@@ -25,17 +25,19 @@ from pipeline.results.store import (
     read_run,
     table_address,
 )
+from pipeline.results.workers import each
 from pipeline.show.report.campaign_page import Campaign, campaign_page
 from pipeline.show.report.ground import availability_pieces, together
 from pipeline.show.report.run_page import Made, Neighbours, run_page
 from pipeline.storage import files
+from pipeline.storage.parquet import parquet_bytes, read_parquet
 from pipeline.studies.safety.side_by_side import side_by_side
 from pipeline.studies.safety.tally import COUNTS, added
 from schemas.config import Configuration, to_toml
 from schemas.run import Site
 from schemas.tables import TABLES
 
-# Kept of each run until it changes: what its page was made from, how many bytes it has, and what the run adds to the
+# Kept of each run until it changes: what its page was made from, the digest of the page, and what the run adds to the
 # page of the campaign, rows of `availability_pieces` and `side_by_side`.
 _KEPT = "pages"
 
@@ -65,7 +67,7 @@ def write_report(
     names = {run: page_name(run) for run in complete_runs(out)}
     config = read_config(out)
     made = Made(config or Configuration(), None if config is None else to_toml(config), site)
-    states = catalogue.states(out, *TABLES) or {}
+    states = catalogue.states(out, tuple(TABLES)) or {}
     ways = [None, *((run, quote(name)) for run, name in names.items()), None]
     folder, index = out / "report" / "runs", out / "report" / "index.html"
     pages = [
@@ -82,13 +84,14 @@ def write_report(
             progress(len(shares), len(pages))
     rows = pl.concat([shares[run] for run in names])
     # Runs that changed while they were read must not pass for what was read.
-    if states and states == catalogue.states(out, *TABLES):
-        catalogue.keep(out, _KEPT, rows, states)
+    if states and states == catalogue.states(out, tuple(TABLES)):
+        catalogue.keep(out, _KEPT, software_digest(), parquet_bytes(rows))
     for name in set(files.list_dir(folder)) - set(names.values()):
         if name.endswith(".html"):
             storage.remove(folder / name)
     hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
     storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, rows), made).encode())
+    note_pages(out, {name: (out / "report" / name).read_bytes() for name in storage.files_below(out / "report")})
     return [index, *(page.path for page in pages)]
 
 
@@ -112,15 +115,15 @@ def _with_digest(page: _Page, state: str | None) -> _Page:
 
 def _known(out: Path, pages: Sequence[_Page]) -> dict[str, pl.DataFrame]:
     """What is kept of the runs whose pages are there and would be the same again, a row each."""
-    kept, _ = catalogue.kept(out, _KEPT)
-    rows = {row["made_of"][0]: row for row in kept.iter_slices(1)}
+    content = catalogue.kept(out, _KEPT, software_digest())
+    kept = [] if content is None else read_parquet(content).iter_slices(1)
+    rows = {row["made_of"][0]: row for row in kept}
     found = ((page, rows.get(page.made_of)) for page in pages if page.made_of)
-    return {page.run: row for page, row in found if row is not None and _size(page.path) == row["page_bytes"][0]}
-
-
-def _size(path: Path) -> int:
-    """Bytes of a file; -1 for none."""
-    return path.stat().st_size if path.exists() else -1
+    return {
+        page.run: row
+        for page, row in found
+        if row is not None and sha256(storage.content_of(page.path)) == row["page_sha256"][0]
+    }
 
 
 def _written(page: _Page) -> pl.DataFrame:
@@ -132,7 +135,7 @@ def _written(page: _Page) -> pl.DataFrame:
     tallies = side_by_side(*judged, page.made.config) if tables.runs.height > 1 else pl.DataFrame(schema=COUNTS)
     content = run_page(tables, metadata, page.made, tallies, page.neighbours).encode()
     storage.write_bytes(page.path, content)
-    return pl.DataFrame({"made_of": page.made_of, "page_bytes": len(content)}).with_columns(
+    return pl.DataFrame({"made_of": page.made_of, "page_sha256": sha256(content)}).with_columns(
         pieces=pl.lit(availability_pieces(tables.epochs.lazy()).to_struct()).implode(),
         tallies=pl.lit(tallies.to_struct()).implode(),
     )
@@ -144,7 +147,7 @@ def _unlisted(rows: pl.DataFrame, name: str) -> pl.DataFrame:
 
 
 def _campaign(out: Path, made: Made, hrefs: dict[str, str], rows: pl.DataFrame) -> Campaign:
-    found = catalogue.gather(out)
+    found = {table: catalogue.scan(out, table).collect() for table in catalogue.CATALOGUED}
     return Campaign(
         runs=found["runs"],
         hazards=found["hazards"],

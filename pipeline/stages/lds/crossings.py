@@ -213,14 +213,16 @@ def reads_of(
     """Telegrams (`t, balise_id`, `odometer_m` at each) in order of time, and those of balises not on the path."""
     if frame is None:
         return [], pl.DataFrame(schema={"t": pl.Datetime("ns", "UTC"), "balise_id": pl.String})
-    known = frame["balise_id"].is_in([balise.balise_id for balise in balises])
+    places: dict[str, list[Balise]] = {}
+    for balise in balises:
+        places.setdefault(balise.balise_id, []).append(balise)
+    known = frame["balise_id"].is_in(list(places))
     rows = frame.filter(known).sort("t", "balise_id").with_columns(t_ns=pl.col("t").dt.epoch("ns"))
     odometer = rows["odometer_m"] if "odometer_m" in rows.columns else [None] * rows.height
     reads: list[Crossing] = []
     last: Crossing | None = None
     for t_ns, balise_id, odometer_m in zip(rows["t_ns"], rows["balise_id"], odometer, strict=True):
-        places = [balise for balise in balises if balise.balise_id == balise_id]
-        reads.append(_read(t_ns, places, odometer_m, journey, last))
+        reads.append(_read(t_ns, places[balise_id], odometer_m, journey, last))
         last = last if odometer_m is None else reads[-1]
     return reads, frame.filter(~known).select("t", "balise_id")
 

@@ -6,6 +6,7 @@ in the direction of travel. One balise is expected at a time, in the order annou
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -43,6 +44,27 @@ class _Turn:
     travelled_m: float
 
 
+class _Announced:
+    """Announced balises in order of travel; identities are found without walking along all of them."""
+
+    def __init__(self, balises: Sequence[Balise], direction: int) -> None:
+        self.balises = balises
+        self._direction = direction
+        self._along_m = [balise.path_m * direction for balise in balises]
+        self._places: dict[str, list[int]] = {}
+        for place, balise in enumerate(balises):
+            self._places.setdefault(balise.balise_id, []).append(place)
+
+    def place_of(self, balise_id: str, begin: int) -> int | None:
+        """The first place of this identity from `begin` on."""
+        places = self._places.get(balise_id, [])
+        first = bisect_left(places, begin)
+        return places[first] if first < len(places) else None
+
+    def first_beyond(self, path_m: float) -> int:
+        return bisect_right(self._along_m, path_m * self._direction)
+
+
 class LinkingChain:
     """Announced balises of one kind, the reference, and the passages so far.
 
@@ -52,12 +74,13 @@ class LinkingChain:
     def __init__(self, balises: Sequence[Balise], config: LdsConfig) -> None:
         self.passages: list[Passage] = []
         self.reference: Reference | None = None
-        self._announced = [balise for balise in balises if balise.linked]
+        self._linked = [balise for balise in balises if balise.linked]
+        self._ways: dict[tuple[int | None, int], _Announced] = {}
         self._config = config
         self._direction = 1
         self._leg: int | None = None
         self._turn: _Turn | None = None
-        self._ahead: list[Balise] = []
+        self._ahead, self._next = _Announced([], 1), 0
         self._optional: set[str] = set()
         self._missed_in_a_row = 0
         self.closing_m = float("inf")
@@ -76,7 +99,7 @@ class LinkingChain:
     def forget(self) -> None:
         """A new initialisation: no reference, no linking."""
         self.reference = None
-        self._look_ahead([])
+        self._expect(_Announced([], 1), 0)
         for kept in (self._own, self._set_aside, self._unoffered):
             kept.clear()
 
@@ -98,10 +121,11 @@ class LinkingChain:
         self._turn = _Turn(self._distance_m(float(journey.odometer_m[k])), travelled_m)
         for kept in (self._own, self._set_aside, self._unoffered):
             kept.clear()
-        windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel()]
+        windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel().balises]
         here_m = self._turn.distance_m
         self._optional = {balise.balise_id for balise, window in windows if window.holds(here_m)}
-        self._look_ahead([balise for balise, window in windows if window.close_m > here_m])
+        ahead = [balise for balise, window in windows if window.close_m > here_m]
+        self._expect(_Announced(ahead, self._direction), 0)
 
     def offer(self, crossing: Crossing, refusal: PassageStatus | None) -> bool:
         """Judge an offered balise; its passage is written whatever comes of it. True where it is accepted.
@@ -157,7 +181,7 @@ class LinkingChain:
         if not self.linking:
             return
         distance_m = self._distance_m(odometer_m)
-        for balise in self._ahead:
+        for balise in self._ahead.balises[self._next :]:
             unseen = balise.balise_id not in self._own and balise.balise_id not in self._optional
             if unseen and self._announced_m(balise) < distance_m:
                 passage = self._new_passage(balise, t_ns, self._direction)
@@ -189,10 +213,9 @@ class LinkingChain:
             passage.status = PassageStatus.REJECTED_UNLINKED
             return
         passage.status = PassageStatus.REJECTED_WINDOW
-        position = self._position_ahead(balise)
-        if position is None:
+        expected = self._expected_at(balise)
+        if expected is None:
             return
-        expected = self._ahead[position]
         if expected.balise_id == balise.balise_id and self._window(balise).holds(distance_m):
             passage.status = PassageStatus.ACCEPTED
         elif expected.balise_id != balise.balise_id and self._window(expected).holds(distance_m):
@@ -200,22 +223,22 @@ class LinkingChain:
         else:
             passage.record(LinkingError.EARLY, balise.reaction)
 
-    def _position_ahead(self, balise: Balise) -> int | None:
-        """Index of the expected balise that this offer stands against, `None` where it is not ahead.
+    def _expected_at(self, balise: Balise) -> Balise | None:
+        """The expected balise that this offer stands against, `None` where it is not ahead.
 
         Balises near which the train turned may or may not be passed: they stand in nobody's way.
         """
-        names = [ahead.balise_id for ahead in self._ahead]
-        if balise.balise_id not in names:
+        place = self._ahead.place_of(balise.balise_id, self._next)
+        if place is None:
             return None
-        position = names.index(balise.balise_id)
-        in_its_way = (i for i in range(position) if names[i] not in self._optional)
-        return next(in_its_way, position)
+        before = (self._ahead.balises[i] for i in range(self._next, place))
+        return next((other for other in before if other.balise_id not in self._optional), self._ahead.balises[place])
 
     def _close_windows(self, distance_m: float, t_ns: int, absence: PassageStatus) -> None:
-        while self._ahead and distance_m > self._window(self._ahead[0]).close_m:
-            self._close(self._ahead[0], t_ns, absence)
-            self._look_ahead(self._ahead[1:])
+        balises = self._ahead.balises
+        while self._next < len(balises) and distance_m > self._window(balises[self._next]).close_m:
+            self._close(balises[self._next], t_ns, absence)
+            self._expect(self._ahead, self._next + 1)
 
     def _close(self, balise: Balise, t_ns: int, absence: PassageStatus) -> None:
         """Not found in its window; the second in a row brakes (3.16.2.7; TVB eq. 4)."""
@@ -239,19 +262,24 @@ class LinkingChain:
         self._missed_in_a_row = 0
         self._optional = set()
         self._own.pop(balise.balise_id, None)
-        beyond = [other for other in self._in_order_of_travel() if self._announced_m(other) > 0]
-        self._look_ahead(beyond if self.linking else [])
+        way = self._in_order_of_travel() if self.linking else _Announced([], 1)
+        self._expect(way, way.first_beyond(balise.path_m))
 
-    def _in_order_of_travel(self) -> list[Balise]:
-        on_leg = [one for one in self._announced if one.leg == self._leg and one.is_valid(self._direction)]
-        return on_leg if self._direction > 0 else on_leg[::-1]
+    def _in_order_of_travel(self) -> _Announced:
+        """Balises of the leg that are valid in the direction of travel."""
+        leg, direction = self._leg, self._direction
+        if (leg, direction) not in self._ways:
+            valid = [balise for balise in self._linked if balise.leg == leg and balise.is_valid(direction)]
+            self._ways[leg, direction] = _Announced(valid[::direction], direction)
+        return self._ways[leg, direction]
 
-    def _look_ahead(self, ahead: list[Balise]) -> None:
-        self._ahead = ahead
+    def _expect(self, announced: _Announced, first: int) -> None:
+        """From now on these balises are expected, from the place `first` on."""
+        self._ahead, self._next = announced, first
         self.closing_m = float("inf")
-        if ahead and self.reference is not None and self.reference.odometer_m is not None:
+        if first < len(announced.balises) and self.reference is not None and self.reference.odometer_m is not None:
             start_m = self.reference.odometer_m * self._direction
-            self.closing_m = start_m + self._window(ahead[0]).close_m
+            self.closing_m = start_m + self._window(announced.balises[first]).close_m
 
     def _passage_of(self, crossing: Crossing) -> Passage:
         """The passage that this offer belongs to: a new one, or one whose window closed before."""
@@ -269,7 +297,7 @@ class LinkingChain:
 
     def _new_passage(self, balise: Balise, t_ns: int, direction: int) -> Passage:
         passage = Passage(balise, t_ns, direction)
-        if balise.balise_id in (ahead.balise_id for ahead in self._ahead):
+        if self._ahead.place_of(balise.balise_id, self._next) is not None:
             passage.window = self._window(balise)
         if self.reference is not None and self.reference.odometer_m is not None:
             along_m = balise.path_m - self.reference.balise.path_m

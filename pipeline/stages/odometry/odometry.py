@@ -194,6 +194,17 @@ class Odometry:
         speed: Floats = (self.distance_at_s(t_s) - self.distance_at_s(start)) / span
         return speed
 
+    def span_s(self, t_s: Floats) -> tuple[Floats, Floats]:
+        """Begin and end of the time about an instant over which its speed is taken, inside the recording."""
+        about_s = self.config.latency_span_s
+        return np.maximum(t_s - about_s, self.t_s[0]), np.minimum(t_s + about_s, self.t_s[-1])
+
+    def reading_at_s(self, t_s: Floats) -> tuple[Floats, Floats]:
+        """Distance [m] and speed [m/s], centred: one over the second before would bias a latency by the same noise."""
+        begin_s, end_s = self.span_s(t_s)
+        speed_mps = (self.distance_at_s(end_s) - self.distance_at_s(begin_s)) / (end_s - begin_s)
+        return self.distance_at_s(t_s), speed_mps
+
     def row_sigma_m(self, t_s: Floats) -> Floats:
         """Standard deviation of the quantisation noise at these times [m]."""
         if not self.noise.quantisation:
@@ -317,7 +328,7 @@ def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
 
 def _leaps_ns(stream: pl.DataFrame, config: AlignConfig) -> tuple[int, ...]:
     t_ns = times_ns(stream)
-    leap = leaps(np.diff(floats(stream, "distance_m")), np.diff(t_ns) / NS_PER_S, config)
+    leap = leaps((t_ns - t_ns[0]) / NS_PER_S, floats(stream, "distance_m"), config)
     return tuple(t_ns[1:][leap].tolist())
 
 

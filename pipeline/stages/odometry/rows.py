@@ -27,36 +27,60 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
     A leap of the distance is no way: there the speeds tell it where they agree with the distance elsewhere. Where rows
     are by turns, nothing is carried over more than `limit_s`.
     """
-    dt_s = np.diff(t_s)
     distance_m = _without_spikes(t_s, distance_m, config)
-    recorded_m = np.diff(distance_m)
-    leap = leaps(recorded_m, dt_s, config)
-    recorded = np.where(leap, np.nan, recorded_m)
-    driven = _trusted(_driven(speed_mps, dt_s), recorded, leap, config)
+    leap = leaps(t_s, distance_m, config)
+    recorded = np.where(leap, np.nan, np.diff(distance_m))
+    driven = _trusted(_driven(t_s, speed_mps), recorded, leap, config)
     step = np.where(np.isnan(recorded), driven, recorded)
     unknown = np.isnan(step)
     if not unknown.any():
         return Ways(step, ~np.isnan(recorded))
-    carried_m = np.diff(_carried(t_s, distance_m, limit_s))
-    leap = leaps(carried_m, dt_s, config)
-    recorded = np.where(unknown & ~leap, carried_m, recorded)
-    driven = _trusted(_driven(_carried(t_s, speed_mps, limit_s), dt_s), recorded, leap, config)
+    carried_m = _carried(t_s, distance_m, limit_s)
+    leap = leaps(t_s, carried_m, config) | _resets(t_s, distance_m, config)
+    recorded = np.where(unknown & ~leap, np.diff(carried_m), recorded)
+    driven = _trusted(_driven(t_s, _carried(t_s, speed_mps, limit_s)), recorded, leap, config)
     counted = ~np.isnan(recorded)
     return Ways(np.where(counted, recorded, driven), counted)
 
 
-def leaps(way_m: Floats, dt_s: Floats, config: AlignConfig) -> Bools:
-    """Ways that are longer than any train can drive in these times: the counter was reset, ran over or lied."""
-    leap: Bools = np.abs(way_m) > config.fastest_mps * dt_s + config.bunched_stamps_m
+def leaps(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
+    """Per step: longer than any train can drive, or back as none can: the counter was reset, ran over or lied."""
+    leap: Bools = _too_far(np.diff(distance_m), np.diff(t_s), config) | _resets(t_s, distance_m, config)
     return leap
+
+
+def _too_far(way_m: Floats, dt_s: Floats, config: AlignConfig) -> Bools:
+    far: Bools = np.abs(way_m) > config.fastest_mps * dt_s + config.bunched_stamps_m
+    return far
+
+
+def _resets(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
+    """Steps back between moves the other way before and after, as no train can brake, turn, brake and turn again.
+
+    Within dt a train that begins and ends at rest gets braking dt^2 / 4 far. A row that is off by itself is no reset:
+    it makes the way before or after as much longer.
+    """
+    resets = np.zeros(t_s.size - 1, dtype=np.bool_)
+    rows = np.flatnonzero(np.isfinite(distance_m))
+    moves = np.flatnonzero(np.diff(distance_m[rows]))
+    if moves.size < 3:
+        return resets
+    first, last = rows[moves], rows[moves + 1]
+    way_m = distance_m[last] - distance_m[first]
+    before_m, back_m, after_m = way_m[:-2], way_m[1:-1], way_m[2:]
+    most_m = config.reset_back_m + 0.25 * config.braking_mps2 * (t_s[last] - t_s[first])[1:-1] ** 2
+    against = (back_m * before_m < 0.0) & (back_m * after_m < 0.0) & (np.abs(back_m) > most_m)
+    for move in (np.flatnonzero(against & (np.abs(after_m - before_m) <= most_m)) + 1).tolist():
+        resets[first[move] : last[move]] = True
+    return resets
 
 
 def _without_spikes(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Floats:
     """The distance without single rows from which it leaps back to where it was."""
-    leap = leaps(np.diff(distance_m), np.diff(t_s), config)
+    leap = _too_far(np.diff(distance_m), np.diff(t_s), config)
     if not leap.any():
         return distance_m
-    over = leap[1:] & leap[:-1] & ~leaps(distance_m[2:] - distance_m[:-2], t_s[2:] - t_s[:-2], config)
+    over = leap[1:] & leap[:-1] & ~_too_far(distance_m[2:] - distance_m[:-2], t_s[2:] - t_s[:-2], config)
     cleaned = distance_m.copy()
     cleaned[1:-1][over] = np.nan
     return cleaned
@@ -75,8 +99,8 @@ def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignCon
     return driven_m if apart_m <= most_m else np.where(leap, np.nan, driven_m)
 
 
-def _driven(speed_mps: Floats, dt_s: Floats) -> Floats:
-    steps: Floats = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * dt_s
+def _driven(t_s: Floats, speed_mps: Floats) -> Floats:
+    steps: Floats = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(t_s)
     return steps
 
 

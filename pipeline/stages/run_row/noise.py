@@ -11,8 +11,7 @@ import polars as pl
 from pipeline.stages.epochs.clock import nominal_period_s
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration
-
-AXES = ("along", "cross", "up")
+from schemas.tables import AXES
 
 
 def widened_by_noise(
@@ -21,20 +20,20 @@ def widened_by_noise(
     """Per axis: last raw threshold over that of the model alone, and the white noise [m]; axes without noise left out.
 
     M at one epoch is 1.5 times the white noise squared, and adds 2 M / Δt² to the variance of the raw monitor.
-    `epochs`: of one solution, in order of time; `run`: its row of `runs`.
+    `epochs`: of one solution, in order of time; `run`: its columns `white_noise_*_m`.
     """
-    found: dict[str, tuple[float, float]] = {}
+    widened: dict[str, tuple[float, float]] = {}
     if epochs.height < 2:
-        return found
+        return widened
     period_s = nominal_period_s(times_ns(epochs))
     for axis in AXES:
-        threshold = floats(epochs, f"{axis}_raw_threshold")
-        threshold = threshold[np.isfinite(threshold)]
-        white_m = run[f"white_noise_{axis}_m"]
-        if not threshold.size or not white_m:
+        thresholds = floats(epochs, f"{axis}_raw_threshold")
+        thresholds = thresholds[np.isfinite(thresholds)]
+        white_m = run.get(f"white_noise_{axis}_m")
+        if not thresholds.size or not white_m:
             continue
-        whole = float(threshold[-1] / config.monitors.threshold_factor) ** 2
+        whole = float(thresholds[-1] / config.monitors.threshold_factor) ** 2
         model = whole - 3.0 * (white_m / period_s) ** 2
         if model > 0.0:
-            found[axis] = (float(np.sqrt(whole / model)), white_m)
-    return found
+            widened[axis] = (float(np.sqrt(whole / model)), white_m)
+    return widened

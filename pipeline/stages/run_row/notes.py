@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 
 import polars as pl
 
-from pipeline.read.ingest.clean import StreamCounts
-from pipeline.read.site.checks import BALISE_PLACE
 from pipeline.stages.epochs.clock import Clock, met
 from pipeline.stages.evidence import Evidence as TrainEvidence
 from pipeline.stages.lds.run import LdsResult
@@ -15,18 +14,20 @@ from pipeline.stages.matching import Match
 from pipeline.stages.matching.fixes import contradictory_covariances
 from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.odometry import Odometry
+from pipeline.stages.ride import Ride
 from pipeline.stages.run_row.lost_time import LostTime
-from pipeline.studies.plausibility.fit import Fit
+from pipeline.stages.run_row.noise import widened_by_noise
 from schemas.arrays import NS_PER_S, times_ns
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration
 from schemas.enums import NO_RELINK, BaliseKind, Evidence, LostTo, Note, NotEvaluated, PassageStatus, VehicleFigures
-from schemas.run import IngestNotes, RunLog, Site
-from schemas.words import Remark, remarks
+from schemas.run import IngestNotes, RunLog
+from schemas.words import Remark, noise_words, remarks
 
-# How much a note says, no figure: so many names stand in one, and a scatter of less than the positions themselves have
-# is not worth a word.
+# How much a note says, no figure: so many names stand in one, and neither a scatter of less than the positions
+# themselves have nor thresholds wider by less than this are worth a word.
 _NAMED = 5
 _WORTH_M = 0.1
+_WORTH_RATIO = 1.05
 _WITHOUT_ODOMETER = (NotEvaluated.NO_ODOMETER, NotEvaluated.BEYOND_SPAN, NotEvaluated.INTERRUPTED)
 
 
@@ -42,51 +43,31 @@ def ingest_notes(ingest: IngestNotes) -> list[Remark]:
     )
 
 
-def ride_notes(
-    run: RunLog,
-    site: Site,
-    counts: StreamCounts,
-    fixes: pl.DataFrame,
-    found: Match,
-    aligned: pl.DataFrame,
-    lds: LdsResult,
-    vehicle: Vehicle,
-    odometry: Odometry | None,
-    fit: Fit,
-    evidence: TrainEvidence,
-    config: Configuration,
-) -> list[Remark]:
-    """What went in, and what matching, alignment and the LDS made of it.
-
-    `counts`, `fixes`: the GNSS of this solution; `evidence`: what is known of where the train was.
-    """
-    off_the_track = [item.place.removeprefix(BALISE_PLACE) for item in site.findings if item.severity == "error"]
-    telegrams = sorted(set(lds.unknown_reads["balise_id"].to_list()))
-    reverses = found.odometer_sign < 0 and vehicle.gnss_antenna_ahead_m
-    return _misfits(fit) + remarks(
+def ride_notes(ride: Ride, evidence: TrainEvidence) -> list[Remark]:
+    """What went in, and what matching, alignment and the LDS made of it."""
+    prepared = ride.prepared
+    run, config, counts = prepared.run, prepared.config, prepared.counts.solutions[ride.solution.name]
+    telegrams = sorted(set(ride.lds.unknown_reads["balise_id"].to_list()))
+    reverses = ride.match.odometer_sign < 0 and prepared.vehicle.gnss_antenna_ahead_m
+    return remarks(
         {
             Note.FAULTS_INJECTED: "" if run.faults is None else ", ".join(sorted(set(run.faults["kind"]))),
-            Note.BALISES_OFF: _few(off_the_track),
+            Note.BALISES_OFF: _few(prepared.site.balises_off()),
             Note.FAR_OFF: counts.far_off,
             Note.PLACEHOLDERS: counts.placeholders,
             Note.CONTRADICTING: counts.contradicting,
             **_extents(run),
-            **_of_odometer(odometry, config.align.straight_s),
+            **_of_odometer(prepared.odometry, config.align.straight_s),
             Note.ODOMETER_REVERSED: reverses,
-            Note.COVARIANCE: contradictory_covariances(fixes),
-            Note.AMBIGUOUS: _ambiguous(found),
-            Note.UNLINKED: _unlinked(lds),
+            Note.COVARIANCE: contradictory_covariances(ride.solution.fixes),
+            Note.AMBIGUOUS: _ambiguous(ride.match),
+            Note.UNLINKED: _unlinked(ride.lds),
             Note.UNKNOWN_TELEGRAMS: ", ".join(telegrams),
-            **_scatter(aligned, config),
+            **_scatter(ride.aligned, config),
             Note.READS_DISPUTED: evidence.disputed,
             Note.READS_UNREACHABLE: evidence.unreachable,
         }
     )
-
-
-def _misfits(fit: Fit) -> list[Remark]:
-    """What of the run does not fit, the impossible first."""
-    return [Remark(Note.MISFIT_MENDED if check.lines else Note.MISFIT, (check.sentence,)) for check in fit.misfits]
 
 
 def _few(names: list[str]) -> str:
@@ -192,6 +173,13 @@ def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> list[Rema
     return [Remark(Note.UNDIAGNOSED, (count, reason.value)) for reason, count in counts.items() if count]
 
 
+def noise_notes(epochs: pl.DataFrame, white_noise: Mapping[str, float | None], config: Configuration) -> list[Remark]:
+    """By how much measured noise widens the thresholds, where that is worth a word."""
+    widened = widened_by_noise(epochs, white_noise, config)
+    worth = {axis: figures for axis, figures in widened.items() if figures[0] >= _WORTH_RATIO}
+    return remarks({Note.WHITE_NOISE: noise_words(worth)})
+
+
 def time_notes(epochs: pl.DataFrame, clock: Clock, lost: LostTime, config: Configuration) -> list[Remark]:
     """For how long nobody knows whether the train moved, and what the moving time without a valid TVB was lost to.
 
@@ -200,11 +188,13 @@ def time_notes(epochs: pl.DataFrame, clock: Clock, lost: LostTime, config: Confi
     unknown_s = float(clock.held_s[met(epochs, pl.col("moving").is_null())].sum())
     low = lost.share is not None and 1.0 - lost.share < config.advice.low_availability
     aside = lost.causes.get(LostTo.NO_POSITION, 0.0) >= config.advice.lost_share
+    poor = lost.causes.get(LostTo.CONFIDENCE, 0.0)
     aside_m = epochs.filter(~pl.col("on_track"))["cross_track_m"].abs().median()
     return remarks(
         {
             Note.MOVING_UNKNOWN: unknown_s if round(unknown_s) > 0 else None,
             Note.AVAILABLE: (1.0 - lost.share, lost.words) if low and lost.share is not None else None,
+            Note.POOR_POSITIONS: poor if low and poor >= config.advice.lost_share else None,
             Note.OFF_TRACK: aside_m if low and aside else None,
         }
     )

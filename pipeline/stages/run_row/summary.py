@@ -9,16 +9,15 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.read.ingest.clean import StreamCounts
-from pipeline.results.provenance import Provenance
+from pipeline.stages.clean.clean import StreamCounts
 from pipeline.stages.epochs.clock import Clock, may_move
 from pipeline.stages.judge.failures import failures_within
 from pipeline.stages.judge.judge import Judged
+from pipeline.stages.provenance import Provenance
 from pipeline.stages.run_row import run_figures as figures
 from pipeline.stages.run_row.lost_time import LostTime, lost_time
-from pipeline.stages.run_row.notes import ingest_notes, judged_notes, time_notes, undiagnosed_notes
+from pipeline.stages.run_row.notes import ingest_notes, judged_notes, noise_notes, time_notes, undiagnosed_notes
 from pipeline.stages.run_row.remedies import remedies, unknown_parts
-from pipeline.stages.run_row.undetected import Spacing, undetected_figures
 from pipeline.stages.run_row.verdict import reasons_of, verdict_of
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
@@ -37,7 +36,7 @@ class SolutionResults:
 
     `odometer_contradicted`: gaps between anchors that the odometer does not close (DOMAIN section 5.1). `alignment`:
     latency and odometer scale at the end of the run. `white_noise`: its columns of `runs`.
-    `spacing`: of physical balises, None where not computed.
+    `undetected`: columns of `runs` on errors that nobody would have noticed, where computed.
     `reasons`: those that no figure holds; `anchored_ns`: first and last instant at which a read or the reference says
     where the train was.
     """
@@ -55,7 +54,7 @@ class SolutionResults:
     notes: Sequence[Remark] = ()
     faults_injected: bool = False
     misfits: Sequence[MisfitCause] = ()
-    spacing: Spacing | None = None
+    undetected: Row = field(default_factory=dict)
     reasons: Sequence[Reason] = ()
     anchored_ns: tuple[int, int] | None = None
 
@@ -80,7 +79,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | figures.state_shares(epochs)
         | figures.stanford_counts(epochs, config.lds.ci_limit_m)
         | figures.stanford_of_receiver(epochs, config.lds.ci_limit_m)
-        | undetected_figures(epochs, results.spacing, config.hazards.failure_limit_m)
+        | results.undetected
         | _provenance(provenance)
     )
     row |= _part(results, row, config) | figures.service_levels(row, config) | _verdict(row, config)
@@ -177,6 +176,7 @@ def _notes(
         *results.notes,
         *judged_notes(results.judged.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
         *undiagnosed_notes(results.epochs, results.judged.passages),
+        *noise_notes(results.epochs, results.white_noise, config),
         *time_notes(results.epochs, clock, lost, config),
         *(Remark(Note.REMEDY, (remedy_words(cure),)) for cure in cures),
     )

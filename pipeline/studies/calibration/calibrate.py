@@ -10,14 +10,12 @@ import polars as pl
 import tomli_w
 
 from pipeline.one_run import replay
-from pipeline.read.ingest.clean import clean
-from pipeline.stages.matching import match
 from pipeline.stages.monitors.axis import error_model
-from pipeline.stages.odometry import odometry_of
+from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.studies.calibration.noise import beyond_noise
 from pipeline.studies.calibration.sigmas import COMPARED, regress_sigmas, sigma_table, velocity_sigma_mps, worst_fit
 from pipeline.studies.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
-from pipeline.studies.plausibility.fit import fit_run, refuse_impossible
+from pipeline.studies.plausibility.fit import clock_advice, fit_run, refuse_impossible
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
@@ -92,8 +90,9 @@ def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, so
     Raises `InputError` where its streams do not fit each other.
     """
     config = _uncalibrated(config)
-    _refuse_what_does_not_fit(log, site, vehicle, config, solution)
-    estimate = _estimate(log, site, vehicle, config, solution)
+    prepared = prepare(log, site, vehicle, config, clock_advice)
+    _refuse_what_does_not_fit(prepared, solution)
+    estimate = _estimate(prepared, solution)
     own = vehicle if estimate is None else _vehicle(vehicle, [estimate], config.align.latency_prior_sigma_s)
     epochs = replay(log, site, own, config).epochs.filter(pl.col("solution") == solution)
     alarms = beyond_noise(epochs, config.monitors.threshold_factor)
@@ -147,17 +146,15 @@ def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
         )
 
 
-def _estimate(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> RunEstimate | None:
-    run, _ = clean(log, config)
-    fixes = run.gnss.filter(pl.col("solution") == solution)
-    odometry = odometry_of(run.odometer, vehicle, config)
-    if odometry is None or fixes.is_empty():
+def _estimate(prepared: PreparedRun, solution: str) -> RunEstimate | None:
+    config, odometry = prepared.config, prepared.odometry
+    if odometry is None or solution not in prepared.run.solutions():
         return None
-    found = match(fixes, odometry, site, vehicle, config.matching, config.fix_sigma, run.balise_reads)
-    epochs = found.epochs.filter("fix_valid", "on_track")
+    match = prepared.match(solution)
+    epochs = match.epochs.filter("fix_valid", "on_track")
     t_s = odometry.seconds(times_ns(epochs))
     seen = Observations(t_s, floats(epochs, "path_m"), floats(epochs, "sigma_along_m"))
-    return estimate_run(seen, odometry.oriented(found.odometer_sign), *error_model(config.monitors), config.calibration)
+    return estimate_run(seen, odometry.oriented(match.odometer_sign), *error_model(config.monitors), config.calibration)
 
 
 def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: float) -> Vehicle:
@@ -174,12 +171,14 @@ def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: flo
     return base.model_copy(update=measured)
 
 
-def _refuse_what_does_not_fit(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> None:
+def _refuse_what_does_not_fit(prepared: PreparedRun, solution: str) -> None:
     """A run with a wrong unit or clock would teach its error to every other run."""
-    run, _ = clean(log, config)
+    run, config = prepared.recorded, prepared.config
     if solution in run.solutions():
-        fit = fit_run(run, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m), config.plausibility, site)
-        refuse_impossible(fit, log.run_id, config.ingest)
+        mounted = Vehicle(antenna_height_m=prepared.vehicle.antenna_height_m)
+        refuse_impossible(
+            fit_run(run, solution, mounted, config.plausibility, prepared.site), run.run_id, config.ingest
+        )
 
 
 def _refuse_figures_of_no_train(vehicle: Vehicle, place: str, config: Configuration) -> None:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.linalg import cho_solve, solve_triangular
 
 from pipeline.stages.odometry import Odometry
+from pipeline.stages.odometry.scale_lag import scale_and_lag
 from schemas.arrays import Floats
 from schemas.config import CalibrationConfig
 
@@ -70,22 +71,22 @@ def estimate_run(
         return None
     factors = [_factor(_covariance(block, odometry, shares, taus_s, config)) for block in blocks]
     by_chance = sum(_chance_information(block, one, odometry) for block, one in zip(blocks, factors, strict=True))
-    estimate = np.array([1.0, latency_s])
+    scale = scale_sigma = latency_sigma_s = misfit = 0.0
     for _ in range(_ITERATIONS):
-        normal, right, left_over, freedom = _accumulate(blocks, factors, odometry, estimate)
-        if np.linalg.matrix_rank(normal) < normal.shape[0]:
+        normal, right, left_over, freedom = _accumulate(blocks, factors, odometry, latency_s)
+        misfit = float(np.sqrt(max(left_over, 0.0) / max(freedom, 1)))
+        estimate = scale_and_lag(normal, right, max(1.0, misfit), latency_s)
+        if estimate is None:
             return None
-        estimate = estimate + np.linalg.solve(normal, right)
-    misfit = float(np.sqrt(max(left_over, 0.0) / max(freedom, 1)))
-    sigma = np.sqrt(np.diag(np.linalg.inv(normal))) * max(1.0, misfit)
-    sigma[1] = _widened(float(sigma[1]), estimate[0] ** 2 * by_chance)
+        scale, scale_sigma, latency_s, latency_sigma_s = estimate
+    latency_sigma_s = _widened(latency_sigma_s, scale**2 * by_chance)
     points = sum(block.t_s.size for block in blocks)
-    return RunEstimate(float(estimate[0]), float(sigma[0]), float(estimate[1]), float(sigma[1]), misfit, points)
+    return RunEstimate(scale, scale_sigma, latency_s, latency_sigma_s, misfit, points)
 
 
 def _blocks(seen: Observations, odometry: Odometry, config: CalibrationConfig) -> list[Observations]:
     """Thinned observations in pieces of unbroken odometry, each with an offset of its own."""
-    begin_s, end_s = _span(seen.t_s, odometry)
+    begin_s, end_s = odometry.span_s(seen.t_s)
     known = (
         odometry.known_at_s(seen.t_s)
         & odometry.known_at_s(seen.t_s - 1.0)
@@ -147,23 +148,24 @@ def _of_rows(odometry: Odometry, one_s: Floats, other_s: Floats) -> Floats:
 
 
 def _accumulate(
-    blocks: list[Observations], factors: list[Floats], odometry: Odometry, estimate: Floats
+    blocks: list[Observations], factors: list[Floats], odometry: Odometry, latency_s: float
 ) -> tuple[Floats, Floats, float, int]:
-    """Normal equations of (scale, latency), offsets eliminated; remaining chi-square before the step, its freedom.
+    """Normal equations of `scale_and_lag`, offsets eliminated; the chi-square that they leave, and its freedom.
 
     `factors`: of the covariance of each block, by Cholesky.
     """
     normal, right = np.zeros((2, 2)), np.zeros(2)
     left_over, freedom = 0.0, -2
     for block, factor in zip(blocks, factors, strict=True):
-        design, miss = _linearised(block, odometry, estimate)
-        white = solve_triangular(factor, np.column_stack([np.ones(miss.size), design, miss]), lower=True)
+        way_m, speed_mps = odometry.reading_at_s(block.t_s - latency_s)
+        columns = [np.ones(way_m.size), way_m - way_m[0], -speed_mps, block.path_m - block.path_m[0]]
+        white = solve_triangular(factor, np.column_stack(columns), lower=True)
         offset = white[:, 0] / np.linalg.norm(white[:, 0])
         free = white[:, 1:] - np.outer(offset, offset @ white[:, 1:])
         normal += free[:, :2].T @ free[:, :2]
         right += free[:, :2].T @ free[:, 2]
         left_over += float(free[:, 2] @ free[:, 2])
-        freedom += miss.size - 1
+        freedom += way_m.size - 1
     if np.linalg.matrix_rank(normal) == normal.shape[0]:
         left_over -= float(right @ np.linalg.solve(normal, right))
     return normal, right, left_over, freedom
@@ -179,7 +181,7 @@ def _chance_information(block: Observations, factor: Floats, odometry: Odometry)
     lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
     noise = odometry.noise.white_m2_per_s * np.maximum(span_s - lag, 0.0) / span_s**2
     if odometry.noise.quantisation:
-        begin_s, end_s = _span(block.t_s, odometry)
+        begin_s, end_s = odometry.span_s(block.t_s)
         across = _of_rows(odometry, begin_s, end_s)
         rows = _of_rows(odometry, begin_s, begin_s) + _of_rows(odometry, end_s, end_s) - across - across.T
         noise = noise + rows / span_s**2
@@ -192,23 +194,6 @@ def _widened(sigma_s: float, by_chance: float) -> float:
     """Sigma of the latency without what chance tells of it; twice its mean, as chance also tells more than that."""
     told = 1.0 / sigma_s**2
     return float(1.0 / np.sqrt(max(told - 2.0 * by_chance, _LEAST_SHARE * told)))
-
-
-def _linearised(block: Observations, odometry: Odometry, estimate: Floats) -> tuple[Floats, Floats]:
-    """Columns of scale and latency, and what is observed over what is expected."""
-    scale, latency_s = estimate
-    at = block.t_s - latency_s
-    distance = odometry.distance_at_s(at)
-    # Centred, as a speed from the odometer noise of the same second would bias the latency.
-    begin_s, end_s = _span(at, odometry)
-    speed = (odometry.distance_at_s(end_s) - odometry.distance_at_s(begin_s)) / (end_s - begin_s)
-    return np.column_stack([distance - distance[0], -scale * speed]), block.path_m - scale * distance
-
-
-def _span(t_s: Floats, odometry: Odometry) -> tuple[Floats, Floats]:
-    """Begin and end of the time over which the speed is taken, within what the odometer recorded."""
-    span_s = odometry.config.latency_span_s
-    return np.maximum(t_s - span_s, odometry.t_s[0]), np.minimum(t_s + span_s, odometry.t_s[-1])
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from pipeline.studies.plausibility.recording import recording_of
 from pipeline.studies.plausibility.witnesses import Lag, clock_checks
 from pipeline.studies.plausibility.written import reference_elsewhere, written_checks
 from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
-from schemas.enums import MisfitCause
+from schemas.enums import MisfitCause, Note
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
+from schemas.words import Remark
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,22 @@ class Fit:
     def misfits(self) -> tuple[Check, ...]:
         """What does not fit, the impossible first."""
         return (*self.impossible, *(check for check in self.checks if check.state is State.MISFIT))
+
+    @property
+    def codes(self) -> list[MisfitCause]:
+        """Causes of what does not fit."""
+        return [cause.code for check in self.misfits for cause in check.causes]
+
+    @property
+    def notes(self) -> list[Remark]:
+        """What does not fit, for the `runs` row."""
+        return [Remark(Note.MISFIT_MENDED if check.lines else Note.MISFIT, (check.sentence,)) for check in self.misfits]
+
+
+def clock_advice(run: RunLog) -> str:
+    """What makes recorders of different times one journey, in sentences; empty where nothing does."""
+    impossible = fit_run(run, run.solutions()[0], Vehicle(), PlausibilityConfig()).impossible
+    return " ".join([*(f"{check.sentence}." for check in impossible), remedy_of(impossible)]).rstrip(" ")
 
 
 def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityConfig, site: Site | None = None) -> Fit:

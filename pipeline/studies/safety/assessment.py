@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 
+from pipeline import storage
 from pipeline.results import catalogue, store
 from pipeline.results.figures.campaign_figures import derived_tables
 from pipeline.results.figures.map_errors import map_suspects
-from pipeline.show.terminal import show_tables, tall, to_json
-from pipeline.storage.address import Address
-from pipeline.studies.safety.reading import figures_for_reading, some_of, source_files
+from pipeline.results.manifest import NAME, read_manifest
+from pipeline.storage.address import Address, join
 from pipeline.studies.safety.sensitivity import Replay, sensitivity
 from pipeline.studies.safety.sentences import (
     level_statements,
@@ -25,7 +27,6 @@ from pipeline.studies.safety.side_by_side import EPOCH_COLUMNS, side_by_side
 from pipeline.studies.safety.tally import added, architecture_figures
 from schemas.config import Configuration
 from schemas.enums import TRUTH, RunStatus, ThrVerdict
-from schemas.errors import visible
 
 
 @dataclass(frozen=True)
@@ -34,16 +35,6 @@ class Assessment:
 
     statements: list[str]
     tables: dict[str, pl.DataFrame]
-
-
-def show(found: Assessment, as_json: bool) -> None:
-    """Print it: the verdict, each table, what it means; or all of it as JSON."""
-    if as_json:
-        print(to_json({"statements": found.statements, **found.tables}))
-        return
-    print(visible(found.statements[0]) + "\n")
-    show_tables(for_reading(found.tables))
-    print(visible("\n".join(found.statements[1:])))
 
 
 def assess(out: Address, config: Configuration | None = None, replay: Replay | None = None) -> Assessment:
@@ -130,37 +121,28 @@ def alarm_causes(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
     return named.group_by(keys).agg(**counts).sort(keys)
 
 
-_SHORT = {
-    "time_to_detect": (
-        *("solution", "service_level", "allowed_s", "failures", "within", "exceeded", "failures_judged"),
-        *("within_judged", "within_share_low", "within_share_high"),
-        *("hazardous_median_s", "hazardous_p95_s", "hazardous_max_s", "hazardous_may_max_s"),
-        *("time_to_detect_median_s", "time_to_detect_p95_s", "time_to_detect_max_s"),
-    ),
-    "accuracy": (
-        *("solution", "grouped_by", "group", "location_error_count", "location_error_mean_m"),
-        "location_error_sigma_m",
-        *("location_error_p95_m", "location_error_max_m", "location_accuracy_m", "within_location_accuracy_share_low"),
-        *("within_location_accuracy", "within_ci_limit"),
-    ),
-}
+SOURCES = {"kind": pl.String, "of": pl.String, "name": pl.String, "bytes": pl.Int64, "sha256": pl.String}
 
 
-def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
-    """The tables as they fit a screen: without those of single runs, wide ones in fewer columns or turned."""
-    figures = figures_for_reading(tables["figures"])
-    shown = {
-        "what this result was made from": some_of(tables["sources"]),
-        "how much the verdict depends on what was chosen": tables["sensitivity"],
-        **{f"figures of {name}, with exact 95 % bounds": table for name, table in figures.items()},
-        "time to detect and hazardous time": tables["time_to_detect"].select(_SHORT["time_to_detect"]),
-        "runs by verdict per service level": tables["levels"],
-        "location error of accepted virtual balises": tables["accuracy"].select(_SHORT["accuracy"]),
-        "composite and reactive fail-safety side by side": tables["side_by_side"],
-        "alarms by verdict and suspect": tables["alarms"],
-        "places where the map is in doubt": tables["map"],
-    }
-    side = "composite and reactive fail-safety side by side"
-    if shown[side].height:
-        shown[side] = tall(shown[side], ("architecture", "solution", "other"))
-    return {name: table for name, table in shown.items() if table.height}
+def source_files(out: Address) -> pl.DataFrame:
+    """`kind, of, name, bytes, sha256`: manifest, program, settings, site and logs; none without a manifest."""
+    manifest = read_manifest(out)
+    if manifest is None:
+        return pl.DataFrame(schema=SOURCES)
+    content = storage.content_of(join(out, NAME)) or b""
+    rows: list[tuple[str, str, str, int | None, str]] = [
+        ("manifest", "", NAME, len(content), hashlib.sha256(content).hexdigest())
+    ]
+    made = {(run["software"], run["software_digest"]) for run in manifest["runs"].values()}
+    rows += [("program", "", software or "", None, digest or "") for software, digest in sorted(made, key=str)]
+    for entries in manifest["settings"].values():
+        rows += [_row(kind, "", file) for entry in entries for kind, file in entry.items() if file]
+    for listed in manifest["sites"].values():
+        rows += [_row("site", "", file) for file in listed]
+    for run_id, run in manifest["runs"].items():
+        rows += [_row("log", run_id, file) for file in run["log"]]
+    return pl.DataFrame(rows, schema=SOURCES, orient="row").unique(maintain_order=True)
+
+
+def _row(kind: str, of: str, file: dict[str, Any]) -> tuple[str, str, str, int, str]:
+    return kind, of, file["name"], file["bytes"], file["sha256"]

@@ -8,17 +8,15 @@ need the logs again.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import polars as pl
 
-from pipeline.campaign import make_plan, run_campaign
 from pipeline.results import store
 from pipeline.stages.run_row.verdict import failures_in, head_of, level_counts, reasons_of, run_verdicts, verdict_of
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration
 from schemas.enums import RunStatus
-from schemas.errors import UsageError
 
 # Shares of the configured value: a half and half as much again; two to five sigma round the usual three.
 _VARIED = {"failure_limit_m": (0.5, 1.5), "evidence_factor": (2.0 / 3.0, 4.0 / 3.0, 5.0 / 3.0)}
@@ -26,15 +24,6 @@ _TABLES, _REPLAYED, _NEEDED = "from tables", "replayed", "needs --logs"
 
 Row = dict[str, Any]
 Replay = Callable[[Configuration, str], object]
-
-
-def replayed(logs: Sequence[str], site: str | None, vehicle: Vehicle, jobs: int) -> Replay | None:
-    """How to replay these logs with another configuration; none without logs. Raises `UsageError` without a site."""
-    if not logs:
-        return None
-    if site is None:
-        raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
-    return lambda settings, to: run_campaign(make_plan(logs, site, to, settings, vehicle), jobs=jobs)
 
 
 def sensitivity(runs: pl.DataFrame, config: Configuration, replay: Replay | None = None) -> pl.DataFrame:

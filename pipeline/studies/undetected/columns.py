@@ -11,8 +11,8 @@ import polars as pl
 from pipeline.stages.epochs.clock import crossing_gap_ns
 from pipeline.stages.lds.relink import Held
 from pipeline.stages.monitors.bank import AxisRecord
-from pipeline.stages.run_row.undetected import Spacing
 from pipeline.studies.undetected.error import largest_errors
+from pipeline.studies.undetected.figures import Spacing, undetected_figures
 from pipeline.studies.undetected.levels import bounded, range_bounds, with_channel
 from pipeline.studies.undetected.spacing import largest_spacing
 from pipeline.studies.undetected.watched import Watched, Window, watched, windows
@@ -50,6 +50,10 @@ class Undetected:
     epochs: pl.DataFrame
     passages: pl.DataFrame
     spacing: Spacing | None = None
+
+    def figures(self, epochs: pl.DataFrame, config: Configuration) -> dict[str, object]:
+        """Columns of the `runs` row, over judged epochs; none where nothing was computed."""
+        return undetected_figures(epochs, self.spacing, config.hazards.failure_limit_m)
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.stages.run_row.undetected import Spacing
 from pipeline.studies.undetected.error import Errors, largest_errors, splits_after
+from pipeline.studies.undetected.figures import Spacing
 from pipeline.studies.undetected.shares import growth_with, splits_of
 from pipeline.studies.undetected.stretch import stretch_after
 from pipeline.studies.undetected.watched import Watched

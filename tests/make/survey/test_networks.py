@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.campaign.plan import make_plan
 from pipeline.read.site.read import read_site
-from pipeline.results.inspection import inspect_path
+from pipeline.show.inspection import inspect_path
 from schemas.errors import BaliseError, SiteError
 from schemas.run import Site
 from tests.make.survey.test_site_of_survey import INFRABEL, site_of, told, way, written

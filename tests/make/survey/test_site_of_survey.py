@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.make.survey.make import make_site, wish_of, write_made
 from pipeline.make.survey.network import make_network
-from pipeline.make.survey.pieces import Piece, Survey
+from pipeline.make.survey.pieces import LinePiece, Survey
 from pipeline.make.survey.trace import clean_traces
 from pipeline.read.site.read import read_site
 from pipeline.show.report.site_page import site_page
@@ -267,11 +267,11 @@ def test_gpx_kml_and_kmz_give_the_same_line_and_the_same_ids_each_time(tmp_path:
         write_made(sites[0], "", tmp_path / "one", force=False)
 
 
-def recorded(name: str, east_m: np.ndarray, north_m: np.ndarray, rng: np.random.Generator) -> Piece:
+def recorded(name: str, east_m: np.ndarray, north_m: np.ndarray, rng: np.random.Generator) -> LinePiece:
     scatter = rng.normal(0.0, 0.02, (2, len(east_m)))
     latitude, longitude = degrees(east_m + scatter[0], north_m + scatter[1])
     unknown = np.full(len(east_m), np.nan)
-    return Piece(name, latitude, longitude, unknown, unknown, np.full(len(east_m), 0.02), recorded=True)
+    return LinePiece(name, latitude, longitude, unknown, unknown, np.full(len(east_m), 0.02), recorded=True)
 
 
 def test_recorded_passes_make_one_line_and_a_branch_meets_it_at_a_switch() -> None:
@@ -329,6 +329,16 @@ BAD = {
     "entity.gpx": ('<!DOCTYPE gpx [<!ENTITY a "b">]><gpx>&a;</gpx>', "line 1: declares a document type"),
     "half.gpx": ("<gpx><trk>", "not well-formed XML"),
     "nowhere.gpx": ('<gpx><trk><trkseg><trkpt lat="50"/></trkseg></trk></gpx>', "line 1: a coordinate cannot be read"),
+    "tiny.gpx": (
+        '<gpx><trk><trkseg><trkpt lat="50" lon="4"/><trkpt lat="50.000000000001" lon="4"/></trkseg></trk></gpx>',
+        "nothing is left of the survey",
+    ),
+    "utf7.gpx": ('<?xml version="1.0" encoding="UTF-7"?><gpx/>', "not well-formed XML"),
+    "digits.gpx": ('<gpx><rte><rtept lat="5_0" lon="4"/></rte></gpx>', "a coordinate cannot be read; found '5_0'"),
+    "script.geojson": (
+        '{"features": [{"geometry": {"type": "LineString", "coordinates": [["\\u0665", 50], [4, 51]]}}]}',
+        "a coordinate cannot be read",
+    ),
     "page.kml": ("<html/>", "neither GPX nor KML"),
     "text.kmz": ("text", "cannot be unpacked"),
     "overpass.json": ('{"elements": []}', "Overpass exports GeoJSON"),

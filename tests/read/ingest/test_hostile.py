@@ -14,10 +14,10 @@ import pytest
 import zstandard
 
 from pipeline.read.ingest import mcap_block, read_run
-from pipeline.read.ingest.clean import clean, of_the_journey
 from pipeline.read.ingest.describe import describe_log
 from pipeline.read.ingest.layout import LayoutDecoder, UnfitError, constant, fixed, layout_of
 from pipeline.read.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
+from pipeline.stages.clean.clean import clean, of_the_journey
 from pipeline.storage.parquet import parquet_bytes
 from schemas.config import IngestConfig
 from schemas.errors import InputError

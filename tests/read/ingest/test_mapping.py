@@ -13,9 +13,9 @@ from mcap.writer import Writer
 from mcap_ros2._dynamic import serialize_dynamic
 
 from pipeline.read.ingest import read_run
-from pipeline.read.ingest.clean import clean
 from pipeline.read.ingest.describe import describe_log
 from pipeline.read.ingest.timescale import utc_from_gps
+from pipeline.stages.clean.clean import clean
 from schemas.config import IngestConfig, settings_from
 from schemas.errors import ConfigError, InputError
 from tests.read.ingest import samples

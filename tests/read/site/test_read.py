@@ -14,7 +14,7 @@ from polars.testing import assert_frame_equal
 
 from pipeline.read.site.describe import describe_site
 from pipeline.read.site.read import read_site
-from pipeline.results.inspection import inspect_path
+from pipeline.show.inspection import inspect_path
 from schemas.errors import BaliseError, SiteError
 from schemas.inputs import Balises, Links, Route, Track
 from tests.read.site import builders

@@ -7,8 +7,8 @@ from pathlib import Path
 from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.known_counts import known_counts
-from pipeline.results.inspection import inspect_result
 from pipeline.results.store import write_run
+from pipeline.show.inspection import inspect_result
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunTables
 from schemas.tables import TABLES, Hazards, Passages, Runs

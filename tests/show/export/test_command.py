@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from cli import app
 from datasets.trial import write_run_log, write_site
-from pipeline.results.provenance import input_digest, provenance
 from pipeline.show.export.write import export_run
+from pipeline.stages.provenance import input_digest, provenance
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from tests.show.export.conftest import Result

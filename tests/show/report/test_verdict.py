@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.results.provenance import Provenance
 from pipeline.results.store import write_run
 from pipeline.show.report import write_report
 from pipeline.show.report.markup import cell
+from pipeline.stages.provenance import Provenance
 from pipeline.stages.run_row.summary import failed_row
 from schemas.run import RunTables
 from schemas.tables import TABLES, Runs

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.read.ingest.clean import clean
+from pipeline.stages.clean.clean import clean
 from schemas.config import Configuration, LdsConfig
 from schemas.errors import InputError
 from schemas.run import RunLog

@@ -147,6 +147,27 @@ def test_a_counter_that_is_reset_or_runs_over_drives_nowhere(reads, leap, speed)
         assert known.all()
 
 
+@pytest.mark.parametrize(("reset_m", "step_s"), [(138.0, 1.0), (39.0, 1.0), (30.0, 0.1), (9.0, 0.1)])
+@pytest.mark.parametrize("speed", [None, 20.0])
+def test_a_counter_that_is_reset_by_little_turns_no_train_round(reset_m, step_s, speed):
+    """20 m/s throughout; a reset by 138 m at 1 Hz was a speed of -118 m/s."""
+    t = step_s * np.arange(60.0)
+    reads = reset_m + 20.0 * t - np.where(np.arange(60) >= 30, reset_m, 0.0)
+    odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=None if speed is None else np.full(60, speed)))
+    assert odometry.speed_at_s(t[1:]).min() >= 0.0
+    assert odometry.segment[-1] == (1 if speed is None else 0)
+    assert len(odometry.leaps_ns) == 1
+
+
+def test_reversing_noise_and_single_rows_are_no_reset():
+    """At 1 Hz: a train that runs to and fro in 4 s, a counter of whole 5 m at an edge, a row 30 m ahead or behind."""
+    to_and_fro = np.abs(np.arange(20.0) % 8.0 - 4.0) * 3.0
+    edge = np.arange(20) % 2 * 5.0
+    ahead, behind = (20.0 * np.arange(20.0) + size_m * (np.arange(20) == 9) for size_m in (30.0, -30.0))
+    for reads in (to_and_fro, edge, ahead, behind):
+        assert odometry_from(odometer_of(np.arange(20.0), distance_m=reads)).leaps_ns == ()
+
+
 @pytest.mark.parametrize("speed", [None, "by turns", "always"])
 def test_a_counter_that_is_reset_in_a_pause_loses_the_way(speed):
     t = np.concatenate([np.arange(0.0, 10.0, 0.5), np.arange(15.0, 25.0, 0.5)])

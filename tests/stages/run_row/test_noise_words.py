@@ -22,7 +22,7 @@ def test_thresholds_against_the_models() -> None:
     found = widened_by_noise(frame, run, CONFIG)
     assert list(found) == ["along"]
     assert found["along"] == (pytest.approx(2.0), 0.1)
-    assert "along the track 2.0 times (white noise 10 cm)" in noise_words(found)
+    assert noise_words(found) == "along the track 2.0 times (white noise 10 cm)"
     assert widened_by_noise(frame.head(1), run, CONFIG) == {}
 
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.read.ingest.clean import StreamCounts
-from pipeline.results.provenance import Provenance
+from pipeline.stages.clean.clean import StreamCounts
 from pipeline.stages.judge.judge import Judged
+from pipeline.stages.provenance import Provenance
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import Evidence, Note, VehicleFigures

@@ -14,8 +14,9 @@ import pytest
 from pipeline.read.site.alike import window_findings
 from pipeline.read.site.read import read_site
 from pipeline.results.store import write_run
+from pipeline.show.line import write_line
 from pipeline.studies.line.proposals import site_balises
-from pipeline.studies.line.write import LineResult, read_points, write_line
+from pipeline.studies.line.study import LineResult, read_points, study_line
 from schemas.conform import dtypes
 from schemas.errors import BaliseError, UsageError
 from schemas.inputs import Balises
@@ -83,7 +84,9 @@ def site() -> Site:
 @pytest.fixture(scope="module")
 def found(out: Path, site: Site) -> LineResult:
     points = pl.DataFrame({"name": ["S1", "S2"], "netelement_id": ["A", "A"], "measure_m": [1150.0, 1650.0]})
-    return write_line(out, site, CRITERIA, points=points)
+    result = study_line(out, site, CRITERIA, points=points)
+    write_line(result, out / "line")
+    return result
 
 
 def test_virtual_balises_stand_on_suitable_pieces_only(found: LineResult) -> None:
@@ -161,7 +164,7 @@ def test_files_open_offline(found: LineResult, out: Path) -> None:
 
 def test_what_cannot_be_said_is_said(found: LineResult, out: Path, site: Site) -> None:
     assert any("2 settings or vehicle files" in text for text in found.remarks)
-    few = write_line(out, site, LineCriteria())
+    few = study_line(out, site, LineCriteria())
     assert any(re.search("a piece has [56] at most, and 36 without", text) for text in few.remarks)
     assert any("nothing to propose" in text for text in few.remarks)
     assert set(few.proposals["virtual"]) == set()
@@ -171,18 +174,18 @@ def test_runs_of_one_direction_without_truth(tmp_path: Path, site: Site) -> None
     write_tables(tmp_path, 0, epochs_of(0, falling=False), evidence="odometer")
     # Only A is passed in the sense of its measure; over B the line runs against it.
     write_tables(tmp_path, 1, epochs_of(2, (), falling=False).filter(pl.col("path_m") < SPLIT_M - 100.0))
-    remarks = write_line(tmp_path, site, CRITERIA).remarks
+    remarks = study_line(tmp_path, site, CRITERIA).remarks
     assert any(text.startswith("1 of 2 runs have neither") for text in remarks)
     assert any("growing measure on B:" in text for text in remarks)
     assert any("falling measure on A:" in text for text in remarks)
     write_tables(tmp_path, 0, epochs_of(0, falling=False).filter(pl.col("path_m") < SPLIT_M - 100.0))
-    assert any("direction of falling measure" in text for text in write_line(tmp_path, site, CRITERIA).remarks)
+    assert any("direction of falling measure" in text for text in study_line(tmp_path, site, CRITERIA).remarks)
 
 
 def test_results_of_another_site_are_refused(tmp_path: Path, site: Site) -> None:
     write_tables(tmp_path, 0, epochs_of(0), digest="elsewhere")
     with pytest.raises(UsageError, match="another site"):
-        write_line(tmp_path, site, CRITERIA)
+        study_line(tmp_path, site, CRITERIA)
 
 
 def test_points_that_cannot_be_read(tmp_path: Path) -> None:
@@ -203,7 +206,7 @@ def test_an_unsafe_acceptance_and_an_undetected_error_count_at_their_place(tmp_p
     run = epochs_of(0, ())
     unsafe = filled(pl.DataFrame([{**offered, **row, "t_offered": run["t"][40]}]), Passages)
     write_tables(tmp_path, 0, run, passages=unsafe)
-    table = write_line(tmp_path, site, LineCriteria(loss_limit=0.99)).pieces.filter(pl.col("netelement_id") == "A")
+    table = study_line(tmp_path, site, LineCriteria(loss_limit=0.99)).pieces.filter(pl.col("netelement_id") == "A")
     bad = table.filter((pl.col("piece_class") == "unsuitable") & (pl.col("from_m") < 2000.0))
     assert bad.select("from_m", "direction", "cause").rows() == [(1000.0, "growing", "unsafe_acceptance")]
     assert set(table.filter(pl.col("from_m") == 1000.0)["largest_undetected_m"]) == {12.5}

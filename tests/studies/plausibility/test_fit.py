@@ -15,13 +15,13 @@ from benchmarks.plausibility_trips import Trip, trip
 from benchmarks.plausibility_wrongs import WRONGS, Wrong, exchanged, moved_site, scaled, shifted
 from datasets.random_trials import random_trial
 from pipeline.one_run import replay as replayed
-from pipeline.read.ingest.clean import clean
 from pipeline.read.ingest.correct import corrected
-from pipeline.results.fit_report import fit_report
+from pipeline.stages.clean.clean import clean
 from pipeline.studies.calibration.calibrate import calibrate
 from pipeline.studies.plausibility.causes import explain_factor, explain_lag
 from pipeline.studies.plausibility.check import CONFIGURATION, Cause, State, Whose
 from pipeline.studies.plausibility.fit import Fit, fit_run, lines_of
+from pipeline.studies.plausibility.report import fit_report
 from schemas.config import Configuration, IngestConfig, PlausibilityConfig, Vehicle, settings_from
 from schemas.enums import MisfitCause, MisfitPlace
 from schemas.errors import ConfigError, InputError

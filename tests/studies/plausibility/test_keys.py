@@ -10,7 +10,7 @@ import pytest
 from benchmarks.plausibility import applies
 from benchmarks.plausibility_trips import trip
 from benchmarks.plausibility_wrongs import WRONGS
-from pipeline.read.ingest.clean import clean
+from pipeline.stages.clean.clean import clean
 from pipeline.studies.plausibility.check import Check
 from pipeline.studies.plausibility.fit import fit_run
 from pipeline.studies.plausibility.pairs import clock_lag

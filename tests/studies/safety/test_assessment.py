@@ -9,7 +9,8 @@ import polars as pl
 import pytest
 
 from pipeline.results.store import write_config, write_run
-from pipeline.studies.safety.assessment import Assessment, alarm_causes, assess, for_reading
+from pipeline.show.assessment import for_reading
+from pipeline.studies.safety.assessment import Assessment, alarm_causes, assess
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import Runs

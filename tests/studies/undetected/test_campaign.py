@@ -5,7 +5,8 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.stages.run_row.undetected import Spacing, spacing_of_runs, undetected_figures, undetected_spread
+from pipeline.results.figures.undetected import spacing_of_runs, undetected_spread
+from pipeline.studies.undetected.figures import Spacing, undetected_figures
 from tests.tables import epochs, passages
 
 

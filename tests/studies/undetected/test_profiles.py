@@ -10,12 +10,13 @@ import pytest
 
 from datasets.faults import FaultSpec, faults_table, offset_m
 from datasets.inject import inject, load_faults
-from pipeline.one_run import replay
+from pipeline.one_run import replay, ride_alone
 from pipeline.studies.undetected.profile import profile_at
+from pipeline.studies.undetected.ride import diagnosis_of
 from schemas.config import Configuration
 from schemas.errors import ConfigError, UsageError
 from tests.replay.journeys import VEHICLE, journey
-from tests.studies.undetected.test_replay import ONE_HZ, diagnosed
+from tests.studies.undetected.test_replay import ONE_HZ
 
 TABLE = "t_s,size_m\n10.0,0.0\n20.0,5.0\n30.0,-1.0\n"
 
@@ -55,7 +56,7 @@ def test_a_fault_along_the_site_moves_the_position_on_its_path_and_not_beside_it
 
 def test_there_is_no_profile_where_nothing_watched() -> None:
     run, site = journey(gnss=ONE_HZ)
-    diagnosis, _, _ = diagnosed(run, site, VEHICLE, Configuration(), "primary")
+    diagnosis = diagnosis_of(ride_alone(run, site, VEHICLE, Configuration(), "primary"))
     with pytest.raises(UsageError, match="epoch 0"):
         profile_at(diagnosis, 0, False, VEHICLE, Configuration())
     found = profile_at(diagnosis, 60, False, VEHICLE, Configuration())

@@ -14,10 +14,11 @@ from datasets.faults import FaultSpec
 from datasets.inject import inject
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
-from pipeline.one_run import diagnosed, replay
+from pipeline.one_run import replay, ride_alone
 from pipeline.studies.undetected.columns import Diagnosis, rows_of
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.levels import range_bounds
+from pipeline.studies.undetected.ride import diagnosis_of
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
@@ -98,7 +99,7 @@ def since_the_start(
     run: RunLog, site: Site, vehicle: Vehicle, settings: Configuration
 ) -> tuple[Floats, Ints, Diagnosis]:
     """The largest errors ahead since the first row, their epochs, and what watched."""
-    diagnosis, _, _ = diagnosed(run, site, vehicle, settings, "primary")
+    diagnosis = diagnosis_of(ride_alone(run, site, vehicle, settings, "primary"))
     rows = rows_of(diagnosis, vehicle, settings)
     return largest_errors(rows.since(0, rows.rows - 1), settings.undetected).most_m, rows.epoch[1:], diagnosis
 
@@ -154,7 +155,7 @@ def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[
     assert both.satellites is not None
     alone = pl.col("solution") == "gps"
     run = both.with_streams(gnss=both.gnss.filter(alone).head(12), satellites=both.satellites.filter(alone))
-    diagnosis, _, _ = diagnosed(run, site, VEHICLE, Configuration(), "gps")
+    diagnosis = diagnosis_of(ride_alone(run, site, VEHICLE, Configuration(), "gps"))
     assert diagnosis.satellites is not None
     low_m, high_m = range_bounds(diagnosis.epochs, diagnosis.satellites, Configuration())
     clean, at = replay(run, site, VEHICLE), 9

@@ -1,27 +1,23 @@
-"""`balise line`: results of runs over a site to tables, GeoJSON and a page."""
+"""`balise line`: classes of pieces and proposals of balises from the runs of a result."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
-from pipeline.results.places import ground_of
 from pipeline.results.store import check_site, complete_runs, completed_runs, read_config, read_table
-from pipeline.storage import write_bytes
 from pipeline.studies.line.classes import piece_classes
-from pipeline.studies.line.page import line_page
 from pipeline.studies.line.passes import Ground, passes_of
 from pipeline.studies.line.pieces import Pieces, middles, pieces_of
-from pipeline.studies.line.proposals import Line, proposals, site_balises
+from pipeline.studies.line.proposals import Line, proposals
 from pipeline.studies.line.remarks import remarks
 from pipeline.studies.line.spans import EPOCH_COLUMNS, State
 from pipeline.studies.line.trials import distinct
 from schemas.arrays import floats
-from schemas.config import Configuration, to_toml
+from schemas.config import Configuration
 from schemas.enums import Evidence
 from schemas.errors import InputError, UsageError
 from schemas.line import LineCriteria
@@ -32,13 +28,16 @@ POINT_COLUMNS = {"name": pl.String, "netelement_id": pl.String, "measure_m": pl.
 
 @dataclass(frozen=True)
 class LineResult:
-    """What `balise line` found, and the files that it wrote, the page first."""
+    """What the runs say of a line: classes per piece, proposals and their balises, what cannot be said."""
 
-    pieces: pl.DataFrame
+    line: Line
     proposals: pl.DataFrame
     balises: pl.DataFrame
     remarks: tuple[str, ...]
-    files: tuple[Path, ...]
+
+    @property
+    def pieces(self) -> pl.DataFrame:
+        return self.line.table
 
     @property
     def summary(self) -> pl.DataFrame:
@@ -48,15 +47,10 @@ class LineResult:
         return self.pieces.group_by(keys).agg(pieces=pl.len(), length_km=length_km).sort(keys)
 
 
-def write_line(
-    out: Path,
-    site: Site,
-    criteria: LineCriteria,
-    solution: str | None = None,
-    points: pl.DataFrame | None = None,
-    to: Path | None = None,
+def study_line(
+    out: Path, site: Site, criteria: LineCriteria, solution: str | None = None, points: pl.DataFrame | None = None
 ) -> LineResult:
-    """Classes and proposals from all complete runs of `out`, written to `to` (by default `OUT/line`).
+    """Classes and proposals from all complete runs of `out`.
 
     `points`: stations and signals (`name, netelement_id, measure_m`). Raises `UsageError` for results of another site.
     """
@@ -68,9 +62,7 @@ def write_line(
     lds = (read_config(out) or Configuration()).lds
     line = Line(site, pieces, table, passes, _known_points(points, pieces), criteria, lds)
     figures, balises = proposals(line)
-    told = (*twice, *remarks(runs, passes, table, figures, criteria))
-    found = LineResult(table, figures, balises, told, ())
-    return LineResult(table, figures, balises, tuple(told), tuple(_write(found, to or out / "line", line)))
+    return LineResult(line, figures, balises, (*twice, *remarks(runs, passes, table, figures, criteria)))
 
 
 def read_points(path: Path) -> pl.DataFrame:
@@ -139,45 +131,3 @@ def _known_points(points: pl.DataFrame | None, pieces: Pieces) -> pl.DataFrame:
     if strange := sorted(set(points["netelement_id"]) - set(pieces.track.index)):
         raise UsageError("are no net elements of the site", place="stations and signals", found=", ".join(strange[:5]))
     return points
-
-
-def _write(found: LineResult, to: Path, line: Line) -> list[Path]:
-    files = {
-        "index.html": line_page(found.pieces, found.proposals, found.balises, found.remarks, line.criteria).encode(),
-        "pieces.csv": found.pieces.write_csv().encode(),
-        "proposals.csv": found.proposals.write_csv().encode(),
-        "proposed_balises.csv": found.balises.write_csv().encode(),
-        "line.geojson": line_geojson(found, line).encode(),
-        "criteria.toml": to_toml(line.criteria).encode(),
-    }
-    for (name,), balises in found.balises.group_by("proposal", maintain_order=True):
-        files[f"{name}/balises.csv"] = site_balises(balises, line.criteria).write_csv().encode()
-    for name, content in files.items():
-        write_bytes(to / name, content)
-    return [to / name for name in files]
-
-
-def line_geojson(found: LineResult, line: Line) -> str:
-    """Pieces as lines and proposed balises as points (RFC 7946)."""
-    names, pieces = line.pieces.names, line.pieces
-    steps = np.linspace(0.0, 1.0, 6)
-    measures = pieces.from_m[:, None] + (pieces.to_m - pieces.from_m)[:, None] * steps
-    ground = ground_of(line.site.track, pl.Series(np.repeat(names, steps.size), dtype=pl.String), measures.ravel())
-    places = (
-        np.round(np.column_stack([ground.longitude_deg, ground.latitude_deg]), 8).reshape(-1, steps.size, 2).tolist()
-    )
-    features = [
-        _feature("LineString", places[row["piece"]], {"kind": "piece", **row})
-        for row in found.pieces.iter_rows(named=True)
-    ]
-    at = ground_of(line.site.track, found.balises["netelement_id"], floats(found.balises, "measure_m"))
-    spots = np.round(np.column_stack([at.longitude_deg, at.latitude_deg]), 8).tolist()
-    features += [
-        _feature("Point", spot, {**row, "kind": "balise", "kind_of_balise": row["kind"]})
-        for spot, row in zip(spots, found.balises.iter_rows(named=True), strict=True)
-    ]
-    return json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), allow_nan=False)
-
-
-def _feature(kind: str, coordinates: list[object], properties: dict[str, object]) -> dict[str, object]:
-    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}

@@ -1,15 +1,23 @@
-"""The page of a line: classes and causes along each net element and direction, and what is proposed."""
+"""The files of `balise line`: the page with classes and causes along each net element, tables, GeoJSON."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
 
+import numpy as np
 import polars as pl
 
+from pipeline.results.places import ground_of
 from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import page, pairs, script_json, section, tiles
-from schemas.line import LineBalises, LineCause, LineCriteria, LineDirection, LinePieces, LineProposals, PieceClass
+from pipeline.storage import write_bytes
+from pipeline.studies.line import LineResult, site_balises
+from schemas.arrays import floats
+from schemas.config import to_toml
+from schemas.line import LineBalises, LineCause, LineDirection, LinePieces, LineProposals, PieceClass
 from schemas.version import SOFTWARE
 
 _TONES = {PieceClass.SUITABLE: "right", PieceClass.UNSUITABLE: "wrong", PieceClass.UNKNOWN: "unknown"}
@@ -31,24 +39,68 @@ _COLUMNS = (*_OPEN, "wrong_in_use", "few_satellites", "claimed_wrongly", "unknow
             "passes_needed", "hours_of_day", "days", "monitors", "largest_undetected_m")  # fmt: skip
 
 
-def line_page(
-    pieces: pl.DataFrame, proposals: pl.DataFrame, balises: pl.DataFrame, remarks: Sequence[str], criteria: LineCriteria
-) -> str:
+def write_line(result: LineResult, to: Path) -> list[Path]:
+    """Page, tables, GeoJSON and the balises of each proposal; the page first."""
+    criteria, proposed = result.line.criteria, result.balises
+    files = {
+        "index.html": line_page(result),
+        "pieces.csv": result.pieces.write_csv(),
+        "proposals.csv": result.proposals.write_csv(),
+        "proposed_balises.csv": proposed.write_csv(),
+        "line.geojson": line_geojson(result),
+        "criteria.toml": to_toml(criteria),
+    }
+    for (name,), balises in proposed.group_by("proposal", maintain_order=True):
+        files[f"{name}/balises.csv"] = site_balises(balises, criteria).write_csv()
+    for name, content in files.items():
+        write_bytes(to / name, content.encode())
+    return [to / name for name in files]
+
+
+def line_geojson(result: LineResult) -> str:
+    """Pieces as lines and proposed balises as points (RFC 7946)."""
+    line, pieces = result.line, result.line.pieces
+    steps = np.linspace(0.0, 1.0, 6)
+    measures = pieces.from_m[:, None] + (pieces.to_m - pieces.from_m)[:, None] * steps
+    ground = ground_of(
+        line.site.track, pl.Series(np.repeat(pieces.names, steps.size), dtype=pl.String), measures.ravel()
+    )
+    places = (
+        np.round(np.column_stack([ground.longitude_deg, ground.latitude_deg]), 8).reshape(-1, steps.size, 2).tolist()
+    )
+    features = [
+        _feature("LineString", places[row["piece"]], {"kind": "piece", **row})
+        for row in result.pieces.iter_rows(named=True)
+    ]
+    at = ground_of(line.site.track, result.balises["netelement_id"], floats(result.balises, "measure_m"))
+    spots = np.round(np.column_stack([at.longitude_deg, at.latitude_deg]), 8).tolist()
+    features += [
+        _feature("Point", spot, {**row, "kind": "balise", "kind_of_balise": row["kind"]})
+        for spot, row in zip(spots, result.balises.iter_rows(named=True), strict=True)
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), allow_nan=False)
+
+
+def _feature(kind: str, coordinates: list[object], properties: dict[str, object]) -> dict[str, object]:
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
+
+
+def line_page(result: LineResult) -> str:
     """One offline page."""
+    pieces, balises, criteria = result.pieces, result.balises, result.line.criteria
+    passed = _with_passes(pieces)
     body = "\n".join(
         [
             _tiles(pieces),
-            section("limits", "What these runs cannot say", _list(remarks)),
+            section("limits", "What these runs cannot say", _list(result.remarks)),
             section("line", "The line", _key(), *_strips(pieces, balises)),
             section(
                 "proposals",
                 "Proposals side by side",
-                frame_table("t-proposals", "Proposals", proposals, contract=LineProposals),
+                frame_table("t-proposals", "Proposals", result.proposals, contract=LineProposals),
             ),
             section("balises", "Proposed balises", frame_table("t-balises", "Balises", balises, contract=LineBalises)),
-            section(
-                "pieces", "Pieces", frame_table("t-pieces", "Pieces with passes", _told(pieces), _COLUMNS, LinePieces)
-            ),
+            section("pieces", "Pieces", frame_table("t-pieces", "Pieces with passes", passed, _COLUMNS, LinePieces)),
             section("criteria", "Criteria", pairs((name, str(value)) for name, value in criteria.model_dump().items())),
         ]
     )
@@ -71,7 +123,7 @@ def _tiles(pieces: pl.DataFrame) -> str:
     return tiles(rows)
 
 
-def _told(pieces: pl.DataFrame) -> pl.DataFrame:
+def _with_passes(pieces: pl.DataFrame) -> pl.DataFrame:
     """Pieces that some run says something of, what is bad first."""
     spoken = pl.sum_horizontal("passes", "unknown", "after_alarm", "claimed_wrongly") > 0
     order = pl.col("piece_class").cast(pl.String).replace_strict({"unsuitable": 0, "unknown": 1, "suitable": 2})
@@ -93,7 +145,7 @@ def _key() -> str:
 
 def _strips(pieces: pl.DataFrame, balises: pl.DataFrame) -> list[str]:
     """A drawing per net element that was passed, long ones over several rows."""
-    spoken = _told(pieces)["netelement_id"].unique()
+    spoken = _with_passes(pieces)["netelement_id"].unique()
     shown = pieces.filter(pl.col("netelement_id").is_in(spoken.implode()))
     first = balises.filter(pl.col("proposal") == balises["proposal"][0]) if balises.height else balises
     drawings = []

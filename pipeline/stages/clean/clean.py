@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.read.ingest.conform import DEFAULTS
-from pipeline.read.ingest.placeholders import without_placeholders
+from pipeline.stages.clean.placeholders import without_placeholders
 from schemas.arrays import NS_PER_S, Bools
-from schemas.config import Configuration, PlausibilityConfig, Vehicle
+from schemas.config import Configuration
 from schemas.errors import InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
@@ -23,10 +22,18 @@ _KEYS: dict[Stream, list[str]] = {
     "satellites": ["solution", "t", "sv"],
     "balise_reads": ["t", "balise_id"],
 }
+_SOURCES = ("solution", "sensor")
+"""Columns that part a stream into sources, each with its own order of time."""
 _PLACE = ("latitude_deg", "longitude_deg")
 _DAY_NS = 86_400 * NS_PER_S
 # Streams that say something only of positions: without them a run is replayed all the same.
 _OF_POSITIONS: tuple[Stream, ...] = ("satellites", "reference", "balise_reads")
+ClockAdvice = Callable[[RunLog], str]
+"""What moves recorders of different times to one journey, in a sentence; empty where nothing does."""
+
+
+def no_advice(run: RunLog) -> str:
+    return ""
 
 
 @dataclass(frozen=True)
@@ -53,7 +60,11 @@ class CleanCounts:
     streams: dict[str, StreamCounts] = field(default_factory=dict)
 
 
-def clean(run: RunLog, config: Configuration = Configuration()) -> tuple[RunLog, CleanCounts]:  # noqa: B008 - frozen
+def clean(
+    run: RunLog,
+    config: Configuration = Configuration(),  # noqa: B008 - frozen
+    clock_advice: ClockAdvice = no_advice,
+) -> tuple[RunLog, CleanCounts]:
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
     A few rows more than a day from the others (a receiver that did not know the date yet), all before 1970, and single
@@ -62,48 +73,64 @@ def clean(run: RunLog, config: Configuration = Configuration()) -> tuple[RunLog,
     Raises `InputError` where no solution or not the odometer has two different times, or both have no time in common:
     nothing can be replayed.
     """
+    dated = _dated_streams(run, config.ingest.wrong_dates_share)
     streams: dict[str, pl.DataFrame] = {}
     counts: dict[str, StreamCounts] = {}
-    far = run.gnss.clear()
-    for name in STREAMS:
-        frame = run.stream(name)
-        if frame is None or name == "faults":
-            continue
-        stray = _strays(frame, config.ingest.wrong_dates_share)
-        if name in _OF_POSITIONS:
-            elsewhere = _far_from_any(frame["t"], streams["gnss"]["t"])
-            # Where no row is near, the clock of the whole recorder is wrong, which the fit of the run tells.
-            stray |= elsewhere & (not elsewhere.all())
-        if name == "gnss":
-            far, recorded = frame.filter(stray), frame.filter(~stray)
-        kept, found = _in_order(frame.filter(~stray) if stray.any() else frame, _KEYS.get(name, ["t"]))
-        streams[name], counts[name] = kept, replace(found, far_off=int(stray.sum()))
+    for name, (kept, strays) in dated.items():
+        streams[name], ordering = _in_order(kept, _KEYS.get(name, ["t"]))
+        counts[name] = replace(ordering, far_off=strays.height)
     others: tuple[pl.DataFrame, ...] = ()
     if "odometer" in streams:
         streams["odometer"], others = _by_sensor(streams["odometer"], config.lds.odometer_sensor, run.run_id)
     streams["gnss"], placeholders = _with_fixes(streams["gnss"], config)
-    parts = recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
-    names = [part["solution"][0] for part in parts]
-    solutions = {
-        name: replace(_of_solution(part, far), placeholders=placeholders.get(name, 0))
-        for name, part in zip(names, parts, strict=True)
-    }
-    gnss, odometer = streams["gnss"], streams.get("odometer")
-    sizes = gnss.group_by("solution", maintain_order=True).len()
-    if not (sizes["len"] >= 2).any():
-        of = f" of solution {gnss['solution'][0]!r}" if gnss.height else ""
-        require_two_times(gnss.head(1), f"{run.run_id}: gnss", of)
-    if odometer is not None:
-        require_two_times(odometer, f"{run.run_id}: odometer")
-        _require_common_time(run.with_streams(**streams))
     cleaned = replace(run, notes=_noted(run.notes, counts), other_odometers=others or run.other_odometers)
-    return cleaned.with_streams(**streams), CleanCounts(solutions, counts)
+    cleaned = cleaned.with_streams(**streams)
+    _require_times(cleaned, clock_advice)
+    return cleaned, CleanCounts(_solution_counts(*dated["gnss"], placeholders), counts)
+
+
+def _dated_streams(run: RunLog, few: float) -> dict[Stream, tuple[pl.DataFrame, pl.DataFrame]]:
+    """Each stream without its strays, and these; GNSS comes first, as positions decide for the others."""
+    dated: dict[Stream, tuple[pl.DataFrame, pl.DataFrame]] = {}
+    for name in STREAMS:
+        frame = run.stream(name)
+        if frame is None or name == "faults":
+            continue
+        stray = _strays(frame, few)
+        if name in _OF_POSITIONS:
+            elsewhere = _far_from_any(frame["t"], dated["gnss"][0]["t"])
+            # Where no row is near, the clock of the whole recorder is wrong: the fit of the run names it.
+            stray |= elsewhere & (not elsewhere.all())
+        dated[name] = (frame.filter(~stray) if stray.any() else frame), frame.filter(stray)
+    return dated
+
+
+def _solution_counts(
+    recorded: pl.DataFrame, far: pl.DataFrame, placeholders: Mapping[str, int]
+) -> dict[str, StreamCounts]:
+    """What was counted in each solution of the GNSS stream."""
+    counts: dict[str, StreamCounts] = {}
+    for part in recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True):
+        name = part["solution"][0]
+        counts[name] = replace(_of_solution(part, far), placeholders=placeholders.get(name, 0))
+    return counts
+
+
+def _require_times(run: RunLog, clock_advice: ClockAdvice) -> None:
+    """Refuse a cleaned run in which no solution, or not the odometer, has two times, or both have none in common."""
+    sizes = run.gnss.group_by("solution", maintain_order=True).len()
+    if not (sizes["len"] >= 2).any():
+        of = f" of solution {run.gnss['solution'][0]!r}" if run.gnss.height else ""
+        require_two_times(run.gnss.head(1), f"{run.run_id}: gnss", of)
+    if run.odometer is not None:
+        require_two_times(run.odometer, f"{run.run_id}: odometer")
+        _require_common_time(run, clock_advice)
 
 
 def of_the_journey(run: RunLog) -> RunLog:
     """The cleaned run without the streams of which no row lies within a day of a position; `notes` say so.
 
-    Their clocks are wrong, which the fit of the run tells: what is judged must not carry anything over years.
+    Their clocks are wrong, as the fit of the run says: what is judged must not carry anything over years.
     """
     away = [
         name
@@ -112,10 +139,9 @@ def of_the_journey(run: RunLog) -> RunLog:
     ]
     if not away:
         return run
-    told = [f"{name}: left out, its times are all more than a day from the positions" for name in away]
-    notes = replace(run.notes, skipped_topics=(*run.notes.skipped_topics, *told))
-    satellites, reference, reads = (None if name in away else run.stream(name) for name in _OF_POSITIONS)
-    return replace(run, notes=notes, satellites=satellites, reference=reference, balise_reads=reads)
+    left_out = [f"{name}: left out, its times are all more than a day from the positions" for name in away]
+    notes = replace(run.notes, skipped_topics=(*run.notes.skipped_topics, *left_out))
+    return replace(run, notes=notes).with_streams(**dict.fromkeys(away))
 
 
 def _by_sensor(odometer: pl.DataFrame, used: str, run_id: str) -> tuple[pl.DataFrame, tuple[pl.DataFrame, ...]]:
@@ -149,12 +175,12 @@ def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame
 
 def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
     """Also with the rows that were left out of streams other than GNSS, whose runs say it for each solution."""
-    told = [
-        f"{name}: {found.far_off} rows left out: their time is more than a day from the others or the positions"
-        for name, found in counts.items()
-        if found.far_off and name != "gnss"
+    left_out = [
+        f"{name}: {count.far_off} rows left out: their time is more than a day from the others or the positions"
+        for name, count in counts.items()
+        if count.far_off and name != "gnss"
     ]
-    return replace(notes, skipped_topics=(*notes.skipped_topics, *told))
+    return replace(notes, skipped_topics=(*notes.skipped_topics, *left_out))
 
 
 def _strays(frame: pl.DataFrame, few: float) -> Bools:
@@ -227,7 +253,7 @@ def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, Strea
         return frame, StreamCounts()
     latest = pl.col("t").cum_max()  # of those recorded so far
     keys = [key for key in keys if key in frame.columns]
-    sources = [key for key in keys if key in DEFAULTS]
+    sources = [key for key in keys if key in _SOURCES]
     late = frame.select((pl.col("t") < (latest.over(sources) if sources else latest)).sum()).item()
     ordered = frame if late == 0 and frame["t"].is_sorted() else frame.sort("t", maintain_order=True)
     unique = ordered.unique(subset=keys, keep="first", maintain_order=True)
@@ -246,29 +272,20 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
         )
 
 
-def _require_common_time(run: RunLog) -> None:
+def _require_common_time(run: RunLog, clock_advice: ClockAdvice) -> None:
     """Refuse an odometer of another time than the GNSS: not one position could be held against it."""
     gnss, odometer = run.gnss, run.odometer
     if gnss.is_empty() or odometer is None:
         return
-    (begin, end), (odometer_begin, odometer_end) = (stream["t"].to_physical()[[0, -1]] for stream in (gnss, odometer))
+    begin, end = gnss["t"].to_physical()[[0, -1]]
+    odometer_begin, odometer_end = odometer["t"].to_physical()[[0, -1]]
     if odometer_begin > end or odometer_end < begin:
+        remedy = "Check date and time scale (UTC or GPS) of both recorders, or leave the odometer out."
+        advice = clock_advice(run) if {"fix", *_PLACE} <= set(gnss.columns) else ""
         raise InputError(
             "does not overlap the GNSS in time",
             place=f"{run.run_id}: odometer, column t",
             found=f"{odometer['t'][0]} to {odometer['t'][-1]}",
             expected=f"times within {gnss['t'][0]} to {gnss['t'][-1]}",
-            remedy=_clock_remedy(run),
+            remedy=f"{remedy} {advice}".rstrip(),
         )
-
-
-def _clock_remedy(run: RunLog) -> str:
-    """What makes both records one journey, if anything does."""
-    # Imported here because only such a run needs it.
-    from pipeline.studies.plausibility.fit import fit_run, remedy_of
-
-    known = "Check date and time scale (UTC or GPS) of both recorders, or leave the odometer out."
-    if not {"fix", *_PLACE} <= set(run.gnss.columns):
-        return known
-    found = fit_run(run, run.solutions()[0], Vehicle(), PlausibilityConfig()).impossible
-    return " ".join([known, *(f"{check.sentence}." for check in found), remedy_of(found)]).rstrip(" ")

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.read.ingest.clean import CleanCounts, clean
+from pipeline.stages.clean.clean import CleanCounts, clean
 from pipeline.studies.plausibility.check import State
-from pipeline.studies.plausibility.fit import Fit, fit_run, lines_of
+from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run, lines_of
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site, Stream
@@ -41,7 +41,7 @@ def fit_report(
     """Every check of every solution; a run that cannot be cleaned has its error as problem."""
     problems: tuple[str, ...] = ()
     try:
-        cleaned, counts = clean(run, config)
+        cleaned, counts = clean(run, config, clock_advice)
     except InputError as error:
         # Recorders of different times: what moves one to the other is told all the same.
         cleaned, counts, problems = _in_order(run), CleanCounts(), (str(error),)

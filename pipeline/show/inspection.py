@@ -14,11 +14,11 @@ from pipeline.read.ingest.describe import StreamSummary, TopicSummary, describe_
 from pipeline.read.site.read import is_geojson, read_site
 from pipeline.results import store
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.results.fit_report import FitReport, fit_report
 from pipeline.show.terminal import show_tables
 from pipeline.stages.run_row.verdict import head_of, run_verdicts
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
+from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding, Site

@@ -1,0 +1,96 @@
+"""What every use of a recorded run begins with: streams in order, one odometer, each solution on the track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.stages.clean import CleanCounts
+from pipeline.stages.clean.clean import (
+    ClockAdvice,
+    clean,
+    no_advice,
+    of_the_journey,
+    require_one_journey,
+    require_two_times,
+)
+from pipeline.stages.evidence import Evidence, evidence_of
+from pipeline.stages.matching import Match, match
+from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of
+from pipeline.stages.provenance import Provenance, provenance
+from pipeline.stages.reference import reference_stretches
+from pipeline.stages.track.network import network_in_pieces, site_network
+from schemas.config import Configuration, Vehicle
+from schemas.enums import VehicleFigures
+from schemas.run import RunLog, Site
+
+
+@dataclass(frozen=True)
+class PreparedRun:
+    """One run on its site, as replay, calibration, injection and route begin with it.
+
+    `recorded`: in order of time; `run`: the same without streams of another day. `odometers`: each as it counted, the
+    one of the LDS first; `odometry`: that one, by the others where it slips.
+    """
+
+    recorded: RunLog
+    run: RunLog
+    site: Site
+    vehicle: Vehicle
+    config: Configuration
+    counts: CleanCounts
+    odometers: tuple[Odometry, ...]
+    odometry: Odometry | None
+
+    def fixes(self, solution: str) -> pl.DataFrame:
+        """The positions of one solution; `InputError` unless they are those of one journey."""
+        fixes = self.run.gnss.filter(pl.col("solution") == solution)
+        require_two_times(fixes, "gnss", f" of solution {solution!r}")
+        require_one_journey(fixes, f"gnss of solution {solution!r}")
+        return fixes
+
+    def ranges(self, solution: str) -> pl.DataFrame | None:
+        """Its satellites, where they were recorded."""
+        satellites = self.run.satellites
+        return None if satellites is None else satellites.filter(pl.col("solution") == solution)
+
+    def match(self, solution: str) -> Match:
+        """The solution on the track network; raises `InputError` where it comes near no track."""
+        config, reads = self.config, self.run.balise_reads
+        fixes = self.fixes(solution)
+        return match(fixes, self.odometry, self.site, self.vehicle, config.matching, config.fix_sigma, reads)
+
+    def evidence(self) -> Evidence:
+        """What is known of where the train was; knows of no solution."""
+        network = site_network(self.site)
+        pieces = network_in_pieces(self.site)
+        reference = reference_stretches(self.run.reference, pieces, network.track.index, self.config)
+        reads, balises = self.run.balise_reads, self.site.balises
+        return evidence_of(reference, reads, balises, self.odometers, network, self.vehicle, self.config)
+
+    @property
+    def provenance(self) -> Provenance:
+        return provenance(self.run, self.site, self.vehicle, self.config)
+
+    @property
+    def figures_from(self) -> VehicleFigures:
+        """Where scale and latency come from (DOMAIN section 5.4)."""
+        if self.odometry is None:
+            return VehicleFigures.NONE
+        given = self.vehicle.odometer_scale is not None and self.vehicle.gnss_latency_s is not None
+        return VehicleFigures.FILE if given else VehicleFigures.LEARNED
+
+
+def prepare(
+    run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, clock_advice: ClockAdvice = no_advice
+) -> PreparedRun:
+    """Clean the streams and make the odometer; `clock_advice` helps where the recorders' times do not meet."""
+    recorded, counts = clean(run, config, clock_advice)
+    journey = of_the_journey(recorded)
+    odometry = odometry_of(journey.odometer, vehicle, config)
+    # Scale and latency of the vehicle file are of the odometer that the LDS uses.
+    others = [odometry_of(stream, Vehicle(), config) for stream in journey.other_odometers]
+    odometers = tuple(odometer for odometer in (odometry, *others) if odometer is not None)
+    counted = None if odometry is None else counted_over_slip(odometry, odometers[1:], config.align)
+    return PreparedRun(recorded, journey, site, vehicle, config, counts, odometers, counted)

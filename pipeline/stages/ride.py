@@ -1,0 +1,110 @@
+"""One solution as the train saw it: aligned with the odometer, monitored, with balises detected by the LDS.
+
+Nothing here knows of the truth, but for one case: without an odometer the direction of travel is the evidence's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.stages.alignment.align import align, odometer_at
+from pipeline.stages.evidence import Evidence
+from pipeline.stages.judge.case import Case, Solution
+from pipeline.stages.judge.epochs import direction_by_evidence
+from pipeline.stages.lds.run import LdsResult, run_lds
+from pipeline.stages.matching import Match
+from pipeline.stages.monitors.bank import MonitorBank
+from pipeline.stages.monitors.pseudorange import pseudorange_monitor
+from pipeline.stages.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor, on_path_of
+from pipeline.stages.odometry import Odometry
+from pipeline.stages.prepare import PreparedRun
+from schemas.enums import NotEvaluated
+
+
+@dataclass(frozen=True)
+class Ride:
+    """What the train made of one solution; `odometry` grows with its path.
+
+    `other`: the solution that the channel monitor compares with, on this one's path; `singles`: monitors without
+    memory, by name.
+    """
+
+    prepared: PreparedRun
+    solution: Solution
+    match: Match
+    aligned: pl.DataFrame
+    odometry: Odometry | None
+    other: pl.DataFrame | None
+    singles: Mapping[str, pl.DataFrame]
+    bank: MonitorBank
+    lds: LdsResult
+
+    def at_the_end(self) -> dict[str, float | None]:
+        """Latency and odometer scale at the last epoch, as columns of `runs`."""
+        columns = ("latency_s", "latency_sigma_s", "odometer_scale")
+        return self.aligned.select(*columns, odometer_scale_sigma="scale_sigma").row(-1, named=True)
+
+
+def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: Evidence) -> Ride:
+    """Align one matched solution with the odometer, monitor it, detect balises."""
+    config, matched = prepared.config, matches[solution]
+    odometry = None if prepared.odometry is None else prepared.odometry.oriented(matched.odometer_sign)
+    aligned = align(matched.epochs, odometry, prepared.vehicle, config)
+    if odometry is None:
+        # Virtual balises may be valid in one direction, and that is the train's: no position's step (DOMAIN section 4).
+        aligned = aligned.with_columns(_direction(prepared, solution, aligned, matched, evidence))
+    other = _other_solution(prepared, solution, aligned, matches)
+    singles = _single_monitors(prepared, solution, aligned, other)
+    bank = MonitorBank(aligned, singles, config)
+    balises = matched.path.balises(prepared.site.balises)
+    reads = _reads_on_odometer(prepared.run.balise_reads, aligned, odometry)
+    scale_sigma = None if odometry is None else odometry.scale_sigma
+    lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)
+    monitored = pl.concat([aligned, lds.epochs.drop("t"), pl.DataFrame(bank.columns())], how="horizontal")
+    fixes = prepared.fixes(solution)
+    taken = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, matched.path)
+    return Ride(prepared, taken, matched, aligned, odometry, other, singles, bank, lds)
+
+
+def _direction(
+    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matched: Match, evidence: Evidence
+) -> pl.Series:
+    """The direction of travel by the evidence, of a solution of which nothing is decided yet."""
+    nothing = pl.DataFrame()
+    given = Solution(solution, prepared.fixes(solution), aligned, nothing, nothing, nothing, matched.path)
+    return direction_by_evidence(Case(given, evidence, None, prepared.vehicle, prepared.config))
+
+
+def _other_solution(
+    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matches: Mapping[str, Match]
+) -> pl.DataFrame | None:
+    """The solution to compare with, on this one's path; none where none is named or the run has it not."""
+    other = prepared.config.monitors.channel_reference
+    if other is None or other == solution or other not in matches:
+        return None
+    return on_path_of(aligned, matches[other].epochs, prepared.config.lds)
+
+
+def _single_monitors(
+    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, other: pl.DataFrame | None
+) -> dict[str, pl.DataFrame]:
+    config = prepared.config
+    named = config.monitors.channel_reference
+    absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
+    return {
+        "along_doppler": doppler_monitor(aligned, config),
+        "channel": channel_monitor(aligned, other, config, absent),
+        "pseudorange": pseudorange_monitor(aligned, prepared.ranges(solution), config),
+    }
+
+
+def _reads_on_odometer(
+    reads: pl.DataFrame | None, aligned: pl.DataFrame, odometry: Odometry | None
+) -> pl.DataFrame | None:
+    """Telegrams with the odometer at each, on the scale of `aligned`."""
+    if reads is None or odometry is None:
+        return reads
+    return reads.with_columns(odometer_at(reads["t"], aligned, odometry))
