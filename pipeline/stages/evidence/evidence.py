@@ -113,8 +113,8 @@ class Evidence:
         factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
         by_reference = self._covered(t_ns, kind == NOTHING, kind)
         by_reads = self._carried(self.by_reads, t_ns, kind != NOTHING, kind)
-        wide = [[one.widened(factor) for one in alternatives] for alternatives in (by_reference, by_reads)]
-        return int(common(*wide, t_ns.size)[1].size)
+        wide, other = ([one.widened(factor) for one in alternatives] for alternatives in (by_reference, by_reads))
+        return int(common(wide, other, t_ns.size)[1].size)
 
     @property
     def clock_assumed(self) -> bool:
