@@ -22,8 +22,8 @@ from pipeline.stages.monitors.axis import (
 )
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.monitors.recursion import AxisState
-from pipeline.stages.odometry.drift import drift_m2, relink_bound_m
 from pipeline.stages.odometry.odometry import Odometry
+from pipeline.stages.odometry.recovery import RecoveryRule
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, Vehicle
 
@@ -73,6 +73,7 @@ class _Learner:
         self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
         self._alphas = np.array(config.monitors.ewma_alphas)
         self._factor, self._limit_m = config.monitors.threshold_factor, config.hazards.failure_limit_m
+        self._rule = RecoveryRule(config)
         # Latencies of five sigmas have to find a known distance too.
         margin_ns, t_ns = round(5e9 * config.align.latency_prior_sigma_s), times_ns(positions)
         self._rows = np.flatnonzero(usable & odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns))
@@ -235,8 +236,8 @@ class _Learner:
             failed_s = np.maximum.accumulate(np.where(failing, t_s, failed_s[-1]))
             away_m = away_m[-1] + np.cumsum(series.rate_mps * series.dt_s)
             variance_m2 = self._drift_m2(begin, position, end, scale_sigma)
-            near = np.abs(away_m) <= relink_bound_m(variance_m2, self._factor, self._limit_m)
-            back = np.flatnonzero(near & (t_s - failed_s >= self._config.lds.recovery_s))
+            near = np.abs(away_m) <= self._rule.bound_m(variance_m2)
+            back = np.flatnonzero(near & self._rule.is_quiet(t_s - failed_s))
             if back.size:
                 first = int(back[0])
                 return position + first, float(away_m[first] ** 2 + variance_m2[first])
@@ -247,13 +248,9 @@ class _Learner:
         """By how much GNSS minus odometer moves from the anchor to these positions without a fault [m^2]."""
         sigma_m, t_ns = self._sigma_m, self._t_ns
         way_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
-        return drift_m2(
-            sigma_m[anchor] ** 2 + sigma_m[begin:end] ** 2,
-            self._t_s[begin:end] - self._t_s[anchor],
-            np.cumsum(way_m),
-            self._config.monitors.odometer_sigma_mps,
-            max(scale_sigma, self._vehicle.odometer_scale_sigma or 0.0),
-        )
+        positions_m2 = sigma_m[anchor] ** 2 + sigma_m[begin:end] ** 2
+        elapsed_s, sigma_scale = self._t_s[begin:end] - self._t_s[anchor], self._vehicle.odometer_scale_sigma or 0.0
+        return self._rule.variance_m2(positions_m2, elapsed_s, np.cumsum(way_m), max(scale_sigma, sigma_scale))
 
 
 def _gaps_before(at_s: Floats, t_s: Floats, gap_s: float) -> Ints:

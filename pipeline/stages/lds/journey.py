@@ -151,10 +151,11 @@ def turning_epochs(journey: Journey) -> frozenset[int]:
     return frozenset(known[1:][changed].tolist())
 
 
-def segment_epochs(journey: Journey) -> list[int]:
-    """The first epochs of the odometer's continuity segments but the first: its distance was lost before them."""
-    found: list[int] = (np.flatnonzero(np.diff(journey.segment)) + 1).tolist()
-    return found
+def odometer_epochs(journey: Journey) -> list[int]:
+    """Epochs at which the odometer begins to slip, or is in another continuity segment than at the epoch before."""
+    changes = (np.diff(journey.segment) != 0) | (journey.slips[1:] & ~journey.slips[:-1])
+    epochs: list[int] = (np.flatnonzero(changes) + 1).tolist()
+    return epochs
 
 
 def mission_epochs(journey: Journey, config: LdsConfig) -> frozenset[int]:
