@@ -121,8 +121,8 @@ def replay(
 ) -> None:
     """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
-    from pipeline.campaign.progress import show_summary, watches
     from pipeline.results.manifest import settings_files
+    from pipeline.show.progress import show_summary, watches
 
     settings, given = _configuration(config), settings_files(config, vehicle)
     if undetected:
@@ -149,7 +149,7 @@ def replay(
 
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
     from pipeline.campaign.calibrated import calibrated
-    from pipeline.campaign.workers import watched
+    from pipeline.results.workers import watched
     from pipeline.show.terminal import how_far
 
     with watched(None if quiet else how_far("runs looked at to calibrate")):
@@ -227,9 +227,10 @@ def safety(
     if out is not None:
         from pipeline.campaign.again import replay_again
         from pipeline.show.assessment import show
+        from pipeline.show.progress import progress_watch
         from pipeline.studies.safety.assessment import assess
 
-        again = replay_again(logs or [], site, _vehicle(vehicle), jobs)
+        again = replay_again(logs or [], site, _vehicle(vehicle), jobs, progress_watch)
         show(assess(out, None if config is None else _configuration(config), again), as_json)
         return
     from pipeline.show.terminal import show_tables
@@ -433,7 +434,7 @@ def experiment(
         print("\n".join(EXPERIMENTS))
         return
     wanted = experiment_of(name)
-    from pipeline.campaign.workers import watched
+    from pipeline.results.workers import watched
     from pipeline.show.terminal import how_far
 
     bank = None if config is None else _configuration(config)

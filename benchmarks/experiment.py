@@ -25,7 +25,7 @@ from datasets.experiment.ranges import RangePlan, run_ranges
 from datasets.experiment.rare import Probability, missed_detection_probability
 from datasets.experiment.rare_ranges import range_system
 from datasets.experiment.workers import generator
-from pipeline.campaign.workers import mapped
+from pipeline.results.workers import mapped
 
 _NORMALS = 15
 _CHUNK = 256

@@ -13,11 +13,11 @@ from datasets.comparison import checks_table, compare
 from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline.campaign import RunOutcome, make_plan, run_campaign
-from pipeline.campaign.watch import Watch
 from pipeline.read.ingest.run import read_run as read_log
 from pipeline.read.site.read import read_site
 from pipeline.results.manifest import settings_files
 from pipeline.results.store import read_run
+from pipeline.show.progress import CampaignWatch
 from pipeline.show.report import write_report
 from pipeline.stages.run_row.verdict import CampaignHead, head_of, word_of, worst_verdict
 from schemas.config import Configuration, Vehicle
@@ -114,7 +114,7 @@ def _replay_trial(scenario: Scenario, paths: list[Path], out: Path, progress: Pr
             run_campaign(plan, jobs=jobs, force=True, watches=watches)
 
 
-class _Replayed(Watch):
+class _Replayed(CampaignWatch):
     """Passes each run on that was replayed."""
 
     def __init__(self, progress: Progress) -> None:

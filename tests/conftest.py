@@ -122,8 +122,9 @@ def pytest_collection_finish() -> None:
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Campaigns and pages are made here: for tests that are not about workers, which take seconds to start."""
-    from pipeline.campaign import run, workers
+    from pipeline.campaign import run
     from pipeline.campaign.engines import SerialEngine
+    from pipeline.results import workers
 
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     monkeypatch.setattr(run, "_engine_for", lambda jobs, runs, scheduler, limit_s: SerialEngine(limit_s))

@@ -24,9 +24,6 @@ DOORS = {
 # To be undone: each of these goes a way that its door does not lead.
 _WRONG_WAYS = {
     "pipeline.show.inspection -> make",
-    "pipeline.campaign.progress -> show",
-    "pipeline.campaign.watch -> show",
-    "pipeline.show.report.write -> campaign",
 }
 DRAWERS = {"utils", "util", "tools", "common", "helpers", "helper", "misc"}
 

@@ -21,7 +21,7 @@ from datasets.experiment.plan import SENSORS
 from datasets.experiment.rare import false_alarm_probability
 from datasets.experiment.tables import Contents, Row, share, table
 from datasets.experiment.workers import generator
-from pipeline.campaign.workers import mapped
+from pipeline.results.workers import mapped
 from schemas.arrays import Ints
 from schemas.config import Configuration, MonitorConfig
 

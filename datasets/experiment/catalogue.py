@@ -17,8 +17,8 @@ from datasets.experiment.catalogue_text import catalogue_page
 from datasets.experiment.catalogue_trial import JOURNEYS, Stage, stage, with_fault
 from datasets.experiment.tables import Contents, Row
 from datasets.motion import build_motion
-from pipeline.campaign.workers import mapped
 from pipeline.one_run import replay
+from pipeline.results.workers import mapped
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import MONITORS

@@ -16,7 +16,7 @@ from datasets.experiment.geometry import Geometry, skies_of_day
 from datasets.experiment.plan import ExperimentPlan
 from datasets.experiment.tables import Contents, share
 from datasets.experiment.workers import generator
-from pipeline.campaign.workers import mapped
+from pipeline.results.workers import mapped
 from schemas.config import Configuration
 
 EPOCHS_PER_PLACE = 40

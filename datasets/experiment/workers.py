@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipeline.campaign.workers import mapped
+from pipeline.results.workers import mapped
 
 T = TypeVar("T")
 

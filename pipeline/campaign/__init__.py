@@ -5,9 +5,8 @@ Touches files, stores, processes and clusters; what one run says is made by `pip
 """
 
 from pipeline.campaign.interruption import Interrupted
-from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan, find_runs, make_plan
 from pipeline.campaign.run import run_campaign
-from pipeline.campaign.watch import Summary
+from pipeline.results.outcome import RunOutcome, Summary
 
 __all__ = ["Interrupted", "Plan", "RunOutcome", "Summary", "find_runs", "make_plan", "run_campaign"]

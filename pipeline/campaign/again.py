@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from pipeline.campaign.plan import make_plan
-from pipeline.campaign.progress import progress_watch
 from pipeline.campaign.run import run_campaign
+from pipeline.campaign.watch import Watch
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 
 
 def replay_again(
-    logs: Sequence[str], site: str | None, vehicle: Vehicle, jobs: int
+    logs: Sequence[str], site: str | None, vehicle: Vehicle, jobs: int, watch: Callable[[], Watch]
 ) -> Callable[[Configuration, str], object] | None:
-    """How to replay these logs into a folder; none without logs. Shows how far it is on standard error.
+    """How to replay these logs into a folder; none without logs. `watch` makes what follows each replay.
 
     Raises `UsageError` without a site.
     """
@@ -22,6 +22,4 @@ def replay_again(
         return None
     if site is None:
         raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
-    return lambda config, to: run_campaign(
-        make_plan(logs, site, to, config, vehicle), jobs=jobs, watches=[progress_watch()]
-    )
+    return lambda config, to: run_campaign(make_plan(logs, site, to, config, vehicle), jobs=jobs, watches=[watch()])

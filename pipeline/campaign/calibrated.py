@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from pipeline.campaign.plan import Plan, RunJob, find_runs
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.worker import site_of
-from pipeline.campaign.workers import mapped
 from pipeline.read.site.route import with_route
+from pipeline.results.workers import mapped
 from schemas.config import Configuration, digest_of
 from schemas.errors import BaliseError, InputError, UsageError
 

@@ -17,10 +17,11 @@ from concurrent.futures import Future
 from typing import Any
 
 from pipeline.campaign.engines import Engine
-from pipeline.campaign.outcome import Result, RunOutcome
+from pipeline.campaign.outcome import Result
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import replay_one
+from pipeline.results.outcome import RunOutcome
 from pipeline.storage.address import redacted
 from schemas.errors import UsageError
 

@@ -20,7 +20,10 @@ from pipeline.campaign.outcome import Failure, Result, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import fail_run, replay_one
-from pipeline.campaign.workers import single_threaded_children
+from pipeline.results.workers import single_threaded_children
+
+# Without it (Windows) nothing could end a run in this process that takes too long.
+HAS_ALARM = hasattr(signal, "SIGALRM")
 
 
 class Engine:

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 import polars as pl
 
 from pipeline import storage
-from pipeline.campaign.plan import software_digest
 from pipeline.results import catalogue, manifest, store
 from pipeline.results.figures.campaign_figures import derived_tables
+from pipeline.results.software import software_digest
 from pipeline.storage.address import Address, join
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import Configuration, digest_of

@@ -1,39 +1,41 @@
 """One campaign at a time per output.
 
 `OUT/.lock` names the campaign that holds it, so that workers of one that has ended (a lost scheduler, a killed
-client) find out before they write. On this machine a lock on the folder itself decides; in a store, the file.
+client) find out before they write. On this machine the lock of the operating system on `OUT/.held` decides, which goes
+with the process, however that ends; in a store, the file.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import os
 import secrets
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from pipeline import storage
 from pipeline.campaign.waits import WAITS
 from pipeline.storage.address import Address, is_url, join, redacted
 from schemas.errors import OutputError
 
-_NAME = ".lock"
+NAME = ".lock"
+HELD = ".held"
 
 
 @contextlib.contextmanager
 def locked(out: Address) -> Iterator[str]:
     """Hold the output for this campaign, under the name that is given. Raises `OutputError` while another holds it."""
-    own = secrets.token_hex(8)
-    with _locked_remote(str(out), own) if is_url(out) else _locked_local(Path(out), own):
-        yield own
+    name = secrets.token_hex(8)
+    with _locked_remote(str(out), name) if is_url(out) else _locked_local(Path(out), name):
+        yield name
 
 
-def check_held(out: Address, own: str) -> None:
+def check_held(out: Address, name: str) -> None:
     """Raises `OutputError` unless the campaign of this name still holds the output."""
-    if not _content(join(out, _NAME)).startswith(own):
+    if not _content(join(out, NAME)).startswith(name):
         raise OutputError(
             "is no longer held by this campaign",
             place=redacted(str(out)),
@@ -42,47 +44,44 @@ def check_held(out: Address, own: str) -> None:
 
 
 @contextlib.contextmanager
-def _locked_local(out: Path, own: str) -> Iterator[None]:
-    """A lock on the folder itself: it goes with the process, however that ends."""
+def _locked_local(out: Path, name: str) -> Iterator[None]:
+    held = FileLock(out / HELD)
     with storage.as_output_error(out):
         out.mkdir(parents=True, exist_ok=True)
-        folder = os.open(out, os.O_RDONLY)
-    try:
         try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+            held.acquire(blocking=False)
+        except Timeout:
             raise _busy(out) from None
-        storage.write_bytes(out / _NAME, own.encode())
-        try:
-            yield
-        finally:
-            storage.remove(out / _NAME)
+    try:
+        storage.write_bytes(out / NAME, name.encode())
+        yield
     finally:
-        os.close(folder)
+        storage.remove(out / NAME)
+        held.release()
 
 
 @contextlib.contextmanager
-def _locked_remote(out: str, own: str) -> Iterator[None]:
+def _locked_remote(out: str, name: str) -> Iterator[None]:
     """A lock object that its holder rewrites every few seconds.
 
     One that stays as it is for several beats belongs to a campaign that was killed. No clocks are
     compared, only what is seen to change.
     """
-    place = str(join(out, _NAME))
+    place = str(join(out, NAME))
     _wait_for_silence(place, out)
-    storage.write_bytes(place, f"{own} 0".encode())
+    storage.write_bytes(place, f"{name} 0".encode())
     time.sleep(WAITS.lock_beat_s / 4)
-    if not _content(place).startswith(own):
+    if not _content(place).startswith(name):
         raise _busy(out)
     ended = threading.Event()
-    beat = threading.Thread(target=_beat, args=(place, own, ended), daemon=True)
+    beat = threading.Thread(target=_beat, args=(place, name, ended), daemon=True)
     beat.start()
     try:
         yield
     finally:
         ended.set()
         beat.join()
-        if _content(place).startswith(own):
+        if _content(place).startswith(name):
             storage.remove(place)
 
 
@@ -101,15 +100,15 @@ def _content(place: Address) -> str:
     return (storage.content_of(place) or b"").decode()
 
 
-def _beat(place: str, own: str, ended: threading.Event) -> None:
+def _beat(place: str, name: str, ended: threading.Event) -> None:
     """Rewrite the lock until the end, or until a campaign that took this one for dead has taken it over."""
     count = 0
     while not ended.wait(WAITS.lock_beat_s):
         count += 1
         with contextlib.suppress(OutputError):
-            if not _content(place).startswith(own):
+            if not _content(place).startswith(name):
                 return
-            storage.write_bytes(place, f"{own} {count}".encode())
+            storage.write_bytes(place, f"{name} {count}".encode())
 
 
 def _busy(out: Address) -> OutputError:

@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 
 from pipeline.campaign.engines import Engine
 from pipeline.campaign.interruption import ENDING, Interrupted
-from pipeline.campaign.outcome import Failure, Result, RunOutcome, failure_of, lost, never_begun, overdue
+from pipeline.campaign.outcome import Failure, Result, failure_of, lost, never_begun, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.watch import Watch
 from pipeline.campaign.worker import fail_run
+from pipeline.results.outcome import RunOutcome
 from schemas.errors import BaliseError, UsageError
 
 

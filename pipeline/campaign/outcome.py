@@ -12,6 +12,7 @@ import polars as pl
 from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.hazard_words import hazard_words
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.results.outcome import RunOutcome
 from pipeline.stages.provenance import Provenance
 from pipeline.stages.run_row.verdict import worst_verdict
 from pipeline.storage.address import Address, redacted
@@ -21,44 +22,6 @@ from schemas.run import RunTables
 from schemas.tables import TABLES
 from schemas.version import SOFTWARE
 from schemas.words import lost_words, reason_words
-
-
-@dataclass(frozen=True)
-class RunOutcome:
-    """What became of one run. With a `trace` its failure is a defect of ours, else the input's.
-
-    `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
-    over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
-    `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved. `log`: what was
-    replayed. The figures beside the verdict, `remedies` and `lost` are of the solution that heads the run;
-    `lost`: what the moving time of a run of low availability was lost to.
-    """
-
-    run_id: str
-    status: RunStatus
-    error: str | None = None
-    verdict: RunVerdict | None = None
-    skipped: bool = False
-    trace: str | None = None
-    seconds: float = 0.0
-    hazards: int | None = None
-    missed_detections: int | None = None
-    attempts: int = 1
-    why: str = ""
-    faults: tuple[str, ...] = ()
-    proof: str = ""
-    log: str = ""
-    balises_accepted: int | None = None
-    balises_on_path: int | None = None
-    availability: float | None = None
-    proof_margin_m: float | None = None
-    held_s: float | None = None
-    remedies: tuple[str, ...] = ()
-    lost: str = ""
-
-    @property
-    def defect(self) -> bool:
-        return self.trace is not None
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,13 @@ import glob
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 
 from pipeline import storage
 from pipeline.read.site.read import read_site, refuse_unrelated
 from pipeline.results import store
 from pipeline.results.manifest import SettingsFiles, listing, settings_files
+from pipeline.results.software import software_digest
 from pipeline.storage import files
 from pipeline.storage.address import Address, check_public, is_url, join, name_of, redacted, stem_of
 from schemas.config import Configuration, Vehicle, digest_of
@@ -21,10 +20,7 @@ from schemas.errors import InputError, UsageError
 from schemas.run import STREAMS
 from schemas.version import SOFTWARE
 
-# What the program is made of: pages also follow from their styles, scripts and words.
-_SOURCES = {".css", ".csv", ".html", ".js", ".py", ".toml"}
 _NULL_OF_HIVE = "__HIVE_DEFAULT_PARTITION__"
-_DECIDING_LIBRARIES = ("dataframely", "numpy", "polars", "pyarrow", "pyproj", "scipy")
 
 
 @dataclass(frozen=True)
@@ -221,20 +217,3 @@ def _looks_like_run(child: Address) -> bool:
         if is_url(child):
             raise  # the store is silent: nobody knows what would be left out
         return False
-
-
-@lru_cache(maxsize=1)
-def software_digest() -> str:
-    """SHA-256 over the program's own sources and the versions of the libraries that its figures rest on.
-
-    The version alone would let results of an edited checkout pass for its own.
-    """
-    root = Path(__file__).parents[2]
-    digest = hashlib.sha256()
-    for package in ("pipeline", "schemas"):
-        for source in sorted(path for path in (root / package).rglob("*.*") if path.suffix in _SOURCES):
-            digest.update(f"{source.relative_to(root).as_posix()} ".encode())
-            digest.update(hashlib.sha256(source.read_bytes()).digest())
-    for library in _DECIDING_LIBRARIES:
-        digest.update(f"{library} {version(library)}\n".encode())
-    return digest.hexdigest()

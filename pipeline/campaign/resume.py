@@ -17,10 +17,11 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from pipeline import storage
-from pipeline.campaign.outcome import RunOutcome
-from pipeline.campaign.plan import Plan, RunJob, digests, software_digest
+from pipeline.campaign.plan import Plan, RunJob, digests
 from pipeline.campaign.waits import WAITS
 from pipeline.results import catalogue, store
+from pipeline.results.outcome import RunOutcome
+from pipeline.results.software import software_digest
 from pipeline.storage.address import is_url
 from schemas.arrays import NS_PER_S
 from schemas.errors import OutputError

@@ -8,15 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.campaign.cluster import DaskEngine
-from pipeline.campaign.engines import Engine, LocalEngine, SerialEngine
+from pipeline.campaign.engines import HAS_ALARM, Engine, LocalEngine, SerialEngine
 from pipeline.campaign.interruption import Interrupted, listening
 from pipeline.campaign.lock import locked
 from pipeline.campaign.loop import CampaignLoop
 from pipeline.campaign.plan import Plan, with_previous
 from pipeline.campaign.resume import keep, unchanged
-from pipeline.campaign.watch import Summary, Watch
+from pipeline.campaign.watch import Watch
 from pipeline.results import store
 from pipeline.results.manifest import note_settings
+from pipeline.results.outcome import Summary
 from pipeline.storage.address import is_url
 from schemas.errors import UsageError
 
@@ -64,7 +65,7 @@ def run_campaign(
 def _engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> Engine:
     if scheduler is not None and runs:
         return DaskEngine(scheduler, limit_s)
-    return SerialEngine(limit_s) if runs <= 1 else LocalEngine(min(jobs, runs))
+    return SerialEngine(limit_s) if runs <= 1 and HAS_ALARM else LocalEngine(max(1, min(jobs, runs)))
 
 
 def _check_shared(plan: Plan, scheduler: str | None) -> None:
@@ -79,7 +80,7 @@ def _watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Watch], at_once: 
     """`at_once`: the work is in this process, so that the loop's next look may be a whole run away."""
     begun = time.monotonic()
     for watch in watches:
-        watch.begin(plan)
+        watch.begin(len(plan.jobs), plan.out)
     stopped: Interrupted | None = None
     with listening(loop.stop, at_once):
         try:

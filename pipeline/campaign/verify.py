@@ -10,12 +10,13 @@ from typing import Any
 import polars as pl
 
 from pipeline import storage
-from pipeline.campaign import resume
+from pipeline.campaign import lock, resume
 from pipeline.campaign.finish import campaign_files, campaign_key
-from pipeline.campaign.plan import RunJob, make_plan, software_digest
+from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
 from pipeline.results import catalogue, store
 from pipeline.results.manifest import NAME, Manifest, contents_of, earlier, gathered, read_manifest, sha256
+from pipeline.results.software import software_digest
 from pipeline.stages.run_row.verdict import word_of, worst_verdict
 from pipeline.storage.address import Address, join, redacted
 from schemas.config import Configuration, Vehicle, digest_of
@@ -27,7 +28,7 @@ Problem = tuple[str, str, str]
 _RUNS_AT_ONCE = 50
 _COLUMNS = ("what", "found", "expected")
 # What a campaign leaves beside the files that the manifest names.
-_OWN_FILES = (NAME, ".lock", "replay.log")
+_OWN_FILES = (NAME, lock.NAME, lock.HELD, "replay.log")
 
 
 @dataclass(frozen=True)

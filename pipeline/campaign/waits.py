@@ -11,8 +11,6 @@ class Waits:
 
     look_s: float = 0.2
     """Between two looks at the runs under way."""
-    say_s: float = 5.0
-    """Between two lines of progress in a pipe."""
     attempts: int = 2
     """At a run whose worker died over it."""
     starts: int = 10

@@ -12,18 +12,19 @@ from pipeline.campaign import lock
 from pipeline.campaign.interruption import ENDING
 from pipeline.campaign.outcome import (
     Failure,
-    RunOutcome,
     failed_tables,
     failure_of,
     outcome_of,
     worst,
 )
-from pipeline.campaign.plan import RunJob, digests, software_digest
+from pipeline.campaign.plan import RunJob, digests
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
 from pipeline.read.site.read import read_site
 from pipeline.read.site.route import with_route
 from pipeline.results import store
+from pipeline.results.outcome import RunOutcome
+from pipeline.results.software import software_digest
 from pipeline.storage import files
 from pipeline.storage.address import redacted
 from schemas.config import SiteConfig

@@ -15,7 +15,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.results.layout import Column, fitted
+from pipeline.show.layout import Column, fitted
 from schemas.errors import visible
 
 _SAID_EVERY_S, _CHANGED_EVERY_S = 5.0, 0.2

@@ -16,7 +16,7 @@ from pipeline.campaign import Plan, make_plan, run_campaign
 from pipeline.campaign import calibrated as calibrated_module
 from pipeline.campaign.calibrated import calibrated
 from pipeline.campaign.plan import RunJob
-from pipeline.campaign.workers import mapped
+from pipeline.results.workers import mapped
 from schemas.config import Vehicle
 from schemas.errors import UsageError
 from tests.campaign.compare import campaign_bytes, result_bytes

@@ -16,11 +16,11 @@ import pytest
 
 from datasets.mcap_log import write_mcap
 from pipeline import storage
-from pipeline.campaign import Plan, RunOutcome, Summary, make_plan, recorded_log, run_campaign
+from pipeline.campaign import RunOutcome, Summary, make_plan, recorded_log, run_campaign
 from pipeline.campaign.outcome import lost
-from pipeline.campaign.progress import LogWatch
 from pipeline.read.ingest import read_run
 from pipeline.results import store
+from pipeline.show.progress import LogWatch
 from schemas.config import Configuration, IngestConfig, LdsConfig
 from schemas.enums import RunStatus
 from schemas.errors import OutputError, UsageError
@@ -38,7 +38,7 @@ class Spy:
         self.losses: list[tuple[str, int]] = []
         self.notes: list[str] = []
 
-    def begin(self, plan: Plan) -> None:
+    def begin(self, runs: int, out: str) -> None:
         self.seen.clear()
 
     def look(self, under_way: Sequence[tuple[str, float]]) -> None:

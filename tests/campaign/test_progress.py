@@ -13,8 +13,9 @@ import pytest
 from rich.console import Console
 
 import cli
-from pipeline.campaign import Plan, RunOutcome, Summary, progress, watch
-from pipeline.campaign.progress import BarWatch, JsonWatch, LineWatch, LogWatch, watches
+from pipeline.campaign import Plan, RunOutcome, Summary
+from pipeline.show import campaign, progress
+from pipeline.show.progress import BarWatch, JsonWatch, LineWatch, LogWatch, watches
 from schemas.enums import RunStatus, RunVerdict
 from tests.campaign.compare import plan_of
 from tests.conftest import SmallTrial
@@ -37,8 +38,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in (progress, watch):
-        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(progress, "time", clock)
     return clock
 
 
@@ -49,7 +49,7 @@ def plan(small_trial: SmallTrial, tmp_path: Path) -> Plan:
 
 def test_counts_in_one_line(clock: Clock, plan: Plan) -> None:
     watch = LineWatch(io.StringIO())
-    watch.begin(replace(plan, jobs=10 * plan.jobs[:1]))
+    watch.begin(10, plan.out)
     for outcome in (OK, BAD, OLD):
         watch.finished(outcome)
     clock.now_s += 4.0
@@ -62,7 +62,7 @@ def test_counts_in_one_line(clock: Clock, plan: Plan) -> None:
 
 def test_no_rate_before_the_first_run(clock: Clock, plan: Plan) -> None:
     watch = LineWatch(io.StringIO())
-    watch.begin(plan)
+    watch.begin(len(plan.jobs), plan.out)
     watch.finished(OLD)
     clock.now_s += 1.0
     assert watch.line() == "1/4 runs, 0 failed or partial, 1 skipped"
@@ -71,7 +71,7 @@ def test_no_rate_before_the_first_run(clock: Clock, plan: Plan) -> None:
 def test_lines_in_a_pipe(clock: Clock, plan: Plan) -> None:
     said = io.StringIO()
     watch = LineWatch(said)
-    watch.begin(plan)
+    watch.begin(len(plan.jobs), plan.out)
     watch.finished(OK)
     watch.look([])
     assert said.getvalue() == ""
@@ -90,7 +90,7 @@ def test_bar_on_a_terminal(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     screen = Console(file=io.StringIO(), force_terminal=True, width=160, color_system=None)
     monkeypatch.setattr(progress, "Console", lambda **_: screen)
     watch = BarWatch()
-    watch.begin(plan)
+    watch.begin(len(plan.jobs), plan.out)
     watch.finished(OK)
     watch.finished(BAD)
     watch.end(Summary(4, (OK, BAD), 5.0))
@@ -103,7 +103,7 @@ def test_bar_on_a_terminal(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_log_beside_the_results(plan: Plan) -> None:
     watch = LogWatch()
     Path(plan.out).mkdir(exist_ok=True)
-    watch.begin(plan)
+    watch.begin(len(plan.jobs), plan.out)
     watch.finished(OK)
     watch.finished(RunOutcome("d", RunStatus.FAILED, "defect", trace="at s3://me:secret@store/x\n"))
     watch.end(Summary(4, (OK,), 5.0))
@@ -117,11 +117,11 @@ def test_log_beside_the_results(plan: Plan) -> None:
 
 def test_the_verdict_is_the_first_word() -> None:
     summary = Summary(4, (OK, BAD, OLD), 5.0)
-    assert watch.summary_line(summary).startswith("unsafe: 1 unsafe, 0 unproven, 1 safe, 1 failed; 3 of 4 runs")
-    assert watch.outcome_line(OLD) == "c: skipped, unsafe"
+    assert campaign.summary_line(summary).startswith("unsafe: 1 unsafe, 0 unproven, 1 safe, 1 failed; 3 of 4 runs")
+    assert campaign.outcome_line(OLD) == "c: skipped, unsafe"
     partial = RunOutcome("d", RunStatus.PARTIAL, "cut off", verdict=RunVerdict.UNPROVEN)
-    assert watch.outcome_line(partial) == "d: unproven, partial: cut off"
-    rows = watch.outcome_rows(summary)
+    assert campaign.outcome_line(partial) == "d: unproven, partial: cut off"
+    rows = campaign.outcome_rows(summary)
     assert rows.columns[:3] == ["verdict", "run_id", "status"]
     assert rows["verdict"].to_list() == ["safe", "failed", "unsafe"]
 
@@ -140,7 +140,7 @@ def test_who_watches(
 def test_json_lines_for_programs(clock: Clock, plan: Plan) -> None:
     said = io.StringIO()
     watch = JsonWatch(said)
-    watch.begin(plan)
+    watch.begin(len(plan.jobs), plan.out)
     watch.look([("a", 1.0)])
     clock.now_s += 5.0
     watch.look([("a", 5.0), ("b", 2.0), ("c", 3.0)])
@@ -183,7 +183,7 @@ def test_each_remedy_stands_once_with_its_command_and_the_worst_run() -> None:
         replace(OK, run_id="b", log="logs/b.mcap", remedies=("route",)),
         replace(OLD, run_id="a", log="logs/a.mcap", remedies=("vehicle_file", "route")),
     ]
-    lines = watch.remedy_lines(Summary(2, tuple(runs), 1.0), site="line9", out="week", options=" --config c.toml")
+    lines = campaign.remedy_lines(Summary(2, tuple(runs), 1.0), site="line9", out="week", options=" --config c.toml")
     assert lines == [
         "2 of 2 runs: name the track that the train took: "
         "`balise replay logs/a.mcap --site line9 --out week --config c.toml --route ROUTES` "
@@ -197,10 +197,10 @@ def test_what_stands_beside_a_verdict_in_the_ending() -> None:
     figures = {"balises_accepted": 28, "balises_on_path": 31, "availability": 0.964, "proof_margin_m": 11.26}
     safe = replace(OK, **figures, held_s=900.0)
     poor = replace(OLD, balises_accepted=2, balises_on_path=9, availability=0.0, held_s=100.0, lost="100% alarms")
-    rows = watch.ending_rows(Summary(2, (safe, BAD), 1.0))
+    rows = campaign.ending_rows(Summary(2, (safe, BAD), 1.0))
     columns = ("verdict", "accepted", "available", "margin")
     assert rows.select(columns).rows() == [("failed", "-", "-", "-"), ("safe", "28 of 31", "96%", "11.3 m")]
-    poor_row = watch.ending_rows(Summary(1, (poor,), 1.0)).row(0, named=True)
+    poor_row = campaign.ending_rows(Summary(1, (poor,), 1.0)).row(0, named=True)
     assert (poor_row["accepted"], poor_row["margin"], poor_row["why"]) == ("2 of 9", "-", "lost to 100% alarms")
-    line = watch.summary_line(Summary(3, (safe, poor, BAD), 1.0))
+    line = campaign.summary_line(Summary(3, (safe, poor, BAD), 1.0))
     assert "; 30 of 40 balises accepted, available for 87% of the moving time, proof margin 11.3 m; 3 of 3 runs" in line

@@ -9,7 +9,7 @@ import pytest
 import typer
 
 import cli
-from pipeline.campaign.plan import software_digest
+from pipeline.results.software import software_digest
 from pipeline.results.store import read_table
 from tests.docs.blocks import PAGES, ROOT, blocks, commands, mentioned
 

@@ -12,11 +12,10 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline import storage
-from pipeline.campaign.plan import software_digest
-from pipeline.campaign.workers import each
 from pipeline.results import catalogue
 from pipeline.results.figures.campaign_figures import derived_tables
 from pipeline.results.manifest import note_pages, sha256
+from pipeline.results.software import software_digest
 from pipeline.results.store import (
     check_site,
     complete_runs,
@@ -26,6 +25,7 @@ from pipeline.results.store import (
     read_run,
     table_address,
 )
+from pipeline.results.workers import each
 from pipeline.show.report.campaign_page import Campaign, campaign_page
 from pipeline.show.report.ground import availability_pieces, together
 from pipeline.show.report.run_page import Made, Neighbours, run_page

@@ -14,27 +14,92 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pipeline import storage
-from pipeline.campaign.outcome import RunOutcome
-from pipeline.campaign.plan import Plan
-from pipeline.campaign.waits import WAITS
-from pipeline.campaign.watch import (
-    Summary,
-    UnderWay,
-    Watch,
-    ending_rows,
-    outcome_line,
-    outcome_rows,
-    remedy_lines,
-    summary_line,
-)
-from pipeline.show.terminal import show_table, to_json
+from pipeline.results.outcome import RunOutcome, Summary, UnderWay
+from pipeline.show.campaign import ending_rows, outcome_line, outcome_rows, remedy_lines, summary_line
+from pipeline.show.terminal import duration_text, show_table, to_json
 from pipeline.stages.run_row.verdict import word_of
 from pipeline.storage.address import is_url, join, redacted
 from schemas.enums import RunStatus
+from schemas.errors import visible
 from schemas.version import SOFTWARE
 
+# Between two lines of progress in a pipe.
+_SAY_S = 5.0
 
-class LineWatch(Watch):
+
+class CampaignWatch:
+    """Whoever wants to see a campaign go on: told of what somebody should see to, and of runs that are not ok."""
+
+    def begin(self, runs: int, out: str) -> None:
+        self.total = runs
+        self.done = self.failed = self.skipped = 0
+        self.since_s = time.monotonic()
+
+    def look(self, under_way: UnderWay) -> None:
+        """Called several times a second with the runs under way and their age [s]."""
+
+    def noted(self, text: str) -> None:
+        """Something that somebody should see to."""
+        raise NotImplementedError
+
+    def lost(self, run_id: str, attempt: int) -> None:
+        """The worker died that was at this attempt of a run; it is tried again."""
+        self.noted(visible(f"{run_id}: its worker died at attempt {attempt}; tried again"))
+
+    def finished(self, outcome: RunOutcome) -> None:
+        self.done += 1
+        self.failed += outcome.status is not RunStatus.OK
+        self.skipped += outcome.skipped
+        self.told(outcome)
+
+    def told(self, outcome: RunOutcome) -> None:
+        """A run that has ended, after it was counted."""
+        if outcome.status is not RunStatus.OK:
+            self.noted(outcome_line(outcome))
+
+    def end(self, summary: Summary) -> None: ...
+
+    @property
+    def rate_per_s(self) -> float | None:
+        """Runs replayed per second; none before the first."""
+        elapsed_s, replayed = time.monotonic() - self.since_s, self.done - self.skipped
+        return replayed / elapsed_s if replayed and elapsed_s > 0 else None
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until the end at this rate."""
+        rate_per_s = self.rate_per_s
+        return None if rate_per_s is None else (self.total - self.done) / rate_per_s
+
+    def line(self, under_way: UnderWay = ()) -> str:
+        """One line: done, failed, rate, time left, slow runs."""
+        parts = [f"{self.done}/{self.total} runs", f"{self.failed} failed or partial"]
+        if self.skipped:
+            parts.append(f"{self.skipped} skipped")
+        if self.rate_per_s is not None and self.left_s is not None:
+            parts += [f"{self.rate_per_s:.2f} runs/s", f"{duration_text(self.left_s)} left"]
+        if slow := slowest(under_way):
+            parts.append("longest now: " + ", ".join(f"{visible(run)} ({duration_text(age_s)})" for run, age_s in slow))
+        return ", ".join(parts)
+
+    def figures(self, under_way: UnderWay = ()) -> dict[str, object]:
+        """The same for programs."""
+        counts = {"done": self.done, "failed": self.failed, "skipped": self.skipped, "total": self.total}
+        slow = [{"run_id": run, "seconds": round(age_s, 3)} for run, age_s in slowest(under_way)]
+        times = {"rate_per_s": _rounded(self.rate_per_s), "left_s": _rounded(self.left_s)}
+        return {**counts, **times, "slow": slow}
+
+
+def slowest(under_way: UnderWay) -> list[tuple[str, float]]:
+    """The two runs that have been under way for longest."""
+    return sorted(under_way, key=lambda item: -item[1])[:2]
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
+class LineWatch(CampaignWatch):
     """Plain lines: each run that is not ok, and every few seconds how far the campaign is."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
@@ -42,7 +107,7 @@ class LineWatch(Watch):
         self._said_s = time.monotonic()
 
     def look(self, under_way: UnderWay) -> None:
-        if time.monotonic() - self._said_s >= WAITS.say_s:
+        if time.monotonic() - self._said_s >= _SAY_S:
             self._said_s = time.monotonic()
             self.progress(under_way)
 
@@ -61,8 +126,8 @@ class LineWatch(Watch):
 class JsonWatch(LineWatch):
     """JSON lines for programs: `run` as each run ends, `lost` with each worker that dies, `progress` in between."""
 
-    def begin(self, plan: Plan) -> None:
-        super().begin(plan)
+    def begin(self, runs: int, out: str) -> None:
+        super().begin(runs, out)
         self.progress(())
 
     def progress(self, under_way: UnderWay) -> None:
@@ -86,14 +151,14 @@ class JsonWatch(LineWatch):
         super().noted(json.dumps({"event": event, **told}))
 
 
-class BarWatch(Watch):
+class BarWatch(CampaignWatch):
     """A progress bar on a terminal."""
 
-    def begin(self, plan: Plan) -> None:
-        super().begin(plan)
+    def begin(self, runs: int, out: str) -> None:
+        super().begin(runs, out)
         columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
         self._bar = Progress(*columns, console=Console(stderr=True))
-        self._task = self._bar.add_task("", total=len(plan.jobs))
+        self._task = self._bar.add_task("", total=runs)
         self._bar.start()
 
     def look(self, under_way: UnderWay) -> None:
@@ -110,13 +175,13 @@ class BarWatch(Watch):
             self._bar.stop()
 
 
-class LogWatch(Watch):
+class LogWatch(CampaignWatch):
     """`OUT/replay.log`: every run with its time; an object store gets it when the campaign ends."""
 
-    def begin(self, plan: Plan) -> None:
-        super().begin(plan)
-        self._place, self._lines = str(join(plan.out, "replay.log")), list[str]()
-        self.noted(f"{SOFTWARE}: {len(plan.jobs)} runs")
+    def begin(self, runs: int, out: str) -> None:
+        super().begin(runs, out)
+        self._place, self._lines = str(join(out, "replay.log")), list[str]()
+        self.noted(f"{SOFTWARE}: {runs} runs")
 
     def told(self, outcome: RunOutcome) -> None:
         self.noted(outcome_line(outcome))
@@ -137,7 +202,7 @@ class LogWatch(Watch):
             storage.write_bytes(self._place, "".join(self._lines).encode())
 
 
-def watches(quiet: bool, as_json: bool = False) -> list[Watch]:
+def watches(quiet: bool, as_json: bool = False) -> list[CampaignWatch]:
     """What shows a campaign on this terminal or pipe."""
     if quiet:
         return [LogWatch()]
@@ -146,7 +211,7 @@ def watches(quiet: bool, as_json: bool = False) -> list[Watch]:
     return [progress_watch(), LogWatch()]
 
 
-def progress_watch() -> Watch:
+def progress_watch() -> CampaignWatch:
     """A bar on a terminal, lines in a pipe."""
     return BarWatch() if sys.stderr.isatty() else LineWatch()
 

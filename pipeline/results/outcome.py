@@ -1,0 +1,99 @@
+"""What became of the runs of a campaign."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import polars as pl
+
+from pipeline.stages.run_row.verdict import CampaignHead, figures_beside, head_of
+from schemas.enums import RunStatus, RunVerdict
+
+_BESIDE = {
+    "balises_accepted": pl.Int64,
+    "balises_on_path": pl.Int64,
+    "availability": pl.Float64,
+    "proof_margin_m": pl.Float64,
+    "held_s": pl.Float64,
+}
+UnderWay = Sequence[tuple[str, float]]
+"""Ids of the runs under way, and for how long [s]."""
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What became of one run. With a `trace` its failure is a defect of ours, else the input's.
+
+    `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
+    over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
+    `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved. `log`: what was
+    replayed. The figures beside the verdict, `remedies` and `lost` are of the solution that heads the run;
+    `lost`: what the moving time of a run of low availability was lost to.
+    """
+
+    run_id: str
+    status: RunStatus
+    error: str | None = None
+    verdict: RunVerdict | None = None
+    skipped: bool = False
+    trace: str | None = None
+    seconds: float = 0.0
+    hazards: int | None = None
+    missed_detections: int | None = None
+    attempts: int = 1
+    why: str = ""
+    faults: tuple[str, ...] = ()
+    proof: str = ""
+    log: str = ""
+    balises_accepted: int | None = None
+    balises_on_path: int | None = None
+    availability: float | None = None
+    proof_margin_m: float | None = None
+    held_s: float | None = None
+    remedies: tuple[str, ...] = ()
+    lost: str = ""
+
+    @property
+    def defect(self) -> bool:
+        return self.trace is not None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A campaign in figures."""
+
+    planned: int
+    outcomes: tuple[RunOutcome, ...]
+    seconds: float
+
+    @property
+    def head(self) -> CampaignHead:
+        """The worst verdict of the runs that were reached, and their counts."""
+        return head_of(outcome.verdict for outcome in self.outcomes)
+
+    def beside(self) -> dict[str, Any]:
+        """The figures beside the verdict over all runs that have one; nothing where none has."""
+        rows = [{name: getattr(outcome, name) for name in _BESIDE} for outcome in self.outcomes if outcome.held_s]
+        return dict(figures_beside(pl.DataFrame(rows, schema=_BESIDE))) if rows else {}
+
+    def count(self, status: RunStatus) -> int:
+        return sum(outcome.status == status for outcome in self.outcomes)
+
+    @property
+    def all_ok(self) -> bool:
+        return self.count(RunStatus.OK) == self.planned
+
+    @property
+    def skipped(self) -> int:
+        return sum(outcome.skipped for outcome in self.outcomes)
+
+    @property
+    def defects(self) -> int:
+        return sum(outcome.defect for outcome in self.outcomes)
+
+    @property
+    def left(self) -> int:
+        """Runs that were not reached."""
+        return self.planned - len(self.outcomes)

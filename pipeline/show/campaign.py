@@ -1,0 +1,123 @@
+"""A campaign in words and rows: one run, all of them, what would mend them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import polars as pl
+
+from pipeline.results.outcome import RunOutcome, Summary
+from pipeline.show.terminal import duration_text
+from pipeline.stages.run_row.verdict import word_of
+from schemas.enums import RunStatus, RunVerdict
+from schemas.errors import visible
+from schemas.words import beside_words, remedy_words
+
+_WORST_FIRST = {"unsafe": 0, "failed": 1, "unproven": 2, "safe": 3}
+
+
+def outcome_line(outcome: RunOutcome) -> str:
+    """One run in one line, its verdict first."""
+    how = "skipped, " if outcome.skipped else ""
+    word, status = word_of(outcome.verdict), outcome.status.value
+    beside = "" if outcome.status is RunStatus.OK or status == word else f", {status}"
+    text = f"{outcome.run_id}: {how}{word}{beside}"
+    if outcome.error:
+        text += f": {outcome.error}"
+    elif not outcome.skipped:
+        text += f" in {duration_text(outcome.seconds)}"
+    if outcome.attempts > 1:
+        text += f" (attempt {outcome.attempts})"
+    return visible(text).replace("\n", r"\n")
+
+
+def summary_line(summary: Summary) -> str:
+    """A campaign in one line, its verdict first."""
+    counts = [f"{summary.count(status)} {status.value}" for status in RunStatus]
+    beside = f"; {beside_words(figures)}" if (figures := summary.beside()) else ""
+    text = f"{summary.head}{beside}; {len(summary.outcomes)} of {summary.planned} runs: " + ", ".join(counts)
+    if summary.skipped:
+        text += f" ({summary.skipped} of them complete before)"
+    return f"{text}; {duration_text(summary.seconds)}"
+
+
+def ending_rows(summary: Summary) -> pl.DataFrame:
+    """What a person reads when a campaign has ended, the worst run first: verdict, figures beside it, why, faults."""
+    ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
+    names = ("verdict", "run_id", "accepted", "available", "margin", "why", "faults")
+    rows = [
+        (word_of(outcome.verdict), outcome.run_id, *_beside(outcome), _reason(outcome), _few(outcome.faults))
+        for outcome in ranked
+    ]
+    return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")
+
+
+def _beside(outcome: RunOutcome) -> tuple[str, str, str]:
+    """Balises accepted of those on the path, availability, proof margin."""
+    if outcome.verdict is None:
+        return "-", "-", "-"
+    accepted = f"{outcome.balises_accepted} of {outcome.balises_on_path}"
+    available = "-" if outcome.availability is None else f"{outcome.availability:.0%}"
+    return accepted, available, "-" if outcome.proof_margin_m is None else f"{outcome.proof_margin_m:.1f} m"
+
+
+def remedy_lines(summary: Summary, **places: str) -> list[str]:
+    """Per remedy how many runs it would mend, and the command for the worst of them; the most frequent first.
+
+    `places`: paths as the user named them.
+    """
+    ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
+    mended: dict[str, list[RunOutcome]] = {}
+    for outcome in ranked:
+        for remedy in outcome.remedies:
+            mended.setdefault(remedy, []).append(outcome)
+    order = sorted(mended, key=lambda remedy: -len(mended[remedy]))
+    return [
+        f"{len(runs)} of {len(ranked)} runs: {remedy_words(remedy, **places | {'run': runs[0].log})}"
+        for remedy, runs in ((remedy, mended[remedy]) for remedy in order)
+    ]
+
+
+def _reason(outcome: RunOutcome) -> str:
+    """What is wrong with the run: why its verdict is no better, what cut it short, what its time was lost to."""
+    why = "" if outcome.verdict is RunVerdict.SAFE else outcome.why
+    cut = "" if outcome.status is RunStatus.OK else outcome.error or outcome.status.value
+    status = f"partial: {cut}" if cut and outcome.status is RunStatus.PARTIAL else cut
+    lost = f"lost to {outcome.lost}" if outcome.lost else ""
+    return "; ".join(text for text in (why, status, lost) if text)
+
+
+def _few(faults: Sequence[str]) -> str:
+    more = [f"and {len(faults) - 2} more"] if len(faults) > 2 else []
+    return "; ".join([*faults[:2], *more]) or "none"
+
+
+def outcome_rows(summary: Summary) -> pl.DataFrame:
+    """A campaign as a table: one row per run that was reached, its verdict first."""
+    kinds: dict[str, type[pl.DataType] | pl.DataType] = {
+        "verdict": pl.String,
+        "run_id": pl.String,
+        "status": pl.String,
+        "hazards": pl.Int64,
+        "missed_detections": pl.Int64,
+        "seconds": pl.Float64,
+        "skipped": pl.Boolean,
+        "attempts": pl.Int64,
+        "error": pl.String,
+        "balises_accepted": pl.Int64,
+        "balises_on_path": pl.Int64,
+        "availability": pl.Float64,
+        "proof_margin_m": pl.Float64,
+        "why": pl.String,
+        "remedies": pl.List(pl.String),
+        "faults": pl.List(pl.String),
+    }
+    rows = [
+        (word_of(outcome.verdict), *(_listed(getattr(outcome, name)) for name in list(kinds)[1:]))
+        for outcome in summary.outcomes
+    ]
+    return pl.DataFrame(rows, schema=kinds, orient="row")
+
+
+def _listed(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value
