@@ -22,6 +22,7 @@ from pipeline.stages.monitors.axis import (
 )
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.monitors.recursion import AxisState
+from pipeline.stages.odometry.driven import under_way
 from pipeline.stages.odometry.odometry import Odometry
 from pipeline.stages.odometry.recovery import RecoveryRule
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
@@ -33,8 +34,7 @@ def learn(
 ) -> Estimates:
     """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only.
 
-    `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `usable`: those on the track; `jitter_s`: see
-    `stamp_jitter_s`.
+    `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `usable`: those on the track.
     """
     prior = prior_of(vehicle, config.align)
     learned = prior.over(positions.height)
@@ -49,13 +49,11 @@ def learn(
 
 
 class _Learner:
-    """Runs the filter along the run and freezes it under alarm of the along-track monitors.
+    """Runs the filter along the run, once the noise is known, and freezes it under alarm of the along-track monitors.
 
-    Estimates in use at an epoch come from epochs before it. From the first failing epoch on they stand still until
-    the raw and fastest monitors have been quiet for `recovery_s` and GNSS minus odometer is back where it was
-    before the alarm (DOMAIN section 3 and 4); a fault that persists is never learned as scale. Nor is an offset that
-    a position brings back from a break or an alarm, or its decay: see `ScaleLatencyFilter.resume`. Learning begins when
-    the noise is known, without which nobody could say what an alarm is.
+    From the first failing epoch on the estimates stand still until the rule of recovery holds (`RecoveryRule`), so that
+    a fault that persists is never learned as scale; nor is an offset that a position brings back from a break or an
+    alarm, or its decay (`ScaleLatencyFilter.resume`).
     """
 
     def __init__(
@@ -77,10 +75,10 @@ class _Learner:
         # Latencies of five sigmas have to find a known distance too.
         margin_ns, t_ns = round(5e9 * config.align.latency_prior_sigma_s), times_ns(positions)
         self._rows = np.flatnonzero(usable & odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns))
-        self._path_m, self._own_m, self._digits_m = (
+        self._path_m, self._calibrated_m, self._digits_m = (
             floats(positions, name)[self._rows] for name in ("along_m", "calibrated_along_m", "digits_along_m")
         )
-        self._sigma_m = np.hypot(self._own_m, self._digits_m)
+        self._sigma_m = np.hypot(self._calibrated_m, self._digits_m)
         t_s = odometry.seconds(t_ns)
         self._t_ns, self._t_s = t_ns[self._rows], t_s[self._rows]
         self._segment = odometry.segment_at_s(self._t_s)
@@ -91,9 +89,10 @@ class _Learner:
         self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
         self._outages = _gaps_before(self._t_s, t_s[usable], gap_s)
         if self._rows.size:
-            speed_mps = np.abs(odometry.speed_at_s(self._t_s))
-            moving, given_m = speed_mps > config.matching.deadband_mps, config.monitors.noise_along_m
-            self._meter = NoiseMeter(self._series(0, self._rows.size, 0), moving, given_m, config)
+            way_m, deadband_mps = odometry.travelled_at(self._t_ns), config.matching.deadband_mps
+            moving = under_way(self._t_s, way_m, deadband_mps, config.align.speed_window_s)
+            series = self._series(0, self._rows.size, 0)
+            self._meter = NoiseMeter(series, moving, config.monitors.noise_along_m, config)
 
     def run(self, prior: Estimates) -> None:
         position = self._meter.known_from() if self._rows.size else 0
@@ -200,7 +199,7 @@ class _Learner:
             t_s=self._t_s[part],
             along_m=self._path_m[part],
             segment=self._odometry.segment_at_s(at_s),
-            sigma_m=self._own_m[part],
+            sigma_m=self._calibrated_m[part],
             digits_m=self._digits_m[part],
             jitter_s=self._jitter_s,
             scale_sigma=in_use.scale_sigma,

@@ -143,13 +143,14 @@ class LinkDistance:
         self._threshold[ahead] = np.where(known, np.where(held, bound_m, threshold_m), np.nan)
         self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
 
-    def hold_against(self, found: Comparison, k: int) -> None:
+    def hold_against(self, comparison: Comparison, k: int) -> None:
         """The verdict on a position after an outage joins that of the bounds at epoch `k`, whose fail remains."""
         if self.fails(k):
             return
-        self._value[k], self._threshold[k] = found.moved_m, found.bound_m
-        self._fails[k] = found.reason is None and not found.holds
-        self._reason[k] = found.reason
+        self._value[k] = comparison.moved_m
+        self._threshold[k] = comparison.bound_m
+        self._fails[k] = comparison.reason is None and not comparison.holds
+        self._reason[k] = comparison.reason
 
     def forget(self, k: int) -> None:
         """From epoch `k` on there is nothing to measure from."""

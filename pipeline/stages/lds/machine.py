@@ -1,8 +1,7 @@
-"""The location determination system as a state machine over the epochs of one solution.
+"""The location determination system: one walk along the epochs of a solution, with one state of its position.
 
-*Initialising*: no reference, no linking. *Linked*: reference known, position in use. *Odometry*:
-reference known, no usable position just now. *Fail-safe*: position negated. In any mode a position is *withheld* where
-the diagnosis itself says that it cannot stand behind it (DOMAIN section 5.2): no VB is accepted, no TVB is valid.
+In any state a position is *withheld* where the diagnosis itself says that it cannot stand behind it (DOMAIN section
+5.2): no VB is accepted, no TVB is valid.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class Use(Enum):
 
 
 class LocationSystem:
-    """Walks once along a journey; what it found stands in its public attributes afterwards.
+    """Walks once along a journey; the results stand in its public attributes afterwards.
 
     Per epoch: `tvb`, `alarm`, `negated`, `evaluated` (`along_raw` has a verdict), `withheld_for` (why the position is
     not used though no monitor fails, None where it is).
@@ -193,9 +192,9 @@ class LocationSystem:
         """The first usable position after an outage or the noise: where it moved meanwhile, that is an alarm."""
         self._use = Use.IN_USE
         if self._validated and self._t_ns[k] - self._t_ns[self._since] > self._bridged_ns:
-            found = self._relink.compare(k, self._relink.anchor_at(k))
-            self.distance.hold_against(found, k)
-            if found.reason is not None:
+            comparison = self._relink.compare(k, self._relink.anchor_at(k))
+            self.distance.hold_against(comparison, k)
+            if comparison.reason is not None:
                 self._negate(k)
 
     def _accept(self, crossing: Crossing, k: int) -> None:
@@ -228,7 +227,7 @@ class LocationSystem:
         return True
 
     def _negate(self, k: int) -> None:
-        self._relink.note_alarm(k)
+        self._relink.note_alarm(k, self._bank.failing_memory_s(k))
         self._bank.freeze(k)
         self._use = Use.NEGATED
         self._recovery.begin(k)

@@ -124,14 +124,18 @@ class Relink:
         """A telegram says where the train is."""
         self._fixed = Anchor.at_crossing(self._journey, read, self._config.hazards.balise_read_sigma_m) or self._fixed
 
-    def note_alarm(self, k: int) -> None:
-        """The first alarm with an anchor before it fixes that; only a telegram moves it from there."""
-        self._fixed = self.anchor_at(k)
+    def note_alarm(self, k: int, memory_s: float = 0.0) -> None:
+        """The first alarm with an anchor before it fixes that; only a telegram moves it from there.
+
+        `memory_s`: of the slowest average that fails: the drift may have gone on for so long.
+        """
+        self._fixed = self.anchor_at(k, memory_s)
         self._alarmed = self._fixed is not None
 
-    def anchor_at(self, k: int) -> Anchor | None:
+    def anchor_at(self, k: int, least_s: float = 0.0) -> Anchor | None:
         """Before the first alarm: the last TVB `anchor_lag_s` before epoch `k`, else the first TVB, or a later read."""
-        return self._fixed if self._alarmed else self._last_validated(k, self._config.lds.anchor_lag_s)
+        lag_s = max(self._config.lds.anchor_lag_s, least_s)
+        return self._fixed if self._alarmed else self._last_validated(k, lag_s)
 
     def anchor_before_slip(self, k: int) -> Anchor | None:
         """The last TVB before slip that began at epoch `k`, or a later telegram."""
@@ -161,10 +165,10 @@ class Relink:
             # Slip at each start counts too much each time, and would soon explain any fault.
             return Comparison(reason=NotEvaluated.RELINK_SLIPPED)
         moved_m, bound_m = (float(values[0]) for values in self.moved_m(anchor, k, k + 1))
-        found = Comparison(moved_m, bound_m)
-        if found.holds:
+        comparison = Comparison(moved_m, bound_m)
+        if comparison.holds:
             self.held.append(Held(k, None if anchor.is_read else anchor.epoch, moved_m, bound_m + doubt_m))
-        return found
+        return comparison
 
     def moved_m(self, anchor: Anchor, k: int, end: int) -> tuple[Floats, Floats]:
         """How far GNSS minus odometer moved since the anchor at these epochs, and how far it may have [m].

@@ -196,6 +196,18 @@ def test_at_a_configured_start_of_mission_the_lds_begins_anew() -> None:
     assert result.epochs["lrvb_id"][59:61].to_list() == ["V1", None]
 
 
+@pytest.mark.parametrize(("memory_s", "again"), [(0.0, 630), (1000.0, None)])
+def test_the_anchor_is_as_old_as_the_average_that_fails(memory_s: float, again: int | None) -> None:
+    """0.02 m/s from 50 s on, found at 600 s with 11 m: at 150 s it was 2 m, at the first TVB (7 s) none.
+
+    At 630 s it is 11.6 m: 9.6 m from the anchor of 450 s, within the bound of 10 m, and too far from the first TVB.
+    """
+    odometer_m = steps(0.0, 20.0, 640)
+    path_m = [x + 0.02 * max(k - 50, 0) for k, x in enumerate(odometer_m)]
+    result = run(epochs_of(path_m, odometer_m), balises_at(V1), ScriptedBank([600], memory_s=memory_s))
+    assert negations(result) == [(600, again)]
+
+
 # Held after a return, for the memory of the slowest average
 
 
