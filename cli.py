@@ -33,7 +33,7 @@ app = Typer(
     name="balise",
     help="Replay recorded train journeys and judge whether satellite positioning could have replaced balises.",
     epilog="Exit status: 0 ok; 1 a run failed or is partial, results differ, or --fail-on; 2 wrong usage, "
-    "configuration or site; 3 defect of the program; 129, 130, 143 interrupted. --debug shows the traceback of an error.",
+    "configuration or site; 3 defect of the program; 129, 130, 143 interrupted. --debug shows the traceback.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
