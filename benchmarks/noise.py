@@ -177,12 +177,13 @@ def ramps(count: int, seed: int) -> None:
             fault_m = rate_mps * np.maximum(np.arange(0.0, 3600.0 * hours, 0.1) - _ONSET_S, 0.0)
             runs = [epochs_of(receiver, hours, rng, fault_m) for _ in range(count)]
             delays_s = np.array([[_delay_s(run, config) for config in (Configuration(), given)] for run in runs])
+            delays_s = delays_s[np.isfinite(delays_s[:, 1]) & ~np.isnan(delays_s[:, 0])]
             found = delays_s[:, 0] / delays_s[:, 1]
             ratios += found.tolist()
             unseen = (delays_s * rate_mps > 20.0).sum(axis=0).tolist()
             print(
                 f"{rate_mps:g} m/s: {np.median(found):.2f} times later, at most {found.max():.2f}; beyond 20 m unseen"
-                f" {unseen[0]}, with noise given {unseen[1]} of {count}: {receiver}",
+                f" {unseen[0]}, with noise given {unseen[1]} of {found.size}: {receiver}",
                 flush=True,
             )
     print(f"all: median {np.median(ratios):.2f}, 95 % {np.quantile(ratios, 0.95):.2f}")
@@ -196,8 +197,11 @@ def _given_noise(receiver: Receiver, rng: np.random.Generator) -> Configuration:
 
 
 def _delay_s(epochs: pl.DataFrame, config: Configuration) -> float:
+    """From the onset to the first alarm; NaN where noise too large kept the position out of use."""
     found = first_alarm(epochs, config, _ONSET_S)
-    return np.inf if found is None else found[1] - _ONSET_S
+    if found is not None:
+        return found[1] - _ONSET_S
+    return np.inf if MonitorBank(epochs, {}, config).noise_known_at(epochs.height - 1) else np.nan
 
 
 def random_receivers(count: int, rng: np.random.Generator) -> Iterator[Receiver]:

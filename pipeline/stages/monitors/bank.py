@@ -133,7 +133,7 @@ class _AxisBank:
         """Value, threshold, state and reason of each monitor of the axis."""
         unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
         unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
-        too_large = (self.noise_m > self._config.noise_limit_m).any(axis=1)
+        too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
         of_noise = first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
         reasons = self.axis.reasons.fill_null(of_noise).fill_null(FIRST_EPOCH)
         columns: list[pl.Series] = []
