@@ -33,8 +33,7 @@ def series_of(offset_m: Floats, period_s: float = 1.0, sigma_m: float = 0.0) -> 
         **errors_of(np.full(count, sigma_m), dt_s, [], CONFIG.monitors),
         white_m2=nothing,
         border_m2=nothing,
-        steady_mps=nothing,
-        latency_mps=nothing,
+        lasting_mps=np.zeros((count, 0)),
     )
 
 
