@@ -7,6 +7,6 @@ Touches files, stores, processes and clusters; what one run says is made by `pip
 from pipeline.campaign.interruption import Interrupted
 from pipeline.campaign.plan import Plan, find_runs, make_plan
 from pipeline.campaign.run import run_campaign
-from pipeline.results.outcome import RunOutcome, Summary
+from pipeline.results.outcome import CampaignSummary, RunOutcome
 
-__all__ = ["Interrupted", "Plan", "RunOutcome", "Summary", "find_runs", "make_plan", "run_campaign"]
+__all__ = ["Interrupted", "Plan", "RunOutcome", "CampaignSummary", "find_runs", "make_plan", "run_campaign"]
