@@ -54,6 +54,9 @@ class StreamMapping(Settings):
     solution: str = "primary"
 
 
+Shift = Annotated[Number, Field(ge=-1e6, le=1e6)]  # [m]
+
+
 class StreamCorrection(Settings):
     """Corrections of a recorded stream, made right after reading, for any kind of file.
 
@@ -65,10 +68,10 @@ class StreamCorrection(Settings):
     solution: str | None = None
     exchange: tuple[str, str] | None = None
     factors: dict[str, Number] = {}
-    shift_s: Number = 0.0
-    shift_east_m: Number = 0.0
-    shift_north_m: Number = 0.0
-    shift_up_m: Number = 0.0
+    shift_s: Annotated[Number, Field(ge=-9e9, le=9e9)] = 0.0  # what 64 bits of nanoseconds hold
+    shift_east_m: Shift = 0.0
+    shift_north_m: Shift = 0.0
+    shift_up_m: Shift = 0.0
 
 
 class IngestConfig(Settings):
@@ -103,7 +106,7 @@ class IngestConfig(Settings):
 
 
 class PlausibilityConfig(Settings):
-    """Whether the streams of a run can be of one journey: what is told, and what no train can have."""
+    """Whether the streams of a run can be of one journey: what is reported, and what no train can have."""
 
     # Worn wheels count 4 % too much, bad radars 6 %; the nearest wrong unit (yards) 9 %.
     scale_limit: Probability = 0.08
@@ -114,86 +117,14 @@ class PlausibilityConfig(Settings):
     lag_told_s: Positive = 0.3
     # Positions without corrections are within 5 m of the track, 95 %; a shift above half of `ci_limit_m` is reported.
     shift_told_m: Positive = 8.0
-    # Slower, positions that scatter by some metres may be of a train that stands.
-    moving_mps: Positive = 1.0
-    # A speed is a mean over this time: positions that scatter by 2 m give it to 0.7 m/s. A pause as long is bridged,
-    # and one of so many usual periods: loggers drop single rows.
-    speed_s: Positive = 4.0
-    bridged_periods: Positive = 3.5
-    # With less in common, of all and of the shorter record, any two journeys look alike.
-    overlap_s: Positive = 90.0
-    overlap_share: Probability = 0.6
-    # Constant speed tells no lag: its scatter over its mean.
-    speed_change: Probability = 0.08
-    # Nobody looks for another lag where speeds agree in so much of the moving time; a journey that repeats itself
-    # agrees nearly as well at another one.
-    speeds_agree: Probability = 0.93
-    lag_rival: Probability = 0.05
-    # Speeds agree within this share of themselves and this one of the usual speed: scatter of 0.7 m/s at 17 m/s.
-    speed_alike_share: Probability = 0.07
-    speed_alike_usual: Probability = 0.04
-    # To so much a lag is known by speeds alone, which are means over 4 s.
-    speed_lag_s: Positive = 2.0
-    # Below this share of the usual speed a record tells more of noise than of the scale.
-    slow_share: Probability = 0.2
-    # Ways are compared over windows of this length: positions that scatter by 2 m tell them to 2 %.
-    window_m: Positive = 150.0
-    # They last so long: over less the stamps tell little, over more a train does not keep its speed.
-    window_least_s: Positive = 8.0
-    window_most_s: Positive = 60.0
-    # A window agrees on a factor within so much: positions, curves and slip together.
-    window_agrees: Positive = 0.12
-    # A lag is told where its sigma is smaller than this; lags and factors where they are so many sigmas apart.
-    lag_sigma_s: Positive = 0.5
-    told_sigmas: Positive = 5.0
-    # Which way the train goes is told by the way of this time before and after a stand, of which the counter shows the
-    # same within this share; headings turn back or go on by more than this cosine.
-    heading_s: Positive = 20.0
-    heading_way: Probability = 0.3
-    heading_cosine: Probability = 0.7
-    # Passages of single places agree on a lag within this time, and so large a share of them has to.
-    passing_s: Positive = 2.0
-    passing_share: Probability = 0.6
-    # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; bad odometers are off by 3 %.
-    unit_share: Probability = 0.045
-    # So many windows agree on the factor of a unit. Pulses, which no unit explains, have to be clearer, and far from 1.
-    unit_windows: Probability = 0.6
-    pulses_windows: Probability = 0.8
-    pulses_factor: Positive = 1.5
-    # Streams are late by so much beside what explains the lag of a clock; two lags so near are of one clock.
-    clock_near_s: Positive = 2.2
-    same_clock_s: Positive = 1.5
     # A vehicle file may differ from the run by so many of its own sigmas, and by this scale at least.
     file_sigmas: Positive = 4.0
     file_scale: Probability = 0.005
-    # Two records are of one place within so much, a read of the balise that it names, and positions of the same line.
-    same_place_m: Positive = 400.0
-    read_m: Positive = 60.0
+    # Positions farther from every track are of another place; a yard lies within it.
     same_line_m: Positive = 2_000.0
-    # Velocities fit if they differ from the displacement by a smaller share of it; slower, scatter turns that.
-    velocity_share: Probability = 0.3
-    velocity_mps: Positive = 3.0
-    # Exchanged axes or signs explain velocities that are off by this share at least, if they leave at most this part.
-    velocity_turned: Probability = 0.1
-    velocity_explained: Probability = 0.35
-    # Up is told from down by this correlation, where the slope changes by so much over the run.
-    climb_agrees: Probability = 0.6
-    climb_mps: Positive = 0.1
-    # One shift of the survey is told if it leaves this share of the distance at most, for so many of the positions.
-    shift_leaves: Probability = 0.5
-    shift_positions: Probability = 0.75
-    # A survey is in a national datum if its shift is so near to the datum's.
-    datum_near_m: Positive = 12.0
-    datum_near_share: Probability = 0.12
-    # A line of one heading: with less of the information across it, a shift along the track is not known.
-    one_heading: Probability = 0.04
     # Of a copy so many places are equal to the last digit, and at most so often would an independent record's be.
     copy_share: Probability = 0.8
     copy_chance: Probability = 0.01
-    # Stamps are equal within this: recorders round them to milliseconds.
-    same_stamp_s: NonNegative = 0.002
-    # Positions as near to the track as this share of their sigma have no errors of their own; 0.67 is usual.
-    without_error: Probability = 0.2
 
 
 class FixSigma(Settings):
@@ -422,8 +353,8 @@ class MonitorConfig(Settings):
     noise_renewal_s: Positive = 10.0
     noise_window_s: Positive = 300.0
     noise_window_lags: Positive = 20.0
-    # Samples of the short lags are no closer: at 10 Hz three times as many would cost much and tell little more.
-    noise_spacing_s: Positive = 0.3
+    # Samples of the short lags are no closer: 300 in the window are enough for the last quantile.
+    noise_spacing_s: Positive = 1.0
     # A lag counts after so many of itself. Longer ones than this take longer than a run lets them: they are expected
     # by how the noise grows over the shorter ones.
     noise_ready_lags: Annotated[Number, Field(gt=2)] = 7.0

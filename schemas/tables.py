@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import dataframely as dy
 
@@ -39,27 +39,35 @@ CONTRACT_VERSION = "2.0"
 
 AXES = ("along", "cross", "up")
 SCALES = ("raw", "ewma_0p1", "ewma_0p01", "ewma_0p001")
-BANK_MONITORS: tuple[str, ...] = tuple(f"{axis}_{scale}" for axis in AXES for scale in SCALES)
-OTHER_MONITORS: tuple[str, ...] = (
-    "link_order",
-    "link_distance",
-    "along_doppler",
-    "pseudorange",
-    "channel",
+
+
+class Monitor(NamedTuple):
+    """One monitor: unit of its value and threshold, the drawing that shows it, and what its line is called there."""
+
+    name: str
+    unit: str
+    drawing: str
+    label: str
+
+
+_SCALE_LABELS = ("raw", "EWMA 0.1", "EWMA 0.01", "EWMA 0.001")
+_BANK: tuple[Monitor, ...] = tuple(
+    Monitor(f"{axis}_{scale}", "m/s", axis, label)
+    for axis in AXES
+    for scale, label in zip(SCALES, _SCALE_LABELS, strict=True)
 )
-MONITORS: tuple[str, ...] = BANK_MONITORS + OTHER_MONITORS
-_UNIT_OF_OTHERS = {
-    "link_order": "1",
-    "link_distance": "m",
-    "along_doppler": "m/s",
-    "pseudorange": "1",
-    "channel": "m",
-}
-
-
-def monitor_unit(monitor: str) -> str:
-    """Unit of a monitor's value and threshold."""
-    return _UNIT_OF_OTHERS.get(monitor, "m/s")
+ALL_MONITORS: tuple[Monitor, ...] = (
+    *_BANK,
+    Monitor("link_order", "1", "other", "link order"),
+    Monitor("link_distance", "m", "other", "link distance"),
+    Monitor("along_doppler", "m/s", "other", "along doppler"),
+    Monitor("pseudorange", "1", "other", "pseudorange"),
+    Monitor("channel", "m", "other", "channel"),
+)
+"""Tables, configuration, pages, exports and dictionary read this tuple; what runs is in `pipeline/stages/monitors`."""
+BANK_MONITORS: tuple[str, ...] = tuple(monitor.name for monitor in _BANK)
+MONITORS: tuple[str, ...] = tuple(monitor.name for monitor in ALL_MONITORS)
+OTHER_MONITORS: tuple[str, ...] = MONITORS[len(BANK_MONITORS) :]
 
 
 class Hazards(dy.Schema):
@@ -82,7 +90,7 @@ class Hazards(dy.Schema):
     t_end = instant("end of the episode", nullable=True)
     monitor = text("monitor that failed first", nullable=True)
     detected = flag("a monitor failed within the episode")
-    alarm_before_onset = flag("an alarm was already active at the onset")
+    alarm_before_onset = flag("an alarm was active at the onset, or is the onset of a drift: T_D 0 is no measurement")
     time_to_detect_s = real("s", "T_D = t_detected - t_onset")
     time_since_failure_s = real("s", "T_dsf, least = t_detected - t_failure; negative = in time")
     time_since_failure_may_s = real("s", "T_dsf, largest = t_detected - t_failure_may: a bound, not a measurement")
@@ -112,7 +120,7 @@ class Passages(dy.Schema):
     direction = one_of(Direction, "direction of travel on the path", nullable=True)
     status = one_of(PassageStatus, "result in the LDS")
     t_offered = instant("the raw matched position crosses the balise, interpolated", nullable=True)
-    t_true = instant("the train passes the balise by the evidence", nullable=True)
+    t_true = instant("the train passes the balise by the evidence: middle of the interval it leaves", nullable=True)
     location_error_m = real("m", "position error at the offer where known to 5 m; + = offered early")
     window_open_m = real("m", "expectation window opens, odometer distance from the LRVB")
     window_close_m = real("m", "expectation window closes, odometer distance from the LRVB")
@@ -227,19 +235,19 @@ class _EpochsAfterMonitors(dy.Schema):
     undetected_behind_m = real("m", "the same behind it; both null where not computed", min=0)
 
 
-def _monitor_columns(monitor: str) -> dict[str, dy.Column]:
-    unit = monitor_unit(monitor)
+def _monitor_columns(monitor: Monitor) -> dict[str, dy.Column]:
+    name, unit = monitor.name, monitor.unit
     return {
-        f"{monitor}_value": real(unit, f"statistic of the monitor `{monitor}`"),
-        f"{monitor}_threshold": real(unit, f"threshold of the monitor `{monitor}`", min=0),
-        f"{monitor}_state": one_of(MonitorState, f"state of the monitor `{monitor}`"),
-        f"{monitor}_reason": text("why it was not evaluated", nullable=True),
+        f"{name}_value": real(unit, f"statistic of the monitor `{name}`"),
+        f"{name}_threshold": real(unit, f"threshold of the monitor `{name}`", min=0),
+        f"{name}_state": one_of(MonitorState, f"state of the monitor `{name}`"),
+        f"{name}_reason": text("why it was not evaluated", nullable=True),
     }
 
 
 def _epochs_schema() -> type[dy.Schema]:
     columns: dict[str, Any] = dict(_EpochsBeforeMonitors.columns())
-    for monitor in MONITORS:
+    for monitor in ALL_MONITORS:
         columns |= _monitor_columns(monitor)
     columns |= _EpochsAfterMonitors.columns()
     return type("Epochs", (dy.Schema,), {"__doc__": _EpochsBeforeMonitors.__doc__, "__module__": __name__, **columns})

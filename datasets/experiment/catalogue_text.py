@@ -5,12 +5,12 @@ from __future__ import annotations
 import polars as pl
 
 from datasets.experiment.catalogue_faults import HEALTHY
+from schemas.tables import OTHER_MONITORS
 
 _HEAD = (
     "| fault | position fails after | seen first by | after | way | seen in | missed at failure (95 %) | unsafe |",
     "|---|---|---|---|---|---|---|---|",
 )
-_BEYOND = ("link_order", "link_distance", "along_doppler", "pseudorange", "channel")
 
 
 def catalogue_page(faults: pl.DataFrame, monitors: pl.DataFrame) -> str:
@@ -33,7 +33,7 @@ def catalogue_page(faults: pl.DataFrame, monitors: pl.DataFrame) -> str:
         "",
         "## What each monitor beyond the bank of averages is for",
         "",
-        *(_purpose(name, monitors) for name in _BEYOND),
+        *(_purpose(name, monitors) for name in OTHER_MONITORS),
         "",
         "## Healthy journeys",
         "",

@@ -13,12 +13,11 @@ import polars as pl
 from pipeline.stages.alignment.align import align, odometer_at
 from pipeline.stages.evidence import Evidence
 from pipeline.stages.judge.case import Case, Solution
-from pipeline.stages.judge.judged import direction_by_evidence
+from pipeline.stages.judge.epochs import direction_by_evidence
 from pipeline.stages.lds.run import LdsResult, run_lds
 from pipeline.stages.matching import Match
 from pipeline.stages.monitors.bank import MonitorBank
-from pipeline.stages.monitors.pseudorange import pseudorange_monitor
-from pipeline.stages.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor, on_path_of
+from pipeline.stages.monitors.single import NO_OTHER_SOLUTION, WITHOUT_MEMORY, Seen, on_path_of
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun
 from schemas.enums import NotEvaluated
@@ -57,7 +56,7 @@ def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], 
         # Virtual balises may be valid in one direction, and that is the train's: no position's step (DOMAIN section 4).
         aligned = aligned.with_columns(_direction(prepared, solution, aligned, matched, evidence))
     other = _other_solution(prepared, solution, aligned, matches)
-    singles = _single_monitors(prepared, solution, aligned, other)
+    singles = _without_memory(prepared, solution, aligned, other)
     bank = MonitorBank(aligned, singles, config)
     balises = matched.path.balises(prepared.site.balises)
     reads = _reads_on_odometer(prepared.run.balise_reads, aligned, odometry)
@@ -88,17 +87,13 @@ def _other_solution(
     return on_path_of(aligned, matches[other].epochs, prepared.config.lds)
 
 
-def _single_monitors(
+def _without_memory(
     prepared: PreparedRun, solution: str, aligned: pl.DataFrame, other: pl.DataFrame | None
 ) -> dict[str, pl.DataFrame]:
-    config = prepared.config
-    named = config.monitors.channel_reference
+    named = prepared.config.monitors.channel_reference
     absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
-    return {
-        "along_doppler": doppler_monitor(aligned, config),
-        "channel": channel_monitor(aligned, other, config, absent),
-        "pseudorange": pseudorange_monitor(aligned, prepared.ranges(solution), config),
-    }
+    seen = Seen(aligned, prepared.ranges(solution), other, absent, prepared.config)
+    return {name: monitor(seen) for name, monitor in WITHOUT_MEMORY.items()}
 
 
 def _reads_on_odometer(

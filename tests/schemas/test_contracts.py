@@ -8,12 +8,13 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from pipeline.stages.monitors.single import WITHOUT_MEMORY
 from schemas.config import Configuration, Vehicle, digest_of, load_settings, settings_from, to_toml
 from schemas.conform import conform
 from schemas.dictionary import dictionary_frame, dictionary_markdown
 from schemas.errors import BaliseError, ConfigError, InputError
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
-from schemas.tables import MONITORS, TABLES, Alarms, Epochs
+from schemas.tables import MONITORS, OTHER_MONITORS, TABLES, Alarms, Epochs
 
 ROOT = Path(__file__).parents[2]
 
@@ -41,6 +42,10 @@ def test_monitors_have_the_names_of_the_domain():
     assert {f"{name}_{part}" for name in MONITORS for part in ("value", "threshold", "state", "reason")} <= set(
         Epochs.column_names()
     )
+
+
+def test_every_monitor_that_runs_has_columns():
+    assert {*WITHOUT_MEMORY, "link_order", "link_distance"} == set(OTHER_MONITORS)
 
 
 def test_allowed_times_to_detect_of_the_papers():

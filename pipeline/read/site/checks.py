@@ -17,10 +17,10 @@ from pipeline.stages.track.survey import (
     MEASURE_TOLERANCE_M,
     Track,
     end_places,
-    geometric_measures_m,
+    geometric_m,
     track_of,
 )
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, Ints, ints
 from schemas.config import SiteConfig
 from schemas.enums import Navigability
 from schemas.run import BALISE_PLACE, Finding
@@ -93,29 +93,37 @@ def relations_to_nowhere(track: Track, links: pl.DataFrame) -> tuple[pl.DataFram
 
 def _relations_that_differ(links: pl.DataFrame) -> Iterator[Finding]:
     """Two ends that are related more than once, and not alike: `network_of` allows what either allows."""
-    said: dict[tuple[tuple[str, int], tuple[str, int]], list[str]] = {}
+    words: dict[tuple[tuple[str, int], tuple[str, int]], list[str]] = {}
+    from_other = {Navigability.AB.value: Navigability.BA.value, Navigability.BA.value: Navigability.AB.value}
     for a, a_end, b, b_end, way in links.iter_rows():
-        one = (a, a_end)
-        other = (b, b_end)
-        from_other = {Navigability.AB.value: Navigability.BA.value, Navigability.BA.value: Navigability.AB.value}
-        pair, word = ((one, other), way) if one <= other else ((other, one), from_other.get(way, way))
-        said.setdefault(pair, []).append(word)
-    for ((a, a_end), (b, b_end)), words in said.items():
-        if len(set(words)) > 1:
-            text = f"end {a_end} of {a} and end {b_end} of {b} are related as {' and as '.join(dict.fromkeys(words))}"
+        if (a, a_end) <= (b, b_end):
+            words.setdefault(((a, a_end), (b, b_end)), []).append(way)
+        else:
+            words.setdefault(((b, b_end), (a, a_end)), []).append(from_other.get(way, way))
+    for ((a, a_end), (b, b_end)), ways in words.items():
+        if len(set(ways)) > 1:
+            text = f"end {a_end} of {a} and end {b_end} of {b} are related as {' and as '.join(dict.fromkeys(ways))}"
             yield Finding("warning", "links", f"{text}: what either allows counts", "Correct the relations.")
+
+
+def _related_ends(track: Track, links: pl.DataFrame) -> tuple[Ints, Ints]:
+    """The two ends of each relation, as rows of `[element, 0 start or 1 end]` taken flat."""
+    numbers = pl.DataFrame({"name": track.ids, "number": np.arange(len(track.ids))})
+    sides = []
+    for side in ("a", "b"):
+        element = links.select(name=f"netelement_{side}").join(numbers, on="name", how="left", maintain_order="left")
+        sides.append(2 * ints(element["number"]) + ints(links[f"position_{side}"]))
+    return sides[0], sides[1]
 
 
 def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
     """No train gets round a corner of less than a right angle: such a relation, as between the two branches of a
     switch, is not navigable, whatever it says.
     """
-    directions = outward(track)
-    back = [
-        way != Navigability.NONE.value
-        and bool(directions[track.index[a], position_a] @ directions[track.index[b], position_b] > 0.0)
-        for a, position_a, b, position_b, way in links.iter_rows()
-    ]
+    one, other = _related_ends(track, links)
+    directions = outward(track).reshape(-1, 3)
+    acute = pl.Series(np.einsum("ij,ij->i", directions[one], directions[other]) > 0.0, dtype=pl.Boolean)
+    back = acute & (links["navigability"] != Navigability.NONE.value)
     findings = [
         Finding(
             "warning",
@@ -124,50 +132,61 @@ def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.Dat
             "turn by more than 90 degrees there: taken as not navigable",
             "Correct the relation.",
         )
-        for a, a_end, b, b_end, way in links.filter(pl.Series(back, dtype=pl.Boolean)).iter_rows()
+        for a, a_end, b, b_end, way in links.filter(back).iter_rows()
     ]
-    closed = pl.when(pl.Series(back, dtype=pl.Boolean)).then(pl.lit(Navigability.NONE.value))
-    return links.with_columns(closed.otherwise("navigability").alias("navigability")), findings
+    closed = pl.when(back).then(pl.lit(Navigability.NONE.value))
+    return links.with_columns(navigability=closed.otherwise("navigability")), findings
 
 
 def outward(track: Track) -> np.ndarray:
     """Direction from each end into its element, earth-centred and not normed: `[element, 0 start or 1 end]`."""
+    surface = points_of(track.latitude_deg, track.longitude_deg).surface
+    start, stop = track.first[:-1], track.first[1:]
     directions = np.zeros((len(track.ids), 2, 3))
-    for element, _, part in track.elements():
-        surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
-        for position, line in ((0, surface), (1, surface[::-1])):
-            way = np.linalg.norm(line - line[0], axis=1)
-            # Single vertices may lie a centimetre apart.
-            inside = int(np.argmax(way >= SAMPLE_SPACING_M)) or int(np.argmax(way))
-            directions[element, position] = line[inside] - line[0]
+    for position, end in ((0, start), (1, stop - 1)):
+        away_m = np.linalg.norm(surface - np.repeat(surface[end], stop - start, axis=0), axis=1)
+        # Single vertices may lie a centimetre apart. A shorter element points to its vertex farthest away.
+        far = np.flatnonzero(away_m >= SAMPLE_SPACING_M)
+        row = np.searchsorted(far, start) if position == 0 else np.searchsorted(far, stop) - 1
+        inside = np.append(far, -1)[row]
+        for element in np.flatnonzero((inside < start) | (inside >= stop)).tolist():
+            part = away_m[track.vertices(element)]
+            nearest_to_end = part if position == 0 else part[::-1]
+            steps = int(np.argmax(nearest_to_end))
+            inside[element] = end[element] + (steps if position == 0 else -steps)
+        directions[:, position] = surface[inside] - surface[end]
     return directions
 
 
 def _check_elements(track: Track, declared_length_m: dict[str, float], found: Remarks) -> None:
     """Length, declared length, height and vertex spacing of each element."""
-    for element, name, part in track.elements():
-        place = f"track: element {name}"
-        latitude = track.latitude_deg[part]
-        longitude = track.longitude_deg[part]
-        height = track.height_m[part]
-        geometric = geometric_measures_m(latitude, longitude, height)
-        length = float(geometric[-1])
+    geometric = geometric_m(track)
+    length_m = geometric[track.first[1:] - 1]
+    stated_m = np.array([declared_length_m.get(name, np.nan) for name in track.ids])
+    tolerance_m = np.maximum(MEASURE_TOLERANCE_M, found.config.length_share * length_m)
+    wrong = [np.abs(declared - length_m) > tolerance_m for declared in (track.length_m, stated_m)]
+    chord_m = np.maximum.reduceat(chord_errors_m(track), track.first[:-1])
+    remarkable = (length_m < GAP_COUNTS_M) | wrong[0] | wrong[1] | (chord_m > found.config.chord_m)
+    for element in np.flatnonzero(remarkable).tolist():
+        place = f"track: element {track.ids[element]}"
+        length = float(length_m[element])
         if length < GAP_COUNTS_M:
             found.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
-        for declared in (float(track.length_m[element]), declared_length_m.get(name, float("nan"))):
-            if abs(declared - length) > max(MEASURE_TOLERANCE_M, found.config.length_share * length):
-                text = f"the declared length is {declared:.1f} m, the geometry is {length:.1f} m long"
+        for declared, off in zip((track.length_m, stated_m), wrong, strict=True):
+            if off[element]:
+                text = f"the declared length is {declared[element]:.1f} m, the geometry is {length:.1f} m long"
                 found.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
-        error = chord_errors_m(track, part).max(initial=0.0)
-        if error > found.config.chord_m:
-            spacing = float(np.diff(geometric).max())
-            text = f"points up to {spacing:.0f} m apart: straight lines between them leave the curve by {error:.2f} m"
+        if chord_m[element] > found.config.chord_m:
+            spacing = float(np.diff(geometric[track.vertices(element)]).max())
+            text = f"points up to {spacing:.0f} m apart: straight lines between them leave the curve by "
+            text += f"{chord_m[element]:.2f} m"
             found.findings.append(Finding("note", place, text, "Survey curves with closer points."))
     _check_heights(track, found)
 
 
 def _check_heights(track: Track, found: Remarks) -> None:
-    flat = [name for _, name, part in track.elements() if np.isnan(track.height_m[part]).any()]
+    # An element has all heights or none.
+    flat = [track.ids[element] for element in np.flatnonzero(np.isnan(track.height_m[track.first[:-1]])).tolist()]
     if flat and len(flat) < len(track.ids):
         text = (
             f"{len(flat)} of {len(track.ids)} elements lack heights and are taken as 2-D ({', '.join(flat[:3])}, ...)"
@@ -176,37 +195,46 @@ def _check_heights(track: Track, found: Remarks) -> None:
         found.findings.append(Finding("warning", "track: column height_m", text, remedy))
 
 
-def chord_errors_m(track: Track, part: slice) -> np.ndarray:
-    """How far the curve may lie off each segment's chord [m]: length times turn angle over 8 (sagitta).
+def chord_errors_m(track: Track) -> Floats:
+    """How far the curve may lie off the chord that begins at each vertex [m]: length times turn over 8 (sagitta).
 
-    Of the turns at its two ends the smaller one: the other may be that of a curve which only begins there.
+    Of the turns at its two ends the smaller one: the other may be that of a curve which only begins there. 0 for an
+    element of one chord, and at the last vertex of each element.
     """
-    surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
-    steps = np.diff(surface, axis=0)
+    surface = points_of(track.latitude_deg, track.longitude_deg).surface
+    steps = np.diff(surface, axis=0, append=surface[-1:])
     lengths = np.linalg.norm(steps, axis=1)
-    units = steps / lengths[:, None]
+    units = steps / np.maximum(lengths, 1e-12)[:, None]
     turn = np.arccos(np.clip(np.einsum("ij,ij->i", units[:-1], units[1:]), -1.0, 1.0))
-    at_ends = np.concatenate([turn[:1], turn, turn[-1:]]) if len(turn) else np.zeros(2)
-    return np.asarray(lengths * np.minimum(at_ends[:-1], at_ends[1:]) / 8.0)
+    begins, ends = (np.full(len(surface), np.inf) for _ in range(2))
+    begins[1:] = turn
+    ends[:-1] = turn
+    begins[track.first[:-1]] = np.inf
+    ends[track.first[1:] - 2] = np.inf
+    least = np.minimum(begins, ends)
+    errors = lengths * np.where(np.isfinite(least), least, 0.0) / 8.0
+    errors[track.first[1:] - 1] = 0.0
+    return np.asarray(errors)
 
 
 def _check_gaps(track: Track, found: Remarks) -> None:
     """Ends that a relation joins must meet, in place and, where both have one, in height."""
-    places = end_places(track)
-    for a, position_a, b, position_b, navigability in found.links.iter_rows():
-        one = places[track.index[a], position_a]
-        other = places[track.index[b], position_b]
-        gap = float(np.linalg.norm(one - other))
-        text = f"end {position_a} of {a} and end {position_b} of {b} are linked but {gap:.1f} m apart"
-        if gap > found.config.joined_m and navigability != Navigability.NONE.value:
+    one, other = _related_ends(track, found.links)
+    places = end_places(track).reshape(-1, 3)
+    gaps = np.linalg.norm(places[one] - places[other], axis=1)
+    heights = track.height_m[np.column_stack([track.first[:-1], track.first[1:] - 1]).ravel()]
+    steps = np.abs(heights[one] - heights[other])
+    for row in np.flatnonzero((gaps > GAP_COUNTS_M) | (steps > GAP_COUNTS_M)).tolist():
+        a, position_a, b, position_b, navigability = found.links.row(row)
+        ends = f"end {position_a} of {a} and end {position_b} of {b}"
+        text = f"{ends} are linked but {gaps[row]:.1f} m apart"
+        if gaps[row] > found.config.joined_m and navigability != Navigability.NONE.value:
             found.breaches.append(f"links: {text}; expected at most {found.config.joined_m:g} m")
-        elif gap > GAP_COUNTS_M:
+        elif gaps[row] > GAP_COUNTS_M:
             remedy = "The straight line between them counts as track; survey the missing piece."
             found.findings.append(Finding("warning", "links", text, remedy))
-        ends = [track.end(track.index[a], position_a), track.end(track.index[b], position_b)]
-        step = float(np.abs(np.diff(track.height_m[ends])[0]))
-        if step > GAP_COUNTS_M:
-            text = f"end {position_a} of {a} and end {position_b} of {b} differ by {step:.1f} m in height"
+        if steps[row] > GAP_COUNTS_M:
+            text = f"{ends} differ by {steps[row]:.1f} m in height"
             found.findings.append(Finding("warning", "links", text, "Correct the heights."))
 
 
@@ -228,15 +256,29 @@ def _near_misses(track: Track, links: pl.DataFrame, config: SiteConfig) -> Itera
 
 
 def _pairs_within(places: Floats, reach_m: float) -> npt.NDArray[np.int64]:
-    """Pairs of places near each other: neighbours along one axis are compared. A search tree takes long to load."""
-    order = np.argsort(places[:, 0], kind="stable")
-    along = places[order, 0]
-    counts = np.searchsorted(along, along + reach_m, side="right") - np.arange(len(along)) - 1
-    first = np.repeat(np.arange(len(along)), counts)
-    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
-    pairs: npt.NDArray[np.int64] = order[np.column_stack([first, second])]
-    near: Bools = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1) <= reach_m
-    return pairs[near]
+    """Pairs of places near each other: those in the same or in neighbouring cells are compared."""
+    cell = np.floor(places / reach_m).astype(np.int64)
+    cell -= cell.min(axis=0, initial=np.iinfo(np.int64).max)
+    # Numbers that wrap around only bring together places that the distance tells apart.
+    across, above = (int(size) for size in cell.max(axis=0, initial=0)[1:] + 3)
+    number = (cell[:, 0] * across + cell[:, 1]) * above + cell[:, 2]
+    order = np.argsort(number, kind="stable")
+    number = number[order]
+    pairs = []
+    for step in _HALF_OF_THE_NEIGHBOURS:
+        other = number + (step[0] * across + step[1]) * above + step[2]
+        low = np.searchsorted(number, other, side="left") if any(step) else np.arange(len(number)) + 1
+        counts = np.maximum(np.searchsorted(number, other, side="right") - low, 0)
+        first = np.repeat(np.arange(len(number)), counts)
+        second = np.repeat(low, counts) + np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
+        pairs.append(order[np.column_stack([first, second])])
+    every: npt.NDArray[np.int64] = np.concatenate(pairs)
+    near: Bools = np.linalg.norm(places[every[:, 0]] - places[every[:, 1]], axis=1) <= reach_m
+    return every[near]
+
+
+# Of two neighbouring cells one comes first.
+_HALF_OF_THE_NEIGHBOURS = [step for step in itertools.product((-1, 0, 1), repeat=3) if step >= (0, 0, 0)]
 
 
 def _nearly_met(places: Floats, inward: Floats, free: np.ndarray, config: SiteConfig) -> list[tuple[int, int, float]]:

@@ -14,7 +14,7 @@ from pipeline.read.site.checks import drop_repeated_points, remarks
 from pipeline.read.site.geojson import GeoJsonNetwork, read_network
 from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
-from pipeline.stages.track.survey import geometric_measures_m, track_of
+from pipeline.stages.track.survey import geometric_m, track_of
 from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.storage.parquet import without_checksums
@@ -224,20 +224,22 @@ def _beyond_deg(area: Any, longitude_deg: float, latitude_deg: float) -> float:
 
 
 def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:
-    """Declared measures where an element has them at every point, geometric where at none."""
-    parts = []
-    for part in frame.partition_by("netelement_id", maintain_order=True):
-        name = part["netelement_id"][0]
-        missing = part["measure_m"].null_count()
-        if missing == part.height:
-            track = track_of(part.with_columns(pl.lit(0.0).alias("measure_m")))
-            geometric = geometric_measures_m(track.latitude_deg, track.longitude_deg, track.height_m)
-            part = part.with_columns(pl.Series("measure_m", geometric))
-        elif missing:
+    """Points by element. Declared measures where an element has them at every point, geometric where at none."""
+    ordered = frame.with_columns(_first=pl.int_range(pl.len())).with_columns(
+        pl.col("_first").min().over("netelement_id"), _missing=pl.col("measure_m").null_count().over("netelement_id")
+    )
+    ordered = ordered.sort("_first", maintain_order=True)
+    falls = pl.col("measure_m").diff() <= 0
+    checked = ordered.group_by("netelement_id", maintain_order=True).agg(
+        points=pl.len(), missing=pl.col("_missing").first(), falls=falls.any(), at=falls.arg_true().first(),
+        measure_m=pl.col("measure_m").filter(falls).first(),
+    )  # fmt: skip
+    for name, points, missing, falling, at, measure_m in checked.iter_rows():
+        if 0 < missing < points:
             breaches.append(f"{file}: column measure_m: element {name} has a measure at some points only")
-        elif not (part["measure_m"].diff().drop_nulls() > 0).all():
-            row = int((part["measure_m"].diff() <= 0).fill_null(False).arg_true()[0])
-            at = part["measure_m"][row]
-            breaches.append(f"{file}: column measure_m: element {name} does not increase at point {row} ({at:g} m)")
-        parts.append(part)
-    return pl.concat(parts)
+        elif falling and missing == 0:
+            text = f"element {name} does not increase at point {at} ({measure_m:g} m)"
+            breaches.append(f"{file}: column measure_m: {text}")
+    geometric = pl.Series(geometric_m(track_of(ordered.with_columns(measure_m=pl.lit(0.0)))))
+    measure_m = pl.when(pl.col("_missing") > 0).then(geometric).otherwise("measure_m")
+    return ordered.with_columns(measure_m=measure_m).select(frame.columns)

@@ -198,8 +198,6 @@
       y: { lo: -1.25 * most, hi: 1.12 * most, title: "location error [m]" } });
   }
 
-  const AXES = [["raw", "raw"], ["ewma_0p1", "EWMA 0.1"], ["ewma_0p01", "EWMA 0.01"], ["ewma_0p001", "EWMA 0.001"]];
-  const OTHERS = ["link_order", "link_distance", "along_doppler", "pseudorange", "channel"];
   const LOOKS = ["a", "b", "c", "d", "e"];
 
   // A monitor far beyond its threshold must not flatten those that are near theirs.
@@ -210,10 +208,10 @@
   }
 
   function monitorPlots(now) {
-    for (const along of ["along", "cross", "up"]) {
-      ratioPlot(now, `monitors-${along}`, AXES.map(([key, name], i) => line(now, `ratio_${along}_${key}`, name, LOOKS[i])));
+    for (const [drawing, monitors] of Object.entries(data.monitors)) {
+      const lines = monitors.map(([name, label], i) => line(now, `ratio_${name}`, label, LOOKS[i % LOOKS.length]));
+      ratioPlot(now, `monitors-${drawing}`, lines);
     }
-    ratioPlot(now, "monitors-other", OTHERS.map((name, i) => line(now, `ratio_${name}`, name.replace("_", " "), LOOKS[i])));
   }
 
   function confidence(now) {

@@ -29,7 +29,7 @@ from pipeline.show.report.markup import (
     verdict_head,
 )
 from pipeline.show.report.route_found import route_section
-from pipeline.show.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
+from pipeline.show.report.series import MOMENTS, moments_of, monitor_lines, reasons, stanford_data, time_data
 from pipeline.show.report.words import WORDS, plots_of
 from pipeline.stages.run_row.verdict import LEVEL_LISTS
 from schemas.campaign import CampaignLevels
@@ -95,6 +95,7 @@ def run_page(
     hazards = made.config.hazards
     data = {
         "run": tables.run_id,
+        "monitors": monitor_lines(),
         "limits": {
             "ci_limit_m": made.config.lds.ci_limit_m,
             "failure_limit_m": hazards.failure_limit_m,

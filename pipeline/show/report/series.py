@@ -12,7 +12,7 @@ from pipeline.show.report.markup import Json, packed
 from pipeline.stages.epochs.clock import gap_limit_s, nominal_period_s
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
-from schemas.tables import MONITORS
+from schemas.tables import ALL_MONITORS, MONITORS
 
 SERIES = (
     "speed_mps",
@@ -75,6 +75,15 @@ def reasons(epochs: pl.DataFrame) -> pl.DataFrame:
         for name in MONITORS
     ]  # fmt: skip
     return pl.concat(counts).group_by("reason", "epochs", maintain_order=True).agg(monitors="monitor")
+
+
+def monitor_lines() -> dict[str, list[list[str]]]:
+    """Name and label of the lines of each drawing of monitors."""
+    drawings = dict.fromkeys(monitor.drawing for monitor in ALL_MONITORS)
+    return {
+        drawing: [[monitor.name, monitor.label] for monitor in ALL_MONITORS if monitor.drawing == drawing]
+        for drawing in drawings
+    }
 
 
 def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:

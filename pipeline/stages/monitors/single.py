@@ -1,9 +1,12 @@
-"""Monitors that look at one epoch, or at the second before it, without memory: Doppler and channel comparison.
+"""Monitors that look at one epoch, or at the second before it, without memory: Doppler, ranges, channel comparison.
 
-Each yields a frame `value, threshold, state, reason`, row for row with the epochs.
+Each yields a frame `value, threshold, state, reason`, row for row with the epochs; `WITHOUT_MEMORY` lists them.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +14,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gap_ns
 from pipeline.stages.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
+from pipeline.stages.monitors.pseudorange import pseudorange_monitor
 from pipeline.stages.monitors.series import FIRST_EPOCH
 from schemas.arrays import Floats, floats, times_ns
 from schemas.config import Configuration, LdsConfig
@@ -162,3 +166,25 @@ def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
         moved=own[0] * own[1]
     )
     return placed.select("t_ns", *_PLACE, sense=pl.col("moved").sum().over("visit").sign().cast(pl.Int8))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What monitors without memory may look at: aligned epochs, satellites of the solution, another solution.
+
+    `other`: that solution on this one's path; `absent`: the reason where there is none.
+    """
+
+    epochs: pl.DataFrame
+    satellites: pl.DataFrame | None
+    other: pl.DataFrame | None
+    absent: NotEvaluated
+    config: Configuration
+
+
+WITHOUT_MEMORY: Mapping[str, Callable[[Seen], pl.DataFrame]] = {
+    "along_doppler": lambda seen: doppler_monitor(seen.epochs, seen.config),
+    "channel": lambda seen: channel_monitor(seen.epochs, seen.other, seen.config, seen.absent),
+    "pseudorange": lambda seen: pseudorange_monitor(seen.epochs, seen.satellites, seen.config),
+}
+"""Monitors by the name that `schemas.tables.ALL_MONITORS` gives them."""

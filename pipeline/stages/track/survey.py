@@ -142,6 +142,15 @@ def geometric_measures_m(latitude_deg: Floats, longitude_deg: Floats, height_m: 
     return np.concatenate([[0.0], np.cumsum(distances_m(latitude_deg, longitude_deg, heights))])
 
 
+def geometric_m(track: Track) -> Floats:
+    """Distance of each vertex from the first of its element, along the element [m]: 3-D where it has heights."""
+    step_m = distances_m(track.latitude_deg, track.longitude_deg, np.nan_to_num(track.height_m))
+    measure_m = np.zeros(len(track.latitude_deg))
+    for first, last in itertools.pairwise(track.first.tolist()):
+        np.cumsum(step_m[first : last - 1], out=measure_m[first + 1 : last])
+    return measure_m
+
+
 def end_places(track: Track) -> Floats:
     """Earth-centred places [m] of the ends of elements at height zero: `[element, 0 start or 1 end]`."""
     vertices = np.column_stack([track.first[:-1], track.first[1:] - 1]).ravel()

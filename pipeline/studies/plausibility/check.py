@@ -10,6 +10,7 @@ from schemas.enums import MisfitCause, MisfitPlace
 from schemas.words import CAUSES, MISFIT_PLACES
 
 CONFIGURATION = "append to the configuration file"
+VEHICLE_FILE = "append to the vehicle file"
 
 
 class State(StrEnum):
@@ -74,6 +75,20 @@ class Check:
         why = " and ".join(cause.words for cause in self.causes)
         whose = "" if self.whose is None else self.whose.words
         return ", ".join(filter(None, (why, whose)))
+
+
+def misfit(
+    what: str,
+    found: str,
+    *codes: MisfitCause,
+    lines: str = "",
+    into: str = CONFIGURATION,
+    advice: str = "",
+    of_evidence: bool = False,
+) -> Check:
+    """A misfit of causes that need no figure."""
+    causes = tuple(map(Cause, codes))
+    return Check(what, State.MISFIT, found, causes, lines, into, advice, of_evidence)
 
 
 def not_checked(what: str, why: str) -> Check:

@@ -5,7 +5,7 @@ the same digits as seldom as these errors are smaller than one of the digits. No
 difference of the stamps at which most places come back.
 
 Positions without errors (drawn by a program, to test the replay) equal a true reference. Only the survey tells: they
-lie on the track far nearer than their sigma. There a copy and the truth are the same, and nothing is told.
+lie on the track far nearer than their sigma. There a copy and the truth are the same, and nothing is said.
 """
 
 from __future__ import annotations
@@ -28,9 +28,15 @@ _WHAT = "reference against the positions"
 # Fewer moving places in common tell nothing.
 _FEWEST = 3 * LEAST
 # Degrees, minutes and seconds of an angle are written with so many decimals; finer is rounding of the computer [deg].
-_UNITS_DEG, _DECIMALS, _LEAST_DEG = (1.0, 1.0 / 60.0, 1.0 / 3600.0), range(2, 10), 1e-9
+_UNITS_DEG = (1.0, 1.0 / 60.0, 1.0 / 3600.0)
+_DECIMALS = range(2, 10)
+_LEAST_DEG = 1e-9
 # Rows of the reference that are looked at.
 _ROWS = 4_000
+# Stamps are equal within this: recorders round them to milliseconds.
+_SAME_STAMP_S = 0.002
+# Positions as near to the track as this share of their sigma have no errors of their own; 0.67 is usual.
+_WITHOUT_ERROR = 0.2
 
 
 class _Track(NamedTuple):
@@ -44,9 +50,9 @@ class _Track(NamedTuple):
 
 
 def copy_check(of: Recording) -> Check | None:
-    """`impossible` where the reference is a copy of the solution; None where it is none, or nothing tells.
+    """`impossible` where the reference is a copy of the solution; None where it is none, or nobody can know.
 
-    An exact, a rounded or a thinned copy is told, and one with other stamps.
+    An exact, a rounded or a thinned copy is seen, and one with other stamps.
     """
     config, fixes, reference = of.config, of.fixes, of.run.reference
     if reference is None or of.reference is None:
@@ -61,19 +67,19 @@ def copy_check(of: Recording) -> Check | None:
     digit_m, sigma_m = digit_deg * to_m, _sigma_m(fixes)
     # Of a normal error, so much lies within a digit on either side.
     chance = float(np.prod(np.minimum(1.0, 2.0 * digit_m / (np.sqrt(2.0 * np.pi) * sigma_m))))
-    lag_s = _lag_s(own, other, 2.0 * float(digit_m[0]), config.same_stamp_s) if chance <= config.copy_chance else None
+    lag_s = _lag_s(own, other, 2.0 * float(digit_m[0])) if chance <= config.copy_chance else None
     if lag_s is None:
         return None
     row = np.clip(np.searchsorted(own.t_s, other.t_s - lag_s), 1, own.t_s.size - 1)
     row -= other.t_s - lag_s - own.t_s[row - 1] < own.t_s[row] - (other.t_s - lag_s)
-    common = np.abs(own.t_s[row] - (other.t_s - lag_s)) <= config.same_stamp_s
+    common = np.abs(own.t_s[row] - (other.t_s - lag_s)) <= _SAME_STAMP_S
     equal = np.all(np.abs(own.degrees[row] - other.degrees) <= 1.001 * digit_deg, axis=1)[common]
     if equal.size < _FEWEST or equal.mean() < config.copy_share:
         return None
-    exact_m = config.without_error * float(sigma_m.min())
-    if of.line is not None and fit_survey(of.gnss, of.line).aside_m < exact_m:
+    exact_m = _WITHOUT_ERROR * float(sigma_m.min())
+    if of.line is not None and fit_survey(of.gnss, of.line, of.config.shift_told_m).aside_m < exact_m:
         return None
-    stamps = f", at stamps {lag_s:+.2f} s from them" if abs(lag_s) > config.same_stamp_s else ""
+    stamps = f", at stamps {lag_s:+.2f} s from them" if abs(lag_s) > _SAME_STAMP_S else ""
     found = (
         f"{equal.sum()} of {equal.size} places are those of the positions to the last digit ({digit_m[0]:.1g} m)"
         f"{stamps}; an independent one would be so near in {chance:.1g} of all cases, for the positions have sigma "
@@ -88,7 +94,7 @@ def _track(frame: pl.DataFrame, t_s: Floats) -> _Track:
     return _Track(t_s, degrees).take(np.all(np.isfinite(degrees), axis=1))
 
 
-def _lag_s(own: _Track, other: _Track, reach_m: float, same_stamp_s: float) -> float | None:
+def _lag_s(own: _Track, other: _Track, reach_m: float) -> float | None:
     """The difference of stamps that most places of the other record have which are in the own one too."""
     from scipy.spatial import cKDTree
 
@@ -98,7 +104,7 @@ def _lag_s(own: _Track, other: _Track, reach_m: float, same_stamp_s: float) -> f
     if near.sum() < _FEWEST:
         return None
     lags_s = np.sort(other.t_s[near] - own.t_s[row[near]])
-    alike = np.searchsorted(lags_s, lags_s + same_stamp_s, "right") - np.arange(lags_s.size)
+    alike = np.searchsorted(lags_s, lags_s + _SAME_STAMP_S, "right") - np.arange(lags_s.size)
     first = int(alike.argmax())
     return float(np.median(lags_s[first : first + alike[first]]))
 
@@ -113,5 +119,7 @@ def _sigma_m(fixes: pl.DataFrame) -> Floats:
     """How far off the positions may be, north and east: as they state, else as their kind of fix usually is."""
     usual_m = pl.col("fix").cast(pl.String).replace_strict({kind.value: FixSigma().horizontal_m(kind) for kind in Fix})
     stated = (pl.when(pl.col(name) > 0.0).then(pl.col(name).sqrt()) for name in ("cov_nn_m2", "cov_ee_m2"))
-    told = fixes.select(pl.coalesce(one, usual_m).median().alias(name) for one, name in zip(stated, "ne", strict=True))
-    return np.array(told.row(0), dtype=np.float64)
+    sigma_m = fixes.select(
+        pl.coalesce(own, usual_m).median().alias(name) for own, name in zip(stated, "ne", strict=True)
+    )
+    return np.array(sigma_m.row(0), dtype=np.float64)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.studies.plausibility.axes import velocity_checks
 from pipeline.studies.plausibility.check import Check, State, not_checked
 from pipeline.studies.plausibility.odometer import odometer_checks
 from pipeline.studies.plausibility.places import read_stamp_checks, reads_lag, reference_checks, survey_checks
 from pipeline.studies.plausibility.recording import recording_of
+from pipeline.studies.plausibility.velocity import velocity_checks
 from pipeline.studies.plausibility.witnesses import Lag, clock_checks
 from pipeline.studies.plausibility.written import reference_elsewhere, written_checks
 from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
@@ -77,9 +77,9 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
         lags.append(reads_lag(of, run.balise_reads, site))
         checks += read_stamp_checks(of, run.balise_reads)
     if of.line is not None:
-        checks = survey_checks(of, of.line, beside_reference) + checks
+        checks = [*survey_checks(of, of.line, beside_reference), *checks]
     if of.fixes["vel_e_mps"].null_count() < of.fixes.height:
-        checks += velocity_checks(of.velocity, of.gnss)
+        checks += velocity_checks(of.velocity, of.gnss, config)
     doubted = any(cause.code is MisfitCause.LATENCY_OF_FILE for check in checks for cause in check.causes)
     return Fit((*checks, *clock_checks(of, lags, 0.0 if doubted else vehicle.gnss_latency_s or 0.0)))
 

@@ -7,92 +7,107 @@ from functools import cache
 import numpy as np
 
 from pipeline.studies.plausibility.causes import explain_factor
-from pipeline.studies.plausibility.check import Cause, Check, State, correction, fits, not_checked
+from pipeline.studies.plausibility.check import VEHICLE_FILE, Cause, Check, State, correction, fits, misfit, not_checked
 from pipeline.studies.plausibility.pairs import PairFit, fit_pair
 from pipeline.studies.plausibility.recording import Recording
-from pipeline.studies.plausibility.records import Places, Record
+from pipeline.studies.plausibility.records import MOVING_MPS, Places, Record
 from pipeline.studies.plausibility.robust import LEAST
 from pipeline.studies.plausibility.witnesses import Lag
 from schemas.arrays import runs_of
-from schemas.config import PlausibilityConfig, Vehicle
+from schemas.config import PlausibilityConfig
 from schemas.enums import MisfitCause
 
 LATENCY = "GNSS latency of the vehicle file"
 _SIGNS = "sign of the odometer's speed against its distance"
 _TURNS = "direction of the counter where the train reverses"
-_TO_VEHICLE = "append to the vehicle file"
+# So many windows agree on the factor of a unit. Pulses, which no unit explains, have to be clearer, and far from 1.
+_UNIT_WINDOWS = 0.6
+_PULSES_WINDOWS = 0.8
+_PULSES_FACTOR = 1.5
+# The way over this time before and after a stand shows the heading, where the counter shows the same way within this
+# share; headings turn back or go on by more than this cosine: a curve of 45 degrees lies within.
+_HEADING_S = 20.0
+_HEADING_WAY = 0.3
+_HEADING_COSINE = 0.7
 
 
 def odometer_checks(of: Recording, reference: Lag | None) -> tuple[list[Check], list[Lag]]:
     """All checks of the odometer, and its clock for comparison with those of the others."""
-    vehicle, config, fitted = of.vehicle, of.config, of.pairs
-    if not fitted:
+    config, pairs = of.config, of.pairs
+    if not pairs:
         return ([not_checked("odometer against the GNSS", "hardly any row")] if of.run.odometer is not None else []), []
-    checks = [_factor_check(name, fitted, config) for name in fitted] + sign_check(of.counters)
-    name = next((name for name, pair in fitted.items() if pair.told), next(iter(fitted)))
-    pair = fitted[name]
-    if not pair.told:
+    checks = [_factor_check(name, pairs, config) for name in pairs] + sign_check(of.counters)
+    name = next((name for name, pair in pairs.items() if pair.known), next(iter(pairs)))
+    pair = pairs[name]
+    if not pair.known:
         return checks, [Lag("odometer", reason=pair.reason)]
     checks.append(turn_check(of.gnss, of.counters[name], pair))
 
     @cache
     def by_reference() -> PairFit | None:
         """The odometer against the reference, which no GNSS drift is in; None where it has none in its own time."""
-        own_time = of.reference is not None and reference is not None and not reference.reason
-        found = fit_pair(of.reference, of.counters[name]) if own_time and of.reference is not None else None
-        return found if found is not None and found.told else None
+        if of.reference is None or reference is None or reference.reason:
+            return None
+        fit = fit_pair(of.reference, of.counters[name])
+        return fit if fit.known else None
 
-    scale, latency = _scale_check(pair, vehicle), _latency_check(pair, reference, vehicle)
+    scale, latency = _scale_check(pair, of), _latency_check(pair, reference, of)
     if scale is not None and scale.state in (State.MISFIT, State.IMPOSSIBLE):
         # Where there is a reference it has to contradict the file too: else it is the positions that drift.
         other = by_reference()
-        beside = None if other is None else _scale_check(other, vehicle, _unit(pair))
+        beside = None if other is None else _scale_check(other, of, _unit(pair, config))
         scale = fits(scale.what, scale.found) if beside is not None and beside.state is State.FITS else scale
     checks += [check for check in (scale, latency) if check is not None]
     if latency is not None and latency.state is State.MISFIT:
         return checks, [Lag("odometer", reason="the latency of the vehicle file does not fit")]
-    lag = _lag(pair, vehicle)
-    small = lag.sure and abs(lag.lag_s) <= config.lag_limit_s
-    other = by_reference() if small else None
-    if other is not None and other.lag_told and not other.other_lag(0.0, config.lag_told_s):
+    lag = _lag(pair, of)
+    other = by_reference() if lag.sure and abs(lag.lag_s) <= config.lag_limit_s else None
+    if other is not None and other.lag_known and not other.other_lag(0.0, config.lag_told_s):
         return checks, [Lag("odometer", reason=f"{lag.lag_s:+.2f} s, but none against the reference")]
     return checks, [lag]
 
 
-def _lag(pair: PairFit, vehicle: Vehicle) -> Lag:
-    """The clock of the odometer; it is sure of what is beyond the latency that the vehicle file tells."""
+def _lag(pair: PairFit, of: Recording) -> Lag:
+    """The clock of the odometer; it is sure of what is beyond the latency of the vehicle file."""
     if pair.shifted:
         return Lag("odometer", pair.lag_s, min(pair.lag_sigma_s, 1.0), sure=True)
-    if pair.clock_reason or not pair.lag_told:
+    if pair.clock_reason or not pair.lag_known:
         return Lag("odometer", reason=pair.clock_reason or "the speed changes too little")
-    config, from_file_s = pair.config, -(vehicle.gnss_latency_s or 0.0)
-    sure = pair.other_lag(from_file_s, config.lag_told_s) and abs(pair.lag_s - from_file_s) <= config.lag_limit_s
-    return Lag("odometer", pair.lag_s, pair.lag_sigma_s, sure, latency_known=vehicle.gnss_latency_s is not None)
+    latency_s = of.vehicle.gnss_latency_s
+    from_file_s = -(latency_s or 0.0)
+    small = abs(pair.lag_s - from_file_s) <= of.config.lag_limit_s
+    sure = small and pair.other_lag(from_file_s, of.config.lag_told_s)
+    return Lag("odometer", pair.lag_s, pair.lag_sigma_s, sure, latency_known=latency_s is not None)
 
 
-def _factor_check(name: str, fitted: dict[str, PairFit], config: PlausibilityConfig) -> Check:
-    what, pair = f"odometer {name} against the positions", fitted[name]
-    if not pair.told:
-        return Check(what, State.MISFIT, pair.reason) if pair.stands else not_checked(what, pair.reason)
+def _metres(pair: PairFit, config: PlausibilityConfig) -> bool:
+    """Whether the counter counts metres, as far as any odometer may be off."""
+    return abs(abs(pair.factor) - 1.0) <= config.scale_limit
+
+
+def _factor_check(name: str, pairs: dict[str, PairFit], config: PlausibilityConfig) -> Check:
+    what, pair = f"odometer {name} against the positions", pairs[name]
+    if not pair.known:
+        return misfit(what, pair.reason) if pair.stands else not_checked(what, pair.reason)
     factor = abs(pair.factor)
-    found = f"{factor:.4g} times the way of the positions"
+    words = f"{factor:.4g} times the way of the positions"
     column = "speed_mps" if name == "speed" else "distance_m"
-    if pair.near_one:
+    if _metres(pair, config):
         if not pair.other_factor(1.0, config.scale_told):
-            return fits(what, found)
-        return Check(what, State.MISFIT, found, (Cause(MisfitCause.WHEEL),), _scale_lines(pair, 1.0), _TO_VEHICLE)
-    if pair.constant < config.unit_windows or not pair.other_factor(1.0, config.scale_limit):
-        return Check(what, State.MISFIT, f"no constant factor ({found} usually)")
+            return fits(what, words)
+        return misfit(what, words, MisfitCause.WHEEL, lines=_scale_lines(pair, 1.0), into=VEHICLE_FILE)
+    if pair.constant < _UNIT_WINDOWS or not pair.other_factor(1.0, config.scale_limit):
+        return misfit(what, f"no constant factor ({words} usually)")
     # What the other column shows too, if it is near 1, is of the wheel or of drifting positions.
-    others = [abs(one.factor) for other, one in fitted.items() if other != name and one.told]
-    base = next((one for one in others if abs(one - 1.0) <= 2.0 * config.scale_limit), 1.0)
-    if (explained := explain_factor(factor / base, name == "speed", config)) is not None:
+    others = [abs(fit.factor) for other, fit in pairs.items() if other != name and fit.known]
+    base = next((other for other in others if abs(other - 1.0) <= 2.0 * config.scale_limit), 1.0)
+    if (explained := explain_factor(factor / base, name == "speed")) is not None:
         lines = correction("odometer", {column: 1.0 / explained.exact})
-        return Check(what, State.IMPOSSIBLE, found, explained.causes, lines)
-    if pair.constant >= config.pulses_windows and max(factor, 1.0 / factor) > config.pulses_factor:
+        return Check(what, State.IMPOSSIBLE, words, explained.causes, lines)
+    if pair.constant >= _PULSES_WINDOWS and max(factor, 1.0 / factor) > _PULSES_FACTOR:
         lines = correction("odometer", {column: float(f"{1.0 / factor:.5g}")})
-        return Check(what, State.IMPOSSIBLE, found, (Cause(MisfitCause.PULSES),), lines)
-    return Check(what, State.MISFIT, found)
+        return Check(what, State.IMPOSSIBLE, words, (Cause(MisfitCause.PULSES),), lines)
+    return misfit(what, words)
 
 
 def _scale_lines(pair: PairFit, unit: float) -> str:
@@ -100,51 +115,51 @@ def _scale_lines(pair: PairFit, unit: float) -> str:
     return f"odometer_scale = {pair.scale(unit):.4f}\nodometer_scale_sigma = {sigma:.4f}\n"
 
 
-def _unit(pair: PairFit) -> float | None:
+def _unit(pair: PairFit, config: PlausibilityConfig) -> float | None:
     """Units of the odometer in a metre, by what the run shows: a unit has a line of its own. None: not known."""
-    if pair.near_one:
+    if _metres(pair, config):
         return 1.0
-    explained = explain_factor(abs(pair.factor), False, pair.config)
+    explained = explain_factor(abs(pair.factor), False)
     return None if explained is None else explained.exact
 
 
-def _scale_check(pair: PairFit, vehicle: Vehicle, unit: float | None = None) -> Check | None:
+def _scale_check(pair: PairFit, of: Recording, unit: float | None = None) -> Check | None:
     """The file's odometer scale against what the run shows, in metres."""
-    if vehicle.odometer_scale is None:
+    config, file_scale = of.config, of.vehicle.odometer_scale
+    if file_scale is None:
         return None
-    what, unit, config = "odometer scale of the vehicle file", unit or _unit(pair), pair.config
+    what, unit = "odometer scale of the vehicle file", unit or _unit(pair, config)
     if unit is None:
         return not_checked(what, "the unit of the odometer is not known")
-    least = max(config.file_scale, config.file_sigmas * (vehicle.odometer_scale_sigma or 0.0))
-    found = f"{vehicle.odometer_scale:.4f}, the run shows {pair.scale(unit):.4f} (sigma {pair.scale_sigma(unit):.4f})"
-    wrong = pair.other_factor(unit / vehicle.odometer_scale, least)
-    no_train = abs(vehicle.odometer_scale - 1.0) > config.scale_limit
+    least = max(config.file_scale, config.file_sigmas * (of.vehicle.odometer_scale_sigma or 0.0))
+    words = f"{file_scale:.4f}, the run shows {pair.scale(unit):.4f} (sigma {pair.scale_sigma(unit):.4f})"
+    no_train = abs(file_scale - 1.0) > config.scale_limit
     code = MisfitCause.IMPOSSIBLE_SCALE if no_train else MisfitCause.SCALE_OF_FILE
-    return _of_file(what, found, wrong, code, _scale_lines(pair, unit))
+    return _of_file(what, words, pair.other_factor(unit / file_scale, least), code, _scale_lines(pair, unit))
 
 
-def _latency_check(pair: PairFit, reference: Lag | None, vehicle: Vehicle) -> Check | None:
+def _latency_check(pair: PairFit, reference: Lag | None, of: Recording) -> Check | None:
     """The file's GNSS latency against what the run shows; a reference that agrees with it is believed."""
-    file_s, config = vehicle.gnss_latency_s, pair.config
+    config, file_s = of.config, of.vehicle.gnss_latency_s
     if file_s is None or pair.shifted:
         return None
-    if not pair.lag_told:
+    if not pair.lag_known:
         return not_checked(LATENCY, "the speed changes too little")
-    least_s = max(config.lag_told_s / 2.0, config.file_sigmas * (vehicle.gnss_latency_sigma_s or 0.0))
+    least_s = max(config.lag_told_s / 2.0, config.file_sigmas * (of.vehicle.gnss_latency_sigma_s or 0.0))
     if reference is not None and not reference.reason and abs(reference.lag_s + file_s) < least_s:
         return fits(LATENCY, f"{file_s:.2f} s, by the reference {-reference.lag_s:.2f} s")
-    found = f"{file_s:.2f} s, the run shows {-pair.lag_s:.2f} s (sigma {pair.lag_sigma_s:.2f} s)"
+    words = f"{file_s:.2f} s, the run shows {-pair.lag_s:.2f} s (sigma {pair.lag_sigma_s:.2f} s)"
     sigma_s = max(2 * pair.lag_sigma_s, 0.02)
     lines = f"gnss_latency_s = {-pair.lag_s:.2f}\ngnss_latency_sigma_s = {sigma_s:.2f}\n"
-    return _of_file(LATENCY, found, pair.other_lag(-file_s, least_s), MisfitCause.LATENCY_OF_FILE, lines)
+    return _of_file(LATENCY, words, pair.other_lag(-file_s, least_s), MisfitCause.LATENCY_OF_FILE, lines)
 
 
-def _of_file(what: str, found: str, wrong: bool, code: MisfitCause, lines: str) -> Check:
+def _of_file(what: str, words: str, wrong: bool, code: MisfitCause, lines: str) -> Check:
     """What a figure of the vehicle file shows; `code`: why, where it is wrong."""
     if not wrong:
-        return fits(what, found)
+        return fits(what, words)
     state = State.IMPOSSIBLE if code is MisfitCause.IMPOSSIBLE_SCALE else State.MISFIT
-    return Check(what, state, found, (Cause(code),), lines, "write instead in the vehicle file")
+    return Check(what, state, words, (Cause(code),), lines, "write instead in the vehicle file")
 
 
 def sign_check(counters: dict[str, Record]) -> list[Check]:
@@ -169,33 +184,33 @@ def sign_check(counters: dict[str, Record]) -> list[Check]:
         found = f"the distance {does} at the opposite speed"
         return [Check(_SIGNS, State.IMPOSSIBLE, found, (Cause(MisfitCause.COUNTS_BACKWARDS, (name,)),), lines)]
     if against > 0.1 and not back.any() and not falls.all():
-        return [Check(_SIGNS, State.MISFIT, "the speed has no sign", (Cause(MisfitCause.SPEED_WITHOUT_SIGN),))]
+        return [misfit(_SIGNS, "the speed has no sign", MisfitCause.SPEED_WITHOUT_SIGN)]
     return [fits(_SIGNS, "the same")]
 
 
 def turn_check(gnss: Places, counter: Record, pair: PairFit) -> Check:
-    """Whether the counter turns where the train does; stands beside a jump of the position tell nothing."""
-    config, lag_s = gnss.config, pair.lag_s
-    grid = np.arange(gnss.t_s[0], gnss.t_s[-1], 1.0)
-    firsts, lasts = (grid[rows] for rows in runs_of(gnss.speed(grid) < config.moving_mps))
-    sides = (firsts - config.heading_s, firsts), (lasts, lasts + config.heading_s)
+    """Whether the counter turns where the train does; stands beside a jump of the position show nothing."""
+    grid = gnss.instants(1.0)
+    firsts, lasts = (grid[rows] for rows in runs_of(gnss.speed(grid) < MOVING_MPS))
+    sides = (firsts - _HEADING_S, firsts), (lasts, lasts + _HEADING_S)
     moved = np.stack([gnss.gained(*side) for side in sides])
     sizes = np.linalg.norm(moved, axis=2)
-    gained = np.stack([counter.gained(begin + lag_s, end + lag_s) / pair.factor for begin, end in sides])
+    counted = [counter.gained(begin + pair.lag_s, end + pair.lag_s) / pair.factor for begin, end in sides]
+    gained = np.stack(counted)
     with np.errstate(invalid="ignore", divide="ignore"):
         cosine = np.einsum("ij,ij->i", *moved) / sizes.prod(axis=0)
-        told = np.isfinite(cosine) & (sizes.min(axis=0) > 2.0 * config.moving_mps * config.heading_s)
-        told &= np.all(np.abs(np.abs(gained) - sizes) < config.heading_way * sizes, axis=0)
-        reversal, onward = told & (cosine < -config.heading_cosine), told & (cosine > config.heading_cosine)
-        turns = gained.prod(axis=0) < 0
+        sure = np.isfinite(cosine) & (sizes.min(axis=0) > 2.0 * MOVING_MPS * _HEADING_S)
+        sure &= np.all(np.abs(np.abs(gained) - sizes) < _HEADING_WAY * sizes, axis=0)
+    reversal, onward = sure & (cosine < -_HEADING_COSINE), sure & (cosine > _HEADING_COSINE)
+    turns = gained.prod(axis=0) < 0
     never, wrongly = int((reversal & ~turns).sum()), int((onward & turns).sum())
     if never and never == reversal.sum():
-        found = f"the train reverses {never} times, the counter never does"
+        words = f"the train reverses {never} times, the counter never does"
         advice = "Let the recorder write the distance falling, and the speed negative, while the train reverses."
-        return Check(_TURNS, State.MISFIT, found, (Cause(MisfitCause.COUNTER_WITHOUT_SIGN),), advice=advice)
+        return misfit(_TURNS, words, MisfitCause.COUNTER_WITHOUT_SIGN, advice=advice)
     if wrongly and wrongly > 0.5 * onward.sum():
-        found = f"the counter turns {wrongly} times where the train goes on"
-        return Check(_TURNS, State.MISFIT, found, (Cause(MisfitCause.SIGN_OF_SOMETHING_ELSE),))
+        words = f"the counter turns {wrongly} times where the train goes on"
+        return misfit(_TURNS, words, MisfitCause.SIGN_OF_SOMETHING_ELSE)
     if not (reversal | onward).any():
         return not_checked(_TURNS, "the train does not stop on the way")
     return fits(_TURNS, f"{reversal.sum()} reversals, {onward.sum()} stops")

@@ -11,15 +11,45 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.studies.plausibility.records import Places, Record
-from pipeline.studies.plausibility.robust import LEAST, explains, regressed, steady, usual
+from pipeline.studies.plausibility.records import MOVING_MPS, SPEED_S, Places, Record
+from pipeline.studies.plausibility.robust import LEAST, SIGNIFICANT_SIGMAS, explains, regressed, steady, usual
 from schemas.arrays import Floats
-from schemas.config import PlausibilityConfig
 
 # Windows overlap by half, which makes sigmas larger by so much; positions a step apart are no better known [m].
-_OVERLAP, _LEAST_SPREAD_M = 1.5, 0.05
+_OVERLAP = 1.5
+_LEAST_SPREAD_M = 0.05
+# Windows of this length tell ways to 2 % where positions scatter by 2 m; they last neither so short that stamps tell
+# little nor so long that a train does not keep its speed.
+_WINDOW_M = 150.0
+_WINDOW_LEAST_S = 8.0
+_WINDOW_MOST_S = 60.0
+# A window agrees on a factor within so much: positions, curves and slip together.
+_WINDOW_AGREES = 0.12
+# Below this share of the usual speed a record tells more of noise than of the scale.
+_SLOW_SHARE = 0.2
+# A lag is known where its sigma is smaller.
+_LAG_SIGMA_S = 0.5
+# With less in common, of all and of the shorter record, any two journeys look alike.
+_COMMON_S = 90.0
+_COMMON_SHARE = 0.6
+# Constant speed shows no lag: its scatter over its mean.
+_SPEED_CHANGE = 0.08
+# Nobody looks for another lag where speeds agree in so much of the moving time; a journey that repeats itself agrees
+# nearly as well at another one.
+_SPEEDS_AGREE = 0.93
+_LAG_RIVAL = 0.05
+# Speeds agree within this share of themselves and this one of the usual speed: scatter of 0.7 m/s at 17 m/s.
+_ALIKE_SHARE = 0.07
+_ALIKE_USUAL = 0.04
+# Speeds are means over 4 s, and show a lag to half of that.
+_SPEED_LAG_S = SPEED_S / 2.0
 # Lags that are worth a closer look: so many, so far from each other [s], improved in these steps.
-_CANDIDATES, _APART_S, _CLIMB_S = 4, 15.0, (8.0, 4.0, 2.0, 1.0)
+_CANDIDATES = 4
+_APART_S = 15.0
+_CLIMB_S = (8.0, 4.0, 2.0, 1.0)
+# All shifts of two records are tried on their longest parts without a longer pause, of so many rows at least per time.
+_PAUSE_S = 3_600.0
+_SPARSE_S = 100.0
 
 
 @dataclass(frozen=True)
@@ -27,13 +57,12 @@ class PairFit:
     """How a counter fits positions.
 
     `factor`: counted units per metre, negative where the counter falls; `lag_s`: the counter's stamp of a moment minus
-    the GNSS's; sigmas of both (inf: not told). `halves`: factor and lag of the first and the second half alone.
-    `constant`: share of windows that agree on the factor, of all in which the positions move.
-    `reason`: why the factor is not told.
-    `shifted`: the lag is one of the clocks, found by the whole journey's speed; `clock_reason`: why that told nothing.
+    the GNSS's; sigmas of both (inf: not known). `halves`: factor and lag of the first and the second half alone.
+    `constant`: share of windows that agree on the factor, of all in which the positions move. `reason`: why the factor
+    is not known; `stands`: the counter stands while the positions move.
+    `shifted`: the lag is one of the clocks, by the whole journey's speed; `clock_reason`: why that showed nothing.
     """
 
-    config: PlausibilityConfig
     factor: float = float("nan")
     factor_sigma: float = float("inf")
     lag_s: float = 0.0
@@ -46,17 +75,12 @@ class PairFit:
     clock_reason: str = ""
 
     @property
-    def told(self) -> bool:
+    def known(self) -> bool:
         return not self.reason
 
     @property
-    def lag_told(self) -> bool:
-        return self.told and self.lag_sigma_s < self.config.lag_sigma_s
-
-    @property
-    def near_one(self) -> bool:
-        """Whether the counter counts metres, as far as any odometer may be off."""
-        return abs(abs(self.factor) - 1.0) <= self.config.scale_limit
+    def lag_known(self) -> bool:
+        return self.known and self.lag_sigma_s < _LAG_SIGMA_S
 
     def scale(self, unit: float = 1.0) -> float:
         """True distance over what is counted, in a unit of which `unit` make a metre."""
@@ -68,12 +92,12 @@ class PairFit:
     def other_lag(self, lag_s: float, least_s: float) -> bool:
         """Whether the lag differs from `lag_s` by more than `least_s` and than its noise, in both halves of the run."""
         apart = np.array([self.lag_s, *(lag for _, lag in self.halves)]) - lag_s
-        return self.lag_told and _beyond(apart, max(least_s, self.config.told_sigmas * self.lag_sigma_s))
+        return self.lag_known and _beyond(apart, max(least_s, SIGNIFICANT_SIGMAS * self.lag_sigma_s))
 
     def other_factor(self, factor: float, least: float) -> bool:
         """Whether the factor differs from this one by a larger share than `least`, in both halves of the run."""
-        apart = np.abs([self.factor, *(one for one, _ in self.halves)]) / abs(factor) - 1.0
-        return self.told and _beyond(apart, max(least, self.config.told_sigmas * self.factor_sigma / abs(self.factor)))
+        apart = np.abs([self.factor, *(half for half, _ in self.halves)]) / abs(factor) - 1.0
+        return self.known and _beyond(apart, max(least, SIGNIFICANT_SIGMAS * self.factor_sigma / abs(self.factor)))
 
 
 def _beyond(apart: Floats, least: float) -> bool:
@@ -84,15 +108,14 @@ def _beyond(apart: Floats, least: float) -> bool:
 def fit_pair(gnss: Places, counter: Record) -> PairFit:
     """Scale and lag of a counter against positions; first the clocks, then both at once."""
     coarse_s, clock_reason = clock_lag(gnss, counter)
-    found = _fitted(gnss, counter, coarse_s)
-    near_s = gnss.config.speed_lag_s
-    if found.lag_told and abs(found.lag_s - coarse_s) <= 2.0 * near_s:
-        found = _fitted(gnss, counter, found.lag_s)
+    fit = _fitted(gnss, counter, coarse_s)
+    if fit.lag_known and abs(fit.lag_s - coarse_s) <= 2.0 * _SPEED_LAG_S:
+        fit = _fitted(gnss, counter, fit.lag_s)
     # Regressed, a lag is twice as near where both halves agree on it, or faults of the counter have bent it.
-    agreed = found.lag_told and all(abs(half_s - found.lag_s) < near_s / 2.0 for _, half_s in found.halves)
-    if coarse_s and abs(found.lag_s - coarse_s) > (2.0 if agreed else 1.0) * near_s:
-        found = replace(found, lag_s=coarse_s, lag_sigma_s=near_s / 2.0)
-    return replace(found, shifted=coarse_s != 0.0, clock_reason=clock_reason)
+    agreed = fit.lag_known and all(abs(half_s - fit.lag_s) < _SPEED_LAG_S / 2.0 for _, half_s in fit.halves)
+    if coarse_s and abs(fit.lag_s - coarse_s) > (2.0 if agreed else 1.0) * _SPEED_LAG_S:
+        fit = replace(fit, lag_s=coarse_s, lag_sigma_s=_SPEED_LAG_S / 2.0)
+    return replace(fit, shifted=coarse_s != 0.0, clock_reason=clock_reason)
 
 
 def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
@@ -101,14 +124,14 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     GNSS way = a counted + b change, for the counter is the less noisy one; a lag of the counter's stamps by `d` beyond
     the assumed one is b = a d.
     """
-    config, (begin_s, end_s) = gnss.config, common(gnss, counter, lag_s)
-    if end_s - begin_s < 3.0 * config.window_least_s:
-        return PairFit(config, reason="nothing in common")
+    begin_s, end_s = common(gnss, counter, lag_s)
+    if end_s - begin_s < 3.0 * _WINDOW_LEAST_S:
+        return PairFit(reason="nothing in common")
     (way, counted, change), counts = _windows(gnss, counter, begin_s, end_s, lag_s)
     stands = counts < 0.1
     if way.size < LEAST:
         reason = "the odometer stands while the positions move" if stands else "hardly any movement in common"
-        return PairFit(config, reason=reason, stands=stands)
+        return PairFit(reason=reason, stands=stands)
     sign, size = -1.0 if np.median(counted) < 0 else 1.0, np.abs(counted)
     ratio = size / way
     unit = float(np.median(ratio))
@@ -117,15 +140,15 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     sane = off < np.log(2.0)
     design = np.column_stack([size, np.sign(counted) * change])[sane, None, :] / unit
     fit = regressed(design, way[sane, None], _LEAST_SPREAD_M, start=(1.0, 0.0))
-    (scale, slope), sigma = (fit.estimate / unit).tolist(), (_OVERLAP * fit.sigma / unit).tolist()
+    scale, slope = (fit.estimate / unit).tolist()
+    sigma, slope_sigma = (_OVERLAP * fit.sigma / unit).tolist()
     return PairFit(
-        config,
         factor=sign / scale,
-        factor_sigma=sigma[0] / scale**2,
+        factor_sigma=sigma / scale**2,
         lag_s=lag_s + slope / scale,
-        lag_sigma_s=sigma[1] / scale,
-        halves=tuple((sign * unit / one, lag_s + lag / one) for one, lag in fit.halves),
-        constant=counts * float(np.mean(off < config.window_agrees)),
+        lag_sigma_s=slope_sigma / scale,
+        halves=tuple((sign * unit / half, lag_s + lag / half) for half, lag in fit.halves),
+        constant=counts * float(np.mean(off < _WINDOW_AGREES)),
     )
 
 
@@ -133,32 +156,31 @@ def _windows(gnss: Places, counter: Record, begin_s: float, end_s: float, lag_s:
     """Of windows in which both move the GNSS way [m], and the counter's signed way and change of speed (3, windows);
     their share of those in which the positions move.
     """
-    config, speed = gnss.config, gnss.speed(np.linspace(begin_s, end_s, 400))
-    fast = speed[np.nan_to_num(speed) > config.moving_mps]
+    speed = gnss.speed(np.linspace(begin_s, end_s, 400))
+    fast = speed[np.nan_to_num(speed) > MOVING_MPS]
     if not fast.size:
         return np.zeros((3, 0)), 1.0
-    length_s = float(np.clip(config.window_m / np.median(fast), config.window_least_s, config.window_most_s))
-    starts = np.arange(begin_s, end_s - length_s, length_s / 2)
+    length_s = float(np.clip(_WINDOW_M / np.median(fast), _WINDOW_LEAST_S, _WINDOW_MOST_S))
+    starts = gnss.instants(length_s / 2, begin_s, end_s - length_s)
     ends = starts + length_s
     change = counter.speed(ends + lag_s, 2.0) - counter.speed(starts + lag_s, 2.0)
-    found = np.stack([gnss.way(starts, ends), counter.gained(starts + lag_s, ends + lag_s), change])
-    found = found[:, np.isfinite(found).all(axis=0)]
-    found = found[:, found[0] > max(config.slow_share * usual(found[0], 0.9), config.moving_mps * length_s)]
-    # Neither a counter that stands most of the time nor one that is reset tells what is usual.
-    size = np.abs(found[1])
-    counts = size > config.slow_share * usual(size, 0.8)
-    return found[:, counts], float(counts.mean()) if counts.size else 1.0
+    windows = np.stack([gnss.way(starts, ends), counter.gained(starts + lag_s, ends + lag_s), change])
+    windows = windows[:, np.isfinite(windows).all(axis=0)]
+    windows = windows[:, windows[0] > max(_SLOW_SHARE * usual(windows[0], 0.9), MOVING_MPS * length_s)]
+    # Neither a counter that stands most of the time nor one that is reset shows what is usual.
+    size = np.abs(windows[1])
+    counts = size > _SLOW_SHARE * usual(size, 0.8)
+    return windows[:, counts], float(counts.mean()) if counts.size else 1.0
 
 
 def clock_lag(gnss: Places, counter: Record) -> tuple[float, str]:
-    """The lag of the clocks that makes the speeds agree, 0 where they do as recorded; and why none is told.
+    """The lag of the clocks that makes the speeds agree, 0 where they do as recorded; and why none is known.
 
-    A lag is the counter's stamp of a moment minus the GNSS's. A fault of one of both leaves part of the journey that
+    A lag is the counter's stamp of a moment minus the GNSS's. A fault of one of the two leaves part of the journey that
     agrees, and with it the right lag ahead of all others.
     """
-    config = gnss.config
     as_recorded = _agreement(gnss, counter, 0.0, 0.0)
-    if as_recorded >= config.speeds_agree:
+    if as_recorded >= _SPEEDS_AGREE:
         return 0.0, ""
     possible_s, reason = _possible_lags(gnss, counter)
     if reason:
@@ -166,25 +188,34 @@ def clock_lag(gnss: Places, counter: Record) -> tuple[float, str]:
     rated = _rated(gnss, counter, possible_s)
     if not rated or not explains(rated[0][0], as_recorded):
         return 0.0, "" if explains(as_recorded, 0.0) else "no shift of the clocks makes the speeds agree"
-    if len(rated) > 1 and rated[0][0] - rated[1][0] < config.lag_rival:
+    if len(rated) > 1 and rated[0][0] - rated[1][0] < _LAG_RIVAL:
         return 0.0, "several shifts of the clocks make the speeds agree"
     return rated[0][1], ""
 
 
 def _possible_lags(gnss: Places, counter: Record) -> tuple[list[float], str]:
     """Lags at which both speeds look alike, to a second, best correlated first; and why there are none."""
-    config = gnss.config
-    times = [np.arange(one.t_s[0], one.t_s[-1] + 0.5, 1.0) for one in (gnss, counter)]
-    speeds = [np.abs(one.speed(t_s)) for one, t_s in zip((gnss, counter), times, strict=True)]
+    spans = [_longest_part(record.t_s) for record in (gnss, counter)]
+    if any(end - begin > _SPARSE_S * rows for begin, end, rows in spans):
+        return [], "the rows are too far apart"
+    times = [np.arange(begin, end + 0.5, 1.0) for begin, end, _ in spans]
+    speeds = [np.abs(record.speed(t_s)) for record, t_s in zip((gnss, counter), times, strict=True)]
     # Without speeds that only a jump of the position has.
     speeds = [np.where(speed > 1.5 * usual(speed, 0.95) + 1e-9, np.nan, speed) for speed in speeds]
-    if any(np.isfinite(speed).sum() < config.overlap_s for speed in speeds):
-        return [], f"less than {config.overlap_s:.0f} s of movement are known"
-    if any(np.nanstd(speed) < config.speed_change * max(float(np.nanmean(speed)), 1e-9) for speed in speeds):
+    if any(np.isfinite(speed).sum() < _COMMON_S for speed in speeds):
+        return [], f"less than {_COMMON_S:.0f} s of movement are known"
+    if any(np.nanstd(speed) < _SPEED_CHANGE * max(float(np.nanmean(speed)), 1e-9) for speed in speeds):
         return [], "the speed hardly changes"
-    rho = _correlations(speeds[0], speeds[1], config)
+    rho = _correlations(*speeds)
     lags_s = times[1][0] - times[0][0] + times[1].size - 1.0 - np.arange(rho.size)
     return list(_peaks(lags_s, rho)), ""
+
+
+def _longest_part(t_s: Floats) -> tuple[float, float, int]:
+    """Begin and end [s] and rows of the longest part of a record without a long pause."""
+    parts = np.split(t_s, np.flatnonzero(np.diff(t_s) > _PAUSE_S) + 1)
+    longest = max(parts, key=lambda part: float(part[-1] - part[0]))
+    return float(longest[0]), float(longest[-1]), longest.size
 
 
 def _peaks(lags_s: Floats, rho: Floats) -> Iterator[float]:
@@ -197,44 +228,44 @@ def _peaks(lags_s: Floats, rho: Floats) -> Iterator[float]:
         left[np.abs(lags_s - lags_s[best]) < _APART_S] = 0.0
 
 
-def _correlations(one: Floats, other: Floats, config: PlausibilityConfig) -> Floats:
+def _correlations(first: Floats, second: Floats) -> Floats:
     """Correlation at every shift over what both know; 0 where that is too little.
 
-    Element k pairs `one[i]` with `other[i - k + n - 1]`, n the length of `other` (Padfield 2012, masked FFT).
+    Element k pairs `first[i]` with `second[i - k + n - 1]`, n the length of `second` (Padfield 2012, masked FFT).
     """
-    size = 1 << (one.size + other.size - 2).bit_length()
+    size = 1 << (first.size + second.size - 2).bit_length()
 
     def spectra(values: Floats) -> list[np.ndarray]:
         """Of what is known, of how it differs from the mean, and of the square of that."""
         apart = np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0)
         return [np.fft.rfft(part, size) for part in (np.isfinite(values).astype(np.float64), apart, apart**2)]
 
-    first, second = spectra(one), spectra(other[::-1])
+    left, right = spectra(first), spectra(second[::-1])
 
-    def sums(left: int, right: int) -> Floats:
-        return np.asarray(np.fft.irfft(first[left] * second[right], size)[: one.size + other.size - 1])
+    def sums(one: int, other: int) -> Floats:
+        return np.asarray(np.fft.irfft(left[one] * right[other], size)[: first.size + second.size - 1])
 
-    least = max(config.overlap_s, config.overlap_share * min(np.isfinite(values).sum() for values in (one, other)))
+    least = max(_COMMON_S, _COMMON_SHARE * min(np.isfinite(values).sum() for values in (first, second)))
     spread = sums(2, 0) * sums(0, 2)
-    told = (np.round(sums(0, 0)) >= least) & (spread > config.speed_change**4)
-    return np.where(told, sums(1, 1) / np.sqrt(np.where(told, spread, 1.0)), 0.0)
+    enough = (np.round(sums(0, 0)) >= least) & (spread > _SPEED_CHANGE**4)
+    return np.where(enough, sums(1, 1) / np.sqrt(np.where(enough, spread, 1.0)), 0.0)
 
 
 def _rated(gnss: Places, counter: Record, possible_s: list[float]) -> list[tuple[float, float]]:
     """Agreement and lag of the best shifts away from 0, best first; a stuck counter moves a correlation by seconds."""
 
     def rated(lag_s: float) -> tuple[float, float]:
-        return _agreement(gnss, counter, lag_s, gnss.config.overlap_share), lag_s
+        return _agreement(gnss, counter, lag_s, _COMMON_SHARE), lag_s
 
-    found: list[tuple[float, float]] = []
+    climbed: list[tuple[float, float]] = []
     for lag_s in possible_s:
         best = rated(lag_s)
         for step_s in _CLIMB_S:
             best = max(best, rated(best[1] - step_s), rated(best[1] + step_s))
-        found.append(best)
-    found.sort(reverse=True)
-    apart = found[:1] + [one for one in found[1:] if abs(one[1] - found[0][1]) > _APART_S]
-    return [one for one in apart if abs(one[1]) > gnss.config.speed_lag_s]
+        climbed.append(best)
+    climbed.sort(reverse=True)
+    apart = climbed[:1] + [lag for lag in climbed[1:] if abs(lag[1] - climbed[0][1]) > _APART_S]
+    return [lag for lag in apart if abs(lag[1]) > _SPEED_LAG_S]
 
 
 def common(gnss: Places, counter: Record, lag_s: float) -> tuple[float, float]:
@@ -246,18 +277,18 @@ def _agreement(gnss: Places, counter: Record, lag_s: float, least_overlap: float
     """Share of the moving time in which both speeds agree at this lag, times what of the shorter record they have in
     common then: a shift that cuts a fault off explains nothing. 0 where that is too little.
     """
-    config, (begin_s, end_s) = gnss.config, common(gnss, counter, lag_s)
+    begin_s, end_s = common(gnss, counter, lag_s)
     shorter_s = min(np.ptp(gnss.t_s), np.ptp(counter.t_s))
     if end_s - begin_s < max(least_overlap * shorter_s, 20.0):
         return 0.0
     grid = np.linspace(begin_s, end_s, int(np.clip(end_s - begin_s, 20, 800)))
     speeds = np.stack([gnss.speed(grid), np.abs(counter.speed(grid + lag_s))])
-    one, other = speeds[:, np.isfinite(speeds).all(axis=0)]
-    moves = [speed > config.slow_share * usual(speed, 0.9) for speed in (one, other)]
-    both, either = moves[0] & moves[1], moves[0] | moves[1]
+    of_gnss, of_counter = speeds[:, np.isfinite(speeds).all(axis=0)]
+    moves = [speed > _SLOW_SHARE * usual(speed, 0.9) for speed in (of_gnss, of_counter)]
+    both = moves[0] & moves[1]
     if both.sum() < LEAST:
         return 0.0
-    factor = float(np.median(other[both] / one[both]))
-    apart, bound = np.abs(other / factor - one), config.speed_alike_share * one
-    alike = apart < bound + config.speed_alike_usual * usual(one, 0.9)
-    return float(np.mean(alike[either])) * float(end_s - begin_s) / float(shorter_s)
+    factor = float(np.median(of_counter[both] / of_gnss[both]))
+    bound = _ALIKE_SHARE * of_gnss + _ALIKE_USUAL * usual(of_gnss, 0.9)
+    alike = np.abs(of_counter / factor - of_gnss) < bound
+    return float(np.mean(alike[moves[0] | moves[1]])) * float(end_s - begin_s) / float(shorter_s)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.survey import track_of
 from pipeline.studies.plausibility.causes import Datum, datums_at, explain_factor
-from pipeline.studies.plausibility.check import Cause, Check, State, correction, fits, not_checked
+from pipeline.studies.plausibility.check import Cause, Check, State, correction, fits, misfit, not_checked
 from pipeline.studies.plausibility.copies import copy_check
 from pipeline.studies.plausibility.recording import Recording
-from pipeline.studies.plausibility.records import Places
-from pipeline.studies.plausibility.robust import explains, steady_median
-from pipeline.studies.plausibility.shifts import Line, SurveyFit, common_lag, fit_places, fit_survey, passes
+from pipeline.studies.plausibility.robust import SIGNIFICANT_SIGMAS, explains, steady_median
+from pipeline.studies.plausibility.shifts import SurveyFit, SurveyLine, common_lag, fit_places, fit_survey, passes
 from pipeline.studies.plausibility.witnesses import Lag
 from schemas.arrays import NS_PER_S, Floats, times_ns
-from schemas.config import PlausibilityConfig
 from schemas.enums import MisfitCause
 from schemas.run import Site
 
@@ -24,8 +24,10 @@ _REFERENCE = "places of the reference against the positions"
 _SURVEY = "positions against the survey"
 # The geoid lies up to so far from the ellipsoid.
 _GEOID_M = 107.0
-# Fewer tell nothing of the clock that stamps them.
+# Fewer tell nothing of the clock that stamps them; positions pass a balise that is read within so much: antenna, survey
+# and position together.
 _FEWEST_READS = 3
+_READ_M = 60.0
 _HEIGHT_UNITS = ("feet", "cm", "mm")
 
 
@@ -36,48 +38,49 @@ def reference_checks(of: Recording) -> tuple[Lag, list[Check], bool]:
         return Lag("reference", reason="hardly any place"), [], False
     if copied := copy_check(of):
         return Lag("reference", reason="a copy of the positions"), [copied], False
-    found = fit_places(of.gnss, of.reference)
+    found = fit_places(of.gnss, of.reference, config)
     if found.reason:
         return Lag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False
-    told = abs(found.lag_s) > max(config.lag_told_s, config.told_sigmas * found.lag_sigma_s)
+    significant = abs(found.lag_s) > max(config.lag_told_s, SIGNIFICANT_SIGMAS * found.lag_sigma_s)
     agrees = explains(found.agreeing, 0.0)
     small = abs(found.lag_s) <= config.lag_limit_s and agrees
-    sure = told and found.lag_is_steady and (small or explains(found.agreeing, found.as_recorded))
+    sure = significant and found.lag_is_steady and (small or explains(found.agreeing, found.as_recorded))
     lag = Lag("reference", found.lag_s, found.lag_sigma_s, sure=sure)
     if not agrees:
         words = "no one lag or shift explains them; the positions may be wrong"
         return lag, [not_checked(_REFERENCE, words)], False
     near, words = found.shift_m <= config.shift_told_m, f"{found.towards} of them"
     # No lines: the judge believes the reference, and nobody should shift it to where the positions want it.
-    causes, advice = (Cause(MisfitCause.OFFSET_OF_REFERENCE),), "Find out which of the two is off."
-    beside = Check(_REFERENCE, State.MISFIT, words, causes, advice=advice)
+    beside = misfit(_REFERENCE, words, MisfitCause.OFFSET_OF_REFERENCE, advice="Find out which of the two is off.")
     beside = fits(_REFERENCE, words) if near or not found.shift_is_steady else beside
-    return lag, [beside, *_reference_heights(of.gnss, of.reference, found.lag_s)], near
+    return lag, [beside, *_reference_heights(of, found.lag_s)], near
 
 
-def _reference_heights(gnss: Places, record: Places, lag_s: float) -> list[Check]:
-    known, t_s = np.isfinite(record.height_m), gnss.t_s + lag_s
-    if known.sum() < 2 or not np.isfinite(gnss.height_m).any():
-        return []
+def _reference_heights(of: Recording, lag_s: float) -> Iterator[Check]:
+    gnss, record = of.gnss, of.reference
+    known = np.zeros(0) if record is None else np.isfinite(record.height_m)
+    if record is None or known.sum() < 2 or not np.isfinite(gnss.height_m).any():
+        return
+    t_s = gnss.t_s + lag_s
     height_m = np.where(record.known(t_s), np.interp(t_s, record.t_s[known], record.height_m[known]), np.nan)
-    return _heights("reference", height_m - gnss.height_m, gnss.height_m, 0.0, gnss.config)
+    yield from _heights("reference", height_m - gnss.height_m, gnss.height_m, of)
 
 
 def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> Lag:
     """The clock of the balise reads: where the positions pass a balise that was read."""
-    config, places = of.config, _balise_places(site)
+    places = _balise_places(site)
     names = reads["balise_id"].to_list()
     known = np.array([name in places for name in names], dtype=np.bool_)
     if known.sum() < _FEWEST_READS:
         return Lag("balise_reads", reason="fewer than three reads of balises of the site")
     at_deg = np.array([places[name] for name in names if name in places])
-    number, passed_s = passes(of.gnss, points_of(*at_deg.T), config.read_m)
+    number, passed_s = passes(of.gnss, points_of(*at_deg.T), _READ_M)
     t_s = of.seconds(reads)[known]
-    lag_s, sigma_s = common_lag(t_s[number] - passed_s, int(known.sum()), config)
+    lag_s, sigma_s = common_lag(t_s[number] - passed_s, int(known.sum()))
     if lag_s is None:
         return Lag("balise_reads", reason="no one lag explains the reads")
     # Antennas far from each other pass a balise at other times: what a train can have may be theirs.
-    return Lag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * config.lag_limit_s)
+    return Lag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * of.config.lag_limit_s)
 
 
 def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
@@ -87,16 +90,11 @@ def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
     """
     if of.reference is not None or reads.height < _FEWEST_READS or (times_ns(reads) % NS_PER_S).any():
         return []
-    return [
-        Check(
-            "stamps of the balise reads",
-            State.MISFIT,
-            f"all {reads.height} are whole seconds",
-            (Cause(MisfitCause.WHOLE_SECONDS),),
-            advice="Record the reads with finer stamps: until then nothing is proved.",
-            of_evidence=True,
-        )
-    ]
+    words, advice = (
+        f"all {reads.height} are whole seconds",
+        "Record the reads with finer stamps: until then nothing is proved.",
+    )
+    return [misfit("stamps of the balise reads", words, MisfitCause.WHOLE_SECONDS, advice=advice, of_evidence=True)]
 
 
 def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:
@@ -111,67 +109,72 @@ def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:
     return places
 
 
-def survey_checks(of: Recording, line: Line, beside_reference: bool) -> list[Check]:
+def survey_checks(of: Recording, line: SurveyLine, beside_reference: bool) -> Iterator[Check]:
     """Positions and heights against the survey; `beside_reference`: the reference lies where the positions do."""
-    found, datum = _by_datum(fit_survey(of.gnss, line), of.gnss, line)
-    heights = _heights("survey", found.up_m, found.height_m, of.vehicle.antenna_height_m, of.config)
-    streams = ("gnss", "reference") if beside_reference else ("gnss",)
-    return [_beside(found, datum, of.config, streams), *heights]
+    near_m = 1.5 * of.config.shift_told_m
+    fit, datum = fit_survey(of.gnss, line, near_m), None
+    if fit.aside_m >= of.config.shift_told_m:
+        fit, datum = _by_datum(fit, of, line, near_m)
+    yield _beside(fit, datum, of, ("gnss", "reference") if beside_reference else ("gnss",))
+    yield from _heights("survey", fit.up_m + of.vehicle.antenna_height_m, fit.height_m, of)
 
 
-def _by_datum(found: SurveyFit, gnss: Places, line: Line) -> tuple[SurveyFit, Datum | None]:
+def _by_datum(fit: SurveyFit, of: Recording, line: SurveyLine, near_m: float) -> tuple[SurveyFit, Datum | None]:
     """The datum that the survey may be in; between curves a large shift is found only from near it."""
-    if found.aside_m < gnss.config.shift_told_m:
-        return found, None
+    gnss = of.gnss
     datums = datums_at(float(np.median(gnss.latitude_deg)), float(np.median(gnss.longitude_deg)))
-    fitted = [(found if found.constant else fit_survey(gnss, line, (one.east_m, one.north_m)), one) for one in datums]
-    named = [
-        (fit, datum) for fit, datum in fitted if fit.constant and datum.explains(fit, fit.one_heading, gnss.config)
+    fitted = [
+        (fit if fit.constant else fit_survey(gnss, line, near_m, (datum.east_m, datum.north_m)), datum)
+        for datum in datums
     ]
-    return min(named, key=lambda item: item[1].off_m(item[0]), default=(found, None))
+    named = [(part, datum) for part, datum in fitted if part.constant and datum.explains(part, part.one_heading)]
+    return min(named, key=lambda item: item[1].off_m(item[0]), default=(fit, None))
 
 
-def _beside(found: SurveyFit, datum: Datum | None, config: PlausibilityConfig, streams: tuple[str, ...]) -> Check:
-    unknown = " (along the track not known: one heading)" if found.one_heading else ""
-    words = f"the survey lies {found.towards} of them{unknown}"
-    told = found.shift_m > config.shift_told_m and found.aside_m > 0.4 * config.shift_told_m
-    if not told or not found.constant:
-        if found.aside_m > config.shift_told_m:
-            return Check(_SURVEY, State.MISFIT, f"they lie {found.aside_m:.0f} m beside the track, not by one shift")
-        return fits(_SURVEY, f"{found.aside_m:.1f} m beside the track usually")
+def _beside(fit: SurveyFit, datum: Datum | None, of: Recording, streams: tuple[str, ...]) -> Check:
+    limit_m = of.config.shift_told_m
+    if not fit.constant or fit.shift_m <= limit_m or fit.aside_m <= 0.4 * limit_m:
+        if fit.aside_m > limit_m:
+            return misfit(_SURVEY, f"they lie {fit.aside_m:.0f} m beside the track, not by one shift")
+        return fits(_SURVEY, f"{fit.aside_m:.1f} m beside the track usually")
+    words = f"the survey lies {fit.towards} of them"
+    words += " (along the track not known: one heading)" if fit.one_heading else ""
     if datum is not None:
-        code = MisfitCause.DATUM_LIKELY if found.one_heading else MisfitCause.DATUM
+        code = MisfitCause.DATUM_LIKELY if fit.one_heading else MisfitCause.DATUM
         causes = (Cause(code, (datum.name, datum.epsg)),)
         advice = "Name the code in the site's track: first line of track.csv, a column epsg, or crs of GeoJSON."
         lines = f"# epsg: {datum.epsg}\n"
         return Check(_SURVEY, State.MISFIT, words, causes, lines, "write as first line of track.csv", advice)
-    shift_m = {"east": round(found.east_m, 1), "north": round(found.north_m, 1)}
+    shift_m = {"east": round(fit.east_m, 1), "north": round(fit.north_m, 1)}
     lines = "".join(correction(stream, shift_m=shift_m) for stream in streams)
     advice = "Name the survey's EPSG code or mend the survey; only where the shift is known to be the map's:"
     code = MisfitCause.MAP_SHIFT_BY_REFERENCE if len(streams) > 1 else MisfitCause.MAP_SHIFT
-    return Check(_SURVEY, State.MISFIT, words, (Cause(code),), lines, advice=advice)
+    return misfit(_SURVEY, words, code, lines=lines, advice=advice)
 
 
-def _heights(other: str, up_m: Floats, height_m: Floats, offset_m: float, config: PlausibilityConfig) -> list[Check]:
-    """Heights of the survey or reference, which lie `up_m` above those of the positions; `offset_m`: as they should."""
+def _heights(other: str, up_m: Floats, height_m: Floats, of: Recording) -> Iterator[Check]:
+    """Heights of the survey or reference, which lie `up_m` above those of the positions."""
     what = f"heights against the {other}"
-    apart_m, is_steady = steady_median(up_m + offset_m)
+    apart_m, is_steady = steady_median(up_m)
     if not np.isfinite(apart_m):
-        return []
+        return
     words = f"the {other} lies {apart_m:.0f} m above them"
-    if abs(apart_m) <= 1.5 * config.shift_told_m or not is_steady:
-        return [fits(what, words)]
-    ratio, _ = steady_median(height_m / (height_m + up_m + offset_m))
+    if abs(apart_m) <= 1.5 * of.config.shift_told_m or not is_steady:
+        yield fits(what, words)
+        return
+    ratio, _ = steady_median(height_m / (height_m + up_m))
     for stream, factor in (("gnss", ratio), (other, 1.0 / ratio)):
-        unit = explain_factor(factor, False, config)
+        unit = explain_factor(factor, False)
         name = "" if unit is None else unit.causes[0].figures[0]
         if unit is not None and name in _HEIGHT_UNITS:
             causes = (Cause(MisfitCause.HEIGHT_UNIT, ("positions" if stream == "gnss" else other, name)),)
             lines = "" if stream == "survey" else correction(stream, {"height_m": 1.0 / unit.exact})
             advice = "Write the survey's heights in metres." if stream == "survey" else ""
-            return [Check(what, State.MISFIT, words, causes, lines, advice=advice)]
+            yield Check(what, State.MISFIT, words, causes, lines, advice=advice)
+            return
     if abs(apart_m) > _GEOID_M:
-        return [Check(what, State.MISFIT, words, (Cause(MisfitCause.HEIGHT_UNKNOWN),))]
+        yield misfit(what, words, MisfitCause.HEIGHT_UNKNOWN)
+        return
     # The judge believes the reference: where it has the other zero, somebody has to say which is right.
     lines = correction("gnss", shift_m={"up": round(apart_m, 1)}) if other == "survey" else ""
-    return [Check(what, State.MISFIT, words, (Cause(MisfitCause.HEIGHT_ZERO),), lines)]
+    yield misfit(what, words, MisfitCause.HEIGHT_ZERO, lines=lines)

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.studies.plausibility.axes import VelocityFit, fit_velocity
 from pipeline.studies.plausibility.pairs import PairFit, fit_pair
 from pipeline.studies.plausibility.records import Places, Record, counters_of, places_of, seconds_since
-from pipeline.studies.plausibility.shifts import Line, line_of
+from pipeline.studies.plausibility.shifts import SurveyLine, line_of
+from pipeline.studies.plausibility.velocity import VelocityFit, fit_velocity
 from schemas.arrays import Floats, times_ns
 from schemas.config import PlausibilityConfig, Vehicle
 from schemas.run import RunLog, Site
@@ -35,20 +35,19 @@ class Recording:
         return int(times_ns(self.run.gnss)[0])
 
     @cached_property
-    def line(self) -> Line | None:
+    def line(self) -> SurveyLine | None:
         return None if self.site is None else line_of(self.site.track)
 
     @cached_property
     def reference(self) -> Places | None:
         """Places of the reference; None where there are hardly any."""
         frame = self.run.reference
-        return None if frame is None or frame.is_empty() else places_of(frame, self.epoch_ns, self.config)
+        return None if frame is None or frame.is_empty() else places_of(frame, self.epoch_ns)
 
     @cached_property
     def counters(self) -> dict[str, Record]:
         """Distance and speed of the odometer."""
-        odometer = self.run.odometer
-        return {} if odometer is None else counters_of(odometer, self.epoch_ns, self.config)
+        return {} if self.run.odometer is None else counters_of(self.run.odometer, self.epoch_ns)
 
     @cached_property
     def pairs(self) -> dict[str, PairFit]:
@@ -67,7 +66,7 @@ class Recording:
         if not np.nanmax(np.abs(latitude_deg)) <= 90.0:
             return None
         fixes = self.fixes.with_columns(latitude_deg=pl.Series(latitude_deg), longitude_deg=pl.Series(longitude_deg))
-        gnss = places_of(fixes, self.epoch_ns, self.config)
+        gnss = places_of(fixes, self.epoch_ns)
         return None if gnss is None else replace(self, fixes=fixes, gnss=gnss)
 
 
@@ -76,5 +75,5 @@ def recording_of(
 ) -> Recording | None:
     """None where hardly any position is valid."""
     fixes = run.gnss.filter(pl.col("solution") == solution)
-    gnss = places_of(fixes, int(times_ns(run.gnss)[0]), config)
+    gnss = places_of(fixes, int(times_ns(run.gnss)[0]))
     return None if gnss is None else Recording(run, solution, config, vehicle, site, fixes, gnss)

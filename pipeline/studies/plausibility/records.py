@@ -10,8 +10,18 @@ import polars as pl
 
 from pipeline.stages.track.geodesy import Points, earth_centred_m, points_of
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
-from schemas.config import PlausibilityConfig
 from schemas.enums import Fix
+
+# A speed is a mean over this time: positions that scatter by 2 m give it to 0.7 m/s.
+SPEED_S = 4.0
+# Slower, positions that scatter by some metres may be of a train that stands.
+MOVING_MPS = 1.0
+# Pauses are bridged up to so many usual periods (loggers drop single rows), and never longer than a minute: instants
+# between rows are then no more than rows allow, whatever the span.
+_BRIDGED_PERIODS = 3.5
+_BRIDGED_S = 60.0
+# Fewer rows of a record tell nothing.
+_LEAST_ROWS = 10
 
 
 @dataclass(frozen=True)
@@ -20,12 +30,11 @@ class Record:
 
     t_s: Floats
     values: Floats
-    config: PlausibilityConfig
 
     @cached_property
     def limit_s(self) -> float:
         """A longer pause is not bridged."""
-        return max(self.config.speed_s, self.config.bridged_periods * float(np.median(np.diff(self.t_s))))
+        return float(np.clip(_BRIDGED_PERIODS * np.median(np.diff(self.t_s)), SPEED_S, _BRIDGED_S))
 
     def known(self, t_s: Floats) -> Bools:
         """Whether instants lie between two rows that are no farther apart than the limit."""
@@ -35,6 +44,20 @@ class Record:
         known: Bools = inside & (self.t_s[after] - self.t_s[after - 1] <= self.limit_s)
         return known
 
+    def instants(self, step_s: float, begin_s: float = -np.inf, end_s: float = np.inf) -> Floats:
+        """Instants a step apart from the first row (or `begin_s`) on, those inside long pauses left out."""
+        origin_s, last_s = max(self.t_s[0], begin_s), min(self.t_s[-1], end_s)
+        rows = self.t_s[(self.t_s >= origin_s - self.limit_s) & (self.t_s <= last_s + self.limit_s)]
+        if rows.size < 2 or last_s <= origin_s:
+            return np.zeros(0)
+        edges = np.flatnonzero(np.diff(rows) > self.limit_s)
+        firsts, lasts = rows[np.append(0, edges + 1)], rows[np.append(edges, rows.size - 1)]
+        begins = np.floor((np.maximum(firsts, origin_s) - origin_s) / step_s).astype(np.int64)
+        ends = np.ceil((np.minimum(lasts, last_s) - origin_s) / step_s).astype(np.int64)
+        number = np.concatenate([np.arange(begin, end + 1) for begin, end in zip(begins, ends, strict=True)])
+        instants = origin_s + np.unique(number) * step_s
+        return np.asarray(instants[instants < last_s])
+
     def at(self, t_s: Floats) -> Floats:
         """Values by straight lines."""
         axes = [np.interp(t_s, self.t_s, axis) for axis in np.atleast_2d(self.values.T)]
@@ -42,12 +65,12 @@ class Record:
 
     def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
         """Signed way, or displacement, from some instants to others; NaN where it is not known."""
-        gained, known = self.at(end_s) - self.at(begin_s), self.known(begin_s) & self.known(end_s)
+        gained = self.at(end_s) - self.at(begin_s)
+        known = self.known(begin_s) & self.known(end_s)
         return np.where(known if gained.ndim == 1 else known[:, None], gained, np.nan)
 
-    def speed(self, t_s: Floats, over_s: float | None = None) -> Floats:
+    def speed(self, t_s: Floats, over_s: float = SPEED_S) -> Floats:
         """Signed speed of a counter in its units per second, of positions over ground; NaN where it is not known."""
-        over_s = self.config.speed_s if over_s is None else over_s
         gained = self.gained(t_s - over_s / 2, t_s + over_s / 2)
         if gained.ndim == 1:
             return gained / over_s
@@ -73,7 +96,7 @@ class Places(Record):
 
     def moves(self, t_s: Floats) -> Bools:
         """Instants at which the train moves for certain."""
-        moves: Bools = np.nan_to_num(self.speed(t_s)) > self.config.moving_mps
+        moves: Bools = np.nan_to_num(self.speed(t_s)) > MOVING_MPS
         return moves
 
     def way(self, begin_s: Floats, end_s: Floats) -> Floats:
@@ -84,26 +107,26 @@ class Places(Record):
         return np.asarray(first + second + (first + second - chord) / 3.0)
 
 
-def places_of(frame: pl.DataFrame, epoch_ns: int, config: PlausibilityConfig) -> Places | None:
-    """Valid positions of a cleaned stream, thinned to two a second; None below ten of them."""
+def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
+    """Valid positions of a cleaned stream; None where there are hardly any."""
     latitude, longitude = floats(frame, "latitude_deg"), floats(frame, "longitude_deg")
     valid = np.isfinite(latitude) & np.isfinite(longitude)
     if "fix" in frame.columns:
         valid &= (frame["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
     t_s = seconds_since(epoch_ns, frame)
     rows = _thinned(t_s, np.flatnonzero(valid))
-    if rows.size < 10:
+    if rows.size < _LEAST_ROWS:
         return None
     t_s, latitude, longitude = t_s[rows], latitude[rows], longitude[rows]
     height = floats(frame, "height_m")[rows] if "height_m" in frame.columns else np.full(rows.size, np.nan)
     level_m = float(np.nanmedian(height)) if np.isfinite(height).any() else 0.0
     flat = np.full(rows.size, level_m if abs(level_m) < 9000.0 else 0.0)
-    return Places(t_s, earth_centred_m(latitude, longitude, flat), config, latitude, longitude, height)
+    return Places(t_s, earth_centred_m(latitude, longitude, flat), latitude, longitude, height)
 
 
-def counters_of(odometer: pl.DataFrame, epoch_ns: int, config: PlausibilityConfig) -> dict[str, Record]:
+def counters_of(odometer: pl.DataFrame, epoch_ns: int) -> dict[str, Record]:
     """`distance`, and `speed` summed up, of an odometer, each where enough rows have it."""
-    found: dict[str, Record] = {}
+    counters: dict[str, Record] = {}
     for name, column in ("distance", "distance_m"), ("speed", "speed_mps"):
         t_s, values = seconds_since(epoch_ns, odometer), floats(odometer, column)
         rows = np.flatnonzero(np.isfinite(values))
@@ -111,9 +134,9 @@ def counters_of(odometer: pl.DataFrame, epoch_ns: int, config: PlausibilityConfi
         if name == "speed" and rows.size:
             way = np.concatenate([[0.0], np.cumsum(0.5 * (way[1:] + way[:-1]) * np.diff(t_s))])
         kept = _thinned(t_s, np.arange(rows.size))
-        if kept.size >= 10:
-            found[name] = Record(t_s[kept], way[kept], config)
-    return found
+        if kept.size >= _LEAST_ROWS:
+            counters[name] = Record(t_s[kept], way[kept])
+    return counters
 
 
 def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
@@ -122,7 +145,7 @@ def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
 
 
 def _thinned(t_s: Floats, rows: Ints) -> Ints:
-    """Of these rows some two a second, which tell all that is asked here."""
+    """Of these rows some two a second."""
     t_s = t_s[rows]
     if t_s.size < 2 or np.median(np.diff(t_s)) >= 0.45:
         return rows

@@ -9,9 +9,12 @@ import numpy as np
 from schemas.arrays import Bools, Floats
 
 # Tukey's biweight, 95 % efficient on Gaussian noise (Huber and Ronchetti 2009), after least absolute deviations.
-_BIWEIGHT, _ROUNDS = 4.685, 12
-# Fewer observations tell nothing, and so do two rivals that agree nearly as well.
+_BIWEIGHT = 4.685
+_ROUNDS = 12
+# Fewer observations tell nothing.
 LEAST = 6
+# Lags and factors differ where they are so many sigmas apart: windows overlap and errors last.
+SIGNIFICANT_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,8 @@ class Shift:
     @property
     def towards(self) -> str:
         """In words."""
-        east, north = ("east" if self.east_m >= 0 else "west"), ("north" if self.north_m >= 0 else "south")
+        east = "east" if self.east_m >= 0 else "west"
+        north = "north" if self.north_m >= 0 else "south"
         return f"{abs(self.east_m):.0f} m {east}, {abs(self.north_m):.0f} m {north}"
 
     def off_m(self, other: Shift) -> float:
@@ -38,9 +42,9 @@ class Shift:
 
 @dataclass(frozen=True)
 class Regression:
-    """`estimate` with `sigma` (inf: not told); `halves`: the estimates of the first and second half of the run alone.
+    """`estimate` with `sigma` (inf: not known); `halves`: the estimates of the first and second half of the run alone.
 
-    `spread`: of what is left [m]; `whole`: every part of the estimate is told.
+    `spread`: of what is left [m]; `whole`: every part of the estimate is known.
     """
 
     estimate: Floats
@@ -63,22 +67,24 @@ def regressed(
     design: Floats,
     target: Floats,
     floor: float,
-    told: float = 1e-12,
+    least_known: float = 1e-12,
     start: tuple[float, ...] | None = None,
     halves: bool = True,
 ) -> Regression:
     """Robust regression; `design` (n, m, k), `target` (n, m): the m parts of one observation share a weight.
 
-    `floor`: least spread of what is left. Directions whose information is below the share `told` of the best known one
-    stay zero. `start`: an estimate to begin with, else that of least absolute deviations.
+    `floor`: least spread of what is left. Directions with less than the share `least_known` of the information of the
+    best known one stay zero. `start`: an estimate to begin with, else that of least absolute deviations.
     """
     half = len(target) // 2
     parts = [(design[:half], target[:half]), (design[half:], target[half:])] if halves else []
-    alone = tuple(_solved(*part, floor, told, start).estimate for part in parts if len(part[1]) >= LEAST)
-    return replace(_solved(design, target, floor, told, start), halves=alone)
+    alone = tuple(_solved(*part, floor, least_known, start).estimate for part in parts if len(part[1]) >= LEAST)
+    return replace(_solved(design, target, floor, least_known, start), halves=alone)
 
 
-def _solved(design: Floats, target: Floats, floor: float, told: float, start: tuple[float, ...] | None) -> Regression:
+def _solved(
+    design: Floats, target: Floats, floor: float, least_known: float, start: tuple[float, ...] | None
+) -> Regression:
     count, each = target.shape
     equations, goal = design.reshape(count * each, -1), target.ravel()
     weight = np.ones(count)
@@ -91,7 +97,7 @@ def _solved(design: Floats, target: Floats, floor: float, told: float, start: tu
             weight = np.clip(1.0 - (left / (_BIWEIGHT * spread)) ** 2, 0.0, None) ** 2
         weighted = (equations * np.repeat(weight, each)[:, None]).T
         strengths, axes = np.linalg.eigh(weighted @ equations)
-        known = strengths > told * strengths[-1]
+        known = strengths > least_known * strengths[-1]
         inverse = (axes[:, known] / strengths[known]) @ axes[:, known].T
         estimate = inverse @ (weighted @ goal)
         left = np.linalg.norm((goal - equations @ estimate).reshape(count, each), axis=1)

@@ -10,11 +10,21 @@ import polars as pl
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.segments import Polyline, on_segments
 from pipeline.stages.track.survey import track_of
-from pipeline.studies.plausibility.records import Places
+from pipeline.studies.plausibility.records import MOVING_MPS, Places
 from pipeline.studies.plausibility.robust import LEAST, Shift, explains, regressed, sampled
 from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
 
+# Two records are of one place within so much: the worst known datum is 700 m off, most 100 to 200.
+_SAME_PLACE_M = 400.0
+# Passages of single places agree on a lag within this time, and so large a share of them has to.
+_PASSING_S = 2.0
+_PASSING_SHARE = 0.6
+# One shift of the survey leaves at most this share of the distance, for so many of the positions.
+_SHIFT_LEAVES = 0.5
+_SHIFT_POSITIONS = 0.75
+# With less of the information across a line of one heading, a shift along the track is not known.
+_ONE_HEADING = 0.04
 # Each round finds the nearest segments of the track anew.
 _ROUNDS = 8
 
@@ -24,7 +34,7 @@ class PlaceFit(Shift):
     """How a record of places fits the GNSS: `lag_s` is its stamp of a moment minus the GNSS's.
 
     The shift is the record's place minus the GNSS's. `agreeing`: share of moving epochs that agree then, and
-    `as_recorded` as they are. Steady is what both halves of the run show. `reason`: why nothing is told.
+    `as_recorded` as they are. Steady is what both halves of the run show. `reason`: why nothing is known.
     """
 
     east_m: float = 0.0
@@ -38,15 +48,15 @@ class PlaceFit(Shift):
     reason: str = ""
 
 
-def fit_places(gnss: Places, record: Places) -> PlaceFit:
+def fit_places(gnss: Places, record: Places, config: PlausibilityConfig) -> PlaceFit:
     """Lag and shift of another record of the same journey; a shift of its clock has to explain more than none."""
-    config, as_recorded = gnss.config, _refined(gnss, record, 0.0)
+    as_recorded = _refined(gnss, record, 0.0, config)
     moving = sampled(gnss.moving, 100)
-    number, passed_s = passes(record, gnss.points.take(np.flatnonzero(moving)), config.same_place_m)
-    lag_s, _ = common_lag(passed_s - gnss.t_s[moving][number], int(moving.sum()), config)
-    if lag_s is None or abs(lag_s) <= config.passing_s:
+    number, passed_s = passes(record, gnss.points.take(np.flatnonzero(moving)), _SAME_PLACE_M)
+    lag_s, _ = common_lag(passed_s - gnss.t_s[moving][number], int(moving.sum()))
+    if lag_s is None or abs(lag_s) <= _PASSING_S:
         return as_recorded
-    shifted = _refined(gnss, record, lag_s)
+    shifted = _refined(gnss, record, lag_s, config)
     if shifted.reason or not explains(shifted.agreeing, 0.0 if as_recorded.reason else as_recorded.agreeing):
         return as_recorded
     return replace(shifted, as_recorded=0.0 if as_recorded.reason else as_recorded.as_recorded)
@@ -64,9 +74,9 @@ def passes(track: Places, places: Points, within_m: float) -> tuple[Ints, Floats
     near = inner < (within_m + np.maximum(step_m[:-1], step_m[1:])) ** 2
     place, row = np.nonzero(near & (inner <= squares[:, :-2]) & (inner < squares[:, 2:]))
     away_m, at_s = np.full(place.size, np.inf), np.full(place.size, np.nan)
-    line, own = Polyline(surface[:-1], surface[1:]), places.take(place)
+    line, passed = Polyline(surface[:-1], surface[1:]), places.take(place)
     for begin in (row, row + 1):
-        foot, period_s = on_segments(own, line, begin), track.t_s[begin + 1] - track.t_s[begin]
+        foot, period_s = on_segments(passed, line, begin), track.t_s[begin + 1] - track.t_s[begin]
         better = (foot.distance_m < away_m) & (period_s <= track.limit_s)
         at_s = np.where(better, track.t_s[begin] + np.clip(foot.fraction, 0.0, 1.0) * period_s, at_s)
         away_m = np.where(better, foot.distance_m, away_m)
@@ -74,37 +84,38 @@ def passes(track: Places, places: Points, within_m: float) -> tuple[Ints, Floats
     return place[kept], at_s[kept]
 
 
-def common_lag(lags_s: Floats, count: int, config: PlausibilityConfig) -> tuple[float | None, float]:
+def common_lag(lags_s: Floats, count: int) -> tuple[float | None, float]:
     """What most of so many passages agree on, with its sigma [s]; None where they do not."""
     if lags_s.size < 3:
         return None, np.inf
     ordered = np.sort(lags_s)
-    near_s = config.passing_s
-    counts = np.searchsorted(ordered, lags_s + near_s, "right") - np.searchsorted(ordered, lags_s - near_s, "left")
+    counts = np.searchsorted(ordered, lags_s + _PASSING_S, "right") - np.searchsorted(
+        ordered, lags_s - _PASSING_S, "left"
+    )
     best = int(counts.argmax())
-    if counts[best] < max(config.passing_share * count, 3):
+    if counts[best] < max(_PASSING_SHARE * count, 3):
         return None, np.inf
-    agreeing = lags_s[np.abs(lags_s - lags_s[best]) <= near_s]
+    agreeing = lags_s[np.abs(lags_s - lags_s[best]) <= _PASSING_S]
     return float(np.median(agreeing)), float(np.std(agreeing) / np.sqrt(agreeing.size))
 
 
-def _refined(gnss: Places, record: Places, lag_s: float) -> PlaceFit:
+def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityConfig) -> PlaceFit:
     """Shift and the rest of the lag by robust regression of what both are apart on the velocity."""
-    config, t_s = gnss.config, gnss.t_s
+    t_s = gnss.t_s
     known = record.known(t_s + lag_s) & record.known(t_s + lag_s + 1.0) & record.known(t_s + lag_s - 1.0)
     rows = np.flatnonzero(sampled(known))
     t_s = t_s[rows] + lag_s
     axes = np.stack([gnss.points.east[rows], gnss.points.north[rows]], axis=1)
     velocity = np.einsum("ijk,ik->ij", axes, (record.at(t_s + 1.0) - record.at(t_s - 1.0)) / 2.0)
     apart = np.einsum("ijk,ik->ij", axes, record.at(t_s) - gnss.values[rows])
-    moves = np.linalg.norm(velocity, axis=1) > config.moving_mps
+    moves = np.linalg.norm(velocity, axis=1) > MOVING_MPS
     if moves.sum() < 3 * LEAST:
         return PlaceFit(reason="hardly any movement in common")
     velocity, apart = velocity[moves], apart[moves]
     design = np.concatenate([velocity[:, :, None], np.broadcast_to(np.eye(2), (len(apart), 2, 2))], axis=2)
     # Along one heading at constant speed a lag and a shift look alike: it is taken for a lag.
-    fit = regressed(design, apart, floor=0.2, told=1e-4)
-    # What is told besides is no disagreement, nor what positions scatter beyond it.
+    fit = regressed(design, apart, floor=0.2, least_known=1e-4)
+    # What is reported besides is no disagreement, nor what positions scatter beyond it.
     bound = 1.5 * config.shift_told_m + config.lag_told_s * np.linalg.norm(velocity, axis=1)
     agreeing = float(np.mean(np.linalg.norm(apart - design @ fit.estimate, axis=1) < bound))
     before = float(np.mean(np.linalg.norm(apart, axis=1) < bound))
@@ -116,7 +127,7 @@ def _refined(gnss: Places, record: Places, lag_s: float) -> PlaceFit:
 
 
 @dataclass(frozen=True)
-class Line(Polyline):
+class SurveyLine(Polyline):
     """The segments of a survey, with the heights of their ends."""
 
     height_start_m: Floats
@@ -146,21 +157,21 @@ class SurveyFit(Shift):
     up_m: Floats
 
 
-def line_of(frame: pl.DataFrame) -> Line:
+def line_of(frame: pl.DataFrame) -> SurveyLine:
     """The segments of a site's track."""
     track = track_of(frame)
     surface = points_of(track.latitude_deg, track.longitude_deg).surface
     within = np.setdiff1d(np.arange(len(surface) - 1), track.first[1:-1] - 1)
     rows = within[np.any(surface[within] != surface[within + 1], axis=1)]
-    return Line(surface[rows], surface[rows + 1], track.height_m[rows], track.height_m[rows + 1])
+    return SurveyLine(surface[rows], surface[rows + 1], track.height_m[rows], track.height_m[rows + 1])
 
 
-def fit_survey(gnss: Places, line: Line, start_m: tuple[float, float] = (0.0, 0.0)) -> SurveyFit:
+def fit_survey(gnss: Places, line: SurveyLine, near_m: float, start_m: tuple[float, float] = (0.0, 0.0)) -> SurveyFit:
     """The constant shift that brings moving positions onto the track, by repeated projection and robust regression.
 
-    `start_m`: a shift to begin with.
+    `near_m`: a position is on the track within so much; `start_m`: a shift to begin with.
     """
-    config, moving = gnss.config, gnss.moving
+    moving = gnss.moving
     rows = np.flatnonzero(sampled(moving if moving.sum() >= 20 else np.ones_like(moving), 400))
     points = gnss.points.take(rows)
     axes = np.stack([points.east, points.north], axis=1)
@@ -179,19 +190,19 @@ def fit_survey(gnss: Places, line: Line, start_m: tuple[float, float] = (0.0, 0.
     shift = np.array(start_m)
     for _ in range(_ROUNDS):
         across, apart, height_m = beside(shift)
-        fit = regressed(across[:, None, :], apart[:, None], floor=1.0, told=config.one_heading, halves=False)
+        fit = regressed(across[:, None, :], apart[:, None], floor=1.0, least_known=_ONE_HEADING, halves=False)
         shift = fit.estimate
     left = np.abs(apart - across @ shift)
     left_m, half = float(np.median(left)), len(apart) // 2
     toward, whole = (across @ shift) * apart, (across @ shift) ** 2
     steady = all(toward[part].sum() > 0.5 * whole[part].sum() for part in (slice(half), slice(half, None)))
     # By metres, not by what is left elsewhere: a shift brings no run onto a network that it left.
-    near = float(np.mean(left < 1.5 * config.shift_told_m)) > config.shift_positions
+    near = float(np.mean(left < near_m)) > _SHIFT_POSITIONS
     return SurveyFit(
         east_m=float(shift[0]),
         north_m=float(shift[1]),
         aside_m=aside_m,
-        constant=left_m < config.shift_leaves * aside_m and near and steady,
+        constant=left_m < _SHIFT_LEAVES * aside_m and near and steady,
         one_heading=not fit.whole,
         height_m=gnss.height_m[rows],
         up_m=height_m - gnss.height_m[rows],

@@ -5,16 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from pipeline.studies.plausibility.causes import explain_lag, leap_seconds
-from pipeline.studies.plausibility.check import Cause, Check, State, Whose, correction, fits, not_checked
+from pipeline.studies.plausibility.check import (
+    VEHICLE_FILE,
+    Cause,
+    Check,
+    State,
+    Whose,
+    correction,
+    fits,
+    misfit,
+    not_checked,
+)
 from pipeline.studies.plausibility.recording import Recording
+from pipeline.studies.plausibility.robust import SIGNIFICANT_SIGMAS
 from schemas.enums import MisfitCause, MisfitPlace
 
+# Two lags so near to each other are of one clock.
+_SAME_CLOCK_S = 1.5
 NAMES = {"odometer": "odometer", "reference": "reference", "balise_reads": "balise reads"}
 
 
 @dataclass(frozen=True)
 class Lag:
-    """Of one stream against the GNSS [s]: its stamp of a moment minus the GNSS's; `reason`: why it is not told.
+    """Of one stream against the GNSS [s]: its stamp of a moment minus the GNSS's; `reason`: why it is not known.
 
     `sure`: its noise is far below it, and no part of the run contradicts it. `latency_known`: the vehicle file says
     how late the GNSS is.
@@ -31,7 +44,7 @@ class Lag:
 def clock_checks(of: Recording, lags: list[Lag], latency_s: float) -> list[Check]:
     """One check per stream. What two recorders say against the GNSS is the GNSS's own.
 
-    `latency_s`: how late the GNSS is by the vehicle file; only what is beyond is told.
+    `latency_s`: how late the GNSS is by the vehicle file; only what is beyond is reported.
     """
     config = of.config
     lags = [replace(lag, lag_s=lag.lag_s + latency_s) for lag in lags]
@@ -42,12 +55,12 @@ def clock_checks(of: Recording, lags: list[Lag], latency_s: float) -> list[Check
 
     def seconded(lag: Lag) -> bool:
         """Two recorders that show the same lag are surer than each."""
-        return lag.sure or (large(lag) and any(abs(lag.lag_s - one_s) < config.same_clock_s for one_s in sure_s))
+        return lag.sure or (large(lag) and any(abs(lag.lag_s - other_s) < _SAME_CLOCK_S for other_s in sure_s))
 
     lags = [lag if lag.reason else replace(lag, sure=seconded(lag)) for lag in lags]
     wrong = [lag for lag in lags if lag.sure and large(lag)]
     others = [lag for lag in lags if not lag.reason and not large(lag)]
-    alike = all(abs(one.lag_s - wrong[0].lag_s) < config.same_clock_s for one in wrong)
+    alike = all(abs(lag.lag_s - wrong[0].lag_s) < _SAME_CLOCK_S for lag in wrong)
     # One clock has one lag, and one line that mends it.
     of_gnss = min(wrong, key=lambda lag: lag.sigma_s) if len(wrong) >= 2 and alike and not others else None
     return [_check(of, lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
@@ -58,7 +71,7 @@ def _check(of: Recording, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
     what, size_s = f"clock of the {name} against the GNSS", abs(lag.lag_s)
     if lag.reason:
         return not_checked(what, lag.reason)
-    if not lag.sure and size_s > max(config.lag_told_s, config.told_sigmas * lag.sigma_s):
+    if not lag.sure and size_s > max(config.lag_told_s, SIGNIFICANT_SIGMAS * lag.sigma_s):
         return not_checked(what, f"{lag.lag_s:+.2f} s, but not in all of the run: a lag, a slip or a drift")
     if not lag.sure or size_s <= config.lag_told_s:
         sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
@@ -67,13 +80,12 @@ def _check(of: Recording, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
     found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {name} are {later}"
     if size_s <= config.lag_limit_s:
         return _small(what, found, lag)
-    told = of_gnss or lag
-    explained = explain_lag(told.lag_s, of.epoch_ns, min(3.0 * told.sigma_s, 3.0), config)
-    exact_s = round(told.lag_s if explained is None else explained.exact, 2)
+    clock = of_gnss or lag
+    explained = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0))
+    exact_s = round(clock.lag_s if explained is None else explained.exact, 2)
     causes = (Cause(MisfitCause.CONSTANT_LAG),) if explained is None else explained.causes
-    rolled_over = explained is not None and explained.has(MisfitCause.GPS_WEEK)
-    rather = _rather_gnss(lag.lag_s, rolled_over, of.epoch_ns, config.same_clock_s)
-    at_gnss = of_gnss is not None or (not known and rather)
+    rolled_over = any(cause.code is MisfitCause.GPS_WEEK for cause in causes)
+    at_gnss = of_gnss is not None or (not known and _rather_gnss(lag.lag_s, rolled_over, of.epoch_ns))
     pair = ("GNSS", name) if at_gnss else (name, "GNSS")
     whose = Whose(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
     if not at_gnss:
@@ -84,12 +96,12 @@ def _check(of: Recording, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
     return Check(what, State.IMPOSSIBLE, found, causes, lines, whose=whose)
 
 
-def _rather_gnss(lag_s: float, rolled_over: bool, t_ns: int, same_s: float) -> bool:
-    """Which of two clocks it is, where nobody else tells.
+def _rather_gnss(lag_s: float, rolled_over: bool, t_ns: int) -> bool:
+    """Which of two clocks it is, where nobody else knows.
 
     GPS time is ahead of UTC, so the stream with the later stamps holds it; a week rolls over in GNSS receivers.
     """
-    if abs(abs(lag_s) - leap_seconds(t_ns)) < same_s:
+    if abs(abs(lag_s) - leap_seconds(t_ns)) < _SAME_CLOCK_S:
         return lag_s < 0
     return rolled_over and lag_s > 0
 
@@ -99,9 +111,9 @@ def _small(what: str, found: str, lag: Lag) -> Check:
     latency_s = round(-lag.lag_s, 2)
     if lag.stream == "odometer" and latency_s > 0 and not lag.latency_known:
         lines = f"gnss_latency_s = {latency_s}\ngnss_latency_sigma_s = {max(round(lag.sigma_s, 3), 0.02)}\n"
-        return Check(what, State.MISFIT, found, (Cause(MisfitCause.LATENCY),), lines, "append to the vehicle file")
-    causes = (Cause(MisfitCause.STAMPED_LATE if latency_s < 0 else MisfitCause.STAMPED_EARLY),)
+        return misfit(what, found, MisfitCause.LATENCY, lines=lines, into=VEHICLE_FILE)
+    code = MisfitCause.STAMPED_LATE if latency_s < 0 else MisfitCause.STAMPED_EARLY
     if lag.stream == "reference":
         # The judge believes the reference: nobody should shift it to where the positions want it.
-        return Check(what, State.MISFIT, found, causes, advice="Find out which clock is wrong before one is corrected.")
-    return Check(what, State.MISFIT, found, causes, correction(lag.stream, shift_s=latency_s))
+        return misfit(what, found, code, advice="Find out which clock is wrong before one is corrected.")
+    return misfit(what, found, code, lines=correction(lag.stream, shift_s=latency_s))

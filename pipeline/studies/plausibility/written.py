@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.stages.track.geodesy import points_of
 from pipeline.studies.plausibility.causes import COORDINATE_MISTAKES, CoordinateMistake
-from pipeline.studies.plausibility.check import Cause, Check, State, Whose, correction, not_checked
+from pipeline.studies.plausibility.check import Cause, Check, State, Whose, correction, misfit, not_checked
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.records import Places
 from schemas.arrays import Floats, floats
@@ -38,7 +38,7 @@ def written_checks(of: Recording) -> list[Check]:
         causes, advice = (Cause(mistake.code),), "Mend the columns of the site's track."
         return [Check(_WHAT, State.IMPOSSIBLE, words, causes, advice=advice, whose=Whose(MisfitPlace.IN_SURVEY))]
     advice = "Check that run and site belong together, and axes and datum of both."
-    return [Check(_WHAT, State.MISFIT, words, (Cause(MisfitCause.OTHER_PLACE),), advice=advice)]
+    return [misfit(_WHAT, words, MisfitCause.OTHER_PLACE, advice=advice)]
 
 
 def _without_survey(of: Recording, recorded: dict[str, bool]) -> list[Check]:
@@ -69,12 +69,13 @@ def _lines(stream: str, mistake: CoordinateMistake) -> str:
 
 
 def _witnesses(of: Recording) -> dict[str, bool]:
-    """What of the run's other streams fits its positions, by name; without those that tell nothing."""
+    """What of the run's other streams fits its positions, by name; without those that show nothing."""
     found: dict[str, bool] = {}
-    if told := [pair for pair in of.pairs.values() if pair.told]:
-        found["odometer"] = any(pair.constant > 0.5 and pair.near_one for pair in told)
+    limit = of.config.scale_limit
+    if known := [pair for pair in of.pairs.values() if pair.known]:
+        found["odometer"] = any(pair.constant > 0.5 and abs(abs(pair.factor) - 1.0) <= limit for pair in known)
     if of.velocity is not None:
-        found["velocity"] = of.velocity.best == 0 and abs(of.velocity.ratio - 1.0) <= of.config.scale_limit
+        found["velocity"] = of.velocity.best == 0 and abs(of.velocity.ratio - 1.0) <= limit
     if of.reference is not None:
         far_m = _apart_m(of.gnss, of.reference.latitude_deg, of.reference.longitude_deg)
         found["reference"] = far_m < of.config.same_line_m

@@ -89,14 +89,6 @@ def test_a_copy_is_told(run: RunLog, change: Changed, said: str) -> None:
     assert said in found
 
 
-def test_how_near_stamps_are_the_same_is_configuration(run: RunLog) -> None:
-    gnss = _gnss(run)
-    later = _later(0.25)(_copied(gnss))
-    (told,), (same,) = _copies(gnss, later), _copies(gnss, later, config=PlausibilityConfig(same_stamp_s=0.3))
-    assert "at stamps" in told
-    assert "at stamps" not in same
-
-
 def test_an_independent_reference_is_none(run: RunLog) -> None:
     """Truth without noise and RTK of 2 cm, in many and in few digits, beside positions of 1 m and of 1 cm."""
     assert run.reference is not None
@@ -138,8 +130,6 @@ def test_positions_without_errors_may_equal_the_truth() -> None:
     site = Site(track, Links.create_empty(), None, None)
     assert _copies(gnss, _copied(gnss), site) == []
     assert len(_copies(_moved(gnss, 0.5), _copied(_moved(gnss, 0.5)), site)) == 1
-    near = PlausibilityConfig(without_error=0.9)
-    assert _copies(_moved(gnss, 0.5), _copied(_moved(gnss, 0.5)), site, near) == []
 
 
 def test_a_run_with_a_copy_fails_or_is_unproven() -> None:

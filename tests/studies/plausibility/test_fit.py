@@ -106,14 +106,14 @@ def test_a_run_at_constant_speed_tells_no_clock() -> None:
     ],
 )
 def test_causes_of_lags(lag_s: float, causes: list[tuple[str, ...]]) -> None:
-    explained = explain_lag(lag_s, NOON_NS, 0.5, PlausibilityConfig())
+    explained = explain_lag(lag_s, NOON_NS, 0.5)
     assert explained is not None
     assert [(cause.code, *cause.figures) for cause in explained.causes] == causes
     assert abs(explained.exact - lag_s) < 2.0
 
 
 def test_leap_seconds_are_those_of_the_day() -> None:
-    in_2014 = explain_lag(16.0, 1_400_000_000 * 10**9, 0.1, PlausibilityConfig())
+    in_2014 = explain_lag(16.0, 1_400_000_000 * 10**9, 0.1)
     assert in_2014 is not None
     assert in_2014.exact == 16
 
@@ -122,14 +122,14 @@ def test_leap_seconds_are_those_of_the_day() -> None:
     ("factor", "speed", "cause"), [(3.5, True, "km/h"), (1.95, True, "knots"), (0.00101, False, "km")]
 )
 def test_causes_of_factors(factor: float, speed: bool, cause: str) -> None:
-    explained = explain_factor(factor, speed, PlausibilityConfig())
+    explained = explain_factor(factor, speed)
     assert explained is not None
     assert explained.causes == (Cause(MisfitCause.UNIT, (cause,)),)
 
 
 @pytest.mark.parametrize("factor", [1.03, 0.95, 1.3, 2.6])
 def test_no_unit_makes_these_factors(factor: float) -> None:
-    assert explain_factor(factor, True, PlausibilityConfig()) is None
+    assert explain_factor(factor, True) is None
 
 
 def test_a_replay_of_an_impossible_run_fails_or_is_unproven() -> None:
