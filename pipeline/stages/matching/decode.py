@@ -60,7 +60,8 @@ class Decoded:
 
 def decode(trellis: Trellis, best: Ints) -> Decoded:
     """Follow the best states over the network, elements without any fix included."""
-    oriented, place = trellis.oriented[best], trellis.place_m[best]
+    oriented = trellis.oriented[best]
+    place = trellis.place_m[best]
     chains = [LegElements((int(oriented[0]),), 0)]
     leg = np.zeros(len(best), dtype=np.int64)
     number = np.zeros(len(best), dtype=np.int64)
@@ -70,9 +71,12 @@ def decode(trellis: Trellis, best: Ints) -> Decoded:
     places = oriented[steps - 1], place[steps - 1], oriented[steps], place[steps]
     moves = best_moves(trellis.network, *places, trellis.ways.along(steps, places[0]), trellis.config)
     for step, move in zip(steps.tolist(), moves, strict=True):
-        leg[before:step], number[before:step], before = len(chains) - 1, at, step
+        leg[before:step] = len(chains) - 1
+        number[before:step] = at
+        before = step
         at = _follow(chains, at, move, int(oriented[step]))
-    leg[before:], number[before:] = len(chains) - 1, at
+    leg[before:] = len(chains) - 1
+    number[before:] = at
     return Decoded(tuple(chains), leg, number, place)
 
 
@@ -123,7 +127,8 @@ def _follow(chains: list[LegElements], at: int, move: Move | None, other: int) -
         chains.append(LegElements((other,), number))
         return number
     for oriented in (*move.between, other) if move.sense else ():
-        chain, number = chains[-1], at + move.sense
+        chain = chains[-1]
+        number = at + move.sense
         if not chain.low <= number <= chain.high:
             chains[-1] = _extended(chain, oriented, move.sense)
         elif chain.oriented[number - chain.low] != oriented:

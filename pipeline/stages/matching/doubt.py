@@ -64,7 +64,8 @@ def stretches(
     `pinned`: per epoch the element that a balise read proves, -1 without one.
     """
     probability = np.minimum(doubt.posterior, doubt.gate)
-    epoch, ids = trellis.steps.epoch, trellis.network.track.ids
+    epoch = trellis.steps.epoch
+    ids = trellis.network.track.ids
     rows = []
     for begin, last in spans_of(probability < config.ambiguity_probability):
         end = last + 1

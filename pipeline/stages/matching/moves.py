@@ -58,7 +58,8 @@ def move_scores(
     """
     ahead_m, ahead_barred, behind_m, behind_barred = _network_distances(network, one, other, way.limit_m)
     length = network.track.length_m
-    left_m, other_left_m = length[one // 2] - one_m, length[other // 2] - other_m
+    left_m = length[one // 2] - one_m
+    other_left_m = length[other // 2] - other_m
     stay = np.where(one == other, distance_scores(other_m - one_m, way, config), -np.inf)
     ahead = distance_scores(left_m + ahead_m + other_m, way, config) - config.barred_cost * ahead_barred
     behind = distance_scores(-(one_m + behind_m + other_left_m), way, config) - config.barred_cost * behind_barred

@@ -158,7 +158,9 @@ def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig)
     usable = np.cumsum(fixes.valid)
     after = np.flatnonzero(np.diff(usable[believed]) > 1) + 1
     size = np.linalg.norm(fixes.points.surface[believed[after]] - fixes.points.surface[believed[after - 1]], axis=1)
-    t_s, begin_s, end_s = fixes.t_s[steps.epoch], fixes.t_s[believed[after - 1]], fixes.t_s[believed[after]]
+    t_s = fixes.t_s[steps.epoch]
+    begin_s = fixes.t_s[believed[after - 1]]
+    end_s = fixes.t_s[believed[after]]
     first = np.searchsorted(t_s, begin_s - config.jump_aside_s)
     last = np.searchsorted(t_s, end_s + config.jump_aside_s, side="right")
     aside_m = np.zeros(len(steps))

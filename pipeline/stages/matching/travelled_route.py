@@ -86,7 +86,8 @@ def _rivals(match: Match, rows: Ints, least: float) -> str:
     if len(rows) == 0:
         return ""
     highest = _highest(match.posterior, int(rows[0]), int(rows[-1]))
-    ids, own = match.path.track.ids, set(match.path.elements())
+    ids = match.path.track.ids
+    own = set(match.path.elements())
     order = sorted((-probability, ids[element]) for element, probability in highest.items())
     return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in own)
 

@@ -81,11 +81,14 @@ class Trellis:
     def moves(self, numbers: slice) -> list[tuple[Terms, Ints]]:
         """Of some steps of `pairs`: the terms `[coefficient, before, after, scale]`, and by which end moves enter."""
         part = slice(int(self.pairs.first[numbers.start]), int(self.pairs.first[numbers.stop]))
-        one, other, score = self.pairs.one[part], self.pairs.other[part], self.pairs.score[part]
+        one = self.pairs.one[part]
+        other = self.pairs.other[part]
+        score = self.pairs.score[part]
         known = np.isfinite(score)
         terms = np.where(known[:, None], self._terms(one, other), self.initial[:, other])
         terms[0] += np.where(known, score, BREAK)[:, None]
-        steps, cuts = self.pairs.steps[numbers], self.pairs.first[numbers.start + 1 : numbers.stop] - part.start
+        steps = self.pairs.steps[numbers]
+        cuts = self.pairs.first[numbers.start + 1 : numbers.stop] - part.start
         count = np.diff(self.first)
         shapes = zip(count[steps - 1].tolist(), count[steps].tolist(), strict=True)
         split = np.split(terms, cuts, axis=1)
@@ -158,7 +161,8 @@ def _states(network: Network, candidates: Candidates, steps: int) -> States:
     usable = np.array(network.usable)
     both = np.column_stack([2 * candidates.element, 2 * candidates.element + 1])
     index = np.flatnonzero(usable[both].ravel())
-    oriented, candidate = both.ravel()[index], index // 2
+    oriented = both.ravel()[index]
+    candidate = index // 2
     backward = (oriented % 2).astype(bool)
     along = candidates.along_m[candidate]
     length = network.track.length_m[candidates.element[candidate]]
@@ -190,7 +194,8 @@ def _stays(network: Network, steps: Steps, states: States, config: MatchingConfi
     way = np.fmax(np.abs(steps.odometer_m), steps.chord_m)
     stays = _unchanged(states) & (np.nan_to_num(way, nan=np.inf) <= config.long_step_m)
     apart: dict[tuple[int, ...], bool] = {}
-    oriented, first = states.oriented.tolist(), states.first.tolist()
+    oriented = states.oriented.tolist()
+    first = states.first.tolist()
     for step in np.flatnonzero(stays).tolist():
         group = tuple(oriented[first[step] : first[step + 1]])
         if group not in apart:
@@ -211,7 +216,8 @@ def _pairs(network: Network, states: States, steps: Ints, ways: StepDistances, c
     count = np.diff(states.first)
     sizes = count[steps - 1] * count[steps]
     begin = np.concatenate([[0], np.cumsum(sizes)])
-    number, width = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes), np.repeat(count[steps], sizes)
+    number = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes)
+    width = np.repeat(count[steps], sizes)
     one = np.repeat(states.first[steps - 1], sizes) + number // width
     other = np.repeat(states.first[steps], sizes) + number % width
     places = states.oriented[one], states.place_m[one], states.oriented[other], states.place_m[other]
@@ -228,14 +234,16 @@ def _before(states: States, stays: Bools, pairs: Pairs) -> Ints:
     count, step = _counted(states.first)
     before = np.where(stays[step], np.arange(len(step)) - count[step], -1).tolist()
     possible = np.flatnonzero(np.isfinite(pairs.score))
-    one, other = pairs.one[possible], pairs.other[possible]
+    one = pairs.one[possible]
+    other = pairs.other[possible]
     cost = np.abs(states.offset_m[other] - states.offset_m[one]) - pairs.score[possible]
     order = np.lexsort((cost, other))
     leading: dict[int, list[tuple[int, float]]] = {}
     for origin, state, own in zip(one[order].tolist(), other[order].tolist(), cost[order].tolist(), strict=True):
         leading.setdefault(state, []).append((origin, own))
     offset_m = states.offset_m.tolist()
-    begun, aside_m = step.tolist(), [0.0] * len(before)
+    begun = step.tolist()
+    aside_m = [0.0] * len(before)
     for state, origin in enumerate(before):
         if state in leading:
             origin = min(leading[state], key=lambda way: (begun[way[0]], aside_m[way[0]] + way[1]))[0]

@@ -177,13 +177,15 @@ def _way_over(
 
     links = [link]
     while links[-1].there not in ends:
-        here, at = links[-1].there, links[-1].at
+        here = links[-1].there
+        at = links[-1].at
         onward = nearest([one for one in here.after if one.there in alive and one.at >= at])
         if onward is None:
             return None
         links.append(onward)
     while links[0].here not in begins:
-        there, at = links[0].here, links[0].at
+        there = links[0].here
+        at = links[0].at
         before = nearest([one for one in there.before if one.here in alive and one.at <= at])
         if before is None:
             return None
