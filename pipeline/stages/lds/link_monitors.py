@@ -175,9 +175,17 @@ def _order_reasons(journey: Journey, disabled: bool) -> pl.Series:
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
     before[known[1:]] = known[:-1]
-    at_end = _distance_reasons(journey, disabled)
-    at_begin = at_end.gather(before)
-    return first_reason((at_end.is_not_null(), at_end), (before < 0, FIRST_EPOCH), (at_begin.is_not_null(), at_begin))
+    odometer = np.isfinite(journey.odometer_m)
+    sigma = np.isfinite(journey.sigma_m)
+    return first_reason(
+        (np.full(before.size, disabled), DISABLED),
+        (~odometer, NO_ODOMETER),
+        (~journey.positioned, NO_POSITION),
+        (before < 0, FIRST_EPOCH),
+        (~odometer[before], NO_ODOMETER),
+        (journey.ambiguous | journey.ambiguous[before], AMBIGUOUS),
+        (~(sigma & sigma[before]), NO_SIGMA),
+    )
 
 
 def _distance_reasons(journey: Journey, disabled: bool) -> pl.Series:
