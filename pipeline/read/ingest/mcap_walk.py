@@ -16,8 +16,17 @@ from mcap import records
 from mcap.opcode import Opcode
 
 from pipeline.read.ingest.mcap_block import Allowance, Block, Piece, block_of, piece_of_chunk, piece_of_messages
-from pipeline.read.ingest.mcap_model import Channel, Schema
-from pipeline.read.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, DamageError, parse, parse_message_index, unpacked
+from pipeline.read.ingest.mcap_records import (
+    HEAD,
+    HEAD_SIZE,
+    MAGIC,
+    Channel,
+    DamageError,
+    Schema,
+    parse,
+    parse_message_index,
+    unpacked,
+)
 from pipeline.read.ingest.mcap_summary import Met, Summary
 
 _AFTER_THE_DATA = (
@@ -34,7 +43,7 @@ _SLACK = 1024 * 1024  # what does not compress grows a little
 
 
 class McapWalk:
-    """Walks a log once; `blocks` yields its messages, the attributes tell what was met so far."""
+    """Walks a log once; `blocks` yields its messages, the attributes hold what was met so far."""
 
     def __init__(self, stream: IO[bytes], size: int, file: str, chunk_limit: int) -> None:
         self.channels: dict[int, Channel] = {}
@@ -160,10 +169,13 @@ class McapWalk:
         return self._read(position + HEAD_SIZE, length)
 
     def _check_length(self, opcode: int, length: int, position: int) -> None:
-        limit = self._limit + _SLACK
-        if length > limit:
-            told = f"over the limit of {limit} ([ingest] chunk_limit_mib)"
-            raise DamageError(position, f"a record of opcode {opcode} declares {length} bytes, {told}")
+        self._check_size(f"a record of opcode {opcode}", length, self._limit + _SLACK, position)
+
+    @staticmethod
+    def _check_size(what: str, size: int, limit: int, position: int) -> None:
+        if size > limit:
+            over = f"over the limit of {limit} ([ingest] chunk_limit_mib)"
+            raise DamageError(position, f"{what} declares {size} bytes, {over}")
 
     def _definition(self, opcode: int, body: bytes, position: int) -> None:
         """A schema or channel; definitions are repeated in every chunk and in the summary."""
@@ -193,15 +205,15 @@ class McapWalk:
     def _chunk(self, body: bytes, position: int) -> int:
         """The messages of a chunk; the position behind it and the message indexes that follow it."""
         chunk = parse(records.Chunk, body, position)
-        if (size := chunk.uncompressed_size) > self._limit:
-            told = f"a chunk declares {size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
-            raise DamageError(position, told)
+        size = chunk.uncompressed_size
+        self._check_size("a chunk", size, self._limit, position)
         end = position + HEAD_SIZE + len(body)
         if not chunk.uncompressed_crc and size:  # that of nothing is 0
             self._bare_chunks.extend((end - len(chunk.data), end))
             self.without_crc += 1
         self.met.add_chunk(chunk, position, HEAD_SIZE + len(body))
-        content, (indexes, end) = unpacked(chunk, position), self._indexes(end, position, size)
+        content = unpacked(chunk, position)
+        indexes, end = self._indexes(end, position, size)
         self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes))
         return end
 
@@ -242,7 +254,9 @@ class McapWalk:
 
     def _block(self) -> Block:
         """The messages that wait."""
-        pieces, self._pieces, self._waiting = self._pieces, [], 0
+        pieces = self._pieces
+        self._pieces = []
+        self._waiting = 0
         block = block_of(pieces, self._ordinal)
         for channel_id, messages in block.items():
             if channel_id not in self.channels:
@@ -257,7 +271,7 @@ class McapWalk:
     def _data_end(self, crc: int, end: int) -> None:
         """The checksum over the whole data section, which few recorders write.
 
-        The Rust writer leaves the contents of chunks out of it when it is told to give chunks no checksums.
+        The Rust writer leaves the contents of chunks out of it where chunks have no checksums.
         """
         if not crc:
             return
@@ -270,11 +284,12 @@ class McapWalk:
 
     def _crc_of(self, end: int, left_out: array[int]) -> int:
         """CRC-32 of the file up to `end`, without some parts (each from and to)."""
-        crc, at = 0, 0
+        crc = at = 0
         for stop, resume in zip([*left_out[::2], end], [*left_out[1::2], end], strict=True):
             while at < stop:
                 piece = self._read(at, min(stop - at, _SLACK))
-                crc, at = crc32(piece, crc), at + len(piece)
+                crc = crc32(piece, crc)
+                at += len(piece)
             at = resume
         return crc
 

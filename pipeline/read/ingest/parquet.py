@@ -7,8 +7,7 @@ from collections.abc import Iterable
 
 import polars as pl
 
-from pipeline.read.ingest.breaches import refuse
-from pipeline.read.ingest.conform import conform
+from pipeline.read.ingest.conform import conform, refuse
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
 from pipeline.storage.parquet import ParquetError, Schema, read_parquet, without_checksums
@@ -67,9 +66,9 @@ def _read(content: bytes, stream: Stream, place: str, breaches: list[InputError]
     contract = STREAM_SCHEMAS[stream].columns()
     met: Schema = {}
 
-    def known(found: Schema) -> list[str]:
-        met.update(found)
-        return [name for name in found if name in contract]
+    def known(schema: Schema) -> list[str]:
+        met.update(schema)
+        return [name for name in schema if name in contract]
 
     try:
         frame = read_parquet(content, known)
