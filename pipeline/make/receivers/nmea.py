@@ -50,7 +50,8 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
         epoch.t_ns = _time_ns(message.date, message.time)
     elif message.msgID == "ZDA" and (day := _date_of(message)):
         epoch.t_ns = _time_ns(day, message.time)
-    _DECODERS[message.msgID](epoch, message)
+    if message.msgID in _DECODERS:
+        _DECODERS[message.msgID](epoch, message)
 
 
 def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
@@ -149,10 +150,6 @@ def _correlation(m: Any) -> dict[str, float]:
     return {"cov_en_m2": shared if abs(shared) <= m.stdLat * m.stdLong else 0.0}
 
 
-def _nothing(_epoch: Epoch, _m: Any) -> None:
-    """ZDA gives only the date."""
-
-
 _POSITIONS = ("GGA", "GNS", "RMC")
 _WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA")
 _DECODERS = {
@@ -160,5 +157,4 @@ _DECODERS = {
     "GNS": _position_of_systems,
     "RMC": _motion,
     "GST": _accuracy,
-    "ZDA": _nothing,
 }

@@ -47,6 +47,9 @@ def unpacked(log: Path) -> Iterator[list[Path]]:
 def _unpack(log: Path, place: Path) -> None:
     if log.suffix.lower() == ".zip":
         with zipfile.ZipFile(log) as archive:
+            names = archive.namelist()
+            if len(set(names)) < len(names):
+                raise OSError("two of its files have the same name")
             archive.extractall(place)
         return
     with gzip.open(log) as packed, (place / log.stem).open("wb") as plain:

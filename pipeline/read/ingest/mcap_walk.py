@@ -56,7 +56,6 @@ class McapWalk:
         self._file = file
         self._limit = chunk_limit
         self._schemas: dict[int, Schema] = {}
-        self._definitions: dict[int, records.Channel] = {}
         self._known: set[bytes] = set()
         self._pieces: list[Piece] = []
         self._waiting = 0
@@ -165,17 +164,8 @@ class McapWalk:
 
     def _body(self, opcode: int, length: int, position: int) -> bytes:
         """No record that is loaded whole may be larger than a chunk."""
-        self._check_length(opcode, length, position)
+        _check_size(f"a record of opcode {opcode}", length, self._limit + _SLACK, position)
         return self._read(position + HEAD_SIZE, length)
-
-    def _check_length(self, opcode: int, length: int, position: int) -> None:
-        self._check_size(f"a record of opcode {opcode}", length, self._limit + _SLACK, position)
-
-    @staticmethod
-    def _check_size(what: str, size: int, limit: int, position: int) -> None:
-        if size > limit:
-            over = f"over the limit of {limit} ([ingest] chunk_limit_mib)"
-            raise DamageError(position, f"{what} declares {size} bytes, {over}")
 
     def _definition(self, opcode: int, body: bytes, position: int) -> None:
         """A schema or channel; definitions are repeated in every chunk and in the summary."""
@@ -194,19 +184,19 @@ class McapWalk:
 
     def _channel(self, body: bytes, position: int) -> None:
         record = parse(records.Channel, body, position)
-        if self._definitions.setdefault(record.id, record) != record:
-            raise DamageError(position, f"channel {record.id} ({record.topic}) is defined twice with different content")
-        if record.schema_id and record.schema_id not in self._schemas:
-            raise DamageError(position, f"schema {record.schema_id} of topic {record.topic} is missing")
         schema = self._schemas.get(record.schema_id)
-        if record.id not in self.channels:
-            self.channels[record.id] = Channel(record.id, record.topic, record.message_encoding, schema, self._file)
+        channel = Channel(record.id, record.topic, record.message_encoding, schema, self._file)
+        if self.channels.get(record.id, channel) != channel:
+            raise DamageError(position, f"channel {record.id} ({record.topic}) is defined twice with different content")
+        if record.schema_id and schema is None:
+            raise DamageError(position, f"schema {record.schema_id} of topic {record.topic} is missing")
+        self.channels[record.id] = channel
 
     def _chunk(self, body: bytes, position: int) -> int:
         """The messages of a chunk; the position behind it and the message indexes that follow it."""
         chunk = parse(records.Chunk, body, position)
         size = chunk.uncompressed_size
-        self._check_size("a chunk", size, self._limit, position)
+        _check_size("a chunk", size, self._limit, position)
         end = position + HEAD_SIZE + len(body)
         if not chunk.uncompressed_crc and size:  # that of nothing is 0
             self._bare_chunks.extend((end - len(chunk.data), end))
@@ -240,7 +230,7 @@ class McapWalk:
 
     def _loose_messages(self, length: int, position: int) -> int:
         """Messages outside of chunks, some at once; the position behind them."""
-        self._check_length(Opcode.MESSAGE, length, position)
+        _check_size("a message", length, self._limit + _SLACK, position)
         several = min(_LOOSE, self._size - position)
         piece = piece_of_messages(self._read(position, max(HEAD_SIZE + length, several)), position)
         self.without_crc += position != self._loose_until  # one for all that follow each other
@@ -320,3 +310,9 @@ class McapWalk:
             raise DamageError(
                 end + len(MAGIC), "there is data after the end of the file: two files may have been joined"
             )
+
+
+def _check_size(what: str, size: int, limit: int, position: int) -> None:
+    if size > limit:
+        over = f"over the limit of {limit} ([ingest] chunk_limit_mib)"
+        raise DamageError(position, f"{what} declares {size} bytes, {over}")
