@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.read.ingest.conform import conform, refuse
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
-from pipeline.storage.parquet import ParquetError, Schema, read_parquet, without_checksums
+from pipeline.storage.parquet import ColumnTypes, ParquetError, read_parquet, without_checksums
 from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -64,11 +64,11 @@ def _read(content: bytes, stream: Stream, place: str, breaches: list[InputError]
         breaches.append(InputError("is empty", place=place, found="0 bytes", expected="a Parquet file"))
         return None
     contract = STREAM_SCHEMAS[stream].columns()
-    met: Schema = {}
+    met: ColumnTypes = {}
 
-    def known(schema: Schema) -> list[str]:
-        met.update(schema)
-        return [name for name in schema if name in contract]
+    def known(types: ColumnTypes) -> list[str]:
+        met.update(types)
+        return [name for name in types if name in contract]
 
     try:
         frame = read_parquet(content, known)
