@@ -54,6 +54,9 @@ class StreamMapping(Settings):
     solution: str = "primary"
 
 
+Shift = Annotated[Number, Field(ge=-1e6, le=1e6)]  # [m]
+
+
 class StreamCorrection(Settings):
     """Corrections of a recorded stream, made right after reading, for any kind of file.
 
@@ -65,10 +68,10 @@ class StreamCorrection(Settings):
     solution: str | None = None
     exchange: tuple[str, str] | None = None
     factors: dict[str, Number] = {}
-    shift_s: Number = 0.0
-    shift_east_m: Number = 0.0
-    shift_north_m: Number = 0.0
-    shift_up_m: Number = 0.0
+    shift_s: Annotated[Number, Field(ge=-9e9, le=9e9)] = 0.0  # what 64 bits of nanoseconds hold
+    shift_east_m: Shift = 0.0
+    shift_north_m: Shift = 0.0
+    shift_up_m: Shift = 0.0
 
 
 class IngestConfig(Settings):
