@@ -16,7 +16,9 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
     Null where the reference is silent, and where the position is farther ahead or behind than the failure limit: a
     curve goes aside by metres over such a way, and a slope up.
     """
-    fixes, reference, at_ns = case.solution.fixes, case.reference, case.instants_of_epochs()
+    fixes = case.solution.fixes
+    reference = case.reference
+    at_ns = case.instants_of_epochs()
     across, up = np.full(at_ns.size, np.nan), np.full(at_ns.size, np.nan)
     if reference is not None and reference.height >= 2:
         stamps = times_ns(reference)
@@ -38,7 +40,5 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
         near = np.abs(along_m) <= case.config.hazards.failure_limit_m
         across[rows] = np.where(near, left_m, np.nan)
         up[rows] = np.where(near, (floats(fixes, "height_m") - height)[rows], np.nan)
-    return [
-        pl.Series("error_cross_m", across, nan_to_null=True),
-        pl.Series("error_up_m", up, nan_to_null=True),
-    ]
+    names = ("error_cross_m", "error_up_m")
+    return [pl.Series(name, values, nan_to_null=True) for name, values in zip(names, (across, up), strict=True)]

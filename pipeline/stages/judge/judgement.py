@@ -151,12 +151,12 @@ def judgements_of(case: Case, positions: MatchedPositions, at_ns: Ints, evidence
 def judge_positions(
     positions: MatchedPositions, evidence: EvidenceSet, legs: Sequence[Route], config: HazardConfig
 ) -> Judgements:
-    """Wrong where it is wrong wherever the train may have been, right where it is right wherever it may have been.
+    """Wrong, or right, where it is so wherever the train may have been; `legs`: of the path, coordinate `path_m`.
 
-    `legs`: of the solution's own path, coordinate `path_m`. The interval spans the tracks on which the place along the
-    track can be compared.
+    The interval spans the tracks on which the place along the track can be compared.
     """
-    size, limit_m = positions.element.size, config.failure_limit_m
+    size = positions.element.size
+    limit_m = config.failure_limit_m
     low_m, high_m = np.full(size, np.inf), np.full(size, -np.inf)
     right, ahead, behind, elsewhere = (np.ones(size, dtype=np.bool_) for _ in range(4))
     judged = np.zeros(size, dtype=np.bool_)
@@ -216,12 +216,13 @@ def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs
 def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence[Route]) -> _Relative:
     """Where the train's place lies on the path of the solution too.
 
-    Where the track of the evidence goes on as far as the position is ahead or behind, and on another net element than
-    the position's, the position is on another track.
+    If the track of the evidence covers the place so far ahead or behind, the position is on another track.
     """
-    rows, middle_m = there.rows, there.middle_m
+    rows = there.rows
+    middle_m = there.middle_m
     element, measure_m, sense = there.route.locate(middle_m)
-    path_m, train_m = positions.path_m[rows], np.full(rows.size, np.nan)
+    path_m = positions.path_m[rows]
+    train_m = np.full(rows.size, np.nan)
     along = np.zeros(rows.size, dtype=np.int64)
     for number, leg in enumerate(legs):
         part = np.flatnonzero(positions.leg[rows] == number)

@@ -17,10 +17,9 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class OdometerSteps:
-    """From each epoch to the next: the odometer counted throughout (`counts`), and shows movement (`moves`).
+    """From each epoch to the next: the odometer `counts` throughout, and `moves`.
 
-    `stood`: times [ns] in which it stands while positions leave their place by more than the failure limit; nobody
-    knows by it whether the train moved there.
+    `stood`: times [ns] in which it stands while positions leave their place by more than the failure limit.
     """
 
     moves: Bools
@@ -29,13 +28,15 @@ class OdometerSteps:
 
 
 def odometer_steps(case: Case) -> OdometerSteps:
-    at_ns, odometry = case.instants_of_epochs(), case.odometry
+    at_ns = case.instants_of_epochs()
+    odometry = case.odometry
     if odometry is None:
         nothing = np.zeros(at_ns.size, dtype=np.bool_)
         return OdometerSteps(nothing, nothing)
     moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
     counts = _to_the_next(np.isfinite(odometry.between(at_ns[:-1], at_ns[1:]).distance_m), at_ns.size)
-    path_m, limit_m = floats(case.solution.epochs, "path_m"), case.config.hazards.failure_limit_m
+    path_m = floats(case.solution.epochs, "path_m")
+    limit_m = case.config.hazards.failure_limit_m
     stood: list[Span] = []
     for first, last in spans_of(counts & ~moves):
         rows = slice(first, min(last + 2, at_ns.size))
@@ -50,8 +51,8 @@ def travel_direction(
 ) -> Ints:
     """Direction of travel along growing path, 1 or -1, per epoch; `direction`: as the train took it.
 
-    Without an odometer it is that of the train's own place, where the evidence gives it: a position that jumps back
-    does not turn the train. With one it is the odometer's, unless the reference shows that it counts up in reverse.
+    Without an odometer it is that of the train's place by the evidence: a position that jumps back does not turn the
+    train. With one it is the odometer's, unless the reference shows that it counts up in reverse.
     """
     train_m = path_m - along.known_m(config.known_error_m)
     moved_m, noise_m, _ = _moved_m(at_ns, train_m, along.half_m, config.turn_s)
@@ -78,8 +79,7 @@ def moving(
 ) -> pl.Series:
     """Per epoch whether the train moves to the next one, null where neither reference nor odometer knows.
 
-    By the reference (`reference_m` +- `half_m`) it moves where it comes farther over a second than the dead band and
-    the noise of both places allow; that also counts where the odometer stands (`stood`) or is silent.
+    By the reference (`reference_m` +- `half_m`) it does where its way over a second exceeds dead band and noise.
     """
     moved_m, noise_m, elapsed_s = _moved_m(at_ns, reference_m, half_m, config.align.speed_window_s)
     with np.errstate(invalid="ignore"):
@@ -105,7 +105,8 @@ def _to_the_next(steps: Bools, size: int) -> Bools:
 def odometer_wrong(case: Case, train_m: Floats, half_m: Floats) -> Bools:
     """Epochs at which the distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""
     epochs = case.solution.epochs
-    odometer_m, accepted_ns = floats(epochs, "odometer_m"), times_ns(case.solution.accepted)
+    odometer_m = floats(epochs, "odometer_m")
+    accepted_ns = times_ns(case.solution.accepted)
     return beyond_confidence(times_ns(epochs), odometer_m, train_m, half_m, accepted_ns, case.config.lds)
 
 
@@ -136,7 +137,8 @@ def beyond_confidence(
 
 def speed_at(epochs: pl.DataFrame, t_ns: Ints) -> Floats:
     """Speed [m/s] by the epochs around each instant; NaN where no epoch knows it."""
-    speed_mps, stamps_ns = np.abs(floats(epochs, "speed_mps")), times_ns(epochs)
+    speed_mps = np.abs(floats(epochs, "speed_mps"))
+    stamps_ns = times_ns(epochs)
     known = np.isfinite(speed_mps)
     if not known.any():
         return np.full(t_ns.size, np.nan)
