@@ -112,17 +112,18 @@ def _every(t_ns: Ints, step_s: float) -> Ints:
     return np.unique(np.searchsorted(t_ns, instants))
 
 
-def reference_lag(found: Sequence[Sided], counter: Counter | None) -> Lag:
+def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> Lag:
     """The reference's clock against the odometer's, by its ways of ten seconds."""
-    if not found:
+    if not sides:
         return Lag()
-    begins, ends, ways = (np.concatenate(column) for column in zip(*(_ways(one) for one in found), strict=True))
+    begins, ends, ways = (np.concatenate(column) for column in zip(*(_ways(one) for one in sides), strict=True))
     return lag_of(begins, ends, ways, counter)
 
 
 def _ways(one: Sided) -> tuple[Ints, Ints, Floats]:
     """Begins, ends and lengths of the ways of ten seconds, as the odometer counts up."""
-    path, t_ns = one.stretch.paths[0], one.stretch.t_ns
+    path = one.stretch.paths[0]
+    t_ns = one.stretch.t_ns
     rows = _every(t_ns, _LAG_WINDOW_S)
     whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
     begin, end = rows[:-1][whole], rows[1:][whole]
