@@ -11,7 +11,7 @@ from pipeline.results.figures.undetected import undetected_spread
 from pipeline.stages.run_row.bounds import Estimator, clopper_pearson, poisson_rate, with_estimates
 from pipeline.stages.run_row.independent import independent_episodes
 from pipeline.stages.run_row.run_figures import acceptances, accepted, is_passage, outcomes, spread
-from pipeline.stages.run_row.verdict import DECISIVE, level_rows
+from pipeline.stages.run_row.verdict import DECISIVE, level_rows, reaction_of
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
@@ -72,11 +72,11 @@ def campaign_levels(runs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     With the reaction time of the configuration (none: one epoch) the period of the epochs is the least that any fault
     takes.
     """
-    reaction_s, period_s = config.hazards.reaction_s, 1.0 / pl.col("gnss_rate_hz")
+    period_s = 1.0 / pl.col("gnss_rate_hz")
     needed = runs.select(
         *(*RUN, "evidence", "failures", "hazardous_max_s", *DECISIVE),
         hazardous_may_max_s=pl.col("failure_hazardous_may_s").list.max(),
-        receiver_needs_s=period_s + (period_s if reaction_s is None else reaction_s),
+        receiver_needs_s=period_s + reaction_of(period_s, config),
     )
     rows = [run | level for run in needed.iter_rows(named=True) for level in level_rows(run, config)]
     quick = pl.col("receiver_needs_s") <= pl.col("allowed_s")

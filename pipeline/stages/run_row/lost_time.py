@@ -11,11 +11,9 @@ import polars as pl
 from pipeline.stages.epochs.clock import Clock, confident, may_move, met, unambiguous, usable
 from schemas.arrays import NS_PER_S, Bools, Ints, times_ns
 from schemas.config import Configuration
-from schemas.enums import LdsMode, LostTo, MonitorState, NotEvaluated, Verdict
+from schemas.enums import LdsMode, LostTo, MonitorState, Verdict
 from schemas.tables import MONITORS
 from schemas.words import lost_words
-
-_NOISE = [NotEvaluated.NOISE_UNKNOWN.value, NotEvaluated.NOISE_TOO_LARGE.value]
 
 
 @dataclass(frozen=True)
@@ -74,13 +72,12 @@ def _causes(epochs: pl.DataFrame, gap: Bools, t_ns: Ints, config: Configuration)
     """Conditions in the order in which they apply."""
     negated = met(epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.FAIL_SAFE.value)
     withheld = pl.col("withheld_for").cast(pl.String)
-    noise = (withheld == LostTo.NOISE.value) | pl.col("along_raw_reason").is_in(_NOISE)
     waiting = met(epochs, withheld == LostTo.RELINK.value)
     return {
         LostTo.NO_POSITION: gap | ~met(epochs, usable()),
         LostTo.CONFIDENCE: ~met(epochs, confident(config)),
         LostTo.TRACK_AMBIGUOUS: ~met(epochs, unambiguous(config)),
-        LostTo.NOISE: met(epochs, noise),
+        LostTo.NOISE: met(epochs, withheld == LostTo.NOISE.value),
         LostTo.SLIP: met(epochs, withheld == LostTo.SLIP.value),
         LostTo.RELINK: waiting | (negated & ~_alarmed(epochs, t_ns, config.lds.recovery_s)),
         LostTo.ALARM: negated,
