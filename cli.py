@@ -399,7 +399,7 @@ def calibrate(
     solution: Solution = "primary",
     as_json: Json = False,
 ) -> None:
-    """Measure odometer scale, GNSS latency and the monitors' sigmas on fault-free runs."""
+    """Measure odometer scale, GNSS latency, fast noise and the monitors' sigmas on fault-free runs."""
     from pipeline.campaign import find_runs
     from pipeline.storage import write_bytes
     from pipeline.studies.calibration.calibrate import calibrate as measure
@@ -409,7 +409,7 @@ def calibrate(
     logs = [_log(address, settings) for address in find_runs(runs).values()]
     found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
-    measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors()}
+    measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors}
     tables = {"Scale and latency": found.runs, "Sigma of the monitors": found.sigmas}
     none = "\nNo latency in the vehicle file: only changes of speed show it, and these runs have too few."
     words = [none] if found.vehicle.gnss_latency_s is None else []

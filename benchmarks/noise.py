@@ -122,6 +122,7 @@ def epochs_of(
             "cross_track_m": _written(_errors(receiver, t_s, stated_m, rng), receiver.digits_m),
             "vertical_m": _written(1.5 * _errors(receiver, t_s, stated_m, rng), receiver.digits_m),
             "odometer_m": odometer_m,
+            "travelled_m": odometer_m,
             "sigma_along_m": stated_m,
             "calibrated_up_m": 1.5 * stated_m,
         }

@@ -15,9 +15,8 @@ import polars as pl
 
 from datasets.to_contract import conformed, virtual_balises
 from pipeline.make.receivers import Converted
-from pipeline.make.receivers.csv import CUT_ROW
 from pipeline.read.ingest.conform import rows_text
-from pipeline.read.ingest.csv_text import read_log_table
+from pipeline.read.ingest.csv_text import CUT_ROW, read_log_table
 from pipeline.read.ingest.novatel import FIX_BY_WORD
 from pipeline.read.site.read import read_site
 from schemas.enums import Fix

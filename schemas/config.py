@@ -54,6 +54,9 @@ class StreamMapping(Settings):
     solution: str = "primary"
 
 
+Shift = Annotated[Number, Field(ge=-1e6, le=1e6)]  # [m]
+
+
 class StreamCorrection(Settings):
     """Corrections of a recorded stream, made right after reading, for any kind of file.
 
@@ -65,10 +68,10 @@ class StreamCorrection(Settings):
     solution: str | None = None
     exchange: tuple[str, str] | None = None
     factors: dict[str, Number] = {}
-    shift_s: Number = 0.0
-    shift_east_m: Number = 0.0
-    shift_north_m: Number = 0.0
-    shift_up_m: Number = 0.0
+    shift_s: Annotated[Number, Field(ge=-9e9, le=9e9)] = 0.0  # what 64 bits of nanoseconds hold
+    shift_east_m: Shift = 0.0
+    shift_north_m: Shift = 0.0
+    shift_up_m: Shift = 0.0
 
 
 class IngestConfig(Settings):
@@ -350,8 +353,8 @@ class MonitorConfig(Settings):
     noise_renewal_s: Positive = 10.0
     noise_window_s: Positive = 300.0
     noise_window_lags: Positive = 20.0
-    # Samples of the short lags are no closer: at 10 Hz three times as many would cost much and tell little more.
-    noise_spacing_s: Positive = 0.3
+    # Samples of the short lags are no closer: 300 in the window are enough for the last quantile.
+    noise_spacing_s: Positive = 1.0
     # A lag counts after so many of itself. Longer ones than this take longer than a run lets them: they are expected
     # by how the noise grows over the shorter ones.
     noise_ready_lags: Annotated[Number, Field(gt=2)] = 7.0

@@ -110,9 +110,7 @@ def _calibrated(job: RunJob, sources: Sequence[_Source]) -> RunJob:
 
 
 def _with_calibration(config: Configuration, found: Calibration, runs: tuple[str, ...]) -> Configuration:
-    from pipeline.studies.calibration.calibrate import NO_NOISE
-
-    monitors = config.monitors.model_copy(update=NO_NOISE | found.monitors())
+    monitors = config.monitors.model_copy(update=found.monitors)
     calibration = config.calibration.model_copy(update={"runs": runs})
     return config.model_copy(update={"monitors": monitors, "calibration": calibration})
 

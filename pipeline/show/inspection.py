@@ -9,7 +9,7 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.make.receivers.csv_draft import draft_mapping
+from pipeline.read.ingest.csv_draft import draft_mapping
 from pipeline.read.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.read.site.read import is_geojson, read_site
 from pipeline.results import store

@@ -47,6 +47,12 @@ def read_bytes(path: Address) -> bytes:
         return _local(file, lambda present: _regular(present).read_bytes())
 
 
+def require_regular(path: Address) -> None:
+    """Refuse pipes and devices on this machine."""
+    if not is_url(path):
+        _local(path, _regular)
+
+
 def _regular(path: Path) -> Path:
     """The file, unless it is a pipe or a device: reading one can last for ever."""
     if path.exists() and not (path.is_file() or path.is_dir()):

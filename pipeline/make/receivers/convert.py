@@ -24,6 +24,7 @@ from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked
 from pipeline.read.ingest.breaches import refuse
 from pipeline.read.ingest.conform import conform
 from pipeline.read.ingest.mapping import mappings_of
+from pipeline.storage import files
 from schemas.config import FixSigma, IngestConfig
 from schemas.errors import InputError
 from schemas.run import STREAMS, RunLog, Stream
@@ -86,6 +87,7 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
     failures: list[NoEpochError] = []
     strangers: list[UnknownError] = []
     for log in logs:
+        files.require_regular(log)
         with unpacked(log) as inner:
             for plain in inner:
                 try:
@@ -157,11 +159,10 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None) -> tuple[St
         return read_bag(log, _of_topics(config))
     if log.suffix.lower() == ".csv" or names_file(config, log):
         return read_csv(log, config)
-    try:
-        content = log.read_bytes()
-    except OSError as error:
-        expected = f"a file, or the folder of a bag with its {BAG_FOLDER}" if log.is_dir() else None
-        raise InputError(f"cannot be read: {error.strerror}", place=str(log), expected=expected) from None
+    if log.is_dir():
+        expected = f"a file, or the folder of a bag with its {BAG_FOLDER}"
+        raise InputError("cannot be read: it is a folder", place=str(log), expected=expected)
+    content = files.read_bytes(log)
     if is_solution(content):
         return read_solution(content, log)
     return _read(content, log, date)

@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.make.receivers.csv_times import instants, time_columns
 from pipeline.read.ingest.breaches import refuse
-from pipeline.read.ingest.csv_text import LogTable, read_log_table
+from pipeline.read.ingest.csv_text import CUT_ROW, read_log_table, with_points
 from pipeline.read.ingest.mapping import mappings_of
 from pipeline.read.ingest.mcap_model import Channel
 from pipeline.read.ingest.plan import Sample, Source, mapped_source
@@ -19,21 +19,17 @@ from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import InputError
 from schemas.run import STREAMS, Stream
 
-# Why a row was left out.
-CUT_ROW = "row that breaks off at the end of the file"
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
 _UNITS_ROW = "row of units"
 _SHORT_ROW = "end of a row, which is missing (taken as empty)"
-# What rows of a stream are for. Fewer positions tell no usual step.
+# What rows of a stream are for.
 _VALUES: dict[Stream, tuple[str, ...]] = {
     "gnss": ("latitude_deg", "longitude_deg"),
     "odometer": ("distance_m", "speed_mps"),
     "reference": ("latitude_deg", "longitude_deg"),
     "balise_reads": ("balise_id",),
 }
-_FEWEST = 3
-# Decimal mark, and what may separate thousands beside it.
-_MARKS = {",": "[.'\u2019 \u00a0\u202f]", ".": "[,'\u2019 \u00a0\u202f]"}
+_FEWEST = 3  # positions that show a usual step
 
 
 def names_file(config: IngestConfig, path: Path) -> bool:
@@ -54,7 +50,7 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
         for mapping in mappings_of(config, name):
             if mapping.topic in (path.name, path.stem, "*"):
                 mapped = _mapped(table, mapping, name, path)
-                frame = mapped.filter(_told(mapped, name, "fix" in mapping.fields))
+                frame = mapped.filter(_recorded(mapped, name, "fix" in mapping.fields))
                 empty[f"row without a value of {name}"] += mapped.height - frame.height
                 streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
     if not streams:
@@ -69,48 +65,27 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
     return streams, {reason: count for reason, count in left.items() if count}
 
 
-def _told(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
-    """Rows that tell something of a stream: tables of several recorders leave cells empty.
+def _recorded(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
+    """Rows that hold something of a stream: tables of several recorders leave cells empty.
 
     An empty position may as well be an outage, which a kind of fix would say. Without one it is none where the
     positions around it follow each other as they usually do.
     """
+    every = pl.repeat(True, frame.height, eager=True)
     names = [name for name in _VALUES.get(stream, ()) if name in frame.columns]
     if not names:
-        return pl.repeat(True, frame.height, eager=True)
-    told = frame.select(pl.any_horizontal(pl.col(names).is_not_null())).to_series()
-    if stream != "gnss" or told.sum() < _FEWEST or told.all():
-        return told if stream != "gnss" else pl.repeat(True, frame.height, eager=True)
+        return every
+    filled = frame.select(pl.any_horizontal(pl.col(names).is_not_null())).to_series()
+    if stream != "gnss":
+        return filled
+    if filled.sum() < _FEWEST or filled.all():
+        return every
     t_ns = frame["t"].to_physical().fill_null(0).to_numpy()
-    at = np.sort(t_ns[told.to_numpy()])
-    after = at.searchsorted(t_ns).clip(1, at.size - 1)
+    at = np.sort(t_ns[filled.to_numpy()])
     steps = np.diff(at)
+    after = at.searchsorted(t_ns).clip(1, at.size - 1)
     between = (t_ns > at[0]) & (t_ns < at[-1]) & (steps[after - 1] <= GAP_PERIODS * np.median(steps))
-    return told | has_fix | pl.Series(~between)
-
-
-def with_points(log: LogTable) -> pl.DataFrame:
-    """The table with its numbers as such: those with a decimal comma where no number of the file has a decimal point,
-    and those with separated thousands.
-
-    Between commas, 1,234 in quotes may be a fraction or a thousand and more: such a file must have other numbers too.
-    """
-    texts = log.table.select(pl.col(pl.String).replace("", None))
-    fitting = {mark: {name for name in texts.columns if _fits(texts[name], mark)} for mark in _MARKS}
-    numbers = set.union(*fitting.values())
-    has_point = any(dtype.is_float() for dtype in log.table.schema.values())
-    marks = [mark for mark, names in fitting.items() if names == numbers and not (mark == "," and has_point)]
-    if not marks or (len(marks) == len(_MARKS) and log.separator == ","):
-        return log.table
-    plain = pl.col(sorted(numbers)).replace("", None).str.replace("\u2212", "-").str.replace_all(_MARKS[marks[0]], "")
-    return log.table.with_columns(plain.str.replace(marks[0], ".", literal=True).cast(pl.Float64))
-
-
-def _fits(column: pl.Series, mark: str) -> bool:
-    """Whether every cell is a number with this decimal mark."""
-    whole = rf"(?:\d{{1,3}}(?:{_MARKS[mark]}\d{{3}})+|\d+)"
-    number = rf"^\s*[+\-\u2212]?(?:{whole}(?:[{mark}]\d+)?|[{mark}]\d+)(?:[eE][+-]?\d+)?\s*$"
-    return column.null_count() < len(column) and bool(column.drop_nulls().str.contains(number).all())
+    return filled | has_fix | pl.Series(~between)
 
 
 def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path) -> pl.DataFrame:

@@ -7,24 +7,33 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.stamps import time_source
-from pipeline.read.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
+from pipeline.read.ingest.stamps import (
+    LEAST_DAY,
+    MOST_DAY,
+    gps_ns_of_weeks,
+    orders_of_day,
+    time_source,
+    utc_of,
+    within,
+)
+from pipeline.read.ingest.timescale import WEEK_NS
+from schemas.arrays import NS_PER_S
 from schemas.config import StreamMapping
 from schemas.errors import InputError
 
-# Whole numbers below are seconds, above nanoseconds; between them lie milliseconds and microseconds. More seconds
-# than these do not fit into nanoseconds.
-_MOST_SECONDS, _LEAST_NANOSECONDS = 9 * 10**9, 10**17
-# Before the second of these weeks lies August 1999: smaller numbers are weeks counted modulo 1024.
-_LEAST_WEEK, _MOST_WEEK = 1024, 9999
-# Days of Excel in the years 1954 and 2119.
-LEAST_DAY, MOST_DAY = 20_000, 80_000
+# Whole numbers below are seconds, above nanoseconds; between them lie milliseconds and microseconds.
+_MOST_SECONDS = 9 * 10**9
+_LEAST_NANOSECONDS = 10**17
+# The first of these weeks is in August 1999: smaller numbers are weeks counted modulo 1024.
+_LEAST_WEEK = 1024
+_MOST_WEEK = 9999
 _TEXT = (
-    r"^(?:(?P<y>\d{4})[-/.](?P<ym>\d{1,2})[-/.](?P<yd>\d{1,2})|(?P<a>\d{1,2})[-/.](?P<b>\d{1,2})[-/.](?P<c>\d{4}|\d{2}))"
-    r"[T ,]+(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,](?P<f>\d{1,9})\d*)?)?"
-    r" ?(?P<half>[AaPp][Mm])? ?(?P<zone>Z|[+-]\d{2}:?\d{2})?$"
+    r"^(?:(?P<y>[0-9]{4})[-/.](?P<ym>[0-9]{1,2})[-/.](?P<yd>[0-9]{1,2})"
+    r"|(?P<a>[0-9]{1,2})[-/.](?P<b>[0-9]{1,2})[-/.](?P<c>[0-9]{4}|[0-9]{2}))"
+    r"[T ,]+(?P<h>[0-9]{1,2}):(?P<m>[0-9]{2})(?::(?P<s>[0-9]{2})(?:[.,](?P<f>[0-9]{1,9})[0-9]*)?)?"
+    r" ?(?P<half>[AaPp][Mm])? ?(?P<zone>Z|[+-][0-9]{2}:?[0-9]{2})?$"
 )
-FORMS = "2025-06-01T12:00:00.25, 01.06.2025 12:00:00, 6/1/2025 1:00 PM, or numbers"
+_FORMS = "2025-06-01T12:00:00.25, 01.06.2025 12:00:00, 6/1/2025 1:00 PM, or numbers"
 
 
 def time_columns(table: pl.DataFrame, mapping: StreamMapping) -> list[str]:
@@ -46,7 +55,7 @@ def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Seri
         return _days(columns, mapping, place)
     if all(is_text):
         texts = columns[0] if len(columns) == 1 else columns[0] + " " + columns[1]
-        return _on_scale(_texts(texts, mapping, place), mapping)
+        return utc_of(_texts(texts, mapping, place), mapping.time_scale)
     if len(columns) == 1:
         return _counted(columns[0], mapping, place)
     raise InputError(
@@ -55,12 +64,6 @@ def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Seri
         found=" and ".join(str(column.drop_nulls().first()) for column in columns),
         expected='a date and hh:mm:ss; with time_epoch = "gps" week and seconds; with "excel" days and their fraction',
     )
-
-
-def _on_scale(t_ns: pl.Series, mapping: StreamMapping) -> pl.Series:
-    if mapping.time_scale == "gps":
-        t_ns = pl.Series(utc_from_gps(t_ns.fill_null(0).to_numpy())).set(t_ns.is_null(), None)
-    return t_ns.cast(pl.Datetime("ns", "UTC"))
 
 
 def _refuse(
@@ -76,23 +79,17 @@ def _refuse(
 def _week_and_seconds(week: pl.Series, tow: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
     """GPS time by definition, whatever `time_scale` says."""
     seconds = tow.cast(pl.Float64) * mapping.factors.get("t", 1.0)
+    longest_s = WEEK_NS / NS_PER_S
     whole = ~week.is_between(_LEAST_WEEK, _MOST_WEEK).fill_null(True)
     _refuse(whole, week, place, "holds no GPS week", f"{_LEAST_WEEK} to {_MOST_WEEK}", "Write the whole week number.")
-    _refuse(
-        ~seconds.is_between(0.0, WEEK_NS / 1e9).fill_null(True),
-        tow,
-        place,
-        "holds no seconds of a week",
-        f"0 to {WEEK_NS / 1e9:g} s",
-        "Give the seconds per unit: factors = { t = 1e-3 } for milliseconds.",
-    )
-    in_week = (seconds * 1e6).round().cast(pl.Int64) * 1000
-    t_ns = GPS_EPOCH_NS + week.cast(pl.Int64) * WEEK_NS + in_week
-    return _on_scale(t_ns, mapping.model_copy(update={"time_scale": "gps"}))
+    beyond = ~seconds.is_between(0.0, longest_s).fill_null(True)
+    remedy = "Give the seconds per unit: factors = { t = 1e-3 } for milliseconds."
+    _refuse(beyond, tow, place, "holds no seconds of a week", f"0 to {longest_s:g} s", remedy)
+    return utc_of(gps_ns_of_weeks(week.cast(pl.Int64), seconds), "gps")
 
 
 def _days(columns: list[pl.Series], mapping: StreamMapping, place: str) -> pl.Series:
-    """A day with its fraction, which may stand in a column of its own."""
+    """A day with its fraction, which may stand in another column."""
     days = sum((column.cast(pl.Float64) for column in columns[1:]), columns[0].cast(pl.Float64))
     wrong = ~days.is_between(LEAST_DAY, MOST_DAY).fill_null(True)
     _refuse(wrong, days, place, "holds no days of Excel", f"{LEAST_DAY} to {MOST_DAY}")
@@ -103,48 +100,42 @@ def _texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
     """Nanoseconds since 1970; without a zone as they stand."""
     texts = texts.str.strip_chars().replace("", None)
     parts = texts.str.extract_groups(_TEXT).struct.unnest()
-    _refuse(parts["h"].is_null() & texts.is_not_null(), texts, place, "holds no times", FORMS)
+    _refuse(parts["h"].is_null() & texts.is_not_null(), texts, place, "holds no times", _FORMS)
     number = parts.select(pl.all().exclude("half", "zone", "f").cast(pl.Int64))
     day, month = ("a", "b") if _day_first(number["a"], number["b"], mapping.date_order, place) else ("b", "a")
     year = pl.when(pl.col("c") < 100).then(pl.col("c") + 2000).otherwise(pl.col("c"))
     late = parts["half"].str.to_lowercase()
-    hour = (
-        pl.when(late == "pm")
-        .then(pl.col("h") % 12 + 12)
-        .when(late == "am")
-        .then(pl.col("h") % 12)
-        .otherwise(pl.col("h"))
-    )
+    hour = pl.when(late.is_null()).then(pl.col("h")).otherwise(pl.col("h") % 12 + 12 * (late == "pm").cast(pl.Int64))
     try:
         civil = pl.datetime(
             pl.coalesce("y", year), pl.coalesce("ym", month), pl.coalesce("yd", day), hour, "m",
             pl.col("s").fill_null(0), time_unit="us",
         )  # fmt: skip
-        whole = number.select(civil.dt.timestamp("us") * 1000).to_series()
+        whole = within(number.select(civil.dt.timestamp("us")).to_series(), 1000) * 1000
     except pl.exceptions.PolarsError as error:
-        raise InputError(f"holds no times: {str(error).splitlines()[0]}", place=place, expected=FORMS) from None
-    _refuse(whole.is_null() & texts.is_not_null(), texts, place, "holds no times", FORMS)
+        raise InputError(f"holds no times: {str(error).splitlines()[0]}", place=place, expected=_FORMS) from None
+    _refuse(whole.is_null() & texts.is_not_null(), texts, place, "holds no times", _FORMS)
     fraction = parts["f"].fill_null("0").str.pad_end(9, "0").cast(pl.Int64)
     return whole + fraction - _offset_ns(parts["zone"])
 
 
 def _offset_ns(zone: pl.Series) -> pl.Series:
-    digits = zone.str.replace_all("[Z:]", "").str.extract(r"(\d{4})").fill_null("0000")
+    digits = zone.str.replace_all("[Z:]", "").str.extract(r"([0-9]{4})").fill_null("0000")
     minutes = digits.str.slice(0, 2).cast(pl.Int64) * 60 + digits.str.slice(2, 2).cast(pl.Int64)
     sign = pl.Series(np.where(zone.str.starts_with("-").fill_null(False).to_numpy(), -1, 1))
-    return sign * minutes * 60_000_000_000
+    return sign * minutes * 60 * NS_PER_S
 
 
 def _day_first(first: pl.Series, second: pl.Series, asked: str, place: str) -> bool:
     """Whether dates such as 01.02.2025 begin with the day: decided over the whole file, never guessed."""
-    fitting = fitting_orders(first, second)
+    fitting = orders_of_day(first, second)
     if not fitting or (asked != "auto" and asked not in fitting):
         raise InputError(
-            "holds dates of two kinds" if not fitting else "holds dates of another kind than was said",
+            "holds dates of another kind than date_order" if fitting else "holds dates of two kinds",
             place=place,
             found=" and ".join(fitting) or "days over 12 before and behind the month",
             expected="day or month first in all rows" if asked == "auto" else asked,
-            remedy="Correct the file." if not fitting else "Correct date_order.",
+            remedy="Correct date_order." if fitting else "Correct the file.",
         )
     if asked == "auto" and len(fitting) > 1 and len(first.drop_nulls()):
         raise InputError(
@@ -157,22 +148,10 @@ def _day_first(first: pl.Series, second: pl.Series, asked: str, place: str) -> b
     return (asked if asked != "auto" else fitting[0]) == "day_first"
 
 
-def fitting_orders(first: pl.Series, second: pl.Series) -> list[str]:
-    """The orders of day and month that all rows allow."""
-    orders = [("day_first", second), ("month_first", first)]
-    return [order for order, month in orders if (month.drop_nulls() <= 12).all()]
-
-
-def orders_of(texts: pl.Series) -> list[str]:
-    """`fitting_orders` of texts, none where they begin with the year or are no dates."""
-    parts = texts.str.extract_groups(r"^(\d{1,2})[-/.](\d{1,2})[-/.]\d").struct.unnest().cast(pl.Int64)
-    return [] if parts.to_series(0).drop_nulls().is_empty() else fitting_orders(parts.to_series(0), parts.to_series(1))
-
-
 def _looks_like(count: int) -> str:
     """The unit in which a time since 1970 lies between 1985 and 2065."""
-    near = [unit for unit, unit_s in (("milliseconds", 1e-3), ("microseconds", 1e-6)) if 5e8 < count * unit_s < 3e9]
-    return f"; looks like {near[0]}" if near else ""
+    units_s = {"milliseconds": 1e-3, "microseconds": 1e-6}
+    return next((f"; looks like {unit}" for unit, unit_s in units_s.items() if 5e8 < count * unit_s < 3e9), "")
 
 
 def _counted(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
@@ -189,5 +168,5 @@ def _counted(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl.Seri
                 expected="seconds or nanoseconds",
                 remedy="Give the seconds per unit: factors = { t = 1e-3 } for milliseconds.",
             )
-        recorded = recorded * (1 if largest >= _LEAST_NANOSECONDS else 1_000_000_000)
+        recorded = recorded * (1 if largest >= _LEAST_NANOSECONDS else NS_PER_S)
     return source.instants(recorded.to_frame(), recorded.name)

@@ -13,6 +13,7 @@ from typing import Any
 import dataframely as dy
 import polars as pl
 
+from pipeline.read.ingest.stamps import LATEST_NS
 from schemas.enums import Fix
 from schemas.inputs import Gnss, Satellites
 from schemas.run import Stream
@@ -94,7 +95,7 @@ class Gathered:
         told = [epoch for epoch in self.epochs if epoch.gnss or epoch.satellites]
         known = [epoch for epoch in told if epoch.has_fix]
         self.drop("epoch without its position message", len(told) - len(known))
-        timed = [epoch for epoch in known if epoch.t_ns is not None]
+        timed = [epoch for epoch in known if epoch.t_ns is not None and 0 <= epoch.t_ns <= LATEST_NS]
         self.drop("time not valid", len(known) - len(timed))
         return Epochs(timed)
 

@@ -32,6 +32,8 @@ def parse(raw: bytes) -> Any:
     """The sentence, none if it is of no interest."""
     from pynmeagps import NMEAReader
 
+    if b"_" in raw:  # Python reads 1_0 as 10
+        raise ValueError("a sentence holds an underscore")
     return NMEAReader.parse(raw) if raw[3:6] in _WANTED and raw[6:7] == b"," else None
 
 

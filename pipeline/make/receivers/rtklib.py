@@ -15,7 +15,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.make.receivers.earth_fixed import earth_fixed, east_north_up, geodetic
-from pipeline.read.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
+from pipeline.read.ingest.csv_text import CUT_ROW
+from pipeline.read.ingest.stamps import gps_ns_of_weeks, utc_of, within
+from pipeline.read.numbers import numbers_of
 from schemas.arrays import NS_PER_S, Floats
 from schemas.enums import Fix
 from schemas.errors import InputError
@@ -32,9 +34,8 @@ _TOGETHER = (
     ("latitude", "longitude", "height"), ("x-ecef", "y-ecef", "z-ecef"), ("e-baseline", "n-baseline", "u-baseline"),
     ("vx", "vy", "vz"),
 )  # fmt: skip
-_DATE = re.compile(r"\d{4}/\d\d?/\d\d?")
+_DATE = re.compile(r"[0-9]{4}/[0-9]{1,2}/[0-9]{1,2}")
 _GEOID = "height over the geoid: left empty, since the file has no separation"
-CUT_ROW = "row that breaks off at the end of the file"
 
 
 @dataclass(frozen=True)
@@ -130,30 +131,28 @@ def _times(words: Any, layout: _Layout, path: Path) -> pl.Series:
     """UTC of the first two words of each row."""
     if _DATE.fullmatch(words[0, 0]):
         text = pl.Series(np.char.add(np.char.add(words[:, 0], "T"), words[:, 1]))
-        told = text.str.to_datetime("%Y/%m/%dT%H:%M:%S%.f", time_unit="ns", strict=False).dt.timestamp("ns")
+        date_us = text.str.to_datetime("%Y/%m/%dT%H:%M:%S%.f", time_unit="us", strict=False).to_physical()
+        exact = text.str.to_datetime("%Y/%m/%dT%H:%M:%S%.f", time_unit="ns", strict=False).to_physical()
+        t_ns = exact.set(within(date_us, 1000).is_null(), None)
     else:
         week = pl.Series(words[:, 0]).cast(pl.Int64, strict=False)
-        tow = pl.Series(words[:, 1]).cast(pl.Float64, strict=False)
-        in_week = (tow * 1e6).round().cast(pl.Int64, strict=False) * 1000  # RTKLIB writes microseconds at most
-        told = GPS_EPOCH_NS + week.set(~week.is_between(0, 9999), None) * WEEK_NS + in_week
-    if told.null_count():
-        row = int(told.is_null().arg_max() or 0)
+        t_ns = gps_ns_of_weeks(week, pl.Series(words[:, 1]).cast(pl.Float64, strict=False))
+    if t_ns.null_count():
+        row = int(t_ns.is_null().arg_max() or 0)
         raise InputError(
             "is no time",
             place=f"{path}: row {row + 1} of the epochs",
             found=" ".join(words[row, :2]),
             expected=f"y/m/d h:m:s, or week and seconds, in {layout.scale}",
         )
-    t_ns = told.to_numpy()
-    utc = utc_from_gps(t_ns) if layout.scale == "GPST" else t_ns - _AHEAD_NS[layout.scale]
-    return pl.Series(utc).cast(pl.Datetime("ns", "UTC"))
+    return utc_of(t_ns - _AHEAD_NS[layout.scale], "gps" if layout.scale == "GPST" else "utc")
 
 
 def _numbers(words: Any, layout: _Layout, path: Path) -> dict[str, Floats]:
     """The columns by name; degrees, minutes and seconds made degrees."""
     rest = words[:, 2:]
     try:
-        values = rest.astype(np.float64)
+        values = numbers_of(rest.ravel()).reshape(rest.shape)
     except ValueError as error:
         raise InputError(f"holds a value that is no number: {error}", place=str(path)) from None
     if layout.sexagesimal:
@@ -164,7 +163,7 @@ def _numbers(words: Any, layout: _Layout, path: Path) -> dict[str, Floats]:
 def _degrees(words: Any) -> Floats:
     """Latitude and longitude of two times degrees, minutes and seconds; -0 degrees have a sign as well."""
     signs = np.where(np.char.startswith(words[:, [0, 3]], "-"), -1.0, 1.0)
-    degrees: Floats = signs * (np.abs(words.astype(np.float64)).reshape(-1, 2, 3) @ np.array([1.0, 1 / 60, 1 / 3600]))
+    degrees: Floats = signs * (np.abs(numbers_of(words.ravel())).reshape(-1, 2, 3) @ np.array([1.0, 1 / 60, 1 / 3600]))
     return degrees
 
 
@@ -201,7 +200,10 @@ def _at_baseline(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dic
     """Places from baselines: the reference stands in the header, in the form that places have."""
     told = re.search(r"^%\s*ref pos\s*:\s*(.*)$", layout.comments, re.MULTILINE)
     words = np.array(re.split(r"[\s,;]+", told[1].strip()) if told else [])
-    values = words.astype(np.float64)
+    try:
+        values = numbers_of(words)
+    except ValueError as error:
+        raise InputError(f"holds a base station's position that cannot be read: {error}", place=str(path)) from None
     if len(values) == 7:  # degrees, minutes and seconds
         values = np.append(_degrees(words[None, :6]), values[6:])
     if len(values) != 3:

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
+from pipeline.read.ingest.breaches import refuse
+from pipeline.read.ingest.conform import conform
 from pipeline.stages.track.geodesy import moved_deg
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import StreamCorrection
@@ -19,10 +21,10 @@ _PLACE = ("latitude_deg", "longitude_deg")
 
 
 def corrected(run: RunLog, corrections: Sequence[StreamCorrection]) -> RunLog:
-    """The run with these corrections applied in order; `notes` tells of each.
+    """The run with these corrections applied in order; `notes` lists them.
 
-    Raises `ConfigError` for a stream or column that the run does not have, `InputError` for places that are none on
-    earth afterwards.
+    Raises `ConfigError` for a stream or column that the run does not have, `InputError` for values that the contract
+    does not allow afterwards.
     """
     for correction in corrections:
         frame = run.stream(correction.stream)
@@ -33,8 +35,8 @@ def corrected(run: RunLog, corrections: Sequence[StreamCorrection]) -> RunLog:
                 remedy="Remove this correction, or replay this run with another configuration.",
             )
         run = run.with_streams(**{correction.stream: _corrected(frame, correction, run.run_id)})
-        notes = replace(run.notes, corrections=(*run.notes.corrections, _told(correction)))
-        run = replace(run, notes=notes)
+        applied = (*run.notes.corrections, _note_of(correction))
+        run = replace(run, notes=replace(run.notes, corrections=applied))
     return run
 
 
@@ -45,16 +47,24 @@ def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -
         one, other = correction.exchange
         mended = mended.with_columns(pl.col(other).alias(one), pl.col(one).alias(other))
     mended = mended.with_columns(pl.col(name) * factor for name, factor in correction.factors.items())
-    shift = pl.duration(nanoseconds=round(correction.shift_s * NS_PER_S), time_unit="ns")
-    mended = mended.with_columns(pl.col("t") + shift) if correction.shift_s else mended
+    mended = _later(mended, correction.shift_s) if correction.shift_s else mended
     if correction.shift_east_m or correction.shift_north_m or correction.shift_up_m:
         mended = _moved(mended, correction)
-    _refuse_no_place(mended, correction, run_id)
-    if correction.solution is None or "solution" not in frame.columns:
-        return mended
-    kept = pl.col("solution") == correction.solution
-    one_solution = [pl.when(kept).then(mended[name]).otherwise(pl.col(name)).alias(name) for name in frame.columns]
-    return frame.with_columns(one_solution)
+    if correction.solution is not None and "solution" in frame.columns:
+        meant = pl.col("solution") == correction.solution
+        mended = frame.with_columns(pl.when(meant).then(mended[name]).otherwise(pl.col(name)) for name in frame.columns)
+    breaches: list[InputError] = []
+    conformed = conform(mended, correction.stream, f"{run_id}: {correction.stream} after [[ingest.correct]]", breaches)
+    refuse(breaches)
+    return conformed
+
+
+def _later(frame: pl.DataFrame, shift_s: float) -> pl.DataFrame:
+    """Times shifted; null where 64 bits of nanoseconds cannot hold them."""
+    shift_ns = round(shift_s * NS_PER_S)
+    later = pl.col("t") + pl.duration(nanoseconds=shift_ns, time_unit="ns")
+    # Beyond 64 bits polars wraps round without an error.
+    return frame.with_columns(pl.when((later > pl.col("t")) == (shift_ns > 0)).then(later).alias("t"))
 
 
 def _moved(frame: pl.DataFrame, correction: StreamCorrection) -> pl.DataFrame:
@@ -85,20 +95,7 @@ def _refuse_unknown(correction: StreamCorrection) -> None:
         )
 
 
-def _refuse_no_place(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -> None:
-    if not set(_PLACE) <= set(frame.columns):
-        return
-    beyond = frame.filter((pl.col(_PLACE[0]).abs() > 90.0) | (pl.col(_PLACE[1]).abs() > 180.0))
-    if beyond.height:
-        raise InputError(
-            "has latitudes or longitudes out of range after correction",
-            place=f"{run_id}: {correction.stream}",
-            found=f"latitude {beyond[_PLACE[0]][0]:g}, longitude {beyond[_PLACE[1]][0]:g}",
-            remedy="Check [[ingest.correct]] in the configuration.",
-        )
-
-
-def _told(correction: StreamCorrection) -> str:
+def _note_of(correction: StreamCorrection) -> str:
     changed = correction.model_dump(exclude_defaults=True)
     changed.pop("stream")
     return f"{correction.stream} corrected by configuration: " + ", ".join(

@@ -1,6 +1,4 @@
-"""CSV as programs and spreadsheets write it: other encodings than UTF-8, other separators than the comma, empty lines,
-a row of units.
-"""
+"""CSV as programs and spreadsheets write it: encodings, separators, decimal commas, empty lines, a row of units."""
 
 from __future__ import annotations
 
@@ -8,6 +6,7 @@ import codecs
 import csv
 import io
 import re
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -15,20 +14,22 @@ from typing import NamedTuple
 import polars as pl
 import polars.selectors as cs
 
+from pipeline.storage import files
 from schemas.errors import InputError
 
+CUT_ROW = "row that breaks off at the end of the file"
 _SEPARATORS = (",", ";", "\t")
-_NO_ROW = r"#|sep=.$"  # a comment; Excel's own line, which says what separates
+_NO_ROW = r"#|sep=.$"  # a comment; Excel's own line, which names the separator
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-
-
 # Without a byte order mark: every other byte of European text is zero.
 _UTF16_ZEROS = 0.3
+# Decimal mark, and what may separate thousands beside it.
+_MARKS = {",": "[.'\u2019 \u00a0\u202f]", ".": "[,'\u2019 \u00a0\u202f]"}
 
 
 class LogTable(NamedTuple):
-    """A table of a log; `cut` rows that break off at the end (0 or 1), rows with fewer values than the header; the row
-    of units, if it has one.
+    """A table of a log, with its row of units. `cut`: rows that break off at the end (0 or 1), `short`: rows with fewer
+    values than the header.
     """
 
     table: pl.DataFrame
@@ -48,32 +49,29 @@ def read_table(data: bytes, infer: bool) -> pl.DataFrame:
 
 
 def read_log_table(log: Path, infer: bool) -> LogTable:
-    """`read_table` of a log, without a last row that breaks off and without a row of units behind the header.
+    """`read_table` of a log, without its row of units and without a last row that breaks off.
 
-    A recorder that lost power leaves half a row: without a line end, and with fewer fields than the header. Raises
-    `InputError` where the file cannot be read or holds no table.
+    A recorder that lost power leaves half a row: without a line end, and with fewer fields than the header.
     """
+    data = files.read_bytes(log)
     try:
-        return _whole_rows(log.read_bytes(), infer)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", place=str(log)) from None
+        return _whole_rows(data, infer)
     except (ValueError, csv.Error, pl.exceptions.PolarsError) as error:
         if isinstance(error, pl.exceptions.ComputeError):
             with suppress(csv.Error):
-                _refuse_long_rows(_lines(log.read_bytes()), log)
+                _refuse_long_rows(_lines(data), log)
         raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
 
 
 def _whole_rows(data: bytes, infer: bool) -> LogTable:
     lines = _lines(data)
     separator = _separator(lines)
-    header = next((line for line in lines if line.strip()), "")
+    fields = _header(lines).count(separator)
     ended = data.rstrip(b" \0").endswith((b"\n", b"\r"))
-    cut = len(lines) > 1 and not ended and lines[-1].count(separator) < header.count(separator)
+    cut = len(lines) > 1 and not ended and lines[-1].count(separator) < fields
     lines, units = _without_units(lines[:-1] if cut else lines, separator)
-    table = _table(lines, infer)
-    short = sum(0 < line.count(separator) < header.count(separator) for line in lines)
-    return LogTable(table, int(cut), short, units, separator)
+    short = sum(0 < line.count(separator) < fields for line in lines)
+    return LogTable(_table(lines, infer), int(cut), short, units, separator)
 
 
 def _refuse_long_rows(lines: list[str], log: Path) -> None:
@@ -91,30 +89,35 @@ def _refuse_long_rows(lines: list[str], log: Path) -> None:
 
 
 def _without_units(lines: list[str], separator: str) -> tuple[list[str], tuple[str, ...]]:
-    """The lines without the row behind the header where that has words only, and the next one a number."""
+    """The lines, and the row behind the header where that holds only words and the next one a number."""
     rows = csv.reader([line for line in lines if line.strip()], delimiter=separator)
     head = [row for row, _ in zip(rows, range(3), strict=False)]
-    if len(head) < 3 or len(head[1]) != len(head[0]) or not any(cell.strip() for cell in head[1]):
+    if len(head) < 3:
         return lines, ()
-    if any(_has_number(cell) for cell in head[1]) or not any(_has_number(cell) for cell in head[2]):
+    names, units, values = head
+    is_units = len(units) == len(names) and any(cell.strip() for cell in units)
+    if not is_units or any(map(_has_number, units)) or not any(map(_has_number, values)):
         return lines, ()
-    at = next(
-        (number for number, line in enumerate(lines) if [*csv.reader([line], delimiter=separator)] == [head[1]]), None
-    )
-    return (lines, ()) if at is None else ([*lines[:at], *lines[at + 1 :]], tuple(cell.strip() for cell in head[1]))
+    for at, line in enumerate(lines):
+        if [*csv.reader([line], delimiter=separator)] == [units]:
+            return [*lines[:at], *lines[at + 1 :]], tuple(cell.strip() for cell in units)
+    return lines, ()
 
 
 def _has_number(cell: str) -> bool:
-    return re.match(r"\s*[+-]?[.,]?\d", cell) is not None
+    return re.match(r"\s*[+-]?[.,]?[0-9]", cell) is not None
 
 
 def _lines(data: bytes) -> list[str]:
     return [line for line in text_of(data).splitlines() if not re.match(_NO_ROW, line)]
 
 
+def _header(lines: list[str]) -> str:
+    return next((line for line in lines if line.strip()), "")
+
+
 def _separator(lines: list[str]) -> str:
-    header = next((line for line in lines if line.strip()), "")
-    return max(_SEPARATORS, key=header.count)
+    return max(_SEPARATORS, key=_header(lines).count)
 
 
 def _table(lines: list[str], infer: bool) -> pl.DataFrame:
@@ -122,20 +125,44 @@ def _table(lines: list[str], infer: bool) -> pl.DataFrame:
     body = "\n".join(lines).lstrip("\n")
     length = None if infer else 0
     frame = pl.read_csv(io.StringIO(body), separator=separator, infer_schema=infer, infer_schema_length=length)
-    frame.columns = _names(body, separator, frame.columns)
+    _refuse_shared_names(body, separator)
+    frame.columns = [name.strip() for name in frame.columns]
     frame = frame.with_columns(pl.col(pl.String).str.strip_chars())
     texts = cs.string()
     return frame.filter(~pl.all_horizontal((texts.is_null() | (texts == "")), (~texts).is_null()))
 
 
-def _names(body: str, separator: str, given: list[str]) -> list[str]:
-    """Names without blanks around them; polars gives those that stand twice names of their own."""
+def _refuse_shared_names(body: str, separator: str) -> None:
+    """Polars renames columns that share a name."""
     first = pl.read_csv(io.StringIO(body), separator=separator, has_header=False, n_rows=1, infer_schema=False)
-    written = [name.strip() for name in first.row(0) if name and name.strip()]
-    twice = sorted({name for name in written if written.count(name) > 1})
-    if twice:
-        raise ValueError(f"two columns have the same name: {', '.join(twice)}")
-    return [name.strip() for name in given]
+    counts = Counter(name.strip() for name in first.row(0) if name and name.strip())
+    if shared := sorted(name for name, count in counts.items() if count > 1):
+        raise ValueError(f"two columns have the same name: {', '.join(shared)}")
+
+
+def with_points(log: LogTable) -> pl.DataFrame:
+    """The table with its numbers as such: those with a decimal comma where no number of the file has a decimal point,
+    and those with separated thousands.
+
+    Between commas, 1,234 in quotes may be a fraction or a thousand and more: such a file must have other numbers too.
+    """
+    texts = log.table.select(pl.col(pl.String).replace("", None))
+    fitting = {mark: _numbers(texts, mark) for mark in _MARKS}
+    numbers = set.union(*fitting.values())
+    has_point = any(dtype.is_float() for dtype in log.table.schema.values())
+    marks = [mark for mark, names in fitting.items() if names == numbers and not (mark == "," and has_point)]
+    if not marks or (len(marks) == len(_MARKS) and log.separator == ","):
+        return log.table
+    plain = pl.col(sorted(numbers)).replace("", None).str.replace("\u2212", "-").str.replace_all(_MARKS[marks[0]], "")
+    return log.table.with_columns(plain.str.replace(marks[0], ".", literal=True).cast(pl.Float64))
+
+
+def _numbers(texts: pl.DataFrame, mark: str) -> set[str]:
+    """The columns whose cells are all numbers with this decimal mark."""
+    whole = rf"(?:[0-9]{{1,3}}(?:{_MARKS[mark]}[0-9]{{3}})+|[0-9]+)"
+    number = rf"^\s*[+\-\u2212]?(?:{whole}(?:[{mark}][0-9]+)?|[{mark}][0-9]+)(?:[eE][+-]?[0-9]+)?\s*$"
+    fits = texts.select(pl.all().str.contains(number).min()).rows(named=True)
+    return {name for name, is_number in fits[0].items() if is_number} if texts.width else set()
 
 
 def comments_of(data: bytes) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of
-from pipeline.read.ingest.guesses import NAMES, columns_in, mapping_lines, word_of
+from pipeline.read.ingest.guesses import COLUMNS, columns_in, mapping_lines, word_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_model import Channel
 from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
@@ -217,7 +217,7 @@ def starting_config(topics: Sequence[TopicSummary]) -> str:
 def _suggestion(topic: TopicSummary) -> str:
     numbers = [path for path, kind in topic.fields.items() if kind in ("int", "float")]
     words = {path: word_of(path.split(".")[-1]) for path in sorted(numbers, key=lambda path: (path.count("."), path))}
-    for stream in NAMES:
+    for stream in COLUMNS:
         time = ['time = "auto"  # or "log", "publish", "field:PATH"']
         if lines := mapping_lines(stream, topic.topic, words, time, None, {}):
             used = set(columns_in(stream, words).values())

@@ -15,6 +15,7 @@ from pipeline.read.ingest.mcap_block import Bytes
 
 # Wire types (protobuf encoding guide).
 _VARINT, _I64, _LEN, _I32 = 0, 1, 2, 5
+_LONGEST_TAG = 5  # bytes: tags and lengths are numbers of 32 bits
 # descriptor.proto: FieldDescriptorProto.Type
 _BOOL, _STRING, _MESSAGE = 8, 9, 11
 _FIXED_WIDTH = {1: "<f8", 6: "<u8", 16: "<i8", 2: "<f4", 7: "<u4", 15: "<i4"}
@@ -74,26 +75,26 @@ class _Walk:
         """All fields of one message by number; tags, lengths and widths of varints are marked as static."""
         met: dict[int, list[Raw]] = {}
         while at < end:
-            tag, start = self._varint(at, end, 0xFF)
+            tag, start = self._varint(at, end, 0xFF, _LONGEST_TAG)
             number, wire = tag >> 3, tag & 7
             if wire == _VARINT:
                 _, at = self._varint(start, end, 0x80)
             elif wire == _LEN:
-                length, start = self._varint(start, end, 0xFF)
+                length, start = self._varint(start, end, 0xFF, _LONGEST_TAG)
                 at = start + length
             elif wire in (_I64, _I32):
                 at = start + (8 if wire == _I64 else 4)
             else:
                 raise UnfitError("a group or unknown wire type")
-            if at > end or number == 0:
+            if at > end or number == 0 or tag >> 32:
                 raise UnfitError("a field runs past its message")
             met.setdefault(number, []).append((wire, start, at))
         return met
 
-    def _varint(self, at: int, end: int, mask: int) -> tuple[int, int]:
+    def _varint(self, at: int, end: int, mask: int, longest: int = 10) -> tuple[int, int]:
         """Value and next offset; the mask fixes the value itself, or its width only."""
         value = 0
-        for place in range(10):
+        for place in range(longest):
             if at >= end:
                 break
             byte = self._payload[at]
@@ -102,7 +103,7 @@ class _Walk:
             at += 1
             if byte < 0x80:
                 return value, at
-        raise UnfitError("a number runs past its message, or has more than ten bytes")
+        raise UnfitError("a number runs past its message, or is too long")
 
     def _packed(self, field: Any, tree: Mapping[Any, Any], wire: int, start: int, end: int) -> None:
         """Elements of a packed array of fixed width."""

@@ -23,7 +23,8 @@ DEEPEST = 32  # messages inside each other
 _CODES = {"u1": "B", "i1": "b", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q", "f4": "f", "f8": "d"}
 # One line at a time, and no two parts of the pattern that could take the same characters: the time is linear.
 _LINE = re.compile(
-    r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?:<=)?\d{0,9}\])?\s+(?P<name>[A-Za-z]\w*)(?P<rest>(?:[\s=].*)?)"
+    r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?:<=)?\d{0,9}\])?\s+(?P<name>[A-Za-z]\w*)(?P<rest>(?:[\s=].*)?)",
+    re.ASCII,
 )
 
 
@@ -42,16 +43,20 @@ class Member:
 
 Definition = tuple[Member, ...]
 _TIME = (Member("sec", "uint32", None), Member("nanosec", "uint32", None))
+_BUILT_IN = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME}
 
 
 @lru_cache(maxsize=64)  # the logs of a campaign share their schemas
 def parse_definitions(name: str, text: str) -> Mapping[str, Definition]:
     """All messages of a concatenated definition by short name (`pkg/Type`); constants are left out."""
-    found: dict[str, Definition] = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME}
+    met: dict[str, Definition] = {}
     for full, lines in _sections(name, text):
-        package = full.split("/")[0]
-        found[short_name(full)] = tuple(member for line in lines if (member := _member(line, package)))
-    return found
+        members = tuple(member for line in lines if (member := _member(line, full.split("/")[0])))
+        if len({member.name for member in members}) < len(members):
+            raise DefinitionError(f"{full} names a field twice")
+        if met.setdefault(short_name(full), members) != members:
+            raise DefinitionError(f"{full} is defined twice with different content")
+    return _BUILT_IN | met
 
 
 def _sections(name: str, text: str) -> list[tuple[str, list[str]]]:
@@ -192,7 +197,7 @@ def layout_of_cdr(
         static[offset : offset + 4] = b"\xff" * 4
     fields: dict[str, Field] = {}
     for path, dtype in types.items():
-        array = re.fullmatch(r"(.*)\[(\d+)\]", path)
+        array = re.fullmatch(r"(.*)\[([0-9]+)\]", path)
         place, index = walk.places.get(path), 0
         if place is None and array and (found := walk.places.get(array[1])) and int(array[2]) < (found.size or 0):
             place, index = found, int(array[2])

@@ -9,14 +9,16 @@ from typing import Literal
 
 import polars as pl
 
-from pipeline.read.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.read.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
 from schemas.arrays import NS_PER_S
 from schemas.config import StreamMapping
 
-_LATEST_NS = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * NS_PER_S  # leaves room in 64 bits for the GPS epoch
-# Spreadsheets count days from 1899-12-30.
+LATEST_NS = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * NS_PER_S  # leaves room in 64 bits for the GPS epoch
 _DAY_S = 86_400
-_EXCEL_TO_UNIX_NS = 25_569 * _DAY_S * NS_PER_S
+# 1970 in what is counted from other epochs: spreadsheets count days from 1899-12-30.
+_EPOCHS_NS = {"unix": 0, "gps": GPS_EPOCH_NS, "excel": -25_569 * _DAY_S * NS_PER_S}
+# Days of Excel in the years 1954 and 2119.
+LEAST_DAY, MOST_DAY = 20_000, 80_000
 LOG_TIME = "(log time)"
 PUBLISH_TIME = "(publish time)"
 _SECONDS = ("sec", "secs", "seconds")
@@ -46,15 +48,8 @@ class TimeSource:
 
         Raises ValueError where the nanoseconds of a stamp make a second or more: it contradicts itself.
         """
-        t = self._nanoseconds(frame).alias(name)
-        if self.epoch == "gps":
-            t = t + GPS_EPOCH_NS
-        elif self.epoch == "excel":
-            t = t - _EXCEL_TO_UNIX_NS
-        if self.scale == "gps":
-            utc = pl.Series(name, utc_from_gps(t.fill_null(0).to_numpy()))
-            t = utc.set(t.is_null(), None) if t.null_count() else utc
-        return t.cast(pl.Datetime("ns", "UTC"))
+        counted = self._nanoseconds(frame).alias(name)
+        return utc_of(counted + _EPOCHS_NS[self.epoch], self.scale)
 
     def _nanoseconds(self, frame: pl.DataFrame) -> pl.Series:
         first = frame[self.fields[0]]
@@ -64,22 +59,42 @@ class TimeSource:
             if wrong.any():
                 row = int(wrong.arg_max() or 0)
                 raise ValueError(f"{rest[row]} nanoseconds beside whole seconds in message {row} of the topic")
-            return _within(first, NS_PER_S) * NS_PER_S + rest
+            return within(first, NS_PER_S) * NS_PER_S + rest
         dtype = self.types.get(self.fields[0], pl.Int64())
         if dtype == pl.String:
             # Beyond 64 bits polars goes round without a word, so the date is read in microseconds before.
             date = first.str.to_datetime("%+", time_unit="us", time_zone="UTC", strict=True).to_physical()
             t = first.str.to_datetime("%+", time_unit="ns", time_zone="UTC", strict=True).to_physical()
-            return t.set(_within(date, 1000).is_null(), None)
+            return t.set(within(date, 1000).is_null(), None)
         if dtype == pl.Int64:
             unit_ns = 1 if self.unit_s is None else round(self.unit_s * 1e9)
-            return _within(first, unit_ns) * unit_ns
-        return _within((first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round(), 1).cast(pl.Int64)
+            return within(first, unit_ns) * unit_ns
+        return within((first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round(), 1).cast(pl.Int64)
 
 
-def _within(counts: pl.Series, unit_ns: int) -> pl.Series:
-    """The counts of a unit since an epoch, null before it and after `_LATEST_NS`: nothing then overflows 64 bits."""
-    return counts.set(~counts.is_between(0, _LATEST_NS // max(unit_ns, 1)), None)
+def utc_of(t_ns: pl.Series, scale: str) -> pl.Series:
+    """UTC of nanoseconds since 1970 on the scale `utc` or `gps`."""
+    if scale == "gps":
+        utc = pl.Series(t_ns.name, utc_from_gps(t_ns.fill_null(0).to_numpy()))
+        t_ns = utc.set(t_ns.is_null(), None) if t_ns.null_count() else utc
+    return t_ns.cast(pl.Datetime("ns", "UTC"))
+
+
+def gps_ns_of_weeks(week: pl.Series, tow_s: pl.Series) -> pl.Series:
+    """Nanoseconds since 1970 on the GPS scale of weeks and seconds in them, to microseconds; null beyond both."""
+    in_week_us = (tow_s.set(~tow_s.is_between(0.0, WEEK_NS / NS_PER_S), None) * 1e6).round()
+    return GPS_EPOCH_NS + within(week, WEEK_NS) * WEEK_NS + in_week_us.cast(pl.Int64) * 1000
+
+
+def orders_of_day(first: pl.Series, second: pl.Series) -> list[str]:
+    """The orders of day and month that all rows allow."""
+    months = {"day_first": second, "month_first": first}
+    return [order for order, month in months.items() if (month.drop_nulls() <= 12).all()]
+
+
+def within(counts: pl.Series, unit_ns: int) -> pl.Series:
+    """The counts of a unit since an epoch, null before it and after `LATEST_NS`: nothing then overflows 64 bits."""
+    return counts.set(~counts.is_between(0, LATEST_NS // max(unit_ns, 1)), None)
 
 
 def stamp_parts(fields: Mapping[str, str], path: str) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from pipeline.stages.monitors.axis import (
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.monitors.recursion import AxisState
 from pipeline.stages.odometry.drift import drift_m2, relink_bound_m
+from pipeline.stages.odometry.driven import under_way
 from pipeline.stages.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, Vehicle
@@ -90,9 +91,10 @@ class _Learner:
         self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
         self._outages = _gaps_before(self._t_s, t_s[usable], gap_s)
         if self._rows.size:
-            speed_mps = np.abs(odometry.speed_at_s(self._t_s))
-            moving, given_m = speed_mps > config.matching.deadband_mps, config.monitors.noise_along_m
-            self._meter = NoiseMeter(self._series(0, self._rows.size, 0), moving, given_m, config)
+            way_m, deadband_mps = odometry.travelled_at(self._t_ns), config.matching.deadband_mps
+            moving = under_way(self._t_s, way_m, deadband_mps, config.align.speed_window_s)
+            series = self._series(0, self._rows.size, 0)
+            self._meter = NoiseMeter(series, moving, config.monitors.noise_along_m, config)
 
     def run(self, prior: Estimates) -> None:
         position = self._meter.known_from() if self._rows.size else 0

@@ -148,6 +148,11 @@ class _AxisBank:
         known = self.noise_m[:, 0][np.isfinite(self.noise_m[:, 0])]
         return float(known[-1]) * WHITE_PART if known.size else None
 
+    def median_noise_m(self) -> tuple[float, ...]:
+        """By monitor, over the epochs at which it was known; empty where it never was."""
+        known = self.noise_m[np.isfinite(self.noise_m).all(axis=1)]
+        return tuple(np.median(known, axis=0).tolist()) if known.size else ()
+
     def columns(self) -> list[pl.Series]:
         """Value, threshold, state and reason of each monitor of the axis."""
         reasons = self.axis.reasons.fill_null(self.noise_reasons()).fill_null(FIRST_EPOCH)
@@ -174,6 +179,7 @@ class MonitorBank:
         self._single = {
             name: no_verdicts(count, DISABLED) if name in disabled else frame for name, frame in single.items()
         }
+        self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in config.monitors.ewma_alphas)])
         self._single_fails = np.zeros(count, dtype=np.bool_)
         for frame in self._single.values():
             self._single_fails |= (frame["state"] == MonitorState.FAIL.value).to_numpy()
@@ -211,6 +217,12 @@ class MonitorBank:
         """
         self._look(epoch)
         return bool(self._fast[epoch])
+
+    def failing_memory_s(self, epoch: int) -> float:
+        """Memory of the slowest average that fails here [s], over which its fault may have gone on; 0 without one."""
+        self._look(epoch)
+        failing = np.any([axis.state[epoch] == FAIL for axis in self._axes], axis=0)
+        return float(np.max(self._memories_s * failing))
 
     def along_evaluated(self, epoch: int) -> bool:
         """`along_raw` has a verdict (pass or fail) at this epoch; an average alone says nothing of a step."""
@@ -283,6 +295,13 @@ class MonitorBank:
     def white_noise(self) -> dict[str, float | None]:
         """`white_noise_*_m` of the run: the noise at one epoch, were it white, as last measured [m]."""
         return {f"white_noise_{axis.axis.name}_m": axis.white_noise_m() for axis in self._axes}
+
+    def median_noise_m(self) -> dict[str, tuple[float, ...]]:
+        """`noise_*_m` of the configuration, as this run shows them; axes whose noise was never known are left out."""
+        if self._any.size:
+            self._look(self._any.size - 1)
+        shown = {f"noise_{axis.axis.name}_m": axis.median_noise_m() for axis in self._axes}
+        return {name: noise_m for name, noise_m in shown.items() if noise_m}
 
     def columns(self) -> list[pl.Series]:
         """All monitor columns of the epochs table but those of the linking monitors."""

@@ -10,6 +10,7 @@ import polars as pl
 
 from pipeline.stages.epochs.verdicts import NO_POSITION, NO_SIGMA, first_reason
 from pipeline.stages.monitors.axis import AlongEpochs, AxisSeries, Source, along_series, errors_of, time_steps
+from pipeline.stages.odometry.driven import under_way
 from pipeline.stages.odometry.odometry import Increments
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
@@ -39,7 +40,7 @@ def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Ax
     along_reasons = matched.zip_with(matched.is_not_null(), epochs["odometer_reason"])
     up_reasons = first_reason((matched.is_not_null(), matched), (epochs["vertical_m"].is_null(), NO_HEIGHT))
     builder = _Builder(epochs, t_s, config)
-    moving = np.abs(np.nan_to_num(floats(epochs, "speed_mps"))) > config.matching.deadband_mps
+    moving = _moving(epochs, t_s, config)
     across = builder.across(matched, "cross_track_m", "calibrated_cross_m", "digits_cross_m")
     built = (
         ("along", builder.along(along_reasons), along_reasons),
@@ -48,6 +49,15 @@ def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Ax
     )
     along, cross, up = (Axis(name, series, moving[series.epoch], reasons) for name, series, reasons in built)
     return along, cross, up
+
+
+def _moving(epochs: pl.DataFrame, t_s: Floats, config: Configuration) -> Bools:
+    """Whether the train moves, by its odometer: noise of the rows at a stand is no way driven."""
+    way_m, deadband_mps = floats(epochs, "travelled_m"), config.matching.deadband_mps
+    known = np.isfinite(way_m)
+    if not known.any():
+        return np.asarray(np.abs(np.nan_to_num(floats(epochs, "speed_mps"))) > deadband_mps)
+    return under_way(t_s, np.interp(t_s, t_s[known], way_m[known]), deadband_mps, config.align.speed_window_s)
 
 
 def _match_reasons(epochs: pl.DataFrame) -> pl.Series:

@@ -66,6 +66,12 @@ def driven_m(distance_m: Floats, width_m: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(ways)])
 
 
+def under_way(t_s: Floats, way_m: Floats, deadband_mps: float, window_s: float) -> Bools:
+    """Whether more was driven over the window before each time than the dead band; `way_m`: way driven up to it."""
+    moving: Bools = way_m - np.interp(t_s - window_s, t_s, way_m) > deadband_mps * window_s
+    return moving
+
+
 def moving_steps(t_s: Floats, distance_m: Floats, deadband_mps: float, window_s: float) -> Bools:
     """Per step between samples: mean speed beyond the dead band, over `window_s` at least, centred on the step."""
     half_s, centre_s = 0.5 * np.maximum(np.diff(t_s), window_s), 0.5 * (t_s[1:] + t_s[:-1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +10,22 @@ import polars as pl
 import tomli_w
 
 from pipeline.one_run import replay
+from pipeline.stages.alignment.align import align
+from pipeline.stages.matching import Match
 from pipeline.stages.monitors.axis import error_model
+from pipeline.stages.monitors.bank import MonitorBank
+from pipeline.stages.monitors.single import doppler_monitor
+from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.studies.calibration.noise import beyond_noise
-from pipeline.studies.calibration.sigmas import COMPARED, regress_sigmas, sigma_table, velocity_sigma_mps, worst_fit
+from pipeline.studies.calibration.sigmas import (
+    COMPARED,
+    SigmaFit,
+    regress_sigmas,
+    sigma_table,
+    velocity_sigma_mps,
+    worst_fit,
+)
 from pipeline.studies.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
 from pipeline.studies.plausibility.fit import clock_advice, fit_run, refuse_impossible
 from schemas.arrays import floats, times_ns
@@ -22,48 +34,40 @@ from schemas.errors import InputError
 from schemas.run import RunLog, Site
 from schemas.tables import AXES
 
-NO_NOISE = {f"noise_{axis}_m": (0.0, 0.0, 0.0, 0.0) for axis in AXES}
-"""For `[monitors]`: the fitted sigma stands for the fast noise too, so that the run itself measures none."""
+_AS_STATED = {"sigma_intercept_m": 0.0, "sigma_slope": 1.0}
+_NO_NOISE = {f"noise_{axis}_m": (0.0, 0.0, 0.0, 0.0) for axis in AXES}
 
 
 @dataclass(frozen=True)
 class Calibration:
     """`vehicle`: the vehicle file; `runs`: scale and latency run by run; `sigmas`: regression by monitor.
 
-    The vehicle has no latency where the runs tell none.
-
-    `sigma_intercept_m`, `sigma_slope`, from the loudest monitor, and `doppler_sigma_mps` are for `[monitors]` of the
-    configuration; None where the monitors were not evaluated.
+    The vehicle has no latency where the runs show none. `monitors`: what was measured for `[monitors]` of the
+    configuration, by key; a key without a measurement is left out.
     """
 
     vehicle: Vehicle
     runs: pl.DataFrame
     sigmas: pl.DataFrame
-    sigma_intercept_m: float | None
-    sigma_slope: float | None
-    doppler_sigma_mps: float | None
-
-    def monitors(self) -> dict[str, float]:
-        """What was measured for `[monitors]` of the configuration, by key."""
-        names = ("sigma_intercept_m", "sigma_slope", "doppler_sigma_mps")
-        return {name: value for name in names if (value := getattr(self, name)) is not None}
+    monitors: Mapping[str, float | tuple[float, ...]]
 
     def monitors_toml(self) -> str:
         """The part of a configuration file that was measured."""
-        measured = self.monitors()
-        return tomli_w.dumps({"monitors": measured}) if measured else ""
+        return tomli_w.dumps({"monitors": self.monitors}) if self.monitors else ""
 
 
 @dataclass(frozen=True)
 class Observed:
-    """What one run tells of its vehicle; `estimate` is None where GNSS and odometer could not be compared.
+    """What one run shows of its vehicle; `estimate` is None where GNSS and odometer could not be compared.
 
-    `epochs`: the columns that sigmas are regressed on. `alarms`: monitors that failed beyond noise (`beyond_noise`).
+    `noise_m`: fast noise by key of `[monitors]`. `epochs`: the columns that sigmas are regressed on, with this noise
+    given. `alarms`: monitors that failed beyond noise (`beyond_noise`).
     """
 
     run_id: str
     estimate: RunEstimate | None
-    epochs: pl.DataFrame
+    noise_m: dict[str, tuple[float, ...]]
+    epochs: pl.DataFrame | None
     alarms: tuple[str, ...]
 
 
@@ -74,10 +78,10 @@ def calibrate(
     config: Configuration | None = None,
     solution: str = "primary",
 ) -> Calibration:
-    """Vehicle and monitor sigmas from fault-free runs over one site.
+    """Vehicle, fast noise and monitor sigmas from fault-free runs over one site.
 
-    `vehicle` brings lever arms and heights; what it says of scale and latency is measured anew, and so are the sigmas
-    of `config`. Raises `InputError` where no run can be compared with an odometer.
+    `vehicle` brings lever arms and heights. Its scale and latency, and noise and sigmas of `config`, are measured anew.
+    Raises `InputError` where no run can be compared with an odometer.
     """
     config, base = config or Configuration(), vehicle or Vehicle()
     _check_solution(logs, solution)
@@ -85,18 +89,46 @@ def calibrate(
 
 
 def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> Observed:
-    """What a fault-free run tells: its scale and latency, and what the monitors show when it is replayed with these.
+    """Scale and latency of a fault-free run, its fast noise, and what the monitors show with these.
 
     Raises `InputError` where its streams do not fit each other.
     """
-    config = _uncalibrated(config)
     prepared = prepare(log, site, vehicle, config, clock_advice)
+    if solution not in prepared.run.solutions():
+        return Observed(log.run_id, None, {}, None, ())
     _refuse_what_does_not_fit(prepared, solution)
-    estimate = _estimate(prepared, solution)
+    match = prepared.match(solution)
+    odometry = None if prepared.odometry is None else prepared.odometry.oriented(match.odometer_sign)
+    estimate = None if odometry is None else _estimate(match, odometry, config)
     own = vehicle if estimate is None else _vehicle(vehicle, [estimate], config.align.latency_prior_sigma_s)
-    epochs = replay(log, site, own, config).epochs.filter(pl.col("solution") == solution)
-    alarms = beyond_noise(epochs, config.monitors.threshold_factor)
-    return Observed(log.run_id, estimate, epochs.select(COMPARED), alarms)
+    noise_m, epochs = _monitored(match, odometry, own, config)
+    return Observed(log.run_id, estimate, noise_m, epochs, _alarms(log, site, own, config, solution))
+
+
+def _estimate(match: Match, odometry: Odometry, config: Configuration) -> RunEstimate | None:
+    epochs = match.epochs.filter("fix_valid", "on_track")
+    t_s = odometry.seconds(times_ns(epochs))
+    seen = Observations(t_s, floats(epochs, "path_m"), floats(epochs, "sigma_along_m"))
+    return estimate_run(seen, odometry, *error_model(config.monitors), config.calibration)
+
+
+def _monitored(
+    match: Match, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
+) -> tuple[dict[str, tuple[float, ...]], pl.DataFrame]:
+    """The fast noise that the bank measures, and what the monitors show with this noise given."""
+    # Without the margin of a single run: the loudest of several counts.
+    stated = _with_monitors(config, {**_AS_STATED, **dict.fromkeys(_NO_NOISE), "noise_doubt": 0.0})
+    aligned = align(match.epochs, odometry, vehicle, stated)
+    noise_m = MonitorBank(aligned, {}, stated).median_noise_m()
+    given = _with_monitors(stated, noise_m)
+    bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, given)}, given)
+    return noise_m, pl.concat([aligned, pl.DataFrame(bank.columns())], how="horizontal").select(COMPARED)
+
+
+def _alarms(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> tuple[str, ...]:
+    """Of a replay without any noise given or measured: a fault must not pass for noise."""
+    replayed = replay(log, site, vehicle, _with_monitors(config, {**_AS_STATED, **_NO_NOISE}))
+    return beyond_noise(replayed.epochs.filter(pl.col("solution") == solution), config.monitors.threshold_factor)
 
 
 def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configuration) -> Calibration:
@@ -115,24 +147,42 @@ def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configura
         )
     fitted = _vehicle(vehicle, found, config.align.latency_prior_sigma_s)
     _refuse_figures_of_no_train(fitted, place, config)
-    epochs = [run.epochs for run in runs]
-    factor = config.monitors.threshold_factor
-    fits = regress_sigmas(epochs, factor, config.calibration)
-    worst = worst_fit(fits)
+    epochs = [run.epochs for run in runs if run.epochs is not None]
+    sigmas = regress_sigmas(epochs, config.monitors.threshold_factor, config.calibration)
+    noise_m = _loudest_noise_m(runs)
+    noisy = any(any(figures) for figures in noise_m.values())
+    velocity_mps = velocity_sigma_mps(epochs, config)
+    velocity = {} if velocity_mps is None else {"doppler_sigma_mps": velocity_mps}
     return Calibration(
         vehicle=fitted,
         runs=_run_table([(run.run_id, run.estimate) for run in runs]),
-        sigmas=sigma_table(fits),
-        sigma_intercept_m=None if worst is None else worst.intercept_m,
-        sigma_slope=None if worst is None else worst.slope,
-        doppler_sigma_mps=velocity_sigma_mps(epochs, factor, config.monitors.doppler_sigma_mps, config.calibration),
+        sigmas=sigma_table(sigmas),
+        monitors={**noise_m, **sigma_keys(sigmas, noisy=noisy), **velocity},
     )
 
 
-def _uncalibrated(config: Configuration) -> Configuration:
-    """Without the figures of an earlier calibration, or of the run: the regression is on what the receiver states."""
-    stated = {"sigma_intercept_m": 0.0, "sigma_slope": 1.0, **NO_NOISE}
-    return config.model_copy(update={"monitors": config.monitors.model_copy(update=stated)})
+def _loudest_noise_m(runs: Sequence[Observed]) -> dict[str, tuple[float, ...]]:
+    """By monitor the largest of all runs."""
+    names = sorted({name for run in runs for name in run.noise_m})
+    shown = {name: [run.noise_m[name] for run in runs if name in run.noise_m] for name in names}
+    return {name: tuple(np.max(noises_m, axis=0).tolist()) for name, noises_m in shown.items()}
+
+
+def sigma_keys(sigmas: Sequence[SigmaFit], *, noisy: bool) -> dict[str, float]:
+    """Sigma of positions by the loudest monitor.
+
+    Noise is measured with a margin. Where it makes every monitor quieter than predicted, the stated sigma stands.
+    """
+    worst = worst_fit(sigmas)
+    if worst is None:
+        return {}
+    if noisy and worst.ratio < 1.0:
+        return _AS_STATED
+    return {"sigma_intercept_m": worst.intercept_m, "sigma_slope": worst.slope}
+
+
+def _with_monitors(config: Configuration, keys: Mapping[str, object]) -> Configuration:
+    return config.model_copy(update={"monitors": config.monitors.model_copy(update=dict(keys))})
 
 
 def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
@@ -144,17 +194,6 @@ def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
             found=", ".join(known),
             remedy="Name one of these with --solution.",
         )
-
-
-def _estimate(prepared: PreparedRun, solution: str) -> RunEstimate | None:
-    config, odometry = prepared.config, prepared.odometry
-    if odometry is None or solution not in prepared.run.solutions():
-        return None
-    match = prepared.match(solution)
-    epochs = match.epochs.filter("fix_valid", "on_track")
-    t_s = odometry.seconds(times_ns(epochs))
-    seen = Observations(t_s, floats(epochs, "path_m"), floats(epochs, "sigma_along_m"))
-    return estimate_run(seen, odometry.oriented(match.odometer_sign), *error_model(config.monitors), config.calibration)
 
 
 def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: float) -> Vehicle:
@@ -174,11 +213,9 @@ def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: flo
 def _refuse_what_does_not_fit(prepared: PreparedRun, solution: str) -> None:
     """A run with a wrong unit or clock would teach its error to every other run."""
     run, config = prepared.recorded, prepared.config
-    if solution in run.solutions():
-        mounted = Vehicle(antenna_height_m=prepared.vehicle.antenna_height_m)
-        refuse_impossible(
-            fit_run(run, solution, mounted, config.plausibility, prepared.site), run.run_id, config.ingest
-        )
+    mounted = Vehicle(antenna_height_m=prepared.vehicle.antenna_height_m)
+    fit = fit_run(run, solution, mounted, config.plausibility, prepared.site)
+    refuse_impossible(fit, run.run_id, config.ingest)
 
 
 def _refuse_figures_of_no_train(vehicle: Vehicle, place: str, config: Configuration) -> None:

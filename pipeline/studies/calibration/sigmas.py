@@ -18,7 +18,7 @@ import polars as pl
 from scipy.optimize import nnls
 
 from schemas.arrays import Floats
-from schemas.config import CalibrationConfig
+from schemas.config import CalibrationConfig, Configuration
 from schemas.tables import AXES, BANK_MONITORS, SCALES
 
 # Numerics of the regression: bins of the same number of epochs. Half or twice as many change a simulated fit by less
@@ -107,21 +107,20 @@ def _fit(samples: Floats, config: CalibrationConfig) -> Floats:
     return np.array([overall, intercept, slope])
 
 
-def velocity_sigma_mps(
-    runs: Sequence[pl.DataFrame], factor: float, assumed_mps: float, config: CalibrationConfig
-) -> float | None:
+def velocity_sigma_mps(runs: Sequence[pl.DataFrame], config: Configuration) -> float | None:
     """Standard deviation of the GNSS velocity along the track [m/s] as monitor `along_doppler` shows it.
 
-    `runs`: epochs tables of fault-free runs, replayed with `assumed_mps` for it; `factor` is k_T. What the odometer's
-    noise, scale and latency account for is taken off; more odometer noise than assumed is in it. None where the monitor
-    was hardly evaluated, or where what is left is below a tenth of what was assumed, which no such difference tells.
+    `runs`: epochs tables of fault-free runs, replayed with this configuration. What the odometer's noise, scale and
+    latency account for is taken off; more odometer noise than assumed is in it. None where the monitor was hardly
+    evaluated, or where what is left is below a tenth of what was assumed, which no such difference shows.
     """
     value, threshold = pl.col("along_doppler_value"), pl.col("along_doppler_threshold")
-    looks = pl.concat([run.select(value, threshold).drop_nulls() for run in runs])
-    if looks.height < config.least_epochs:
+    looks = [run.select(value, threshold).drop_nulls() for run in runs]
+    if sum(look.height for look in looks) < config.calibration.least_epochs:
         return None
-    of_others = (threshold / factor) ** 2 - assumed_mps**2
-    variance = looks.select((value**2 - of_others).mean()).item()
+    assumed_mps = config.monitors.doppler_sigma_mps
+    of_others = (threshold / config.monitors.threshold_factor) ** 2 - assumed_mps**2
+    variance = pl.concat(looks).select((value**2 - of_others).mean()).item()
     return float(np.sqrt(variance)) if variance > (0.1 * assumed_mps) ** 2 else None
 
 

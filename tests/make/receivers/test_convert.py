@@ -118,7 +118,7 @@ def test_something_else_is_one_error(tmp_path):
     path.write_bytes(b"hello world" * 30)
     with pytest.raises(InputError, match="no message of a known receiver"):
         convert([path], "r")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="does not exist"):
         convert([tmp_path / "none.log"], "r")
 
 

@@ -7,7 +7,7 @@ import tomllib
 import pytest
 
 from pipeline.make.receivers import convert, gather
-from pipeline.make.receivers.csv_draft import draft_mapping
+from pipeline.read.ingest.csv_draft import draft_mapping
 from schemas.config import Configuration, settings_from
 from schemas.errors import BaliseError, ConfigError, InputError
 
@@ -147,7 +147,7 @@ def test_day_and_month_are_decided_over_the_whole_file_or_asked_for(converted):
     assert asked["t"].dt.date().cast(str).to_list() == ["2025-01-06", "2025-02-06"]
     with pytest.raises(InputError, match="dates of two kinds"):
         converted(GERMAN.format("13.06.2025", "06.13.2025"), **COLUMNS)
-    with pytest.raises(InputError, match="another kind than was said; found day_first"):
+    with pytest.raises(InputError, match="another kind than date_order; found day_first"):
         converted(GERMAN.format("13.06.2025", "13.06.2025"), **COLUMNS, date_order="month_first")
 
 

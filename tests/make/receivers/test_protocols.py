@@ -46,6 +46,12 @@ def test_ubx_kinds_of_fix(converted, fix, flags, kind):
     assert (row["cov_ee_m2"] is None) == (kind == "none")
 
 
+def test_a_time_beyond_all_calendars_is_no_time(converted):
+    """A year of 9999 does not fit into nanoseconds: the table was refused by an error of polars."""
+    log = converted(nav_pvt(1000), nav_pvt(2000, (9999, 6, 1, 12, 0, 1)), nav_pvt(3000, (1950, 6, 1, 12, 0, 2)))
+    assert (log.run.gnss.height, log.dropped) == (1, {"time not valid": 2})
+
+
 def test_ubx_units_and_negative_nanoseconds(converted):
     row = converted(nav_pvt(1000, nano=-500)).run.gnss.row(0, named=True)
     assert iso(converted(nav_pvt(1000, nano=-500)).run.gnss) == ["2025-06-01T11:59:59.999999500"]

@@ -37,6 +37,12 @@ def test_times(row_of, scale, time, utc):
     assert row["t"].strftime("%Y-%m-%d %H:%M:%S.%f")[:-3] == f"2021-03-19 {utc}"
 
 
+@pytest.mark.parametrize("row", ["2149 4_0.0 50.5", "2149 1e13 50.5", "9999/01/01 00:00:00.0 50.5", "2149 40.0 5_0.5"])
+def test_what_only_python_reads_as_a_number_or_a_time_is_refused(row_of, row):
+    with pytest.raises(InputError, match=r"is no time|holds a value that is no number"):
+        row_of(f"% {LLH}\n%  GPST {PLANE}\n", f"{row} -4.5 120.5 {END}")
+
+
 def test_deviations_are_variances_with_the_sign_of_their_covariance(row_of):
     row = row_of(f"% {LLH}\n%  GPST {PLANE}\n", f"2021/03/19 13:00:00.000 50.5 -4.5 120.5 {END}")
     assert (row["latitude_deg"], row["longitude_deg"], row["height_m"]) == (50.5, -4.5, 120.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import subprocess
 import sys
@@ -12,14 +13,20 @@ import numpy as np
 import polars as pl
 import pytest
 import zstandard
+from google.protobuf.message import DecodeError
+from google.protobuf.timestamp_pb2 import Timestamp
+from pydantic import ValidationError
 
+from pipeline.make.receivers import gather
 from pipeline.read.ingest import mcap_block, read_run
+from pipeline.read.ingest.correct import corrected
 from pipeline.read.ingest.describe import describe_log
 from pipeline.read.ingest.layout import LayoutDecoder, UnfitError, constant, fixed, layout_of
+from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
 from pipeline.stages.clean.clean import clean, of_the_journey
 from pipeline.storage.parquet import parquet_bytes
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, StreamCorrection
 from schemas.errors import InputError
 from tests.read.ingest import samples
 from tests.read.ingest.samples import (
@@ -73,7 +80,7 @@ import resource, sys, time
 from pathlib import Path
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.describe import describe_log
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, StreamCorrection
 from schemas.errors import InputError
 
 read_run(Path(sys.argv[1]), IngestConfig())
@@ -181,6 +188,46 @@ def test_definitions_are_read_in_linear_time() -> None:
     for line in (f"string {LETTERS}!", f"uint8 {LETTERS * 4000}! x", "x" + " " * 100_000 + "!", "=" * 100_000 + "x"):
         with pytest.raises(DefinitionError, match="is not understood"):
             parse_definitions("a/msg/B", line)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("C c\n===\nMSG: a/C\nfloat64 x\n===\nMSG: a/msg/C\nfloat32 x\n", "a/msg/C is defined twice"),
+        ("float64 x\nfloat32 y\nfloat64 x\n", "a/msg/B names a field twice"),
+    ],
+)
+def test_definitions_that_contradict_themselves_are_refused(text: str, reason: str) -> None:
+    """Of two definitions of a header the last one counted: a latitude was read as 3e-319."""
+    with pytest.raises(DefinitionError, match=reason):
+        parse_definitions("a/msg/B", text)
+    repeated = parse_definitions("a/msg/B", "C c" + "\n===\nMSG: a/C\nfloat64 x" * 2)
+    assert repeated["a/C"] == (Member("x", "float64", None),)
+
+
+@pytest.mark.parametrize("tag", [b"\x88\x80\x80\x80\x80\x00", b"\x88\x80\x80\x80\x10"], ids=["6 bytes", "bit 32"])
+def test_a_protobuf_tag_has_32_bits(tag: bytes) -> None:
+    layout = layout_by(Timestamp.DESCRIPTOR, {"seconds": pl.Int64()})
+    assert layout(b"\x08\x05").fields["seconds"].start == 1
+    with pytest.raises(DecodeError):
+        Timestamp.FromString(tag + b"\x05")
+    with pytest.raises(UnfitError):
+        layout(tag + b"\x05")
+
+
+def test_a_pipe_is_refused_before_it_blocks(tmp_path: Path) -> None:
+    for name in ("run.mcap", "run.ubx", "run.csv"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(InputError, match="is no regular file"):
+            read_run(tmp_path / name) if name.endswith(".mcap") else gather([tmp_path / name])
+
+
+def test_a_shift_that_64_bits_do_not_hold_is_refused() -> None:
+    shift = StreamCorrection(stream="gnss", shift_s=8e9)
+    with pytest.raises(InputError, match=r"after \[\[ingest.correct\]\]: column t: has missing values"):
+        corrected(samples.run(), [shift])
+    with pytest.raises(ValidationError, match="less than or equal to 9000000000"):
+        StreamCorrection(stream="gnss", shift_s=1e300)
 
 
 def test_a_message_does_not_make_more_than_it_holds() -> None:

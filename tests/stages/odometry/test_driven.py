@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.odometry.driven import driven_m, evenly_driven, with_hysteresis
+from pipeline.stages.odometry.driven import driven_m, evenly_driven, under_way, with_hysteresis
 from schemas.config import AlignConfig, Configuration
 from tests.replay.journeys import VEHICLE, journey, replay
 from tests.stages.alignment.straight import NO_NOISE
@@ -43,6 +43,16 @@ def test_a_stand_lasts_to_its_last_count_and_to_the_end_of_the_record():
     around = nodes.index((10.0, 10.0))
     assert nodes[around + 1 : around + 3] == [(70.0, 10.0), (71.0, 11.0)]
     assert nodes[-2:] == [(90.0, 30.0), (100.0, 30.0)]
+
+
+def test_rows_that_scatter_at_a_stand_are_not_under_way():
+    """Half a metre from row to row at 5 Hz looks like 2.5 m/s; from 20 s on the train drives 5 m/s."""
+    t_s = np.arange(0.0, 40.0, 0.2)
+    rows_m = 5.0 * np.maximum(t_s - 20.0, 0.0) + np.random.default_rng(1).normal(0.0, 0.5, t_s.size)
+    way_m = driven_m(rows_m, np.full(t_s.size, 2.5))
+    moving = under_way(t_s, way_m, 0.3, 1.0)
+    assert not moving[t_s < 20.0].any()
+    assert moving[t_s > 21.5].mean() > 0.9
 
 
 def test_hysteresis_by_hand():

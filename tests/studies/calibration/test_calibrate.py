@@ -12,9 +12,10 @@ from datasets.demo import demo_scenario
 from datasets.scenario import OdometerSpec
 from datasets.trial import build_run, build_site
 from pipeline.one_run import replay
-from pipeline.studies.calibration.calibrate import Calibration, calibrate
+from pipeline.studies.calibration.calibrate import Calibration, Observed, calibrate, calibration_of, sigma_keys
 from pipeline.studies.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
-from schemas.config import CalibrationConfig, Configuration, MonitorConfig
+from pipeline.studies.calibration.vehicle import RunEstimate
+from schemas.config import CalibrationConfig, Configuration, MonitorConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
@@ -105,9 +106,9 @@ def test_calibration_finds_the_simulated_vehicle(result: Calibration) -> None:
     assert 0 < (vehicle.gnss_latency_sigma_s or 0) < 0.03
     assert result.runs["run_id"].to_list() == ["clean0", "clean1"]
     assert result.sigmas.height == 12
-    assert result.sigma_slope == pytest.approx(1.0, abs=0.1)
+    assert result.monitors["sigma_slope"] == pytest.approx(1.0, abs=0.1)
     settings = tomllib.loads(result.monitors_toml())
-    assert settings["monitors"]["sigma_slope"] == result.sigma_slope
+    assert settings["monitors"]["sigma_slope"] == result.monitors["sigma_slope"]
 
 
 def test_sigmas_of_an_earlier_calibration_do_not_count(
@@ -116,7 +117,24 @@ def test_sigmas_of_an_earlier_calibration_do_not_count(
     config = Configuration(monitors=MonitorConfig(sigma_intercept_m=0.5, sigma_slope=2.0, doppler_sigma_mps=0.3))
     again = calibrate(*fault_free, config=config)
     assert again.sigmas.equals(result.sigmas)
-    assert again.doppler_sigma_mps == pytest.approx(result.doppler_sigma_mps)
+    assert again.monitors == result.monitors
+
+
+def seen(run_id: str, noise_m: dict[str, tuple[float, ...]]) -> Observed:
+    return Observed(run_id, RunEstimate(1.0, 1e-4, 0.0, 0.01, 1.0, 100), noise_m, None, ())
+
+
+def test_the_loudest_run_counts_monitor_by_monitor_and_an_axis_unknown_to_all_stays_unset() -> None:
+    one = seen("one", {"noise_along_m": (0.1, 0.1, 0.4, 0.4), "noise_cross_m": (0.0, 0.0, 0.0, 0.0)})
+    other = seen("other", {"noise_along_m": (0.2, 0.3, 0.3, 0.3)})
+    found = calibration_of([one, other], Vehicle(), Configuration())
+    assert found.monitors == {"noise_along_m": (0.2, 0.3, 0.4, 0.4), "noise_cross_m": (0.0, 0.0, 0.0, 0.0)}
+
+
+def test_quieter_than_predicted_is_believed_only_where_no_noise_explains_it() -> None:
+    (fit,) = regress_sigmas([monitored(1, 0.0, 0.7, spread=0.0)], FACTOR, CONFIG)
+    assert sigma_keys([fit], noisy=True) == {"sigma_intercept_m": 0.0, "sigma_slope": 1.0}
+    assert sigma_keys([fit], noisy=False)["sigma_slope"] == pytest.approx(0.7, rel=0.02)
 
 
 def test_a_noisy_odometer_shows_in_the_sigma_of_the_velocity(fault_free: tuple[list[RunLog], Site]) -> None:
@@ -127,7 +145,7 @@ def test_a_noisy_odometer_shows_in_the_sigma_of_the_velocity(fault_free: tuple[l
     noisy = clean.model_copy(update={"odometer": clean.odometer.model_copy(update={"noise_m_per_root_s": 0.2})})
     log = build_run(scenario, noisy)
     result = calibrate([log], site)
-    assert result.doppler_sigma_mps == pytest.approx(np.sqrt(0.2**2 - 0.05**2 + 0.03**2 / 10), rel=0.1)
+    assert result.monitors["doppler_sigma_mps"] == pytest.approx(np.sqrt(0.2**2 - 0.05**2 + 0.03**2 / 10), rel=0.1)
     followed = MonitorConfig.model_validate(tomllib.loads(result.monitors_toml())["monitors"])
     alarms = [
         replay(log, site, result.vehicle, Configuration(monitors=monitors)).epochs["along_doppler_state"] == "fail"
@@ -142,7 +160,7 @@ def test_where_no_velocity_was_recorded_nothing_is_said_of_it(fault_free: tuple[
     nothing = pl.lit(None, pl.Float64)
     still = logs[0].gnss.with_columns(pl.col("^velocity_.*_mps$").cast(pl.Float64) * nothing)
     result = calibrate([logs[0].with_streams(gnss=still)], site)
-    assert result.doppler_sigma_mps is None
+    assert "doppler_sigma_mps" not in result.monitors
     assert "doppler_sigma_mps" not in result.monitors_toml()
 
 

@@ -1,4 +1,4 @@
-"""A mapping to begin with, from the header of a CSV file: what names and units tell, and what is left to decide."""
+"""A mapping to begin with, from the header of a CSV file: what names and units show, and what is left to decide."""
 
 from __future__ import annotations
 
@@ -8,38 +8,10 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.make.receivers.csv import with_points
-from pipeline.make.receivers.csv_times import LEAST_DAY, MOST_DAY, orders_of
-from pipeline.read.ingest.csv_text import read_log_table
-from pipeline.read.ingest.guesses import NAMES, columns_in, first, mapping_lines, one_line, unit_in, word_of
+from pipeline.read.ingest.csv_text import read_log_table, with_points
+from pipeline.read.ingest.guesses import COLUMNS, WORDS, columns_in, first, mapping_lines, one_line, unit_in, word_of
+from pipeline.read.ingest.stamps import LEAST_DAY, MOST_DAY, orders_of_day
 from schemas.run import Stream
-
-_TIMES = (
-    r"(gps|utc|gnss)?(t|time|timestamp|datetime|zeit|zeitstempel|zeitpunkt|utc|datumzeit|datumuhrzeit|heure)"
-    r"(utc|gps|s|ms|us|ns)?"
-)
-_DATES, _WEEKS = r"(gps|utc)?(date|datum|day|tag)(utc)?", r"(gps|gpst)?(week|wk|wn|weekno|weeknumber|woche)"
-_SECONDS = r"(gps)?(tow|sow|itow|timeofweek|secondsofweek|secofweek|weekseconds|gpsseconds|gpstime|seconds)(s|ms)?"
-_CLOCKS = r"(gps|utc)?(time|zeit|uhrzeit|timeofday|clock|heure)(utc)?"
-
-_SENSORS = r"(odo|odometer)?(sensor|sensorid|sensorname|geber|capteur)"
-_BALISES = r"(balise|balisen|balisegroup|bg|eurobalise)(id|nr|no|name|number|nummer)?"
-
-
-def draft_mapping(path: Path) -> str:
-    """Configuration text for `balise convert`, to be saved and checked; what nothing tells is a comment."""
-    log = read_log_table(path, infer=True)
-    table = with_points(log)
-    pairs = zip(log.table.columns, log.units, strict=False)
-    units = {name: unit for name, told in pairs if (unit := told.strip("[]()<> ").lower())}
-    words = {name: word_of(name) for name in table.columns if name.strip()}
-    time = _time_lines(table, words, units)
-    parts = [part for stream in NAMES if (part := _stream(stream, table, words, path.name, time, units))]
-    parts += [] if parts else _reads(words, path.name, time)
-    head = f"# Draft from the header of {path.name}: check each line, above all units and the scale of the times.\n"
-    columns = f"# Columns: {', '.join(map(one_line, table.columns))}\n"
-    return head + columns + ("\n".join(parts) if parts else _EMPTY.format(topic=json.dumps(path.name)))
-
 
 _EMPTY = """
 # No name tells what is position, distance or speed. Write, for instance:
@@ -49,8 +21,22 @@ _EMPTY = """
 # fields = {{ distance_m = "COLUMN" }}
 """
 
-
 Words = Mapping[str, str]
+
+
+def draft_mapping(path: Path) -> str:
+    """Configuration text for `balise convert`, to be saved and checked; what nothing shows is a comment."""
+    log = read_log_table(path, infer=True)
+    table = with_points(log)
+    pairs = zip(log.table.columns, log.units, strict=False)
+    units = {name: unit for name, written in pairs if (unit := written.strip("[]()<> ").lower())}
+    words = {name: word_of(name) for name in table.columns if name.strip()}
+    time = _time_lines(table, words, units)
+    parts = [part for stream in COLUMNS if (part := _stream(stream, table, words, path.name, time, units))]
+    parts = parts or _reads(words, path.name, time)
+    head = f"# Draft from the header of {path.name}: check each line, above all units and the scale of the times.\n"
+    columns = f"# Columns: {', '.join(map(one_line, table.columns))}\n"
+    return head + columns + ("\n".join(parts) if parts else _EMPTY.format(topic=json.dumps(path.name)))
 
 
 def _stream(
@@ -58,7 +44,7 @@ def _stream(
 ) -> str:
     numbers = {name: word for name, word in words.items() if table[name].dtype.is_numeric()}
     # Rows of several odometers must stay apart: one after the other they are no counter.
-    sensor = first(words, _SENSORS) if stream == "odometer" else None
+    sensor = first(words, WORDS["sensor"]) if stream == "odometer" else None
     lines = mapping_lines(stream, file, numbers, *time, units, {"sensor": sensor} if sensor else {})
     unfit = _unfit(stream, table, {name: word for name, word in words.items() if name not in numbers})
     return "\n".join(["", *lines, *unfit]) + "\n" if lines or unfit else ""
@@ -66,7 +52,7 @@ def _stream(
 
 def _reads(words: Words, file: str, time: tuple[list[str], float | None]) -> list[str]:
     """The mapping of balise reads, of a table that is nothing else."""
-    balise = first(words, _BALISES)
+    balise = first(words, WORDS["balise"])
     if balise is None:
         return []
     factors = [f"factors = {{ t = {time[1]:.10g} }}"] if time[1] else []
@@ -77,32 +63,32 @@ def _reads(words: Words, file: str, time: tuple[list[str], float | None]) -> lis
 
 def _unfit(stream: Stream, table: pl.DataFrame, words: Words) -> list[str]:
     """What is left out though its name fits, since it holds texts."""
-    found = columns_in(stream, words)
-    texts = {column: table[name].cast(pl.String).replace("", None).drop_nulls() for column, name in found.items()}
-    wrong = {column: cells.filter(cells.cast(pl.Float64, strict=False).is_null()) for column, cells in texts.items()}
-    return [
-        f"# {column}: left out, since {one_line(found[column])!r} holds no number in {len(cells)} rows, "
-        f"first {one_line(str(cells[0]))!r}"
-        for column, cells in wrong.items()
-        if len(cells)
-    ]
+    lines = []
+    for column, name in columns_in(stream, words).items():
+        cells = table[name].cast(pl.String).replace("", None).drop_nulls()
+        wrong = cells.filter(cells.cast(pl.Float64, strict=False).is_null())
+        if len(wrong):
+            reason = f"{one_line(name)!r} holds no number in {len(wrong)} rows, first {one_line(str(wrong[0]))!r}"
+            lines.append(f"# {column}: left out, since {reason}")
+    return lines
 
 
 def _time_lines(table: pl.DataFrame, words: Words, units: Words) -> tuple[list[str], float | None]:
     """The lines on time, and the seconds per unit of the times where they are not seconds."""
-    week, seconds = first(words, _WEEKS), first(words, _SECONDS)
+    week = first(words, WORDS["week"])
+    seconds = first(words, WORDS["seconds"])
     if week and seconds:
         milli = (unit_in(seconds) or units.get(seconds)) == "ms" or words[seconds] == "itow"
         return [_field(week, seconds), 'time_epoch = "gps"'], 1e-3 if milli else None
-    date, clock = first(words, _DATES), first(words, _CLOCKS)
-    time = clock if date and clock else first(words, _TIMES) or date
-    if time is None:
-        return ['# time = "field:COLUMN"  # no name tells which column is the time'], None
-    told = date if date and clock else time
-    epoch, scale = _epoch(table[told or time])
-    gps = ['# time_scale = "gps"  # if these times are 18 s ahead of UTC'] if "gps" in words[time] else []
-    named = _field(date, clock) if date and clock else _field(time)
-    return [named, *epoch, *_order(table[told or time]), *gps], scale
+    date = first(words, WORDS["date"])
+    clock = first(words, WORDS["clock"])
+    names = [date, clock] if date and clock else [first(words, WORDS["time"]) or date]
+    if names[0] is None:
+        return ['# time = "field:COLUMN"  # no name shows which column is the time'], None
+    written = [name for name in names if name]
+    epoch, scale = _epoch(table[written[0]])
+    gps = ['# time_scale = "gps"  # if these times are 18 s ahead of UTC'] if "gps" in words[written[-1]] else []
+    return [_field(*written), *epoch, *_order(table[written[0]]), *gps], scale
 
 
 def _field(*names: str) -> str:
@@ -110,7 +96,12 @@ def _field(*names: str) -> str:
 
 
 def _order(column: pl.Series) -> list[str]:
-    if column.dtype != pl.String or len(orders_of(column)) < 2:
+    """The choice between day and month, where all dates fit both."""
+    if column.dtype != pl.String:
+        return []
+    parts = column.str.extract_groups(r"^([0-9]{1,2})[-/.]([0-9]{1,2})[-/.][0-9]").struct.unnest().cast(pl.Int64)
+    day_or_month = parts.to_series(0)
+    if day_or_month.null_count() == len(column) or len(orders_of_day(day_or_month, parts.to_series(1))) < 2:
         return []
     return ['# date_order = "day_first"  # or "month_first": all dates of the file fit both, so you must say it']
 
@@ -122,5 +113,5 @@ def _epoch(column: pl.Series) -> tuple[list[str], float | None]:
     least, most = float(column.min()), float(column.max())  # type: ignore[arg-type]
     if least >= LEAST_DAY and most <= MOST_DAY:
         return ['time_epoch = "excel"  # days since 1899-12-30'], None
-    sizes = ((1e-3, 1e12), (1e-6, 1e15))
-    return [], next((unit for unit, size in sizes if 0.5 * size < least and most < 4 * size), None)
+    sizes = {1e-3: 1e12, 1e-6: 1e15}
+    return [], next((unit for unit, size in sizes.items() if 0.5 * size < least and most < 4 * size), None)
