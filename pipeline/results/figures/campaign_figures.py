@@ -96,7 +96,8 @@ def _of_open_cases(sums: pl.DataFrame, figure: Callable[[int, float], float | No
 
 def _sums() -> dict[str, pl.Expr]:
     """What is added up over the runs of one solution."""
-    evidence, judged = pl.col("evidence"), pl.col("false_alarm_rate_per_h").is_not_null()
+    evidence = pl.col("evidence")
+    judged = pl.col("false_alarm_rate_per_h").is_not_null()
     truth = evidence.is_in(TRUTH)
     sums = {name: pl.col(name).sum() for name in (*_SUMMED, *_NAMES.values())}
     sums |= {
@@ -125,7 +126,8 @@ def _shares() -> dict[str, pl.Expr]:
     P0 and P1 need a truth, so that the time is that of the runs with one. What the odometer alone tells of the error is
     not good enough to call a position right. Without a truth P2 and P3 are those of all runs.
     """
-    held, truth = pl.col("held_s").fill_null(0.0), pl.col("truth_held_s") > 0.0
+    held = pl.col("held_s").fill_null(0.0)
+    truth = pl.col("truth_held_s") > 0.0
     counted = truth | ~truth.any()
     whole = held.filter(counted).sum()
     shares: dict[str, pl.Expr] = {}
@@ -144,7 +146,8 @@ def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, levels: pl.Dat
     Eq. 7 limits how long a hazardous position may be in use, so the hazardous time is compared. The quantiles of T_D
     and of both bounds of T_dsf leave out faults that were not detected. `levels`: of the same runs (`campaign_levels`).
     """
-    spent, may = pl.col("hazardous_s"), pl.col("hazardous_may_s")
+    spent = pl.col("hazardous_s")
+    may = pl.col("hazardous_may_s")
     of_failures = (
         failures_of(runs)
         .group_by("solution")
@@ -154,7 +157,9 @@ def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, levels: pl.Dat
     detected = pl.col("time_to_detect_s").count()
     of_episodes = independent_episodes(hazards).group_by("solution").agg(detected=detected, **times)
     measured = of_failures.join(of_episodes, on="solution", how="full", coalesce=True).sort("solution")
-    within, exceeded, by_truth = pl.col("within"), pl.col("exceeded"), pl.col("evidence").is_in(TRUTH)
+    within = pl.col("within")
+    exceeded = pl.col("exceeded")
+    by_truth = pl.col("evidence").is_in(TRUTH)
     counts = {
         "within": within.sum(),
         "exceeded": exceeded.sum(),

@@ -58,7 +58,8 @@ def counted_runs(runs: pl.DataFrame, hazards: pl.DataFrame) -> pl.DataFrame:
 
 def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """Every `runs` row with rates, exact bounds and the verdict per service level (CONTRACT section 3)."""
-    table, levels = with_estimates(counted_runs(runs, hazards), *RATES), campaign_levels(runs, config)
+    table = with_estimates(counted_runs(runs, hazards), *RATES)
+    levels = campaign_levels(runs, config)
     for level in config.safety.service_levels:
         named = {f"allowed_{level}_s": "allowed_s"}
         named |= {f"{part}_{level}": part for part in ("within", "exceeded", "verdict")}
@@ -86,7 +87,8 @@ def campaign_levels(runs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
 
 
 def _faults_per_run(hazards: pl.DataFrame) -> pl.DataFrame:
-    missed, truth = pl.col("missed"), pl.col("with_truth")
+    missed = pl.col("missed")
+    truth = pl.col("with_truth")
     counts = {
         "faults": pl.len(),
         "missed": missed.sum(),
@@ -115,7 +117,9 @@ def _spread() -> dict[str, pl.Expr]:
 
 def _counts() -> dict[str, pl.Expr]:
     """Conditions on passages (`with_truth`): in how many rows each holds."""
-    mode, passage, judged = pl.col("failure_mode"), is_passage(), acceptances()
+    mode = pl.col("failure_mode")
+    passage = is_passage()
+    judged = acceptances()
     counts = {
         **outcomes(),
         **judged,
@@ -188,11 +192,13 @@ def _speed_band() -> pl.Expr:
     return band.fill_null("unknown")
 
 
-def _accuracy(found: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def _accuracy(offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     keys = ["grouped_by", "solution", "group"]
-    size, own_m, limit_m = pl.col("location_error_m").abs(), pl.col("location_accuracy_m"), config.lds.ci_limit_m
+    size = pl.col("location_error_m").abs()
+    own_m = pl.col("location_accuracy_m")
+    limit_m = config.lds.ci_limit_m
     counted = (
-        found.group_by(keys, maintain_order=True)
+        offers.group_by(keys, maintain_order=True)
         .agg(
             **_spread(),
             location_error_median_m=pl.col("location_error_m").median(),

@@ -13,12 +13,12 @@ from schemas.enums import RunStatus, RunVerdict
 
 def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
     """The verdict that heads several; None stands for one that failed, and proves nothing beside others."""
-    found = {None if verdict is None else RunVerdict(verdict) for verdict in verdicts}
-    if RunVerdict.UNSAFE in found:
+    known = {None if verdict is None else RunVerdict(verdict) for verdict in verdicts}
+    if RunVerdict.UNSAFE in known:
         return RunVerdict.UNSAFE
-    if not found - {None}:
+    if not known - {None}:
         return None
-    return RunVerdict.SAFE if found == {RunVerdict.SAFE} else RunVerdict.UNPROVEN
+    return RunVerdict.SAFE if known == {RunVerdict.SAFE} else RunVerdict.UNPROVEN
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ def word_of(verdict: RunVerdict | str | None) -> str:
 
 def head_of(verdicts: Iterable[RunVerdict | None]) -> CampaignHead:
     """The head of a campaign from the verdicts of its runs."""
-    found = list(verdicts)
-    counts = {verdict.value: found.count(verdict) for verdict in RunVerdict}
-    return CampaignHead(worst_verdict(found), **counts, failed=found.count(None))
+    listed = list(verdicts)
+    counts = {verdict.value: listed.count(verdict) for verdict in RunVerdict}
+    return CampaignHead(worst_verdict(listed), **counts, failed=listed.count(None))
 
 
 def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:

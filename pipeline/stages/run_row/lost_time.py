@@ -55,14 +55,15 @@ def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, clock: Clock, config: 
         return LostTime()
     gap = clock.held_s < steps_s
     lost = moving & (gap | ~met(epochs, pl.col("tvb") & pl.col("moving").is_not_null()))
-    share, left = float(steps_s[lost].sum()) / whole_s, lost
-    found: dict[LostTo, Bools] = {}
+    share = float(steps_s[lost].sum()) / whole_s
+    left = lost
+    by_cause: dict[LostTo, Bools] = {}
     for cause, applies in _causes(epochs, gap, clock.t_ns, config).items():
-        found[cause] = left & applies
+        by_cause[cause] = left & applies
         left = left & ~applies
-    parts = {cause: float(steps_s[rows].sum()) / whole_s for cause, rows in found.items()}
+    parts = {cause: float(steps_s[rows].sum()) / whole_s for cause, rows in by_cause.items()}
     ranked = sorted((cause for cause, part in parts.items() if part > 0.0), key=lambda cause: -parts[cause])
-    alarmed = found[LostTo.ALARM]
+    alarmed = by_cause[LostTo.ALARM]
     unexplained = alarmed & ~_explained(alarms, clock.t_ns, config.lds.recovery_s)
     unfounded = bool(2.0 * steps_s[unexplained].sum() > steps_s[alarmed].sum())
     return LostTime(share, {cause: parts[cause] for cause in ranked}, _loudest(epochs.filter(alarmed)), unfounded)

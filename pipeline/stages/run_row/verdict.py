@@ -57,10 +57,10 @@ def reasons_of(run: Row, allowed_s: float, undiagnosed_share: float) -> list[Rea
 
 def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
     """The worst that applies; an assumed clock alone changes nothing (DOMAIN section 5.4)."""
-    found = set(reasons) - {Reason.CLOCK_ASSUMED}
-    if found & _UNSAFE:
+    against = set(reasons) - {Reason.CLOCK_ASSUMED}
+    if against & _UNSAFE:
         return RunVerdict.UNSAFE
-    return RunVerdict.UNPROVEN if found else RunVerdict.SAFE
+    return RunVerdict.UNPROVEN if against else RunVerdict.SAFE
 
 
 LEVEL_LISTS = {
@@ -70,14 +70,14 @@ LEVEL_LISTS = {
     "exceeded": "level_exceeded",
     "verdict": "level_verdict",
 }
-"""What `level_rows` tells of each service level, and the list of the `runs` table that holds it."""
+"""What `level_rows` gives for each service level, and the list of the `runs` table that holds it."""
 
 
 _OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVerdict.UNKNOWN}
 
 
 def level_rows(run: Row, config: Configuration) -> list[dict[str, object]]:
-    """One `runs` row against the allowed T_D of each service level, by the rules of its own verdict."""
+    """One `runs` row against the allowed T_D of each service level, by the rules of the run's verdict."""
     failures = failures_in(run)
     in_time = ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
     rows: list[dict[str, object]] = []
