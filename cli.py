@@ -263,7 +263,7 @@ def claim(
         head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
         title = f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}"
         answer = {**head, "notes": found.notes, "requirements": found.table}
-        _tell(as_json, answer, {title: for_reading(found.table)}, "", *found.notes)
+        _tell(as_json, answer, {title: for_reading(found)}, "", *found.notes)
 
 
 @_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12")

@@ -120,7 +120,7 @@ class _Replayed(CampaignWatch):
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
 
-    def told(self, outcome: RunOutcome) -> None:
+    def counted(self, outcome: RunOutcome) -> None:
         self._progress(f"{outcome.run_id}: replayed")
 
     def noted(self, text: str) -> None:

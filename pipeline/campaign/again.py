@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 
 from pipeline.campaign.plan import make_plan
 from pipeline.campaign.run import run_campaign
-from pipeline.campaign.watch import Watch
+from pipeline.campaign.watch import Follower
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 
 
 def replay_again(
-    logs: Sequence[str], site: str | None, vehicle: Vehicle, jobs: int, watch: Callable[[], Watch]
+    logs: Sequence[str], site: str | None, vehicle: Vehicle, jobs: int, watch: Callable[[], Follower]
 ) -> Callable[[Configuration, str], object] | None:
     """How to replay these logs into a folder; none without logs. `watch` makes what follows each replay.
 

@@ -16,7 +16,7 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from types import FrameType
 
 from pipeline.campaign.interruption import StopRun, answered
-from pipeline.campaign.outcome import Failure, Result, overdue
+from pipeline.campaign.outcome import Result, RunFailure, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import fail_run, replay_one
@@ -75,7 +75,7 @@ class SerialEngine(Engine):
             with _alarm(self._limit_s):
                 result.set_result(replay_one(job))
         except _Overdue:
-            result.set_result(fail_run(job, Failure(overdue(self._limit_s), lasting=False)))
+            result.set_result(fail_run(job, RunFailure(overdue(self._limit_s), lasting=False)))
         except Exception as error:
             result.set_exception(error)
         return result
@@ -105,8 +105,8 @@ class LocalEngine(Engine):
     """Processes of this machine, each in an executor of its own, so that the loss of one touches no other."""
 
     def __init__(self, jobs: int) -> None:
-        self._idle = [_Slot() for _ in range(jobs)]
-        self._busy: dict[Result, _Slot] = {}
+        self._idle = [_WorkerSlot() for _ in range(jobs)]
+        self._busy: dict[Result, _WorkerSlot] = {}
 
     def capacity(self) -> int:
         return len(self._idle) + len(self._busy)
@@ -133,7 +133,7 @@ class LocalEngine(Engine):
             slot.kill()
 
 
-class _Slot:
+class _WorkerSlot:
     """One worker process, started when first needed and again after it was lost."""
 
     def __init__(self) -> None:
@@ -164,7 +164,10 @@ class _Slot:
             return
         self._process.kill()
         self._executor.shutdown(wait=True, cancel_futures=True)
-        self._executor, self._process, self._answer, self._runs = None, None, None, 0
+        self._executor = None
+        self._process = None
+        self._answer = None
+        self._runs = 0
 
     def _started(self) -> ProcessPoolExecutor:
         if self._process is not None and not self._process.is_alive():

@@ -52,5 +52,5 @@ def _is_current(out: Address, key: str) -> bool:
 
 def campaign_key(out: Address, config: Configuration) -> str:
     """The digest of all that decides these tables: program, configuration and every marker, which names its tables."""
-    runs = [(run, manifest.sha256(content)) for run, content in manifest.markers(out)]
+    runs = [(run, manifest.sha256(content)) for run, content in store.markers(out)]
     return hashlib.sha256(repr((software_digest(), digest_of(config), runs)).encode()).hexdigest()

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from pipeline.results.outcome import Summary
+from pipeline.results.outcome import CampaignSummary
 
 Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
@@ -28,7 +28,7 @@ ENDING = (StopRun, KeyboardInterrupt, SystemExit, GeneratorExit, CancelledError)
 class Interrupted(StopRun):
     """The user or the system asked to stop; `summary` tells what is complete."""
 
-    def __init__(self, signum: int, summary: Summary | None = None) -> None:
+    def __init__(self, signum: int, summary: CampaignSummary | None = None) -> None:
         super().__init__(signal.Signals(signum).name)
         self.signum = signum
         self.summary = summary

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 from pipeline.campaign.engines import Engine
 from pipeline.campaign.interruption import ENDING, Interrupted
-from pipeline.campaign.outcome import Failure, Result, failure_of, lost, never_begun, overdue
+from pipeline.campaign.outcome import Result, RunFailure, failure_of, lost, never_begun, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
-from pipeline.campaign.watch import Watch
+from pipeline.campaign.watch import Follower
 from pipeline.campaign.worker import fail_run
 from pipeline.results.outcome import RunOutcome
 from schemas.errors import BaliseError, UsageError
@@ -34,7 +34,7 @@ class _Attempt:
 
 
 @dataclass
-class _UnderWay:
+class _RunUnderWay:
     attempt: _Attempt
     since_s: float
     overdue: bool = False
@@ -51,13 +51,15 @@ class CampaignLoop:
         jobs: Sequence[RunJob],
         engine: Engine,
         limit_s: float,
-        watches: Sequence[Watch],
+        watches: Sequence[Follower],
         known: Sequence[RunOutcome] = (),
     ) -> None:
         self.outcomes: list[RunOutcome] = []
-        self._engine, self._limit_s, self._watches = engine, limit_s, watches
+        self._engine = engine
+        self._limit_s = limit_s
+        self._watches = watches
         self._waiting = deque(map(_Attempt, jobs))
-        self._under_way: dict[Result, _UnderWay] = {}
+        self._under_way: dict[Result, _RunUnderWay] = {}
         self._known = known
         self._planned = len(jobs) + len(known)
         self._stop: int | None = None
@@ -95,7 +97,7 @@ class CampaignLoop:
         capacity = self._engine.capacity()
         while self._waiting and len(self._under_way) < capacity and self._stop is None:
             attempt = self._waiting.popleft()
-            self._under_way[self._engine.submit(attempt.job)] = _UnderWay(attempt, time.monotonic())
+            self._under_way[self._engine.submit(attempt.job)] = _RunUnderWay(attempt, time.monotonic())
 
     def _note(self, outcome: RunOutcome | None) -> None:
         if outcome is not None:
@@ -112,7 +114,7 @@ class CampaignLoop:
             if error is None:
                 return replace(result.result(), attempts=attempt.number)
             if item.overdue:
-                return _failed(attempt, Failure(overdue(self._limit_s), lasting=False))
+                return _failed(attempt, RunFailure(overdue(self._limit_s), lasting=False))
             if isinstance(error, CancelledError):
                 raise UsageError(
                     "the cluster cancelled this campaign", remedy="Repeat the command: complete runs are skipped."
@@ -137,7 +139,9 @@ class CampaignLoop:
                 watch.lost(attempt.job.run_id, attempt.number)
             self._waiting.appendleft(_Attempt(attempt.job, attempt.number + 1))
             return None
-        return _failed(attempt, Failure(lost(attempt.number) if begun else never_begun(attempt.starts), lasting=False))
+        return _failed(
+            attempt, RunFailure(lost(attempt.number) if begun else never_begun(attempt.starts), lasting=False)
+        )
 
     def _end_overdue(self) -> None:
         now = time.monotonic()
@@ -167,5 +171,5 @@ class CampaignLoop:
         self._said = lonely_s > WAITS.lonely_said_s
 
 
-def _failed(attempt: _Attempt, failure: Failure) -> RunOutcome:
+def _failed(attempt: _Attempt, failure: RunFailure) -> RunOutcome:
     return replace(fail_run(attempt.job, failure), attempts=attempt.number)

@@ -1,4 +1,4 @@
-"""What became of a run, and how failures are told."""
+"""What became of a run, and failures in words."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from schemas.words import lost_words, reason_words
 
 
 @dataclass(frozen=True)
-class Failure:
+class RunFailure:
     """Why a run failed; a `lasting` reason comes again with the same input, so that the run is not tried again."""
 
     error: str
@@ -63,16 +63,16 @@ def never_begun(workers: int) -> str:
     return f"{workers} workers died before they started this run. See the logs of the workers."
 
 
-def failure_of(error: BaseException, lasting: bool) -> Failure:
-    """How a failure is told, and whether the same input would fail again."""
+def failure_of(error: BaseException, lasting: bool) -> RunFailure:
+    """A failure in words, and whether the same input would fail again."""
     if isinstance(error, BaliseError):
         again = isinstance(error, InputError) and not isinstance(error, ChangedError) and not _is_of_the_machine(error)
-        return Failure(redacted(str(error)), lasting and again)
+        return RunFailure(redacted(str(error)), lasting and again)
     if isinstance(error, MemoryError):
-        return Failure("not enough memory", lasting=False)
+        return RunFailure("not enough memory", lasting=False)
     text = f"defect of the program: {type(error).__name__}: {error}"
     trace = "".join(traceback.format_exception(error))
-    return Failure(text, lasting=False, trace=trace)
+    return RunFailure(text, lasting=False, trace=trace)
 
 
 def _is_of_the_machine(error: BaseException | None) -> bool:
@@ -86,8 +86,8 @@ def _is_of_the_machine(error: BaseException | None) -> bool:
 
 def worst(runs: pl.DataFrame) -> RunStatus:
     """The status of a run with several solutions: the worst of theirs."""
-    found = set(runs["status"].cast(pl.String).to_list())
-    return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in found), RunStatus.OK)
+    statuses = set(runs["status"].cast(pl.String).to_list())
+    return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in statuses), RunStatus.OK)
 
 
 def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame) -> RunOutcome:
@@ -116,11 +116,11 @@ def _beside(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[
         return {}
     row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
     names = ("balises_accepted", "balises_on_path", "availability", "proof_margin_m", "held_s")
-    found = {name: row[name] for name in names} | {"remedies": tuple(row["remedies"] or ())}
+    figures = {name: row[name] for name in names} | {"remedies": tuple(row["remedies"] or ())}
     available = row["availability"]
     if available is None or available >= low:
-        return found
-    return found | {"lost": lost_words(row["lost_to"], row["lost_to_share"], row["lost_to_monitor"], 1.0 - available)}
+        return figures
+    return figures | {"lost": lost_words(row["lost_to"], row["lost_to_share"], row["lost_to_monitor"], 1.0 - available)}
 
 
 def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:

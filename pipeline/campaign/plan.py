@@ -75,7 +75,8 @@ def make_plan(
 
     `routes`: a route file for all runs, or a folder with one per run id. `write_routes`: a folder for those found.
     """
-    config, vehicle = config or Configuration(), vehicle or Vehicle()
+    config = config or Configuration()
+    vehicle = vehicle or Vehicle()
     try:
         addresses = find_runs(runs)
     except InputError as error:
@@ -110,12 +111,12 @@ def _with_routes(job: RunJob, routes: Address | None, write_routes: Address | No
     if routes is None:
         return job
     names = [f"{job.run_id}{suffix}" for suffix in (".csv", ".parquet")]
-    own = [join(routes, name) for name in names] if files.is_dir(routes) else [routes]
-    found = next((address for address in own if files.exists(address)), None)
-    if found is None:
+    candidates = [join(routes, name) for name in names] if files.is_dir(routes) else [routes]
+    route = next((address for address in candidates if files.exists(address)), None)
+    if route is None:
         return job
-    digest = hashlib.sha256(files.read_bytes(found)).hexdigest()
-    return replace(job, route=storage.absolute(found), route_digest=digest)
+    digest = hashlib.sha256(files.read_bytes(route)).hexdigest()
+    return replace(job, route=storage.absolute(route), route_digest=digest)
 
 
 def with_previous(plan: Plan, known: Collection[str] = ()) -> Plan:
@@ -138,19 +139,19 @@ def digests(job: RunJob, files_digest: str) -> dict[str, str]:
 
 def find_runs(named: Iterable[str]) -> dict[str, str]:
     """Addresses by run id, sorted: paths, globs, folders of runs and `s3://`-style addresses."""
-    found: dict[str, str] = {}
+    addresses: dict[str, str] = {}
     for name in named:
         for address in _expand(name):
             run_id = stem_of(address)
             _check_name(run_id, address)
-            other = found.setdefault(run_id, storage.absolute(address))
+            other = addresses.setdefault(run_id, storage.absolute(address))
             if other != storage.absolute(address):
                 raise UsageError(
                     f"and {redacted(str(address))} have the same run id {run_id!r}",
                     place=redacted(other),
                     remedy="Rename one of them: results are stored by run id.",
                 )
-    return dict(sorted(found.items()))
+    return dict(sorted(addresses.items()))
 
 
 def _check_name(run_id: str, address: Address) -> None:

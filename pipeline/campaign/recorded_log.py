@@ -36,7 +36,7 @@ class RecordedLog:
         self.state: tuple[storage.FileState, ...] = ()
 
     def known_digest(self) -> str:
-        """The digest of the log's content, where it can be told without fetching it."""
+        """The digest of the log's content, where it is known without fetching it."""
         self._version = self._stored_version()
         if self._version is None or self._job.previous is None:
             return ""
@@ -53,7 +53,7 @@ class RecordedLog:
     @contextlib.contextmanager
     def here(self) -> Iterator[Path]:
         """The log on this machine; raises `ChangedError` if somebody has written to it meanwhile."""
-        with storage.local_copy(self._job.address, self._version) as path, _told_of(self._job, path):
+        with storage.local_copy(self._job.address, self._version) as path, _named_by_address(self._job, path):
             if self._stored_version() != self._version:
                 raise changed(redacted(self._job.address))
             self.state = _signature(path)
@@ -83,7 +83,8 @@ class RecordedLog:
         if not self.digest:
             with _as_input_error(path):
                 listed = storage.file_digests(path, known)
-            self.digest, self.files = storage.digest_of_files(listed), manifest.listing(listed)
+            self.digest = storage.digest_of_files(listed)
+            self.files = manifest.listing(listed)
             if self._version is not None:
                 catalogue.keep(self._job.out, self._note(), self._key(), self.digest.encode())
         return self.digest
@@ -111,7 +112,7 @@ def _as_input_error(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _told_of(job: RunJob, path: Path) -> Iterator[None]:
+def _named_by_address(job: RunJob, path: Path) -> Iterator[None]:
     """Errors name the log by its own address, not by that of a temporary copy."""
     try:
         yield

@@ -45,8 +45,8 @@ def proof_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
 def unchanged(plan: Plan) -> list[RunOutcome]:
     """The outcomes of the runs of a plan that are complete, and whose log nobody has touched since."""
     known = kept(plan.out)
-    found = ((job, known[job.run_id]) for job in plan.jobs if job.run_id in known)
-    return [replace(outcome, skipped=True) for job, outcome in found if _holds(job, outcome)]
+    candidates = ((job, known[job.run_id]) for job in plan.jobs if job.run_id in known)
+    return [replace(outcome, skipped=True) for job, outcome in candidates if _holds(job, outcome)]
 
 
 def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:

@@ -14,10 +14,10 @@ from pipeline.campaign.lock import locked
 from pipeline.campaign.loop import CampaignLoop
 from pipeline.campaign.plan import Plan, with_previous
 from pipeline.campaign.resume import keep, unchanged
-from pipeline.campaign.watch import Watch
+from pipeline.campaign.watch import Follower
 from pipeline.results import store
 from pipeline.results.manifest import note_settings
-from pipeline.results.outcome import Summary
+from pipeline.results.outcome import CampaignSummary
 from pipeline.storage.address import is_url
 from schemas.errors import UsageError
 
@@ -31,8 +31,8 @@ def run_campaign(
     scheduler: str | None = None,
     force: bool = False,
     time_limit_s: float = TIME_LIMIT_S,
-    watches: Sequence[Watch] = (),
-) -> Summary:
+    watches: Sequence[Follower] = (),
+) -> CampaignSummary:
     """Replay every run of the plan whose result is not there already.
 
     Raises `OutputError` where results cannot be written, `Interrupted` on SIGINT, SIGTERM and SIGHUP; either way
@@ -76,7 +76,7 @@ def _check_shared(plan: Plan, scheduler: str | None) -> None:
         raise UsageError("workers cannot write into this process's memory", place=plan.out)
 
 
-def _watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Watch], at_once: bool) -> Summary:
+def _watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Follower], at_once: bool) -> CampaignSummary:
     """`at_once`: the work is in this process, so that the loop's next look may be a whole run away."""
     begun = time.monotonic()
     for watch in watches:
@@ -89,7 +89,7 @@ def _watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Watch], at_once: 
             stopped = interrupted
         finally:
             outcomes = sorted(loop.outcomes, key=lambda outcome: outcome.run_id)
-            summary = Summary(len(plan.jobs), tuple(outcomes), time.monotonic() - begun)
+            summary = CampaignSummary(len(plan.jobs), tuple(outcomes), time.monotonic() - begun)
             for watch in watches:
                 watch.end(summary)
     if stopped is not None:
@@ -104,7 +104,7 @@ def _tidy(plan: Plan, loop: CampaignLoop) -> None:
             store.sweep_run(Path(plan.out), run_id)
 
 
-def _finish(plan: Plan, loop: CampaignLoop, summary: Summary) -> None:
+def _finish(plan: Plan, loop: CampaignLoop, summary: CampaignSummary) -> None:
     """The tables over all runs; they too are given up when somebody asks to stop."""
     from pipeline.campaign.finish import write_campaign  # statistics, which take long to load
 

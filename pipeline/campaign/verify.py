@@ -16,7 +16,7 @@ from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
 from pipeline.results import catalogue, store
 from pipeline.results.figures.head import word_of, worst_verdict
-from pipeline.results.manifest import NAME, Manifest, contents_of, earlier, gathered, read_manifest, sha256
+from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest, sha256
 from pipeline.results.software import software_digest
 from pipeline.storage.address import Address, join, redacted
 from schemas.config import Configuration, Vehicle, digest_of
@@ -57,21 +57,15 @@ def verify(out: Address, progress: Progress | None = None) -> Verification:
     """
     manifest = _manifest(out)
     again = gathered(out, manifest)
-    there, named = again["runs"], manifest["runs"]
+    there = again["runs"]
+    named = manifest["runs"]
     problems = [_only_in_one(run, run in there) for run in sorted(there.keys() ^ named.keys())]
     problems += _differences("", *(_digests(of["files"]) for of in (again, manifest)))
     problems += _differences("page ", _pages(out), _digests(manifest.get("pages", {})))
-    problems += _differences(
-        "site ", *({key: str(of["sites"][key]) for key in of["sites"]} for of in (again, manifest))
-    )
+    problems += _differences("site ", *(_sites(of["sites"]) for of in (again, manifest)))
     runs = sorted(there.keys() & named.keys())
     for first in range(0, len(runs), _RUNS_AT_ONCE):
-        some = runs[first : first + _RUNS_AT_ONCE]
-        contents = _tables(out, some)
-        for run in some:
-            found, expected = _parts(there[run]) | contents[run], _parts(named[run]) | named[run]["tables"]
-            problems += _differences(f"run {run}, ", found, expected)
-            problems += _differences(f"marker of run {run}, ", there[run]["tables"], named[run]["tables"])
+        problems += _of_runs(out, runs[first : first + _RUNS_AT_ONCE], there, named)
         if progress is not None:
             progress(min(first + _RUNS_AT_ONCE, len(runs)), len(runs))
     known = {*manifest["files"], *again["files"], *_OWN_FILES}
@@ -79,7 +73,17 @@ def verify(out: Address, progress: Progress | None = None) -> Verification:
     if not problems:
         problems = _made_again(out, {run["software_digest"] for run in there.values()})
     files = len(manifest["files"]) + len(manifest.get("pages", {})) + len(TABLES) * len(runs)
-    return Verification(f"{files} files of {len(runs)} runs against {NAME}", tuple(dict.fromkeys(problems)))
+    return Verification(f"{files} files of {len(runs)} runs against {NAME}", tuple(problems))
+
+
+def _of_runs(out: Address, runs: Sequence[str], there: dict[str, Any], named: dict[str, Any]) -> Iterator[Problem]:
+    """Provenance and tables of some runs; and of tables that agree with the manifest, what the marker says of them."""
+    contents = _tables(out, runs)
+    for run in runs:
+        found = _parts(there[run]) | contents[run]
+        expected = _parts(named[run]) | named[run]["tables"]
+        yield from _differences(f"run {run}, ", found, expected)
+        yield from _differences(f"marker of run {run}, ", there[run]["tables"], named[run]["tables"])
 
 
 def recompute(
@@ -145,11 +149,11 @@ def _digests(files: dict[str, Any]) -> dict[str, str]:
 
 def _manifest(out: Address) -> Manifest:
     store.complete_runs(out)
-    found = read_manifest(out)
-    if found is None:
+    manifest = read_manifest(out)
+    if manifest is None:
         remedy = "Results of an earlier version have none: replay them again."
         raise UsageError(f"has no {NAME}", place=redacted(str(out)), remedy=remedy)
-    return found
+    return manifest
 
 
 def _only_in_one(run: str, is_there: bool) -> Problem:
@@ -162,8 +166,8 @@ def _only_in_one(run: str, is_there: bool) -> Problem:
 def _tables(out: Address, runs: Sequence[str]) -> dict[str, dict[str, str]]:
     """The digest of each table of some runs as it lies there."""
     places = {run: {table: str(store.table_address(out, table, run)) for table in TABLES} for run in runs}
-    found = contents_of([place for tables in places.values() for place in tables.values()])
-    return {run: {table: sha256(found.get(place)) for table, place in places[run].items()} for run in runs}
+    contents = storage.read_many([place for tables in places.values() for place in tables.values()])
+    return {run: {table: sha256(contents.get(place)) for table, place in places[run].items()} for run in runs}
 
 
 def _pages(out: Address) -> dict[str, str]:
@@ -186,20 +190,20 @@ def _made_again(out: Address, software: set[str]) -> list[Problem]:
     The campaign's tables can be made again by the build that made them, with the configuration that lies there.
     """
     try:
-        own = {table: store.read_table(out, table).collect() for table in catalogue.CATALOGUED}
+        tables = {table: store.read_table(out, table).collect() for table in catalogue.CATALOGUED}
     except UsageError:
         return []  # written by another build of the program, which alone can read them
-    copies = {table: catalogue.fresh(out, table) for table in own}
-    stale = [table for table, copy in copies.items() if copy is not None and not copy.equals(own[table])]
+    copies = {table: catalogue.fresh(out, table) for table in tables}
+    stale = [table for table, copy in copies.items() if copy is not None and not copy.equals(tables[table])]
     problems = [(f"{catalogue.FOLDER}/{table}", "other rows", "those of the runs' tables") for table in stale]
-    verdicts = own["runs"].group_by("run_id").agg(pl.col("verdict").cast(pl.String)).rows()
+    verdicts = tables["runs"].group_by("run_id").agg(pl.col("verdict").cast(pl.String)).rows()
     worst = {run: worst_verdict(words) for run, words in verdicts}
     for run, outcome in resume.kept(str(out)).items():
         if outcome.verdict != worst.get(run, outcome.verdict):
             problems.append((f"{catalogue.FOLDER}/complete, {run}", word_of(outcome.verdict), word_of(worst[run])))
     config = store.read_config(out)
     if config is not None and software == {software_digest()}:
-        for name, content in campaign_files(own, config, campaign_key(out, config)):
+        for name, content in campaign_files(tables, config, campaign_key(out, config)):
             problems += _differences("", {name: sha256(content)}, {name: sha256(storage.content_of(join(out, name)))})
     return problems
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from pipeline.results.outcome import RunOutcome, Summary, UnderWay
+from pipeline.results.outcome import CampaignSummary, RunOutcome, UnderWay
 
 
-class Watch(Protocol):
+class Follower(Protocol):
     """Follows a campaign of some runs to its end."""
 
     def begin(self, runs: int, out: str) -> None: ...
@@ -23,4 +23,4 @@ class Watch(Protocol):
     def noted(self, text: str) -> None:
         """Something that somebody should see to."""
 
-    def end(self, summary: Summary) -> None: ...
+    def end(self, summary: CampaignSummary) -> None: ...

@@ -11,7 +11,7 @@ from pipeline import storage
 from pipeline.campaign import lock
 from pipeline.campaign.interruption import ENDING
 from pipeline.campaign.outcome import (
-    Failure,
+    RunFailure,
     failed_tables,
     failure_of,
     outcome_of,
@@ -40,7 +40,8 @@ def replay_one(job: RunJob) -> RunOutcome:
     Whatever is wrong with the run, a panic of a decoder included, becomes a `runs` row of status `failed`; only an
     output that cannot be written, a changed site and an interruption leave this function as an exception.
     """
-    log, begun = RecordedLog(job), time.monotonic()
+    log = RecordedLog(job)
+    begun = time.monotonic()
     try:
         outcome = _replay_one(job, log)
     except (OutputError, SiteError, UsageError, *ENDING):
@@ -67,7 +68,7 @@ def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
     return _proved(job, log, outcome_of(job, tables.runs, tables.hazards, tables.passages))
 
 
-def fail_run(job: RunJob, failure: Failure, log: RecordedLog | None = None) -> RunOutcome:
+def fail_run(job: RunJob, failure: RunFailure, log: RecordedLog | None = None) -> RunOutcome:
     """Write the tables of a run that failed: one `runs` row that says why, the others empty.
 
     Unless the reason is lasting (a worker was lost, a run took too long) the next campaign tries the run again.

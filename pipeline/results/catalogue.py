@@ -28,7 +28,7 @@ _MARKER = "runs"
 # Hexadecimal digits that tell one state of a run's files from another.
 _STATE = 20
 
-States = Mapping[str, str]
+RunStates = Mapping[str, str]
 """What changes with the files of each run."""
 
 
@@ -54,21 +54,21 @@ def address_of(out: Address, name: str) -> Address:
     return join(join(out, FOLDER), name)
 
 
-def states(out: Address, tables: Sequence[str]) -> States | None:
+def states(out: Address, tables: Sequence[str]) -> RunStates | None:
     """What changes with the content of these tables, per complete run in order; None where files have no version."""
     versions = [storage.versions(join(out, name), f"{name}.parquet") for name in (_MARKER, *tables)]
-    markers, *others = [found for found in versions if found is not None]
+    markers, *others = [of_runs for of_runs in versions if of_runs is not None]
     if not markers or len(others) < len(tables):
         return None
     contract = "".join(f"{name} {dtype}\n" for table in tables for name, dtype in dtypes(TABLES[table]).items())
     begun = hashlib.sha256(contract.encode())
-    found = {}
+    of_runs = {}
     for folder, marker in markers.items():
         if folder.startswith("run_id="):
             state = begun.copy()
             state.update(repr((marker, [files.get(folder) for files in others])).encode())
-            found[unquote(folder.removeprefix("run_id="))] = state.hexdigest()[:_STATE]
-    return dict(sorted(found.items()))
+            of_runs[unquote(folder.removeprefix("run_id="))] = state.hexdigest()[:_STATE]
+    return dict(sorted(of_runs.items()))
 
 
 def gather(out: Address) -> dict[str, pl.DataFrame]:
@@ -105,5 +105,5 @@ def _gathered(out: Address, table: str) -> pl.DataFrame:
 
 def _key(out: Address, table: str) -> str:
     """What changes with this table of any run; empty where files have no version."""
-    found = states(out, [table])
-    return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest() if found else ""
+    of_runs = states(out, [table])
+    return hashlib.sha256(repr(sorted(of_runs.items())).encode()).hexdigest() if of_runs else ""

@@ -23,14 +23,13 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pipeline import storage
 from pipeline.results import store
 from pipeline.storage import FileDigest, files
-from pipeline.storage.address import Address, is_url, join, redacted
+from pipeline.storage.address import Address, join, redacted
 from schemas.errors import UsageError
 from schemas.tables import CONTRACT_VERSION, TABLES
 from schemas.version import SOFTWARE
 
 NAME = "manifest.json"
 FORMAT = 1
-_AT_ONCE = 500
 
 T = TypeVar("T")
 Manifest = dict[str, Any]
@@ -88,17 +87,17 @@ def listing(listed: Iterable[tuple[str, int, str]]) -> str:
 
 def note_settings(out: Address, config_digest: str, given: SettingsFiles) -> None:
     """Keep the names of this call's settings files, before any run is made with them."""
-    found = earlier(out)
-    known = found["settings"].setdefault(config_digest, [])
+    manifest = earlier(out)
+    known = manifest["settings"].setdefault(config_digest, [])
     if given not in known:
         known.append(given)
-        _write(out, found)
+        _write(out, manifest)
 
 
 def note_pages(out: Address, pages: Mapping[str, bytes]) -> None:
     """Keep the digests of the pages of this result, by their names in `OUT/report`."""
-    found = earlier(out)
-    _write(out, found | {"pages": {name: _digested(content) for name, content in sorted(pages.items())}})
+    manifest = earlier(out)
+    _write(out, manifest | {"pages": {name: _digested(content) for name, content in sorted(pages.items())}})
 
 
 def write_manifest(out: Address) -> None:
@@ -110,7 +109,7 @@ def gathered(out: Address, before: Manifest) -> Manifest:
     """The manifest as the files of the result say; of the one before what no file says."""
     runs: dict[str, Any] = {}
     sites: dict[str, Any] = {}
-    for run_id, content in markers(out):
+    for run_id, content in store.markers(out):
         metadata = store.metadata_of(content)
         site = metadata.get("site_digest", "").partition(" ")[0]
         sites[site] = _files(metadata.get("site_files"))
@@ -160,14 +159,6 @@ def own_file_names(out: Address) -> list[str]:
     there = files.list_dir(campaign) if files.exists(campaign) else []
     settings = ["config.toml", *(["vehicle.toml"] if files.exists(join(out, "vehicle.toml")) else [])]
     return [*settings, *(f"campaign/{name}" for name in there if re.fullmatch(r"\w+\.parquet", name))]
-
-
-def contents_of(places: list[str]) -> dict[str, bytes]:
-    """The content of each of these files of one result, in one go where it lies in a store; missing ones left out."""
-    if places and is_url(places[0]):
-        return storage.read_many(places)
-    found = {place: storage.content_of(place) for place in places}
-    return {place: content for place, content in found.items() if content is not None}
 
 
 def _frame() -> Manifest:
@@ -236,15 +227,6 @@ def _own_files(out: Address) -> dict[str, dict[str, Any]]:
 
 def _digested(content: bytes) -> dict[str, Any]:
     return {"bytes": len(content), "sha256": sha256(content)}
-
-
-def markers(out: Address) -> Iterable[tuple[str, bytes]]:
-    """The `runs` table of each complete run as it lies there."""
-    runs = store.run_ids(out)
-    for first in range(0, len(runs), _AT_ONCE):
-        some = {str(store.table_address(out, "runs", run)): run for run in runs[first : first + _AT_ONCE]}
-        contents = contents_of(list(some))
-        yield from ((run, contents[place]) for place, run in some.items() if place in contents)
 
 
 def _write(out: Address, manifest: Manifest) -> None:

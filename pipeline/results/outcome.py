@@ -61,7 +61,7 @@ class RunOutcome:
 
 
 @dataclass(frozen=True)
-class Summary:
+class CampaignSummary:
     """A campaign in figures."""
 
     planned: int

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 import dataframely as dy
 import polars as pl
 
+from pipeline import storage
 from pipeline.results import catalogue, store
 from pipeline.results.source import source_of
 from pipeline.storage import parquet
@@ -66,7 +66,7 @@ def run_sql(
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, RecursionError) as error:
         said = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UsageError(
-            f"cannot be answered: {_told(said, tables, others or {})}",
+            f"cannot be answered: {_in_our_words(said, tables, others or {})}",
             place="SQL",
             expected=_EXPECTED,
             remedy=_REMEDY,
@@ -111,8 +111,8 @@ def _tables(out: Address, sql: str, prefix: str = "") -> dict[str, pl.LazyFrame]
     def named(names: Iterable[str]) -> list[str]:
         return [name for name in names if re.search(rf"\b{prefix}{name}\b", sql, re.IGNORECASE)]
 
-    found = {name: catalogue.scan(out, name) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
-    return {f"{prefix}{name}": frame for name, frame in found.items()}
+    tables = {name: catalogue.scan(out, name) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
+    return {f"{prefix}{name}": frame for name, frame in tables.items()}
 
 
 def _contracts(others: Iterable[str]) -> dict[str, tuple[str, type[dy.Schema]]]:
@@ -133,19 +133,19 @@ def _tables_there_are(others: Iterable[str]) -> pl.DataFrame:
 
 def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
     known = _contracts(others)
-    found = known.get(table.lower())
-    if found is None:
+    contract = known.get(table.lower())
+    if contract is None:
         raise UsageError(
             f"is not a table{did_you_mean(table, known)}", place=table, expected=", ".join(known), remedy=_REMEDY
         )
-    columns = dictionary_frame(found[0]).drop("group", "table")
-    if found[0] not in TABLES:
+    columns = dictionary_frame(contract[0]).drop("group", "table")
+    if contract[0] not in TABLES:
         return columns
-    own = {"column": "run_id", "dtype": "String", "unit": "", "nullable": False, "meaning": "id of the run"}
-    return pl.concat([pl.DataFrame([own], schema=columns.schema), columns])
+    run_id = {"column": "run_id", "dtype": "String", "unit": "", "nullable": False, "meaning": "id of the run"}
+    return pl.concat([pl.DataFrame([run_id], schema=columns.schema), columns])
 
 
-def _told(said: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
+def _in_our_words(said: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
     """What polars says, of a name or a value that it does not know in our words, with the nearest that there is."""
     contracts = _contracts(others)
     columns = {"run_id": None} | {
@@ -165,11 +165,11 @@ def _campaign_tables(out: Address, names: Iterable[str]) -> dict[str, pl.LazyFra
     """`campaign/runs.parquet` as `campaign_runs`, and so on; those that are not there are left out."""
     folder = join(out, "campaign")
     places = {name: str(join(folder, f"{name.removeprefix('campaign_')}.parquet")) for name in names}
-    found = store.sources(list(places.values()))
-    return {name: _campaign_table(name, found[place]) for name, place in places.items() if place in found}
+    contents = storage.read_many(list(places.values()))
+    return {name: _campaign_table(name, contents[place]) for name, place in places.items() if place in contents}
 
 
-def _campaign_table(name: str, source: bytes | Path) -> pl.LazyFrame:
+def _campaign_table(name: str, source: bytes) -> pl.LazyFrame:
     try:
         frame = parquet.read_parquet(source)
     except parquet.ParquetError as error:

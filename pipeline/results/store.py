@@ -143,7 +143,7 @@ def tables_of(out: Address, table: str, runs: Sequence[str], columns: Sequence[s
 
     places = [str(table_address(out, table, run)) for run in runs]
     contents = storage.read_many(places) if is_url(out) else {}
-    reader = parquet.Reader(own)
+    reader = parquet.TableReader(own)
     try:
         for run, place in zip(runs, places, strict=True):
             if is_url(out) and place not in contents:
@@ -208,26 +208,24 @@ def check_site(site: Site | None, replayed_digest: str | None, run_id: str) -> N
 
 def completed_runs(out: Address, among: Sequence[str] | None = None) -> dict[str, dict[str, str]]:
     """Metadata of each complete run, or of those among these, without reading any table."""
+    return {run: metadata_of(content) for run, content in markers(out, among)}
+
+
+def markers(out: Address, among: Sequence[str] | None = None) -> Iterator[tuple[str, bytes]]:
+    """The `runs` table of each complete run, or of those among these, as it lies there."""
     runs = run_ids(out) if among is None else among
-    addresses = {str(table_address(out, _MARKER, run)): run for run in runs}
-    found = sources(list(addresses))
-    return {run: metadata_of(found[place]) for place, run in addresses.items() if place in found}
-
-
-def sources(places: Sequence[str]) -> Mapping[str, bytes | Path]:
-    """Those of these files of one result that are there: the content of those in a store, in one go, else the path."""
-    if places and is_url(places[0]):
-        return storage.read_many(list(places))
-    return {place: Path(place) for place in places if Path(place).exists()}
+    for first in range(0, len(runs), _AT_ONCE):
+        some = {str(table_address(out, _MARKER, run)): run for run in runs[first : first + _AT_ONCE]}
+        yield from ((some[place], content) for place, content in storage.read_many(list(some)).items())
 
 
 def metadata_of(source: Path | bytes) -> dict[str, str]:
-    """What `write_run` was told about the run; nothing for a file that cannot be read."""
+    """The metadata that `write_run` was given; nothing for a file that cannot be read."""
     try:
-        found = pl.read_parquet_metadata(source)
+        metadata = pl.read_parquet_metadata(source)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError):
         return {}
-    return {key.removeprefix(PREFIX): value for key, value in found.items() if key.startswith(PREFIX)}
+    return {key.removeprefix(PREFIX): value for key, value in metadata.items() if key.startswith(PREFIX)}
 
 
 def sweep(out: Address) -> None:

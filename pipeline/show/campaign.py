@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import polars as pl
 
 from pipeline.results.figures.head import word_of
-from pipeline.results.outcome import RunOutcome, Summary
+from pipeline.results.outcome import CampaignSummary, RunOutcome
 from pipeline.show.terminal import duration_text
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
@@ -19,7 +19,8 @@ _WORST_FIRST = {"unsafe": 0, "failed": 1, "unproven": 2, "safe": 3}
 def outcome_line(outcome: RunOutcome) -> str:
     """One run in one line, its verdict first."""
     how = "skipped, " if outcome.skipped else ""
-    word, status = word_of(outcome.verdict), outcome.status.value
+    word = word_of(outcome.verdict)
+    status = outcome.status.value
     beside = "" if outcome.status is RunStatus.OK or status == word else f", {status}"
     text = f"{outcome.run_id}: {how}{word}{beside}"
     if outcome.error:
@@ -31,7 +32,7 @@ def outcome_line(outcome: RunOutcome) -> str:
     return visible(text).replace("\n", r"\n")
 
 
-def summary_line(summary: Summary) -> str:
+def summary_line(summary: CampaignSummary) -> str:
     """A campaign in one line, its verdict first."""
     counts = [f"{summary.count(status)} {status.value}" for status in RunStatus]
     beside = f"; {beside_words(figures)}" if (figures := summary.beside()) else ""
@@ -41,7 +42,7 @@ def summary_line(summary: Summary) -> str:
     return f"{text}; {duration_text(summary.seconds)}"
 
 
-def ending_rows(summary: Summary) -> pl.DataFrame:
+def ending_rows(summary: CampaignSummary) -> pl.DataFrame:
     """What a person reads when a campaign has ended, the worst run first: verdict, figures beside it, why, faults."""
     ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
     names = ("verdict", "run_id", "accepted", "available", "margin", "why", "faults")
@@ -61,7 +62,7 @@ def _beside(outcome: RunOutcome) -> tuple[str, str, str]:
     return accepted, available, "-" if outcome.proof_margin_m is None else f"{outcome.proof_margin_m:.1f} m"
 
 
-def remedy_lines(summary: Summary, **places: str) -> list[str]:
+def remedy_lines(summary: CampaignSummary, **places: str) -> list[str]:
     """Per remedy how many runs it would mend, and the command for the worst of them; the most frequent first.
 
     `places`: paths as the user named them.
@@ -92,7 +93,7 @@ def _few(faults: Sequence[str]) -> str:
     return "; ".join([*faults[:2], *more]) or "none"
 
 
-def outcome_rows(summary: Summary) -> pl.DataFrame:
+def outcome_rows(summary: CampaignSummary) -> pl.DataFrame:
     """A campaign as a table: one row per run that was reached, its verdict first."""
     kinds: dict[str, type[pl.DataType] | pl.DataType] = {
         "verdict": pl.String,

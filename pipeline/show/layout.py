@@ -15,7 +15,8 @@ from itertools import zip_longest
 _GAP = 2
 _HEADING_LINES = 3
 # A text column is not folded to less than this, or than its longest word within reason.
-_NARROWEST, _LONGEST_WORD = 10, 24
+_NARROWEST = 10
+_LONGEST_WORD = 24
 _FEW_ROWS = 5
 
 

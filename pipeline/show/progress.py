@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from pipeline import storage
 from pipeline.results.figures.head import word_of
-from pipeline.results.outcome import RunOutcome, Summary, UnderWay
+from pipeline.results.outcome import CampaignSummary, RunOutcome, UnderWay
 from pipeline.show.campaign import ending_rows, outcome_line, outcome_rows, remedy_lines, summary_line
 from pipeline.show.terminal import duration_text, show_table, to_json
 from pipeline.storage.address import is_url, join, redacted
@@ -28,7 +28,7 @@ _SAY_S = 5.0
 
 
 class CampaignWatch:
-    """Whoever wants to see a campaign go on: told of what somebody should see to, and of runs that are not ok."""
+    """Counts the runs of a campaign, and shows those that are not ok and what somebody should see to."""
 
     def begin(self, runs: int, out: str) -> None:
         self.total = runs
@@ -50,19 +50,20 @@ class CampaignWatch:
         self.done += 1
         self.failed += outcome.status is not RunStatus.OK
         self.skipped += outcome.skipped
-        self.told(outcome)
+        self.counted(outcome)
 
-    def told(self, outcome: RunOutcome) -> None:
+    def counted(self, outcome: RunOutcome) -> None:
         """A run that has ended, after it was counted."""
         if outcome.status is not RunStatus.OK:
             self.noted(outcome_line(outcome))
 
-    def end(self, summary: Summary) -> None: ...
+    def end(self, summary: CampaignSummary) -> None: ...
 
     @property
     def rate_per_s(self) -> float | None:
         """Runs replayed per second; none before the first."""
-        elapsed_s, replayed = time.monotonic() - self.since_s, self.done - self.skipped
+        elapsed_s = time.monotonic() - self.since_s
+        replayed = self.done - self.skipped
         return replayed / elapsed_s if replayed and elapsed_s > 0 else None
 
     @property
@@ -119,7 +120,7 @@ class LineWatch(CampaignWatch):
         with contextlib.suppress(OSError):
             print(text, file=self._stream, flush=True)
 
-    def end(self, summary: Summary) -> None:
+    def end(self, summary: CampaignSummary) -> None:
         self.progress(())
 
 
@@ -133,13 +134,13 @@ class JsonWatch(LineWatch):
     def progress(self, under_way: UnderWay) -> None:
         self._say("progress", **self.figures(under_way))
 
-    def told(self, outcome: RunOutcome) -> None:
+    def counted(self, outcome: RunOutcome) -> None:
         names = (
             *("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections"),
             *("balises_accepted", "balises_on_path", "availability", "proof_margin_m", "remedies"),
         )
-        told = {"verdict": word_of(outcome.verdict), **{name: getattr(outcome, name) for name in names}}
-        self._say("run", **told | {"seconds": round(outcome.seconds, 3)} | self.figures())
+        fields = {"verdict": word_of(outcome.verdict), **{name: getattr(outcome, name) for name in names}}
+        self._say("run", **fields | {"seconds": round(outcome.seconds, 3)} | self.figures())
 
     def lost(self, run_id: str, attempt: int) -> None:
         self._say("lost", run_id=run_id, attempt=attempt)
@@ -147,8 +148,8 @@ class JsonWatch(LineWatch):
     def noted(self, text: str) -> None:
         self._say("note", text=text)
 
-    def _say(self, event: str, **told: object) -> None:
-        super().noted(json.dumps({"event": event, **told}))
+    def _say(self, event: str, **fields: object) -> None:
+        super().noted(json.dumps({"event": event, **fields}))
 
 
 class BarWatch(CampaignWatch):
@@ -168,7 +169,7 @@ class BarWatch(CampaignWatch):
     def noted(self, text: str) -> None:
         self._bar.console.print(text, markup=False, highlight=False)
 
-    def end(self, summary: Summary) -> None:
+    def end(self, summary: CampaignSummary) -> None:
         # The terminal may be closed.
         with contextlib.suppress(OSError):
             self.look(())
@@ -180,10 +181,11 @@ class LogWatch(CampaignWatch):
 
     def begin(self, runs: int, out: str) -> None:
         super().begin(runs, out)
-        self._place, self._lines = str(join(out, "replay.log")), list[str]()
+        self._place = str(join(out, "replay.log"))
+        self._lines = list[str]()
         self.noted(f"{SOFTWARE}: {runs} runs")
 
-    def told(self, outcome: RunOutcome) -> None:
+    def counted(self, outcome: RunOutcome) -> None:
         self.noted(outcome_line(outcome))
         if outcome.trace:
             self.noted(redacted(outcome.trace))
@@ -196,7 +198,7 @@ class LogWatch(CampaignWatch):
         with storage.as_output_error(self._place), Path(self._place).open("a", encoding="utf-8") as log:
             log.write(line)
 
-    def end(self, summary: Summary) -> None:
+    def end(self, summary: CampaignSummary) -> None:
         self.noted(summary_line(summary))
         if is_url(self._place):
             storage.write_bytes(self._place, "".join(self._lines).encode())
@@ -216,13 +218,13 @@ def progress_watch() -> CampaignWatch:
     return BarWatch() if sys.stderr.isatty() else LineWatch()
 
 
-def show_summary(summary: Summary, out: str, quiet: bool, as_json: bool, **places: str) -> None:
+def show_summary(summary: CampaignSummary, out: str, quiet: bool, as_json: bool, **places: str) -> None:
     """How it ended: as JSON, as messages of what failed alone, or for people; `places`: as in `remedy_lines`."""
     if as_json:
-        told = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.beside()}
+        head = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.beside()}
         figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
         seconds = round(summary.seconds, 3)
-        print(to_json({**told, **figures, "seconds": seconds, "out": out, "runs": outcome_rows(summary)}))
+        print(to_json({**head, **figures, "seconds": seconds, "out": out, "runs": outcome_rows(summary)}))
     elif quiet:
         for outcome in summary.outcomes:
             if outcome.status is not RunStatus.OK:
@@ -233,7 +235,7 @@ def show_summary(summary: Summary, out: str, quiet: bool, as_json: bool, **place
             print(f"To mend {line}")
 
 
-def _show_ending(summary: Summary, out: str, most: int = 25) -> None:
+def _show_ending(summary: CampaignSummary, out: str, most: int = 25) -> None:
     """The verdicts, the worst first; of many runs those that are not safe."""
     print(summary_line(summary))
     rows = ending_rows(summary)

@@ -18,7 +18,8 @@ import polars as pl
 from pipeline.show.layout import Column, fitted
 from schemas.errors import visible
 
-_SAID_EVERY_S, _CHANGED_EVERY_S = 5.0, 0.2
+_SAID_EVERY_S = 5.0
+_CHANGED_EVERY_S = 0.2
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 # Right is green, wrong red, not known grey; the word itself says it where there are no colours.
 _COLOURS = {"unsafe": "\x1b[1;31m", "failed": "\x1b[31m", "unproven": "\x1b[90m", "safe": "\x1b[32m"}
@@ -31,7 +32,8 @@ def show_table(frame: pl.DataFrame, title: str = "") -> None:
     """Print a frame to standard output, every row, no wider than the terminal."""
     lines = table_lines(frame, screen_width())
     if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
-        title, lines = f"{_BOLD}{title}{_PLAIN}" if title else "", [_coloured(line) for line in lines]
+        title = f"{_BOLD}{title}{_PLAIN}" if title else ""
+        lines = [_coloured(line) for line in lines]
     print("\n".join([title, *lines] if title else lines))
     if frame.width and not frame.height:
         print("(no rows)")

@@ -33,16 +33,22 @@ def folders_in(address: Address) -> list[str]:
             return []
         except OSError as error:
             raise OutputError(f"cannot be listed: {error.strerror}", place=str(address)) from None
-    found = on_store(address, entries_of)
-    return sorted(name_of(entry["name"]) for entry in found if entry["type"] == "directory")
+    entries = on_store(address, entries_of)
+    return sorted(name_of(entry["name"]) for entry in entries if entry["type"] == "directory")
 
 
 def files_below(address: Address) -> list[str]:
     """Every file in a folder and in those below, from that folder on, with slashes; sorted."""
     if not is_url(address):
-        found = (Path(folder, name) for folder, _, names in os.walk(address) for name in names)
-        return sorted(file.relative_to(address).as_posix() for file in found)
+        walked = os.walk(address, onerror=_raise_listing)
+        paths = (Path(folder, name) for folder, _, names in walked for name in names)
+        return sorted(file.relative_to(address).as_posix() for file in paths)
     return on_store(address, lambda store, path: sorted(_names_below(store, path.rstrip("/"), "")))
+
+
+def _raise_listing(error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError):
+        raise OutputError(f"cannot be listed: {error.strerror}", place=str(error.filename)) from None
 
 
 def _names_below(store: Any, place: str, before: str) -> Iterator[str]:
@@ -86,17 +92,18 @@ def _folders_below(store: Any, place: str) -> Iterator[str]:
 
 
 def read_many(addresses: list[str]) -> dict[str, bytes]:
-    """Contents of those of the remote objects that exist."""
-    if not addresses:
-        return {}
+    """Contents of those of these files that exist, in one go where they lie in a store."""
+    if not addresses or not is_url(addresses[0]):
+        contents = {address: content_of(address) for address in addresses}
+        return {address: content for address, content in contents.items() if content is not None}
     by_path = {opened(address)[1]: address for address in addresses}
 
     def fetch(store: Any, _: str) -> dict[str, bytes]:
-        found: dict[str, bytes | Exception] = store.cat(list(by_path), on_error="return")
-        for content in found.values():
+        answers: dict[str, bytes | Exception] = store.cat(list(by_path), on_error="return")
+        for content in answers.values():
             if isinstance(content, Exception) and not isinstance(content, FileNotFoundError):
                 raise content
-        return {by_path[path]: data for path, data in found.items() if isinstance(data, bytes)}
+        return {by_path[path]: data for path, data in answers.items() if isinstance(data, bytes)}
 
     # With a single path fsspec would return bare bytes where it is not asked for a list.
     return on_store(addresses[0], fetch)

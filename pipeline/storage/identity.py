@@ -25,8 +25,8 @@ def versions(folder: Address, name: str) -> dict[str, str] | None:
         return _local_versions(str(folder), name)
     listed = on_store(folder, lambda store, path: store.find(path, detail=True))
     infos = {place.split("/")[-2]: info for place, info in listed.items() if place.endswith(f"/{name}")}
-    found = {part: version_of(info) for part, info in infos.items()}
-    return None if None in found.values() else {part: str(version) for part, version in found.items()}
+    of_parts = {part: version_of(info) for part, info in infos.items()}
+    return None if None in of_parts.values() else {part: str(version) for part, version in of_parts.items()}
 
 
 def version(address: Address) -> str | None:
@@ -35,13 +35,13 @@ def version(address: Address) -> str | None:
 
 
 def _local_versions(folder: str, name: str) -> dict[str, str]:
-    found = {}
+    of_parts = {}
     for part in folders_in(folder):
         # Gone or not complete: no version.
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             stat = os.stat(f"{folder}/{part}/{name}")  # noqa: PTH116 - ten thousand of them
-            found[part] = f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns} {stat.st_ino}"
-    return found
+            of_parts[part] = f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns} {stat.st_ino}"
+    return of_parts
 
 
 class FileDigest(NamedTuple):

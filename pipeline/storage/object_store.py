@@ -44,7 +44,7 @@ def on_store(address: Address, operation: Callable[[Any, str], T], kind: type[Ba
     """
     store, path = opened(address, kind)
     limit_s = patience_s()
-    watched = _Watched(store, limit_s)
+    watched = _PatientStore(store, limit_s)
     reason = "no answer"
     for attempt in count():
         try:
@@ -55,7 +55,7 @@ def on_store(address: Address, operation: Callable[[Any, str], T], kind: type[Ba
             # Stores raise their client library's own exceptions, which share no base class.
             if isinstance(error, FileNotFoundError) and kind is InputError:
                 raise _absent(address) from None
-            reason = _told(error, reason)
+            reason = _words_of(error, reason)
             pause_s = min(_FIRST_PAUSE_S * 2**attempt, _LONGEST_PAUSE_S)
             silent = _may_pass(error) and watched.silence_s + pause_s > limit_s
             if silent or attempt + 1 >= _tries(error):
@@ -101,11 +101,12 @@ def _filesystem(protocol: str, root: str) -> Any:
     return fsspec.core.url_to_fs(root, **{**settings, "use_listings_cache": False})[0]
 
 
-class _Watched:
+class _PatientStore:
     """A store whose operations end when nothing has come for a while; `arrived` tells that something has."""
 
     def __init__(self, store: Any, limit_s: float) -> None:
-        self._store, self._limit_s = store, limit_s
+        self._store = store
+        self._limit_s = limit_s
         self.arrived()
 
     @property
@@ -143,7 +144,7 @@ class _Watched:
         return task.result()
 
 
-def arrivals(store: _Watched) -> Any:
+def arrivals(store: _PatientStore) -> Any:
     """What fsspec tells of the bytes of all files that arrive, passed on to the watch."""
     from fsspec.callbacks import Callback
 
@@ -157,7 +158,7 @@ def arrivals(store: _Watched) -> Any:
     return Arrivals()
 
 
-def _told(error: Exception, before: str) -> str:
+def _words_of(error: Exception, before: str) -> str:
     """What an error says; that time has run out says less than what was answered before."""
     if isinstance(error, TimeoutError):
         return before

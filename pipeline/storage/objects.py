@@ -30,17 +30,17 @@ def objects_at(store: Any, path: str) -> Listing:
         info = store.info(path)
     except FileNotFoundError:
         return {}
-    found = entries_of(store, path) if info["type"] == "directory" else [info]
-    return {entry["name"]: entry for entry in found if entry["type"] != "directory"}
+    entries = entries_of(store, path) if info["type"] == "directory" else [info]
+    return {entry["name"]: entry for entry in entries if entry["type"] != "directory"}
 
 
 def entries_of(store: Any, folder: str) -> list[dict[str, Any]]:
     """What lies in a folder; nothing where it does not exist."""
     try:
-        found = store.ls(folder, detail=True)
+        entries = store.ls(folder, detail=True)
     except FileNotFoundError:
         return []
-    return [entry for entry in found if entry["name"].strip("/") != folder.strip("/")]
+    return [entry for entry in entries if entry["name"].strip("/") != folder.strip("/")]
 
 
 def kind_of(store: Any, path: str) -> str:
@@ -61,10 +61,10 @@ def version_of(info: Mapping[str, Any]) -> str | None:
 
 def version_in(listing: Listing) -> str | None:
     """What changes with the content of any of these objects; none where one of them has no version."""
-    found = {place: version_of(info) for place, info in listing.items()}
-    if not found or None in found.values():
+    versions = {place: version_of(info) for place, info in listing.items()}
+    if not versions or None in versions.values():
         return None
-    return "\n".join(f"{name_of(place)} {text}" for place, text in sorted(found.items()))
+    return "\n".join(f"{name_of(place)} {text}" for place, text in sorted(versions.items()))
 
 
 def check_copy(store: Any, place: str, info: Mapping[str, Any], copy: Path) -> None:
@@ -86,5 +86,5 @@ def _tag_is_digest(store: Any, place: str) -> bool:
     if not hasattr(store, "call_s3"):
         return False
     bucket, key, _ = store.split_path(place)
-    told = store.call_s3("head_object", Bucket=bucket, Key=key)
-    return told.get("ServerSideEncryption") in _PLAIN and "SSECustomerAlgorithm" not in told
+    head = store.call_s3("head_object", Bucket=bucket, Key=key)
+    return head.get("ServerSideEncryption") in _PLAIN and "SSECustomerAlgorithm" not in head

@@ -49,7 +49,7 @@ def parquet_bytes(
     return buffer.getvalue()
 
 
-Schema = dict[str, pl.DataType]
+ColumnTypes = dict[str, pl.DataType]
 # A panic of polars is a BaseException: it has one for metadata of a column that is not UTF-8.
 _ERRORS = (
     pa.ArrowException,
@@ -70,20 +70,20 @@ def _reading() -> Iterator[None]:
         raise ParquetError((str(error).strip().splitlines() or [type(error).__name__])[0]) from None
 
 
-def read_parquet(source: bytes | Path, choose: Callable[[Schema], Sequence[str]] | None = None) -> pl.DataFrame:
+def read_parquet(source: bytes | Path, choose: Callable[[ColumnTypes], Sequence[str]] | None = None) -> pl.DataFrame:
     """The table; of all its columns and their types `choose` says which are read. Raises `ParquetError`."""
-    reader = Reader(choose)
+    reader = TableReader(choose)
     reader.add(source)
     return reader.frame()
 
 
-class Reader:
+class TableReader:
     """Tables of one kind from many files, one below the other: a frame of each would take most of the time.
 
     `choose` is asked of each kind of columns that comes which of them are read, in which order, and may refuse them.
     """
 
-    def __init__(self, choose: Callable[[Schema], Sequence[str]] | None = None) -> None:
+    def __init__(self, choose: Callable[[ColumnTypes], Sequence[str]] | None = None) -> None:
         self._choose = choose
         self._tables: list[pa.Table] = []
         self._kind: pa.Schema | None = None
@@ -124,8 +124,8 @@ class Reader:
 def metadata_of(content: bytes) -> dict[str, str]:
     """The file's key-value metadata. Raises `ParquetError`."""
     with _reading():
-        found = pq.read_metadata(pa.BufferReader(content)).metadata or {}
-        return {name.decode(errors="replace"): value.decode(errors="replace") for name, value in found.items()}
+        metadata = pq.read_metadata(pa.BufferReader(content)).metadata or {}
+        return {name.decode(errors="replace"): value.decode(errors="replace") for name, value in metadata.items()}
 
 
 def without_checksums(content: bytes) -> bool:

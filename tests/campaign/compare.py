@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.campaign import Plan, RunOutcome, Summary, make_plan
+from pipeline.campaign import CampaignSummary, Plan, RunOutcome, make_plan
 from schemas.tables import TABLES
 from tests.conftest import SmallTrial
 
@@ -98,5 +98,5 @@ class Hurried:
         self._ahead_s += by_s
 
 
-def by_run(summary: Summary) -> dict[str, RunOutcome]:
+def by_run(summary: CampaignSummary) -> dict[str, RunOutcome]:
     return {outcome.run_id: outcome for outcome in summary.outcomes}

@@ -16,7 +16,7 @@ import pytest
 
 from datasets.mcap_log import write_mcap
 from pipeline import storage
-from pipeline.campaign import RunOutcome, Summary, make_plan, recorded_log, run_campaign
+from pipeline.campaign import CampaignSummary, RunOutcome, make_plan, recorded_log, run_campaign
 from pipeline.campaign.outcome import lost
 from pipeline.read.ingest import read_run
 from pipeline.results import store
@@ -54,7 +54,7 @@ class Spy:
     def finished(self, outcome: RunOutcome) -> None:
         self.seen.append(outcome)
 
-    def end(self, summary: Summary) -> None:
+    def end(self, summary: CampaignSummary) -> None:
         assert len(self.seen) == len(summary.outcomes)
 
 

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 import cli
-from pipeline.campaign import Plan, RunOutcome, Summary
+from pipeline.campaign import CampaignSummary, Plan, RunOutcome
 from pipeline.show import campaign, progress
 from pipeline.show.progress import BarWatch, JsonWatch, LineWatch, LogWatch, watches
 from schemas.enums import RunStatus, RunVerdict
@@ -79,7 +79,7 @@ def test_lines_in_a_pipe(clock: Clock, plan: Plan) -> None:
     clock.now_s += 5.0
     watch.look([("a", 5.0)])
     watch.look([("a", 5.0)])
-    watch.end(Summary(4, (OK, BAD), 5.0))
+    watch.end(CampaignSummary(4, (OK, BAD), 5.0))
     lines = said.getvalue().splitlines()
     assert lines[0] == "b: failed: b.mcap: damaged"
     assert [line.partition(",")[0] for line in lines[1:]] == ["2/4 runs", "2/4 runs"]
@@ -93,7 +93,7 @@ def test_bar_on_a_terminal(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     watch.begin(len(plan.jobs), plan.out)
     watch.finished(OK)
     watch.finished(BAD)
-    watch.end(Summary(4, (OK, BAD), 5.0))
+    watch.end(CampaignSummary(4, (OK, BAD), 5.0))
     said = screen.file.getvalue()  # type: ignore[attr-defined]
     assert "b: failed: b.mcap: damaged" in said
     assert "2/4" in said
@@ -106,7 +106,7 @@ def test_log_beside_the_results(plan: Plan) -> None:
     watch.begin(len(plan.jobs), plan.out)
     watch.finished(OK)
     watch.finished(RunOutcome("d", RunStatus.FAILED, "defect", trace="at s3://me:secret@store/x\n"))
-    watch.end(Summary(4, (OK,), 5.0))
+    watch.end(CampaignSummary(4, (OK,), 5.0))
     lines = (Path(plan.out) / "replay.log").read_text().splitlines()
     assert all(re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ ", line) for line in lines if line)
     assert lines[0].endswith("4 runs")
@@ -116,7 +116,7 @@ def test_log_beside_the_results(plan: Plan) -> None:
 
 
 def test_the_verdict_is_the_first_word() -> None:
-    summary = Summary(4, (OK, BAD, OLD), 5.0)
+    summary = CampaignSummary(4, (OK, BAD, OLD), 5.0)
     assert campaign.summary_line(summary).startswith("unsafe: 1 unsafe, 0 unproven, 1 safe, 1 failed; 3 of 4 runs")
     assert campaign.outcome_line(OLD) == "c: skipped, unsafe"
     partial = RunOutcome("d", RunStatus.PARTIAL, "cut off", verdict=RunVerdict.UNPROVEN)
@@ -147,7 +147,7 @@ def test_json_lines_for_programs(clock: Clock, plan: Plan) -> None:
     watch.lost("b", 1)
     watch.finished(OK)
     watch.finished(BAD)
-    watch.end(Summary(4, (OK, BAD), 5.0))
+    watch.end(CampaignSummary(4, (OK, BAD), 5.0))
     lines = [json.loads(line) for line in said.getvalue().splitlines()]
     assert [line["event"] for line in lines] == ["progress", "progress", "lost", "run", "run", "progress"]
     nothing = {"done": 0, "failed": 0, "skipped": 0, "total": 4, "rate_per_s": None, "left_s": None}
@@ -183,7 +183,9 @@ def test_each_remedy_stands_once_with_its_command_and_the_worst_run() -> None:
         replace(OK, run_id="b", log="logs/b.mcap", remedies=("route",)),
         replace(OLD, run_id="a", log="logs/a.mcap", remedies=("vehicle_file", "route")),
     ]
-    lines = campaign.remedy_lines(Summary(2, tuple(runs), 1.0), site="line9", out="week", options=" --config c.toml")
+    lines = campaign.remedy_lines(
+        CampaignSummary(2, tuple(runs), 1.0), site="line9", out="week", options=" --config c.toml"
+    )
     assert lines == [
         "2 of 2 runs: name the track that the train took: "
         "`balise replay logs/a.mcap --site line9 --out week --config c.toml --route ROUTES` "
@@ -197,10 +199,10 @@ def test_what_stands_beside_a_verdict_in_the_ending() -> None:
     figures = {"balises_accepted": 28, "balises_on_path": 31, "availability": 0.964, "proof_margin_m": 11.26}
     safe = replace(OK, **figures, held_s=900.0)
     poor = replace(OLD, balises_accepted=2, balises_on_path=9, availability=0.0, held_s=100.0, lost="100% alarms")
-    rows = campaign.ending_rows(Summary(2, (safe, BAD), 1.0))
+    rows = campaign.ending_rows(CampaignSummary(2, (safe, BAD), 1.0))
     columns = ("verdict", "accepted", "available", "margin")
     assert rows.select(columns).rows() == [("failed", "-", "-", "-"), ("safe", "28 of 31", "96%", "11.3 m")]
-    poor_row = campaign.ending_rows(Summary(1, (poor,), 1.0)).row(0, named=True)
+    poor_row = campaign.ending_rows(CampaignSummary(1, (poor,), 1.0)).row(0, named=True)
     assert (poor_row["accepted"], poor_row["margin"], poor_row["why"]) == ("2 of 9", "-", "lost to 100% alarms")
-    line = campaign.summary_line(Summary(3, (safe, poor, BAD), 1.0))
+    line = campaign.summary_line(CampaignSummary(3, (safe, poor, BAD), 1.0))
     assert "; 30 of 40 balises accepted, available for 87% of the moving time, proof margin 11.3 m; 3 of 3 runs" in line

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.storage.parquet import ParquetError, Reader, parquet_bytes, read_parquet
+from pipeline.storage.parquet import ParquetError, TableReader, parquet_bytes, read_parquet
 
 WORDS = pl.Enum(["none", "early", "late"])
 FRAMES = [
@@ -22,7 +22,7 @@ FRAMES = [
 
 def test_files_with_other_words_of_an_enum_are_read_as_each_alone() -> None:
     """Each file holds a dictionary of its own words: read together, no word may become another."""
-    reader = Reader(lambda found: [name for name in found if name != "x"])
+    reader = TableReader(lambda found: [name for name in found if name != "x"])
     for number, frame in enumerate([*FRAMES, FRAMES[0].clear()]):
         reader.add(parquet_bytes(frame, {"file": str(number)}))
     assert reader.heights == [1, 1, 1, 1, 0]
@@ -32,7 +32,7 @@ def test_files_with_other_words_of_an_enum_are_read_as_each_alone() -> None:
 
 def test_every_other_kind_of_columns_is_asked_for() -> None:
     asked: list[list[str]] = []
-    reader = Reader(lambda found: asked.append(list(found)) or list(found))  # type: ignore[func-returns-value]
+    reader = TableReader(lambda found: asked.append(list(found)) or list(found))  # type: ignore[func-returns-value]
     for frame in (FRAMES[0], FRAMES[1], FRAMES[2].drop("x")):
         reader.add(parquet_bytes(frame))
     assert asked == [["word", "words", "x"], ["word", "words"]]
@@ -42,7 +42,7 @@ def test_a_damaged_file_among_others_is_an_error() -> None:
     """Of the bytes of its first page none may change a value unseen."""
     good, seen = parquet_bytes(FRAMES[0]), 0
     for place in range(4, 60):
-        reader = Reader()
+        reader = TableReader()
         reader.add(parquet_bytes(FRAMES[1]))
         try:
             reader.add(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])

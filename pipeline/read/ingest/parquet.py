@@ -11,7 +11,7 @@ from pipeline.read.ingest.breaches import refuse
 from pipeline.read.ingest.conform import conform
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
-from pipeline.storage.parquet import ParquetError, Schema, read_parquet, without_checksums
+from pipeline.storage.parquet import ColumnTypes, ParquetError, read_parquet, without_checksums
 from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -65,9 +65,9 @@ def _read(content: bytes, stream: Stream, place: str, breaches: list[InputError]
         breaches.append(InputError("is empty", place=place, found="0 bytes", expected="a Parquet file"))
         return None
     contract = STREAM_SCHEMAS[stream].columns()
-    met: Schema = {}
+    met: ColumnTypes = {}
 
-    def known(found: Schema) -> list[str]:
+    def known(found: ColumnTypes) -> list[str]:
         met.update(found)
         return [name for name in found if name in contract]
 

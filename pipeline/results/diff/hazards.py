@@ -61,10 +61,10 @@ def compare_hazards(a: pl.DataFrame, b: pl.DataFrame) -> tuple[list[Difference],
     changes = [(_stamp(a, row), _change("vanished", a, row)) for row in gone]
     changes += [(_stamp(b, row), _change("appeared", b, row)) for row in come]
     for row_a, row_b in pairs.items():
-        one, other = (frame.drop(ids, strict=False)[row : row + 1] for frame, row in ((a, row_a), (b, row_b)))
-        found = [item for item in compare_tables(one, other, Hazards) if item.kind == "values"]
-        if found:
-            changes.append((_stamp(a, row_a), _change("changed", a, row_a, tuple(found))))
+        row_of_a, row_of_b = (frame.drop(ids, strict=False)[row : row + 1] for frame, row in ((a, row_a), (b, row_b)))
+        differing = [item for item in compare_tables(row_of_a, row_of_b, Hazards) if item.kind == "values"]
+        if differing:
+            changes.append((_stamp(a, row_a), _change("changed", a, row_a, tuple(differing))))
     return schema, [change for _, change in sorted(changes, key=lambda item: item[0])]
 
 

@@ -27,7 +27,7 @@ def verdict_changes(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
 def balise_counts(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
     """`accepted 15 became 3`: counts of virtual balises that changed, from two `runs` tables of one run."""
     return tuple(
-        f"{_of(solution, a, b)}{words} {_told(one)} became {_told(other)}"
+        f"{_of(solution, a, b)}{words} {_or_unknown(one)} became {_or_unknown(other)}"
         for column, words in BALISE_COUNTS.items()
         for solution, one, other in _both(a, b, column)
         if one != other
@@ -48,7 +48,7 @@ def passage_changes(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
     )
 
 
-def _told(count: object) -> object:
+def _or_unknown(count: object) -> object:
     return "unknown" if count is None else count
 
 

@@ -23,7 +23,7 @@ _KEYS: dict[str, tuple[str, ...]] = {
     "epochs": ("solution", "t"),
     "runs": ("solution",),
 }
-# How a result was made is told, but it is no change of the result.
+# How a result was made is shown, but is no change of the result.
 _PROVENANCE = ("config_digest", "input_digest", "software", "contract")
 _LINES_SHOWN = 20
 _COLUMNS_SHOWN = 8
@@ -56,8 +56,8 @@ class RunDiff:
     @property
     def other_columns(self) -> set[str]:
         """Columns that changed beside verdicts, hazards and balises."""
-        told = {"runs.verdict", "passages.status", *(f"runs.{name}" for name in BALISE_COUNTS)}
-        return {item.place for item in self.differences} - told
+        shown = {"runs.verdict", "passages.status", *(f"runs.{name}" for name in BALISE_COUNTS)}
+        return {item.place for item in self.differences} - shown
 
 
 @dataclass(frozen=True)
@@ -119,13 +119,13 @@ def diff_results(out_a: Address, out_b: Address) -> ResultDiff:
     """
     runs_a, runs_b = (store.complete_runs(out) for out in (out_a, out_b))
     common = [run for run in runs_a if run in set(runs_b)]
-    found = [_diff_run(out_a, out_b, run) for run in common]
-    others = Counter(column for run in found for column in run.made_otherwise)
+    diffs = [_diff_run(out_a, out_b, run) for run in common]
+    others = Counter(column for run in diffs for column in run.made_otherwise)
     return ResultDiff(
         compared=len(common),
         only_in_a=tuple(run for run in runs_a if run not in set(runs_b)),
         only_in_b=tuple(run for run in runs_b if run not in set(runs_a)),
-        runs=tuple(run for run in found if not run.same),
+        runs=tuple(run for run in diffs if not run.same),
         notes=tuple(f"{column} differs in {others[column]} runs" for column in _PROVENANCE if others[column]),
     )
 
@@ -151,14 +151,15 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str) -> RunDiff:
             continue
         frame_a, frame_b = (_frame(out, table, run_id, content) for out, content in ((out_a, a), (out_b, b)))
         if table == "hazards":
-            found, hazards = compare_hazards(frame_a, frame_b)
+            differing, hazards = compare_hazards(frame_a, frame_b)
         else:
-            found = compare_tables(frame_a, frame_b, contract, _KEYS[table])
+            differing = compare_tables(frame_a, frame_b, contract, _KEYS[table])
         if table == "runs":
-            verdicts, balises = verdict_changes(frame_a, frame_b), balise_counts(frame_a, frame_b) + balises
+            verdicts = verdict_changes(frame_a, frame_b)
+            balises = balise_counts(frame_a, frame_b) + balises
         elif table == "passages":
             balises = passage_changes(frame_a, frame_b)
-        differences += found
+        differences += differing
     made = [item for item in differences if item.kind == "values" and item.column in _PROVENANCE]
     changed = [item for item in differences if item not in made]
     return RunDiff(run_id, verdicts, balises, tuple(hazards), tuple(changed), tuple(item.column for item in made))

@@ -12,7 +12,7 @@ from typing import Literal
 import dataframely as dy
 import polars as pl
 
-Kind = Literal["schema", "rows", "values"]
+DifferenceKind = Literal["schema", "rows", "values"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Difference:
     """One difference between two tables; `rows` counts the rows concerned."""
 
     table: str
-    kind: Kind
+    kind: DifferenceKind
     column: str
     message: str
     rows: int = 0
@@ -56,9 +56,9 @@ def compare_tables(
         return [*differences, Difference(name, "rows", "", f"{a.height} rows became {b.height}", rows)]
     columns = contract.columns()
     for column in common:
-        found = _values_differ(a[column], b[column], tolerance_of(columns.get(column)))
-        if found is not None:
-            message, rows = found
+        differing = _values_differ(a[column], b[column], tolerance_of(columns.get(column)))
+        if differing is not None:
+            message, rows = differing
             differences.append(Difference(name, "values", column, message, rows))
     return differences
 
@@ -70,15 +70,19 @@ def tolerance_of(column: dy.Column | None) -> float:
 
 
 def _schema_differences(table: str, a: pl.DataFrame, b: pl.DataFrame) -> list[Difference]:
-    found = [Difference(table, "schema", column, "column is lost") for column in a.columns if column not in b.columns]
-    found += [Difference(table, "schema", column, "column is new") for column in b.columns if column not in a.columns]
+    differences = [
+        Difference(table, "schema", column, "column is lost") for column in a.columns if column not in b.columns
+    ]
+    differences += [
+        Difference(table, "schema", column, "column is new") for column in b.columns if column not in a.columns
+    ]
     both = [column for column in a.columns if column in b.columns]
     if both != [column for column in b.columns if column in a.columns]:
-        found.append(Difference(table, "schema", "", "columns stand in another order"))
+        differences.append(Difference(table, "schema", "", "columns stand in another order"))
     for column in both:
         if a.schema[column] != b.schema[column]:
-            found.append(Difference(table, "schema", column, f"{a.schema[column]} became {b.schema[column]}"))
-    return found
+            differences.append(Difference(table, "schema", column, f"{a.schema[column]} became {b.schema[column]}"))
+    return differences
 
 
 def _paired(
@@ -88,14 +92,14 @@ def _paired(
     by = [*keys, "_turn"]
     a, b = (frame.with_columns(_turn=pl.int_range(pl.len()).over(list(keys))) for frame in (a, b))
     lost, new = _joined(a, b, by, "anti"), _joined(b, a, by, "anti")
-    found = []
+    differences = []
     for word, rows in (("lost", lost), ("new", new)):
         if rows.height:
             first = ", ".join(f"{key} {_text(rows[key][0])}" for key in keys)
-            found.append(Difference(table, "rows", "", f"{rows.height} rows {word}, first: {first}", rows.height))
+            differences.append(Difference(table, "rows", "", f"{rows.height} rows {word}, first: {first}", rows.height))
     kept = _joined(a, b, by, "semi")
     partners = _joined(kept.select(by), b, by, "left").select(b.columns)
-    return found, kept.drop("_turn"), partners.drop("_turn")
+    return differences, kept.drop("_turn"), partners.drop("_turn")
 
 
 def _joined(a: pl.DataFrame, b: pl.DataFrame, by: list[str], how: Literal["anti", "semi", "left"]) -> pl.DataFrame:

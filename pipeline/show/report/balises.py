@@ -65,6 +65,8 @@ def architectures_section(identity: str, counts: pl.DataFrame) -> str:
     """`counts` as of `pipeline.studies.safety.tally`; nothing where there is but one solution."""
     if counts["other"].null_count() == counts.height:
         return ""
-    found = architecture_figures(counts)
-    shown = frame_table(f"table-{identity}", "Composite and reactive fail-safety side by side", found, _ARCHITECTURES)
+    shown_figures = architecture_figures(counts)
+    shown = frame_table(
+        f"table-{identity}", "Composite and reactive fail-safety side by side", shown_figures, _ARCHITECTURES
+    )
     return section(identity, "Architectures", _NOTE, shown)

@@ -115,7 +115,7 @@ def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
     hours, km = (
         float(once[name].sum() or 0.0) / unit for name, unit in (("duration_s", 3600.0), ("distance_m", 1000.0))
     )
-    found = {
+    lines = {
         "Dates": f"{begun:%Y-%m-%d %H:%M} to {ended:%Y-%m-%d %H:%M} UTC" if begun and ended else "not known",
         "Ridden": f"{number(hours)} h, {number(km)} km",
         "Line": f"{plural(elements, 'net element')}, {plural(campaign.passages['balise_id'].n_unique(), 'balise')} met",
@@ -123,7 +123,7 @@ def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
         "Receivers": f"{', '.join(solutions)} at {', '.join(number(rate) for rate in rates)} Hz",
         "Files": "each run's digest of log and site is in the last column of Table 1",
     }
-    return list(found.items())
+    return list(lines.items())
 
 
 def _runs_table(campaign: Campaign, made: Made) -> str:
@@ -252,6 +252,7 @@ def _location(passages: pl.DataFrame) -> Json:
 def _provenance(runs: pl.DataFrame, made: Made) -> str:
     names = ("software", "contract", "config_digest")
     digests = pairs((name, ", ".join(runs[name].unique().sort().to_list())) for name in names)
-    level, allowed = escape(made.config.hazards.service_level), number(made.config.budget_s, 4)
+    level = escape(made.config.hazards.service_level)
+    allowed = number(made.config.budget_s, 4)
     budget = f"<p>A wrong position may be in use for {allowed} s (service level {level}).</p>"
     return section("provenance", "Provenance", digests, budget, configuration(made))

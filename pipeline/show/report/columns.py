@@ -52,7 +52,8 @@ def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema]) ->
     """One row as a table downwards: the name of each column as in the data, its value with unit and bounds, and what
     it means.
     """
-    meanings, bounds = _meanings(contract), bounds_of(row)
+    meanings = _meanings(contract)
+    bounds = bounds_of(row)
     rows = [
         [Cell(name, name), Cell(_text(row, name, bounds.get(name))), Cell(meanings[name], meanings[name])]
         for name in _figure_names(row)

@@ -117,7 +117,7 @@ def _balises(view: _View, passages: pl.DataFrame) -> list[Json]:
     groups = (
         passages.with_columns(outcome=outcome())
         .group_by("balise_id", "netelement_id", "measure_m", maintain_order=True)
-        .agg(pl.col("path_m").first(), worst=worst.max(), told=pl.col("outcome").value_counts(sort=True))
+        .agg(pl.col("path_m").first(), worst=worst.max(), outcomes=pl.col("outcome").value_counts(sort=True))
         .sort("worst", maintain_order=True)
     )
     x, y = view.at(floats(groups, "path_m"))
@@ -125,7 +125,7 @@ def _balises(view: _View, passages: pl.DataFrame) -> list[Json]:
         {
             "id": row["balise_id"],
             "outcome": OUTCOMES[row["worst"]],
-            "told": ", ".join(sorted(f"{one['count']} {one['outcome']}" for one in row["told"])),
+            "outcomes": ", ".join(sorted(f"{met['count']} {met['outcome']}" for met in row["outcomes"])),
             "place": f"{row['netelement_id']} at {row['measure_m']:.1f} m",
             "x": _rounded(x[number]),
             "y": _rounded(y[number]),
@@ -159,28 +159,28 @@ def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
     extents = moving.group_by("netelement_id").agg(low_m=pl.col("measure_m").min(), high_m=pl.col("measure_m").max())
     step_m = _step_m(extents.collect())
     valid = pl.col("tvb") & pl.col("moving").fill_null(value=False)
-    found = moving.group_by(_PLACE[:2], from_m=_piece_m(pl.col("measure_m"), step_m)).agg(
+    counted = moving.group_by(_PLACE[:2], from_m=_piece_m(pl.col("measure_m"), step_m)).agg(
         epochs=pl.len().cast(pl.Int64),
         tvb=valid.sum().cast(pl.Int64),
         alarms=pl.col("alarm").sum().cast(pl.Int64),
         low_m=pl.col("measure_m").min(),
         high_m=pl.col("measure_m").max(),
     )
-    return _of_length(found.collect(), step_m)
+    return _of_length(counted.collect(), step_m)
 
 
 def together(pieces: pl.DataFrame) -> pl.DataFrame:
     """The pieces of several runs as pieces of one length, none shorter than those of any run."""
     step_m = _step_m(pieces)
     sums = (pl.col(name).sum() for name in ("epochs", "tvb", "alarms"))
-    found = pieces.with_columns(from_m=_piece_m(pl.col("from_m"), step_m)).group_by(_PLACE)
-    return _of_length(found.agg(*sums, pl.col("low_m").min(), pl.col("high_m").max()), step_m)
+    merged = pieces.with_columns(from_m=_piece_m(pl.col("from_m"), step_m)).group_by(_PLACE)
+    return _of_length(merged.agg(*sums, pl.col("low_m").min(), pl.col("high_m").max()), step_m)
 
 
 def _step_m(extents: pl.DataFrame) -> float:
     """Length of pieces for net elements of which these parts were ridden."""
-    found = extents.group_by("netelement_id").agg(pl.col("low_m").min(), pl.col("high_m").max())
-    total_m = float((found["high_m"] - found["low_m"]).sum() or 0.0)
+    extent = extents.group_by("netelement_id").agg(pl.col("low_m").min(), pl.col("high_m").max())
+    total_m = float((extent["high_m"] - extent["low_m"]).sum() or 0.0)
     long_m = _STEPS_M[-1]
     return next((step for step in _STEPS_M if total_m / step <= _PIECES), long_m * ceil(total_m / _PIECES / long_m))
 

@@ -40,13 +40,13 @@ def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, passages: pl.DataFr
     worst = _worst(heading, hazards, passages)
     beside = ". ".join(filter(None, (beside_words(heading), part_words(heading))))
     if len(listed) > 1:
-        told = " ".join(_told(row) for row in listed)
-        return Headline(word_of(verdict), f"{heading['solution']}: {worst}", told, beside)
-    told = f"{reason_words(heading)}." if verdict == RunVerdict.UNSAFE else ""
-    return Headline(word_of(verdict), worst, told, beside)
+        reasons = " ".join(_of_solution(row) for row in listed)
+        return Headline(word_of(verdict), f"{heading['solution']}: {worst}", reasons, beside)
+    reasons = f"{reason_words(heading)}." if verdict == RunVerdict.UNSAFE else ""
+    return Headline(word_of(verdict), worst, reasons, beside)
 
 
-def _told(row: Row) -> str:
+def _of_solution(row: Row) -> str:
     why = "" if row["verdict"] is None else f", {reason_words(row)}, {beside_words(row)}"
     return f"{row['solution']}: {word_of(row['verdict'])}{why}."
 
@@ -56,11 +56,12 @@ def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame) -> str:
 
     Of a safe run with faults: what it withstood.
     """
-    own = pl.col("solution") == run["solution"]
-    if run["verdict"] == RunVerdict.SAFE and (met := withstood(hazards.filter(own))):
+    of_solution = pl.col("solution") == run["solution"]
+    if run["verdict"] == RunVerdict.SAFE and (met := withstood(hazards.filter(of_solution))):
         return met
-    accepted, late = pl.col("accepted_ids").list.len() > 0, pl.col("within_budget").eq(other=False)
-    guilty = hazards.filter(own, accepted | late)
+    accepted = pl.col("accepted_ids").list.len() > 0
+    late = pl.col("within_budget").eq(other=False)
+    guilty = hazards.filter(of_solution, accepted | late)
     return next(iter(hazard_words(guilty, passages)), reason_words(run))
 
 
@@ -105,7 +106,7 @@ JUDGES = {"reference": "a reference", "balise": "balise reads", "odometer": "the
 def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -> list[tuple[str, str]]:
     """When, where, with what, by which program, from which files."""
     first = rows[0]
-    found = {
+    lines = {
         "Date": _span(first),
         "Line": _line(first, tables.epochs),
         "Train": _TRAINS.get(first["vehicle"], "not known"),
@@ -119,7 +120,7 @@ def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -
         "Digest of configuration and vehicle": first["config_digest"],
         "Digest of the log": metadata.get("log_digest", ""),
     }
-    return [(name, value) for name, value in found.items() if value]
+    return [(name, value) for name, value in lines.items() if value]
 
 
 def _span(row: Row) -> str:

@@ -136,7 +136,8 @@ def page(title: str, heading: str, body: str, data: str, script: str, foot: str)
 
     `title` and `foot` stand on each sheet of paper.
     """
-    shared, printed = _text("report.css"), _sheets(title, foot)
+    shared = _text("report.css")
+    printed = _sheets(title, foot)
     code = _code(script)
     policy = (
         f"default-src 'none'; script-src {_digest(code)}; style-src {_digest(shared)} {_digest(printed)}; "
@@ -186,8 +187,8 @@ def _numbered(body: str) -> str:
 def _th(head: tuple[str, str], numeric: bool) -> str:
     title, meaning = head
     kind = ' class="number"' if numeric else ""
-    told = f' title="{escape(meaning)}"' if meaning else ""
-    return f'<th scope="col"{kind}{told}>{escape(title)}</th>'
+    hint = f' title="{escape(meaning)}"' if meaning else ""
+    return f'<th scope="col"{kind}{hint}>{escape(title)}</th>'
 
 
 def _td(item: Cell, numeric: bool) -> str:

@@ -36,7 +36,7 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
     ways = stretches_of(epochs)
     if ways.is_empty() or ways["netelement_id"].n_unique() < ways.height:
         return None
-    told = (
+    of_elements = (
         epochs.filter(pl.col("path_m").is_not_null())
         .group_by("netelement_id")
         .agg(
@@ -47,7 +47,7 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
         )
     )
     return (
-        ways.join(told, on="netelement_id", how="left")
+        ways.join(of_elements, on="netelement_id", how="left")
         .sort("first_m")
         .select(
             "netelement_id",

@@ -274,7 +274,7 @@
     const track = plan.track.map((element, index) => ({ type: "line", look: "track", name: index ? "" : "track",
       x: unpack(element.x), y: unpack(element.y) }));
     const places = plan.balises.filter((one) => one.x !== null);
-    const balises = marksOf(places, (one) => one.x, (one) => one.y, (one) => `${one.id}: ${one.told} (${one.place})`);
+    const balises = marksOf(places, (one) => one.x, (one) => one.y, (one) => `${one.id}: ${one.outcomes} (${one.place})`);
     for (const layer of balises) layer.labels = places.filter((one) => one.outcome === layer.tone).map((one) => one.id);
     for (const layer of balises) layer.name = `balise: ${layer.name}`;
     draw(id, { height: 460, layers: [...track, ...gnssLayers(plan, t0), ...balises], equal: plan.geographic,

@@ -88,10 +88,10 @@ def run_page(
     names = [row["solution"] for row in rows if row["solution"]]
     parts = [_solution(f"s{number}", row, tables, made, len(rows) > 1) for number, row in enumerate(rows)]
     side_by_side = architectures_section("architectures", architectures)
-    told = pairs(facts(rows, tables, metadata))
+    about = pairs(facts(rows, tables, metadata))
     digests = pairs(sorted((name, value) for name, value in metadata.items() if not name.endswith(FILES)))
     provenance = section("provenance", "Provenance", file_table(metadata), digests, configuration(made))
-    body = "\n".join([told, _navigation(names), *parts, side_by_side, provenance])
+    body = "\n".join([about, _navigation(names), *parts, side_by_side, provenance])
     hazards = made.config.hazards
     data = {
         "run": tables.run_id,
@@ -106,7 +106,8 @@ def run_page(
         "solutions": {name: _solution_data(name, tables, made) for name in names},
     }
     head = run_headline(rows, tables.hazards, tables.passages)
-    verdict, ways = verdict_head(head.word, head.worst, head.reasons, head.beside), _ways(neighbours)
+    verdict = verdict_head(head.word, head.worst, head.reasons, head.beside)
+    ways = _ways(neighbours)
     heading = f"{verdict}{ways}<h1>Run {escape(tables.run_id)}</h1>"
     foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
     return page(f"{tables.run_id} · balise: {head.word}", heading, body, script_json(data), "run.js", foot)
@@ -187,14 +188,16 @@ def _navigation(names: list[str]) -> str:
 
 def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) -> str:
     """All sections of one solution; of one that failed what reading and matching found out."""
-    name, told = row["solution"], [text for text in (row["error"], *notes_apart(row["notes"])) if text]
-    items = "".join(f"<li>{escape(text)}</li>" for text in told)
+    name = row["solution"]
+    texts = [text for text in (row["error"], *notes_apart(row["notes"])) if text]
+    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
     notes = f'<ul class="notice {row["status"]}">{items}</ul>' if items else ""
     if not name:
         return notes
-    own = pl.col("solution") == name
+    of_solution = pl.col("solution") == name
     hazards, passages, alarms, epochs, runs = (
-        frame.filter(own) for frame in (tables.hazards, tables.passages, tables.alarms, tables.epochs, tables.runs)
+        frame.filter(of_solution)
+        for frame in (tables.hazards, tables.passages, tables.alarms, tables.epochs, tables.runs)
     )
     known = known_counts(runs).row(0, named=True)
     named = (frame.with_columns(run_id=pl.lit(tables.run_id)) for frame in (passages, runs))
@@ -213,7 +216,7 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
         part("figures", f"Summary of {name}" if several else "Summary", shown, notes),
         part("hazards", "Hazards", _hazards(key, row, hazards)),
         part("balises", "Balises", balise_table(f"table-balises-{key}", "Balises, the worst first", balises)),
-        part("drawings", "Drawings", *(figure(f"{key}-{plot}", *told) for plot, *told in plots_of("run"))),
+        part("drawings", "Drawings", *(figure(f"{key}-{plot}", *text) for plot, *text in plots_of("run"))),
         part("passages", "Passages", rows("passages", in_order, passages, _PASSAGES, Passages, {"status": _status})),
         part("levels", "Service levels", rows("levels", ALLOWED, levels, (), CampaignLevels)),
         part("alarms", "Alarms", rows("alarms", "Alarm episodes", alarms, _ALARMS, Alarms)),

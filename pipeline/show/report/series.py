@@ -28,7 +28,8 @@ SERIES = (
     "undetected_ahead_m",
     "undetected_behind_m",
 )
-NO_EPOCH, UNKNOWN = "no epoch", "not known"
+NO_EPOCH = "no epoch"
+UNKNOWN = "not known"
 MONITOR_CODES = (NO_EPOCH, MonitorState.PASS.value, MonitorState.NOT_EVALUATED.value, MonitorState.FAIL.value)
 _BINS = 56
 MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")

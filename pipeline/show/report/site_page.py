@@ -22,7 +22,8 @@ _BALISES = ("balise_id", "netelement_id", "measure_m", "kind", "direction", "loc
 
 def site_page(name: str, site: Site) -> str:
     """The page, in one file that opens offline."""
-    elements, findings = elements_table(site), findings_table(site.findings)
+    elements = elements_table(site)
+    findings = findings_table(site.findings)
     balises = (Balises.create_empty() if site.balises is None else site.balises).select(_BALISES)
     doubtful = (findings["severity"] != "note").sum()
     figures = [
@@ -31,11 +32,11 @@ def site_page(name: str, site: Site) -> str:
         ("Balises", str(balises.height), "" if balises.height else "doubt"),
         ("To look at", str(doubtful), "doubt" if doubtful else "good"),
     ]
-    told = "Draw a box to zoom in; a double click shows all. Elements carry their ids at their middle."
+    hint = "Draw a box to zoom in; a double click shows all. Elements carry their ids at their middle."
     body = "\n".join(
         [
             tiles(figures),
-            section("plan", "Plan", figure("site", "Net elements and balises, in metres", told)),
+            section("plan", "Plan", figure("site", "Net elements and balises, in metres", hint)),
             section("findings", "What is doubtful", frame_table("findings", "Findings", findings)),
             section("elements", "Net elements", frame_table("elements", "Net elements", elements)),
             section("balises", "Balises", frame_table("balises", "Balises", balises, contract=Balises)),

@@ -62,14 +62,15 @@ def write_report(
     The pages open from disk and make no request. Plans need the site; without it
     places are drawn along the path. Pages of runs that are no longer in the result are removed; those that were made
     from these very tables, settings and program are left as they are. `jobs` processes make the others, by
-    default one per core where there are many; `progress` is told how many pages of how many are done.
+    default one per core where there are many; `progress` receives how many pages of how many are done.
     """
     names = {run: page_name(run) for run in complete_runs(out)}
     config = read_config(out)
     made = Made(config or Configuration(), None if config is None else to_toml(config), site)
     states = catalogue.states(out, tuple(TABLES)) or {}
     ways = [None, *((run, quote(name)) for run, name in names.items()), None]
-    folder, index = out / "report" / "runs", out / "report" / "index.html"
+    folder = out / "report" / "runs"
+    index = out / "report" / "index.html"
     pages = [
         _with_digest(_Page(out, run, folder / name, made, Neighbours(ways[at], ways[at + 2])), states.get(run))
         for at, (run, name) in enumerate(names.items())
@@ -91,7 +92,8 @@ def write_report(
             storage.remove(folder / name)
     hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
     storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, rows), made).encode())
-    note_pages(out, {name: (out / "report" / name).read_bytes() for name in storage.files_below(out / "report")})
+    contents = {name: storage.content_of(out / "report" / name) for name in storage.files_below(out / "report")}
+    note_pages(out, {name: content for name, content in contents.items() if content is not None})
     return [index, *(page.path for page in pages)]
 
 
@@ -118,10 +120,10 @@ def _known(out: Path, pages: Sequence[_Page]) -> dict[str, pl.DataFrame]:
     content = catalogue.kept(out, _KEPT, software_digest())
     kept = [] if content is None else read_parquet(content).iter_slices(1)
     rows = {row["made_of"][0]: row for row in kept}
-    found = ((page, rows.get(page.made_of)) for page in pages if page.made_of)
+    candidates = ((page, rows.get(page.made_of)) for page in pages if page.made_of)
     return {
         page.run: row
-        for page, row in found
+        for page, row in candidates
         if row is not None and sha256(storage.content_of(page.path)) == row["page_sha256"][0]
     }
 
@@ -147,12 +149,12 @@ def _unlisted(rows: pl.DataFrame, name: str) -> pl.DataFrame:
 
 
 def _campaign(out: Path, made: Made, hrefs: dict[str, str], rows: pl.DataFrame) -> Campaign:
-    found = {table: catalogue.scan(out, table).collect() for table in catalogue.CATALOGUED}
+    tables = {table: catalogue.scan(out, table).collect() for table in catalogue.CATALOGUED}
     return Campaign(
-        runs=found["runs"],
-        hazards=found["hazards"],
-        passages=found["passages"],
-        derived=derived_tables(found["runs"], found["hazards"], found["passages"], found["alarms"], made.config),
+        runs=tables["runs"],
+        hazards=tables["hazards"],
+        passages=tables["passages"],
+        derived=derived_tables(tables["runs"], tables["hazards"], tables["passages"], tables["alarms"], made.config),
         pieces=together(_unlisted(rows, "pieces")),
         hrefs=hrefs,
         architectures=added([_unlisted(rows, "tallies")]),

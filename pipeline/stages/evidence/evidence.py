@@ -43,6 +43,10 @@ class Alternative:
     low_m: Floats
     high_m: Floats
 
+    @property
+    def middle_m(self) -> Floats:
+        return 0.5 * (self.low_m + self.high_m)
+
     def where(self, kept: Bools) -> Alternative:
         """At some of its instants only."""
         return Alternative(self.rows[kept], self.route, self.low_m[kept], self.high_m[kept])
@@ -90,6 +94,7 @@ class Evidence:
     clocks: tuple[Clock, ...]
     network: Network
     config: Configuration
+    stood: tuple[Span, ...] = ()
 
     @property
     def contradicted(self) -> int:
@@ -108,9 +113,7 @@ class Evidence:
         kind = np.full(self.reads_ns.size, NOTHING)
         factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
         by_reference = [one.widened(factor) for one in self._covered(self.reads_ns, np.ones(kind.size, np.bool_), kind)]
-        by_reads = [
-            one.widened(factor) for one in self._carried(self.by_reads, self.reads_ns, kind != NOTHING, kind, ())
-        ]
+        by_reads = [one.widened(factor) for one in self._carried(self.by_reads, self.reads_ns, kind != NOTHING, kind)]
         return int(common(by_reference, by_reads, kind.size)[1].size)
 
     @property
@@ -125,18 +128,15 @@ class Evidence:
         times += [int(t_ns) for one in self.stretches for t_ns in one.t_ns[[0, -1]]]
         return (min(times), max(times)) if times else None
 
-    def at(self, t_ns: Ints, stood: Sequence[Span] = ()) -> EvidenceSet:
-        """Evidence at these instants.
-
-        `stood`: when the odometer stood although the train may have moved; there nothing is carried from one side.
-        """
+    def at(self, t_ns: Ints) -> EvidenceSet:
+        """Evidence at these instants; nothing is carried from one side over a stand of the odometer (`stood`)."""
         kind, heard = np.full(t_ns.size, NOTHING), ~within_spans(t_ns, self.silent)
         found = self._covered(t_ns, heard, kind)
-        found += self._carried(self.carried, t_ns, heard & (kind == NOTHING), kind, stood)
+        found += self._carried(self.carried, t_ns, heard & (kind == NOTHING), kind)
         if not self.stretches or not self.by_reads:
             return EvidenceSet(kind, tuple(found))
         of_reads = np.full(t_ns.size, NOTHING)
-        by_reads = self._carried(self.by_reads, t_ns, heard, of_reads, stood)
+        by_reads = self._carried(self.by_reads, t_ns, heard, of_reads)
         both, disputed = common(found, by_reads, t_ns.size)
         return EvidenceSet(np.where(kind == NOTHING, of_reads, kind), tuple(both), disputed=disputed)
 
@@ -166,9 +166,7 @@ class Evidence:
                     kind[rows[own]] = KINDS.index(Kind.REFERENCE)
         return found
 
-    def _carried(
-        self, sources: Sequence[Carried], t_ns: Ints, wanted: Bools, kind: Ints, stood: Sequence[Span]
-    ) -> list[Alternative]:
+    def _carried(self, sources: Sequence[Carried], t_ns: Ints, wanted: Bools, kind: Ints) -> list[Alternative]:
         """By each odometer, from the anchors of its gaps: the train was where one of them says."""
         found: list[Alternative] = []
         for source in sources:
@@ -176,7 +174,7 @@ class Evidence:
             for gap in source.gaps:
                 inside = (t_ns >= gap.begin_ns) & (t_ns <= gap.end_ns) & open_rows
                 if len(gap.anchors) == 1:
-                    inside &= ~_after_standing(t_ns, gap, stood)
+                    inside &= ~_after_standing(t_ns, gap, self.stood)
                 rows = np.flatnonzero(inside)
                 for way in gap.ways or [] if rows.size else []:
                     low, high = self._interval(source.counter, gap, way, t_ns[rows])

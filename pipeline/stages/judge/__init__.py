@@ -1,5 +1,23 @@
-"""One solution against the evidence: judgements, failures, hazards, alarms, passages (DOMAIN sections 5.2 to 5.5).
+"""Was each position right, which failures and hazards follow, were alarms due (DOMAIN sections 5.2 to 5.5).
 
-In: a solution as it was replayed (`Solution`), `Evidence`, the odometer. Out: `Judged`, the tables of the contract.
-Touches no file. Velocity, and scale and latency learned in the run, are heard for no judgement, time or verdict.
+In: a solution as it was replayed, the evidence of its run, the odometer (`Case`). Out: `Judged`, the contract's tables.
+Touches no file. Velocity, and scale and latency learned in the run, decide no judgement, time or verdict.
+
+| question | module |
+|---|---|
+| in which order is it judged | `judge.py` |
+| what is judged, and by what | `case.py` |
+| was a position right | `judgement.py` |
+| did the train move, which way, does the odometer count wrong | `travel.py` |
+| for how long was a position in use; state of the LDS | `in_use.py` |
+| errors across the track | `cross_errors.py` |
+| all of these per epoch, and per offered balise | `epochs.py`, `offers.py` |
+| where did the position jump | `jumps.py` |
+| which wrong time in use is one failure | `failures.py` |
+| since when and until when was a position wrong, when was it detected | `episodes.py` |
+| which hazards | `hazards.py` |
+| was an alarm due | `alarms.py` |
+| which component is suspected (an opinion) | `attribution.py` |
+| when did the train itself pass each balise | `true_crossings.py` |
+| what became of each passage | `passages.py` |
 """

@@ -8,9 +8,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog
-from pipeline.stages.judge.hazards import HazardRow
+from pipeline.stages.judge.attribution import suspect_of
+from pipeline.stages.judge.episodes import Episode
 from pipeline.stages.judge.judgement import Judgements, margins_m
-from pipeline.stages.judge.suspect import suspect_of
 from schemas.arrays import NS_PER_S, Bools, Floats, floats, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.conform import dtypes
@@ -19,27 +19,27 @@ from schemas.tables import Alarms
 
 
 def alarms_table(
-    name: str, epochs: pl.DataFrame, log: FailureLog, rows: Sequence[HazardRow], config: Configuration
+    name: str, epochs: pl.DataFrame, log: FailureLog, hazards: Sequence[Episode], config: Configuration
 ) -> pl.DataFrame:
-    """One row per alarm episode in order of time; `name`: of the solution; `epochs`: judged."""
+    """One row per alarm episode; `name`: of the solution, `epochs`: judged, `hazards`: the episode of each row."""
     healthy = healthy_across(epochs, config.hazards)
-    found = [
+    rows = [
         {
             "solution": name,
             "alarm_id": number,
-            "t_start": span.start_ns,
-            "t_end": span.end_ns,
-            "monitors": list(span.monitors),
-            "peak_ratio": span.peak_ratio,
-            "verdict": verdict_of(span, epochs, healthy, config.hazards).value,
-            "suspect": suspect_of(epochs, span.start_ns, span.end_ns, config).value,
-            "hazard_id": _hazard_of(span, rows),
-            "netelement_id": epochs["netelement_id"][span.first],
-            "measure_m": epochs["measure_m"][span.first],
+            "t_start": alarm.start_ns,
+            "t_end": alarm.end_ns,
+            "monitors": list(alarm.monitors),
+            "peak_ratio": alarm.peak_ratio,
+            "verdict": verdict_of(alarm, epochs, healthy, config.hazards).value,
+            "suspect": suspect_of(epochs, alarm.start_ns, alarm.end_ns, config).value,
+            "hazard_id": next((number for number, episode in enumerate(hazards) if _belongs(alarm, episode)), None),
+            "netelement_id": epochs["netelement_id"][alarm.first],
+            "measure_m": epochs["measure_m"][alarm.first],
         }
-        for number, span in enumerate(log.alarms)
+        for number, alarm in enumerate(log.alarms)
     ]
-    return pl.DataFrame(found, schema=dtypes(Alarms))
+    return pl.DataFrame(rows, schema=dtypes(Alarms))
 
 
 def healthy_across(epochs: pl.DataFrame, config: HazardConfig) -> dict[str, Bools]:
@@ -53,21 +53,21 @@ def healthy_across(epochs: pl.DataFrame, config: HazardConfig) -> dict[str, Bool
     return healthy
 
 
-def verdict_of(span: AlarmEpisode, epochs: pl.DataFrame, healthy: dict[str, Bools], config: HazardConfig) -> Verdict:
+def verdict_of(alarm: AlarmEpisode, epochs: pl.DataFrame, healthy: dict[str, Bools], config: HazardConfig) -> Verdict:
     """True where the whole interval was beyond the margin at some epoch, false where all of it stayed within.
 
     Only reference or balise reads can say false, and only of every position from 300 s before the alarm to its end; of
     an alarm across the track only a reference, for four metres aside are another track.
     """
-    since_ns = span.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
-    first = int(np.searchsorted(times_ns(epochs), since_ns))
-    part = epochs[first : span.last + 1]
+    since_ns = alarm.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
+    rows = np.arange(int(np.searchsorted(times_ns(epochs), since_ns)), alarm.last + 1)
+    part = epochs[rows]
     positioned = part["path_m"].is_not_null().to_numpy()
     judged = Judgements.of(part)
     can_say_false = judged.by_truth
-    for axis, well in healthy.items():
-        if any(monitor.startswith(axis) for monitor in span.monitors):
-            can_say_false = can_say_false & well[first : span.last + 1]
+    for axis, within in healthy.items():
+        if any(monitor.startswith(axis) for monitor in alarm.monitors):
+            can_say_false = can_say_false & within[rows]
     if (judged.wrong_track & positioned).any():
         return Verdict.TRUE
     margin_m = margins_m(floats(part, "sigma_along_m"), config)
@@ -85,11 +85,8 @@ def verdict_within(low_m: Floats, high_m: Floats, margin_m: Floats, can_say_fals
     return Verdict.FALSE if within.size and within.all() else Verdict.UNKNOWN
 
 
-def _hazard_of(span: AlarmEpisode, rows: Sequence[HazardRow]) -> int | None:
-    """The first hazard that lasted during the alarm, or that it detected."""
-    for number, episode in enumerate(row.episode for row in rows):
-        lasted = span.start_ns <= episode.end_ns and span.end_ns >= episode.onset_ns
-        detected = episode.detected_ns is not None and span.start_ns <= episode.detected_ns <= span.end_ns
-        if lasted or detected:
-            return number
-    return None
+def _belongs(alarm: AlarmEpisode, episode: Episode) -> bool:
+    """The fault lasted during the alarm, or the alarm detected it."""
+    lasted = alarm.start_ns <= episode.end_ns and alarm.end_ns >= episode.onset_ns
+    detected_ns = episode.detection.t_ns
+    return lasted or (detected_ns is not None and alarm.start_ns <= detected_ns <= alarm.end_ns)

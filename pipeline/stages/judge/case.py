@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
-import numpy as np
 import polars as pl
 
 from pipeline.stages.evidence import Evidence
@@ -12,15 +12,12 @@ from pipeline.stages.odometry import Odometry
 from pipeline.stages.track.path import Route, TravelledPath
 from schemas.arrays import NS_PER_S, Ints, times_ns
 from schemas.config import Configuration, Vehicle
+from schemas.enums import BaliseKind, PassageStatus
 
 
 @dataclass(frozen=True)
 class Solution:
-    """One solution as it was recorded and replayed.
-
-    `fixes`: its positions as recorded; `epochs`: matched, aligned and monitored, with the LDS columns; `crossings` and
-    `passages`: of the LDS; `balises`: those on the path.
-    """
+    """One solution: `fixes` as recorded, `epochs` with all columns up to the LDS, `balises` on its path."""
 
     name: str
     fixes: pl.DataFrame
@@ -30,10 +27,24 @@ class Solution:
     balises: pl.DataFrame
     path: TravelledPath
 
+    @cached_property
+    def offers(self) -> pl.DataFrame:
+        """Crossings and telegrams, with `virtual` and `accepted`; also crossings before the balise was re-armed."""
+        status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
+        virtual = kind == BaliseKind.VIRTUAL.value
+        accepted = (virtual & (status == PassageStatus.ACCEPTED.value)).fill_null(value=False)
+        crossings = self.crossings.filter(pl.col("offered") | pl.col("status").is_null())
+        return crossings.with_columns(virtual=virtual, accepted=accepted)
+
+    @cached_property
+    def accepted(self) -> pl.DataFrame:
+        """The virtual balises that the LDS accepted, in order of time."""
+        return self.offers.filter("accepted").sort("t")
+
 
 @dataclass(frozen=True)
 class Case:
-    """One solution before the judge; `odometry` grows with its path; `faults`: what was injected, if anything was."""
+    """One solution with the evidence of its run; `odometry` grows with its path, `faults` were injected."""
 
     solution: Solution
     evidence: Evidence
@@ -57,14 +68,3 @@ class Case:
         """Net elements by their numbers in the survey, -1 for none."""
         index = self.evidence.network.track.index
         return names.replace_strict(index, default=-1, return_dtype=pl.Int64).fill_null(-1).to_numpy()
-
-
-def between_far_epochs(at_ns: Ints, step_s: float) -> Ints:
-    """The instants of the positions, and others between those that are far apart."""
-    step_ns = round(step_s * NS_PER_S)
-    far = np.flatnonzero(np.diff(at_ns) > 1.5 * step_ns)
-    between = [
-        np.arange(begin, end, step_ns, dtype=np.int64)[1:]
-        for begin, end in zip(at_ns[far].tolist(), at_ns[far + 1].tolist(), strict=True)
-    ]
-    return np.unique(np.concatenate([at_ns, *between]))

@@ -1,80 +1,81 @@
-"""Episodes: since when and until when a position was wrong, and when that was seen (DOMAIN section 5.3)."""
+"""Episodes: since when and until when a position was wrong, and when that was detected (DOMAIN section 5.3)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.failure_log import FailureLog
 from pipeline.stages.evidence.evidence import NOTHING
-from pipeline.stages.judge.failures import Course, Failure, numbers_of
+from pipeline.stages.judge.failures import Course, Failure, failure_at
 from pipeline.stages.judge.judgement import WRONG, Judgements
 from pipeline.stages.judge.jumps import Jump
-from schemas.arrays import NS_PER_S, Bools, flags, spans_of
-from schemas.config import HazardConfig
+from schemas.arrays import NS_PER_S, Bools, spans_of
+from schemas.config import Configuration, HazardConfig
 
 _ODOMETER = "odometer"
+
+
+@dataclass(frozen=True)
+class Detection:
+    """First fail of a monitor in an episode; `standing`: an alarm was there before the fault could be seen."""
+
+    t_ns: int | None = None
+    monitor: str | None = None
+    standing: bool = False
 
 
 @dataclass(frozen=True)
 class Episode:
     """A fault from its onset until the position is right again; numbers are of `Course`, `end` is the first after it.
 
-    `step`: the jump that began it; `jump_back`: the one that ended it. `t_failure_ns`: begin of the position failure;
-    `t_failure_may_ns`: since when it may have been one. `failure`: the time wrong in use that the episode belongs to.
+    `mark`: the first wrong position, or offer; `step`: the jump that began it; `jump_back`: the one that ended it;
+    `failed`: begin of the position failure; `may_ns`: since when it may have been one. `failure`: the time wrong in use
+    that the episode belongs to.
     """
 
     mark: int
     onset: int
     end: int
+    begin_ns: int
     onset_ns: int
     end_ns: int
     step: Jump | None
     jump_back: Jump | None
-    begin_ns: int
-    failure_number: int | None
-    t_failure_ns: int | None
-    t_failure_may_ns: int | None
-    detected_ns: int | None
-    monitor: str | None
-    alarm_before_onset: bool
-    failure: Failure | None
+    failed: int | None
+    may_ns: int | None
+    detection: Detection
+    failure: Failure
 
     @property
     def undetected_ns(self) -> tuple[int, int]:
         """From the begin to detection, or to the end; what a step offers on its way lies before its first position."""
-        return self.begin_ns, self.end_ns if self.detected_ns is None else self.detected_ns
+        detected_ns = self.detection.t_ns
+        return self.begin_ns, self.end_ns if detected_ns is None else detected_ns
 
 
 def find_episodes(
-    course: Course,
-    offers: pl.DataFrame,
-    failures: Sequence[Failure],
-    log: FailureLog,
-    faults: pl.DataFrame | None,
-    config: HazardConfig,
+    course: Course, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None, config: Configuration
 ) -> list[Episode]:
     """One episode for each time that positions left the evidence, or offered a VB wrong."""
-    marks = np.flatnonzero(course.judged.is_wrong | _offered_wrong(course, offers))
     episodes: list[Episode] = []
-    until = 0
-    for mark in marks.tolist():
-        if mark < until:
-            continue
-        episode = _episode(course, mark, until, failures, log, faults, config)
-        episodes.append(episode)
-        until = max(episode.end, mark + 1, 0 if episode.jump_back is None else episode.jump_back.last + 1)
+    floor = 0
+    for mark in np.flatnonzero(course.judged.is_wrong | _offered_wrong(course)).tolist():
+        if mark >= floor:
+            episode = _episode(course, mark, floor, failures, log, faults, config)
+            back = episode.jump_back
+            episodes.append(episode)
+            floor = max(episode.end, mark + 1, 0 if back is None else back.last + 1)
     return episodes
 
 
-def _offered_wrong(course: Course, offers: pl.DataFrame) -> Bools:
+def _offered_wrong(course: Course) -> Bools:
     """Positions that complete an offer judged wrong; what a jump offers on its way is the jump's."""
     marked = np.zeros(course.size, dtype=np.bool_)
-    wrong = flags(offers, "offered") & Judgements.of(offers).is_wrong
-    marked[numbers_of(offers, course.positions)[wrong]] = True
+    marked[course.offers.number[course.offers.offered & course.offers.judged.is_wrong]] = True
     for jump in course.jumps:
         marked[jump.first : jump.last + 1] = False
     return marked
@@ -87,33 +88,30 @@ def _episode(
     failures: Sequence[Failure],
     log: FailureLog,
     faults: pl.DataFrame | None,
-    config: HazardConfig,
+    config: Configuration,
 ) -> Episode:
+    hazards = config.hazards
     after_quiet = course.after_quiet(floor, mark)
     step = next(iter(course.jumps_in(after_quiet, mark + 1)), None)
-    onset = max(floor, step.first) if step is not None else after_quiet
-    jump_back, end = _end(course, mark, step, config)
-    onset_ns = _onset_ns(course, onset, mark, step, log, faults, config)
+    onset = after_quiet if step is None else max(floor, step.first)
+    jump_back, end = _end(course, mark, step, hazards)
     end_ns = int(course.t_ns[end]) if end < course.size else int(course.t_ns[-1]) + 1
-    detected_ns, monitor, before = _detection(log, onset_ns, end_ns)
-    failed = _failure(course, onset, end, step, config)
-    own = (failure for failure in failures if failure.meets(onset, end))
+    onset_ns, detection = _detected(course, onset, mark, end_ns, step, log, faults, hazards)
+    failed = _failed(course, onset, end, step, hazards)
+    in_use = (failure for failure in failures if failure.first < end and failure.last >= onset)
     return Episode(
         mark=mark,
         onset=onset,
         end=end,
+        begin_ns=onset_ns if step is None else min(onset_ns, int(course.t_ns[step.first - 1]) + 1),
         onset_ns=onset_ns,
         end_ns=end_ns,
         step=step,
         jump_back=jump_back,
-        begin_ns=onset_ns if step is None else min(onset_ns, int(course.t_ns[step.first - 1]) + 1),
-        failure_number=failed,
-        t_failure_ns=None if failed is None else int(course.t_ns[failed]),
-        t_failure_may_ns=None if failed is None else _failure_may_ns(course, failed, config),
-        detected_ns=detected_ns,
-        monitor=monitor,
-        alarm_before_onset=before,
-        failure=next(own, None),
+        failed=failed,
+        may_ns=None if failed is None else _failed_may_ns(course, failed, hazards),
+        detection=detection,
+        failure=next(in_use, None) or failure_at(course, onset, end, np.zeros(0, dtype=np.int64), config),
     )
 
 
@@ -134,27 +132,31 @@ def _is_back(judged: Judgements, jump: Jump, config: HazardConfig) -> bool:
     return back and float(ends.least_m[1]) <= config.failure_limit_m and ends.code[1] != WRONG
 
 
-def _onset_ns(
+def _detected(
     course: Course,
     onset: int,
     mark: int,
+    end_ns: int,
     step: Jump | None,
     log: FailureLog,
     faults: pl.DataFrame | None,
     config: HazardConfig,
-) -> int:
-    """As a `faults` stream names it; else the first epoch of the step or drift, or an alarm up to 30 s before."""
-    onset_ns, mark_ns = int(course.t_ns[onset]), int(course.t_ns[mark])
-    named = _named_onset_ns(faults, onset_ns, mark_ns)
-    if named is not None:
-        return named
-    if step is None:
-        began = log.start_within(onset_ns - round(config.alarm_lead_s * NS_PER_S), onset_ns)
-        return onset_ns if began is None else began
-    return onset_ns
+) -> tuple[int, Detection]:
+    """Onset and detection. The onset is as a `faults` stream names it; else the first epoch of the step or drift.
+
+    A drift is seen late: an alarm up to 30 s before its onset is the onset, and was standing when it came.
+    """
+    onset_ns = int(course.t_ns[onset])
+    alarm_ns = None
+    named_ns = named_onset_ns(faults, onset_ns, int(course.t_ns[mark]))
+    if named_ns is None and step is None:
+        alarm_ns = log.start_within(onset_ns - round(config.alarm_lead_s * NS_PER_S), onset_ns)
+    begin_ns = next((t_ns for t_ns in (named_ns, alarm_ns) if t_ns is not None), onset_ns)
+    detection = _detection(log, begin_ns, end_ns)
+    return begin_ns, detection if alarm_ns is None else replace(detection, standing=True)
 
 
-def _named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> int | None:
+def named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> int | None:
     """Begin of the fault that a `faults` stream names: the last one before the onset as seen, else the first after."""
     if faults is None:
         return None
@@ -166,37 +168,37 @@ def _named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) ->
     return before[-1] if before else next(iter(begins), None)
 
 
-def _detection(log: FailureLog, onset_ns: int, end_ns: int) -> tuple[int | None, str | None, bool]:
+def _detection(log: FailureLog, onset_ns: int, end_ns: int) -> Detection:
     """First fail of any monitor in the episode; at once where an alarm was standing."""
     standing = log.standing_at(onset_ns)
     if standing is not None:
-        return onset_ns, standing, True
-    found = log.first_in(onset_ns, end_ns)
-    return (None, None, False) if found is None else (*found, False)
+        return Detection(onset_ns, standing, standing=True)
+    first = log.first_in(onset_ns, end_ns)
+    return Detection() if first is None else Detection(*first)
 
 
-def _failure(course: Course, onset: int, end: int, step: Jump | None, config: HazardConfig) -> int | None:
+def _failed(course: Course, onset: int, end: int, step: Jump | None, config: HazardConfig) -> int | None:
     """First position of a second of `wrong`; a step counts at once; else the first wrong one of the episode."""
-    spans = spans_of(course.judged.is_wrong[onset:end])
+    spans = [(onset + first, onset + last) for first, last in spans_of(course.judged.is_wrong[onset:end])]
     hold_ns = round(config.failure_hold_s * NS_PER_S)
     for first, last in spans:
-        begin, until = onset + first, onset + last
-        at_once = step is not None and step.first <= begin <= step.last
-        if at_once or course.t_ns[until] - course.t_ns[begin] >= hold_ns:
-            return begin
-    return onset + spans[0][0] if spans else None
+        at_once = step is not None and step.first <= first <= step.last
+        if at_once or course.t_ns[last] - course.t_ns[first] >= hold_ns:
+            return first
+    return spans[0][0] if spans else None
 
 
-def _failure_may_ns(course: Course, failed: int, config: HazardConfig) -> int | None:
+def _failed_may_ns(course: Course, failed: int, config: HazardConfig) -> int | None:
     """First of the unbroken run of unknown or wrong positions before a failure at which it may have been one.
 
     That is where the interval reaches beyond the limit. None where the evidence is silent in that run: a failure may
     have begun at any time of it.
     """
     right = np.flatnonzero(course.judged.is_right[:failed])
-    run = slice(int(right[-1]) + 1 if right.size else 0, failed + 1)
-    if (course.judged.kind[run] == NOTHING).any():
+    run = np.arange(int(right[-1]) + 1 if right.size else 0, failed + 1)
+    judged = course.judged.take(run)
+    if (judged.kind == NOTHING).any():
         return None
-    # Where no place along the track can be compared, any error may be.
-    may = np.flatnonzero(~(course.judged.largest_m[run] <= config.failure_limit_m) | course.judged.is_wrong[run])
-    return int(course.t_ns[run][may[0]])
+    # Where no place along the track can be compared (NaN), any error may be.
+    may = ~(judged.largest_m <= config.failure_limit_m) | judged.is_wrong
+    return int(course.t_ns[run[may]][0])

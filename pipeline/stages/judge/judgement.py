@@ -8,22 +8,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
+from pipeline.stages.evidence.carrying import carried_forward
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
+from pipeline.stages.judge.case import Case
 from pipeline.stages.track.path import Route
-from schemas.arrays import Bools, Floats, Ints, flags, floats, ints
+from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import HazardConfig
 from schemas.enums import Evidence, Judgement
 
 JUDGEMENTS = tuple(Judgement)
-RIGHT, WRONG, UNKNOWN = (JUDGEMENTS.index(one) for one in (Judgement.RIGHT, Judgement.WRONG, Judgement.UNKNOWN))
+RIGHT, WRONG, UNKNOWN = (JUDGEMENTS.index(word) for word in (Judgement.RIGHT, Judgement.WRONG, Judgement.UNKNOWN))
+REFERENCE, BALISE, ODOMETER = (KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER))
 
 
 @dataclass(frozen=True)
-class Positions:
-    """Positions of one solution on the network at some instants.
+class MatchedPositions:
+    """Positions of a solution, or balises that it offers, on the network; `element` -1 without a position.
 
-    `element`: net element by its number in the survey, -1 without a position; `unambiguous`: the track is not in doubt
-    by the train's own knowledge.
+    `unambiguous`: the track was not in doubt by what the train knew then.
     """
 
     element: Ints
@@ -31,6 +33,12 @@ class Positions:
     leg: Ints
     path_m: Floats
     unambiguous: Bools
+
+    @classmethod
+    def of(cls, case: Case, frame: pl.DataFrame, unambiguous: Bools) -> MatchedPositions:
+        path_m = floats(frame, "path_m")
+        element = np.where(np.isfinite(path_m), case.element_numbers(frame["netelement_id"]), -1)
+        return cls(element, floats(frame, "measure_m"), ints(frame["leg"]), path_m, unambiguous)
 
     @property
     def known(self) -> Bools:
@@ -40,10 +48,9 @@ class Positions:
 
 @dataclass(frozen=True)
 class Judgements:
-    """Per instant: judgement (number in `JUDGEMENTS`), least and largest error along the track [m].
+    """Per instant: judgement (number in `JUDGEMENTS`), interval of the error along the track [m], kind of evidence.
 
-    Along growing path as `judge_positions` makes them, in the direction of travel once `turned`. `kind`: of evidence,
-    number in `KINDS`; `wrong_track`: judged wrong for its net element, whatever the place along the track.
+    Errors are along growing path until `turned`. `wrong_track`: wrong for its net element, wherever along it.
     """
 
     code: Ints
@@ -54,7 +61,7 @@ class Judgements:
 
     @classmethod
     def of(cls, frame: pl.DataFrame) -> Judgements:
-        """Those of a frame that holds the columns of `columns`."""
+        """From a frame with the columns of `columns`."""
         return cls(
             code=ints(frame["judgement"].to_physical()),
             low_m=floats(frame, "error_low_m"),
@@ -67,9 +74,10 @@ class Judgements:
         return Judgements(self.code[rows], self.low_m[rows], self.high_m[rows], self.kind[rows], self.wrong_track[rows])
 
     def columns(self) -> list[pl.Series]:
+        words = [word.value for word in JUDGEMENTS]
         kinds = pl.Series("evidence", [*(kind.value for kind in KINDS), None], dtype=pl.Enum(Evidence))
         return [
-            judgement_words(self.code),
+            pl.Series("judgement", words, dtype=pl.Enum(words)).gather(self.code),
             pl.Series("error_low_m", self.low_m, nan_to_null=True),
             pl.Series("error_high_m", self.high_m, nan_to_null=True),
             kinds.gather(np.where(self.kind == NOTHING, len(KINDS), self.kind)),
@@ -77,7 +85,7 @@ class Judgements:
         ]
 
     def turned(self, direction: Ints) -> Judgements:
-        """The same with the errors in the direction of travel: +1 along growing path, -1 against it."""
+        """With the errors in the direction of travel: +1 along growing path, -1 against it."""
         forward = direction > 0
         low_m = np.where(forward, self.low_m, -self.high_m)
         return replace(self, low_m=low_m, high_m=np.where(forward, self.high_m, -self.low_m))
@@ -94,8 +102,11 @@ class Judgements:
 
     @property
     def middle_m(self) -> Floats:
-        middle: Floats = 0.5 * (self.low_m + self.high_m)
-        return middle
+        return 0.5 * (self.low_m + self.high_m)
+
+    @property
+    def half_m(self) -> Floats:
+        return 0.5 * (self.high_m - self.low_m)
 
     @property
     def least_m(self) -> Floats:
@@ -110,17 +121,12 @@ class Judgements:
         return largest
 
     @property
-    def half_m(self) -> Floats:
-        half: Floats = 0.5 * (self.high_m - self.low_m)
-        return half
-
-    @property
     def by_truth(self) -> Bools:
-        """Judged by reference or balise reads, which alone can call a position right."""
-        return np.isin(self.kind, [KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE)])
+        """By reference or balise reads, which alone can call a position right."""
+        return np.isin(self.kind, [REFERENCE, BALISE])
 
     def known_m(self, known_to_m: float) -> Floats:
-        """The error where reference or balise reads tell it so closely [m], else NaN."""
+        """The error where reference or balise reads give it to plus or minus so much, else NaN [m]."""
         return np.where(self.by_truth & (self.half_m <= known_to_m), self.middle_m, np.nan)
 
 
@@ -130,127 +136,119 @@ def margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
     return np.maximum(config.false_alarm_margin_m, noise)
 
 
-def judgement_words(code: Ints) -> pl.Series:
-    kinds = [one.value for one in JUDGEMENTS]
-    return pl.Series("judgement", kinds, dtype=pl.Enum(kinds)).gather(code)
-
-
-@dataclass(frozen=True)
-class _Relative:
-    """Positions against one alternative: error interval (NaN: not known), and on another track than it."""
-
-    low_m: Floats
-    high_m: Floats
-    off_track: Bools
+def judgements_of(case: Case, positions: MatchedPositions, at_ns: Ints, evidence: EvidenceSet) -> Judgements:
+    """Positions at instants against the evidence, else against the odometer's way since an accepted VB."""
+    judged = judge_positions(positions, evidence, case.legs(), case.config.hazards)
+    if case.odometry is None:
+        return judged
+    accepted = case.solution.accepted
+    since_ns = case.instants(times_ns(accepted))
+    stood = case.evidence.stood
+    train_m = carried_forward(since_ns, floats(accepted, "path_m"), at_ns, case.odometry, stood, case.config)
+    return with_own_anchors(judged, positions, train_m, case.config.hazards)
 
 
 def judge_positions(
-    positions: Positions, evidence: EvidenceSet, legs: Sequence[Route], config: HazardConfig
+    positions: MatchedPositions, evidence: EvidenceSet, legs: Sequence[Route], config: HazardConfig
 ) -> Judgements:
     """Wrong where it is wrong wherever the train may have been, right where it is right wherever it may have been.
 
-    `legs`: the legs of the solution's own path, coordinate `path_m`. The interval is that of the tracks on which the
-    place along the track can be compared.
+    `legs`: of the solution's own path, coordinate `path_m`. The interval spans the tracks on which the place along the
+    track can be compared.
     """
     size, limit_m = positions.element.size, config.failure_limit_m
-    low, high = np.full(size, np.inf), np.full(size, -np.inf)
-    right, ahead, behind, off = (np.ones(size, dtype=np.bool_) for _ in range(4))
-    weighed = np.zeros(size, dtype=np.bool_)
+    low_m, high_m = np.full(size, np.inf), np.full(size, -np.inf)
+    right, ahead, behind, elsewhere = (np.ones(size, dtype=np.bool_) for _ in range(4))
+    judged = np.zeros(size, dtype=np.bool_)
+    sense = _path_sense(positions, legs)
     for alternative in evidence.alternatives:
-        kept = positions.known[alternative.rows]
-        rows = alternative.rows[kept]
-        found = _relative(positions, rows, _only(alternative, kept), legs)
-        excluded = found.off_track & positions.unambiguous[rows]
+        there = alternative.where(positions.known[alternative.rows])
+        rows = there.rows
+        least_m, most_m, off_track = _relative(positions, sense, there, legs)
+        excluded = off_track & positions.unambiguous[rows]
         with np.errstate(invalid="ignore"):
-            ahead[rows] &= excluded | (found.low_m > limit_m)
-            behind[rows] &= excluded | (found.high_m < -limit_m)
-            right[rows] &= ~found.off_track & (found.low_m >= -limit_m) & (found.high_m <= limit_m)
-        off[rows] &= excluded
-        weighed[rows] = True
-        low[rows], high[rows] = np.fmin(low[rows], found.low_m), np.fmax(high[rows], found.high_m)
-    wrong = ahead | behind
-    code = np.where(weighed & wrong, WRONG, np.where(weighed & right, RIGHT, UNKNOWN))
-    told = weighed & np.isfinite(low)
+            ahead[rows] &= excluded | (least_m > limit_m)
+            behind[rows] &= excluded | (most_m < -limit_m)
+            right[rows] &= ~off_track & (least_m >= -limit_m) & (most_m <= limit_m)
+        elsewhere[rows] &= excluded
+        judged[rows] = True
+        low_m[rows] = np.fmin(low_m[rows], least_m)
+        high_m[rows] = np.fmax(high_m[rows], most_m)
+    wrong = judged & (ahead | behind)
+    compared = judged & np.isfinite(low_m)
     return Judgements(
-        code=code,
-        low_m=np.where(told, low, np.nan),
-        high_m=np.where(told, high, np.nan),
-        kind=np.where(weighed, evidence.kind, NOTHING),
-        wrong_track=weighed & wrong & off,
+        code=np.where(wrong, WRONG, np.where(judged & right, RIGHT, UNKNOWN)),
+        low_m=np.where(compared, low_m, np.nan),
+        high_m=np.where(compared, high_m, np.nan),
+        kind=np.where(judged, evidence.kind, NOTHING),
+        wrong_track=wrong & elsewhere,
     )
 
 
-def _only(alternative: Alternative, kept: Bools) -> Alternative:
-    rows, low, high = alternative.rows[kept], alternative.low_m[kept], alternative.high_m[kept]
-    return Alternative(rows, alternative.route, low, high)
-
-
-def _relative(positions: Positions, rows: Ints, there: Alternative, legs: Sequence[Route]) -> _Relative:
-    """Positions on the track of the evidence, else by their own path where that leads to the train."""
-    element, measure = positions.element[rows], positions.measure_m[rows]
-    own_sense, middle = _own_sense(positions, rows, legs), 0.5 * (there.low_m + there.high_m)
-    at_m, sense = there.route.coordinate(element, measure, middle)
-    low, high = at_m - there.high_m, at_m - there.low_m
-    facing = own_sense * sense
-    off = ~np.isfinite(at_m)
-    if off.any():
-        away = np.flatnonzero(off)
-        by_path = _by_own_path(positions, rows[away], _only(there, off), legs)
-        low[away], high[away], off[away] = by_path.low_m, by_path.high_m, by_path.off_track
-        facing[away] = 1
-    ahead = facing > 0
-    return _Relative(np.where(ahead, low, -high), np.where(ahead, high, -low), off)
-
-
-def _own_sense(positions: Positions, rows: Ints, legs: Sequence[Route]) -> Ints:
-    """+1 where the path of the solution grows with the measure of the position's net element."""
-    sense = np.ones(rows.size, dtype=np.int64)
+def _path_sense(positions: MatchedPositions, legs: Sequence[Route]) -> Ints:
+    """+1 where the path of the solution grows with the measure of the position's net element, else -1."""
+    sense = np.ones(positions.element.size, dtype=np.int64)
     for number, leg in enumerate(legs):
-        own = np.flatnonzero(positions.leg[rows] == number)
-        here = rows[own]
-        _, found = leg.coordinate(positions.element[here], positions.measure_m[here], positions.path_m[here])
-        sense[own] = np.where(found == 0, 1, found)
+        rows = np.flatnonzero((positions.leg == number) & positions.known)
+        _, along = leg.coordinate(positions.element[rows], positions.measure_m[rows], positions.path_m[rows])
+        sense[rows] = np.where(along == 0, 1, along)
     return sense
 
 
-def _by_own_path(positions: Positions, rows: Ints, there: Alternative, legs: Sequence[Route]) -> _Relative:
-    """Error along growing path, where the train's place lies on the path of the solution too.
+_Relative = tuple[Floats, Floats, Bools]
+"""Error interval along growing path (NaN: not known), and where the position is on another track."""
+
+
+def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs: Sequence[Route]) -> _Relative:
+    """Positions against one alternative: on its track, else by their own path where that leads to the train."""
+    rows = there.rows
+    at_m, along = there.route.coordinate(positions.element[rows], positions.measure_m[rows], there.middle_m)
+    forward = sense[rows] * along > 0
+    low_m = np.where(forward, at_m - there.high_m, there.low_m - at_m)
+    high_m = np.where(forward, at_m - there.low_m, there.high_m - at_m)
+    off_track = ~np.isfinite(at_m)
+    away = np.flatnonzero(off_track)
+    if away.size:
+        low_m[away], high_m[away], off_track[away] = _by_own_path(positions, there.where(off_track), legs)
+    return low_m, high_m, off_track
+
+
+def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence[Route]) -> _Relative:
+    """Where the train's place lies on the path of the solution too.
 
     Where the track of the evidence goes on as far as the position is ahead or behind, and on another net element than
     the position's, the position is on another track.
     """
-    middle = 0.5 * (there.low_m + there.high_m)
-    element, measure, sense = there.route.locate(middle)
-    low, high = np.full((2, rows.size), np.nan)
-    off = np.ones(rows.size, dtype=np.bool_)
+    rows, middle_m = there.rows, there.middle_m
+    element, measure_m, sense = there.route.locate(middle_m)
+    path_m, train_m = positions.path_m[rows], np.full(rows.size, np.nan)
+    along = np.zeros(rows.size, dtype=np.int64)
     for number, leg in enumerate(legs):
-        own = np.flatnonzero(positions.leg[rows] == number)
-        path_m = positions.path_m[rows[own]]
-        train_m, path_sense = leg.coordinate(element[own], measure[own], path_m)
-        turned = path_sense * sense[own] < 0
-        below, above = (middle - there.low_m)[own], (there.high_m - middle)[own]
-        low[own] = path_m - train_m - np.where(turned, below, above)
-        high[own] = path_m - train_m + np.where(turned, above, below)
-        onward = middle[own] + (path_m - train_m) * np.where(turned, -1.0, 1.0)
-        off[own] = ~np.isfinite(train_m) | there.route.covers(np.nan_to_num(onward, nan=-np.inf))
-    off |= ~np.isfinite(low)
-    return _Relative(np.where(off, np.nan, low), np.where(off, np.nan, high), off)
+        part = np.flatnonzero(positions.leg[rows] == number)
+        train_m[part], along[part] = leg.coordinate(element[part], measure_m[part], path_m[part])
+    against = along * sense < 0
+    ahead_m = path_m - train_m
+    onward_m = middle_m + np.where(against, -ahead_m, ahead_m)
+    off_track = ~np.isfinite(train_m) | there.route.covers(np.nan_to_num(onward_m, nan=-np.inf))
+    low_m = ahead_m - np.where(against, middle_m - there.low_m, there.high_m - middle_m)
+    high_m = ahead_m + np.where(against, there.high_m - middle_m, middle_m - there.low_m)
+    return np.where(off_track, np.nan, low_m), np.where(off_track, np.nan, high_m), off_track
 
 
 def with_own_anchors(
-    judged: Judgements, positions: Positions, train_m: tuple[Floats, Floats], config: HazardConfig
+    judged: Judgements, positions: MatchedPositions, train_m: tuple[Floats, Floats], config: HazardConfig
 ) -> Judgements:
     """Where there is no other evidence, by the odometer since an accepted VB: wrong, or unknown, never right.
 
-    `train_m`: least and largest path position of the train; errors along growing path.
+    `train_m`: least and largest path position of the train.
     """
     rows = (judged.kind == NOTHING) & positions.known & np.isfinite(train_m[0])
-    low, high = positions.path_m - train_m[1], positions.path_m - train_m[0]
-    beyond = rows & ((low > config.failure_limit_m) | (high < -config.failure_limit_m))
+    low_m, high_m = positions.path_m - train_m[1], positions.path_m - train_m[0]
+    beyond = rows & ((low_m > config.failure_limit_m) | (high_m < -config.failure_limit_m))
     return Judgements(
         code=np.where(beyond, WRONG, judged.code),
-        low_m=np.where(rows, low, judged.low_m),
-        high_m=np.where(rows, high, judged.high_m),
-        kind=np.where(rows, KINDS.index(Evidence.ODOMETER), judged.kind),
+        low_m=np.where(rows, low_m, judged.low_m),
+        high_m=np.where(rows, high_m, judged.high_m),
+        kind=np.where(rows, ODOMETER, judged.kind),
         wrong_track=judged.wrong_track,
     )

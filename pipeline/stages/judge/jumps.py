@@ -14,10 +14,9 @@ from schemas.config import HazardConfig
 
 @dataclass(frozen=True)
 class Steps:
-    """How position minus evidence changed from each valid position to the next, along growing path [m].
+    """Per position: sum of the changes of position minus evidence up to it [m], along growing path.
 
-    Arrays over valid positions; `excess_m`: sum of the changes; `linked`: the change from the position before is
-    known, and no gap lies between.
+    `linked`: the change since the position before is known, and no gap lies between.
     """
 
     t_ns: Ints
@@ -27,7 +26,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Jump:
-    """A jump from valid position `first - 1` to `last`; `step_m` in the direction of travel."""
+    """A jump from position `first - 1` to `last`; `step_m` in the direction of travel."""
 
     first: int
     last: int
@@ -44,21 +43,21 @@ def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: int, co
     return find_jumps(steps, ints(positions["direction"]), config)
 
 
-def steps_of(t_ns: Ints, path_m: Floats, train_m: Floats, counted_m: Floats, gap_ns: int) -> Steps:
-    """`train_m`: path position by the reference, NaN elsewhere; there `counted_m`, the odometer's steps, serves."""
-    by_reference, by_odometer = np.diff(path_m - train_m), np.diff(path_m) - counted_m
-    change = np.where(np.isfinite(by_reference), by_reference, by_odometer)
-    linked = np.isfinite(change) & (np.diff(t_ns) <= gap_ns)
-    excess = np.concatenate([[0.0], np.cumsum(np.where(linked, change, 0.0))])
-    return Steps(t_ns, excess[: t_ns.size], np.concatenate([[False], linked])[: t_ns.size])
+def steps_of(t_ns: Ints, path_m: Floats, reference_m: Floats, counted_m: Floats, gap_ns: int) -> Steps:
+    """`reference_m`: path position by the reference, NaN elsewhere; there the odometer's steps `counted_m` serve."""
+    by_reference_m = np.diff(path_m - reference_m)
+    change_m = np.where(np.isfinite(by_reference_m), by_reference_m, np.diff(path_m) - counted_m)
+    linked = np.isfinite(change_m) & (np.diff(t_ns) <= gap_ns)
+    excess_m = np.concatenate([[0.0], np.cumsum(np.where(linked, change_m, 0.0))])
+    return Steps(t_ns, excess_m[: t_ns.size], np.concatenate([[False], linked])[: t_ns.size])
 
 
 def find_jumps(steps: Steps, direction: Ints, config: HazardConfig) -> list[Jump]:
     """All jumps in order of time."""
-    largest = _largest_step(steps, config)
+    largest_m = _largest_step(steps, config)
     jumps: list[Jump] = []
     for sign in (1.0, -1.0):
-        for begin, end in spans_of(largest * sign > config.jump_limit_m):
+        for begin, end in spans_of(largest_m * sign > config.jump_limit_m):
             first, last = _extent(steps, begin, end, sign, config)
             step_m = float(steps.excess_m[last] - steps.excess_m[first - 1]) * float(direction[last])
             jumps.append(Jump(first, last, step_m))
@@ -70,10 +69,10 @@ def _largest_step(steps: Steps, config: HazardConfig) -> Floats:
 
     The position just before always counts: a slower log has no other.
     """
-    excess, size = steps.excess_m, steps.t_ns.size
-    largest = np.zeros(size)
-    if size < 2 or np.ptp(excess) <= config.jump_limit_m:
-        return largest
+    excess_m, size = steps.excess_m, steps.t_ns.size
+    largest_m = np.zeros(size)
+    if size < 2 or np.ptp(excess_m) <= config.jump_limit_m:
+        return largest_m
     window_ns = round(config.jump_window_s * NS_PER_S)
     chain = np.cumsum(~steps.linked)
     for lag in range(1, size):
@@ -82,10 +81,10 @@ def _largest_step(steps: Steps, config: HazardConfig) -> Floats:
             near &= steps.t_ns[lag:] - steps.t_ns[:-lag] <= window_ns
         if not near.any():
             break
-        step = np.where(near, excess[lag:] - excess[:-lag], 0.0)
-        part = largest[lag:]
-        part[:] = np.where(np.abs(step) > np.abs(part), step, part)
-    return largest
+        step_m = np.where(near, excess_m[lag:] - excess_m[:-lag], 0.0)
+        part = largest_m[lag:]
+        part[:] = np.where(np.abs(step_m) > np.abs(part), step_m, part)
+    return largest_m
 
 
 def _extent(steps: Steps, begin: int, end: int, sign: float, config: HazardConfig) -> tuple[int, int]:
@@ -93,7 +92,7 @@ def _extent(steps: Steps, begin: int, end: int, sign: float, config: HazardConfi
     window_ns = round(config.jump_window_s * NS_PER_S)
     earliest = int(np.searchsorted(steps.t_ns, steps.t_ns[begin] - window_ns, side="left"))
     start = max(min(earliest + 1, begin), 1)
-    increments = np.diff(steps.excess_m[start - 1 : end + 1]) * sign
-    increments[~steps.linked[start : end + 1]] = 0.0
-    part = np.flatnonzero(increments >= config.jump_share * increments.max())
+    increments_m = np.diff(steps.excess_m[start - 1 : end + 1]) * sign
+    increments_m[~steps.linked[start : end + 1]] = 0.0
+    part = np.flatnonzero(increments_m >= config.jump_share * increments_m.max())
     return start + int(part[0]), start + int(part[-1])

@@ -10,38 +10,37 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gap_ns
 from pipeline.stages.evidence.evidence import NOTHING, within_spans
-from pipeline.stages.judge.case import Case, Solution
-from pipeline.stages.judge.hazards import HazardRow, speed_at
+from pipeline.stages.judge.case import Case
+from pipeline.stages.judge.hazards import HazardRow
 from pipeline.stages.judge.judgement import Judgements
-from pipeline.stages.judge.true_crossings import TrueCrossing
+from pipeline.stages.judge.travel import Span, speed_at
+from pipeline.stages.judge.true_crossings import TrueCrossing, crossings_of
 from schemas.arrays import Bools, Ints, ints, times_ns
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
 from schemas.tables import Passages
 
+Crossings = dict[str, list[TrueCrossing]]
+
 
 def passages_table(
-    case: Case,
-    epochs: pl.DataFrame,
-    offers: pl.DataFrame,
-    rows: Sequence[HazardRow],
-    crossings: dict[str, list[TrueCrossing]],
-    spans: Sequence[tuple[int, int]],
+    case: Case, epochs: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[HazardRow], undetected: Sequence[Span]
 ) -> pl.DataFrame:
-    """Passages of the LDS, and those that it knows nothing of, with the columns of the evidence.
+    """Passages of the LDS, and those of the train that it knows nothing of, with the columns of the evidence.
 
-    `epochs`, `offers`: judged; `crossings`: of the train itself; `spans`: from each fault's onset to its detection.
+    `epochs`, `offers`: judged; `undetected`: from each fault's onset to its detection.
     """
     stamps = times_ns(epochs.filter(pl.col("path_m").is_not_null()))
     gap_ns = crossing_gap_ns(stamps, case.config.lds)
-    known = case.solution.passages.with_columns(_assigned(case.solution.passages, crossings))
-    passages = _with_unoffered(known, case.solution, crossings, stamps, gap_ns)
+    crossings = crossings_of(case)
+    known = case.solution.passages.with_columns(_true_times(case.solution.passages, crossings))
+    passages = _with_unoffered(known, case, crossings, stamps, gap_ns)
     t_true = passages["t_true"]
     positioned = _within_gap(stamps, ints(t_true), gap_ns) & t_true.is_not_null().to_numpy()
     frame = passages.with_columns(
         pl.col("t_true").cast(pl.Datetime("ns", "UTC")),
         *_of_offers(passages, offers, rows),
         pl.Series("_positioned", positioned),
-        pl.Series("suspect_after_the_fact", _inside(passages, spans)),
+        pl.Series("suspect_after_the_fact", _accepted_within(passages, undetected)),
         _speeds(passages, t_true, epochs, gap_ns),
     )
     return _with_failures(frame).select(Passages.column_names())
@@ -53,7 +52,8 @@ def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[Haza
     Inserted is one by a jump, on another track, or early and wrong.
     """
     judged = Judgements.of(offers)
-    hazard, jumped = np.full(offers.height, NOTHING), np.zeros(offers.height, dtype=np.bool_)
+    hazard = np.full(offers.height, NOTHING)
+    jumped = np.zeros(offers.height, dtype=np.bool_)
     for number, row in reversed(list(enumerate(rows))):
         hazard[row.hits] = number
         jumped[row.crossed] = True
@@ -73,31 +73,28 @@ def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[Haza
     return joined.drop("crossing_id").with_columns(pl.col("_inserted").fill_null(value=False))
 
 
-def _assigned(passages: pl.DataFrame, crossings: dict[str, list[TrueCrossing]]) -> pl.Series:
-    """The true passing of each passage [ns]: the nearest in time to its offer or to its reckoning, each given once.
+def _true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
+    """The train's own crossing of each passage [ns]: the nearest in time to its offer or reckoning, each given once.
 
-    A passage with neither takes what is left, in order.
+    A passage with neither takes what is left, in order. `crossings` keeps those that no passage took.
     """
     about = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series().dt.timestamp("ns").to_list()
     balises = passages["balise_id"].to_list()
     pairs = sorted(
-        (abs(instant - t_ns), row, instant)
+        (abs(crossing.t_ns - t_ns), row, crossing)
         for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True))
         if t_ns is not None
-        for instant, _, _ in crossings.get(balise, ())
+        for crossing in crossings.get(balise, ())
     )
-    result: list[int | None] = [None] * len(balises)
-    taken: set[tuple[str, int]] = set()
-    for _, row, instant in pairs:
-        if result[row] is None and (balises[row], instant) not in taken:
-            result[row] = instant
-            taken.add((balises[row], instant))
+    times: list[int | None] = [None] * len(balises)
+    for _, row, crossing in pairs:
+        if times[row] is None and crossing in crossings[balises[row]]:
+            crossings[balises[row]].remove(crossing)
+            times[row] = crossing.t_ns
     for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True)):
-        left = [one.t_ns for one in crossings.get(balise, ()) if (balise, one.t_ns) not in taken]
-        if t_ns is None and left:
-            result[row] = left[0]
-            taken.add((balise, left[0]))
-    return pl.Series("t_true", result, dtype=pl.Int64)
+        if t_ns is None and crossings.get(balise):
+            times[row] = crossings[balise].pop(0).t_ns
+    return pl.Series("t_true", times, dtype=pl.Int64)
 
 
 def _within_gap(stamps: Ints, t_ns: Ints, gap_ns: int) -> Bools:
@@ -109,12 +106,11 @@ def _within_gap(stamps: Ints, t_ns: Ints, gap_ns: int) -> Bools:
     return np.asarray(inside & (stamps[after] - stamps[after - 1] <= gap_ns))
 
 
-def _inside(passages: pl.DataFrame, spans: Sequence[tuple[int, int]]) -> Bools:
-    """Virtual balises accepted from a fault's onset on and before its detection."""
+def _accepted_within(passages: pl.DataFrame, spans: Sequence[Span]) -> Bools:
+    """Virtual balises accepted in some spans of time."""
     accepted = (passages["status"].cast(pl.String) == PassageStatus.ACCEPTED.value).to_numpy()
-    accepted &= (passages["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy()
-    t_ns = ints(passages["t_offered"].dt.timestamp("ns"))
-    return accepted & within_spans(t_ns, spans)
+    virtual = (passages["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy()
+    return np.asarray(accepted & virtual & within_spans(ints(passages["t_offered"].dt.timestamp("ns")), spans))
 
 
 def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, gap_ns: int) -> pl.Series:
@@ -128,9 +124,11 @@ def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, gap
 def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:
     """ETCS failure mode and cause: insertion where offered where it is not, deletion where not offered in time."""
     beyond_window = (pl.col("odometer_distance_m") > pl.col("window_close_m")).fill_null(value=False)
-    offered, wrong = pl.col("t_offered").is_not_null(), (pl.col("judgement") == "wrong").fill_null(value=False)
+    offered = pl.col("t_offered").is_not_null()
+    wrong = (pl.col("judgement") == "wrong").fill_null(value=False)
     absent = pl.col("status") == PassageStatus.NOT_AVAILABLE.value
-    insertion, deletion = offered & pl.col("_inserted"), absent | ~offered | beyond_window
+    insertion = offered & pl.col("_inserted")
+    deletion = absent | ~offered | beyond_window
     by_position = insertion | (beyond_window & wrong) | (~offered & ~absent & pl.col("_positioned"))
     without = absent | (~offered & ~pl.col("_positioned"))
     return frame.with_columns(
@@ -146,39 +144,40 @@ def _word(frame: pl.DataFrame, column: str, *rows: tuple[pl.Expr, FailureMode | 
 
 
 def _with_unoffered(
-    passages: pl.DataFrame, solution: Solution, crossings: dict[str, list[TrueCrossing]], stamps: Ints, gap_ns: int
+    passages: pl.DataFrame, case: Case, crossings: Crossings, stamps: Ints, gap_ns: int
 ) -> pl.DataFrame:
-    """One more passage for each virtual balise that the train passed and the LDS knows nothing of.
+    """One more passage for each crossing of a virtual balise that the LDS knows nothing of.
 
     The LDS follows the position: before the first one, or where it is wrong at an end of the run, no window has closed
-    yet. `passages`: with their true passing; `stamps`: of valid positions.
+    yet. `crossings`: those that belong to no passage; `stamps`: of valid positions.
     """
-    given = set(passages.select("balise_id", "t_true").iter_rows())
-    virtual = solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
-    rows = [
-        _unoffered(balise, instant, sense * balise["sense"], seen, solution.name)
+    virtual = case.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
+    missed = [
+        (balise, crossing)
         for balise in virtual.unique("balise_id", keep="first", maintain_order=True).iter_rows(named=True)
-        for instant, sense, clear in crossings.get(balise["balise_id"], ())
-        for seen in _within_gap(stamps, np.array([instant]), gap_ns).tolist()
-        if clear and (balise["balise_id"], instant) not in given
+        for crossing in crossings.get(balise["balise_id"], ())
+        if crossing.clear
     ]
-    if not rows:
+    if not missed:
         return passages
+    positioned = _within_gap(stamps, np.array([crossing.t_ns for _, crossing in missed]), gap_ns).tolist()
+    rows = [_unoffered(*pair, case, seen) for pair, seen in zip(missed, positioned, strict=True)]
     added = pl.DataFrame(rows, schema=passages.schema)
     when = pl.coalesce("t_offered", "t_reckoned")
     ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
     return pl.concat([ordered, added.with_columns(_when=when)]).sort("_when", maintain_order=True).drop("_when")
 
 
-def _unoffered(balise: dict[str, Any], instant: int, direction: int, seen: bool, solution: str) -> dict[str, Any]:
-    own = ("balise_id", "kind", "netelement_id", "measure_m", "path_m", "location_accuracy_m")
-    return {name: balise[name] for name in own} | {
-        "solution": solution,
-        "direction": (Direction.GROWING if direction > 0 else Direction.FALLING).value,
-        "status": (PassageStatus.MISSED if seen else PassageStatus.NOT_AVAILABLE).value,
+def _unoffered(balise: dict[str, Any], crossing: TrueCrossing, case: Case, positioned: bool) -> dict[str, Any]:
+    names = ("balise_id", "kind", "netelement_id", "measure_m", "path_m", "location_accuracy_m")
+    growing = crossing.sense * balise["sense"] > 0
+    return {name: balise[name] for name in names} | {
+        "solution": case.solution.name,
+        "direction": (Direction.GROWING if growing else Direction.FALLING).value,
+        "status": (PassageStatus.MISSED if positioned else PassageStatus.NOT_AVAILABLE).value,
         "linking_error": LinkingError.NONE.value,
         "reaction": Reaction.NONE.value,
         "initialising": False,
-        "t_reckoned": instant,
-        "t_true": instant,
+        "t_reckoned": crossing.t_ns,
+        "t_true": crossing.t_ns,
     }

@@ -5,16 +5,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import polars as pl
 
-from pipeline.stages.evidence.evidence import EvidenceSet
-from pipeline.stages.track.path import Place, Route
-from schemas.arrays import Bools, Floats, Ints
+from pipeline.stages.evidence.evidence import Alternative, EvidenceSet
+from pipeline.stages.judge.case import Case
+from pipeline.stages.track.path import Place
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
+from schemas.config import Configuration
 
 
 class TrueCrossing(NamedTuple):
-    """Instant [ns]; `sense` +1 where the train moved with the measure of the balise's net element, else -1.
+    """Instant [ns] by the middle of the interval; `sense` +1 with the measure of the balise's net element, else -1.
 
-    `clear`: it came from beyond the re-arming distance and went on beyond it.
+    `clear`: the train came from beyond the re-arming distance and went on beyond it.
     """
 
     t_ns: int
@@ -22,33 +25,63 @@ class TrueCrossing(NamedTuple):
     clear: bool
 
 
-def true_crossings(
-    t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], known_to_m: float, rearm_m: float
-) -> dict[str, list[TrueCrossing]]:
-    """Crossings of each balise in order of time, where the evidence leaves one track and the place to `known_to_m`.
+def crossings_of(case: Case) -> dict[str, list[TrueCrossing]]:
+    """Crossings of each balise of the path by the train, in a direction in which the balise is valid."""
+    balises = case.solution.balises.unique("balise_id", keep="first")
+    elements = case.element_numbers(balises["netelement_id"]).tolist()
+    spots = zip(balises["balise_id"], elements, balises["measure_m"], strict=True)
+    places = {name: Place(element, measure_m) for name, element, measure_m in spots}
+    at_ns = between_far_epochs(case.instants_of_epochs(), case.config.align.speed_window_s)
+    crossings = true_crossings(at_ns, case.evidence.at(at_ns), places, case.config)
+    # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both ways.
+    valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).iter_rows())
+    return {name: [one for one in crossed if valid[name] in (0, one.sense)] for name, crossed in crossings.items()}
 
-    `t_ns`: the instants of the evidence, in order, close enough for straight lines. A train that came no farther than
-    `rearm_m` from a balise since it passed it has not passed it again.
+
+def between_far_epochs(at_ns: Ints, step_s: float) -> Ints:
+    """The instants of the positions, and others between those that are far apart."""
+    step_ns = round(step_s * NS_PER_S)
+    far = np.flatnonzero(np.diff(at_ns) > 1.5 * step_ns)
+    gaps = zip(at_ns[far].tolist(), at_ns[far + 1].tolist(), strict=True)
+    between = [np.arange(begin, end, step_ns, dtype=np.int64)[1:] for begin, end in gaps]
+    return np.unique(np.concatenate([at_ns, *between]))
+
+
+def true_crossings(
+    t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], config: Configuration
+) -> dict[str, list[TrueCrossing]]:
+    """Crossings of each balise in order of time, where the evidence leaves one track.
+
+    Where it gives the place to `known_error_m` the middle of the interval crosses; else the whole interval has to pass
+    from one side to the other. `t_ns`: instants of the evidence, in order, close enough for straight lines.
     """
     alone = _alone(evidence, t_ns.size)
-    certain: list[tuple[Route, Ints, Floats]] = []
-    element, measure_m = np.full(alone.size, -1), np.full(alone.size, np.nan)
-    for one in evidence.alternatives:
-        close = (one.high_m - one.low_m <= 2.0 * known_to_m) & alone[one.rows]
-        rows, at_m = one.rows[close], (0.5 * (one.low_m + one.high_m))[close]
-        certain.append((one.route, rows, at_m))
-        element[rows], measure_m[rows], _ = one.route.locate(at_m)
-    names, spots = list(places), list(places.values())
-    balises = np.array([place.element for place in spots]), np.array([place.measure_m for place in spots])
-    found: dict[str, list[TrueCrossing]] = {name: [] for name in names}
-    for route, told, told_m in certain:
-        rows, at_m = _with_places_before(told, told_m, route, element, measure_m)
+    tracks = [track.where(alone[track.rows]) for track in evidence.alternatives]
+    train = _Train(t_ns, *np.full((3, t_ns.size), np.nan))
+    for track in tracks:
+        train.element[track.rows], train.measure_m[track.rows], _ = track.route.locate(track.middle_m)
+        train.half_m[track.rows] = 0.5 * (track.high_m - track.low_m)
+    names = list(places)
+    elements = np.array([place.element for place in places.values()])
+    measures_m = np.array([place.measure_m for place in places.values()])
+    crossings: dict[str, list[TrueCrossing]] = {name: [] for name in names}
+    for track in tracks:
+        rows, at_m = _with_places_before(track, train)
         least_m, most_m = at_m.min(initial=np.inf), at_m.max(initial=-np.inf)
-        for balise, visit_m, sense in zip(*route.places(*balises), strict=True):
+        for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
             if least_m <= visit_m <= most_m:
-                instants = _crossed(t_ns, rows, at_m - visit_m, rearm_m)
-                found[names[balise]] += [one._replace(sense=int(one.sense * sense)) for one in instants]
-    return {name: sorted(instants) for name, instants in found.items()}
+                found = _crossed(train, rows, at_m - visit_m, config)
+                crossings[names[balise]] += [one._replace(sense=int(one.sense * sense)) for one in found]
+    return {name: sorted(found) for name, found in crossings.items()}
+
+
+class _Train(NamedTuple):
+    """Where the train was at each instant, NaN where not known: net element, measure, half the interval."""
+
+    t_ns: Ints
+    element: Floats
+    measure_m: Floats
+    half_m: Floats
 
 
 def _alone(evidence: EvidenceSet, size: int) -> Bools:
@@ -60,35 +93,38 @@ def _alone(evidence: EvidenceSet, size: int) -> Bools:
     return alone
 
 
-def _with_places_before(
-    rows: Ints, at_m: Floats, route: Route, element: Ints, measure_m: Floats
-) -> tuple[Ints, Floats]:
-    """The instants just before the route is told of, where the train was on it by what was told before.
-
-    `element`, `measure_m`: per instant the place of the train, -1 and NaN where not known.
-    """
+def _with_places_before(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
+    """Rows and coordinates on a track, with the rows just before it begins where the train's place lies on it too."""
+    rows = track.rows
     before = np.setdiff1d(rows[rows > 0] - 1, rows)
-    there_m, _ = route.coordinate(element[before], measure_m[before], at_m[np.searchsorted(rows, before)])
+    element = np.nan_to_num(train.element[before], nan=-1).astype(np.int64)
+    near_m = track.middle_m[np.searchsorted(rows, before)]
+    there_m, _ = track.route.coordinate(element, train.measure_m[before], near_m)
     known = np.isfinite(there_m)
     order = np.argsort(np.concatenate([rows, before[known]]), kind="stable")
-    return np.concatenate([rows, before[known]])[order], np.concatenate([at_m, there_m[known]])[order]
+    coordinates_m = np.concatenate([track.middle_m, there_m[known]])
+    return np.concatenate([rows, before[known]])[order], coordinates_m[order]
 
 
-def _crossed(t_ns: Ints, rows: Ints, away_m: Floats, rearm_m: float) -> list[TrueCrossing]:
-    """Instants at which the train went from one side of the balise to the other, and which way."""
-    side = away_m >= 0.0
-    changes = np.flatnonzero((side[1:] != side[:-1]) & (np.diff(rows) == 1)) + 1
-    found: list[TrueCrossing] = []
+def _crossed(train: _Train, rows: Ints, away_m: Floats, config: Configuration) -> list[TrueCrossing]:
+    """Instants at which the train went from one side of the balise to the other, and which way.
+
+    A train that came no farther than `rearm_m` from a balise since it passed it has not passed it again.
+    """
+    half_m = train.half_m[rows]
+    close = half_m <= config.hazards.known_error_m
+    beyond = np.abs(away_m) >= np.maximum(config.lds.rearm_m, half_m)
+    ahead = away_m >= 0.0
+    changes = np.flatnonzero((ahead[1:] != ahead[:-1]) & (np.diff(rows) == 1)) + 1
+    crossings: list[TrueCrossing] = []
     armed_from = 0
-    for change in changes.tolist():
-        if found and float(np.abs(away_m[armed_from:change]).max(initial=0.0)) < rearm_m:
-            continue
-        before, after = float(away_m[change - 1]), float(away_m[change])
-        begin, end = int(t_ns[rows[change - 1]]), int(t_ns[rows[change]])
-        later = changes[changes > change]
-        beyond = away_m[change : int(later[0]) if later.size else away_m.size]
-        clear = min(np.abs(away_m[armed_from:change]).max(), np.abs(beyond).max()) >= rearm_m
-        instant = begin + round((end - begin) * before / (before - after))
-        found.append(TrueCrossing(instant, 1 if after > before else -1, bool(clear)))
-        armed_from = change
-    return found
+    for change, later in zip(changes.tolist(), [*changes[1:].tolist(), away_m.size], strict=False):
+        armed = bool(beyond[armed_from:change].any())
+        clear = armed and bool(beyond[change:later].any())
+        if clear or (close[change - 1 : change + 1].all() and (armed or not crossings)):
+            before_m, after_m = away_m[change - 1 : change + 1].tolist()
+            begin_ns, end_ns = train.t_ns[rows[change - 1 : change + 1]].tolist()
+            instant_ns = begin_ns + round((end_ns - begin_ns) * before_m / (before_m - after_m))
+            crossings.append(TrueCrossing(instant_ns, 1 if after_m > before_m else -1, clear))
+            armed_from = change
+    return crossings

@@ -13,10 +13,11 @@ from pipeline.storage.address import Address
 from pipeline.studies.claim.front import front_of
 from pipeline.studies.claim.profile import Profile
 from pipeline.studies.claim.requirements import ALL, Requirement, Ride, Tallies, requirements, tallies
-from pipeline.studies.claim.tally import ALWAYS, S_PER_H, Finding, Tally, drawn
-from pipeline.studies.line import distinct
+from pipeline.studies.claim.tally import S_PER_H, Finding, Kind, Tally, drawn
+from pipeline.studies.reservations import failed_runs, runs_without_truth, several_settings
+from pipeline.studies.trials import distinct
 from schemas.config import Configuration
-from schemas.enums import TRUTH, RunStatus
+from schemas.enums import RunStatus
 from schemas.run import Site
 
 SCHEMA = {
@@ -55,10 +56,10 @@ def claim(
     days: set[tuple[object, ...]] = set()
     # Which run of a day is its trial is drawn before an error is looked at, and apart from its instant.
     for run in sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}")):
-        told = _tallies_of(out, run, config, profile, areas, ahead_m)
+        of_run = _tallies_of(out, run, config, profile, areas, ahead_m)
         if profile.method.independent == "day" and run["t_start"] is not None:
-            told = _once_a_day(told, (run["solution"], run["t_start"].date()), days)
-        _add(found[run["solution"]], told)
+            of_run = _once_a_day(of_run, (run["solution"], run["t_start"].date()), days)
+        _add(found[run["solution"]], of_run)
     outside_h = sum(counts["no_area", ALL].held_s for counts in found.values()) / S_PER_H
     notes = [*twice, *_notes(runs, outside_h, areas, ahead_m)]
     if profile.method.independent == "run":
@@ -68,12 +69,12 @@ def claim(
     return Claim(profile, claim_table(found, profile), notes)
 
 
-def _once_a_day(told: Tallies, day: tuple[object, ...], days: set[tuple[object, ...]]) -> Tallies:
+def _once_a_day(of_run: Tallies, day: tuple[object, ...], days: set[tuple[object, ...]]) -> Tallies:
     """Without the trials of requirements that another run of the day was a trial of; time and events stay."""
-    spent = {key for key, counts in told.items() if counts.trials and (*day, *key) in days}
-    days.update((*day, *key) for key, counts in told.items() if counts.trials)
+    spent = {key for key, counts in of_run.items() if counts.trials and (*day, *key) in days}
+    days.update((*day, *key) for key, counts in of_run.items() if counts.trials)
     return {
-        key: replace(counts, trials=0, kept=0, broken=0) if key in spent else counts for key, counts in told.items()
+        key: replace(counts, trials=0, kept=0, broken=0) if key in spent else counts for key, counts in of_run.items()
     }
 
 
@@ -140,8 +141,8 @@ def _row(solution: str, one: Requirement, counts: Tally) -> dict[str, Any]:
 
 # What a recording cannot say of a requirement, however long it is.
 _NEVER = {
-    ("start", "last position"): "no recording tells what the unit knew at switch-on; worst: time to a position in use",
-    ("start", "cold movement"): "no recording tells what the unit knew at switch-on",
+    ("start", "last position"): "no recording says what the unit knew at switch-on; worst: time to a position in use",
+    ("start", "cold movement"): "no recording says what the unit knew at switch-on",
     ("start", "nothing known"): "a recording begins after switch-on, so times are too short; worst: time to a TVB or "
     "an accepted balise",
     ("cold_movement", ALL): "a train without power records nothing",
@@ -162,7 +163,7 @@ def _reason(one: Requirement, finding: Finding, counts: Tally) -> str | None:
         return "nothing recorded to which it applies"
     if not counts.known_s:
         return "the evidence says nothing of it: too wide, missing, or the position in doubt"
-    if one.demand is ALWAYS:
+    if one.demand.kind is Kind.ALWAYS:
         return "no exceedance was seen, and no number of hours proves a maximum that is demanded without a probability"
     if counts.events == 0 and counts.known_s < counts.held_s:
         return "too few runs or hours; part of the time the evidence does not say"
@@ -171,24 +172,17 @@ def _reason(one: Requirement, finding: Finding, counts: Tally) -> str | None:
 
 def _notes(runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahead_m: float) -> list[str]:
     """What the reader must know before the rows."""
-    said = []
-    failed = runs.filter(pl.col("status").cast(pl.String) == RunStatus.FAILED.value).height
-    if failed:
-        said.append(f"{failed} of {runs.height} rows of runs failed and are not counted.")
+    said = failed_runs(runs)
     if areas is None:
         said.append("Without areas (`--site` with areas.csv or areas.parquet) nothing is said of limits by area type.")
-    blind = runs.filter(~pl.col("evidence").cast(pl.String).is_in(TRUTH).fill_null(value=False)).height
-    if blind:
-        said.append(
-            f"{blind} of {runs.height} runs have no reference and no balise reads: they can show no error small."
-        )
-    settings = runs["config_digest"].n_unique()
-    if settings > 1:
-        said.append(
-            f"{settings} configurations or vehicle files: trains may differ. Errors do not depend on where the front "
-            "end is, but areas are looked up with one distance for all."
-        )
-    elif not ahead_m:
+    said += runs_without_truth(runs, "they can show no error small.")
+    settings = several_settings(
+        runs,
+        ": trains may differ. Errors do not depend on where the front end is, but areas are looked up with one "
+        "distance for all.",
+    )
+    said += settings
+    if not settings and not ahead_m:
         said.append("Areas are looked up at the balise antenna; `--front-ahead` puts the front end ahead of it.")
     if outside_h and areas is not None:
         said.append(f"{outside_h:.3g} h lie outside all areas: no limit by area type applied there.")
@@ -204,17 +198,19 @@ def _notes(runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahe
     return said
 
 
-def for_reading(table: pl.DataFrame) -> pl.DataFrame:
+def for_reading(claim: Claim) -> pl.DataFrame:
     """The rows as they fit a screen: what was found of each requirement, and what it rests on."""
-    drawn = pl.when(pl.col("demanded").str.starts_with("p >=")).then(pl.format("{}/{}", "kept", "trials"))
-    solution = ["solution"] if table["solution"].n_unique() > 1 else []
-    return table.select(
+    by_runs = {one.key for one in requirements(claim.profile) if one.demand.kind in (Kind.SHARE, Kind.AVAILABILITY)}
+    keys = claim.table.select("requirement", "applies_to").iter_rows()
+    shares = pl.Series([key in by_runs for key in keys], dtype=pl.Boolean)
+    solution = ["solution"] if claim.table["solution"].n_unique() > 1 else []
+    return claim.table.select(
         *solution,
         pl.col("requirement"),
         pl.col("applies_to").alias("of"),
         pl.col("finding"),
         pl.col("events"),
-        drawn.alias("runs kept"),
+        pl.when(shares).then(pl.format("{}/{}", "kept", "trials")).alias("runs kept"),
         pl.col("hours_needed").round_sig_figs(3).alias("hours needed"),
         pl.col("limit"),
     )

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from pipeline.results.places import stretches_of, train_path_m
 from pipeline.stages.epochs.clock import Clock
 from pipeline.studies.claim.areas import Placed, placed
 from pipeline.studies.claim.profile import KMH_PER_MPS, Method
@@ -31,8 +32,9 @@ class Front:
 
     `path_m`: estimate of the balise antenna, `front_m`: estimated front end, both path positions. `over_m`: estimate
     minus min safe front end, `under_m`: max safe front end minus estimate. `low_m`, `high_m`: error of the estimate in
-    the direction of travel, as an interval. `proved`: the interval is complete and the track is right; `judged`: it may
-    show an exceedance; `wrong_track`: the track is wrong for certain. `speed_late_s`: speeds are means over so long.
+    the direction of travel, as an interval. `train_m` (2, epochs): least and largest path position of the train by the
+    evidence, where that leaves one net element. `proved`: the interval is complete and the track is right; `judged`:
+    it may show an exceedance; `wrong_track`: the track is wrong for certain. `speed_late_s`: length of speed means.
     """
 
     clock: Clock
@@ -42,6 +44,7 @@ class Front:
     under_m: Floats
     low_m: Floats
     high_m: Floats
+    train_m: Floats
     proved: Bools
     judged: Bools
     wrong_track: Bools
@@ -92,6 +95,12 @@ def front_of(
     shift = np.where(gnss, 0.0, direction * (estimate - path))
     low, high = floats(epochs, "error_low_m") + shift, floats(epochs, "error_high_m") + shift
     right, wrong, elsewhere = _judged(epochs, config.hazards.failure_limit_m)
+    train_m = np.stack(train_path_m(epochs, stretches_of(epochs)))
+    # Without a position nothing was judged: the report is compared with the place of the train itself.
+    silent = np.isnan(path) & np.isfinite(train_m).all(axis=0)
+    ends = np.where(silent, direction * (estimate - train_m), np.stack([low, high]))
+    low, high = np.where(silent, ends.min(axis=0), low), np.where(silent, ends.max(axis=0), high)
+    right |= silent
     there, known = np.isfinite(estimate), np.isfinite(low) & np.isfinite(high)
     # A train that has not moved yet has no direction of travel: its front end is looked up at the antenna.
     front = estimate + np.nan_to_num(direction) * ahead_m
@@ -103,6 +112,7 @@ def front_of(
         under_m=under + np.abs(speed) * late_under,
         low_m=low,
         high_m=high,
+        train_m=train_m,
         proved=there & known & right,
         judged=there & known & (right | (wrong & ~elsewhere)),
         wrong_track=gnss & elsewhere,
@@ -191,16 +201,23 @@ def speed_errors(front: Front, window_s: float) -> SpeedErrors:
     way = np.concatenate(([0.0], np.cumsum(np.nan_to_num(steps))))
     sense = front.direction[first]
     estimated = sense * (way[last] - way[first])
-    run_m = sense * (front.path_m[last] - front.path_m[first])
-    # The evidence calls the position itself right at both ends, so path less error is where the train was.
+    # The evidence calls the position itself right at both ends.
     known = front.proved[first] & front.proved[last]
+    begin_m, end_m = _train_m(front, first), _train_m(front, last)
     # The estimate is a mean over the time before each epoch: how late that is while the speed changes is not known.
     late_m = front.speed_late_s * np.abs(front.speed_mps[last] - front.speed_mps[first])
-    least = run_m - (front.high_m[last] - front.low_m[first]) - late_m
-    most = run_m - (front.low_m[last] - front.high_m[first]) + late_m
+    least = end_m[0] - begin_m[1] - late_m
+    most = end_m[1] - begin_m[0] + late_m
     low, high = (np.where(known, (estimated - way_m) / length, np.nan) for way_m in (most, least))
     fastest = np.array([np.abs(front.speed_mps[begin : end + 1]).max() for begin, end in pairs], dtype=np.float64)
     return SpeedErrors(clock.t_ns[last], length, *(speed * KMH_PER_MPS for speed in (fastest, low, high)))
+
+
+def _train_m(front: Front, rows: Ints) -> Floats:
+    """Least and largest place of the train in its direction of travel [m]; at joints the estimate less its error."""
+    sense, evidence = front.direction[rows], np.sort(front.direction[rows] * front.train_m[:, rows], axis=0)
+    by_error = sense * front.path_m[rows] - np.stack([front.high_m[rows], front.low_m[rows]])
+    return np.where(np.isfinite(evidence).all(axis=0), evidence, by_error)
 
 
 def _windows(front: Front, window_ns: int) -> list[tuple[int, int]]:

@@ -19,12 +19,10 @@ from pipeline.studies.claim.tally import (
     NOT_KNOWN,
     S_PER_H,
     Demand,
+    Kind,
     Tally,
-    at_least,
-    below,
     codes,
-    of_availability,
-    tally,
+    counted,
 )
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags
 from schemas.enums import AreaType, BaliseKind, PassageStatus
@@ -47,9 +45,10 @@ class Ride:
         clock, silent = self.front.clock, self.front.silent_s
         rows = np.flatnonzero(where | ((silent > 0) & np.append(where[1:], False)))
         here = where[rows]
-        held, told = np.where(here, clock.held_s[rows], 0.0), np.where(here, code[rows], NOT_KNOWN)
+        held = np.where(here, clock.held_s[rows], 0.0)
+        codes = np.where(here, code[rows], NOT_KNOWN)
         sizes = None if size is None else np.where(here, size[rows], np.nan)
-        return tally(self.name, clock.t_ns[rows], held, told, self.profile.method.event_gap_s, sizes, silent[rows])
+        return counted(self.name, clock.t_ns[rows], held, codes, self.profile.method.event_gap_s, sizes, silent[rows])
 
     def inside(self, kind: AreaType) -> Bools:
         """Epochs with an estimated front end in areas of this type."""
@@ -123,8 +122,8 @@ def requirements(profile: Profile) -> list[Requirement]:
     rate = profile.failure_rate
     return [
         *(one for kind, area in profile.areas.items() for one in _of_area(kind, area, profile)),
-        Requirement("safe_front_end", ALL, "own CI", below(rate.aim_per_h), rate.clause, _safe),
-        Requirement("safe_front_end_bound", ALL, "own CI", below(rate.bound_per_h), rate.clause, _safe),
+        Requirement("safe_front_end", ALL, "own CI", Demand(Kind.RATE, rate.aim_per_h), rate.clause, _safe),
+        Requirement("safe_front_end_bound", ALL, "own CI", Demand(Kind.RATE, rate.bound_per_h), rate.clause, _safe),
         *(one for kind in profile.slow.area_types for one in _slow(kind, profile)),
         *_after_balise(profile),
         *_speed(profile),
@@ -153,14 +152,15 @@ def _of_area(kind: AreaType, area: AreaLimits, profile: Profile) -> list[Require
         return ride.tally(code, ride.inside(kind), ride.front.least_m)
 
     of, rate = kind.value, profile.failure_rate
+    aim = Demand(Kind.RATE, rate.aim_per_h)
     limit = f"{area.limit_m:g} m" if not area.way_s else f"{area.limit_m:g} m/{area.way_s:g} s"
-    near, often = f"{area.accuracy_m:g} m", at_least(area.accuracy_share)
+    near, often = f"{area.accuracy_m:g} m", Demand(Kind.SHARE, area.accuracy_share)
     return [
         *(
             Requirement(name, of, limit, ALWAYS, area.limit_clause, partial(exceeded, name=name))
             for name in ("mapo_claimed", "mapu_claimed", "mapo", "mapu")
         ),
-        Requirement("safe_front_end", of, "own CI", below(rate.aim_per_h), rate.clause, partial(_safe, kind=kind)),
+        Requirement("safe_front_end", of, "own CI", aim, rate.clause, partial(_safe, kind=kind)),
         Requirement("front_accuracy", of, near, often, area.accuracy_clause, close),
     ]
 
@@ -184,7 +184,7 @@ def _slow(kind: AreaType, profile: Profile) -> list[Requirement]:
     return [
         Requirement("slow_claimed", of, limit, ALWAYS, slow.clause, claimed),
         Requirement("slow_front_end", of, limit, ALWAYS, slow.clause, safe),
-        Requirement("slow_accuracy", of, close, at_least(slow.accuracy_share), slow.clause, accurate),
+        Requirement("slow_accuracy", of, close, Demand(Kind.SHARE, slow.accuracy_share), slow.clause, accurate),
     ]
 
 
@@ -203,12 +203,12 @@ def _after_balise(profile: Profile) -> list[Requirement]:
         rows = _first_after(front, at_ns)
         at_ns, rows = at_ns[~faster[rows]], rows[~faster[rows]]
         # Each balise weighs the same, whatever time its epoch holds.
-        counts = tally(ride.name, at_ns, np.zeros(rows.size), code[rows], profile.method.event_gap_s)
+        counts = counted(ride.name, at_ns, np.zeros(rows.size), code[rows], profile.method.event_gap_s)
         held, known = np.append(front.clock.held_s, 0.0)[rows], code[rows] != NOT_KNOWN
         return replace(counts, held_s=float(held.sum()), known_s=float(held[known].sum()))
 
     near = f"{after.fixed_m:g} m, from {after.below_kmh:g} km/h {after.offset_m:g} m + {after.per_mps_s:g} s·v"
-    often, kinds = at_least(after.share), (BaliseKind.PHYSICAL, BaliseKind.VIRTUAL)
+    often, kinds = Demand(Kind.SHARE, after.share), (BaliseKind.PHYSICAL, BaliseKind.VIRTUAL)
     return [
         Requirement("after_balise", kind.value, near, often, after.clause, partial(count, kind=kind)) for kind in kinds
     ]
@@ -246,7 +246,7 @@ def _speed(profile: Profile) -> list[Requirement]:
     return [
         Requirement("maso", ALL, margin, ALWAYS, safe.clause, ahead),
         Requirement("masu", ALL, margin, ALWAYS, safe.clause, behind),
-        Requirement("speed_accuracy", ALL, near, at_least(speed.share, by_means=True), speed.clause, close),
+        Requirement("speed_accuracy", ALL, near, Demand(Kind.SHARE, speed.share, by_means=True), speed.clause, close),
     ]
 
 
@@ -257,11 +257,11 @@ def _of_windows(ride: Ride, code: Ints, where: Bools) -> Tally:
     t_ns = np.concatenate((found.t_ns, ride.front.clock.t_ns[gaps]))
     held_s = np.concatenate((found.length_s, nothing))
     silent_s = np.concatenate((np.zeros(found.t_ns.size), gap_s))
-    told = np.concatenate((code, np.full(gaps.size, NOT_KNOWN)))
+    codes = np.concatenate((code, np.full(gaps.size, NOT_KNOWN)))
     order = np.argsort(t_ns, kind="stable")
     rows = order[np.concatenate((where, gap_s > 0))[order]]
     gap = ride.profile.method.event_gap_s
-    return tally(ride.name, t_ns[rows], held_s[rows], told[rows], gap, silent_s=silent_s[rows])
+    return counted(ride.name, t_ns[rows], held_s[rows], codes[rows], gap, silent_s=silent_s[rows])
 
 
 def _start(profile: Profile) -> list[Requirement]:
@@ -299,7 +299,7 @@ def _operation(profile: Profile) -> list[Requirement]:
     """Availability, and ways without physical balises: none is ever proved."""
     asked, way_m = profile.availability, profile.way.without_balise_m
     outside = f"{asked.outside_s:g} s in {asked.within_s / S_PER_H:g} h"
-    demand = Demand(f"p >= {asked.share:g}", lambda found: of_availability(found, asked.share, asked.outside_s))
+    demand = Demand(Kind.AVAILABILITY, asked.share, outside_s=asked.outside_s)
     return [
         Requirement("availability", ALL, outside, demand, asked.clause, _availability),
         Requirement("way_without_balise", ALL, f"{way_m / 1000:g} km", ALWAYS, profile.way.clause, _ways),

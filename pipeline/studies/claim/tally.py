@@ -8,7 +8,6 @@ not known; that counts as broken before anything is called `met`, and as kept be
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -22,12 +21,11 @@ from pipeline.stages.run_row.bounds import (
     poisson_rate,
     poisson_rate_upper,
 )
-from pipeline.studies.line import trials_needed
+from pipeline.studies.trials import Trials
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
 S_PER_H = 3600.0
 KEPT, NOT_KNOWN, BROKEN = 1, 0, -1
-
 
 _COUNTS = ("trials", "kept", "broken", "events", "possible", "held_s", "known_s")
 
@@ -76,7 +74,7 @@ def codes(kept: Bools, broken: Bools) -> Ints:
     return np.where(broken, BROKEN, np.where(kept, KEPT, NOT_KNOWN)).astype(np.int64)
 
 
-def tally(
+def counted(
     run: str,
     t_ns: Ints,
     held_s: Floats,
@@ -145,72 +143,89 @@ class Shown:
     needed_h: float | None = None
 
 
+class Kind(StrEnum):
+    """What is demanded: a maximum at all times, a share of trials, a rate, a share of time."""
+
+    ALWAYS = "always"
+    SHARE = "share"
+    RATE = "rate"
+    AVAILABILITY = "availability"
+
+
 @dataclass(frozen=True)
 class Demand:
-    """What is demanded of a requirement in words, and what counts show of it."""
+    """What is demanded of a requirement, and what counts show of it.
 
-    words: str
-    shown: Callable[[Tally], Shown]
+    `limit`: share or rate [1/h]. `by_means`: what is kept as a mean may be exceeded at an instant, so is never met.
+    `outside_s`: a run is unavailable where it is for so long.
+    """
+
+    kind: Kind
+    limit: float = 0.0
+    by_means: bool = False
+    outside_s: float = 0.0
+
+    @property
+    def words(self) -> str:
+        if self.kind is Kind.ALWAYS:
+            return "always"
+        return f"< {self.limit:g} /h" if self.kind is Kind.RATE else f"p >= {self.limit:g}"
+
+    def shown(self, tally: Tally) -> Shown:
+        if self.kind is Kind.RATE:
+            return of_rate(tally, self.limit)
+        if self.kind is Kind.AVAILABILITY:
+            return of_availability(tally, self.limit, self.outside_s)
+        if self.kind is Kind.ALWAYS:
+            return of_always(tally)
+        shown = of_share(tally, self.limit)
+        unmet = Finding.NOT_SHOWN if shown.finding is Finding.MET else shown.finding
+        return replace(shown, finding=unmet, needed_h=None) if self.by_means else shown
 
 
-def at_least(share: float, by_means: bool = False) -> Demand:
-    """This share of all trials; `by_means`: what is kept as a mean may be exceeded at an instant, so is never met."""
-
-    def shown(found: Tally) -> Shown:
-        told = of_share(found, share)
-        unmet = Finding.NOT_SHOWN if told.finding is Finding.MET else told.finding
-        return replace(told, finding=unmet, needed_h=None) if by_means else told
-
-    return Demand(f"p >= {share:g}", shown)
+ALWAYS = Demand(Kind.ALWAYS)
 
 
-def below(rate_per_h: float) -> Demand:
-    return Demand(f"< {rate_per_h:g} /h", lambda found: of_rate(found, rate_per_h))
-
-
-def of_share(found: Tally, share: float) -> Shown:
+def of_share(tally: Tally, share: float) -> Shown:
     """At least this share, by exact bounds over runs (Clopper and Pearson)."""
-    measured = clopper_pearson(found.kept, found.kept + found.broken)
-    if found.trials == 0:
+    if tally.trials == 0:
         return Shown(Finding.NOT_SHOWN)
-    least = clopper_pearson(found.kept, found.trials).low or 0.0
-    most = clopper_pearson(found.trials - found.broken, found.trials).high
-    if least >= share:
+    judged = tally.kept + tally.broken
+    trials = Trials(judged, tally.broken, tally.trials - judged)
+    broken, measured = trials.share(), clopper_pearson(tally.kept, judged)
+    if broken.high is not None and 1.0 - broken.high >= share:
         return Shown(Finding.MET, measured, 0.0)
-    finding = Finding.NOT_MET if most is not None and most < share else Finding.NOT_SHOWN
-    hours = found.held_s / found.trials / S_PER_H
-    needed = trials_needed(found.trials - found.kept, found.trials, 1.0 - share)
+    finding = Finding.NOT_MET if broken.low is not None and 1.0 - broken.low < share else Finding.NOT_SHOWN
+    hours = tally.held_s / tally.trials / S_PER_H
+    needed = trials.needed(1.0 - share)
     return Shown(finding, measured, needed * hours if hours > 0 and needed is not None else None)
 
 
-def of_rate(found: Tally, rate_per_h: float) -> Shown:
+def of_rate(tally: Tally, rate_per_h: float) -> Shown:
     """Below this rate [1/h], by exact Poisson bounds on events; the one-sided bound for `met`, as a THR claim needs."""
-    hours = found.held_s / S_PER_H
-    measured = poisson_rate(found.events, found.known_s / S_PER_H)
+    hours = tally.held_s / S_PER_H
+    measured = poisson_rate(tally.events, tally.known_s / S_PER_H)
     if hours <= 0.0:
-        return Shown(Finding.NOT_SHOWN, needed_h=hours_still_needed(rate_per_h, found.possible, 0.0))
-    low, high = poisson_rate(found.events, hours).low, poisson_rate_upper(found.possible, hours)
-    needed_h = hours_still_needed(rate_per_h, found.possible, hours)
+        return Shown(Finding.NOT_SHOWN, needed_h=hours_still_needed(rate_per_h, tally.possible, 0.0))
+    low, high = poisson_rate(tally.events, hours).low, poisson_rate_upper(tally.possible, hours)
+    needed_h = hours_still_needed(rate_per_h, tally.possible, hours)
     if high is not None and high <= rate_per_h:
         return Shown(Finding.MET, measured, 0.0)
     return Shown(Finding.NOT_MET if low is not None and low > rate_per_h else Finding.NOT_SHOWN, measured, needed_h)
 
 
-def of_always(found: Tally) -> Shown:
+def of_always(tally: Tally) -> Shown:
     """A maximum without a probability: one event breaks it, no number of hours shows it."""
-    measured = poisson_rate(found.events, found.known_s / S_PER_H)
-    return Shown(Finding.NOT_MET if found.events else Finding.NOT_SHOWN, measured)
+    measured = poisson_rate(tally.events, tally.known_s / S_PER_H)
+    return Shown(Finding.NOT_MET if tally.events else Finding.NOT_SHOWN, measured)
 
 
-def of_availability(found: Tally, share: float, outside_s: float) -> Shown:
+def of_availability(tally: Tally, share: float, outside_s: float) -> Shown:
     """Broken runs were unavailable for `outside_s` at least, so for that part of the longest run at least.
 
     Never `met`: the result does not hold the confidence of speed, nor what stood in gaps of the log.
     """
-    broken = clopper_pearson(found.broken, found.trials) if found.trials else UNKNOWN
-    lost = (broken.low or 0.0) * outside_s / found.longest_s if found.longest_s > 0 else 0.0
-    measured = Estimate(found.known_s / found.held_s, None, 1.0 - lost) if found.held_s > 0 else UNKNOWN
+    broken = clopper_pearson(tally.broken, tally.trials) if tally.trials else UNKNOWN
+    lost = (broken.low or 0.0) * outside_s / tally.longest_s if tally.longest_s > 0 else 0.0
+    measured = Estimate(tally.known_s / tally.held_s, None, 1.0 - lost) if tally.held_s > 0 else UNKNOWN
     return Shown(Finding.NOT_MET if lost > 1.0 - share else Finding.NOT_SHOWN, measured)
-
-
-ALWAYS = Demand("always", of_always)

@@ -10,6 +10,5 @@ Touches results, to read. `show/line.py` writes its files.
 
 from pipeline.studies.line.proposals import site_balises
 from pipeline.studies.line.study import LineResult, read_points, study_line
-from pipeline.studies.line.trials import distinct, trials_needed
 
-__all__ = ["LineResult", "distinct", "read_points", "site_balises", "study_line", "trials_needed"]
+__all__ = ["LineResult", "read_points", "site_balises", "study_line"]

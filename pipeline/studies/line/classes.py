@@ -7,10 +7,9 @@ from collections import Counter
 import numpy as np
 import polars as pl
 
-from pipeline.stages.run_row.bounds import clopper_pearson
 from pipeline.studies.line.pieces import Pieces
 from pipeline.studies.line.spans import FIRST_LOSS, State
-from pipeline.studies.line.trials import trials_needed
+from pipeline.studies.trials import Trials
 from schemas.conform import conform
 from schemas.line import LOSSES, SHORT_OF_SATELLITES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
 
@@ -49,12 +48,11 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Independent passes: each run, or the worst of a day."""
     if criteria.independent == "pass":
         return passes
-    # Loss, then what the evidence should have shown, then right, then what says nothing.
     state = pl.col("state").replace_strict({int(State.UNKNOWN): 2, int(State.RIGHT): 1}, default=0)
     dated = passes.with_columns(
         day=pl.col("t").dt.date(), judged=pl.when(pl.col("state") >= int(FIRST_LOSS)).then(3).otherwise(state)
     )
-    # Of passes as bad as each other the one with the fewest satellites, those that tell none last.
+    # Of passes as bad as each other the one with the fewest satellites, those without a number last.
     order, falling = ("judged", "state", "cause", "satellites"), [True, True, False, False]
     worst = dated.sort(order, descending=falling, nulls_last=True).group_by(*KEYS, "day", maintain_order=True)
     claimed = dated.group_by(*KEYS, "day").agg(pl.col("claimed").any())
@@ -102,7 +100,7 @@ def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     cases = counted.select(_TRIALS).unique()
     bounds = [_bounds(bad, number, wrong, lost, criteria) for bad, number, wrong, lost in cases.iter_rows()]
     schema = dict.fromkeys(("loss_share", "loss_low", "loss_high", "unsafe_high"), pl.Float64)
-    told = pl.concat(
+    bounded = pl.concat(
         [cases, pl.DataFrame(bounds, schema=schema | {"passes_needed": pl.Int64}, orient="row")], how="horizontal"
     )
     misleading = (pl.col("wrong_in_use") > 0) | (pl.col("claimed_wrongly") > 0)
@@ -116,7 +114,7 @@ def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
         .then(pl.lit(PieceClass.SUITABLE.value))
         .otherwise(pl.lit(PieceClass.UNKNOWN.value))
     )
-    return counted.join(told, on=_TRIALS, how="left", maintain_order="left").with_columns(
+    return counted.join(bounded, on=_TRIALS, how="left", maintain_order="left").with_columns(
         piece_class=classed,
         cause=_cause(unsuitable, shown, hours),
         passes_needed=pl.when(~unsuitable).then("passes_needed"),
@@ -156,10 +154,6 @@ def _bounds(
     bad: int, number: int, wrong: int, unjudged: int, criteria: LineCriteria
 ) -> tuple[float | None, float | None, float | None, float | None, int | None]:
     """Share lost with its bounds, upper bound of the share wrong in use, further right passes needed."""
-    low, high, unsafe = (
-        clopper_pearson(events, number + unjudged, criteria.confidence)
-        for events in (bad, bad + unjudged, wrong + unjudged)
-    )
-    share = bad / number if number else None
-    needed = trials_needed(bad + unjudged, number + unjudged, criteria.loss_limit, criteria.confidence)
-    return share, low.low, high.high, unsafe.high, needed
+    passes = Trials(number, bad, unjudged)
+    lost, unsafe = passes.share(criteria.confidence), Trials(number, wrong, unjudged).share(criteria.confidence)
+    return lost.value, lost.low, lost.high, unsafe.high, passes.needed(criteria.loss_limit, criteria.confidence)

@@ -142,9 +142,9 @@ def _rows(frame: pl.DataFrame, cause: LineCause | None = None) -> pl.DataFrame:
     """Rows of `_OUTCOMES` with the cause that the state has, or another."""
     names = {int(state): found.value for state, found in CAUSES.items()}
     own = pl.col("state").replace_strict(names, default=LineCause.NONE.value, return_dtype=pl.String)
-    told = own if cause is None else pl.lit(cause.value)
+    code = own if cause is None else pl.lit(cause.value)
     claimed = cause is LineCause.CLAIMED_WRONGLY
-    return frame.with_columns(cause=told, claimed=pl.lit(claimed)).select(
+    return frame.with_columns(cause=code, claimed=pl.lit(claimed)).select(
         pl.col(name).cast(dtype) for name, dtype in _OUTCOMES.items()
     )
 
@@ -164,13 +164,15 @@ def _misleading(
     epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, ground: Ground, criteria: LineCriteria
 ) -> list[pl.DataFrame]:
     """Pieces that wrong positions in use claimed, and those beside a position on a wrong track."""
-    told = epochs.with_columns(state=pl.Series(states), ahead="direction").filter(pl.col("netelement_id").is_not_null())
+    placed = epochs.with_columns(state=pl.Series(states), ahead="direction").filter(
+        pl.col("netelement_id").is_not_null()
+    )
     track = pl.col("error_low_m").is_null()
     in_use = pl.col("state") == int(State.WRONG_IN_USE)
-    claims = _named(told.filter(in_use & ~track), legs, ground.pieces)
+    claims = _named(placed.filter(in_use & ~track), legs, ground.pieces)
     parts = [_rows(claims, LineCause.CLAIMED_WRONGLY)]
     for state in (State.WRONG_TRACK, State.WRONG_IN_USE):
-        rows = told.filter(track & (pl.col("state") == int(state)))
+        rows = placed.filter(track & (pl.col("state") == int(state)))
         if rows.height:
             # On which of these tracks it was, and so which way over each, nobody knows.
             piece = pl.DataFrame({"piece": ground.beside(rows, criteria.beside_m)})

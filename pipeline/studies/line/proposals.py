@@ -278,11 +278,11 @@ def _figures(
     sides = [(piece, bool(growing[piece]) == ahead, ahead) for piece in virtual for ahead in MODES[mode]]
     schema = {"piece": pl.Int64, "growing": pl.Boolean, "ahead": pl.Boolean}
     wanted = pl.DataFrame(sides, schema=schema, orient="row")
-    told = line.table.with_columns(growing=pl.col("direction").cast(pl.String) == LineDirection.GROWING.value)
-    lost = wanted.join(told, on=KEYS).group_by("ahead").agg(pl.col("loss_share").sum(), pl.col("loss_high").sum())
+    sided = line.table.with_columns(growing=pl.col("direction").cast(pl.String) == LineDirection.GROWING.value)
+    lost = wanted.join(sided, on=KEYS).group_by("ahead").agg(pl.col("loss_share").sum(), pl.col("loss_high").sum())
     decided = (pl.col("state") >= int(State.UNKNOWN)) | (pl.col("state") == int(State.RIGHT))
     judged = line.passes.filter(decided).join(wanted, on=KEYS)
-    # What the evidence should have told and did not may have been wrong.
+    # What the evidence should have judged and did not may have been wrong.
     maybe = pl.col("state").is_in([int(State.UNKNOWN), int(State.WRONG_IN_USE)])
     journeys = judged.group_by("run_id").agg(wrong=maybe.any())
     distances: Floats = np.array([one.distance_m for one in placed if one.distance_m is not None])

@@ -6,12 +6,17 @@ from collections.abc import Iterator
 
 import polars as pl
 
-from pipeline.studies.line.trials import trials_needed
-from schemas.enums import TRUTH
+from pipeline.studies.reservations import runs_without_truth, several_settings
+from pipeline.studies.trials import trials_needed
 from schemas.line import LineCriteria, LineDirection
 
 # So many net elements are named; the table has the rest.
 _NAMED = 8
+_BLIND = "nothing in them can show that a position was right, so they make no piece suitable."
+_TRAINS = (
+    "; their passes are counted together. Positions are those of the balise antenna: how a piece looks to the rest "
+    "of a longer train is not known."
+)
 
 
 def remarks(
@@ -19,28 +24,18 @@ def remarks(
 ) -> list[str]:
     """Sentences for people, the gravest limits first."""
     return [
-        *_evidence(runs),
+        *runs_without_truth(runs, _BLIND),
         *_numbers(table, criteria),
         *_sides(table),
-        *_trains(runs),
+        *several_settings(runs, _TRAINS),
+        "The tables hold neither train lengths nor C/N0: no cause is derived from them.",
         *_rest(passes, table, figures),
     ]
 
 
-def _evidence(runs: pl.DataFrame) -> Iterator[str]:
-    without = runs.filter(~pl.col("evidence").cast(pl.String).is_in(TRUTH).fill_null(value=False)).height
-    if without:
-        yield (
-            f"{without} of {runs.height} runs have neither a reference nor balise reads: nothing in them can show that "
-            "a position was right, so they make no piece suitable."
-        )
-
-
 def _numbers(table: pl.DataFrame, criteria: LineCriteria) -> Iterator[str]:
-    needed, most = (
-        trials_needed(0, 0, criteria.loss_limit, criteria.confidence),
-        max(table["passes"].to_list(), default=0),
-    )
+    needed = trials_needed(0, 0, criteria.loss_limit, criteria.confidence)
+    most = max(table["passes"].to_list(), default=0)
     if needed is None or most < needed:
         yield (
             f"Too few passes: a piece has {most} at most, and {needed or 'more than can be'} without a loss are needed "
@@ -63,21 +58,11 @@ def _sides(table: pl.DataFrame) -> Iterator[str]:
             )
 
 
-def _trains(runs: pl.DataFrame) -> Iterator[str]:
-    kinds = runs["config_digest"].n_unique()
-    if kinds > 1:
-        yield (
-            f"The runs were replayed with {kinds} settings or vehicle files; their passes are counted together. "
-            "Positions are those of the balise antenna: how a piece looks to the rest of a longer train is not known."
-        )
-    yield "The tables hold neither train lengths nor C/N0: no cause is derived from them."
-
-
 def _rest(passes: pl.DataFrame, table: pl.DataFrame, figures: pl.DataFrame) -> Iterator[str]:
     if passes.is_empty():
         yield "No run has a place that the evidence knows on this site."
     elif passes["satellites"].is_null().all():
-        yield "The runs do not tell how many satellites were used: no cause is derived from that."
+        yield "The runs do not say how many satellites were used: no cause is derived from that."
     if figures.is_empty():
         yield "No piece is suitable: there is nothing to propose."
     elif figures["points"].max() and (figures["points_served"] < figures["points"]).any():

@@ -64,7 +64,7 @@ def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Con
     """One row per pair of epochs: `low_m, high_m` where the train may have been, `from_m, to_m` where it was most
     likely, `direction, state, t, elements` (net elements of the train there), `satellites` (the fewer of the two).
 
-    Between two places that are known the worst is told of what lies between where that is a pure outage, or the
+    Between two places that are known the worst counts of what lies between where that is a pure outage, or the
     evidence leaves only net elements of this way (at a joint both of them): else it is unknown, for nobody knows on
     which piece it was. So is a place known less closely than the failure limit on both sides. What
     was wrong at an end of such a way, or of an outage, was wrong there and not along it: a row of its own.

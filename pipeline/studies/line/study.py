@@ -15,7 +15,7 @@ from pipeline.studies.line.pieces import Pieces, middles, pieces_of
 from pipeline.studies.line.proposals import Line, proposals
 from pipeline.studies.line.remarks import remarks
 from pipeline.studies.line.spans import EPOCH_COLUMNS, State
-from pipeline.studies.line.trials import distinct
+from pipeline.studies.trials import distinct
 from schemas.arrays import floats
 from schemas.config import Configuration
 from schemas.enums import Evidence

@@ -7,6 +7,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.results.figures.head import figures_beside, head_of, run_verdicts
+from pipeline.studies.reservations import failed_runs, several_settings
 from schemas.enums import RunStatus, Verdict
 from schemas.words import beside_words
 
@@ -21,38 +22,20 @@ def verdict_statement(runs: pl.DataFrame) -> str:
 
 def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     """What keeps the figures from being those of traffic, and what they leave out."""
-    injected = runs.filter(pl.col("faults_injected").fill_null(value=False))
-    failed = runs.filter((pl.col("status") == RunStatus.FAILED).all().over("run_id"))["run_id"].n_unique()
-    said = []
-    if injected.height:
-        said.append(
-            f"Faults were injected into {injected['run_id'].n_unique()} of {runs['run_id'].n_unique()} runs: rates of "
-            "hazards, misses and outages per hour are those of the trial, not of traffic."
+    injected = runs.filter(pl.col("faults_injected").fill_null(value=False))["run_id"].n_unique()
+    number = runs["run_id"].n_unique()
+    said = failed_runs(runs)
+    if injected:
+        said.insert(
+            0,
+            f"Faults were injected into {injected} of {number} runs: rates of hazards, misses and outages per hour are "
+            "those of the trial, not of traffic.",
         )
-    if failed:
-        said.append(f"{failed} of {runs['run_id'].n_unique()} runs failed and are left out of all figures.")
-    said += [
-        f"{solution}: {count} of {runs['run_id'].n_unique()} runs failed with this solution alone and are left out"
-        " of its figures."
-        for solution, count in _failed_alone(runs)
-    ]
     partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
     if partial:
-        said.append(f"{partial} of {runs['run_id'].n_unique()} runs are partial: only what was read of them counts.")
-    kinds = runs.filter(pl.col("status") != RunStatus.FAILED)["config_digest"].n_unique()
-    if kinds > 1:
-        said.append(
-            f"The runs were replayed with {kinds} settings or vehicle files: each verdict is by its own limits; those"
-            " shown are the last ones."
-        )
-    return [*said, *_unjudged(runs, alarms)]
-
-
-def _failed_alone(runs: pl.DataFrame) -> list[tuple[str, int]]:
-    """Solutions that failed in runs of which another one was replayed, and in how many."""
-    failed = pl.col("status") == RunStatus.FAILED
-    alone = runs.filter(failed & ~failed.all().over("run_id"))
-    return alone.group_by("solution").agg(pl.col("run_id").n_unique()).sort("solution").rows()
+        said.append(f"{partial} of {number} runs are partial: only what was read of them counts.")
+    limits = ": each verdict is by its own limits; those shown are the last ones."
+    return [*said, *several_settings(runs, limits), *_unjudged(runs, alarms)]
 
 
 def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:

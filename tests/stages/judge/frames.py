@@ -51,8 +51,8 @@ def offers(epochs: Sequence[int], **columns: Any) -> pl.DataFrame:
     return _frame(size, values, dtypes(JudgedOffers))
 
 
-def course(frame: pl.DataFrame, *jumps: Jump) -> Course:
-    return course_of(frame, jumps, CONFIG)
+def course(frame: pl.DataFrame, *jumps: Jump, offered: pl.DataFrame | None = None) -> Course:
+    return course_of(frame, offers([]) if offered is None else offered, jumps, CONFIG)
 
 
 def _frame(size: int, values: dict[str, Any], kinds: Any) -> pl.DataFrame:

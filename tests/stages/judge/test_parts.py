@@ -10,37 +10,46 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.epochs.failure_log import FailureLog
+from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
-from pipeline.stages.judge.across import errors_across
 from pipeline.stages.judge.alarms import verdict_within
-from pipeline.stages.judge.case import Case, between_far_epochs
-from pipeline.stages.judge.episodes import Episode, _failure, _failure_may_ns, _is_back, _named_onset_ns, find_episodes
-from pipeline.stages.judge.failures import Course, accepted_in, find_failures, within_budget
-from pipeline.stages.judge.hazards import HazardRow, Offers, crossed_by, hazard_rows, instants, rate_mps, size_m
+from pipeline.stages.judge.attribution import suspect_of
+from pipeline.stages.judge.case import Case, Solution
+from pipeline.stages.judge.cross_errors import cross_errors
+from pipeline.stages.judge.episodes import (
+    Detection,
+    Episode,
+    _failed,
+    _failed_may_ns,
+    _is_back,
+    find_episodes,
+    named_onset_ns,
+)
+from pipeline.stages.judge.failures import Course, Failure, find_failures, within_budget
+from pipeline.stages.judge.hazards import HazardRow, crossed_by, hazard_rows, instants, rate_mps, size_m
+from pipeline.stages.judge.in_use import lds_states, time_in_use
 from pipeline.stages.judge.judgement import (
     RIGHT,
     UNKNOWN,
     WRONG,
     Judgements,
-    Positions,
+    MatchedPositions,
     judge_positions,
     margins_m,
     with_own_anchors,
 )
 from pipeline.stages.judge.jumps import Jump, find_jumps, steps_of
-from pipeline.stages.judge.movement import Counted, moving, travel_direction
-from pipeline.stages.judge.suspect import suspect_of
-from pipeline.stages.judge.true_crossings import TrueCrossing, true_crossings
-from pipeline.stages.judge.use import lds_states, odometer_beyond_confidence, time_in_use
+from pipeline.stages.judge.offers import Offers
+from pipeline.stages.judge.travel import OdometerSteps, beyond_confidence, moving, travel_direction
+from pipeline.stages.judge.true_crossings import TrueCrossing, between_far_epochs, true_crossings
 from pipeline.stages.track.path import Place, Route
 from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
 from schemas.enums import Evidence, Hazard, Judgement, Suspect, Verdict
 from tests.stages.judge.frames import NS, course, offers, positions
 
 EPISODE = Episode(
-    mark=0, onset=0, end=1, onset_ns=0, end_ns=1, step=None, jump_back=None, begin_ns=0, failure_number=None,
-    t_failure_ns=None, t_failure_may_ns=None, detected_ns=None, monitor=None, alarm_before_onset=False, failure=None,
+    mark=0, onset=0, end=1, begin_ns=0, onset_ns=0, end_ns=1, step=None, jump_back=None, failed=None, may_ns=None,
+    detection=Detection(), failure=Failure(0, 0, 0, 1, 0.0, 0.0, Judgement.RIGHT, True),
 )  # fmt: skip
 DEG_PER_M = np.degrees(1.0 / 6378137.0)  # east along the equator
 
@@ -56,7 +65,7 @@ def ns(t_s: float | None) -> int | None:
 def episodes(of: Course) -> list[Episode]:
     """Where no monitor fails and nothing was offered."""
     quiet = FailureLog(of.t_ns, np.zeros(of.size, dtype=bool), np.zeros(0, dtype=np.int64), (), ())
-    return find_episodes(of, offers([]), find_failures(of, offers([]), Configuration()), quiet, None, HazardConfig())
+    return find_episodes(of, find_failures(of, Configuration()), quiet, None, Configuration())
 
 
 @pytest.mark.parametrize(
@@ -74,7 +83,7 @@ def test_a_budget_is_kept_where_nothing_wrong_was_accepted_in_the_failure(
 ) -> None:
     """From the third of eight positions on."""
     offered = offers([epoch], judgement=judged, accepted=accepted)
-    worst = accepted_in(offered, positions(range(8)), 2, 8)
+    worst = Offers.of(offered, positions(range(8))).worst_accepted(2, 8)
     assert within_budget(0.2, may_s, worst, 0.5) is kept
 
 
@@ -82,13 +91,13 @@ def test_the_distance_counts_from_the_last_accepted_balise() -> None:
     """The odometer misses 30 m between 1 s and 2 s; a balise accepted at 3 s is a new begin."""
     t_ns, odometer_m = seconds(0, 1, 2, 3, 4), np.linspace(0.0, 40.0, 5)
     train_m = odometer_m + np.array([0.0, 0.0, 30.0, 30.0, 30.0])
-    beyond = odometer_beyond_confidence(t_ns, odometer_m, train_m, np.zeros(5), seconds(1, 3), LdsConfig())
+    beyond = beyond_confidence(t_ns, odometer_m, train_m, np.zeros(5), seconds(1, 3), LdsConfig())
     assert beyond.tolist() == [False, False, True, False, False]
 
 
 @pytest.mark.parametrize(("detected_ns", "until_ns"), [(None, 30), (20, 20)])
 def test_a_fault_is_undetected_until_a_monitor_fails_or_to_its_end(detected_ns: int | None, until_ns: int) -> None:
-    episode = replace(EPISODE, begin_ns=1, end_ns=30, detected_ns=detected_ns)
+    episode = replace(EPISODE, begin_ns=1, end_ns=30, detection=Detection(detected_ns))
     assert episode.undetected_ns == (1, until_ns)
 
 
@@ -118,6 +127,14 @@ def test_an_alarm_is_false_only_where_all_of_its_positions_were_well(
     assert verdict_within(np.array(low_m), np.array(high_m), margin_m, np.array(told, dtype=bool)) is verdict
 
 
+def errors_across(fixes: pl.DataFrame, heading_deg: Any, at_s: list[float], reference: pl.DataFrame) -> list[Any]:
+    absent: Any = None
+    stamps = pl.DataFrame({"t": seconds(*at_s)}).cast(pl.Datetime("ns", "UTC"))
+    solution = Solution("primary", fixes, stamps, absent, absent, absent, absent)
+    case = Case(solution, absent, None, Vehicle(), Configuration(), reference)
+    return [column.fill_null(np.nan).to_numpy() for column in cross_errors(case, heading_deg)]
+
+
 def test_errors_across_are_left_of_growing_path_and_upwards() -> None:
     """Two samples of a reference on the equator, 2 s and 20 m east apart; positions 1 m north and 3 m above."""
     stamps = pl.Series("t", [0, 2 * NS], dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
@@ -128,12 +145,11 @@ def test_errors_across_are_left_of_growing_path_and_upwards() -> None:
     north_deg = np.degrees(1.0 / 6335439.3)  # radius of curvature of the meridian at the equator, WGS 84
     fixes = pl.DataFrame({"latitude_deg": [north_deg] * 5, "longitude_deg": east_m * DEG_PER_M, "height_m": [54.0] * 5})
     for heading_deg, left_m in ((90.0, 1.0), (270.0, -1.0)):
-        across, up = errors_across(fixes, np.full(5, heading_deg), seconds(*at_s), reference, 2.0, 20.0)
+        across, up = errors_across(fixes, np.full(5, heading_deg), at_s, reference)
         # The third is 25 m ahead, the last after the reference ended.
         assert across == pytest.approx([left_m, left_m, np.nan, left_m, np.nan], abs=1e-3, nan_ok=True)
         assert up == pytest.approx([4.0, 3.0, np.nan, 2.0, np.nan], abs=1e-3, nan_ok=True)
-    nothing = errors_across(fixes, np.full(5, 90.0), seconds(*at_s), reference.head(1), 2.0, 20.0)
-    assert all(np.isnan(values).all() for values in nothing)
+    assert all(np.isnan(values).all() for values in errors_across(fixes, np.full(5, 90.0), at_s, reference.head(1)))
 
 
 def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of() -> None:
@@ -151,11 +167,38 @@ def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of()
     )
     evidence = EvidenceSet(np.zeros(6, dtype=np.int64), alternatives)
     places = {"V1": Place(1, 2.0), "V2": Place(1, 60.0)}
-    found = true_crossings(seconds(0, 1, 2, 3, 4, 5), evidence, places, 5.0, 3.0)
+    config = Configuration(lds=LdsConfig(rearm_m=3.0))
+    found = true_crossings(seconds(0, 1, 2, 3, 4, 5), evidence, places, config)
     # 102 m lies in the middle between 98 m and 106 m; 160 m was not reached.
     assert found == {"V1": [TrueCrossing(round(2.5 * NS), 1, True)], "V2": []}
-    # Where the place is known to 0.5 m only, evidence of 1 m to both sides tells of no passing.
-    assert true_crossings(seconds(0, 1, 2, 3, 4, 5), evidence, places, 0.5, 3.0) == {"V1": [], "V2": []}
+
+
+@pytest.mark.parametrize(("half_m", "last_m", "crossings"), [(5.0, 105.0, 1), (40.0, 145.0, 1), (40.0, 135.0, 0)])
+def test_a_balise_is_passed_where_the_whole_interval_passes_it(half_m: float, last_m: float, crossings: int) -> None:
+    """From 5 m on at 10 m/s past a balise at 100 m; a place known to 5 m passes with its middle."""
+    at_m = np.arange(5.0, last_m + 1.0, 10.0)
+    route = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
+    rows = np.arange(at_m.size)
+    evidence = EvidenceSet(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - half_m, at_m + half_m),))
+    found = true_crossings(rows * NS, evidence, {"V": Place(0, 100.0)}, Configuration())
+    # 95 m at 9 s, 105 m at 10 s; it is far enough beyond only where the run goes on.
+    assert found == {"V": [TrueCrossing(round(9.5 * NS), 1, half_m > 5.0)] * crossings}
+
+
+@pytest.mark.parametrize(("alarm_s", "onset_s", "standing"), [(3, 3, True), (12, 10, False), (None, 10, False)])
+def test_an_alarm_shortly_before_a_drift_is_its_onset_and_was_there_before_it(
+    alarm_s: int | None, onset_s: int, standing: bool
+) -> None:
+    """5 m more each second from 10 s on, beyond 20 m from 15 s on; at most 30 s before lies the alarm."""
+    frame = positions(range(40), np.clip(5.0 * (np.arange(40.0) - 9.0), 0.0, 60.0))
+    drift = course(frame)
+    failing = np.array([] if alarm_s is None else [alarm_s], dtype=np.int64)
+    alarms = tuple(AlarmEpisode(t, t, t * NS, t * NS, ("along_raw",), 2.0) for t in failing.tolist())
+    log = FailureLog(drift.t_ns, np.zeros(drift.size, bool), failing, ("along_raw",) * failing.size, alarms)
+    (episode,) = find_episodes(drift, find_failures(drift, Configuration()), log, None, Configuration())
+    assert episode.onset_ns == onset_s * NS
+    assert episode.detection.standing is standing
+    assert episode.detection.t_ns == ns(alarm_s)
 
 
 def test_the_margin_of_a_healthy_position() -> None:
@@ -172,8 +215,8 @@ def test_what_an_episode_hit() -> None:
         epoch, judgement=code, error_low_m=least_m, error_high_m=least_m + 2.0,
         offered=[k != 2 for k in range(10)], wrong_track=[number == 7 for number in epoch],
     )  # fmt: skip
-    told = course(positions(range(10)))
-    found = hazard_rows([replace(EPISODE, onset=2, end=8)], told, Offers.of(offered, told.positions), HazardConfig())
+    met = course(positions(range(10)), offered=offered)
+    found = hazard_rows([replace(EPISODE, onset=2, end=8)], met, HazardConfig())
     assert [(row.hazard, row.hits) for row in found] == [(Hazard.VB_SHIFT, [1, 9]), (Hazard.VB_WRONG_TRACK, [6])]
 
 
@@ -202,13 +245,11 @@ def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
 @pytest.mark.parametrize(("may_s", "detected_s"), [(104.5, 107.0), (None, 107.0), (104.5, None)])
 def test_the_times_of_a_hazard(may_s: float | None, detected_s: float | None) -> None:
     """Onset at 103 s, a VB hit at 104 s, failure at 105 s or a little before, alarm at 107 s, end at 109 s."""
-    told = course(positions([100.0 + k for k in range(10)]))
-    offered = Offers.of(offers([1, 4], t=[101 * NS, 104 * NS]), told.positions)
+    met = course(positions([100.0 + k for k in range(10)]), offered=offers([1, 4], t=[101 * NS, 104 * NS]))
     episode = replace(
-        EPISODE, onset_ns=103 * NS, end_ns=109 * NS, t_failure_ns=105 * NS, t_failure_may_ns=ns(may_s),
-        detected_ns=ns(detected_s),
-    )  # fmt: skip
-    found = instants(HazardRow(Hazard.VB_SHIFT, episode, None, [1]), told, offered, Configuration())
+        EPISODE, onset_ns=103 * NS, end_ns=109 * NS, failed=5, may_ns=ns(may_s), detection=Detection(ns(detected_s))
+    )
+    found = instants(HazardRow(Hazard.VB_SHIFT, episode, None, [1]), met, Configuration())
     times = [found[name] for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
     assert times == seconds(103, 104, 105, 109).tolist()
     seen = detected_s is not None
@@ -260,7 +301,7 @@ def test_a_failure_is_a_second_of_wrong_from_the_onset_on(
     """Positions each 0.5 s, the onset is the third."""
     frame = positions(0.5 * np.arange(8), [30.0 if k in wrong else 0.0 for k in range(8)])
     jump = None if step is None else Jump(*step, 30.0)
-    assert _failure(course(frame), 2, 8, jump, HazardConfig()) == failure
+    assert _failed(course(frame), 2, 8, jump, HazardConfig()) == failure
 
 
 @pytest.mark.parametrize(
@@ -277,15 +318,15 @@ def test_since_when_a_drift_may_have_failed(
 ) -> None:
     """6 m more each second, known to 5 m: beyond 20 m for certain at 5 s, and possibly from 3 s on."""
     frame = positions(range(6), 6.0 * np.arange(6), 5.0, judgement=judgement, evidence=evidence)
-    assert _failure_may_ns(course(frame), 5, HazardConfig()) == ns(may_s)
+    assert _failed_may_ns(course(frame), 5, HazardConfig()) == ns(may_s)
 
 
-def placed(path_m: list[float], element: int = 0) -> Positions:
+def placed(path_m: list[float], element: int = 0) -> MatchedPositions:
     """Positions on one element, whose measure is the path position."""
     at_m, size = np.array(path_m), len(path_m)
     of_element = np.where(np.isnan(at_m), -1, element)
     leg = np.zeros(size, dtype=np.int64)
-    return Positions(of_element, at_m, leg, at_m, np.ones(size, dtype=bool))
+    return MatchedPositions(of_element, at_m, leg, at_m, np.ones(size, dtype=bool))
 
 
 def test_each_alternative_is_weighed_however_few_instants_it_tells_of() -> None:
@@ -391,11 +432,10 @@ def test_a_train_moves_farther_in_a_second_than_the_noise_of_its_places() -> Non
     at_m = np.array([0.0, 0.2, 0.4, 0.8, 1.2, 1.6, np.nan, np.nan, np.nan, np.nan])
     moves = np.array([True] * 8 + [False] * 2)
     counted = np.array([False] * 6 + [True] * 3 + [False])
-    odometer = Counted(moves, counted, [(round(3.5 * NS), 4 * NS)])
-    moved, sure = moving(seconds(*(0.5 * np.arange(10))), at_m, np.full(10, 0.1), odometer, Configuration())
+    odometer, stood = OdometerSteps(moves, counted), np.arange(10) == 7
+    moved = moving(seconds(*(0.5 * np.arange(10))), at_m, np.full(10, 0.1), odometer, stood, Configuration())
     # By the reference up to 1.5 s, as far as it goes; then by the odometer from 3 s on, but for what it stood.
-    assert sure.tolist() == [True, True, True, True, False, False, True, False, True, True]
-    assert moved[sure].tolist() == [False, True, True, True, True, False, False]
+    assert moved.to_list() == [False, True, True, True, None, None, True, None, False, False]
 
 
 def along(error_m: Any, half_m: float, kind: Evidence) -> Judgements:
@@ -458,7 +498,7 @@ def test_where_the_evidence_ends_the_position_is_held_to_it_by_its_own_path(onwa
         return Route(np.array(elements), np.full(size, True), entry_m, np.zeros(size), np.full(size, 100.0))
 
     at_m, leg, sure = np.array([110.0]), np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool)
-    given = Positions(np.array([1]), at_m - 100.0, leg, at_m, sure)
+    given = MatchedPositions(np.array([1]), at_m - 100.0, leg, at_m, sure)
     told = Alternative(np.array([0]), route(onward), np.array([95.0]), np.array([97.0]))
     evidence = EvidenceSet(np.array([KINDS.index(Evidence.BALISE)]), (told,))
     found = judge_positions(given, evidence, [route([0, 1])], HazardConfig())
@@ -495,8 +535,8 @@ def test_a_jump_crosses_what_the_train_itself_did_not(train_m: float, crossed: l
     """From 100 m to 140 m by a jump of 30 m: the train's own 10 m cross what lies in them, from where it is known."""
     path_m, virtual = [99.0, 125.0, 135.0, 111.0, 138.0, 145.0], [True, True, True, True, False, True]
     offered = offers([2, 3, 3, 3, 3, 4], path_m=path_m, virtual=virtual)
-    told = course(positions(range(5), path_m=[80.0, 90.0, 100.0, 140.0, 150.0], train_m=np.full(5, train_m)))
-    assert crossed_by(Jump(3, 3, 30.0), Offers.of(offered, told.positions), told) == crossed
+    at = positions(range(5), path_m=[80.0, 90.0, 100.0, 140.0, 150.0], train_m=np.full(5, train_m))
+    assert crossed_by(Jump(3, 3, 30.0), course(at, offered=offered)) == crossed
 
 
 @pytest.mark.parametrize(
@@ -520,10 +560,10 @@ def test_the_onset_is_that_of_a_fault_of_the_positions_that_lasted(
             "target": ["position", "along", "odometer", "G08"],
         }
     ).with_columns(pl.col("t_start", "t_end").cast(pl.Datetime("ns", "UTC")))
-    found = _named_onset_ns(faults, onset_s * NS, mark_s * NS)
+    found = named_onset_ns(faults, onset_s * NS, mark_s * NS)
     assert found == (None if named_s is None else named_s * NS)
-    assert _named_onset_ns(faults.clear(), onset_s * NS, mark_s * NS) is None
-    assert _named_onset_ns(None, onset_s * NS, mark_s * NS) is None
+    assert named_onset_ns(faults.clear(), onset_s * NS, mark_s * NS) is None
+    assert named_onset_ns(None, onset_s * NS, mark_s * NS) is None
 
 
 def test_evidence_is_looked_at_between_positions_that_are_far_apart() -> None:
@@ -546,14 +586,12 @@ def test_the_size_and_slope_of_a_hazard(
     half_m: float, jump: Jump | None, back: bool, size: float, rate: float | None
 ) -> None:
     """2.5 m more each second; the third position is the onset, and the failure the one after it."""
-    told = course(positions(range(12), -2.5 * np.arange(12.0) + 2.5, half_m))
-    episode = replace(
-        EPISODE, onset=2, end=12, mark=10, failure_number=3, onset_ns=2 * NS, jump_back=jump if back else None
-    )
+    offered = offers([9], error_low_m=np.nan, error_high_m=np.nan)
+    drift = course(positions(range(12), -2.5 * np.arange(12.0) + 2.5, half_m), offered=offered)
+    episode = replace(EPISODE, onset=2, end=12, mark=10, failed=3, onset_ns=2 * NS, jump_back=jump if back else None)
     row = HazardRow(Hazard.VB_SHIFT, episode, jump, [0])
-    offered = Offers.of(offers([9], error_low_m=np.nan, error_high_m=np.nan), told.positions)
-    assert size_m(row, told, offered) == pytest.approx(size)
-    found = rate_mps(row, told)
+    assert size_m(row, drift) == pytest.approx(size)
+    found = rate_mps(row, drift)
     assert found == (None if rate is None else pytest.approx(rate))
 
 
@@ -561,8 +599,7 @@ def test_pulses_are_one_failure_and_a_calm_half_minute_ends_it() -> None:
     """60 m for 0.3 s in each of ten seconds at 10 Hz, right for 45 s, one pulse more: 3.0 s and 0.3 s wrong in use."""
     t_s = 0.1 * np.arange(600)
     pulse = ((t_s % 1.0) < 0.25) & (t_s < 9.95) | ((t_s > 54.95) & (t_s < 55.25))
-    told = course(positions(t_s, np.where(pulse, 60.0, 0.0)))
-    found = find_failures(told, offers([]), Configuration())
+    found = find_failures(course(positions(t_s, np.where(pulse, 60.0, 0.0))), Configuration())
     assert [one.hazardous_s for one in found] == pytest.approx([3.0, 0.3])
     assert [one.within_budget for one in found] == [False, True]
 
@@ -573,7 +610,7 @@ def test_a_failure_goes_on_until_it_is_calm_for_long_enough(apart_s: int, betwee
     error_m = np.full(60, 0.0)
     error_m[10 : 10 + apart_s] = between_m
     error_m[[10, 10 + apart_s]] = 60.0
-    assert len(find_failures(course(positions(range(60), error_m)), offers([]), Configuration())) == failures
+    assert len(find_failures(course(positions(range(60), error_m)), Configuration())) == failures
 
 
 def test_unknown_time_in_use_counts_to_the_failure_that_it_belongs_to() -> None:
@@ -581,5 +618,5 @@ def test_unknown_time_in_use_counts_to_the_failure_that_it_belongs_to() -> None:
     error_m = np.full(30, 0.0)
     error_m[5:9] = [60.0, np.nan, np.nan, np.nan]
     frame = positions(range(30), error_m, path_m=10.0 * np.arange(30))
-    (found,) = find_failures(course(frame), offers([7], judgement="unknown"), Configuration())
+    (found,) = find_failures(course(frame, offered=offers([7], judgement="unknown")), Configuration())
     assert (found.hazardous_s, found.hazardous_may_s, found.accepted) == (1.0, 4.0, Judgement.UNKNOWN)

@@ -24,13 +24,13 @@ from pipeline.studies.claim.tally import (
     Finding,
     Tally,
     clusters_s,
+    counted,
     of_always,
     of_availability,
     of_rate,
     of_share,
-    tally,
 )
-from pipeline.studies.line import trials_needed
+from pipeline.studies.trials import trials_needed
 from schemas.config import Configuration
 from schemas.errors import ConfigError, SiteError
 from schemas.inputs import Areas, Links, Track
@@ -195,7 +195,7 @@ def test_exceedances_close_to_each_other_are_one_event() -> None:
     t_ns = np.array([0, 10, 310, 611]) * NS
     assert clusters_s(t_ns, t_ns, 300.0) == [310.0, 0.0]
     code = np.array([-1, 0, 0, -1])
-    counts = tally("run", t_ns, np.ones(4), code, 300.0)
+    counts = counted("run", t_ns, np.ones(4), code, 300.0)
     # What is not known between them may hold another event.
     assert (counts.events, counts.possible, counts.trials, counts.known_s) == (2, 3, 1, 2.0)
 
@@ -248,8 +248,8 @@ def test_weaker_evidence_never_shows_what_stronger_refutes(runs: list[list[tuple
         t_ns, held = np.arange(len(run)) * 200 * NS, np.full(len(run), 200.0)
         full = np.array([code for code, _ in run])
         less = np.array([0 if hidden else code for code, hidden in run])
-        strong += tally(str(number), t_ns, held, full, 300.0)
-        weak += tally(str(number), t_ns, held, less, 300.0)
+        strong += counted(str(number), t_ns, held, full, 300.0)
+        weak += counted(str(number), t_ns, held, less, 300.0)
     fault_free = Tally(trials=1, kept=1, held_s=3600.0, known_s=3600.0)
     for shown in (lambda c: of_share(c, 0.6), lambda c: of_rate(c, 8.0), of_always):
         findings = (shown(strong).finding, shown(weak).finding)
@@ -297,6 +297,38 @@ def test_the_odometer_goes_on_where_no_position_is_in_use() -> None:
     assert found.low_m[[6, 9]] == pytest.approx([-0.5, -40.5])
     # Where GNSS is wrong the report of the odometer is never proved, but its error is seen.
     assert found.within(found.over_m, found.under_m).tolist() == [1] * 6 + [0, 0, 0, -1]
+
+
+def test_the_report_of_an_outage_is_compared_with_the_place_of_the_train() -> None:
+    """Train at 0, 20, ... 180 m on A, measure is path; no position from 120 m on, odometer 40 m short at 180 m."""
+    seconds = [float(second) for second in range(10)]
+    true = np.array([20.0 * second for second in seconds])
+    odometer = true - np.where(np.arange(10) >= 9, 40.0, 0.0)
+    lost = [None] * 4
+    frame = epochs(
+        seconds,
+        netelement_id=["A"] * 6 + lost,
+        measure_m=[*true[:6].tolist(), *lost],
+        path_m=[*true[:6].tolist(), *lost],
+        odometer_m=odometer.tolist(),
+        in_use=[True] * 6 + [False] * 4,
+        judgement=["right"] * 6 + ["unknown"] * 4,
+        error_low_m=[-0.5] * 6 + lost,
+        error_high_m=[0.5] * 6 + lost,
+        true_netelement_ids=[["A"]] * 8 + [["A", "B"], ["A"]],
+        true_measure_low_m=(true - 0.5).tolist(),
+        true_measure_high_m=(true + 0.5).tolist(),
+        lrvb_id=[None] * 5 + ["b"] * 5,
+        distance_from_lrvb_m=[None] * 5 + (odometer[5:] - 100.0).tolist(),
+        doubt_over_m=[None] * 5 + [17.0, 18.0, 19.0, 20.0, 21.0],
+        doubt_under_m=[None] * 5 + [17.0, 18.0, 19.0, 20.0, 21.0],
+    )
+    crossed = passages(1, balise_id="b", status="accepted", path_m=100.0, kind="virtual")
+    front = front_of(frame, crossed, RUN, Configuration(), PROFILE.method)
+    assert front.low_m[[6, 7, 9]] == pytest.approx([-0.5, -0.5, -40.5])
+    assert front.high_m[[6, 7, 9]] == pytest.approx([0.5, 0.5, -39.5])
+    # Kept where the place is known, unknown on one of two net elements, beyond its interval at the end.
+    assert front.within(front.over_m, front.under_m).tolist() == [1] * 8 + [0, -1]
 
 
 def test_the_front_end_decides_on_the_area() -> None:
@@ -478,8 +510,8 @@ def test_a_result_with_and_without_areas(result: Path) -> None:
     assert rows["front_accuracy", "node"]["kept"] == 1
     assert rows["mapo", "dense_line"]["reason"] == "nothing recorded to which it applies"
     assert rows["cold_movement", "all"]["reason"] == "a train without power records nothing"
-    assert any("1 of 2 runs have no reference" in note for note in found.notes)
-    assert any("2 configurations or vehicle files: trains may differ" in note for note in found.notes)
+    assert any("1 of 2 runs have neither a reference" in note for note in found.notes)
+    assert any("2 settings or vehicle files: trains may differ" in note for note in found.notes)
     without = claim(result, PROFILE)
     assert any("Without areas" in note for note in without.notes)
     by_area = without.table.filter(pl.col("applies_to").is_in(["mainline", "dense_line", "node", "precise"]))

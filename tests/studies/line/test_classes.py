@@ -5,9 +5,9 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.studies.line import distinct, trials_needed
 from pipeline.studies.line.classes import piece_classes
 from pipeline.studies.line.spans import State
+from pipeline.studies.trials import distinct, trials_needed
 from schemas.line import LineCriteria
 from schemas.run import Site
 from tests.studies.line.tables import (

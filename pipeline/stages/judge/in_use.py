@@ -10,10 +10,11 @@ import polars as pl
 from pipeline.stages.epochs.clock import crossing_gap_ns, met, nominal_period_s, trusted
 from pipeline.stages.judge.judgement import RIGHT, WRONG
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, runs_of, times_ns
-from schemas.config import Configuration, LdsConfig
+from schemas.config import Configuration
 from schemas.enums import LdsState
 
 _STATES = tuple(LdsState)
+# Numerics: times shorter than half a nanosecond are rounding.
 _LEAST_S = 0.5 / NS_PER_S
 
 
@@ -35,73 +36,72 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
     known = met(epochs, pl.col("path_m").is_not_null())
     steps = _Steps.of(epochs, known, config)
     usable = met(epochs.filter(known), trusted(config) & ~pl.col("withheld"))
-    in_use = usable & (steps.left_s(steps.alone_s()) > _LEAST_S)
-    code = code[known]
-    wrong_s = steps.lasting_s(in_use & (code == WRONG))
-    open_s = steps.lasting_s(in_use & (code != RIGHT))
-    used_s = np.where(in_use, np.where(code == RIGHT, steps.left_s(steps.near_s()), open_s), 0.0)
+    in_use = usable & (steps.left_s(steps.alone_s) > _LEAST_S)
+    judged = code[known]
+    wrong_s = steps.lasting_s(in_use & (judged == WRONG))
+    doubtful_s = steps.lasting_s(in_use & (judged != RIGHT))
+    used_s = np.where(in_use & (judged == RIGHT), steps.left_s(steps.near_s), doubtful_s)
     columns = {"in_use": in_use, "used_s": used_s, "wrong_s": wrong_s}
     whole = {name: np.zeros(known.size, dtype=values.dtype) for name, values in columns.items()}
     for name, values in columns.items():
         whole[name][known] = values
-    counted_s = np.where(whole["wrong_s"] > 0.0, whole["wrong_s"], _since_before_s(times_ns(epochs), known, steps))
+    counted_s = np.where(whole["wrong_s"] > 0.0, whole["wrong_s"], _counted_s(times_ns(epochs), known, steps))
     return pl.DataFrame({**whole, "counted_s": counted_s})
 
 
 @dataclass(frozen=True)
 class _Steps:
-    """From each valid position to the next: `end_s` of each, the time since the one before, and what is negated."""
+    """To each position from the one before: `step_s`; `near_s` with one period for a gap; `alone_s` one at most.
+
+    `edge_s`, `blocked_s`: time negated up to some instants, between them in proportion.
+    """
 
     end_s: Floats
     step_s: Floats
+    near_s: Floats
+    alone_s: Floats
     period_s: float
     gap_s: float
-    negated: list[tuple[float, float]]
+    edge_s: Floats
+    blocked_s: Floats
 
     @classmethod
     def of(cls, epochs: pl.DataFrame, known: Bools, config: Configuration) -> _Steps:
         all_ns = times_ns(epochs)
         t_ns = all_ns[known]
-        period_s = nominal_period_s(t_ns) or 0.0
         all_s = (all_ns - all_ns[:1]) / NS_PER_S
-        delay_s = reaction_s(t_ns, config)
-        negated = negated_spans(all_s, flags(epochs, "negated"), flags(epochs, "withheld"), delay_s)
+        period_s = nominal_period_s(t_ns) or 0.0
+        gap_s = crossing_gap_ns(t_ns, config.lds) / NS_PER_S
         step_s = np.diff(all_s[known], prepend=all_s[known][:1] - period_s)
-        return cls(all_s[known], step_s, period_s, crossing_gap_ns(t_ns, config.lds) / NS_PER_S, negated)
-
-    def alone_s(self) -> Floats:
-        """At most one nominal period: in a gap nothing was in use."""
-        return np.minimum(self.step_s, self.period_s)
-
-    def near_s(self) -> Floats:
-        """The time since the position before; one period after a gap."""
-        near: Floats = np.where(self.step_s <= self.gap_s, self.step_s, self.alone_s())
-        return near
+        alone_s = np.minimum(step_s, period_s)
+        near_s = np.where(step_s <= gap_s, step_s, alone_s)
+        negated = negated_spans(all_s, flags(epochs, "negated"), flags(epochs, "withheld"), reaction_s(t_ns, config))
+        blocked_s = np.cumsum(np.diff(negated, axis=1, prepend=negated[:, :1]).ravel())
+        return cls(all_s[known], step_s, near_s, alone_s, period_s, gap_s, negated.ravel(), blocked_s)
 
     def left_s(self, length_s: Floats) -> Floats:
         """So much time before each position, less what is negated."""
-        begin_s, blocked_s = self.end_s - length_s, np.zeros(self.end_s.size)
-        for from_s, until_s in self.negated:
-            blocked_s += np.clip(np.minimum(self.end_s, until_s) - np.maximum(begin_s, from_s), 0.0, None)
-        left_s = length_s - blocked_s
+        if self.edge_s.size == 0:
+            return length_s
+        until_s, since_s = (np.interp(t_s, self.edge_s, self.blocked_s) for t_s in (self.end_s, self.end_s - length_s))
+        left_s = length_s - (until_s - since_s)
         return np.where(left_s > _LEAST_S, left_s, 0.0)
 
     def lasting_s(self, member: Bools) -> Floats:
         """Time of the members: whole since the position before where that is a member too."""
         lasted = np.concatenate([[False], member[:-1]])[: member.size]
-        found_s = self.left_s(np.where(lasted, self.step_s, self.alone_s()))
-        return np.where(member, found_s, 0.0)
+        return np.where(member, self.left_s(np.where(lasted, self.step_s, self.alone_s)), 0.0)
 
 
-def negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) -> list[tuple[float, float]]:
-    """From each detection plus the reaction to the return [s]; at once where nothing was in use at the detection."""
+def negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) -> Floats:
+    """Rows of begin and end [s]: from each detection plus the reaction, at once where nothing was in use, to return."""
     firsts, lasts = runs_of(negated)
-    until_s = np.append(t_s, np.inf)[lasts + 1]
+    until_s = np.append(t_s, t_s[-1:])[lasts + 1]
     from_s = t_s[firsts] + np.where(withheld[firsts], 0.0, delay_s)
-    return list(zip(from_s.tolist(), until_s.tolist(), strict=True))
+    return np.column_stack([np.minimum(from_s, until_s), until_s])
 
 
-def _since_before_s(t_ns: Ints, known: Bools, steps: _Steps) -> Floats:
+def _counted_s(t_ns: Ints, known: Bools, steps: _Steps) -> Floats:
     """Time since the epoch before [s], one period of a gap; nothing between near positions, where the later has all."""
     since_s = np.diff(t_ns, prepend=t_ns[:1] - round(steps.period_s * NS_PER_S)) / NS_PER_S
     since_s = np.where(since_s <= max(steps.gap_s, steps.period_s), since_s, steps.period_s)
@@ -109,7 +109,7 @@ def _since_before_s(t_ns: Ints, known: Bools, steps: _Steps) -> Floats:
     after = np.searchsorted(rows, np.arange(t_ns.size))
     near = np.append(steps.step_s <= steps.gap_s, False)
     since_s[(after > 0) & near[after]] = 0.0
-    since_s[rows] = steps.near_s()
+    since_s[rows] = steps.near_s
     return since_s
 
 
@@ -123,29 +123,5 @@ def lds_states(epochs: pl.DataFrame, code: Ints, in_use: Bools, undiagnosed: Boo
     state[undiagnosed] = _STATES.index(LdsState.P3)
     state[flags(epochs, "negated")] = _STATES.index(LdsState.P2)
     state[(code == WRONG) & in_use] = _STATES.index(LdsState.P1)
-    words = pl.Series("lds_state", [*(one.value for one in _STATES), None], dtype=pl.Enum(LdsState))
+    words = pl.Series("lds_state", [*(state.value for state in _STATES), None], dtype=pl.Enum(LdsState))
     return words.gather(state)
-
-
-def odometer_beyond_confidence(
-    t_ns: Ints, odometer_m: Floats, train_m: Floats, half_m: Floats, accepted_ns: Ints, lds: LdsConfig
-) -> Bools:
-    """The distance counted since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1).
-
-    `train_m`, `half_m`: path position by reference or balise reads and half its interval, NaN elsewhere: only these
-    can say so. The whole interval has to say it.
-    """
-    beyond = np.zeros(t_ns.size, dtype=np.bool_)
-    rows = np.flatnonzero(np.isfinite(odometer_m) & np.isfinite(train_m))
-    last = np.searchsorted(accepted_ns, t_ns[rows], side="right") - 1
-    rows, last = rows[last >= 0], last[last >= 0]
-    if rows.size == 0:
-        return beyond
-    x = (t_ns[rows] - t_ns[rows[0]]).astype(np.float64)
-    at = (accepted_ns[last] - t_ns[rows[0]]).astype(np.float64)
-    since = (np.interp(at, x, values[rows]) for values in (odometer_m, train_m, half_m))
-    counted_from, moved_from, half_from = since
-    counted, moved = odometer_m[rows] - counted_from, train_m[rows] - moved_from
-    allowed = lds.odometer_fixed_m + lds.odometer_share * np.abs(counted) + half_m[rows] + half_from
-    beyond[rows] = np.abs(counted - moved) > allowed
-    return beyond

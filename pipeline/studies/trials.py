@@ -1,10 +1,12 @@
-"""What counts as a trial: no journey twice; and how many more trials show something."""
+"""Trials as all studies count them: no journey twice, exact bounds, and how many more would show something."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import polars as pl
 
-from pipeline.stages.run_row.bounds import CONFIDENCE, clopper_pearson
+from pipeline.stages.run_row.bounds import CONFIDENCE, Estimate, clopper_pearson
 from schemas.enums import RunVerdict
 
 # Share of the distance by which two records of one journey differ at most.
@@ -39,6 +41,26 @@ def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
         "too favourable: remove what repeats others.": overlapping,
     }
     return kept.sort("run_id", "solution"), [text for text, count in remarks.items() if count]
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Independent trials: those that the evidence judged, the bad ones among them, and those that it did not judge."""
+
+    judged: int
+    bad: int
+    unjudged: int = 0
+
+    def share(self, confidence: float = CONFIDENCE) -> Estimate:
+        """Share of bad trials; what was not judged counts as good in the lower bound and as bad in the upper one."""
+        number = self.judged + self.unjudged
+        low = clopper_pearson(self.bad, number, confidence).low
+        high = clopper_pearson(self.bad + self.unjudged, number, confidence).high
+        return Estimate(self.bad / self.judged if self.judged else None, low, high)
+
+    def needed(self, limit: float, confidence: float = CONFIDENCE) -> int | None:
+        """Further good trials until the upper bound of the share keeps the limit; None beyond 2^40."""
+        return trials_needed(self.bad + self.unjudged, self.judged + self.unjudged, limit, confidence)
 
 
 def trials_needed(bad: int, number: int, limit: float, confidence: float = CONFIDENCE) -> int | None:

@@ -1,21 +1,18 @@
-"""An opinion on who was at fault (DOMAIN section 5.5). Nothing but the column `suspect` depends on it."""
+"""Which component is suspected (DOMAIN section 5.5): an opinion, only the column `suspect` depends on it."""
 
 from __future__ import annotations
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.evidence.evidence import KINDS
-from pipeline.stages.judge.judgement import Judgements, margins_m
+from pipeline.stages.judge.judgement import ODOMETER, Judgements, margins_m
 from schemas.arrays import NS_PER_S, Floats, floats, times_ns
 from schemas.config import Configuration
-from schemas.enums import Evidence, Suspect
+from schemas.enums import Suspect
 
 
 def suspect_of(epochs: pl.DataFrame, begin_ns: int, end_ns: int, config: Configuration) -> Suspect:
-    """The decision table, from `suspect_lookback_s` before the alarm or hazard to its end; the first row that applies.
-
-    `epochs`: judged.
+    """The decision table, from `suspect_lookback_s` before an alarm or hazard to its end; the first row that applies.
 
     | row | evidence | suspect |
     |---|---|---|
@@ -33,7 +30,7 @@ def suspect_of(epochs: pl.DataFrame, begin_ns: int, end_ns: int, config: Configu
     judged, margin_m = Judgements.of(part), margins_m(floats(part, "sigma_along_m"), config.hazards)
     with np.errstate(invalid="ignore"):
         left = (judged.least_m > margin_m) | judged.wrong_track
-    if (left & (judged.kind != KINDS.index(Evidence.ODOMETER))).any():
+    if (left & (judged.kind != ODOMETER)).any():
         return Suspect.GNSS
     if (part["stood"] | part["odometer_wrong"]).any() or _parted_together(part, margin_m, config):
         return Suspect.ODOMETER

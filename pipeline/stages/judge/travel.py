@@ -1,0 +1,144 @@
+"""Did the train move, which way, does its odometer count wrong: by odometer and evidence, never by the positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.judge.case import Case
+from pipeline.stages.judge.judgement import REFERENCE, Judgements
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, spans_of, times_ns
+from schemas.config import Configuration, HazardConfig, LdsConfig
+
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class OdometerSteps:
+    """From each epoch to the next: the odometer counted throughout (`counts`), and shows movement (`moves`).
+
+    `stood`: times [ns] in which it stands while positions leave their place by more than the failure limit; nobody
+    knows by it whether the train moved there.
+    """
+
+    moves: Bools
+    counts: Bools
+    stood: tuple[Span, ...] = ()
+
+
+def odometer_steps(case: Case) -> OdometerSteps:
+    at_ns, odometry = case.instants_of_epochs(), case.odometry
+    if odometry is None:
+        nothing = np.zeros(at_ns.size, dtype=np.bool_)
+        return OdometerSteps(nothing, nothing)
+    moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
+    counts = _to_the_next(np.isfinite(odometry.between(at_ns[:-1], at_ns[1:]).distance_m), at_ns.size)
+    path_m, limit_m = floats(case.solution.epochs, "path_m"), case.config.hazards.failure_limit_m
+    stood: list[Span] = []
+    for first, last in spans_of(counts & ~moves):
+        rows = slice(first, min(last + 2, at_ns.size))
+        places_m = path_m[rows][np.isfinite(path_m[rows])]
+        if places_m.size and float(np.abs(places_m - places_m[0]).max()) > limit_m:
+            stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
+    return OdometerSteps(moves, counts, tuple(stood))
+
+
+def travel_direction(
+    direction: Ints, along: Judgements, at_ns: Ints, path_m: Floats, has_odometer: bool, config: HazardConfig
+) -> Ints:
+    """Direction of travel along growing path, 1 or -1, per epoch; `direction`: as the train took it.
+
+    Without an odometer it is that of the train's own place, where the evidence gives it: a position that jumps back
+    does not turn the train. With one it is the odometer's, unless the reference shows that it counts up in reverse.
+    """
+    train_m = path_m - along.known_m(config.known_error_m)
+    moved_m, noise_m, _ = _moved_m(at_ns, train_m, along.half_m, config.turn_s)
+    with np.errstate(invalid="ignore"):
+        sure = np.abs(moved_m) > noise_m
+    by_reference = along.kind == REFERENCE
+    if has_odometer:
+        # Not over a turn: the odometer knows best when that was.
+        turned, _, _ = _moved_m(at_ns, direction.astype(np.float64), along.half_m, config.turn_s)
+        sure &= by_reference & (turned == 0.0)
+    rows = np.flatnonzero(sure)
+    if rows.size == 0:
+        return direction
+    last = rows[np.maximum(np.searchsorted(rows, np.arange(at_ns.size), side="right") - 1, 0)]
+    sense = np.sign(moved_m[last]).astype(np.int64)
+    if not has_odometer:
+        return sense
+    # An odometer that agreed with the reference then goes on to agree, and one that did not does not.
+    return direction * np.where(by_reference, sense * direction[last], 1)
+
+
+def moving(
+    at_ns: Ints, reference_m: Floats, half_m: Floats, steps: OdometerSteps, stood: Bools, config: Configuration
+) -> pl.Series:
+    """Per epoch whether the train moves to the next one, null where neither reference nor odometer knows.
+
+    By the reference (`reference_m` +- `half_m`) it moves where it comes farther over a second than the dead band and
+    the noise of both places allow; that also counts where the odometer stands (`stood`) or is silent.
+    """
+    moved_m, noise_m, elapsed_s = _moved_m(at_ns, reference_m, half_m, config.align.speed_window_s)
+    with np.errstate(invalid="ignore"):
+        by_reference = np.abs(moved_m) > config.matching.deadband_mps * elapsed_s + noise_m
+    moves = by_reference | (steps.moves & steps.counts)
+    sure = np.isfinite(moved_m) | (steps.counts & ~stood)
+    frame = pl.DataFrame({"moving": _to_the_next(moves[:-1], at_ns.size), "sure": _to_the_next(sure[:-1], at_ns.size)})
+    return frame.select(pl.when("sure").then("moving")).to_series()
+
+
+def _moved_m(at_ns: Ints, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
+    """Way from each epoch to the one `window_s` later [m], what both places may be off by [m], and the time [s]."""
+    ahead = np.searchsorted(at_ns, at_ns + round(window_s * NS_PER_S)).clip(0, at_ns.size - 1)
+    return place_m[ahead] - place_m, half_m + half_m[ahead], (at_ns[ahead] - at_ns) / NS_PER_S
+
+
+def _to_the_next(steps: Bools, size: int) -> Bools:
+    """What holds from each epoch to the next; the last one stays as it was before."""
+    last = steps[-1:] if steps.size else np.zeros(1, dtype=np.bool_)
+    return np.concatenate([steps, last])[:size]
+
+
+def odometer_wrong(case: Case, train_m: Floats, half_m: Floats) -> Bools:
+    """Epochs at which the distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""
+    epochs = case.solution.epochs
+    odometer_m, accepted_ns = floats(epochs, "odometer_m"), times_ns(case.solution.accepted)
+    return beyond_confidence(times_ns(epochs), odometer_m, train_m, half_m, accepted_ns, case.config.lds)
+
+
+def beyond_confidence(
+    t_ns: Ints, odometer_m: Floats, train_m: Floats, half_m: Floats, accepted_ns: Ints, lds: LdsConfig
+) -> Bools:
+    """The distance counted since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1).
+
+    `train_m` +- `half_m`: path position of the train, NaN where not known; the whole interval has to be beyond.
+    """
+    beyond = np.zeros(t_ns.size, dtype=np.bool_)
+    rows = np.flatnonzero(np.isfinite(odometer_m) & np.isfinite(train_m))
+    last = np.searchsorted(accepted_ns, t_ns[rows], side="right") - 1
+    rows, last = rows[last >= 0], last[last >= 0]
+    if rows.size == 0:
+        return beyond
+    since = (t_ns[rows] - t_ns[rows[0]]).astype(np.float64)
+    accepted = (accepted_ns[last] - t_ns[rows[0]]).astype(np.float64)
+    odometer_then_m, train_then_m, half_then_m = (
+        np.interp(accepted, since, values[rows]) for values in (odometer_m, train_m, half_m)
+    )
+    counted_m = odometer_m[rows] - odometer_then_m
+    driven_m = train_m[rows] - train_then_m
+    allowed_m = lds.odometer_fixed_m + lds.odometer_share * np.abs(counted_m) + half_m[rows] + half_then_m
+    beyond[rows] = np.abs(counted_m - driven_m) > allowed_m
+    return beyond
+
+
+def speed_at(epochs: pl.DataFrame, t_ns: Ints) -> Floats:
+    """Speed [m/s] by the epochs around each instant; NaN where no epoch knows it."""
+    speed_mps, stamps_ns = np.abs(floats(epochs, "speed_mps")), times_ns(epochs)
+    known = np.isfinite(speed_mps)
+    if not known.any():
+        return np.full(t_ns.size, np.nan)
+    at_s, stamps_s = ((values - stamps_ns[0]) / NS_PER_S for values in (t_ns, stamps_ns[known]))
+    return np.asarray(np.interp(at_s, stamps_s, speed_mps[known]))
