@@ -83,8 +83,7 @@ def watched_of(offset_m: Floats, sigmas_m: Floats, alphas: Floats) -> Watched:
         decorrelation=np.tile(-np.expm1(-1.0 / TAUS_S), (size, 1)),
         white_m2=_ODOMETER_M**2 * second,
         border_m2=zero,
-        steady_mps=zero,
-        latency_mps=zero,
+        lasting_mps=np.zeros((zero.size, 0)),
     )
     value, sigma, _ = run_axis(series, alphas)
     limit = np.where(fresh[:, None], np.inf, threshold_factor(_PROBABILITY) * sigma)

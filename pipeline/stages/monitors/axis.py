@@ -32,13 +32,12 @@ FIRST_BLOCK, BLOCK = 2048, 8192
 class AxisSeries:
     """Increments of one axis, one row per usable epoch, in order; all arrays of the same length m.
 
-    `epoch`: index of the row among all epochs. `fresh`: no increment leads here (start, long gap, lost distance).
-    `rate_mps`: increment of GNSS minus odometer or track over `dt_s`. `border`: the increment crosses into another
-    net element, whose survey offset is another (`border_m2`, its variance). `sigma_m`, `sigma_before_m` and
-    `decorrelation` (m, sources): sqrt R_j here and at the row before (see `before_steps`), and
-    1 - phi_j. `white_m2`: odometer noise of
-    the increment. `steady_mps`, `latency_mps`: what one sigma of an error that stays (odometer scale; the position
-    error that a curve turns into this axis) and of the latency makes of the rate, signed.
+    `epoch`: row among all epochs. `fresh`: no increment leads here (start, long gap, lost distance). `rate_mps`:
+    increment of GNSS minus odometer or track over `dt_s`. `border`: it crosses into another net element, whose survey
+    has another offset, of variance `border_m2`. `sigma_m`, `sigma_before_m`, `decorrelation` (m, sources): sqrt R_j
+    here and at the row before (`before_steps`), 1 - phi_j. `white_m2`: odometer noise of the increment. `lasting_mps`
+    (m, errors): what one sigma of each error that stays makes of the rate, signed: scale and latency of the odometer,
+    the position error that a curve turns into this axis.
     """
 
     epoch: Ints
@@ -51,8 +50,7 @@ class AxisSeries:
     decorrelation: Floats
     white_m2: Floats
     border_m2: Floats
-    steady_mps: Floats
-    latency_mps: Floats
+    lasting_mps: Floats
 
     def between(self, low: int, high: int) -> AxisSeries:
         """Rows [low, high)."""
@@ -100,7 +98,7 @@ def run_axis(
     """
     noise_m2 = np.zeros((series.dt_s.size, 1 + alphas.size)) if noise_m2 is None else noise_m2
     known_m2 = np.nan_to_num(noise_m2)
-    state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1])
+    state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1], series.lasting_mps.shape[1])
     moving = ~series.fresh
     weight = ewma_weight(alphas, series.dt_s) * moving[:, None]
     keep = (1.0 - weight) * moving[:, None]
@@ -108,34 +106,25 @@ def run_axis(
     errors = series.sigma_m, series.sigma_before_m, series.decorrelation
     increment_m2 = increment_variance(*errors) + series.white_m2
     variance, smooth = variance_of_ewma(keep, gain, *errors, increment_m2, series.white_m2, state)
+    noise, fast = noise_of_ewma(keep, gain, known_m2[:, 1:], state)
     # A step between the surveys of two elements is no motion of the GNSS error: only the raw monitor, with the
     # survey's sigma, judges it; inside the EWMAs it would ring for long.
     smooth_rate = np.where(series.border, 0.0, series.rate_mps)
     ewma = linear_recurrence(keep, weight * smooth_rate[:, None], state.ewma)
-    steady = _response(keep, weight, series.steady_mps, state.steady_response)
-    latency = _response(keep, weight, series.latency_mps, state.latency_response)
-    raw_variance = _raw_variance(series, increment_m2)
-    raw_noise = 2.0 * known_m2[:, 0] / series.dt_s**2
-    noise, fast = noise_of_ewma(keep, gain, known_m2[:, 1:], state)
-    sigma = np.sqrt(np.column_stack([raw_variance + raw_noise, variance + noise + steady**2 + latency**2]))
+    lasting = zip(series.lasting_mps.T, state.lasting, strict=True)
+    responses = [linear_recurrence(keep, weight * rate_mps[:, None], before) for rate_mps, before in lasting]
+    averaged_m2 = variance + noise + sum(response**2 for response in responses)
+    raw_m2 = _raw_variance(series, increment_m2 + 2.0 * known_m2[:, 0])
+    sigma = np.sqrt(np.column_stack([raw_m2, averaged_m2]))
     sigma[np.isnan(noise_m2)] = np.nan
-    value = np.column_stack([series.rate_mps, ewma])
-    carried = AxisState(ewma[-1], *smooth, *fast, steady[-1], latency[-1])
-    return value, sigma, carried
-
-
-def _response(keep: Floats, weight: Floats, rate_mps: Floats, before: Floats) -> Floats:
-    """What one sigma of an error that stays has made of the EWMAs [m/s]; most axes know none."""
-    if not (rate_mps.any() or before.any()):
-        return np.zeros_like(keep)
-    return linear_recurrence(keep, weight * rate_mps[:, None], before)
+    carried = np.array([response[-1] for response in responses]).reshape(state.lasting.shape)
+    return np.column_stack([series.rate_mps, ewma]), sigma, AxisState(ewma[-1], *smooth, *fast, carried)
 
 
 def _raw_variance(series: AxisSeries, increment_m2: Floats) -> Floats:
     """Variance of the raw rate (DIAG eq. 4-7 with correlated GNSS errors) [m^2/s^2]."""
     border = np.where(series.border, series.border_m2, 0.0)
-    noise: Floats = (increment_m2 + border) / series.dt_s**2
-    return noise + series.steady_mps**2 + series.latency_mps**2
+    return np.asarray((increment_m2 + border) / series.dt_s**2 + (series.lasting_mps**2).sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -180,8 +169,9 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
         **errors_of(epochs.sigma_m, dt, beside, config.monitors),
         white_m2=epochs.white_m2_per_s * dt,
         border_m2=zero,
-        steady_mps=epochs.scale_sigma * odometer.distance_m / dt,
-        latency_mps=epochs.latency_sigma_s * odometer.speed_mps / dt,
+        lasting_mps=np.column_stack(
+            [epochs.scale_sigma * odometer.distance_m / dt, epochs.latency_sigma_s * odometer.speed_mps / dt]
+        ),
     )
 
 

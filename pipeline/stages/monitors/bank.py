@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from pipeline.stages.epochs.verdicts import (
@@ -49,99 +48,76 @@ class AxisRecord:
 
 
 class _AxisBank:
-    """One axis of the bank over all epochs of a solution; results are filled up to `_done` rows.
+    """One axis of the bank over all epochs of a solution; rows are evaluated up to `_done`.
 
     `noise_m`: fast noise that the thresholds count with, per epoch and monitor; NaN where not known or no row is.
+    `noise_known`: it is known, and no failure can hide in it; true where the axis has no row.
     """
 
     def __init__(self, axis: Axis, epochs: int, config: Configuration) -> None:
         self.axis = axis
+        self.series = axis.series
+        self._config = config
         self._alphas = np.array(config.monitors.ewma_alphas)
-        self._factor = config.monitors.threshold_factor
-        self._limit_m = config.noise_limit_m
         self._enabled = np.array([f"{axis.name}_{scale}" not in config.monitors.disabled for scale in SCALES])
-        width = len(SCALES)
-        self.value = np.full((epochs, width), np.nan, order="F")
-        self.threshold = np.full((epochs, width), np.nan, order="F")
-        self.state = np.full((epochs, width), NOT_EVALUATED, dtype=np.int8, order="F")
-        self.noise_m = np.full((epochs, width), np.nan, order="F")
+        shape = epochs, len(SCALES)
+        self.value, self.threshold, self.noise_m = (np.full(shape, np.nan, order="F") for _ in range(3))
+        self.state = np.full(shape, NOT_EVALUATED, dtype=np.int8, order="F")
         self.begins = np.zeros(epochs, dtype=np.bool_)
-        self._quiet = np.ones(epochs, dtype=np.bool_)
-        self._series = axis.series
+        self.noise_known = np.ones(epochs, dtype=np.bool_)
         given_m: tuple[float, ...] | None = getattr(config.monitors, f"noise_{axis.name}_m")
-        self.after_outages: Ints = axis.series.epoch[axis.series.dt_s > config.align.gap_reset_s]
         self._meter = NoiseMeter(axis.series, axis.moving, given_m, config)
-        self._done = 0
-        self._block = BLOCK
-        self._carry: AxisState | None = None
-        self._begun: tuple[int, AxisState | None] = 0, None  # the last block, and what it was begun with
+        self._begin_at(0, None, BLOCK)
+
+    def _begin_at(self, row: int, state: AxisState | None, block: int) -> None:
+        """Rows from this one on are evaluated next, from this state of the recursions on."""
+        self._done, self._state, self._block = row, state, block
+        self._last_block = row, state
 
     def advance(self, epoch: int) -> int:
         """Evaluate up to this epoch at least; returns the last epoch that is evaluated now."""
-        rows = self._series.epoch
+        rows = self.series.epoch
         while self._done < rows.size and rows[self._done] <= epoch:
             end = min(self._done + self._block, rows.size)
-            self._begun = self._done, self._carry
-            part, noise_m2 = self._series.between(self._done, end), self._meter.variance_m2(self._done, end)
-            value, sigma, self._carry = run_axis(part, self._alphas, self._carry, noise_m2)
-            self._store(part, value, self._factor * sigma, np.sqrt(noise_m2))
+            self._last_block = self._done, self._state
+            part, noise_m2 = self.series.between(self._done, end), self._meter.variance_m2(self._done, end)
+            value, sigma, self._state = run_axis(part, self._alphas, self._state, noise_m2)
+            self._store(part, value, self._config.monitors.threshold_factor * sigma, np.sqrt(noise_m2))
             self._done, self._block = end, min(2 * self._block, BLOCK)
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats, noise_m: Floats) -> None:
         present = ~part.fresh[:, None] & self._enabled[None, :]
         # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
-        quiet: Bools = np.all((noise_m <= self._limit_m) | ~self._enabled.any(), axis=1)
-        judged = present & quiet[:, None]
+        known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self._enabled.any(), axis=1)
+        judged = present & known[:, None]
         self.state[part.epoch] = states_of(value, threshold, judged)
         self.value[part.epoch] = np.where(present, value, np.nan)
         self.threshold[part.epoch] = np.where(judged, threshold, np.nan)
         self.noise_m[part.epoch] = noise_m
         self.begins[part.epoch] = part.fresh
-        self._quiet[part.epoch] = quiet
+        self.noise_known[part.epoch] = known
 
     def freeze(self, epoch: int) -> None:
-        """Nothing from this epoch on tells of the noise, until a restart. Evaluated anew from the last block on.
+        """No row from this epoch on enters the noise, until a restart; evaluated anew from the last block on.
 
         Noise that is not known yet, or too large, goes on being measured: it would never be known, or smaller.
         """
-        before = int(np.searchsorted(self._series.epoch, epoch, side="right")) - 1
-        if before >= 0 and np.all(self.noise_m[self._series.epoch[before]] <= self._limit_m):
-            self._meter.freeze(int(np.searchsorted(self._series.epoch, epoch)))
-            self._done, self._carry = self._begun
-            self._block = FIRST_BLOCK
-
-    def noise_known(self, part: slice) -> Bools:
-        """Per epoch whether the fast noise is known and no failure can hide in it; true where the axis has no row."""
-        return self._quiet[part]
+        row = int(np.searchsorted(self.series.epoch, epoch))
+        before = int(np.searchsorted(self.series.epoch, epoch, side="right")) - 1
+        if before >= 0 and np.all(self.noise_m[self.series.epoch[before]] <= self._config.noise_limit_m):
+            self._meter.freeze(row)
+            self._begin_at(*self._last_block, FIRST_BLOCK)
 
     def restart(self, epoch: int) -> None:
         """Forget all before this epoch but the noise; the first increment is from the first usable epoch on."""
-        row = int(np.searchsorted(self._series.epoch, epoch))
-        if row < self._series.epoch.size:
-            fresh = self._series.fresh.copy()
-            fresh[row] = True
-            self._series = replace(self._series, fresh=fresh)
+        row = int(np.searchsorted(self.series.epoch, epoch))
+        self.series = replace(self.series, fresh=self.series.fresh | (np.arange(self.series.fresh.size) == row))
         self._meter.restart(row)
-        self._done = row
-        self._carry = None
-        self._begun = row, None
-        self._block = FIRST_BLOCK
-
-    @property
-    def has_rows(self) -> bool:
-        """There is an epoch that the axis can evaluate, or begin at."""
-        return self._series.epoch.size > 0
+        self._begin_at(row, None, FIRST_BLOCK)
 
     def record(self) -> AxisRecord:
-        return AxisRecord(self._series, self.value, self.threshold, self._enabled)
-
-    def noise_reasons(self) -> pl.Series:
-        """Per epoch that the axis has a row of: why its noise lets nothing be evaluated; null where it does."""
-        unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
-        unknown[self._series.epoch] = np.any(np.isnan(self.noise_m[self._series.epoch]), axis=1)
-        too_large: Bools = np.any(self.noise_m > self._limit_m, axis=1)
-        return first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
+        return AxisRecord(self.series, self.value, self.threshold, self._enabled)
 
     def white_noise_m(self) -> float | None:
         """sqrt(4 M / 6) of one epoch at the end; None where it was never known (DOMAIN section 3)."""
@@ -155,39 +131,43 @@ class _AxisBank:
 
     def columns(self) -> list[pl.Series]:
         """Value, threshold, state and reason of each monitor of the axis."""
-        reasons = self.axis.reasons.fill_null(self.noise_reasons()).fill_null(FIRST_EPOCH)
+        unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
+        unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
+        too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
+        of_noise = first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
+        reasons = self.axis.reasons.fill_null(of_noise).fill_null(FIRST_EPOCH)
         columns: list[pl.Series] = []
         for index, scale in enumerate(SCALES):
-            own = reasons if self._enabled[index] else self.axis.reasons.fill_null(DISABLED)
-            said = verdicts(self.value[:, index], self.threshold[:, index], own, self.state[:, index])
-            columns += of_monitor(f"{self.axis.name}_{scale}", said)
+            why = reasons if self._enabled[index] else self.axis.reasons.fill_null(DISABLED)
+            frame = verdicts(self.value[:, index], self.threshold[:, index], why, self.state[:, index])
+            columns += of_monitor(f"{self.axis.name}_{scale}", frame)
         return columns
 
 
 class MonitorBank:
     """The bank as the location determination system sees it: monitors of one solution, from the last restart on.
 
-    Epochs are rows of the solution's epochs. The answers for an epoch may change with `restart` at that epoch or before
-    it, never through later ones. `single` are monitors without memory beyond an epoch, evaluated beforehand: frames
-    `value, threshold, state, reason` by monitor name. A fail of any monitor at an epoch is an alarm.
+    Epochs are rows of the solution's epochs. The answers for an epoch may change with `freeze` or `restart` at that
+    epoch or before it, never through later ones. `single`: monitors without memory beyond an epoch, evaluated
+    beforehand, `value, threshold, state, reason` by name. A fail of any monitor at an epoch is an alarm.
     """
 
     def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration):
-        count = epochs.height
+        self._count = epochs.height
         disabled = config.monitors.disabled
-        self._axes = tuple(_AxisBank(axis, count, config) for axis in axes_of(epochs, config))
-        self._single = {
-            name: no_verdicts(count, DISABLED) if name in disabled else frame for name, frame in single.items()
-        }
         self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in config.monitors.ewma_alphas)])
-        self._single_fails = np.zeros(count, dtype=np.bool_)
-        for frame in self._single.values():
-            self._single_fails |= (frame["state"] == MonitorState.FAIL.value).to_numpy()
-        self._any = np.zeros(count, dtype=np.bool_)
-        self._stops = np.zeros(count, dtype=np.bool_)
-        self._fast = np.zeros(count, dtype=np.bool_)
-        self._along = np.zeros(count, dtype=np.bool_)
-        self._noise_known = np.zeros(count, dtype=np.bool_)
+        self._axes = tuple(_AxisBank(axis, self._count, config) for axis in axes_of(epochs, config))
+        along, across, _ = self._axes
+        # In a run without an odometer the axis across the track has to say where the bank begins.
+        self._begins = (along if along.series.epoch.size else across).begins
+        self._noise_known = along.noise_known
+        self.after_outages: Ints = along.series.epoch[along.series.dt_s > config.align.gap_reset_s]
+        self._single = {
+            name: no_verdicts(self._count, DISABLED) if name in disabled else frame for name, frame in single.items()
+        }
+        fails = [(frame["state"] == MonitorState.FAIL.value).to_numpy() for frame in self._single.values()]
+        self._single_fails = np.logical_or.reduce([np.zeros(self._count, dtype=np.bool_), *fails])
+        self._any, self._stops, self._fast, self._along = (np.zeros(self._count, dtype=np.bool_) for _ in range(4))
         self._known_to = -1
 
     def _look(self, epoch: int) -> None:
@@ -196,13 +176,14 @@ class MonitorBank:
         begin = self._known_to + 1
         self._known_to = min(axis.advance(epoch) for axis in self._axes)
         part = slice(begin, self._known_to + 1)
-        fails = [axis.state[part] == FAIL for axis in self._axes]
-        self._any[part] = np.logical_or.reduce([fail.any(axis=1) for fail in fails]) | self._single_fails[part]
-        self._noise_known[part] = self._axes[0].noise_known(part)
-        self._stops[part] = self._any[part] | self._watching.begins[part] | ~self._noise_known[part]
-        fast = np.logical_or.reduce([fail[:, :2].any(axis=1) for fail in fails])
-        self._fast[part] = fast | self._single_fails[part]
+        fails = np.logical_or.reduce([axis.state[part] == FAIL for axis in self._axes])
+        self._any[part] = fails.any(axis=1) | self._single_fails[part]
+        self._fast[part] = fails[:, :2].any(axis=1) | self._single_fails[part]
+        self._stops[part] = self._any[part] | self._begins[part] | ~self._noise_known[part]
         self._along[part] = self._axes[0].state[part, 0] != NOT_EVALUATED
+
+    def _look_to_the_end(self) -> None:
+        self._look(self._count - 1)
 
     def failed(self, epoch: int) -> bool:
         """Any monitor of the bank fails at this epoch."""
@@ -239,40 +220,19 @@ class MonitorBank:
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
-    def along_evaluated_between(self, epoch: int, end: int) -> npt.NDArray[np.bool_]:
+    def along_evaluated_between(self, epoch: int, end: int) -> Bools:
         """`along_evaluated` of the epochs [epoch, end), none of them beyond what `quiet_until` answered."""
         return self._along[epoch:end]
 
-    @property
-    def noise_known(self) -> Bools:
-        """Per epoch whether the fast noise along the track is known and no failure can hide in it.
-
-        To be asked once the LDS has walked to the end of the run.
-        """
-        if self._any.size:
-            self._look(self._any.size - 1)
-        return self._noise_known
-
     def noise_known_at(self, epoch: int) -> bool:
-        """The fast noise along the track is known at this epoch, by what was before it."""
+        """The fast noise along the track is known at this epoch, and no failure can hide in it."""
         self._look(epoch)
         return bool(self._noise_known[epoch])
-
-    @property
-    def after_outages(self) -> Ints:
-        """The first epochs along the track after gaps that the bank does not bridge (`gap_reset_s`)."""
-        return self._axes[0].after_outages
 
     def begins_at(self, epoch: int) -> bool:
         """The bank begins here: at the start, after a gap, after lost distance or at a restart; nothing leads here."""
         self._look(epoch)
-        return bool(self._watching.begins[epoch])
-
-    @property
-    def _watching(self) -> _AxisBank:
-        """The axis along the track, or, in a run without an odometer, the one across it."""
-        along, across, _ = self._axes
-        return along if along.has_rows else across
+        return bool(self._begins[epoch])
 
     def freeze(self, epoch: int) -> None:
         """The position is negated from this epoch on: until the next restart nothing enters the measured noise."""
@@ -288,8 +248,7 @@ class MonitorBank:
 
     def along(self) -> AxisRecord:
         """What the monitors along the track saw, once the LDS has walked to the end of the run."""
-        if self._any.size:
-            self._look(self._any.size - 1)
+        self._look_to_the_end()
         return self._axes[0].record()
 
     def white_noise(self) -> dict[str, float | None]:
@@ -298,14 +257,12 @@ class MonitorBank:
 
     def median_noise_m(self) -> dict[str, tuple[float, ...]]:
         """`noise_*_m` of the configuration, as this run shows them; axes whose noise was never known are left out."""
-        if self._any.size:
-            self._look(self._any.size - 1)
+        self._look_to_the_end()
         shown = {f"noise_{axis.axis.name}_m": axis.median_noise_m() for axis in self._axes}
         return {name: noise_m for name, noise_m in shown.items() if noise_m}
 
     def columns(self) -> list[pl.Series]:
         """All monitor columns of the epochs table but those of the linking monitors."""
-        if self._any.size:
-            self._look(self._any.size - 1)
+        self._look_to_the_end()
         columns = [column for axis in self._axes for column in axis.columns()]
         return columns + [column for name, frame in self._single.items() for column in of_monitor(name, frame)]

@@ -189,8 +189,7 @@ class _Sampler:
         self._piece = np.cumsum(series.fresh | unknown)  # one number for rows that increments lead through
         self._offset_m = np.cumsum(np.where(series.border | unknown, 0.0, series.rate_mps) * series.dt_s)
         self._white_m2 = np.cumsum(series.white_m2)
-        staying_mps = [rate_mps for rate_mps in (series.steady_mps, series.latency_mps) if rate_mps.any()]
-        self._staying_m = [np.cumsum(rate_mps * series.dt_s) for rate_mps in staying_mps]
+        self._lasting_m = [np.cumsum(rate_mps * series.dt_s) for rate_mps in series.lasting_mps.T if rate_mps.any()]
 
     def over(self, lag_s: float) -> _Samples:
         config = self._config
@@ -239,8 +238,8 @@ class _Sampler:
             earlier = np.exp(age[rows.oldest] - age[rows.middle])
             variance_m2 = series.sigma_m[rows.last, source] ** 2
             model_m2 += variance_m2 * (6.0 - 4.0 * (later + earlier) + 2.0 * later * earlier)
-        for staying_m in self._staying_m:
-            model_m2 += rows.second_difference(staying_m) ** 2
+        for lasting_m in self._lasting_m:
+            model_m2 += rows.second_difference(lasting_m) ** 2
         return np.asarray(model_m2 + self._white_m2[rows.last] - self._white_m2[rows.oldest])
 
 

@@ -45,7 +45,8 @@ def ewma_weight(alpha: Floats, dt_s: Floats) -> Floats:
 class AxisState:
     """What the recursions of one axis carry on; all zero at a restart. Shapes (alphas,), (alphas, sources).
 
-    `noise_variance`, `noise_covariance`: of the noise that each average has of its own.
+    `noise_variance`, `noise_covariance`: of the noise that each average has of its own; `lasting` (errors, alphas):
+    what one sigma of each error that stays has made of the averages.
     """
 
     ewma: Floats
@@ -53,13 +54,12 @@ class AxisState:
     covariance: Floats
     noise_variance: Floats
     noise_covariance: Floats
-    steady_response: Floats
-    latency_response: Floats
+    lasting: Floats
 
     @classmethod
-    def at_restart(cls, alphas: int, sources: int) -> AxisState:
+    def at_restart(cls, alphas: int, sources: int, lasting: int = 0) -> AxisState:
         zero = np.zeros(alphas)
-        return cls(zero, zero, np.zeros((alphas, sources)), zero, zero, zero, zero)
+        return cls(zero, zero, np.zeros((alphas, sources)), zero, zero, np.zeros((lasting, alphas)))
 
 
 def variance_of_ewma(

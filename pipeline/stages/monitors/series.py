@@ -116,14 +116,13 @@ class _Builder:
             **errors_of(self._column(sigma, rows), dt, beside, self._config.monitors),
             white_m2=zero,
             border_m2=2.0 * survey**2,
-            steady_mps=self._turned_mps(rows) if position == "cross_track_m" else zero,
-            latency_mps=zero,
+            lasting_mps=self._turned_mps(rows) if position == "cross_track_m" else np.zeros((rows.size, 0)),
         )
 
     def _turned_mps(self, rows: Ints) -> Floats:
-        """What one sigma of the error along the track makes across it while a curve turns the axes [m/s]."""
+        """What one sigma of the error along the track makes across it while a curve turns the axes [m/s]; (rows, 1)."""
         turning = self._column("curvature_per_m", rows) * self._column("speed_mps", rows)
-        return np.nan_to_num(turning) * self._column("calibrated_along_m", rows)
+        return (np.nan_to_num(turning) * self._column("calibrated_along_m", rows))[:, None]
 
     def _wander(self, rows: Ints) -> Source:
         """How the survey's error changes along the elements [m], and its decorrelation over the way of each step.

@@ -33,8 +33,7 @@ def series_of(offset_m: Floats, period_s: float = 1.0, sigma_m: float = 0.0) -> 
         **errors_of(np.full(count, sigma_m), dt_s, [], CONFIG.monitors),
         white_m2=nothing,
         border_m2=nothing,
-        steady_mps=nothing,
-        latency_mps=nothing,
+        lasting_mps=np.zeros((count, 0)),
     )
 
 
@@ -76,8 +75,8 @@ def test_what_the_model_knows_is_not_counted_twice() -> None:
 
 def test_unknown_for_thirty_seconds_and_said_so() -> None:
     bank = MonitorBank(epochs_of(Receiver(), 0.1, np.random.default_rng(1)), {}, CONFIG)
-    known = bank.noise_known
-    assert known.tolist() == [False] * 30 + [True] * 330
+    known = [bank.noise_known_at(epoch) for epoch in range(360)]
+    assert known == [False] * 30 + [True] * 330
     reasons = pl.DataFrame(bank.columns())["along_raw_reason"]
     assert reasons.to_list() == [NOISE_UNKNOWN] * 30 + [None] * 330
 
@@ -85,7 +84,7 @@ def test_unknown_for_thirty_seconds_and_said_so() -> None:
 def test_no_verdict_where_noise_hides_a_failure() -> None:
     bank = MonitorBank(epochs_of(Receiver(white_m=3.0), 0.1, np.random.default_rng(1)), {}, CONFIG)
     assert pl.DataFrame(bank.columns())["along_raw_reason"][40:].unique().to_list() == [NOISE_TOO_LARGE]
-    assert not bank.noise_known.any()
+    assert not bank.noise_known_at(200)
 
 
 def test_given_noise_holds_from_the_first_epoch_and_replaces_what_is_measured() -> None:
@@ -141,7 +140,7 @@ def test_an_alarm_before_the_noise_is_known_freezes_nothing() -> None:
     bank = MonitorBank(epochs_of(Receiver(white_m=0.1), 0.1, np.random.default_rng(4)), {}, CONFIG)
     bank.failed(5)
     bank.freeze(5)
-    assert bank.noise_known[30:].all()
+    assert bank.noise_known_at(30)
 
 
 def test_a_stand_is_no_sample() -> None:

@@ -206,8 +206,7 @@ def test_an_axis_goes_on_from_where_it_stopped(first):
         **errors_of(dice.uniform(0.5, 3.0, count), dt_s, [], MonitorConfig()),
         white_m2=0.0025 * dt_s,
         border_m2=zero,
-        steady_mps=dice.uniform(0.1, 1.0, count),
-        latency_mps=dice.normal(size=count),
+        lasting_mps=np.column_stack([dice.uniform(0.1, 1.0, count), dice.normal(size=count)]),
     )
     value, sigma, _ = run_axis(series, ALPHAS)
     *before, state = run_axis(series.between(0, first), ALPHAS)
@@ -229,8 +228,7 @@ def test_where_a_block_ends_leaves_the_sigmas_as_they_are():
         **errors_of(np.full(count, 1e-3), dt_s, [], MonitorConfig()),
         white_m2=zero,
         border_m2=zero,
-        steady_mps=zero,
-        latency_mps=zero,
+        lasting_mps=np.zeros((zero.size, 0)),
     )
     alphas, noise_m2 = np.array([0.3]), np.tile(np.where(np.arange(count) < 6, 4.0, 0.04)[:, None], (1, 2))
     whole = run_axis(series, alphas, None, noise_m2)[1]
