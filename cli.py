@@ -32,8 +32,8 @@ OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
 app = Typer(
     name="balise",
     help="Replay recorded train journeys and judge whether satellite positioning could have replaced balises.",
-    epilog="Exit status: 0 ok; 1 a run failed or is partial, or results differ; 2 wrong usage, configuration or site; "
-    "3 defect of the program; 129, 130, 143 interrupted. --debug shows the traceback of an error.",
+    epilog="Exit status: 0 ok; 1 a run failed or is partial, results differ, or --fail-on; 2 wrong usage, "
+    "configuration or site; 3 defect of the program; 129, 130, 143 interrupted. --debug shows the traceback.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
@@ -116,6 +116,9 @@ def replay(
     time_limit: Annotated[float, Option(min=0.1, help="Seconds that one run may take; a slower run fails.")] = 3600.0,
     undetected: Annotated[bool, Option("--undetected", help="Also the largest error no monitor would notice.")] = False,
     calibrate: Annotated[list[str] | None, Option(metavar="RUNS|auto", help=_CALIBRATE)] = None,
+    fail_on: Annotated[
+        Literal["unsafe", "unproven"] | None, Option(help="Exit status 1 also for this verdict, and for worse ones.")
+    ] = None,
     quiet: Quiet = False,
     as_json: Annotated[bool, Option("--json", help="JSON: progress on standard error, then the result.")] = False,
 ) -> None:
@@ -144,7 +147,9 @@ def replay(
             print("balise: interrupted; repeat the command to continue", file=sys.stderr)
         raise Exit(128 + interrupted.signum) from None
     show_summary(summary, out, quiet, as_json, **places)
-    raise Exit(DEFECT if summary.defects else OK if summary.all_ok else RUNS_NOT_OK)
+    refused = {"unsafe": ["unsafe"], "unproven": ["unsafe", "unproven"]}.get(fail_on or "", [])
+    acceptable = summary.all_ok and not any(summary.head.counts()[verdict] for verdict in refused)
+    raise Exit(DEFECT if summary.defects else OK if acceptable else RUNS_NOT_OK)
 
 
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:

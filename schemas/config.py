@@ -454,6 +454,9 @@ class HazardConfig(Settings):
     evidence_clock_s: Positive = 0.1
     # A train that brakes by 1 m/s2 leaves a straight line by 0.5 m in 2 s.
     reference_gap_s: Positive = 2.0
+    # Behind an open end a track may go on unsurveyed: sidings are as long as the longest trains (740 m on the TEN-T
+    # network, Regulation (EU) 2024/1679) and their switches.
+    open_end_m: NonNegative = 1000.0
     # If no way between two known places is within the odometer's confidence, ways that differ from its distance by no
     # more than this are taken: slip may be that large. A limit of the search: beyond it position and track are unknown.
     slip_m: NonNegative = 200.0

@@ -84,6 +84,12 @@ def test_quiet_says_what_failed_and_nothing_else(balise: Balise, small_trial: Sm
     assert "bad.mcap" in line
 
 
+def test_a_verdict_that_is_refused_is_the_exit_status(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
+    replayed = ("replay", small_trial.paths[0], "--site", small_trial.site, "--out", tmp_path, "--quiet")
+    # Without vehicle file, reference and reads the run is unproven; the second call only looks at what is there.
+    assert [balise(*replayed, "--fail-on", name).status for name in ("unproven", "unsafe")] == [1, 0]
+
+
 def test_replay_as_json(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"")
     said = balise(

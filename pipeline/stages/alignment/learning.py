@@ -22,9 +22,9 @@ from pipeline.stages.monitors.axis import (
 )
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.monitors.recursion import AxisState
-from pipeline.stages.odometry.drift import drift_m2, relink_bound_m
 from pipeline.stages.odometry.driven import under_way
 from pipeline.stages.odometry.odometry import Odometry
+from pipeline.stages.odometry.recovery import RecoveryRule
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, Vehicle
 
@@ -34,8 +34,7 @@ def learn(
 ) -> Estimates:
     """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only.
 
-    `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `usable`: those on the track; `jitter_s`: see
-    `stamp_jitter_s`.
+    `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `usable`: those on the track.
     """
     prior = prior_of(vehicle, config.align)
     learned = prior.over(positions.height)
@@ -50,13 +49,11 @@ def learn(
 
 
 class _Learner:
-    """Runs the filter along the run and freezes it under alarm of the along-track monitors.
+    """Runs the filter along the run, once the noise is known, and freezes it under alarm of the along-track monitors.
 
-    Estimates in use at an epoch come from epochs before it. From the first failing epoch on they stand still until
-    the raw and fastest monitors have been quiet for `recovery_s` and GNSS minus odometer is back where it was
-    before the alarm (DOMAIN section 3 and 4); a fault that persists is never learned as scale. Nor is an offset that
-    a position brings back from a break or an alarm, or its decay: see `ScaleLatencyFilter.resume`. Learning begins when
-    the noise is known, without which nobody could say what an alarm is.
+    From the first failing epoch on the estimates stand still until the rule of recovery holds (`RecoveryRule`), so that
+    a fault that persists is never learned as scale; nor is an offset that a position brings back from a break or an
+    alarm, or its decay (`ScaleLatencyFilter.resume`).
     """
 
     def __init__(
@@ -74,13 +71,14 @@ class _Learner:
         self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
         self._alphas = np.array(config.monitors.ewma_alphas)
         self._factor, self._limit_m = config.monitors.threshold_factor, config.hazards.failure_limit_m
+        self._rule = RecoveryRule(config)
         # Latencies of five sigmas have to find a known distance too.
         margin_ns, t_ns = round(5e9 * config.align.latency_prior_sigma_s), times_ns(positions)
         self._rows = np.flatnonzero(usable & odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns))
-        self._path_m, self._own_m, self._digits_m = (
+        self._path_m, self._calibrated_m, self._digits_m = (
             floats(positions, name)[self._rows] for name in ("along_m", "calibrated_along_m", "digits_along_m")
         )
-        self._sigma_m = np.hypot(self._own_m, self._digits_m)
+        self._sigma_m = np.hypot(self._calibrated_m, self._digits_m)
         t_s = odometry.seconds(t_ns)
         self._t_ns, self._t_s = t_ns[self._rows], t_s[self._rows]
         self._segment = odometry.segment_at_s(self._t_s)
@@ -201,7 +199,7 @@ class _Learner:
             t_s=self._t_s[part],
             along_m=self._path_m[part],
             segment=self._odometry.segment_at_s(at_s),
-            sigma_m=self._own_m[part],
+            sigma_m=self._calibrated_m[part],
             digits_m=self._digits_m[part],
             jitter_s=self._jitter_s,
             scale_sigma=in_use.scale_sigma,
@@ -237,8 +235,8 @@ class _Learner:
             failed_s = np.maximum.accumulate(np.where(failing, t_s, failed_s[-1]))
             away_m = away_m[-1] + np.cumsum(series.rate_mps * series.dt_s)
             variance_m2 = self._drift_m2(begin, position, end, scale_sigma)
-            near = np.abs(away_m) <= relink_bound_m(variance_m2, self._factor, self._limit_m)
-            back = np.flatnonzero(near & (t_s - failed_s >= self._config.lds.recovery_s))
+            near = np.abs(away_m) <= self._rule.bound_m(variance_m2)
+            back = np.flatnonzero(near & self._rule.is_quiet(t_s - failed_s))
             if back.size:
                 first = int(back[0])
                 return position + first, float(away_m[first] ** 2 + variance_m2[first])
@@ -249,13 +247,9 @@ class _Learner:
         """By how much GNSS minus odometer moves from the anchor to these positions without a fault [m^2]."""
         sigma_m, t_ns = self._sigma_m, self._t_ns
         way_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
-        return drift_m2(
-            sigma_m[anchor] ** 2 + sigma_m[begin:end] ** 2,
-            self._t_s[begin:end] - self._t_s[anchor],
-            np.cumsum(way_m),
-            self._config.monitors.odometer_sigma_mps,
-            max(scale_sigma, self._vehicle.odometer_scale_sigma or 0.0),
-        )
+        positions_m2 = sigma_m[anchor] ** 2 + sigma_m[begin:end] ** 2
+        elapsed_s, sigma_scale = self._t_s[begin:end] - self._t_s[anchor], self._vehicle.odometer_scale_sigma or 0.0
+        return self._rule.variance_m2(positions_m2, elapsed_s, np.cumsum(way_m), max(scale_sigma, sigma_scale))
 
 
 def _gaps_before(at_s: Floats, t_s: Floats, gap_s: float) -> Ints:

@@ -27,7 +27,7 @@ from schemas.config import AlignConfig, Vehicle
 
 
 class Estimates(NamedTuple):
-    """Scale (true over odometer distance) and latency [s] with their standard deviations: of one, or epoch by epoch."""
+    """Scale (true over odometer distance) and latency [s] with standard deviations, at an instant or epoch by epoch."""
 
     scale: Floats
     scale_sigma: Floats
@@ -36,11 +36,9 @@ class Estimates(NamedTuple):
 
     @classmethod
     def of(cls, scale: float, scale_sigma: float, latency_s: float, latency_sigma_s: float) -> Estimates:
-        """One of each."""
         return cls(*(np.asarray(value) for value in (scale, scale_sigma, latency_s, latency_sigma_s)))
 
     def over(self, epochs: int) -> Estimates:
-        """The same at so many epochs."""
         return Estimates(*(np.full(epochs, value) for value in self))
 
     def at(self, rows: Ints) -> Estimates:
@@ -54,11 +52,9 @@ class Estimates(NamedTuple):
 
 
 def stamp_jitter_s(t_s: Floats, clock_periods: float) -> float:
-    """Standard deviation of the stamps about a regular clock [s].
+    """Standard deviation of the stamps about a regular clock [s]; steps of more than `clock_periods` are left out.
 
-    A receiver measures at regular times; a recorder that stamps on receipt scatters them, and at 40 m/s ten
-    milliseconds are 0.4 m from one epoch to the next. Only the stamps are looked at, never a position. Steps of more
-    than `clock_periods` tell nothing.
+    A recorder that stamps on receipt scatters them: at 40 m/s ten milliseconds are 0.4 m from one epoch to the next.
     """
     dt = np.diff(t_s)
     period = float(np.median(dt))
@@ -77,8 +73,7 @@ _CERTAIN = 100.0
 class FilterState(NamedTuple):
     """State of (offset, scale error, latency, e_j...) at a time and from an odometer origin.
 
-    `joint` holds the covariance and, as its last column, the mean: shape (states, states + 1). `unsettled_m2`: the
-    variance that the offset has still to walk until a position that came back has settled.
+    `joint`: covariance and, as last column, mean, (states, states + 1). `unsettled_m2`: the offset has still to walk.
     """
 
     joint: Floats
@@ -123,8 +118,7 @@ class ScaleLatencyFilter:
     ) -> FilterState:
         """The state at the first position after a break, before anything is learned from it.
 
-        Whether it came back beside its place, by up to about `limit_m`, it tells itself, as far as the odometer does.
-        The offset may have moved so far, and may move so far again while the position settles.
+        The offset may have moved by about `limit_m`, as far as the position shows, and as much again as it settles.
         """
         joint, row = np.empty_like(state.joint), self._rows(np.array([sigma_m]))[0]
         left_m2 = self._unsettled_m2(state, t_s)
@@ -144,10 +138,7 @@ class ScaleLatencyFilter:
         return state._replace(joint=joint, t_s=t_s, unsettled_m2=self._unsettled_m2(state, t_s))
 
     def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: float) -> Floats:
-        """The joint state after each of these epochs, shape (epochs, states, states + 1).
-
-        Times [s], GNSS path positions and their sigmas, shapes (epochs,); `jitter_s`: how the stamps scatter.
-        """
+        """The joint state after each of these epochs, (epochs, states, states + 1)."""
         joints = np.empty((t_s.size, *state.joint.shape))
         times_s, rows = t_s.tolist(), self._rows(sigma_m)
         steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
@@ -181,8 +172,7 @@ class ScaleLatencyFilter:
     def _seen(self, joint: Floats, row: Floats, now_s: float, place_m: float, origin_m: float) -> tuple[Floats, float]:
         """Covariance of the states with what is observed and, as its last, how far the states miss it; the speed.
 
-        Completes `row`. The miss is all but the latency, about whose mean the distance was read, and the scale's own
-        way.
+        Completes `row`. The distance was read at the mean of the latency, so its part of the miss is added.
         """
         scale, latency_s = 1.0 + joint.item(_SCALE, -1), joint.item(_LATENCY, -1)
         way_m, speed_mps = self._odometer_at(now_s - latency_s, origin_m)
@@ -201,11 +191,7 @@ class ScaleLatencyFilter:
         return state.unsettled_m2 * math.exp((state.t_s - t_s) / self.config.settling_tau_s)
 
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
-        """Way from the origin [m] and speed [m/s].
-
-        The speed is centred, but at the ends of the odometer: one from the same odometer noise as the innovation would
-        bias the latency upwards.
-        """
+        """Way from the origin [m] and speed [m/s], as `Odometry.reading_at_s` of one instant, several times faster."""
         times_s, span_s = self.odometry.t_s, self.config.latency_span_s
         begin_s, end_s = max(at_s - span_s, times_s.item(0)), min(at_s + span_s, times_s.item(-1))
         before, distance, after = np.interp((begin_s, at_s, end_s), times_s, self.odometry.distance_m).tolist()

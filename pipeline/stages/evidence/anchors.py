@@ -1,4 +1,4 @@
-"""What is known by itself: balise reads, and the reference on every track that it may have run along."""
+"""Anchors: balise reads, and the reference on every track along which it may have run."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _EVEN_S = 2.0
 
 @dataclass(frozen=True)
 class KnownPath:
-    """A way of the reference as evidence, per sample: leg, and least and largest coordinate on it [m].
+    """One path of the reference: per sample the coordinate and its least and largest value [m].
 
-    `sense`: +1 where the odometer counts up as the coordinate grows, else -1. `step_m`: size of the step that every
-    odometer contradicts between a sample and the next, else 0: in between the reference may be on either side of it.
+    `sense`: +1 where the odometer counts up as the coordinate grows, else -1. `step_m`: size of a step to the next
+    sample that every odometer contradicts, else 0; in between the train may be on either side.
     """
 
     path: ReferencePath
@@ -54,7 +54,7 @@ class KnownStretch:
     paths: tuple[KnownPath, ...]
 
     def anchor(self, sample: int) -> Anchor:
-        """The places of one sample; what a step of the reference left open counts as its clock."""
+        """The places of one sample; what a step left open widens it like the clock."""
         open_m = max(float((one.high_m - one.low_m)[sample]) for one in self.paths)
         return Anchor(
             t_ns=int(self.t_ns[sample]),
@@ -65,15 +65,17 @@ class KnownStretch:
         )
 
     def ends(self, counter: Counter | None) -> tuple[Anchor, Anchor]:
-        """The outermost samples at which the odometer counted, for only from these can a place be carried."""
-        counted = np.flatnonzero(counter.odometer.known_at(self.t_ns)) if counter is not None else np.zeros(0, np.int64)
-        first, last = (int(counted[0]), int(counted[-1])) if counted.size else (0, self.t_ns.size - 1)
-        return self.anchor(first), self.anchor(last)
+        """The outermost samples at which the odometer counted: only from these is a place carried."""
+        ends = np.array([0, self.t_ns.size - 1])
+        if counter is not None:
+            counted = np.flatnonzero(counter.odometer.known_at(self.t_ns))
+            ends = counted if counted.size else ends
+        return self.anchor(int(ends[0])), self.anchor(int(ends[-1]))
 
 
 @dataclass(frozen=True)
 class Sided:
-    """A stretch with the sense of its first way, and what the odometer says of that: m counted with it and against."""
+    """A stretch with the sense of its first path: metres that the odometer counted with it and against it."""
 
     stretch: Stretch
     sense: int
@@ -89,21 +91,19 @@ class Sided:
 
 
 def sided(stretch: Stretch, counter: Counter | None, least_m: float) -> Sided:
-    """Which way the odometer counts along the coordinate: by the first movement of `least_m` (DOMAIN section 2)."""
+    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
     path = stretch.paths[0]
-    at_m = path.at_m
     rows = _every(stretch.t_ns, 1.0)
-    step_m = np.where(np.diff(path.leg[rows]) == 0, np.diff(at_m[rows]), 0.0)
-    if counter is None:
-        counted_m = np.abs(step_m)
-    else:
-        counted_m = np.nan_to_num(counter.between(stretch.t_ns[rows[:-1]], stretch.t_ns[rows[1:]]).distance_m)
-    together = np.sign(step_m) * counted_m if counter is not None else step_m
-    gone = np.flatnonzero(np.abs(np.cumsum(together)) >= least_m)
-    total = float(np.cumsum(together)[gone[0]]) if gone.size else float(together.sum())
-    positive, negative = float(together[together > 0].sum()), float(-together[together < 0].sum())
-    sense = -1 if total < 0.0 else 1
-    return Sided(stretch, sense, *((positive, negative) if sense > 0 else (negative, positive)))
+    step_m = np.where(np.diff(path.leg[rows]) == 0, np.diff(path.at_m[rows]), 0.0)
+    if counter is not None:
+        counted_m = counter.between(stretch.t_ns[rows[:-1]], stretch.t_ns[rows[1:]]).distance_m
+        step_m = np.sign(step_m) * np.nan_to_num(counted_m)
+    moved_m = np.cumsum(step_m)
+    first = np.flatnonzero(np.abs(moved_m) >= least_m)
+    total_m = float(moved_m[first[0]]) if first.size else float(step_m.sum())
+    sense = -1 if total_m < 0.0 else 1
+    with_m, against_m = (float((sign * sense * step_m).clip(min=0.0).sum()) for sign in (1, -1))
+    return Sided(stretch, sense, with_m, against_m)
 
 
 def _every(t_ns: Ints, step_s: float) -> Ints:
@@ -113,19 +113,20 @@ def _every(t_ns: Ints, step_s: float) -> Ints:
 
 
 def reference_lag(found: Sequence[Sided], counter: Counter | None) -> Lag:
-    """The reference's clock against the odometer's, by the ways of ten seconds."""
-    begins, ends, ways = [], [], []
-    for one in found:
-        path = one.stretch.paths[0]
-        rows = _every(one.stretch.t_ns, _LAG_WINDOW_S)
-        whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
-        begin, end = rows[:-1][whole], rows[1:][whole]
-        begins.append(one.stretch.t_ns[begin])
-        ends.append(one.stretch.t_ns[end])
-        ways.append(one.sense * (path.at_m[end] - path.at_m[begin]))
-    if not ways:
+    """The reference's clock against the odometer's, by its ways of ten seconds."""
+    if not found:
         return Lag()
-    return lag_of(np.concatenate(begins), np.concatenate(ends), np.concatenate(ways), counter)
+    begins, ends, ways = (np.concatenate(column) for column in zip(*(_ways(one) for one in found), strict=True))
+    return lag_of(begins, ends, ways, counter)
+
+
+def _ways(one: Sided) -> tuple[Ints, Ints, Floats]:
+    """Begins, ends and lengths of the ways of ten seconds, as the odometer counts up."""
+    path, t_ns = one.stretch.paths[0], one.stretch.t_ns
+    rows = _every(t_ns, _LAG_WINDOW_S)
+    whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
+    begin, end = rows[:-1][whole], rows[1:][whole]
+    return t_ns[begin], t_ns[end], one.sense * (path.at_m[end] - path.at_m[begin])
 
 
 def known_stretch(
@@ -136,7 +137,7 @@ def known_stretch(
     ahead_m: float,
     config: Configuration,
 ) -> KnownStretch:
-    """The stretch as evidence; `reads`: balise reads, which close a step where they confirm the reference."""
+    """The stretch as evidence; `reads` close a step of the reference where they confirm it."""
     stretch = one.stretch
     t_ns = stretch.t_ns - round(clock.shift_s * NS_PER_S)
     paths: list[KnownPath] = []
@@ -155,7 +156,7 @@ def known_stretch(
 
 
 def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
-    """Speed over a second about each sample, by the reference alone."""
+    """Speed over a second about each sample."""
     half_ns = NS_PER_S // 2
     begin = np.searchsorted(t_ns, t_ns - half_ns)
     end = np.minimum(np.searchsorted(t_ns, t_ns + half_ns), t_ns.size - 1)
@@ -169,12 +170,12 @@ def _confirming_ns(
     known: KnownPath, t_ns: Ints, sigma_m: Floats, clock_m: Floats, reads: Sequence[Anchor], config: HazardConfig
 ) -> Ints:
     """Reads of balises that lie where the reference was, within k roots and both clocks."""
-    found: list[int] = []
+    confirming: list[int] = []
+    since_ns = (t_ns - t_ns[0]).astype(np.float64)
     for read in reads:
         if not t_ns[0] <= read.t_ns <= t_ns[-1]:
             continue
-        since = (t_ns - t_ns[0]).astype(np.float64)
-        at_m = np.interp([float(read.t_ns - t_ns[0])], since, known.at_m)
+        at_m = np.interp([float(read.t_ns - t_ns[0])], since_ns, known.at_m)
         sample = int(np.searchsorted(t_ns, read.t_ns))
         route = known.path.legs[int(known.path.leg[sample])]
         half_m = config.evidence_factor * float(np.hypot(sigma_m[sample], read.sigma_m))
@@ -182,17 +183,17 @@ def _confirming_ns(
         for place in read.places:
             there_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
             if abs(float(there_m[0] - at_m[0])) <= half_m:
-                found.append(read.t_ns)
-    return np.unique(np.array(found, dtype=np.int64))
+                confirming.append(read.t_ns)
+    return np.unique(np.array(confirming, dtype=np.int64))
 
 
 def _left_open(
     known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter], reads_ns: Ints, config: Configuration
 ) -> tuple[Floats, Floats, Floats]:
-    """How far behind and ahead of each sample the train may be because the reference stepped away, and the steps [m].
+    """How far behind and ahead of each sample the train may be because the reference stepped aside, and the steps [m].
 
     A step that every odometer contradicts by more than k_T roots leaves both sides possible, until the step back or
-    the next read that confirms the reference: one that contradicts it does not say that the reference is right.
+    the next read that confirms the reference (DOMAIN section 5.1).
     """
     low_m, high_m, open_step_m = np.zeros((3, t_ns.size))
     if t_ns.size < 2:
@@ -216,7 +217,7 @@ def _left_open(
 
 
 def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
-    """Steps that the reference's own movement about then does not explain: an odometer that fails makes none."""
+    """Steps that the reference's speed about then does not explain: a failing odometer makes none."""
     dt_s = np.diff(t_ns) / NS_PER_S
     speed_mps = np.diff(at_m) / dt_s
     beside = max(1, round(_EVEN_S / float(np.median(dt_s))))
@@ -226,7 +227,7 @@ def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
 
 
 def _contradicted(known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter]) -> tuple[Floats, Floats]:
-    """Per step to the next sample: its difference from the odometer nearest to it, and the root of both [m]."""
+    """Per step to the next sample: its difference from the nearest odometer, and the root of both variances [m]."""
     whole = np.diff(known.path.leg) == 0
     least, root = np.full(t_ns.size - 1, np.inf), np.ones(t_ns.size - 1)
     for counter in counters:
@@ -255,7 +256,7 @@ def read_anchors(
 
 
 def on_clock(anchors: Sequence[Anchor], clock: Clock, counter: Counter) -> list[Anchor]:
-    """The reads on the odometer's clock, with what it may add at their speed."""
+    """The reads on the odometer's clock, with what that clock may add at their speed."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
     clock_m = clock.delta_s * np.abs(counter.best_speed_mps(t_ns))
     shift_ns = round(clock.shift_s * NS_PER_S)

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.odometry import Way as Counted
 from pipeline.stages.track.path import Place
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
+from schemas.arrays import NS_PER_S, Floats, Ints, runs_of
 from schemas.config import Configuration
 from schemas.enums import Evidence
 
@@ -19,7 +19,7 @@ Interval = tuple[Floats, Floats]
 
 @dataclass(frozen=True)
 class Anchor:
-    """A place known by evidence at an instant: one of `places`; `clock_m`: what its clock may add [m]."""
+    """At an instant the train was at one of `places`; `clock_m`: what the clock may add [m]."""
 
     t_ns: int
     places: tuple[Place, ...]
@@ -30,7 +30,7 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Counter:
-    """An odometer as evidence: between two instants only where it counted throughout; `breaks_ns`: where it did not."""
+    """An odometer as evidence: silent over `breaks_ns`, the instants at which it did not count."""
 
     odometer: Odometry
     breaks_ns: Ints
@@ -55,18 +55,18 @@ class Counter:
         return Counted(np.where(breaks[0] == breaks[1], counted.distance_m, np.nan), counted.variance_m2)
 
     def driven_m(self, since_ns: Ints | int, t_ns: Ints) -> Floats:
-        """Way driven from instants, or from one, to others, turns included [m]."""
+        """Way driven, turns included [m]."""
         driven: Floats = np.abs(self.odometer.travelled_at(t_ns) - self.odometer.travelled_at(np.atleast_1d(since_ns)))
         return driven
 
     def speed_mps(self, t_ns: Ints) -> Floats:
-        """Speed at instants, over a second about each [m/s]; NaN where it did not count throughout that second."""
+        """Speed over a second about each instant [m/s]; NaN where it did not count throughout."""
         half_ns = round(0.5 * self.odometer.config.speed_window_s * NS_PER_S)
         speed: Floats = self.between(t_ns - half_ns, t_ns + half_ns).distance_m / (2 * half_ns / NS_PER_S)
         return speed
 
     def best_speed_mps(self, t_ns: Ints) -> Floats:
-        """Speed over so much of a second about each instant as was recorded [m/s]; a best guess over a break."""
+        """Speed over as much of that second as was recorded [m/s]; a best guess over a break."""
         odometer, at_s = self.odometer, self.odometer.seconds(t_ns)
         half_s = 0.5 * odometer.config.speed_window_s
         begin_s = np.clip(at_s - half_s, odometer.t_s[0], odometer.t_s[-1])
@@ -83,13 +83,13 @@ def _stands_ns(odometer: Odometry) -> Ints:
 
 
 def beside_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
-    """Half the interval on one side of a place known to `known_m`: 5 m + 5 % of the way (SUBSET-041 5.3.1.1)."""
+    """Half the interval away from a place known to `known_m`: 5 m + 5 % of the way (SUBSET-041 5.3.1.1)."""
     half: Floats = max(config.lds.odometer_fixed_m, known_m) + config.lds.odometer_share * driven_m
     return half
 
 
 def carried(counter: Counter, anchor: Anchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
-    """Least and largest coordinate on one side of an anchor at this coordinate; NaN where the odometer is silent."""
+    """Least and largest coordinate on one side of an anchor at `at_m`; NaN where the odometer is silent."""
     centre = at_m + counter.between(anchor.t_ns, t_ns).distance_m
     known_m = config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m
     half = beside_m(counter.driven_m(anchor.t_ns, t_ns), known_m, config)
@@ -99,10 +99,10 @@ def carried(counter: Counter, anchor: Anchor, at_m: float, t_ns: Ints, config: C
 def between_anchors(
     counter: Counter, anchors: tuple[Anchor, Anchor], at_m: tuple[float, float], t_ns: Ints, config: Configuration
 ) -> Interval:
-    """Least and largest coordinate between two anchors that lie at these coordinates of their route.
+    """Least and largest coordinate between two anchors at these coordinates (DOMAIN section 5.1, carrying).
 
-    Where a vehicle file's odometer closes, the inverse-variance mean of what both say, +- (k roots + closing error):
-    what was lost may have been lost at one place. Else the hull of both.
+    Where the way closes by a vehicle file, the inverse-variance mean of both +- (k roots + closing error): the loss may
+    lie at one place. Else the hull of both.
     """
     factor, clock_m = config.hazards.evidence_factor, [anchor.clock_m for anchor in anchors]
     ways = [counter.between(anchor.t_ns, t_ns) for anchor in anchors]
@@ -122,10 +122,7 @@ def between_anchors(
 
 
 def closes(counter: Counter, anchors: tuple[Anchor, Anchor], apart_m: float, config: Configuration) -> bool:
-    """The odometer's way from anchor to anchor is their distance.
-
-    Within k roots of both anchors and the way, without a vehicle file within 5 m + 5 % of the way.
-    """
+    """The odometer's way is the anchors' distance: within k roots, without a vehicle file within 5 m + 5 %."""
     begin, end = anchors
     end_ns = np.array([end.t_ns])
     way = counter.between(begin.t_ns, end_ns)
@@ -145,11 +142,10 @@ def carried_forward(
     stood: Sequence[tuple[int, int]],
     config: Configuration,
 ) -> Interval:
-    """Least and largest path position of the train [m], NaN where no accepted balise reaches.
+    """Least and largest path position of the train [m] by the way since the last accepted balise, 5 m + 5 % of it.
 
-    5 m + 5 % of the way since the last balise accepted (`accepted_ns`, in order, at `path_m` of the solution's own
-    path), never bridged. It can show that something was wrong, never that it was right. A balise that was accepted
-    beyond the limit by the one before is no anchor. `odometer` grows with the path.
+    NaN where none reaches. `accepted_ns` in order, at `path_m` of the solution's own path, with which the odometer
+    grows. A balise accepted beyond the limit by the one before is no anchor.
     """
     counter = Counter.of(odometer)
     used = _consistent(accepted_ns, path_m, counter, config)
@@ -158,9 +154,11 @@ def carried_forward(
         last = np.searchsorted(accepted_ns[used], t_ns, side="right") - 1
         rows = np.flatnonzero(last >= 0)
         own = used[last[rows]]
-        found = _since_accepted(counter, accepted_ns[own], path_m[own], t_ns[rows], config)
-        void = _stood_since(accepted_ns[own], t_ns[rows], stood)
-        low[rows], high[rows] = (np.where(void, np.nan, values) for values in found)
+        interval = _since_accepted(counter, accepted_ns[own], path_m[own], t_ns[rows], config)
+        void = np.zeros(rows.size, dtype=np.bool_)
+        for begin_ns, end_ns in stood:
+            void |= (t_ns[rows] >= begin_ns) & (accepted_ns[own] <= end_ns)
+        low[rows], high[rows] = (np.where(void, np.nan, values) for values in interval)
     return low, high
 
 
@@ -171,7 +169,7 @@ def _since_accepted(counter: Counter, since_ns: Ints, at_m: Floats, t_ns: Ints, 
 
 
 def _consistent(accepted_ns: Ints, path_m: Floats, counter: Counter, config: Configuration) -> Ints:
-    """Accepted balises, but for those that the odometer since the one before puts beyond the limit."""
+    """Accepted balises without those that the odometer since the one before puts beyond the limit."""
     used: list[int] = []
     limit_m = config.hazards.failure_limit_m
     for number in range(path_m.size):
@@ -184,10 +182,3 @@ def _consistent(accepted_ns: Ints, path_m: Floats, counter: Counter, config: Con
         if counter.odometer.known_at(accepted_ns[here])[0]:
             used.append(number)
     return np.array(used, dtype=np.int64)
-
-
-def _stood_since(begin_ns: Ints, t_ns: Ints, stood: Sequence[tuple[int, int]]) -> Bools:
-    void = np.zeros(t_ns.size, dtype=np.bool_)
-    for from_ns, until_ns in stood:
-        void |= (t_ns >= from_ns) & (begin_ns <= until_ns)
-    return void

@@ -52,16 +52,15 @@ class Alternative:
         return Alternative(self.rows[kept], self.route, self.low_m[kept], self.high_m[kept])
 
     def widened(self, factor: float) -> Alternative:
-        middle, half = 0.5 * (self.low_m + self.high_m), 0.5 * factor * (self.high_m - self.low_m)
-        return Alternative(self.rows, self.route, middle - half, middle + half)
+        half_m = 0.5 * factor * (self.high_m - self.low_m)
+        return Alternative(self.rows, self.route, self.middle_m - half_m, self.middle_m + half_m)
 
 
 @dataclass(frozen=True)
 class EvidenceSet:
-    """Evidence at instants: `kind` is the number in `KINDS`, -1 where nothing is known.
+    """Evidence at instants: where there are several alternatives the train was on one of them.
 
-    Where there are several alternatives at an instant the train was on one of them. `disputed`: instants at which
-    reference and reads exclude each other.
+    `kind`: number in `KINDS`, -1 where nothing is known; `disputed`: where reference and reads exclude each other.
     """
 
     kind: Ints
@@ -81,9 +80,9 @@ class Carried:
 class Evidence:
     """All evidence of a run.
 
-    `silent`: times at which nobody knows, because the reference was heard and lay nowhere. `carried`: by each odometer
-    from reads and the reference's ends, outside its time; `by_reads`: from reads alone, over the whole run.
-    `contradicted`: gaps that the odometer of a vehicle file does not close. `clocks`: of the recorders there are.
+    `silent`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends of
+    the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
+    odometer carries nothing from one side.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -98,7 +97,7 @@ class Evidence:
 
     @property
     def contradicted(self) -> int:
-        """Gaps between anchors that the odometer does not close by any way, with the scale of a vehicle file."""
+        """Gaps between anchors that the odometer of a vehicle file closes by no way."""
         by_file = [one.gaps for one in self.carried[:1] if one.counter.by_file]
         return sum(bool(gap.ways) and len(gap.anchors) == 2 and not gap.closed for gaps in by_file for gap in gaps)
 
@@ -109,21 +108,22 @@ class Evidence:
 
     @property
     def disputed(self) -> int:
-        """Reads that exclude the reference beyond all noise of both: at k = 3 noise alone does so in a long run."""
-        kind = np.full(self.reads_ns.size, NOTHING)
+        """Reads that exclude the reference beyond k_T roots: at k = 3 noise alone does so in a long run."""
+        t_ns, kind = self.reads_ns, np.full(self.reads_ns.size, NOTHING)
         factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
-        by_reference = [one.widened(factor) for one in self._covered(self.reads_ns, np.ones(kind.size, np.bool_), kind)]
-        by_reads = [one.widened(factor) for one in self._carried(self.by_reads, self.reads_ns, kind != NOTHING, kind)]
-        return int(common(by_reference, by_reads, kind.size)[1].size)
+        by_reference = self._covered(t_ns, kind == NOTHING, kind)
+        by_reads = self._carried(self.by_reads, t_ns, kind != NOTHING, kind)
+        wide, other = ([one.widened(factor) for one in alternatives] for alternatives in (by_reference, by_reads))
+        return int(common(wide, other, t_ns.size)[1].size)
 
     @property
     def clock_assumed(self) -> bool:
-        """The clock of reference or reads against the odometer's could not be measured, and is taken as close."""
+        """The clock of reference or reads against the odometer's could not be measured."""
         return any(clock.assumed for clock in self.clocks)
 
     @property
     def anchored_ns(self) -> Span | None:
-        """First and last anchor: beyond them nothing holds the train from the other side; none without anchors."""
+        """First and last anchor; None without anchors."""
         times = [anchor.t_ns for one in self.carried[:1] for gap in one.gaps for anchor in gap.anchors]
         times += [int(t_ns) for one in self.stretches for t_ns in one.t_ns[[0, -1]]]
         return (min(times), max(times)) if times else None
@@ -195,9 +195,9 @@ class Evidence:
 
 
 def common(one: Sequence[Alternative], other: Sequence[Alternative], size: int) -> tuple[list[Alternative], Ints]:
-    """What two kinds of evidence leave together, and the instants at which they exclude each other.
+    """The net elements common to both and the narrower interval; instants at which the two exclude each other.
 
-    The net elements common to both and the narrower interval; where they exclude each other, all that either says.
+    There all that either says stays possible.
     """
     spoken = np.zeros((2, size), dtype=np.bool_)
     for number, alternatives in enumerate((one, other)):
@@ -213,15 +213,15 @@ def common(one: Sequence[Alternative], other: Sequence[Alternative], size: int) 
 
 def _narrowed(one: Alternative, other: Alternative) -> Alternative:
     """The part of the first that the second leaves too, at the instants of both; on the first's route."""
-    rows, here, there = np.intersect1d(one.rows, other.rows, assume_unique=True, return_indices=True)
-    low, high = one.low_m[here], one.high_m[here]
-    middle = 0.5 * (low + high)
-    element, measure, sense = one.route.locate(middle)
-    own_low, own_high = other.low_m[there], other.high_m[there]
-    at_m, own_sense = other.route.coordinate(element, measure, 0.5 * (own_low + own_high))
-    ends = [middle + sense * own_sense * (end_m - at_m) for end_m in (own_low, own_high)]
-    low, high = np.maximum(low, np.minimum(*ends)), np.minimum(high, np.maximum(*ends))
-    return Alternative(rows, one.route, low, high).where(low <= high)
+    _, here, there = np.intersect1d(one.rows, other.rows, assume_unique=True, return_indices=True)
+    one = Alternative(one.rows[here], one.route, one.low_m[here], one.high_m[here])
+    other = Alternative(other.rows[there], other.route, other.low_m[there], other.high_m[there])
+    element, measure_m, sense = one.route.locate(one.middle_m)
+    at_m, along = other.route.coordinate(element, measure_m, other.middle_m)
+    ends_m = [one.middle_m + sense * along * (end_m - at_m) for end_m in (other.low_m, other.high_m)]
+    low_m = np.maximum(one.low_m, np.minimum(*ends_m))
+    high_m = np.minimum(one.high_m, np.maximum(*ends_m))
+    return Alternative(one.rows, one.route, low_m, high_m).where(low_m <= high_m)
 
 
 def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
@@ -252,10 +252,9 @@ def evidence_of(
     vehicle: Vehicle,
     config: Configuration,
 ) -> Evidence:
-    """Everything that is known of where the train was, but from GNSS.
+    """Everything that is known of where the train was, except from GNSS.
 
-    `reference`: its stretches and when it lay nowhere (`reference_stretches`); `reads`, `balises`: as in the run and
-    the site; `odometers`: as recorded, that of the LDS first.
+    `reference`: as from `reference_stretches`; `odometers`: that of the LDS first.
     """
     hazards = config.hazards
     by_file = vehicle.gnss_latency_s is not None
@@ -288,7 +287,6 @@ def evidence_of(
 
 
 def _points(anchors: Sequence[Anchor]) -> list[tuple[Anchor, Anchor]]:
-    """Anchors that know no more than their own instant."""
     return [(anchor, anchor) for anchor in anchors]
 
 

@@ -18,9 +18,9 @@ from schemas.config import Configuration
 
 @dataclass(frozen=True)
 class Way:
-    """A chain through a gap, in the sense in which the odometer counts up; `at_m`: where its anchors lie on it.
+    """A chain through a gap, in the sense in which the odometer counts up, with its anchors at `at_m`.
 
-    `closed`: the odometer counted its length, within its own noise.
+    `closed`: the odometer counted its length within its own noise.
     """
 
     chain: Chain
@@ -47,16 +47,14 @@ class Gap:
 
     @property
     def closed(self) -> bool:
-        """The odometer counted the length of a way through it, within its own noise."""
         return any(way.closed for way in self.ways or [])
 
     @property
     def alone(self) -> list[Way]:
-        """The one way of a gap between two anchors whose length the odometer counted; nothing where there are more."""
-        lengths = {round(way.at_m[-1] - way.at_m[0], 2) for way in self.ways or [] if way.closed}
-        return (
-            [way for way in self.ways or [] if way.closed][:1] if len(lengths) == 1 and len(self.anchors) == 2 else []
-        )
+        """The one closed way between two anchors; nothing where ways of several lengths close."""
+        closed = [way for way in self.ways or [] if way.closed]
+        lengths = {round(way.at_m[-1] - way.at_m[0], 2) for way in closed}
+        return closed[:1] if len(lengths) == 1 and len(self.anchors) == 2 else []
 
 
 def gaps_of(
@@ -66,9 +64,9 @@ def gaps_of(
     network: Network,
     config: Configuration,
 ) -> list[Gap]:
-    """Gaps before, between and after what is known from one anchor to another, with all chains through each.
+    """Gaps before, between and after the borders (known from one anchor to the other), with all chains through each.
 
-    `facing`: oriented net elements over which the train ran as the odometer counted up, where the reference tells.
+    `facing`: oriented net elements over which the train ran, by the reference, as the odometer counted up.
     """
     first, last = borders[0][0], borders[-1][1]
     found = [Gap(min(counter.odometer.begin_ns, first.t_ns), first.t_ns, None, first, [])]
@@ -107,33 +105,32 @@ def _between(a: Anchor, b: Anchor, counter: Counter, network: Network, config: C
 
 
 def unreachable(gaps: Sequence[Gap]) -> list[Gap]:
-    """Gaps whose anchors no train can have passed one after the other: one of the two is not where it says."""
+    """Gaps whose anchors no train can have passed one after the other: one of the two is wrong."""
     return [gap for gap in gaps if gap.begin is not None and gap.end is not None and gap.ways == []]
 
 
 def _without_contradicted(gaps: list[Gap]) -> list[Gap]:
-    """Without what rests on an anchor that others contradict.
+    """Nothing is carried outward from an anchor none of whose ways closes, nor beside an unreachable gap.
 
-    An anchor none of whose ways closes carries nothing outward. Nothing is said of the gaps on either side of an
-    unreachable one, for nobody knows which of its anchors is wrong.
+    Which of the two anchors of an unreachable gap is wrong nobody knows.
     """
     weighed = [gap for gap in gaps if len(gap.anchors) == 2 and gap.ways is not None]
     joined = {id(anchor) for gap in weighed for anchor in gap.anchors}
     closed = {id(anchor) for gap in weighed if gap.closed for anchor in gap.anchors}
     wrong = {id(anchor) for gap in unreachable(gaps) for anchor in gap.anchors}
 
-    def rests(gap: Gap) -> bool:
-        own = {id(anchor) for anchor in gap.anchors}
-        return bool(own & wrong) or (len(own) == 1 and bool(own & (joined - closed)))
+    def doubtful(gap: Gap) -> bool:
+        anchors = {id(anchor) for anchor in gap.anchors}
+        return bool(anchors & wrong) or (len(anchors) == 1 and bool(anchors & (joined - closed)))
 
     apart = unreachable(gaps)
-    return [replace(gap, ways=None) if gap not in apart and rests(gap) else gap for gap in gaps]
+    return [replace(gap, ways=None) if gap not in apart and doubtful(gap) else gap for gap in gaps]
 
 
 def _ways_of_length(
     a: Anchor, b: Anchor, length_m: float, slack_m: float, network: Network, most: int
 ) -> list[Way] | None:
-    """Chains from anchor to anchor whose length is that of the odometer but for the slack, either way round."""
+    """Chains from anchor to anchor of the odometer's length +- the slack, either way round."""
     ways: list[Way] = []
     for begins, goals, way_m, back in ((a.places, b.places, length_m, False), (b.places, a.places, -length_m, True)):
         lengths = (max(way_m - slack_m, 0.0), way_m + slack_m)

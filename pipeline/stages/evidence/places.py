@@ -10,7 +10,7 @@ from pipeline.stages.track.survey import Track
 
 
 def true_places(found: EvidenceSet, track: Track) -> pl.DataFrame:
-    """Per instant `true_netelement_ids`, in the order of the survey, and `true_measure_low_m`, `true_measure_high_m`.
+    """Per instant `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m`.
 
     Null where nothing is known; the measures also where there are several net elements.
     """

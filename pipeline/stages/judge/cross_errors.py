@@ -38,7 +38,5 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
         near = np.abs(along_m) <= case.config.hazards.failure_limit_m
         across[rows] = np.where(near, left_m, np.nan)
         up[rows] = np.where(near, (floats(fixes, "height_m") - height)[rows], np.nan)
-    return [
-        pl.Series("error_cross_m", across, nan_to_null=True),
-        pl.Series("error_up_m", up, nan_to_null=True),
-    ]
+    names = ("error_cross_m", "error_up_m")
+    return [pl.Series(name, values, nan_to_null=True) for name, values in zip(names, (across, up), strict=True)]

@@ -21,7 +21,7 @@ _ODOMETER = "odometer"
 
 @dataclass(frozen=True)
 class Detection:
-    """First fail of a monitor in an episode; `standing`: an alarm was there before the fault could be seen."""
+    """First fail of a monitor in an episode; `standing`: the alarm was there before the fault was visible."""
 
     t_ns: int | None = None
     monitor: str | None = None
@@ -32,9 +32,8 @@ class Detection:
 class Episode:
     """A fault from its onset until the position is right again; numbers are of `Course`, `end` is the first after it.
 
-    `mark`: the first wrong position, or offer; `step`: the jump that began it; `jump_back`: the one that ended it;
-    `failed`: begin of the position failure; `may_ns`: since when it may have been one. `failure`: the time wrong in use
-    that the episode belongs to.
+    `mark`: the first position that is wrong or completes a wrong offer; `step`, `jump_back`: the jumps at its ends;
+    `failed`: begin of the position failure, possibly since `may_ns`; `failure`: the time wrong in use around it.
     """
 
     mark: int
@@ -52,7 +51,7 @@ class Episode:
 
     @property
     def undetected_ns(self) -> tuple[int, int]:
-        """From the begin to detection, or to the end; what a step offers on its way lies before its first position."""
+        """From the begin, that of a step included, to detection or to the end."""
         detected_ns = self.detection.t_ns
         return self.begin_ns, self.end_ns if detected_ns is None else detected_ns
 
@@ -142,9 +141,9 @@ def _detected(
     faults: pl.DataFrame | None,
     config: HazardConfig,
 ) -> tuple[int, Detection]:
-    """Onset and detection. The onset is as a `faults` stream names it; else the first epoch of the step or drift.
+    """Onset, as a `faults` stream names it, else the first epoch of the step or drift; and detection.
 
-    A drift is seen late: an alarm up to 30 s before its onset is the onset, and was standing when it came.
+    A drift is visible late: an alarm up to `alarm_lead_s` before its onset becomes the onset, with T_D 0.
     """
     onset_ns = int(course.t_ns[onset])
     alarm_ns = None
@@ -189,10 +188,9 @@ def _failed(course: Course, onset: int, end: int, step: Jump | None, config: Haz
 
 
 def _failed_may_ns(course: Course, failed: int, config: HazardConfig) -> int | None:
-    """First of the unbroken run of unknown or wrong positions before a failure at which it may have been one.
+    """First of the unbroken run of unknown or wrong positions before a failure whose interval reaches beyond the limit.
 
-    That is where the interval reaches beyond the limit. None where the evidence is silent in that run: a failure may
-    have begun at any time of it.
+    None where the evidence is silent in that run: the failure may have begun at any time of it.
     """
     right = np.flatnonzero(course.judged.is_right[:failed])
     run = np.arange(int(right[-1]) + 1 if right.size else 0, failed + 1)

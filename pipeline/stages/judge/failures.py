@@ -23,8 +23,8 @@ from schemas.stages import Failures
 class Course:
     """The positions in order of time, with the jumps between them and the offers; numbers are rows of `positions`.
 
-    `calm_from`: for each position the first from it on at which the error stays within half the limit for long enough;
-    `quiet`: errors that noise explains.
+    `calm_from`: the first position from each on at which the error stays within half the limit for long enough;
+    `quiet`: noise explains the error.
     """
 
     positions: pl.DataFrame

@@ -26,12 +26,11 @@ def reaction_s(position_ns: Ints, config: Configuration) -> float:
 
 
 def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.DataFrame:
-    """Per epoch `in_use`, and the time that it stands for [s]: `used_s`, `wrong_s`, `counted_s`.
+    """Per epoch `in_use`, and the time that it stands for [s]: `used_s`, `wrong_s`, `counted_s` (DOMAIN section 5.3).
 
-    An epoch stands for the time since the position before it, for a fault may be that old. Judged wrong in use
-    (`wrong_s`): whole where that position was wrong in use too, else at most one nominal period. `used_s`: the same of
-    what is wrong or unknown, and of any other position in use. `counted_s`: what shares of time count, with `wrong_s`
-    where there is any. Epochs without a position stand for time in a gap between positions only.
+    A fault may be as old as the position before. `wrong_s`: whole since then where that was wrong in use too, else one
+    nominal period at most. `used_s`: the same of wrong or unknown, and of any other position in use. `counted_s`: for
+    shares of time, `wrong_s` where there is any. Epochs without a position stand for time in a gap only.
     """
     known = met(epochs, pl.col("path_m").is_not_null())
     steps = _Steps.of(epochs, known, config)
@@ -51,9 +50,9 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
 
 @dataclass(frozen=True)
 class _Steps:
-    """To each position from the one before: `step_s`; `near_s` with one period for a gap; `alone_s` one at most.
+    """From the position before to each: `step_s`; `near_s` with one period for a gap; `alone_s` one period at most.
 
-    `edge_s`, `blocked_s`: time negated up to some instants, between them in proportion.
+    `blocked_s`: time negated up to `edge_s`, linear between.
     """
 
     end_s: Floats
@@ -94,7 +93,7 @@ class _Steps:
 
 
 def negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) -> Floats:
-    """Rows of begin and end [s]: from each detection plus the reaction, at once where nothing was in use, to return."""
+    """Begin and end of each negation [s]: after the reaction, at once where nothing was in use, until the return."""
     firsts, lasts = runs_of(negated)
     until_s = np.append(t_s, t_s[-1:])[lasts + 1]
     from_s = t_s[firsts] + np.where(withheld[firsts], 0.0, delay_s)

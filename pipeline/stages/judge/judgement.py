@@ -151,10 +151,9 @@ def judgements_of(case: Case, positions: MatchedPositions, at_ns: Ints, evidence
 def judge_positions(
     positions: MatchedPositions, evidence: EvidenceSet, legs: Sequence[Route], config: HazardConfig
 ) -> Judgements:
-    """Wrong where it is wrong wherever the train may have been, right where it is right wherever it may have been.
+    """Wrong, or right, where it is so wherever the train may have been; `legs`: of the path, coordinate `path_m`.
 
-    `legs`: of the solution's own path, coordinate `path_m`. The interval spans the tracks on which the place along the
-    track can be compared.
+    The interval spans the tracks on which the place along the track can be compared.
     """
     size, limit_m = positions.element.size, config.failure_limit_m
     low_m, high_m = np.full(size, np.inf), np.full(size, -np.inf)
@@ -216,8 +215,7 @@ def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs
 def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence[Route]) -> _Relative:
     """Where the train's place lies on the path of the solution too.
 
-    Where the track of the evidence goes on as far as the position is ahead or behind, and on another net element than
-    the position's, the position is on another track.
+    If the track of the evidence covers the place so far ahead or behind, the position is on another track.
     """
     rows, middle_m = there.rows, there.middle_m
     element, measure_m, sense = there.route.locate(middle_m)

@@ -65,10 +65,7 @@ def find_jumps(steps: Steps, direction: Ints, config: HazardConfig) -> list[Jump
 
 
 def _largest_step(steps: Steps, config: HazardConfig) -> Floats:
-    """For each position the largest change since one at most the window before, signed.
-
-    The position just before always counts: a slower log has no other.
-    """
+    """The largest signed change up to each position within the window; that since the one before always counts."""
     excess_m, size = steps.excess_m, steps.t_ns.size
     largest_m = np.zeros(size)
     if size < 2 or np.ptp(excess_m) <= config.jump_limit_m:

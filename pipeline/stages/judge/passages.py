@@ -74,9 +74,9 @@ def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[Haza
 
 
 def _true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
-    """The train's own crossing of each passage [ns]: the nearest in time to its offer or reckoning, each given once.
+    """The train's crossing of each passage [ns], taken out of `crossings`: the nearest to its offer or reckoning.
 
-    A passage with neither takes what is left, in order. `crossings` keeps those that no passage took.
+    A passage with neither takes what is left, in order.
     """
     about = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series().dt.timestamp("ns").to_list()
     balises = passages["balise_id"].to_list()
@@ -146,10 +146,9 @@ def _word(frame: pl.DataFrame, column: str, *rows: tuple[pl.Expr, FailureMode | 
 def _with_unoffered(
     passages: pl.DataFrame, case: Case, crossings: Crossings, stamps: Ints, gap_ns: int
 ) -> pl.DataFrame:
-    """One more passage for each crossing of a virtual balise that the LDS knows nothing of.
+    """One more passage for each crossing of a virtual balise that the LDS knows nothing of, as it follows the position.
 
-    The LDS follows the position: before the first one, or where it is wrong at an end of the run, no window has closed
-    yet. `crossings`: those that belong to no passage; `stamps`: of valid positions.
+    `crossings`: those that belong to no passage; `stamps`: of valid positions.
     """
     virtual = case.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
     missed = [

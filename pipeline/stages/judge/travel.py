@@ -17,10 +17,9 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class OdometerSteps:
-    """From each epoch to the next: the odometer counted throughout (`counts`), and shows movement (`moves`).
+    """From each epoch to the next: the odometer `counts` throughout, and `moves`.
 
-    `stood`: times [ns] in which it stands while positions leave their place by more than the failure limit; nobody
-    knows by it whether the train moved there.
+    `stood`: times [ns] in which it stands while positions leave their place by more than the failure limit.
     """
 
     moves: Bools
@@ -50,8 +49,8 @@ def travel_direction(
 ) -> Ints:
     """Direction of travel along growing path, 1 or -1, per epoch; `direction`: as the train took it.
 
-    Without an odometer it is that of the train's own place, where the evidence gives it: a position that jumps back
-    does not turn the train. With one it is the odometer's, unless the reference shows that it counts up in reverse.
+    Without an odometer it is that of the train's place by the evidence: a position that jumps back does not turn the
+    train. With one it is the odometer's, unless the reference shows that it counts up in reverse.
     """
     train_m = path_m - along.known_m(config.known_error_m)
     moved_m, noise_m, _ = _moved_m(at_ns, train_m, along.half_m, config.turn_s)
@@ -78,8 +77,7 @@ def moving(
 ) -> pl.Series:
     """Per epoch whether the train moves to the next one, null where neither reference nor odometer knows.
 
-    By the reference (`reference_m` +- `half_m`) it moves where it comes farther over a second than the dead band and
-    the noise of both places allow; that also counts where the odometer stands (`stood`) or is silent.
+    By the reference (`reference_m` +- `half_m`) it does where its way over a second exceeds dead band and noise.
     """
     moved_m, noise_m, elapsed_s = _moved_m(at_ns, reference_m, half_m, config.align.speed_window_s)
     with np.errstate(invalid="ignore"):

@@ -13,6 +13,9 @@ from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration
 
+# So many instants before and after its own a track is looked at, for where the train came from and went on to.
+_BESIDE = 100
+
 
 class TrueCrossing(NamedTuple):
     """Instant [ns] by the middle of the interval; `sense` +1 with the measure of the balise's net element, else -1.
@@ -50,10 +53,10 @@ def between_far_epochs(at_ns: Ints, step_s: float) -> Ints:
 def true_crossings(
     t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], config: Configuration
 ) -> dict[str, list[TrueCrossing]]:
-    """Crossings of each balise in order of time, where the evidence leaves one track.
+    """Crossings of each balise in order of time, where the evidence leaves one track; `t_ns`: its instants.
 
     Where it gives the place to `known_error_m` the middle of the interval crosses; else the whole interval has to pass
-    from one side to the other. `t_ns`: instants of the evidence, in order, close enough for straight lines.
+    from one side to the other.
     """
     alone = _alone(evidence, t_ns.size)
     tracks = [track.where(alone[track.rows]) for track in evidence.alternatives]
@@ -66,11 +69,13 @@ def true_crossings(
     measures_m = np.array([place.measure_m for place in places.values()])
     crossings: dict[str, list[TrueCrossing]] = {name: [] for name in names}
     for track in tracks:
-        rows, at_m = _with_places_before(track, train)
-        least_m, most_m = at_m.min(initial=np.inf), at_m.max(initial=-np.inf)
+        if track.rows.size == 0:
+            continue
+        rows, at_m = _with_beside(track, train)
+        own, least_m, most_m = np.isin(rows, track.rows), at_m.min(), at_m.max()
         for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
             if least_m <= visit_m <= most_m:
-                found = _crossed(train, rows, at_m - visit_m, config)
+                found = _crossed(train, rows, own, at_m - visit_m, config)
                 crossings[names[balise]] += [one._replace(sense=int(one.sense * sense)) for one in found]
     return {name: sorted(found) for name, found in crossings.items()}
 
@@ -93,21 +98,22 @@ def _alone(evidence: EvidenceSet, size: int) -> Bools:
     return alone
 
 
-def _with_places_before(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
-    """Rows and coordinates on a track, with the rows just before it begins where the train's place lies on it too."""
+def _with_beside(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
+    """Rows and coordinates on a track, with the rows beside it at which the train's place lies on it too."""
     rows = track.rows
-    before = np.setdiff1d(rows[rows > 0] - 1, rows)
-    element = np.nan_to_num(train.element[before], nan=-1).astype(np.int64)
-    near_m = track.middle_m[np.searchsorted(rows, before)]
-    there_m, _ = track.route.coordinate(element, train.measure_m[before], near_m)
+    around = np.arange(max(rows[0] - _BESIDE, 0), min(rows[-1] + _BESIDE + 1, train.t_ns.size))
+    beside = np.setdiff1d(around, rows)
+    element = np.nan_to_num(train.element[beside], nan=-1).astype(np.int64)
+    near_m = track.middle_m[np.searchsorted(rows, beside).clip(0, rows.size - 1)]
+    there_m, _ = track.route.coordinate(element, train.measure_m[beside], near_m)
     known = np.isfinite(there_m)
-    order = np.argsort(np.concatenate([rows, before[known]]), kind="stable")
-    coordinates_m = np.concatenate([track.middle_m, there_m[known]])
-    return np.concatenate([rows, before[known]])[order], coordinates_m[order]
+    both = np.concatenate([rows, beside[known]])
+    order = np.argsort(both, kind="stable")
+    return both[order], np.concatenate([track.middle_m, there_m[known]])[order]
 
 
-def _crossed(train: _Train, rows: Ints, away_m: Floats, config: Configuration) -> list[TrueCrossing]:
-    """Instants at which the train went from one side of the balise to the other, and which way.
+def _crossed(train: _Train, rows: Ints, own: Bools, away_m: Floats, config: Configuration) -> list[TrueCrossing]:
+    """Instants, up to one of the track's `own`, at which the train went from one side of the balise to the other.
 
     A train that came no farther than `rearm_m` from a balise since it passed it has not passed it again.
     """
@@ -117,14 +123,16 @@ def _crossed(train: _Train, rows: Ints, away_m: Floats, config: Configuration) -
     ahead = away_m >= 0.0
     changes = np.flatnonzero((ahead[1:] != ahead[:-1]) & (np.diff(rows) == 1)) + 1
     crossings: list[TrueCrossing] = []
-    armed_from = 0
+    armed_from, passed = 0, False
     for change, later in zip(changes.tolist(), [*changes[1:].tolist(), away_m.size], strict=False):
         armed = bool(beyond[armed_from:change].any())
         clear = armed and bool(beyond[change:later].any())
-        if clear or (close[change - 1 : change + 1].all() and (armed or not crossings)):
+        if not clear and not (close[change - 1 : change + 1].all() and (armed or not passed)):
+            continue
+        armed_from, passed = change, True
+        if own[change]:
             before_m, after_m = away_m[change - 1 : change + 1].tolist()
             begin_ns, end_ns = train.t_ns[rows[change - 1 : change + 1]].tolist()
             instant_ns = begin_ns + round((end_ns - begin_ns) * before_m / (before_m - after_m))
             crossings.append(TrueCrossing(instant_ns, 1 if after_m > before_m else -1, clear))
-            armed_from = change
     return crossings

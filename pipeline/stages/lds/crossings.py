@@ -1,7 +1,4 @@
-"""Where the position passes a virtual balise, and telegrams of physical ones on the path: found once, here.
-
-The raw matched position counts (DOMAIN section 4).
-"""
+"""Where the raw matched position passes a virtual balise, and telegrams of physical ones (DOMAIN section 4)."""
 
 from __future__ import annotations
 
@@ -117,13 +114,13 @@ def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
 
 
 def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing]:
-    """Crossings in order of the epoch that completes them, those of one step in the order of being passed.
+    """Crossings of virtual balises, those of one step in the order of being passed.
 
-    A balise is passed growing when the position comes from before it to it or beyond, and falling
-    when it comes from there to before it, so that touching it and turning back are two passings.
+    A balise is passed growing when the position comes from before it to it or beyond, and falling when it comes from
+    there to before it, so that touching it and turning back are two crossings.
     """
     known = np.flatnonzero(journey.positioned)
-    found: list[Crossing] = []
+    crossings: list[Crossing] = []
     for leg in sorted({balise.leg for balise in balises}):
         on_leg = [balise for balise in balises if balise.leg == leg]
         at_m = np.array([balise.path_m for balise in on_leg])
@@ -134,15 +131,14 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing
         passing = np.flatnonzero(passed_before != passed_after)
         for step in passing.tolist():
             i, k, first, last = (int(rows[step]) for rows in (before, after, passed_before, passed_after))
-            found += [_crossing(journey, balise, i, k, sense) for balise, sense in _in_order(on_leg, first, last)]
-    return sorted((one for one in found if _is_valid(one, journey)), key=lambda crossing: crossing.epoch)
+            crossings += [_crossing(journey, balise, i, k, sense) for balise, sense in _in_order(on_leg, first, last)]
+    return [crossing for crossing in crossings if _is_valid(crossing, journey)]
 
 
 def _is_valid(crossing: Crossing, journey: Journey) -> bool:
     """Valid in the train's direction of travel, whatever that of the position's step (DOMAIN section 4).
 
-    A turn is known some metres after it (`odometer_fixed_m`): on these the train's own knowledge and the way that it
-    really goes differ, and a balise of one direction is offered in neither.
+    A turn is known some metres after it (`odometer_fixed_m`): on these a balise of one direction is offered in neither.
     """
     as_it_was = journey.direction_at(crossing.t_ns)
     return crossing.balise.is_valid(crossing.direction) and crossing.balise.is_valid(as_it_was)
@@ -192,14 +188,12 @@ def crossing_rows(crossings: Sequence[Crossing], journey: Journey) -> pl.DataFra
 
 
 def _row(number: int, crossing: Crossing, journey: Journey) -> dict[str, object]:
-    own = {name: getattr(crossing, name) for name in ("before", "epoch", "sense", "odometer_m", "offered")}
-    place = {
-        name: getattr(crossing.balise, name) for name in ("balise_id", "netelement_id", "measure_m", "leg", "path_m")
-    }
+    offer = ("before", "epoch", "sense", "odometer_m", "offered")
+    place = ("balise_id", "netelement_id", "measure_m", "leg", "path_m")
     return {
         "crossing_id": number,
-        **own,
-        **place,
+        **{name: getattr(crossing, name) for name in offer},
+        **{name: getattr(crossing.balise, name) for name in place},
         "kind": crossing.balise.kind.value,
         "t": crossing.t_ns,
         "direction": journey.direction_at(crossing.t_ns),

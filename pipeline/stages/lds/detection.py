@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import isnan
 
-import numpy as np
-
 from pipeline.stages.lds.crossings import Balise, Crossing
 from pipeline.stages.lds.journey import Journey, turning_epochs
 from pipeline.stages.lds.link_monitors import LinkOrder, disorder
@@ -78,7 +76,8 @@ class BaliseDetection:
         if not offered:
             return [], False
         overdue = sum(self.virtual.is_overdue(crossing.balise) for crossing in offered)
-        accepted = [one for one in offered if self._offer(one, self._refusal_of(one, distrusted, entering))]
+        refusals = [(crossing, self._refusal_of(crossing, distrusted, entering)) for crossing in offered]
+        accepted = [crossing for crossing, refusal in refusals if self._offer(crossing, refusal)]
         return accepted, self._order_fails(k, offered, overdue)
 
     def rearm(self, k: int) -> None:
@@ -96,7 +95,7 @@ class BaliseDetection:
 
     def finish(self, t_ns: int) -> None:
         """Balises that the train has passed by its odometer when the run ends without a position."""
-        known = np.flatnonzero(np.isfinite(self._journey.odometer_m))
+        known = self._journey.on_odometer
         absence = self._absence(len(self._along_m) - 1) if known.size else PassageStatus.MISSED
         if absence is not PassageStatus.MISSED:
             self.virtual.finish(float(self._journey.odometer_m[known[-1]]), t_ns, absence)
@@ -112,8 +111,7 @@ class BaliseDetection:
         A step out of an ambiguous position crosses what the train did not.
         """
         if distrusted:
-            # "The noise is known and no monitor has failed" is one condition of a detection (DOMAIN section 4), so that
-            # a withheld position is refused as a negated one is; `withheld_for` of the epoch says why.
+            # "The noise is known and no monitor has failed" is one condition of a detection (DOMAIN section 4).
             return PassageStatus.REJECTED_MONITOR
         if self._journey.refusal[crossing.before] is PassageStatus.REJECTED_AMBIGUOUS:
             return PassageStatus.REJECTED_AMBIGUOUS

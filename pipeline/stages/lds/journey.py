@@ -17,15 +17,12 @@ from schemas.enums import PassageStatus
 
 @dataclass(frozen=True)
 class Journey:
-    """Epochs in order of time; a NaN is a value that is not known.
+    """Epochs in order of time; a NaN is a value that is not known. Names are those of `schemas.stages.Aligned`, but:
 
-    `positioned`: placed on the path. `refusal`: why a detection at this epoch would not
-    count, `None` where it would. `direction`: direction of travel (+1/-1 along growing path) as known at that epoch;
-    `travel`: that of the step from this epoch to the next, put back to where the train turned (for
-    labels only). `travelled_m`: way run, turns included. `segment`: continuity segment of the odometer, between
-    segments its distance was lost; `scale_sigma`: of its scale, None unless a vehicle file gives both. `slips`: the
-    odometer says so itself; `counter` is `segment` but that slip does not end it, and `slip_doubt_m` by how much slip
-    may have falsified it so far. `blind`: no position for longer than a crossing is interpolated over (`gap_ns`).
+    `positioned`: placed on the path. `refusal`: why a detection here would not count, `None` where it would.
+    `direction` of travel (+1/-1 along growing path) as known at that epoch; `travel`: that of the step to the next
+    epoch, put back to where the train turned (for labels only). `segment`: between segments the odometer lost its
+    distance; `counter`: the same, over slip. `blind`: no position for longer than a crossing is interpolated over.
     """
 
     t_ns: Ints
@@ -59,14 +56,13 @@ class Journey:
         return np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in self.refusal], dtype=bool)
 
     @cached_property
-    def comparable(self) -> Bools:
-        """The position can be held against the odometer."""
-        known: Bools = np.isfinite(self.odometer_m) & np.isfinite(self.sigma_m)
-        return known & self.positioned & ~self.ambiguous
+    def on_odometer(self) -> Ints:
+        """Epochs at which the odometer is known."""
+        return np.flatnonzero(np.isfinite(self.odometer_m))
 
-    @cached_property
+    @property
     def has_odometer(self) -> bool:
-        return bool(np.isfinite(self.odometer_m).any())
+        return self.on_odometer.size > 0
 
     def absence(self, epochs: slice) -> PassageStatus:
         """What to say of a balise passed while no position was on the path: off all track, or none."""
@@ -146,15 +142,16 @@ def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[
 
 def turning_epochs(journey: Journey) -> frozenset[int]:
     """Epochs at which direction or leg differ from those of the epoch before, odometer known."""
-    known = np.flatnonzero(np.isfinite(journey.odometer_m))
+    known = journey.on_odometer
     changed = (np.diff(journey.direction[known]) != 0) | (np.diff(journey.leg[known]) != 0)
     return frozenset(known[1:][changed].tolist())
 
 
-def segment_epochs(journey: Journey) -> list[int]:
-    """The first epochs of the odometer's continuity segments but the first: its distance was lost before them."""
-    found: list[int] = (np.flatnonzero(np.diff(journey.segment)) + 1).tolist()
-    return found
+def odometer_epochs(journey: Journey) -> list[int]:
+    """Epochs at which the odometer begins to slip, or is in another continuity segment than at the epoch before."""
+    changes = (np.diff(journey.segment) != 0) | (journey.slips[1:] & ~journey.slips[:-1])
+    epochs: list[int] = (np.flatnonzero(changes) + 1).tolist()
+    return epochs
 
 
 def mission_epochs(journey: Journey, config: LdsConfig) -> frozenset[int]:

@@ -19,7 +19,7 @@ from pipeline.stages.epochs.verdicts import (
 from pipeline.stages.lds.crossings import Crossing
 from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.relink import Anchor, Comparison
-from schemas.arrays import Bools
+from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
 
@@ -72,7 +72,8 @@ class LinkDistance:
     """GNSS against odometer distance since the LRVB, or since the TVB that began the chain.
 
     Bounds: the odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T. At the first
-    position after an outage it is the distance since the re-link anchor, within the bound of a re-link (`relink`).
+    position after an outage, and for a while after a return, it is the distance since the re-link anchor, within the
+    bound of a re-link (`relink`).
     """
 
     def __init__(self, journey: Journey, config: Configuration) -> None:
@@ -87,10 +88,17 @@ class LinkDistance:
         self._fails = np.zeros(journey.t_ns.size, dtype=bool)
         self._anchor: Anchor | None = None
         self._done = 0
+        self._since_return = np.full((2, journey.t_ns.size), np.nan)  # moved since the re-link anchor, its bound
 
     def measure_from(self, anchor: Anchor | None, k: int) -> None:
         """From epoch `k` on the distance counts from this anchor."""
         self._anchor, self._done = anchor, k
+
+    def hold_to(self, k: int, moved_m: Floats, bound_m: Floats) -> None:
+        """From epoch `k` on the position is held to the re-link anchor, for as long as these are; then measure anew."""
+        self._since_return[:, k:] = np.nan
+        self._since_return[:, k : k + moved_m.size] = moved_m, bound_m
+        self._done = k
 
     def is_possible(self, k: int) -> bool:
         """There is a position and an odometer to compare at this epoch."""
@@ -126,23 +134,28 @@ class LinkDistance:
         threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
         lost = self._possible[ahead] & (self._journey.segment[ahead] != anchor.segment)
         known = self._possible[ahead] & ~lost
+        moved_m, bound_m = self._since_return[:, ahead]
+        held = known & np.isfinite(moved_m)
         self._reason[ahead][self._possible[ahead]] = None
         self._reason[ahead][lost] = LOST
-        self._value[ahead] = np.where(known, self._offset_m[ahead] - anchor.offset_m, np.nan)
-        self._threshold[ahead] = np.where(known, threshold_m, np.nan)
+        since_m = np.where(held, moved_m, self._offset_m[ahead] - anchor.offset_m)
+        self._value[ahead] = np.where(known, since_m, np.nan)
+        self._threshold[ahead] = np.where(known, np.where(held, bound_m, threshold_m), np.nan)
         self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
 
-    def hold_against(self, found: Comparison, k: int) -> None:
+    def hold_against(self, comparison: Comparison, k: int) -> None:
         """The verdict on a position after an outage joins that of the bounds at epoch `k`, whose fail remains."""
         if self.fails(k):
             return
-        self._value[k], self._threshold[k] = found.moved_m, found.bound_m
-        self._fails[k] = found.reason is None and not found.holds
-        self._reason[k] = found.reason
+        self._value[k] = comparison.moved_m
+        self._threshold[k] = comparison.bound_m
+        self._fails[k] = comparison.reason is None and not comparison.holds
+        self._reason[k] = comparison.reason
 
     def forget(self, k: int) -> None:
         """From epoch `k` on there is nothing to measure from."""
         self.measure_from(None, k)
+        self._since_return[:, k:] = np.nan
         self._value[k:] = self._threshold[k:] = np.nan
         self._reason[k:][self._possible[k:]] = None
 

@@ -1,29 +1,54 @@
-"""The location determination system as a state machine over the epochs of one solution.
+"""The location determination system: one walk along the epochs of a solution, with one state of its position.
 
-*Initialising*: no reference, no linking. *Linked*: reference known, position in use. *Odometry*:
-reference known, no usable position just now. *Fail-safe*: position negated. In any mode a position is *withheld* where
-the diagnosis itself says that it cannot stand behind it (DOMAIN section 5.2): no VB is accepted, no TVB is valid.
+In any state a position is *withheld* where the diagnosis itself says that it cannot stand behind it (DOMAIN section
+5.2): no VB is accepted, no TVB is valid.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
+from enum import Enum, auto
+
+import numpy as np
 
 from pipeline.stages.lds.crossings import Balise, Crossing
 from pipeline.stages.lds.detection import BaliseDetection
-from pipeline.stages.lds.journey import Journey, mission_epochs, segment_epochs
+from pipeline.stages.lds.journey import Journey, mission_epochs, odometer_epochs
 from pipeline.stages.lds.link_monitors import LinkDistance
 from pipeline.stages.lds.linking import LrvbChange
-from pipeline.stages.lds.relink import Anchor, Held, Recovery, Relink, breaks
+from pipeline.stages.lds.relink import Anchor, Held, Recovery, Relink
 from pipeline.stages.monitors.bank import MonitorBank
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, LostTo
 
+_NOTHING = np.zeros((2, 0))
+
+
+class Use(Enum):
+    """Whether the train uses the position (DOMAIN section 4).
+
+    | from | when | to |
+    |---|---|---|
+    | in use | the odometer reports slip, and something was validated | slipped |
+    | in use | an outage, or the noise hides what the position does | unseen |
+    | unseen | a usable position, watched again within `gap_reset_s`, or it re-links | in use |
+    | unseen | it has moved (an alarm), or nothing can be said of that | negated |
+    | slipped | it re-links | in use |
+    | any but negated | a monitor fails | negated |
+    | negated | `recovery_s` without a fast failure, and it re-links | in use |
+    | any | a start of mission; in negated also recovery where nothing was validated before | in use |
+    """
+
+    IN_USE = auto()
+    UNSEEN = auto()
+    SLIPPED = auto()
+    NEGATED = auto()
+
 
 class LocationSystem:
-    """Walks once along a journey; what it found stands in its public attributes afterwards.
+    """Walks once along a journey; the results stand in its public attributes afterwards.
 
     Per epoch: `tvb`, `alarm`, `negated`, `evaluated` (`along_raw` has a verdict), `withheld_for` (why the position is
     not used though no monitor fails, None where it is).
@@ -37,7 +62,7 @@ class LocationSystem:
         crossings: Sequence[Crossing],
         config: Configuration,
     ) -> None:
-        self._journey, self._bank, self._config = journey, bank, config.lds
+        self._journey, self._bank, self._config = journey, bank, config
         self.balises = BaliseDetection(journey, balises, crossings, config)
         self.distance = LinkDistance(journey, config)
         self.lrvb_changes = [LrvbChange(0, None, chain_begun=False)]
@@ -48,14 +73,15 @@ class LocationSystem:
         # The walk reads single elements: lists are several times faster at that than arrays.
         self._t_ns: list[int] = journey.t_ns.tolist()
         self._way_m = journey.odometer_m * journey.direction
-        self._breaks = breaks(journey, bank.after_outages)
+        self._after_outages = frozenset(bank.after_outages.tolist())
         self._bridged_ns = round(config.align.gap_reset_s * NS_PER_S)
+        self._memory_ns = round(NS_PER_S / min(config.monitors.ewma_alphas))
         self._missions = mission_epochs(journey, config.lds)
-        self._events = sorted({*self.balises.events, *self._breaks, *self._missions, *segment_epochs(journey)})
+        self._events = sorted({*self.balises.events, *self._after_outages, *self._missions, *odometer_epochs(journey)})
         self._relink = Relink(journey, self.tvb, config)
-        self._recovery: Recovery | None = None  # while negated
-        self._slipped = False  # since slip that the odometer reported, until re-link
-        self._unwatched_since_ns: int | None = None  # the noise hides whether the position moves
+        self._use = Use.IN_USE
+        self._since = 0  # the epoch from which the position is slipped or unseen
+        self._recovery = Recovery(journey, bank, config)
         self._validated = False  # a VB or a TVB
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
         self._consistent_since_ns: int | None = None
@@ -84,9 +110,9 @@ class LocationSystem:
 
         So it is on linked way where no balise, read, turn, outage, loss of distance, alarm or end of a window is near.
         """
-        if self._recovery is not None or self.balises.disarmed or self._chain_from is None or k <= self._chain_from:
+        if self._use is not Use.IN_USE or self._withheld_for(k) is not None:
             return k
-        if self._unwatched_since_ns is not None or self._withheld_for(k) is not None:
+        if self.balises.disarmed or self._chain_from is None or k <= self._chain_from:
             return k
         if self._journey.has_odometer and not self.distance.can_measure(k):
             return k
@@ -110,12 +136,12 @@ class LocationSystem:
         self.balises.turn(k)
         for read in self.balises.read(k):
             self._relink.note_read(read)
+            self.distance.hold_to(k, *_NOTHING)
         bank_failed = self._bank.failed(k)
-        self._test_after_slip(k)
-        self._test_after_outage(k)
+        self._watch(k)
         self.withheld_for[k] = self._withheld_for(k)
         withheld = self.withheld_for[k] is not None
-        distrusted = bank_failed or self.distance.fails(k) or self._recovery is not None or withheld
+        distrusted = bank_failed or self.distance.fails(k) or self._use is Use.NEGATED or withheld
         accepted, disordered = self.balises.pass_virtual(k, distrusted, self._chain_from is None)
         for crossing in accepted:
             self._accept(crossing, k)
@@ -123,8 +149,8 @@ class LocationSystem:
         self.balises.close_windows(k, self._t_ns[k])
         self.evaluated[k] = self._bank.along_evaluated(k)
         self.alarm[k] = bank_failed or disordered or self.distance.fails(k)
-        if self._recovery is not None:
-            self._seek_return(self._recovery, k, disordered)
+        if self._use is Use.NEGATED:
+            self._seek_return(k, disordered)
         elif self.alarm[k]:
             self._negate(k)
         elif self.evaluated[k] and self._journey.usable[k] and not withheld:
@@ -136,49 +162,40 @@ class LocationSystem:
             return LostTo.NOISE
         if self._journey.slips[k]:
             return LostTo.SLIP
-        return LostTo.RELINK if self._slipped or self._bank.begins_at(k) else None
+        return LostTo.RELINK if self._use is Use.SLIPPED or self._bank.begins_at(k) else None
 
-    def _test_after_slip(self, k: int) -> None:
-        """Nothing watched the position while the odometer slipped: it has to re-link, like after an alarm."""
+    def _watch(self, k: int) -> None:
+        """Whether anybody looks on at the position, or has looked on until now."""
         if self._journey.slips[k]:
             self._consistent_since_ns = None
-            if self._validated and not self._slipped:
-                self._relink.note_slip(k)
-                self._slipped = True
-        elif self._slipped and self._recovery is None and self._can_return(k):
-            self._slipped = not self._relink.compare(k, slipped=True).holds
-            if not self._slipped:
-                self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+            if self._use in (Use.IN_USE, Use.UNSEEN) and self._validated:
+                self._use, self._since = Use.SLIPPED, k
+        elif self._use is Use.SLIPPED:
+            self._relink_after_slip(k)
+        if self._use is Use.IN_USE and not self._bank.noise_known_at(k):
+            self._use, self._since = Use.UNSEEN, k
+        if self._use in (Use.IN_USE, Use.UNSEEN) and k in self._after_outages:
+            # The last epoch that lies farther back than the bank bridges: there is one before an outage.
+            self._use, self._since = Use.UNSEEN, bisect_left(self._t_ns, self._t_ns[k] - self._bridged_ns) - 1
+        if self._use is Use.UNSEEN and self._bank.noise_known_at(k) and self._can_return(k):
+            self._relink_unseen(k)
 
     def _can_return(self, k: int) -> bool:
         return self.distance.is_possible(k) and bool(self._journey.usable[k])
 
-    def _test_after_outage(self, k: int) -> None:
-        """Nobody looked on over the outage, or in the noise: the position has to re-link, or is not used."""
-        in_noise = self._was_unwatched(k)
-        if (
-            not (k in self._breaks or in_noise)
-            or self._recovery is not None
-            or self._slipped
-            or not (self._validated and self.distance.is_possible(k))
-        ):
-            return
-        found = self._relink.compare(k)
-        self.distance.hold_against(found, k)
-        if found.reason is not None:
-            self._negate(k)
+    def _relink_after_slip(self, k: int) -> None:
+        if self._can_return(k) and self._relink.compare(k, self._relink.anchor_before_slip(self._since)).holds:
+            self._use = Use.IN_USE
+            self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
 
-    def _was_unwatched(self, k: int) -> bool:
-        """The first usable position after noise too large, or not known, for longer than the bank bridges."""
-        if not self._bank.noise_known_at(k):
-            if self._unwatched_since_ns is None:
-                self._unwatched_since_ns = self._t_ns[k]
-            return False
-        if self._unwatched_since_ns is None or not self._can_return(k):
-            return False
-        waited_ns = self._t_ns[k] - self._unwatched_since_ns
-        self._unwatched_since_ns = None
-        return waited_ns > self._bridged_ns
+    def _relink_unseen(self, k: int) -> None:
+        """The first usable position after an outage or the noise: where it moved meanwhile, that is an alarm."""
+        self._use = Use.IN_USE
+        if self._validated and self._t_ns[k] - self._t_ns[self._since] > self._bridged_ns:
+            comparison = self._relink.compare(k, self._relink.anchor_at(k))
+            self.distance.hold_against(comparison, k)
+            if comparison.reason is not None:
+                self._negate(k)
 
     def _accept(self, crossing: Crossing, k: int) -> None:
         self.accepted_at_ns[k] = crossing.t_ns
@@ -203,44 +220,50 @@ class LocationSystem:
         if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns:
             self._consistent_since_ns = t_ns
         self._consistent_at_ns = t_ns
-        if t_ns - self._consistent_since_ns < self._config.init_s * NS_PER_S:
+        if t_ns - self._consistent_since_ns < self._config.lds.init_s * NS_PER_S:
             return False
         self._chain_from = k
         self._note_lrvb(k)
         return True
 
     def _negate(self, k: int) -> None:
-        self._relink.note_alarm(k)
+        self._relink.note_alarm(k, self._bank.failing_memory_s(k))
         self._bank.freeze(k)
-        self._recovery = Recovery(k, self._journey, self._bank, self._config)
+        self._use = Use.NEGATED
+        self._recovery.begin(k)
         self.negated[k] = True
         self._consistent_since_ns = None
 
-    def _seek_return(self, recovery: Recovery, k: int, disordered: bool) -> None:
+    def _seek_return(self, k: int, disordered: bool) -> None:
         self.negated[k] = True
-        if not recovery.is_over(k, self.evaluated[k], disordered):
+        if not self._recovery.is_over(k, self.evaluated[k], disordered):
             return
         if not self._validated:
             self._initialise_anew(k)
-        elif self._relink.compare(k).holds:
-            self._return(k)
-            self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
-        else:
+            return
+        anchor = self._relink.anchor_at(k)
+        if anchor is None or not self._relink.compare(k, anchor).holds:
             self.withheld_for[k] = LostTo.RELINK
+            return
+        self._return(k)
+        # The bank begins anew: for the memory of its slowest average nothing else would see a slow drift go on.
+        end = bisect_right(self._t_ns, self._t_ns[k] + self._memory_ns)
+        self.distance.hold_to(k, *self._relink.moved_m(anchor, k, end))
+        self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
 
     def _initialise_anew(self, k: int) -> None:
         """No reference and no linking: a start of mission, or a fault before anything was validated."""
         self.balises.virtual.forget()
         self.distance.forget(k)
         self._chain_from = self._consistent_since_ns = None
-        self._validated = self._slipped = False
-        if self._recovery is not None:
+        self._validated = False
+        if self._use is Use.NEGATED:
             self._return(k)
+        self._use = Use.IN_USE
         self._note_lrvb(k)
 
     def _return(self, k: int) -> None:
-        self._recovery = None
-        self._slipped = False
+        self._use = Use.IN_USE
         self.negated[k] = False
         self._bank.restart(k)
         self.withheld_for[k] = LostTo.RELINK

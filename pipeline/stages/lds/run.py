@@ -28,15 +28,17 @@ from schemas.conform import dtypes
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode
 from schemas.tables import Epochs, Passages
 
+# Numerics: so many epochs are looked at first, back from where a window closed; then twice as many.
+_RECKONED_AT_ONCE = 256
+
 
 @dataclass(frozen=True)
 class LdsResult:
     """What the LDS made of one solution.
 
-    `epochs`: `t` and the LDS columns, row for row with the input. `crossings`: as in `schemas.stages.Crossings`, each
-    balise crossed or read. `passages`: as in the contract, in order of time, joined to crossings by `crossing_id`;
-    what needs a truth is null or `none`; beside it `t_reckoned`: when the train passes a balise that was not offered,
-    by LRVB and odometer. `unknown_reads`: telegrams of balises not on the path. `held`: re-links that held.
+    `epochs`: `t` and the LDS columns, row for row with the input. `crossings`: `schemas.stages.Crossings`. `passages`:
+    as in the contract, what needs a truth null or `none`, and `t_reckoned`: when the train passes a balise that was not
+    offered, by LRVB and odometer. `unknown_reads`: telegrams of balises not on the path. `held`: re-links that held.
     """
 
     epochs: pl.DataFrame
@@ -57,25 +59,17 @@ def run_lds(
 ) -> LdsResult:
     """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
 
-    `withheld` of the result: nothing is in use, and no VB is accepted, because of `withheld_for` (DOMAIN section 5.2):
-    the noise is not known yet, the odometer says itself that it slips, or the bank has just restarted or slip ended,
-    and a re-link is due.
-
-    `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
-    gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
-    where unknown)`, travelled_m, odometer_segment, odometer_slips, odometer_counter, slip_doubt_m, direction` (+1/-1,
-    used where there is no odometer).
-    `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, `odometer_m` at the read where the run has
-    an odometer. A run without that stream has no reader, so its physical balises have no passages. `scale_sigma`: of
-    the odometer, None unless a vehicle file gives it with the scale.
+    `epochs`: `schemas.stages.Aligned`, of which `journey_of` takes its columns. `balises`: those of the travelled path.
+    `balise_reads`: `t, balise_id`, `odometer_m` at the read where the run has an odometer. A run without that stream
+    has no reader, so its physical balises have no passages. `scale_sigma`: of the odometer, None unless a vehicle file
+    gives it with the scale.
     """
     journey = journey_of(epochs, scale_sigma, config)
     on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
     reads, unknown = reads_of(balise_reads, on_path[BaliseKind.PHYSICAL], journey)
-    found = [*find_crossings(journey, on_path[BaliseKind.VIRTUAL]), *reads]
-    system = LocationSystem(journey, bank, on_path, found, config)
+    crossings = in_order_of_time([*find_crossings(journey, on_path[BaliseKind.VIRTUAL]), *reads])
+    system = LocationSystem(journey, bank, on_path, crossings, config)
     system.run()
-    crossings = in_order_of_time(found)
     passages = system.balises.virtual.passages + system.balises.physical.passages
     return LdsResult(
         epochs=epoch_columns(epochs["t"], system, journey, config.lds),
@@ -222,12 +216,17 @@ def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
     """When the odometer last passed the announced place before the passage was settled."""
     if passage.crossing is not None or passage.announced_odometer_m is None:
         return None
-    known = np.flatnonzero(np.isfinite(journey.odometer_m) & (journey.t_ns <= passage.t_ns))
-    beyond = (journey.odometer_m[known] - passage.announced_odometer_m) >= 0
-    steps = np.flatnonzero(beyond[1:] != beyond[:-1])
-    if not steps.size:
-        return None
-    i, j = known[steps[-1]], known[steps[-1] + 1]
-    part_m = passage.announced_odometer_m - journey.odometer_m[i]
-    share = float(part_m / (journey.odometer_m[j] - journey.odometer_m[i]))
-    return int(journey.t_ns[i]) + round(share * int(journey.t_ns[j] - journey.t_ns[i]))
+    known = journey.on_odometer
+    end = int(np.searchsorted(journey.t_ns[known], passage.t_ns, side="right"))
+    size = _RECKONED_AT_ONCE
+    while end > 1:
+        rows = known[max(end - size, 0) : end]
+        beyond = journey.odometer_m[rows] >= passage.announced_odometer_m
+        steps = np.flatnonzero(beyond[1:] != beyond[:-1])
+        if steps.size:
+            i, j = rows[steps[-1]], rows[steps[-1] + 1]
+            part_m = passage.announced_odometer_m - journey.odometer_m[i]
+            share = float(part_m / (journey.odometer_m[j] - journey.odometer_m[i]))
+            return int(journey.t_ns[i]) + round(share * int(journey.t_ns[j] - journey.t_ns[i]))
+        end, size = end - rows.size + 1, 2 * size
+    return None

@@ -31,7 +31,7 @@ class Segments(Polyline):
     height_start_m: Floats
     height_end_m: Floats
     heading_rad: Floats
-    sigma_m: Floats
+    vertex: Ints
     tree: cKDTree
     probe_segment: Ints
 
@@ -40,9 +40,9 @@ class Segments(Polyline):
 class Candidates:
     """Candidates in order of step, then element; `first[k] : first[k + 1]` are those of step k.
 
-    `along_m` from the element's start and `left_m` to its end, `beyond_m` how far the position lies past the
-    end that `past` names (-1 start, 1 end, 0 neither), `offset_m` left of the element's own sense; `height_m` of the
-    track there (NaN on a 2-D survey); `linked_start`, `linked_end`: whether a relation leads on there.
+    `along_m` from the element's start and `left_m` to its end; `beyond_m` how far the position lies past the end that
+    `past` names (-1 start, 1 end, 0 neither); `offset_m` left of its own sense; `height_m` of the track (NaN
+    on a 2-D survey); `vertex` at which the segment begins; `linked_start`, `linked_end`: a relation leads on there.
     """
 
     first: Ints
@@ -55,7 +55,7 @@ class Candidates:
     distance_m: Floats
     height_m: Floats
     heading_rad: Floats
-    survey_sigma_m: Floats
+    vertex: Ints
     past: Ints
     linked_start: Bools
     linked_end: Bools
@@ -96,7 +96,7 @@ def segments_of(track: Track) -> Segments:
         height_start_m=track.height_m[head],
         height_end_m=track.height_m[head + 1],
         heading_rad=np.arctan2(east, north),
-        sigma_m=np.fmax(track.sigma_m[head], track.sigma_m[head + 1]),
+        vertex=head,
         tree=cKDTree(probes, balanced_tree=False, compact_nodes=False),
         probe_segment=probe_segment,
     )
@@ -191,7 +191,7 @@ def _candidates(points: int, network: Network, segments: Segments, step: Ints, f
         distance_m=feet.distance_m,
         height_m=(1.0 - held) * segments.height_start_m[segment] + held * segments.height_end_m[segment],
         heading_rad=segments.heading_rad[segment],
-        survey_sigma_m=segments.sigma_m[segment],
+        vertex=segments.vertex[segment],
         past=past,
         linked_start=linked[element, 0],
         linked_end=linked[element, 1],

@@ -49,7 +49,9 @@ def innovations_of(
 def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats, before: Ints, keep: Floats) -> Floats:
     """What of the movements that differ from the shared one has been taken for an error of the survey [m].
 
-    Errors are those of tracks against each other: of each step the smallest is taken for none, or all would drift.
+    What is common to all errors nobody can tell from an error of the position: only differences count. So each step all
+    are shifted to their median, by no more than it takes: a track that leads aside on its own moves no other. By the
+    smallest error a crossover became the measure of both tracks, and lifted them by as much as it led aside.
     """
     parted, limit, side, origin = parted_m.tolist(), tolerance_m.tolist(), sense.tolist(), before.tolist()
     errors = [0.0] * len(parted)
@@ -62,7 +64,10 @@ def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats,
             # As far as no other leaves its tolerance: that would be a parting that counts nowhere.
             lowest = max(error - limit[row] for row, error in zip(rows, taken, strict=True))
             highest = min(error + limit[row] for row, error in zip(rows, taken, strict=True))
-            shift = min(max(min(taken, key=abs), lowest), highest)
+            ordered = sorted(taken)
+            lower, upper = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+            common = min(max(0.0, lower), upper)
+            shift = min(max(common, lowest), highest)
             for row, error in zip(rows, taken, strict=True):
                 errors[row] = kept[step] * side[row] * (error - shift)
     return np.array(errors)

@@ -56,11 +56,13 @@ class Likelihood:
         return np.stack([constant, np.zeros_like(constant), 1.0 / self.bias_m2])
 
 
-def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: MatchingConfig) -> Likelihood:
+def likelihood_of(
+    fixes: Fixes, steps: Steps, candidates: Candidates, survey_sigma_m: Floats, config: MatchingConfig
+) -> Likelihood:
     """The part of the likelihood that needs no neighbouring step."""
     row = steps.epoch[candidates.step]
     gnss_m2 = _cross_m2(fixes, row, candidates.heading_rad)
-    survey_m2 = survey_sigmas_m(candidates, config) ** 2
+    survey_m2 = survey_sigma_m**2
     scales = _scales(fixes, steps, config)
     elapsed_s = np.nan_to_num(steps.elapsed_s[candidates.step])
     keep = np.exp(-elapsed_s / config.noise_tau_s)
@@ -116,12 +118,6 @@ def step_terms(movement_m: Floats, level_m: Floats, candidate: Ints, like: Likel
     return terms
 
 
-def survey_sigmas_m(candidates: Candidates, config: MatchingConfig) -> Floats:
-    """Sigma of the survey at each candidate [m]."""
-    stated = candidates.survey_sigma_m
-    return np.where(np.isfinite(stated), stated, config.survey_sigma_default_m)
-
-
 def _quadratic(value_m: Floats, slope: Floats, variance_m2: Floats) -> Terms:
     """Log density of `value_m - slope b`, Gaussian."""
     constant = -0.5 * (value_m**2 / variance_m2 + np.log(2.0 * np.pi * variance_m2))
@@ -150,10 +146,10 @@ def _bias_m2(
     """Variance of what lasts the whole run, the same on every track (DOMAIN section 2), under each scale.
 
     Antenna and datum, what of the position's error outlasts minutes (DIAG Table 1), and twice the survey's variance:
-    of a step the larger one, over the run the median.
+    of a step the larger one, over the run the mean, for a mean of errors varies by no more than that.
     """
     gnss_m2 = float(np.median(0.5 * (fixes.cov_ee_m2 + fixes.cov_nn_m2)[steps.epoch]))
-    worst_m2 = float(np.median(np.maximum.reduceat(survey_m2, candidates.first[:-1])))
+    worst_m2 = float(np.mean(np.maximum.reduceat(survey_m2, candidates.first[:-1])))
     return np.asarray(config.cross_bias_sigma_m**2 + 2.0 * worst_m2 + config.slow_share * gnss_m2 * scales**2)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.stages.matching.candidates import Candidates
 from pipeline.stages.matching.innovations import Innovations, innovations_of, movements_m
-from pipeline.stages.matching.likelihood import Likelihood, Terms, initial_terms, step_terms, survey_sigmas_m
+from pipeline.stages.matching.likelihood import Likelihood, Terms, initial_terms, step_terms
 from pipeline.stages.matching.steps import Steps
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
@@ -134,14 +134,19 @@ class States:
 
 
 def trellis_of(
-    network: Network, steps: Steps, candidates: Candidates, like: Likelihood, config: MatchingConfig
+    network: Network,
+    steps: Steps,
+    candidates: Candidates,
+    survey_sigma_m: Floats,
+    like: Likelihood,
+    config: MatchingConfig,
 ) -> Trellis:
     """The candidates as states, every step with at least one, and how a train gets from one to the next."""
     states = _states(network, candidates, len(steps))
     ways = _ways(network, steps, states, config)
     stays = _stays(network, steps, states, config)
     pairs = _pairs(network, states, np.flatnonzero(~stays)[1:], ways, config)
-    tolerance_m = _tolerances_m(candidates, like, config)[candidates.step[states.candidate]]
+    tolerance_m = _tolerances_m(candidates, survey_sigma_m, like, config)[candidates.step[states.candidate]]
     heading_rad = candidates.heading_rad[states.candidate] + np.pi * (states.oriented % 2)
     keep = np.exp(-np.nan_to_num(steps.chord_m) / config.survey_mean_m)
     before = _before(states, stays, pairs)
@@ -166,10 +171,10 @@ def _states(network: Network, candidates: Candidates, steps: int) -> States:
     )
 
 
-def _tolerances_m(candidates: Candidates, like: Likelihood, config: MatchingConfig) -> Floats:
+def _tolerances_m(candidates: Candidates, survey_sigma_m: Floats, like: Likelihood, config: MatchingConfig) -> Floats:
     """Per step by how much the distance of tracks may be wrong; how a position off every track moves tells nothing."""
     begin = candidates.first[:-1]
-    worst_m = np.maximum.reduceat(survey_sigmas_m(candidates, config), begin)
+    worst_m = np.maximum.reduceat(survey_sigma_m, begin)
     lost = np.logical_and.reduceat(like.off, begin)
     return np.where(lost, np.inf, config.survey_sigmas * np.sqrt(2.0) * worst_m)
 

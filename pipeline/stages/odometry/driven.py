@@ -1,7 +1,7 @@
 """The odometer's distance without quantisation noise, which is neither way nor turn.
 
-A train that stands beside the edge of two counts, or whose odometer's reading is noisy, drives to and fro in the rows
-alone. The distance follows them with a hysteresis as wide as they scatter, so that only what leaves it counts.
+The distance follows the rows with a hysteresis as wide as they scatter: a stand at the edge of two counts is no
+movement.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
 def turns_of(distance_m: Floats, back_m: float) -> list[tuple[int, int, int]]:
     """Where the train turned, where that showed by its coming back so far, and the sense from then on (+1 or -1).
 
-    The distance grows at first, as far as anybody knows. In whole arrays, for each turn one: trains turn seldom.
+    The distance is taken to grow at first.
     """
     turns: list[tuple[int, int, int]] = []
     start, sense = 0, 1
@@ -99,10 +99,9 @@ def driven_or_left_m(distance_m: Floats, moving: Bools) -> Floats:
 def evenly_driven(
     t_s: Floats, distance_m: Floats, sigma_m: Floats, least_mps: float, config: AlignConfig
 ) -> tuple[Floats, Floats]:
-    """Times and distances [m] between which the train drove evenly, after the fact; slower than this it stood.
+    """Times and distances [m] between which the train drove evenly, after the fact; slower than `least_mps` it stood.
 
-    From one row that moves the held distance to the next. Where that is a stand, it moved no sooner than from the last
-    row about where it stood.
+    From one row that moves the held distance to the next; out of a stand, from the last row near where it stood.
     """
     width_m = hysteresis_m(sigma_m, config)
     held = with_hysteresis(distance_m, width_m)

@@ -32,10 +32,7 @@ class Increments(NamedTuple):
 
 @dataclass(frozen=True)
 class Noise:
-    """What the distance is off by: it gathers `white_m2_per_s` in a second; single rows have noise beside.
-
-    `counter_m`: the step of a counter [m], 0 where there is none.
-    """
+    """Noise of the distance: what gathers in a second, the scatter of rows, and the step of a counter."""
 
     white_m2_per_s: float
     quantisation: QuantisationNoise = NO_QUANTISATION
@@ -46,14 +43,12 @@ class Noise:
 class Odometry:
     """Distance over time in continuity segments, with its noise.
 
-    Instants are int64 nanoseconds. Distances [m] are as recorded, but for `between` and `increments`, and grow with the
-    path once `oriented`. `t_s` and `distance_m` are samples (rows, and what was filled in between), in seconds since
-    `epoch_ns`; `segment` counts sample by sample how often the distance was lost before; `pause[i]` marks a pause of
-    the recording between samples i and i+1, inside which nothing is interpolated; `slip`: as the odometer reports.
-    `counter` numbers segments as `segment` does, but goes on over slip: there the wheel turned and was counted, and
-    `slip_doubt_m` is by how much the count may be off through slip, summed up to each sample [m].
-    `scale` is true over recorded distance, by the vehicle file when that gives its sigma too, else None.
-    `leaps_ns`: rows to which the recorded distance leaps farther than a train can drive.
+    Instants are int64 nanoseconds; `t_s` of the samples (rows, and what was filled in) and all `_s` arguments are
+    seconds since `epoch_ns`. Distances are as recorded, but for `between` and `increments`, and grow with the path once
+    `oriented`. `segment`: how often the distance was lost before a sample; `counter`: the same, over slip, where the
+    wheel was counted all the same; `slip_doubt_m`: by how much the count may be off through slip so far. `pause[i]`:
+    between samples i and i+1 nothing is interpolated. `scale`: true over recorded distance, None without its sigma.
+    `leaps_ns`: rows to which the counter leaps (`rows.leaps`).
     """
 
     epoch_ns: int
@@ -74,12 +69,10 @@ class Odometry:
 
     @property
     def begin_ns(self) -> int:
-        """The first sample."""
         return self.epoch_ns
 
     @property
     def end_ns(self) -> int:
-        """The last row."""
         return self.epoch_ns + int(np.ceil(self.t_s[-1] * 1e9))
 
     def oriented(self, sign: int) -> Odometry:
@@ -91,26 +84,23 @@ class Odometry:
         return ((t_ns - self.epoch_ns) * 1e-9).astype(np.float64)
 
     def known_at(self, t_ns: Ints) -> Bools:
-        """Whether the distance is known: between two samples without a pause, none of which reports slip."""
         return self.known_at_s(self.seconds(t_ns))
 
     def segment_at(self, t_ns: Ints) -> Ints:
-        """Number of the continuity segment: distances can be compared only where it is the same."""
+        """Distances can be compared only where the continuity segment is the same."""
         return self.segment_at_s(self.seconds(t_ns))
 
     def slips_at_s(self, t_s: Floats) -> Bools:
-        """Whether the odometer reports slip at the sample before or after these times, on its own scale [s]."""
+        """Whether the odometer reports slip at the sample before or after."""
         before, after = self._around(t_s)
         slips: Bools = self.slip[before] | self.slip[after]
         return slips
 
     def counter_at_s(self, t_s: Floats) -> Ints:
-        """Number of the counter's segment at these times; slip does not end it."""
         counter: Ints = self.counter[self._sample_at(t_s)]
         return counter
 
     def slip_doubt_at_s(self, t_s: Floats) -> Floats:
-        """By how much slip may have falsified the count up to these times [m]."""
         return np.interp(t_s, self.t_s, self.slip_doubt_m)
 
     def distance_at(self, t_ns: Ints) -> Floats:
@@ -119,25 +109,19 @@ class Odometry:
         return np.where(self.known_at_s(t_s), self.distance_at_s(t_s), np.nan)
 
     def travelled_at(self, t_ns: Ints) -> Floats:
-        """Way driven since the first row [m], turns included, as recorded; a best guess where it is not known.
-
-        Quantisation noise is neither way nor turn, and noise at standstill adds up to no more than it leaves the place.
-        """
+        """Way driven since the first row [m], turns included, noise of rows and stands not; a guess where not known."""
         return np.interp(self.seconds(t_ns), self.t_s, self._travelled_m)
 
     def moving_s_at(self, t_ns: Ints) -> Floats:
-        """Time since the first row in which the train moved [s]."""
+        """Time moving since the first row [s]."""
         return np.interp(self.seconds(t_ns), *self._moving_s)
 
     def moved(self, t_ns: Ints) -> Bools:
-        """Per step from an instant to the next: whether the train moved for more than half of it; shape (n - 1,).
-
-        The one movement test: mean speed beyond the dead band, over a second at least (DOMAIN section 2).
-        """
+        """Whether the train moved for more than half of each step (DOMAIN section 2), shape (n - 1,)."""
         return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
 
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> Way:
-        """True distance from some instants, or from one, to others, and its variance; the one answer to "how far".
+        """True distance from some instants, or from one, to others, and its variance.
 
         s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) +
         (sigma_s D)^2 (DOMAIN section 5.1). NaN where either end is not known or the distance was lost in between.
@@ -152,10 +136,7 @@ class Odometry:
         return Way(scale * recorded, variance)
 
     def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
-        """Along-track increments between consecutive instants, both ends with the estimates in use at the later one.
-
-        `scale`: true over recorded distance; `latency_s`: by how much the position at an instant is older.
-        """
+        """Increments between consecutive instants, both ends with the scale and latency in use at the later one."""
         before, now = self._steps_s(t_ns, latency_s)
         distance = scale * (self.distance_at_s(now) - self.distance_at_s(before))
         return Increments(distance, scale * (self.speed_at_s(now) - self.speed_at_s(before)))
@@ -166,13 +147,12 @@ class Odometry:
         return np.asarray(scale * (end_m - begin_m))
 
     def _steps_s(self, t_ns: Ints, latency_s: Floats) -> tuple[Floats, Floats]:
-        """Begin and end of the step to each instant, both less the latency in use at the later one [s]."""
         t_s = self.seconds(t_ns)
         now = t_s - latency_s
         return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
 
     def known_at_s(self, t_s: Floats) -> Bools:
-        """`known_at` in seconds on the odometer's own scale, as the functions below: for estimates of latency."""
+        """Whether the distance is known: between two samples without a pause, none of which reports slip."""
         before, after = self._around(t_s)
         paused = (before != after) & self.pause[np.minimum(before, self.pause.size - 1)]
         inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
@@ -184,7 +164,7 @@ class Odometry:
         return segment
 
     def distance_at_s(self, t_s: Floats) -> Floats:
-        """Distance [m], also where it is not known: the best guess, and outside the recording the end value."""
+        """Distance [m]; a guess where it is not known, the end value outside the recording."""
         return np.interp(t_s, self.t_s, self.distance_m)
 
     def speed_at_s(self, t_s: Floats) -> Floats:
@@ -206,7 +186,6 @@ class Odometry:
         return self.distance_at_s(t_s), speed_mps
 
     def row_sigma_m(self, t_s: Floats) -> Floats:
-        """Standard deviation of the quantisation noise at these times [m]."""
         if not self.noise.quantisation:
             return np.zeros(t_s.size)
         return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
@@ -216,14 +195,12 @@ class Odometry:
         return index.clip(0, self.t_s.size - 1)
 
     def _around(self, t_s: Floats) -> tuple[Ints, Ints]:
-        """Samples before and after each time, twice the same where it is that of a sample."""
         after = np.searchsorted(self.t_s, t_s, side="left").clip(0, self.t_s.size - 1)
         before = np.where(self.t_s[after] == t_s, after, np.maximum(after - 1, 0))
         return before, after
 
     @cached_property
     def _moving_s(self) -> tuple[Floats, Floats]:
-        """Times [s], and the time moving up to each [s]."""
         at_s, at_m = self.t_s, self.distance_m
         if self.noise.quantisation:
             at_s, at_m = evenly_driven(at_s, at_m, self.row_sigma_m(at_s), self.deadband_mps, self.config)
@@ -232,7 +209,6 @@ class Odometry:
 
     @cached_property
     def _travelled_m(self) -> Floats:
-        """Way driven up to each sample."""
         if self.noise.quantisation:
             return driven_m(self.distance_m, hysteresis_m(self.row_sigma_m(self.t_s), self.config))
         moving = moving_steps(self.t_s, self.distance_m, self.deadband_mps, self.config.speed_window_s)
@@ -242,13 +218,9 @@ class Odometry:
 def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> Odometry | None:
     """The odometer of a cleaned stream (CONTRACT section 1), as recorded; None without at least two rows.
 
-    Distance from the recorded distance where there is one, else from speed (trapezoids). A pause longer than
-    `odometer_gap_s` (and than `odometer_gap_periods`) loses the way of speed-only odometry: the speeds before and after
-    it give the best guess, but a new continuity segment begins. A cumulative distance carries over it. Slip that the
-    odometer itself reports (`_slips`) loses the way too, and so does a leap of the distance where no speed tells the
-    way.
-    `odometer_sigma_mps` is the white noise at 1 Hz; a larger declared `sigma_speed_mps`, taken as independent from row
-    to row, replaces it.
+    Distance as recorded, else by the speeds. A new continuity segment begins where the way is lost: a pause beyond
+    `odometer_gap_s` without a counter, slip that the odometer reports, a leap that no speed bridges. White noise is
+    `odometer_sigma_mps`, or a larger declared `sigma_speed_mps`, taken as independent from row to row.
     """
     if stream is None or stream.height < 2:
         return None
@@ -297,14 +269,13 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 
 
 def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: Configuration) -> Noise:
-    """Noise of a recorded distance, of whose ways those to the next row are `whole` (rows - 1,)."""
     counter_m, deadband_mps = count_step_m(distance_m, whole, config.align), config.matching.deadband_mps
     scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, deadband_mps, config.align)
     return Noise(white_m2_per_s, scatter, counter_m)
 
 
 def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
-    """Rows at which the odometer itself says that it slips: by its flag, or by a sigma of its speed beyond any use."""
+    """Rows at which the odometer reports slip: by its flag, or by a sigma of its speed beyond any use."""
     slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
     return slips
 
@@ -312,8 +283,7 @@ def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
 def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
     """By how much the count of each way that begins or ends in slip may be off [m].
 
-    By a share of the way, and by no less than the sigma that the odometer gives: an error that lasts while it slips, so
-    that it grows with time and not with its root.
+    A share of the way, or the odometer's own sigma: an error that lasts while it slips grows with time, not its root.
     """
     sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
     doubt_m = np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s)
@@ -321,7 +291,7 @@ def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, c
 
 
 def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
-    """Variance that the distance gathers in a second by the recorded sigma of the speed [m^2/s]; 0 without one."""
+    """White noise by the recorded sigma of the speed; 0 without one."""
     declared = stream["sigma_speed_mps"].median()
     return float(declared) ** 2 * period_s if isinstance(declared, float) else 0.0
 

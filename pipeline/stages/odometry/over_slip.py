@@ -15,8 +15,7 @@ from schemas.config import AlignConfig
 def counted_over_slip(odometry: Odometry, others: Sequence[Odometry], config: AlignConfig) -> Odometry:
     """The odometer, with its way over slip from the first of the others that knew it throughout.
 
-    Slip stays reported: nothing is in use meanwhile. But the re-link after it compares with a way that was counted, in
-    doubt by `other_way_share` of it: nobody has measured the other's scale. Elsewhere the odometer's own count stays.
+    Slip stays reported, but the re-link after it compares with a way in doubt by only `other_way_share` of it.
     """
     if not others or not odometry.slip.any():
         return odometry
@@ -35,9 +34,9 @@ def counted_over_slip(odometry: Odometry, others: Sequence[Odometry], config: Al
     return replace(odometry, distance_m=distance_m, slip_doubt_m=_sums(doubt_m))
 
 
-def _sense(one: Odometry, other: Odometry, t_ns: Ints) -> float:
-    """+1 where both count up alike, -1 where one of them runs backwards."""
-    both = np.diff(one.distance_m) * np.diff(other.distance_at_s(other.seconds(t_ns)))
+def _sense(odometry: Odometry, other: Odometry, t_ns: Ints) -> float:
+    """+1 where both count up alike, -1 where one of the two runs backwards."""
+    both = np.diff(odometry.distance_m) * np.diff(other.distance_at_s(other.seconds(t_ns)))
     return -1.0 if both.sum() < 0.0 else 1.0
 
 

@@ -11,10 +11,8 @@ from schemas.arrays import Floats, Ints
 def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) -> int:
     """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement.
 
-    `path_m` grows in the direction of that same movement (DOMAIN section 2), so GNSS decides once, over these
-    metres only: starts every metre have a vote each, so that a leap of the
-    position in between does not turn the odometer round. A run that never moves so far is judged by its largest
-    movement.
+    Starts every metre have a vote each, so that a leap of the position does not turn the odometer round. A run that
+    never moves so far is judged by its largest movement.
     """
     recorded_m = odometry.distance_at(t_ns)
     usable = np.flatnonzero(np.isfinite(path_m) & np.isfinite(recorded_m))
@@ -31,11 +29,7 @@ def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) 
 
 
 def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distance_m: float) -> bool:
-    """Whether the run's first `distance_m` of net movement went with the given positions (NaN: not known).
-
-    The odometer says when that distance was covered and in which sense, and its `polarity` against the positions which
-    way they went. Without an odometer the positions say both.
-    """
+    """Whether the first `distance_m` of net movement, by the odometer if there is one, went with the positions."""
     known = np.isfinite(position_m)
     if not known.any():
         return True

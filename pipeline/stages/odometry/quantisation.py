@@ -1,8 +1,7 @@
 """Quantisation noise: what single rows of an odometer's distance are off by, measured from the rows themselves.
 
-A counter of whole metres, a recorder that stamps on receipt, or noise of the reading: the distance of a row is off by
-some of it, the next by something else, and nothing adds up. At 10 Hz a counter of half metres so seems to change its
-speed by metres per second from epoch to epoch. Only the odometer is looked at, never a position.
+A counter of whole metres, stamps on receipt, noise of the reading: nothing of it adds up, but at 10 Hz a counter of
+half metres seems to change its speed by metres per second from epoch to epoch.
 """
 
 from __future__ import annotations
@@ -52,11 +51,10 @@ def quantisation_noise(
 ) -> QuantisationNoise:
     """What rows scatter about smooth curves beyond what white noise of the increments explains.
 
-    `whole` (rows - 1,): ways between rows that are recorded. Medians over pieces in which the train moves (faster than
-    `deadband_mps`), so that slips do not count. Noise of stamps grows with the square of the speed: lower and higher
-    speeds are told apart where their squares differ by `quantisation_factor`, as scatter has to. Noise that is less
-    than what the white noise makes of the same rows counts as none. A counter has the noise of its step (`counter_m`)
-    at least: at a speed at which each row gains as many steps as the last it does not show, until it does.
+    `whole` (rows - 1,): ways between rows that are recorded. Medians over pieces in which the train moves, so that
+    slips do not count. Noise of stamps grows with the square of the speed: lower and higher speeds are separated where
+    their squares differ by `quantisation_factor`. A counter has the noise of its step (`counter_m`) at least: it does
+    not show while each row gains as many steps as the last.
     """
     scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s, deadband_mps, config)
     return replace(scatter, still_m2=max(scatter.still_m2, counter_m**2 / 12.0))
@@ -71,18 +69,17 @@ def count_step_m(distance_m: Floats, whole: Bools, config: AlignConfig) -> float
 def _scatter_beyond(
     t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, deadband_mps: float, config: AlignConfig
 ) -> QuantisationNoise:
-    """What the rows show of their noise."""
     rows = _moving_pieces(t_s, distance_m, whole, deadband_mps, config)
     if len(rows) < _FEWEST_PIECES:
         return QuantisationNoise()
     since_s, ways = t_s[rows] - t_s[rows[:, :1]], distance_m[rows] - distance_m[rows[:, :1]]
-    found, explained = _scatter(since_s, ways, white_m2_per_s)
+    scatter, explained = _scatter(since_s, ways, white_m2_per_s)
     speeds = np.abs(ways[:, -1]) / since_s[:, -1]
     fast = speeds > np.median(speeds)
     low_mps, high_mps = (float(np.median(speeds[part])) if part.any() else 0.0 for part in (~fast, fast))
     if fast.sum() < _FEWEST_PIECES or high_mps**2 < config.quantisation_factor * low_mps**2:
-        return QuantisationNoise(_beyond(found, explained, config))
-    low_m2, high_m2 = (_beyond(found[part], explained[part], config) for part in (~fast, fast))
+        return QuantisationNoise(_beyond(scatter, explained, config))
+    low_m2, high_m2 = (_beyond(scatter[part], explained[part], config) for part in (~fast, fast))
     moving_s2 = max(high_m2 - low_m2, 0.0) / (high_mps**2 - low_mps**2)
     return QuantisationNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
 
@@ -113,14 +110,14 @@ def _scatter(since_s: Floats, way_m: Floats, white_m2_per_s: float) -> tuple[Flo
     powers = (2.0 * since_s / since_s[:, -1:] - 1.0)[:, :, None] ** np.arange(_DEGREE + 1)
     curves, _ = np.linalg.qr(powers)
     fitted = curves @ (curves.transpose(0, 2, 1) @ way_m[:, :, None])
-    found = ((way_m - fitted[:, :, 0]) ** 2).sum(axis=1)
+    scatter = ((way_m - fitted[:, :, 0]) ** 2).sum(axis=1)
     walk = np.minimum(since_s[:, :, None], since_s[:, None, :])
     left = since_s.sum(axis=1) - (curves * (walk @ curves)).sum(axis=(1, 2))
     free = count - _DEGREE - 1
-    return found / free, white_m2_per_s * left / free
+    return scatter / free, white_m2_per_s * left / free
 
 
-def _beyond(found_m2: Floats, explained_m2: Floats, config: AlignConfig) -> float:
-    """The median of what is found where it is not explained [m^2], else none."""
-    found, explained = float(np.median(found_m2)), float(np.median(explained_m2))
-    return found - explained if found > config.quantisation_factor * explained else 0.0
+def _beyond(scatter_m2: Floats, explained_m2: Floats, config: AlignConfig) -> float:
+    """The median scatter less what explains it [m^2], none where that is most of it."""
+    scatter, explained = float(np.median(scatter_m2)), float(np.median(explained_m2))
+    return scatter - explained if scatter > config.quantisation_factor * explained else 0.0

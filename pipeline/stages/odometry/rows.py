@@ -15,7 +15,7 @@ from schemas.config import AlignConfig
 
 
 class Ways(NamedTuple):
-    """Per step from a row to the next: way [m], NaN where not known, and whether the recorded distance told it."""
+    """Per step from a row to the next: way [m], NaN where not known, and whether it is of the recorded distance."""
 
     way_m: Floats
     counted: Bools
@@ -120,11 +120,10 @@ def _carried(t_s: Floats, values: Floats, limit_s: float) -> Floats:
 def filled_in(
     t_s: Floats, distance_m: Floats, speed_mps: Floats, rows: Ints, config: AlignConfig
 ) -> tuple[Floats, Floats, Ints]:
-    """Samples of a distance with finer ones between the given rows and the next, on cubic curves.
+    """Samples with finer ones between the given rows and the next, on cubic curves: times, distances, row of each.
 
-    Returns times [s], distances [m] and the row that each sample belongs to. Slopes of the curves at the rows are the
-    speeds where these make about the way between (a unit, a sign or a sensor may be wrong), else those of a curve
-    through the distances that keeps its direction (PCHIP), and never so steep that the train would turn back.
+    Slopes at the rows are the speeds where these make about the way between (a unit, a sign or a sensor may be wrong),
+    else those of a curve that keeps its direction (PCHIP), and never so steep that the train would turn back.
     """
     from scipy.interpolate import PchipInterpolator  # hardly a log needs it, and it takes long to load
 

@@ -13,11 +13,10 @@ _FEWEST_BENDS = 8
 
 
 def step_of(changes: Floats, single: Floats, least: float, rounded: float) -> float:
-    """The step that all these changes are multiples of, now of more and now of less; in the unit of the changes.
+    """The step that all these changes are multiples of, in their unit; 0 where there is none of at least `least`.
 
-    `single`: differences of which some are of one step. 0 where there is no step, none of at least `least`, or where
-    the change is always the same: so a smooth way at one speed looks too. Less than `rounded` is no difference: decimal
-    numbers are not whole in binary.
+    `single`: differences of which some are of one step. A change that is always the same shows no step: so does a
+    smooth way at one speed. Less than `rounded` is no difference: decimal numbers are not whole in binary.
     """
     single = np.abs(single)
     single = single[single > rounded]

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.stages.track.geodesy import Points, points_of
+from pipeline.stages.track.network import Network
 from pipeline.stages.track.segments import SAMPLE_SPACING_M, Polyline, on_segments
 from pipeline.stages.track.survey import Track
 from schemas.arrays import Bools, Floats, Ints
 
 # Numerics: so near an end a foot lies at it [m].
-_AT_END_M = 1e-6
+AT_END_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -52,20 +53,20 @@ class Near:
         for pair in np.flatnonzero(position[self.sample] >= 0).tolist():
             element, measure_m = int(self.element[pair]), float(self.measure_m[pair])
             ends = (abs(measure_m - self.track.begin_m[element]), abs(measure_m - self.track.end_m[element]))
-            end = int(np.argmin(ends)) if min(ends) < _AT_END_M else None
+            end = int(np.argmin(ends)) if min(ends) < AT_END_M else None
             foot = Foot(element, float(self.distance_m[pair]), measure_m, end)
             found[position[self.sample[pair]]].append(foot)
         return found
 
 
-def near_elements(points: Points, sigma_m: Floats, track: Track, factor: float, unstated_m: float) -> Near:
+def near_elements(points: Points, sigma_m: Floats, network: Network, factor: float, unstated_m: float) -> Near:
     """Net elements within `factor` roots of samples' and survey's sigma; `unstated_m`: that of a silent survey."""
+    track = network.track
     owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
     surface = points_of(track.latitude_deg, track.longitude_deg).surface
     begin = np.flatnonzero(owner[1:] == owner[:-1])
     line = Polyline(surface[begin], surface[begin + 1])
-    stated_m = np.where(np.isfinite(track.sigma_m), track.sigma_m, unstated_m)
-    segment_sigma_m = np.maximum(stated_m[begin], stated_m[begin + 1])
+    segment_sigma_m = network.survey_sigmas_m(unstated_m)[begin]
     sample, segment = _candidates(points, line, factor * np.hypot(sigma_m, segment_sigma_m.max(initial=0.0)))
     feet = on_segments(points.take(sample), line, segment)
     part = np.clip(feet.fraction, 0.0, 1.0)

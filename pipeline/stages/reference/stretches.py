@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.reference.near import Foot, Near, near_elements
+from pipeline.stages.reference.open_ends import off_the_survey
 from pipeline.stages.reference.visits import Move, Node, Stay, nodes_of, pieces_of, ways_over
 from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.geodesy import Points, points_of
@@ -72,8 +73,9 @@ def reference_stretches(
     samples = Samples(times_ns(reference), points, stated)
     # A sample beyond k_T roots of every track is no sample of the track.
     factor = config.align.sure_sigmas
-    near = near_elements(samples.points, samples.sigma_m, network.track, factor, config.hazards.survey_sigma_m)
-    placed = np.flatnonzero(near.any_near)
+    near = near_elements(samples.points, samples.sigma_m, network, factor, config.hazards.survey_sigma_m)
+    off = off_the_survey(samples.points, samples.sigma_m, near, network, config.hazards)
+    placed = np.flatnonzero(near.any_near & ~off)
     found: list[Stretch] = []
     used = np.zeros(samples.t_ns.size, dtype=np.bool_)
     for rows in _between_gaps(samples.t_ns, placed, config.hazards.reference_gap_s):

@@ -16,9 +16,10 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
+from pipeline.stages.track.chords import chord_sigmas_m
 from pipeline.stages.track.leg import Visit
 from pipeline.stages.track.survey import Track, end_places, gaps_m, in_pieces, pieces_of, track_in_parts, track_of
-from schemas.arrays import Bools, Ints
+from schemas.arrays import Bools, Floats, Ints
 from schemas.enums import Navigability
 from schemas.run import Site
 
@@ -65,6 +66,18 @@ class Network:
     def parts(self) -> Ints:
         """Per oriented element the number of the part of the network that it is connected with."""
         return connected_parts(self.successors)
+
+    @cached_property
+    def _chord_sigmas_m(self) -> Floats:
+        return chord_sigmas_m(self.track, [[edge.to for edge in edges] for edges in self.successors])
+
+    def survey_sigmas_m(self, unstated_m: float) -> Floats:
+        """Sigma of the survey across the segment that begins at each vertex [m]: of its points, and of its chords.
+
+        `unstated_m`: of points without one.
+        """
+        stated_m = np.where(np.isfinite(self.track.sigma_m), self.track.sigma_m, unstated_m)
+        return np.asarray(np.hypot(np.maximum(stated_m, np.append(stated_m[1:], 0.0)), self._chord_sigmas_m))
 
     @property
     def count(self) -> int:

@@ -133,3 +133,44 @@ def test_pauses_part_stretches_and_lost_samples_are_silence() -> None:
     at_s = np.array([2.5, 4.5, 7.0, 7.5, 8.5, 9.0])
     kinds = found.at((at_s * 1e9).astype(np.int64)).kind
     assert (kinds != NOTHING).tolist() == [True, False, True, False, False, True]
+
+
+SIDING = site(
+    {"m": line((0.0, 0.0), (4000.0, 0.0)), "s": line((0.0, 4.5), (1000.0, 4.5))},
+    sigma_m=0.3,
+)
+
+
+def spans_and_tracks(x_m: Floats, y_m: Floats, sigma_m: float) -> list[tuple[float, float, set[str]]]:
+    """From where to where each stretch of the reference goes on the siding's site, and the tracks of it."""
+    frame = samples(x_m, y_m, sigma_m)
+    network = site_network(SIDING)
+    found, _ = reference_stretches(frame, network_in_pieces(SIDING), network.track.index, Configuration())
+    t_ns = frame["t"].to_physical().to_numpy()
+    return [
+        (
+            float(x_m[np.searchsorted(t_ns, one.t_ns[0])]),
+            float(x_m[np.searchsorted(t_ns, one.t_ns[-1])]),
+            {network.track.ids[e] for path in one.paths for route in path.legs for e in route.element.tolist()},
+        )
+        for one in found
+    ]
+
+
+@pytest.mark.parametrize("outward", [True, False])
+def test_behind_the_open_end_of_a_siding_its_neighbour_is_not_known(outward: bool) -> None:
+    """A siding surveyed to 1000 m goes on beside the main track; a reference of 2 m cannot tell the two apart."""
+    x_m = np.linspace(20.0, 3000.0, 1500)
+    x_m = x_m if outward else x_m[::-1]
+    for y_m in (4.5, 0.0, 2.0):
+        found = spans_and_tracks(x_m, np.full(x_m.size, y_m), 2.0)
+        assert [names for *_, names in found] == ([{"m", "s"}, {"m"}] if outward else [{"m"}, {"m", "s"}])
+        span = (found[0][1], found[1][0]) if outward else (found[1][0], found[0][1])
+        assert span == pytest.approx((1000.0, 2000.0), abs=5.0)
+
+
+def test_a_reference_that_excludes_the_siding_knows_its_track_behind_the_open_end() -> None:
+    x_m = np.linspace(20.0, 3000.0, 1500)
+    assert spans_and_tracks(x_m, np.zeros(x_m.size), 0.5) == [(20.0, 3000.0, {"m"})]
+    # The end of the survey itself, with no other track near.
+    assert spans_and_tracks(np.linspace(3000.0, 4004.0, 500), np.zeros(500), 2.0)[0][2] == {"m"}

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
-from pipeline.stages.judge.alarms import verdict_within
+from pipeline.stages.judge.alarms import healthy_across, verdict_of, verdict_within
 from pipeline.stages.judge.attribution import suspect_of
 from pipeline.stages.judge.case import Case, Solution
 from pipeline.stages.judge.cross_errors import cross_errors
@@ -40,6 +40,7 @@ from pipeline.stages.judge.judgement import (
 )
 from pipeline.stages.judge.jumps import Jump, find_jumps, steps_of
 from pipeline.stages.judge.offers import Offers
+from pipeline.stages.judge.passages import _true_times, _with_failures
 from pipeline.stages.judge.travel import OdometerSteps, beyond_confidence, moving, travel_direction
 from pipeline.stages.judge.true_crossings import TrueCrossing, between_far_epochs, true_crossings
 from pipeline.stages.track.path import Place, Route
@@ -620,3 +621,81 @@ def test_unknown_time_in_use_counts_to_the_failure_that_it_belongs_to() -> None:
     frame = positions(range(30), error_m, path_m=10.0 * np.arange(30))
     (found,) = find_failures(course(frame, offered=offers([7], judgement="unknown")), Configuration())
     assert (found.hazardous_s, found.hazardous_may_s, found.accepted) == (1.0, 4.0, Judgement.UNKNOWN)
+
+
+def stamps(t_s: Sequence[float | None]) -> pl.Series:
+    return pl.Series([ns(t) for t in t_s], dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+
+
+def test_each_crossing_of_the_train_belongs_to_one_passage() -> None:
+    """V1 offered at 11 s and again at 13 s, passed at 12.2 s; V2 reckoned at 30 s; V3 without either, passed twice."""
+    passages = pl.DataFrame({
+        "balise_id": ["V1", "V1", "V2", "V3", "V4"],
+        "t_offered": stamps([11.0, 13.0, None, None, 50.0]),
+        "t_reckoned": stamps([None, None, 30.0, None, None]),
+    })  # fmt: skip
+    crossings = {
+        name: [TrueCrossing(round(t * NS), 1, True) for t in passed]
+        for name, passed in {"V1": [12.2], "V2": [20.0, 29.0], "V3": [40.0, 41.0], "V4": []}.items()
+    }
+    found = _true_times(passages, crossings)
+    assert found.to_list() == [None, ns(12.2), ns(29.0), ns(40.0), None]
+    assert {name: [round(left.t_ns / NS) for left in several] for name, several in crossings.items()} == {
+        "V1": [], "V2": [20], "V3": [41], "V4": [],
+    }  # fmt: skip
+
+
+PASSAGES = [
+    # status, offered, odometer way, judgement, inserted, positioned | failure mode, cause
+    ("accepted", True, 100.0, "right", False, True, "none", "none"),
+    ("accepted", True, 100.0, "wrong", True, True, "insertion", "position"),
+    ("rejected_window", True, 300.0, "right", False, True, "deletion", "none"),  # beyond its window at 200 m
+    ("rejected_window", True, 300.0, "wrong", False, True, "deletion", "position"),
+    ("rejected_window", True, 300.0, "wrong", True, True, "insertion", "position"),
+    ("rejected_monitor", True, None, "unknown", False, True, "none", "none"),
+    ("missed", False, None, None, False, True, "deletion", "position"),
+    ("missed", False, None, None, False, False, "deletion", "no_position"),
+    ("not_available", False, None, None, False, True, "deletion", "no_position"),
+    ("not_available", True, None, None, True, True, "insertion", "position"),
+]
+
+
+def test_failure_mode_and_cause_of_a_passage() -> None:
+    names = ("status", "offered", "odometer_distance_m", "judgement", "_inserted", "_positioned", "mode", "why")
+    frame = pl.DataFrame(PASSAGES, schema=names, orient="row").with_columns(
+        t_offered=pl.when("offered").then(pl.lit(0)),
+        window_close_m=pl.lit(200.0),
+        failure_mode=pl.lit("none"),
+        cause=pl.lit("none"),
+    )
+    found = _with_failures(frame)
+    assert found["failure_mode"].to_list() == frame["mode"].to_list()
+    assert found["cause"].to_list() == frame["why"].to_list()
+
+
+@pytest.mark.parametrize(
+    ("error_m", "half_m", "evidence", "monitor", "verdict"),
+    [
+        (0.0, 1.0, "reference", "along_raw", Verdict.FALSE),
+        (0.0, 1.0, "balise", "along_raw", Verdict.FALSE),
+        (0.0, 1.0, "balise", "cross_raw", Verdict.UNKNOWN),  # four metres aside are another track
+        (0.0, 1.0, "reference", "cross_raw", Verdict.FALSE),
+        (0.0, 1.0, "odometer", "along_raw", Verdict.UNKNOWN),
+        (0.0, 6.0, "reference", "along_raw", Verdict.UNKNOWN),  # 5 m is the margin
+        (7.0, 1.0, "reference", "along_raw", Verdict.TRUE),
+        (7.0, 1.0, "odometer", "along_raw", Verdict.TRUE),  # it can show that something was wrong
+    ],
+)
+def test_whether_an_alarm_was_due(error_m: float, half_m: float, evidence: str, monitor: str, verdict: Verdict) -> None:
+    """Ten epochs, an alarm at the sixth; the error is that of the fourth, across the track there is none."""
+    epochs = positions(range(10), np.where(np.arange(10) == 3, error_m, 0.0), half_m, evidence=evidence)
+    across = np.nan if evidence != "reference" else 0.0
+    epochs = epochs.with_columns(
+        pl.Series(name, [across] * 10, nan_to_null=True) for name in ("error_cross_m", "error_up_m")
+    ).with_columns(sigma_cross_m=pl.lit(1.0), sigma_up_m=pl.lit(1.0))
+    alarm = AlarmEpisode(5, 5, 5 * NS, 5 * NS, (monitor,), 2.0)
+    config = HazardConfig()
+    assert verdict_of(alarm, epochs, healthy_across(epochs, config), config) is verdict
+    # What comes after the alarm says nothing of it.
+    early = AlarmEpisode(2, 2, 2 * NS, 2 * NS, (monitor,), 2.0)
+    assert verdict_of(early, epochs, healthy_across(epochs, config), config) is not Verdict.TRUE

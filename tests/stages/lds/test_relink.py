@@ -11,8 +11,8 @@ import pytest
 from pipeline.stages.lds import LdsResult
 from pipeline.stages.lds.crossings import balises_of, reads_of
 from pipeline.stages.lds.journey import journey_of
-from pipeline.stages.lds.relink import LOST, NO_VEHICLE, SWITCHED_OFF, Relink
-from schemas.enums import BaliseKind
+from pipeline.stages.lds.relink import Comparison, Relink
+from schemas.enums import BaliseKind, NotEvaluated
 from tests.stages.lds.scripted import (
     K_T,
     SCALE_SIGMA,
@@ -26,6 +26,11 @@ from tests.stages.lds.scripted import (
     steps,
     told,
 )
+
+
+def compared(relink: Relink, k: int) -> Comparison:
+    return relink.compare(k, relink.anchor_at(k))
+
 
 V1 = {"V1": 110.0}
 V1_P1 = {"V1": 110.0, "P1": 1410.0}
@@ -60,7 +65,7 @@ def test_the_first_alarm_fixes_the_anchor_and_later_alarms_do_not_move_it() -> N
         anchor = relink.anchor_at(k)
         assert (anchor and anchor.epoch) == epoch
     # At 9 s the position is 9 m ahead of the odometer, at the anchor it was 2 m.
-    found = relink.compare(9)
+    found = compared(relink, 9)
     assert found.moved_m == pytest.approx(7.0)
     assert found.holds
 
@@ -78,11 +83,11 @@ def test_only_a_telegram_renews_the_anchor() -> None:
     """The balise at 100 m is read at 5.5 s, where the odometer is at 110 m: GNSS minus odometer should be -10 m."""
     relink, journey = relink_of([-12.0] * 10, list(range(10)), 3.0)
     relink.note_alarm(4)
-    assert relink.compare(6).moved_m == pytest.approx(0.0)
+    assert compared(relink, 6).moved_m == pytest.approx(0.0)
     physical = balises_of(balises_at({"P1": 100.0}, kind="physical"), BaliseKind.PHYSICAL)
     [read], _ = reads_of(reads_at([(5.5, "P1")]).with_columns(odometer_m=110.0), physical, journey)
     relink.note_read(read)
-    found = relink.compare(9)
+    found = compared(relink, 9)
     assert found.moved_m == pytest.approx(-2.0)
     # 3.5 s and 70 m since the telegram: sigma 1 m of the position and 1 m of the read.
     assert found.bound_m == pytest.approx(K_T * sqrt(2.0 + 0.05**2 * 3.5 + (1e-4 * 70.0) ** 2))
@@ -110,7 +115,7 @@ def test_the_bound_adds_the_variances_of_both_positions() -> None:
     """Sigma 0.5 m at the anchor (2 s) and 1.2 m now (9 s), 140 m later."""
     relink, _ = relink_of([0.0] * 10, [2], 3.0, position_sigma_m=[0.5] * 5 + [1.2] * 5)
     expected = K_T * sqrt(0.25 + 1.44 + 0.05**2 * 7.0 + (1e-4 * 140.0) ** 2)
-    assert relink.compare(9).bound_m == pytest.approx(expected)
+    assert compared(relink, 9).bound_m == pytest.approx(expected)
 
 
 # Returns
@@ -127,11 +132,11 @@ def test_bound_of_the_relink(scale_sigma: float, bound_m: float) -> None:
 
 
 def test_a_slow_drift_does_not_come_back_step_by_step() -> None:
-    """0.1 m/s from 340 s on, an alarm every 90 s: 9 m at the first return, 18 m at the next, which is too far."""
+    """0.1 m/s from 340 s on, an alarm every 90 s: 9 m at the return, and 11 s later more than half the limit."""
     odometer_m = steps(0.0, 20.0, 700)
     path_m = [x + max(0.0, 0.1 * (k - 340)) for k, x in enumerate(odometer_m)]
     result = run(epochs_of(path_m, odometer_m), balises_at(V1), ScriptedBank([400, 490, 580]))
-    assert negations(result) == [(400, 430), (490, None)]
+    assert negations(result) == [(400, 430), (441, None)]
 
 
 def test_false_alarms_one_after_the_other_all_return() -> None:
@@ -191,6 +196,40 @@ def test_at_a_configured_start_of_mission_the_lds_begins_anew() -> None:
     assert result.epochs["lrvb_id"][59:61].to_list() == ["V1", None]
 
 
+@pytest.mark.parametrize(("memory_s", "again"), [(0.0, 630), (1000.0, None)])
+def test_the_anchor_is_as_old_as_the_average_that_fails(memory_s: float, again: int | None) -> None:
+    """0.02 m/s from 50 s on, found at 600 s with 11 m: at 150 s it was 2 m, at the first TVB (7 s) none.
+
+    At 630 s it is 11.6 m: 9.6 m from the anchor of 450 s, within the bound of 10 m, and too far from the first TVB.
+    """
+    odometer_m = steps(0.0, 20.0, 640)
+    path_m = [x + 0.02 * max(k - 50, 0) for k, x in enumerate(odometer_m)]
+    result = run(epochs_of(path_m, odometer_m), balises_at(V1), ScriptedBank([600], memory_s=memory_s))
+    assert negations(result) == [(600, again)]
+
+
+# Held after a return, for the memory of the slowest average
+
+
+@pytest.mark.parametrize(("drift_mps", "again"), [(0.2, 80), (0.0, None)])
+def test_a_drift_that_goes_on_after_a_return_is_negated_again(drift_mps: float, again: int | None) -> None:
+    """First TVB at 7 s, alarm at 20 s, return at 50 s with 2 m; at 80 s 8 m are beyond k_T sqrt(2.2 m2) = 7.9 m."""
+    odometer_m = steps(0.0, 20.0, 120)
+    path_m = [x + drift_mps * max(k - 40, 0) for k, x in enumerate(odometer_m)]
+    result = run(epochs_of(path_m, odometer_m), balises_at(V1), ScriptedBank([20]))
+    assert negations(result)[:2] == [(20, 50), *([(again, None)] if again else [])]
+    assert result.epochs["alarm"][again or 80] is (again is not None)
+
+
+def test_a_telegram_ends_the_hold_after_a_return() -> None:
+    """P1 at 1410 m is read where the position is 6 m ahead: from then on that is the anchor, and no hold."""
+    odometer_m = steps(0.0, 20.0, 120)
+    path_m = [x + 0.2 * max(k - 40, 0) for k, x in enumerate(odometer_m)]
+    balises = balises_at(V1_P1, kind=KINDS)
+    result = run(epochs_of(path_m, odometer_m), balises, ScriptedBank([20]), reads_at([(70.5, "P1")]))
+    assert negations(result) == [(20, 50)]
+
+
 # After an outage
 
 BEFORE = 21  # epochs 0 to 20 s
@@ -233,7 +272,11 @@ def test_over_a_gap_that_the_bank_bridges_its_increment_decides() -> None:
 
 @pytest.mark.parametrize(
     ("settings", "reason"),
-    [({"scale_sigma": None}, NO_VEHICLE), ({"lost": True}, LOST), ({"relink": False}, SWITCHED_OFF)],
+    [
+        ({"scale_sigma": None}, NotEvaluated.RELINK_NO_VEHICLE),
+        ({"lost": True}, NotEvaluated.RELINK_DISTANCE_LOST),
+        ({"relink": False}, NotEvaluated.RELINK_OFF),
+    ],
 )
 def test_what_cannot_re_link_after_an_outage_is_not_used_and_raises_no_alarm(
     settings: dict[str, Any], reason: str
@@ -286,7 +329,7 @@ def test_noise_without_a_vehicle_file_ends_the_use_as_an_outage_does() -> None:
         scale_sigma=None,
     )
     assert negations(result) == [(end, None)]
-    assert result.epochs["link_distance_reason"][end] == NO_VEHICLE
+    assert result.epochs["link_distance_reason"][end] == NotEvaluated.RELINK_NO_VEHICLE
 
 
 def test_without_the_monitor_there_is_no_test_after_an_outage() -> None:

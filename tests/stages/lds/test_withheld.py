@@ -99,7 +99,27 @@ def test_a_fault_right_after_slip_is_the_banks() -> None:
 def test_where_slip_may_hide_a_failure_nothing_links_again() -> None:
     """12 m counted too much and a position 12 m ahead agree; with 10.1 m in doubt they might be 20.1 m."""
     assert set(slipping(12.0, 10.1, slipped_m=12.0).epochs["withheld_for"][30:]) == {"relink"}
-    assert slipping(12.0, 9.9, slipped_m=12.0).epochs["withheld_for"][31] is None
+    result = slipping(12.0, 9.9, slipped_m=12.0)
+    assert result.epochs["withheld_for"][31] is None
+    assert result.held[-1].bound_m == pytest.approx(19.9)
+
+
+def test_slip_late_in_a_run_is_held_against_the_last_tvb_before_it() -> None:
+    """Three times 6 m are miscounted and one alarm lies before: each slip explains its own 6 m, not all 18 m."""
+    slips = [k % 60 in range(40, 50) for k in range(200)]
+    counted_m = [6.0 * sum(k >= 60 * leg + 50 for leg in range(3)) for k in range(200)]
+    odometer_m = [None if slips[k] else x + counted_m[k] for k, x in enumerate(steps(0.0, 20.0, 200))]
+    epochs = epochs_of(
+        steps(0.0, 20.0, 200),
+        odometer_m,
+        odometer_slips=slips,
+        odometer_segment=[sum(slips[: k + 1]) for k in range(200)],
+        odometer_counter=[0] * 200,
+        slip_doubt_m=counted_m,
+    )
+    result = run(epochs, balises_at(V), ScriptedBank([8]), anchor_lag_s=0.0)
+    assert negations(result) == [(8, 38)]
+    assert [result.epochs["withheld_for"][k] for k in (51, 111, 171)] == [None] * 3
 
 
 def test_a_position_that_comes_back_after_slip_links_again() -> None:

@@ -46,3 +46,21 @@ def test_the_shared_movement_is_that_of_the_track_which_the_position_moves_least
     """A step of 0.8 m at a joint of a, then one of b: neither is a movement of the train."""
     on_a, on_b, _ = followed([0.0, 0.8, 0.8], [-4.0, -4.0, -4.8], 1.0)
     assert on_a.tolist() == on_b.tolist() == [0.0, 0.0]
+
+
+def test_a_crossover_does_not_lift_the_tracks_that_it_joins() -> None:
+    """The position drifts by 0.3 m a step towards b while the crossover leads there, then stays.
+
+    For three steps it moves least against the crossover x. By the smallest error x became the measure of both tracks:
+    a and b were lifted by 0.9 m, and by 0.3 m more each step as x went on.
+    """
+    a_m = [0.0, 0.3, 0.6, 0.9, 0.9, 0.9, 0.9]
+    x_m = [0.0, 0.0, 0.0, 0.0, -0.3, -0.6, -0.9]
+    offset = np.array([a_m, [value - 4.0 for value in a_m], x_m]).T.ravel()
+    state = np.arange(len(offset))
+    before: Ints = np.where(state < 3, -1, state - 3)
+    first = np.arange(0, len(offset) + 1, 3)
+    found = innovations_of(first, offset, np.zeros(len(offset)), np.full(len(offset), 4.0), before, np.ones(len(a_m)))
+    error_m = found.survey_m.reshape(-1, 3)
+    assert error_m[:, :2] == pytest.approx(np.zeros((7, 2)))
+    assert error_m[:, 2] == pytest.approx([0.0, -0.3, -0.6, -0.9, -1.2, -1.5, -1.8])

@@ -1,0 +1,145 @@
+"""How far the chords of a survey may lie beside the curve that they stand for.
+
+A chord of length L between two points of an arc, at each of which the line turns by Δθ, lies up to L Δθ / 8 beside it,
+on the mean two thirds of that. Half of it counts as sigma: twice its variance is that of the mean, and three cover it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.stages.track.geodesy import points_of
+from pipeline.stages.track.survey import Track
+from schemas.arrays import Floats, Ints
+
+# Numerics [m]: turns of points so close together are one; smaller sigmas count as none; no longer chord is looked for.
+_ONE_POINT_M = 1.0
+_LEAST_M = 0.02
+_LONGEST_M = 2000.0
+
+
+def chord_sigmas_m(track: Track, successors: Sequence[Sequence[int]]) -> Floats:
+    """Sigma of the distance between chord and curve [m] for the segment that begins at each vertex.
+
+    `successors`: of each oriented element. It follows from the shape alone: points on a chord and borders of net
+    elements change nothing.
+    """
+    length_m, heading_rad = _segments(track)
+    first, last = track.first[:-1], track.first[1:] - 2
+    enter = np.column_stack([heading_rad[first, 0], heading_rad[last, 1] + np.pi]).ravel()
+    leave = np.column_stack([heading_rad[last, 1], heading_rad[first, 0] + np.pi]).ravel()
+    onward = [_straightest(leave[one], enter, ways) for one, ways in enumerate(successors)]
+    chains = _chains([to for to, _ in onward])
+    # Points of all chains one after the other: a vertex each, and one at the end of each chain.
+    vertex, against, ends = _points(track, chains)
+    begin = heading_rad[vertex, against] + np.pi * against
+    end = heading_rad[vertex, 1 - against] + np.pi * against
+    turn_rad = _wrapped(begin - np.roll(end, 1))
+    turn_rad[np.append(0, ends[:-1] + 1)] = [onward[chain[0] ^ 1][1] for chain in chains]
+    turn_rad[ends] = [onward[chain[-1]][1] for chain in chains]
+    step_m = length_m[vertex]
+    step_m[ends] = 3.0 * _ONE_POINT_M
+    way_m = np.append(0.0, np.cumsum(step_m)[:-1])
+    sigma_m = _sigmas_m(way_m, turn_rad, ends)
+    out = np.zeros(len(length_m))
+    inside = np.ones(len(vertex), dtype=np.bool_)
+    inside[ends] = False
+    out[vertex[inside]] = sigma_m[inside]
+    return out
+
+
+def _segments(track: Track) -> tuple[Floats, Floats]:
+    """Length [m] of the segment that begins at each vertex, and its heading [rad] as seen from its start and end."""
+    places = points_of(track.latitude_deg, track.longitude_deg)
+    along = np.diff(places.surface, axis=0, append=places.surface[-1:])
+    sides = [(along, places.east, places.north)]
+    sides.append((along, np.roll(places.east, -1, axis=0), np.roll(places.north, -1, axis=0)))
+    headings = [np.arctan2(np.sum(way * east, axis=1), np.sum(way * north, axis=1)) for way, east, north in sides]
+    return np.linalg.norm(along, axis=1), np.column_stack(headings)
+
+
+def _straightest(leave_rad: float, enter_rad: Floats, ways: Sequence[int]) -> tuple[int, float]:
+    """The successor that an oriented element goes on to with the least turn, and that turn; -1 without one."""
+    turns = [(to, float(_wrapped(enter_rad[[to]] - leave_rad)[0])) for to in ways]
+    return min(turns, key=lambda way: abs(way[1]), default=(-1, 0.0))
+
+
+def _chains(onward: Sequence[int]) -> list[list[int]]:
+    """Oriented elements of which each is the straightest way on from the one before, there and back."""
+    after = [to if to >= 0 and onward[to ^ 1] == one ^ 1 else -1 for one, to in enumerate(onward)]
+    chains: list[list[int]] = []
+    left = dict.fromkeys(range(0, len(onward), 2))
+    while left:
+        start = one = next(iter(left))
+        while after[one ^ 1] not in (-1, start ^ 1):
+            one = after[one ^ 1] ^ 1
+        chain = [one]
+        while after[chain[-1]] not in (-1, one):
+            chain.append(after[chain[-1]])
+        for member in chain:
+            del left[member & ~1]
+        chains.append(chain)
+    return chains
+
+
+def _points(track: Track, chains: Sequence[Sequence[int]]) -> tuple[Ints, Ints, Ints]:
+    """Vertices at which the segments of chains begin, whether they are run against their measure, ends of chains."""
+    parts: list[Ints] = []
+    senses: list[int] = []
+    ends: list[int] = []
+    count = 0
+    for chain in chains:
+        for one in chain:
+            part = np.arange(track.first[one // 2], track.first[one // 2 + 1] - 1)
+            parts.append(part[::-1] if one % 2 else part)
+            senses.append(one % 2)
+            count += len(part)
+        parts.append(parts[-1][-1:])
+        senses.append(senses[-1])
+        ends.append(count)
+        count += 1
+    against = np.repeat(senses, [len(part) for part in parts])
+    return np.concatenate(parts), against, np.array(ends)
+
+
+def _sigmas_m(way_m: Floats, turn_rad: Floats, ends: Ints) -> Floats:
+    """Of the segment behind each point the largest sigma of all chords that it may be a part of.
+
+    What turns within a chord is no part of the turn at its ends, of which the geometric mean counts: a chord with a
+    straight at one end is straight. Where the survey ends, nothing is known of its turn, and it counts as none.
+    """
+    bend_rad = _turn_about(way_m, turn_rad)
+    inside_rad = np.abs(turn_rad)
+    inside_rad[ends] = np.pi * _LONGEST_M  # no chord goes on from one chain to the next
+    inside_rad = np.cumsum(inside_rad)
+    out = np.zeros(len(way_m))
+    begin = np.delete(np.arange(len(way_m)), ends)
+    points = 0
+    while len(begin):
+        points += 1
+        end = begin + points
+        length_m = way_m[end] - way_m[begin]
+        turn = np.sqrt(bend_rad[begin] * bend_rad[end]) - (inside_rad[end - 1] - inside_rad[begin])
+        sigma_m = length_m * turn / 16.0
+        for row in np.flatnonzero(sigma_m > _LEAST_M).tolist():
+            chord = slice(int(begin[row]), int(end[row]))
+            out[chord] = np.maximum(out[chord], sigma_m[row])
+        sharpest = np.sqrt(bend_rad[begin] * bend_rad.max())
+        longer = (sharpest > inside_rad[end] - inside_rad[begin]) & (length_m < _LONGEST_M)
+        begin = begin[longer & (sharpest * _LONGEST_M / 8.0 > _LEAST_M)]
+    return out
+
+
+def _turn_about(way_m: Floats, turn_rad: Floats) -> Floats:
+    """Turn at each point together with those beside it."""
+    turned = np.cumsum(np.append(0.0, turn_rad))
+    low = np.searchsorted(way_m, way_m - _ONE_POINT_M)
+    high = np.searchsorted(way_m, way_m + _ONE_POINT_M, side="right")
+    return np.asarray(np.abs(turned[high] - turned[low]))
+
+
+def _wrapped(angle_rad: Floats) -> Floats:
+    """Angle between -π and π."""
+    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
