@@ -1,6 +1,6 @@
 """Vehicle and noise of each run from other runs of the same vehicle (`balise replay --calibrate`).
 
-What a run tells is measured once (`calibration.observe`), whoever uses it; a run never calibrates itself. Order and
+A run is measured once (`calibration.observe`), whoever uses it; a run never calibrates itself. Order and
 number of processes change nothing.
 """
 
@@ -35,7 +35,7 @@ class _Source:
 
 
 def calibrated(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
-    """The plan with vehicle and monitor sigmas of each run as the given runs tell them.
+    """The plan with vehicle, noise and sigmas of each run as measured on the given runs.
 
     `runs`: paths, globs and folders, or `auto`: the runs of the plan itself that raise no alarm beyond their noise.
     Each run is left out of its own calibration. Raises `UsageError` where given runs cannot calibrate, are too few, or
@@ -45,22 +45,22 @@ def calibrated(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
     sources = mapped(_source, _jobs_of(plan, runs, automatic), jobs)
     refused = [source for source in sources if source.reason]
     if refused and not automatic:
-        found = "; ".join(f"{source.run_id}: {source.reason}" for source in refused)
-        raise UsageError("cannot calibrate", place="--calibrate", found=found, expected="fault-free runs")
+        reasons = "; ".join(f"{source.run_id}: {source.reason}" for source in refused)
+        raise UsageError("cannot calibrate", place="--calibrate", found=reasons, expected="fault-free runs")
     good = [source for source in sources if not source.reason]
     _require_one_vehicle(good, plan.config)
-    own = {source.run_id: source.content for source in sources}
+    contents = {source.run_id: source.content for source in sources}
     made: dict[tuple[str, ...], RunJob] = {}
     finished = []
     for job in plan.jobs:
-        others = [one for one in good if one.run_id != job.run_id and one.content != own.get(job.run_id)]
-        names = tuple(one.run_id for one in others)
+        itself = job.run_id, contents.get(job.run_id)
+        others = [source for source in good if source.run_id != itself[0] and source.content != itself[1]]
+        names = tuple(source.run_id for source in others)
         if names not in made:
             _require_enough(job, others, refused)
             made[names] = _calibrated(job, others)
         given = made[names]
-        own_settings = replace(job, config=given.config, vehicle=given.vehicle, config_digest=given.config_digest)
-        finished.append(own_settings)
+        finished.append(replace(job, config=given.config, vehicle=given.vehicle, config_digest=given.config_digest))
     whole = plan if len(made) != 1 else replace(plan, config=finished[0].config, vehicle=finished[0].vehicle)
     return replace(whole, jobs=tuple(finished))
 
@@ -78,7 +78,7 @@ def _jobs_of(plan: Plan, runs: Sequence[str], automatic: bool) -> list[RunJob]:
 
 
 def _source(job: RunJob) -> _Source:
-    """What a run tells, or why it tells nothing; no error of a log ends the campaign here."""
+    """What a run shows, or why it shows nothing; no error of a log ends the campaign here."""
     from pipeline.studies.calibration.calibrate import observe  # replays, which the parent of a campaign need not load
 
     log = RecordedLog(job)
@@ -102,15 +102,17 @@ def _calibrated(job: RunJob, sources: Sequence[_Source]) -> RunJob:
 
     seen = [source.observed for source in sources if source.observed is not None]
     try:
-        found = calibration_of(seen, job.vehicle, job.config)
+        calibration = calibration_of(seen, job.vehicle, job.config)
     except BaliseError as error:
         raise UsageError(error.message, place=error.place, found=error.found, remedy=error.remedy) from None
-    config = _with_calibration(job.config, found, tuple(source.run_id for source in sources))
-    return replace(job, config=config, vehicle=found.vehicle, config_digest=digest_of(config, found.vehicle))
+    config = _with_calibration(job.config, calibration, tuple(source.run_id for source in sources))
+    return replace(
+        job, config=config, vehicle=calibration.vehicle, config_digest=digest_of(config, calibration.vehicle)
+    )
 
 
-def _with_calibration(config: Configuration, found: Calibration, runs: tuple[str, ...]) -> Configuration:
-    monitors = config.monitors.model_copy(update=found.monitors)
+def _with_calibration(config: Configuration, measured: Calibration, runs: tuple[str, ...]) -> Configuration:
+    monitors = config.monitors.model_copy(update=measured.monitors)
     calibration = config.calibration.model_copy(update={"runs": runs})
     return config.model_copy(update={"monitors": monitors, "calibration": calibration})
 
@@ -130,19 +132,19 @@ def _require_enough(job: RunJob, sources: Sequence[_Source], refused: Sequence[_
 
 
 def _require_one_vehicle(sources: Sequence[_Source], config: Configuration) -> None:
-    """Scales that differ by more than wear tell of different vehicles, whose mean fits none."""
-    told = [(one.observed.estimate, one.run_id) for one in sources if one.observed and one.observed.estimate]
-    if not told:
+    """Scales that differ by more than wear are of different vehicles, whose mean fits none."""
+    estimates = {run.observed.estimate: run.run_id for run in sources if run.observed and run.observed.estimate}
+    if not estimates:
         return
-    least, first = min(told, key=lambda one: one[0].scale)
-    most, last = max(told, key=lambda one: one[0].scale)
+    by_scale = sorted(estimates, key=lambda estimate: estimate.scale)
+    least, most = by_scale[0], by_scale[-1]
     noise = config.monitors.threshold_factor * (least.scale_sigma**2 + most.scale_sigma**2) ** 0.5
     if most.scale - least.scale <= config.calibration.same_vehicle_scale + noise:
         return
     raise UsageError(
         "the runs are of different vehicles",
         place="--calibrate",
-        found=f"odometer scale {least.scale:.4f} in {first}, {most.scale:.4f} in {last}",
+        found=f"odometer scale {least.scale:.4f} in {estimates[least]}, {most.scale:.4f} in {estimates[most]}",
         expected=f"scales within {config.calibration.same_vehicle_scale:g} (calibration.same_vehicle_scale)",
         remedy="Give runs of one vehicle, or replay each vehicle's runs by themselves.",
     )

@@ -33,7 +33,7 @@ def states_of(value: Floats, threshold: Floats, evaluated: Bools) -> States:
 def verdicts(value: Floats, threshold: Floats, reasons: pl.Series, state: States | None = None) -> pl.DataFrame:
     """`value, threshold, state, reason` per epoch; `reasons`: why a monitor is not evaluated, null where it is.
 
-    `state` where the monitor has told it already. Else what has no reason and yet no value or threshold is not
+    `state` where the monitor gives it already. Else what has no reason and yet no value or threshold is not
     evaluated either: absence is never health.
     """
     if state is None:
@@ -57,9 +57,9 @@ def no_verdicts(epochs: int, reason: str) -> pl.DataFrame:
     return verdicts(nothing, nothing, pl.Series([reason], dtype=pl.String).new_from_index(0, epochs))
 
 
-def of_monitor(name: str, said: pl.DataFrame) -> list[pl.Series]:
+def of_monitor(name: str, frame: pl.DataFrame) -> list[pl.Series]:
     """The same under the names that they have among the columns of the epochs."""
-    return [column.alias(f"{name}_{column.name}") for column in said]
+    return [column.alias(f"{name}_{column.name}") for column in frame]
 
 
 def first_reason(*reasons: tuple[Bools | pl.Series, str | pl.Series]) -> pl.Series:

@@ -88,10 +88,10 @@ def variance_of_ewma(
         v <- b^2 v + (alpha g)^2 [s_k^2 + s_p^2 - 2 phi s_k s_p] + 2 alpha g b c (phi r - 1) + (alpha g)^2 white
         c <- b phi r c + alpha g s_k (s_k - phi s_p)
     """
-    carried, own, change = _memory(sigma_m, sigma_before_m, decorrelation)
+    carried, fresh_m2, change = _memory(sigma_m, sigma_before_m, decorrelation)
     coupling, covariances = np.empty_like(gain), np.empty_like(state.covariance)
     for index, before in enumerate(state.covariance):
-        drive = np.asfortranarray(gain[:, index, None] * own)
+        drive = np.asfortranarray(gain[:, index, None] * fresh_m2)
         covariance = _solved(keep[:, index, None] * carried, drive, before)
         coupling[1:, index] = (covariance[:-1] * change[1:]).sum(axis=1)
         coupling[:1, index] = (before * change[:1]).sum(axis=1)
@@ -127,8 +127,8 @@ def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> t
         return 1.0 - decorrelation, sigma_m * (decorrelation * sigma_m), -decorrelation
     ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
     carried = (1.0 - decorrelation) * ratio
-    own = sigma_m * (sigma_m - sigma_before_m + decorrelation * sigma_before_m)
-    return carried, own, np.where(ratio == 1.0, -decorrelation, carried - 1.0)
+    fresh_m2 = sigma_m * (sigma_m - sigma_before_m + decorrelation * sigma_before_m)
+    return carried, fresh_m2, np.where(ratio == 1.0, -decorrelation, carried - 1.0)
 
 
 def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Floats:

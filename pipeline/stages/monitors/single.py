@@ -141,13 +141,13 @@ def paired(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.Data
     Null where there is nothing to compare. `epochs` with `t, path_m` (null where not usable), `other` with `t`.
     """
     stamps = other.select(t_other=_stamp()).with_row_index("row_other")
-    own = epochs.select("path_m", t_ns=_stamp())
+    mine = epochs.select("path_m", t_ns=_stamp())
     since = pl.col("t_ns") - pl.col("t_ns").shift(1)
     early = pl.col("t_ns") - pl.col("t_other")
     between = (early < since) & (since <= crossing_gap_ns(times_ns(epochs), lds))
     way = (pl.col("path_m") - pl.col("path_m").shift(1)) * (early / since)
     return (
-        own.join_asof(stamps, left_on="t_ns", right_on="t_other", strategy="backward")
+        mine.join_asof(stamps, left_on="t_ns", right_on="t_other", strategy="backward")
         .with_columns(path_m=pl.when(early == 0).then("path_m").when(between).then(pl.col("path_m") - way))
         .select("path_m", row_other=pl.when(pl.col("path_m").is_not_null()).then("row_other"))
     )
@@ -161,10 +161,9 @@ def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
     """Places with `sense`: +1 where the path runs with the measure of its net element, -1 against it; 0 where a
     visit does not tell.
     """
-    own = [pl.col(name) - pl.col(name).mean().over("visit") for name in ("path_m", "measure_m")]
-    placed = epochs.select(*_PLACE, t_ns=_stamp(), visit=pl.col("netelement_id").rle_id()).with_columns(
-        moved=own[0] * own[1]
-    )
+    path, measure = (pl.col(name) - pl.col(name).mean().over("visit") for name in ("path_m", "measure_m"))
+    placed = epochs.select(*_PLACE, t_ns=_stamp(), visit=pl.col("netelement_id").rle_id())
+    placed = placed.with_columns(moved=path * measure)
     return placed.select("t_ns", *_PLACE, sense=pl.col("moved").sum().over("visit").sign().cast(pl.Int8))
 
 

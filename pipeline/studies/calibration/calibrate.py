@@ -1,9 +1,9 @@
-"""What recorded fault-free runs tell of a vehicle and of its monitors (`balise calibrate`)."""
+"""Vehicle, fast noise and monitor sigmas measured on recorded fault-free runs (`balise calibrate`)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 import polars as pl
@@ -17,10 +17,10 @@ from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.monitors.single import doppler_monitor
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun, prepare
-from pipeline.studies.calibration.noise import beyond_noise
 from pipeline.studies.calibration.sigmas import (
     COMPARED,
     SigmaFit,
+    beyond_noise,
     regress_sigmas,
     sigma_table,
     velocity_sigma_mps,
@@ -100,9 +100,9 @@ def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, so
     match = prepared.match(solution)
     odometry = None if prepared.odometry is None else prepared.odometry.oriented(match.odometer_sign)
     estimate = None if odometry is None else _estimate(match, odometry, config)
-    own = vehicle if estimate is None else _vehicle(vehicle, [estimate], config.align.latency_prior_sigma_s)
-    noise_m, epochs = _monitored(match, odometry, own, config)
-    return Observed(log.run_id, estimate, noise_m, epochs, _alarms(log, site, own, config, solution))
+    measured = vehicle if estimate is None else _vehicle(vehicle, [estimate], config.align.latency_prior_sigma_s)
+    noise_m, epochs = _monitored(match, odometry, measured, config)
+    return Observed(log.run_id, estimate, noise_m, epochs, _alarms(log, site, measured, config, solution))
 
 
 def _estimate(match: Match, odometry: Odometry, config: Configuration) -> RunEstimate | None:
@@ -132,20 +132,20 @@ def _alarms(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, so
 
 
 def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configuration) -> Calibration:
-    """Vehicle and monitor sigmas that runs tell together.
+    """Vehicle, noise and sigmas of all runs together.
 
     `vehicle` and `config` as the runs were observed with. Raises `InputError` as `calibrate` does.
     """
     place = ", ".join(run.run_id for run in runs)
-    found = [run.estimate for run in runs if run.estimate is not None]
-    if not found:
+    estimates = [run.estimate for run in runs if run.estimate is not None]
+    if not estimates:
         raise InputError(
             "no run gives odometer scale and latency",
             place=place,
             expected="GNSS of the solution on the track, and an odometer, while the speed changes",
             remedy="Calibrate on longer runs that stop and start.",
         )
-    fitted = _vehicle(vehicle, found, config.align.latency_prior_sigma_s)
+    fitted = _vehicle(vehicle, estimates, config.align.latency_prior_sigma_s)
     _refuse_figures_of_no_train(fitted, place, config)
     epochs = [run.epochs for run in runs if run.epochs is not None]
     sigmas = regress_sigmas(epochs, config.monitors.threshold_factor, config.calibration)
@@ -155,7 +155,7 @@ def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configura
     velocity = {} if velocity_mps is None else {"doppler_sigma_mps": velocity_mps}
     return Calibration(
         vehicle=fitted,
-        runs=_run_table([(run.run_id, run.estimate) for run in runs]),
+        runs=_run_table(runs),
         sigmas=sigma_table(sigmas),
         monitors={**noise_m, **sigma_keys(sigmas, noisy=noisy), **velocity},
     )
@@ -196,14 +196,14 @@ def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
         )
 
 
-def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: float) -> Vehicle:
+def _vehicle(base: Vehicle, runs: Sequence[RunEstimate], latency_unknown_s: float) -> Vehicle:
     """The vehicle with what was measured.
 
-    A latency that the runs leave more than half as uncertain as `latency_unknown_s`, with which a replay without a
-    vehicle file begins to learn it, is no measurement: at constant speed nothing tells it. What `base` says stays.
+    A latency more than half as uncertain as `latency_unknown_s`, with which learning in a run begins, is no
+    measurement: at constant speed nothing shows it. That of `base` stays.
     """
-    scale = pooled(np.array([one.scale for one in found]), np.array([one.scale_sigma for one in found]))
-    latency = pooled(np.array([one.latency_s for one in found]), np.array([one.latency_sigma_s for one in found]))
+    scale = pooled(np.array([run.scale for run in runs]), np.array([run.scale_sigma for run in runs]))
+    latency = pooled(np.array([run.latency_s for run in runs]), np.array([run.latency_sigma_s for run in runs]))
     measured = {"odometer_scale": scale.value, "odometer_scale_sigma": scale.sigma}
     if latency.sigma <= 0.5 * latency_unknown_s:
         measured |= {"gnss_latency_s": latency.value, "gnss_latency_sigma_s": latency.sigma}
@@ -233,8 +233,7 @@ def _refuse_figures_of_no_train(vehicle: Vehicle, place: str, config: Configurat
     )
 
 
-def _run_table(estimates: Sequence[tuple[str, RunEstimate | None]]) -> pl.DataFrame:
-    names = ("scale", "scale_sigma", "latency_s", "latency_sigma_s", "misfit", "points")
-    rows = [(run_id, *(None if one is None else getattr(one, name) for name in names)) for run_id, one in estimates]
-    schema = {"run_id": pl.String} | dict.fromkeys(names, pl.Float64) | {"points": pl.Int64}
-    return pl.DataFrame(rows, schema=schema, orient="row")
+def _run_table(runs: Sequence[Observed]) -> pl.DataFrame:
+    kinds: dict[str, type[pl.DataType]] = {field.name: pl.Float64 for field in fields(RunEstimate)}
+    rows = [{"run_id": run.run_id} | ({} if run.estimate is None else asdict(run.estimate)) for run in runs]
+    return pl.DataFrame(rows, schema={"run_id": pl.String} | kinds | {"points": pl.Int64})

@@ -11,7 +11,7 @@ where the position's true sigma is a + b sigma_axis; a = 0, b = 1 says that rece
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 import polars as pl
@@ -19,11 +19,13 @@ from scipy.optimize import nnls
 
 from schemas.arrays import Floats
 from schemas.config import CalibrationConfig, Configuration
+from schemas.enums import MonitorState
 from schemas.tables import AXES, BANK_MONITORS, SCALES
 
 # Numerics of the regression: bins of the same number of epochs. Half or twice as many change a simulated fit by less
 # than a fifth of its standard error.
 _BINS = 12
+_LINKING = ("link_order", "link_distance")
 
 _READ = ("state", "value", "threshold")
 COMPARED = (
@@ -126,10 +128,9 @@ def velocity_sigma_mps(runs: Sequence[pl.DataFrame], config: Configuration) -> f
 
 def sigma_table(fits: Sequence[SigmaFit]) -> pl.DataFrame:
     """The fits as a table; errors are null where one piece of data gives none."""
-    names = list(SigmaFit.__dataclass_fields__)
-    rows = [tuple(getattr(fit, name) for name in names) for fit in fits]
-    schema = {name: pl.String if name == "monitor" else pl.Float64 for name in names} | {"epochs": pl.Int64}
-    return pl.DataFrame(rows, schema=schema, orient="row").with_columns(pl.selectors.float().fill_nan(None))
+    kinds: dict[str, type[pl.DataType]] = {field.name: pl.Float64 for field in fields(SigmaFit)}
+    table = pl.DataFrame([asdict(fit) for fit in fits], schema=kinds | {"monitor": pl.String, "epochs": pl.Int64})
+    return table.with_columns(pl.selectors.float().fill_nan(None))
 
 
 def worst_fit(fits: Sequence[SigmaFit]) -> SigmaFit | None:
@@ -139,3 +140,23 @@ def worst_fit(fits: Sequence[SigmaFit]) -> SigmaFit | None:
     the ratio after two standard errors, as among twelve monitors one always looks loud by chance.
     """
     return max(fits, key=lambda fit: fit.ratio - 2.0 * float(np.nan_to_num(fit.ratio_error)), default=None)
+
+
+def beyond_noise(epochs: pl.DataFrame, factor: float) -> tuple[str, ...]:
+    """Monitors of a run, replayed without any noise, that fail by more than its noise; `factor` is k_T.
+
+    The raw monitor of an axis shows its noise; a drift hardly moves it, and of a step only one epoch in thousands is
+    large. So every monitor of the axis is held against k_T times its sigma, widened by what the raw one measured over
+    what was predicted. An average would be widened by the very fault that it sees. Linking knows no such noise.
+    """
+    failing: list[str] = []
+    for axis in AXES:
+        shown = _ratios(epochs, f"{axis}_raw")
+        widened = max(1.0, overall_ratio((factor * shown).to_numpy())) if len(shown) else 1.0
+        failing += [name for scale in SCALES if (_ratios(epochs, name := f"{axis}_{scale}").abs() > widened).any()]
+    return (*failing, *(name for name in _LINKING if (epochs[f"{name}_state"] == MonitorState.FAIL.value).any()))
+
+
+def _ratios(epochs: pl.DataFrame, monitor: str) -> pl.Series:
+    """Value over threshold where the monitor was evaluated."""
+    return (epochs[f"{monitor}_value"] / epochs[f"{monitor}_threshold"]).drop_nulls()

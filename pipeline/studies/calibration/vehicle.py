@@ -191,9 +191,9 @@ def _chance_information(block: Observations, factor: Floats, odometry: Odometry)
 
 
 def _widened(sigma_s: float, by_chance: float) -> float:
-    """Sigma of the latency without what chance tells of it; twice its mean, as chance also tells more than that."""
-    told = 1.0 / sigma_s**2
-    return float(1.0 / np.sqrt(max(told - 2.0 * by_chance, _LEAST_SHARE * told)))
+    """Sigma of the latency without the information of chance: twice its mean, as chance often shows more than that."""
+    information = 1.0 / sigma_s**2
+    return float(1.0 / np.sqrt(max(information - 2.0 * by_chance, _LEAST_SHARE * information)))
 
 
 @dataclass(frozen=True)
