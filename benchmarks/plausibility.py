@@ -19,7 +19,7 @@ from benchmarks.plausibility_wrongs import WRONGS, Wrong
 from benchmarks.results import Figure
 from pipeline.stages.clean.clean import clean
 from pipeline.studies.plausibility.check import Check, State
-from pipeline.studies.plausibility.fit import Fit, fit_run
+from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
@@ -30,7 +30,7 @@ _CONFIG = Configuration()
 def fit_of(run: RunLog, site: Site, vehicle: Vehicle | None = None) -> Fit | str:
     """The fit of a run as a replay makes it, or the error of one that has no time in common."""
     try:
-        cleaned, _ = clean(run, _CONFIG)
+        cleaned, _ = clean(run, _CONFIG, clock_advice)
     except InputError as error:
         return str(error)
     return fit_run(cleaned, "primary", vehicle or Vehicle(), _CONFIG.plausibility, site)

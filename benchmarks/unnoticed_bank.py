@@ -24,7 +24,7 @@ from pipeline.stages.monitors.axis import AxisSeries, run_axis
 from pipeline.stages.monitors.recursion import ewma_weight
 from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
 from pipeline.studies.undetected.error import largest_errors
-from pipeline.studies.undetected.shapes import Shape, largest_of_shape
+from pipeline.studies.undetected.steps_and_ramps import Shape, largest_of_shape
 from pipeline.studies.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Floats
 from schemas.config import Configuration, MonitorConfig, threshold_factor

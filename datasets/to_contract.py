@@ -10,8 +10,7 @@ import polars as pl
 import polars.selectors as cs
 from dataframely import Schema
 
-from pipeline.read.ingest.breaches import refuse
-from pipeline.read.ingest.conform import conform
+from pipeline.read.ingest.conform import conform, refuse
 from schemas.enums import BaliseDirection, BaliseKind, Reaction
 from schemas.errors import InputError
 from schemas.inputs import Balises

@@ -161,6 +161,7 @@ class MisfitCause(StrEnum):
     SPEED_WITHOUT_SIGN = "speed_without_sign"
     COUNTER_WITHOUT_SIGN = "counter_without_sign"
     SIGN_OF_SOMETHING_ELSE = "sign_of_something_else"
+    TWO_COUNTERS = "two_counters"
     OFFSET_OF_REFERENCE = "offset_of_reference"
     WHOLE_SECONDS = "whole_seconds"
     DATUM = "datum"

@@ -41,7 +41,8 @@ _COLUMNS = (*_OPEN, "wrong_in_use", "few_satellites", "claimed_wrongly", "unknow
 
 def write_line(result: LineResult, to: Path) -> list[Path]:
     """Page, tables, GeoJSON and the balises of each proposal; the page first."""
-    criteria, proposed = result.line.criteria, result.balises
+    criteria = result.line.criteria
+    proposed = result.balises
     files = {
         "index.html": line_page(result),
         "pieces.csv": result.pieces.write_csv(),
@@ -59,7 +60,8 @@ def write_line(result: LineResult, to: Path) -> list[Path]:
 
 def line_geojson(result: LineResult) -> str:
     """Pieces as lines and proposed balises as points (RFC 7946)."""
-    line, pieces = result.line, result.line.pieces
+    line = result.line
+    pieces = result.line.pieces
     steps = np.linspace(0.0, 1.0, 6)
     measures = pieces.from_m[:, None] + (pieces.to_m - pieces.from_m)[:, None] * steps
     ground = ground_of(
@@ -87,7 +89,9 @@ def _feature(kind: str, coordinates: list[object], properties: dict[str, object]
 
 def line_page(result: LineResult) -> str:
     """One offline page."""
-    pieces, balises, criteria = result.pieces, result.balises, result.line.criteria
+    pieces = result.pieces
+    balises = result.balises
+    criteria = result.line.criteria
     passed = _with_passes(pieces)
     body = "\n".join(
         [
@@ -175,13 +179,16 @@ def _strip(name: str, part: pl.DataFrame, balises: pl.DataFrame, row: int) -> st
 
 
 def _block(piece: dict[str, object], begin_m: float, scale: float) -> str:
-    kind, cause = PieceClass(str(piece["piece_class"])), LineCause(str(piece["cause"]))
-    from_m, to_m = float(str(piece["from_m"])), float(str(piece["to_m"]))
-    x, width = 40.0 + (from_m - begin_m) * scale, max((to_m - from_m) * scale - 0.6, 0.5)
+    kind = PieceClass(str(piece["piece_class"]))
+    cause = LineCause(str(piece["cause"]))
+    from_m = float(str(piece["from_m"]))
+    to_m = float(str(piece["to_m"]))
+    x = 40.0 + (from_m - begin_m) * scale
+    width = max((to_m - from_m) * scale - 0.6, 0.5)
     top = 2.0 if piece["direction"] == LineDirection.GROWING.value else 28.0
     height = _LANE / 2 if kind is PieceClass.UNKNOWN else _LANE
     found = f"{kind.value}, {cause.value}; {piece['passes']} passes, {piece['lost']} lost"
-    told = f"{from_m:.0f} to {to_m:.0f} m, {piece['direction']}: {found}"
+    title = f"{from_m:.0f} to {to_m:.0f} m, {piece['direction']}: {found}"
     sign = _SIGNS.get(cause, "") if kind is PieceClass.UNSUITABLE else ""
     letter = (
         f'<text class="name" x="{x + width / 2:.1f}" y="{top + 16:.0f}" text-anchor="middle">{sign}</text>'
@@ -189,6 +196,6 @@ def _block(piece: dict[str, object], begin_m: float, scale: float) -> str:
         else ""
     )
     return (
-        f'<g><title>{escape(told)}</title><rect class="bars tone-{_TONES[kind]}" x="{x:.1f}" '
+        f'<g><title>{escape(title)}</title><rect class="bars tone-{_TONES[kind]}" x="{x:.1f}" '
         f'y="{top + _LANE - height:.0f}" width="{width:.1f}" height="{height:.0f}"/>{letter}</g>'
     )

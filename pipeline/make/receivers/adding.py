@@ -68,7 +68,8 @@ def _reference(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
         )
     by_fix = {fix.value: sigmas.horizontal_m(fix) for fix in Fix}
     table = pl.col("fix").cast(pl.String).replace_strict(by_fix, return_dtype=pl.Float64)
-    mean, half = (pl.col("cov_ee_m2") + pl.col("cov_nn_m2")) / 2, (pl.col("cov_ee_m2") - pl.col("cov_nn_m2")) / 2
+    mean = (pl.col("cov_ee_m2") + pl.col("cov_nn_m2")) / 2
+    half = (pl.col("cov_ee_m2") - pl.col("cov_nn_m2")) / 2
     stated = (mean + (half**2 + pl.col("cov_en_m2") ** 2).sqrt()).sqrt()  # of the worst direction
     columns = ("t", "latitude_deg", "longitude_deg", "height_m")
     return {"reference": fixes.select(*columns, sigma_m=pl.coalesce(stated, table))}
@@ -82,7 +83,8 @@ def added(run: RunLog, streams: Streams, force: bool, place: Path) -> RunLog:
     _refuse_what_is_lost(run, place)
     merged: Streams = {}
     for name in STREAMS:
-        new, old = streams.get(name), run.stream(name)
+        new = streams.get(name)
+        old = run.stream(name)
         if new is None:
             continue
         _refuse_other_times(run, name, new, place)
@@ -104,13 +106,14 @@ def _beside(name: Stream, old: pl.DataFrame, new: pl.DataFrame, force: bool, pla
 
 
 def _refuse_other_times(run: RunLog, name: Stream, new: pl.DataFrame, place: Path) -> None:
-    have, told = run.gnss["t"].drop_nulls(), new.to_series(0).drop_nulls()
-    if len(have) and len(told) and (told.max() < have.min() or told.min() > have.max()):  # type: ignore[operator]
+    run_t = run.gnss["t"].drop_nulls()
+    new_t = new.to_series(0).drop_nulls()
+    if len(run_t) and len(new_t) and (new_t.max() < run_t.min() or new_t.min() > run_t.max()):  # type: ignore[operator]
         raise InputError(
             f"is of another time than the {name} to add",
             place=str(place),
-            found=f"{name} from {told.min()!s} to {told.max()!s}",
-            expected=f"times between {have.min()!s} and {have.max()!s}",
+            found=f"{name} from {new_t.min()!s} to {new_t.max()!s}",
+            expected=f"times between {run_t.min()!s} and {run_t.max()!s}",
             remedy="Check the date and the time scale of the log, or name another run.",
         )
 

@@ -39,10 +39,10 @@ def read_bag(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
 
 
 def _streams(run: RunLog, left: dict[str, int]) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
-    found = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
+    streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
     if run.notes.damage is not None:
         left = left | {f"end of the log, {run.notes.damage}": 1}
-    return found, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
+    return streams, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
 
 
 def _transcribe(path: Path, to: Path) -> dict[str, int]:

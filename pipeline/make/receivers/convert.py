@@ -21,8 +21,7 @@ from pipeline.make.receivers.epochs import Epochs, Gathered
 from pipeline.make.receivers.frames import Frame, Protocol, frames, name_of
 from pipeline.make.receivers.rtklib import is_solution, read_solution
 from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked
-from pipeline.read.ingest.breaches import refuse
-from pipeline.read.ingest.conform import conform
+from pipeline.read.ingest.conform import conform, refuse
 from pipeline.read.ingest.mapping import mappings_of
 from pipeline.storage import files
 from schemas.config import FixSigma, IngestConfig
@@ -48,9 +47,9 @@ def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -
     return as_run(gather(logs, config), run_id)
 
 
-def as_run(found: Gatherings, run_id: str, purpose: Purpose | None = None, sigmas: FixSigma | None = None) -> Converted:
+def as_run(logs: Gatherings, run_id: str, purpose: Purpose | None = None, sigmas: FixSigma | None = None) -> Converted:
     """A new run of what logs hold, the positions as `purpose` says; raises `InputError` where they hold none."""
-    streams = assigned(found.streams, purpose or Purpose(), sigmas or FixSigma())
+    streams = assigned(logs.streams, purpose or Purpose(), sigmas or FixSigma())
     gnss = streams.pop("gnss", None)
     if gnss is None:
         raise InputError(
@@ -58,14 +57,14 @@ def as_run(found: Gatherings, run_id: str, purpose: Purpose | None = None, sigma
             place=run_id,
             found=", ".join(streams) or None,
             expected="GNSS positions, which a new run needs",
-            remedy="Convert the log of the receiver first or in the same call." + _reasons(found.dropped),
+            remedy="Convert the log of the receiver first or in the same call." + _reasons(logs.dropped),
         )
-    return Converted(RunLog(run_id, gnss).with_streams(**streams), found.dropped)
+    return Converted(RunLog(run_id, gnss).with_streams(**streams), logs.dropped)
 
 
-def extended(run: RunLog, place: Path, found: Gatherings, purpose: Purpose, sigmas: FixSigma, force: bool) -> Converted:
+def extended(run: RunLog, place: Path, logs: Gatherings, purpose: Purpose, sigmas: FixSigma, force: bool) -> Converted:
     """A run that stands at a place, with what logs hold added to it."""
-    return Converted(added(run, assigned(found.streams, purpose, sigmas), force, place), found.dropped)
+    return Converted(added(run, assigned(logs.streams, purpose, sigmas), force, place), logs.dropped)
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,7 @@ def _of_topics(config: IngestConfig) -> IngestConfig:
 
 
 def _read(content: bytes, log: Path, date: date | None) -> tuple[Streams, Mapping[str, int]]:
-    """The epochs of the protocol that tells most; what is damaged or told twice is counted."""
+    """The epochs of the protocol that says most; what is damaged or said twice is counted."""
     dropped: Counter[str] = Counter()
     gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
     for frame in frames(content, lambda: dropped.update(["damaged message"])):
@@ -187,16 +186,16 @@ def _read(content: bytes, log: Path, date: date | None) -> tuple[Streams, Mappin
             _decode(frame, gathered[frame.protocol])
     nmea.settle_days(gathered[Protocol.NMEA], date)
     novatel.settle_source(gathered[Protocol.NOVATEL])
-    told = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
-    best = max(told, key=lambda protocol: _worth(protocol, told[protocol]))
-    for protocol, epochs in told.items():
-        if protocol is best or not told[best].positions:
+    settled = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
+    best = max(settled, key=lambda protocol: _worth(protocol, settled[protocol]))
+    for protocol, epochs in settled.items():
+        if protocol is best or not settled[best].positions:
             dropped.update(gathered[protocol].dropped)
         elif epochs.positions:
             dropped[f"{protocol} position beside those of {best}"] += epochs.positions
-    if not told[best].epochs:
+    if not settled[best].epochs:
         raise _no_epoch(content, log, dropped)
-    return told[best].streams(), dropped
+    return settled[best].streams(), dropped
 
 
 def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:

@@ -9,10 +9,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.make.receivers.csv_times import instants, time_columns
-from pipeline.read.ingest.breaches import refuse
+from pipeline.read.ingest.conform import refuse
 from pipeline.read.ingest.csv_text import CUT_ROW, read_log_table, with_points
 from pipeline.read.ingest.mapping import mappings_of
-from pipeline.read.ingest.mcap_model import Channel
+from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.plan import Sample, Source, mapped_source
 from pipeline.stages.epochs.clock import GAP_PERIODS
 from schemas.config import IngestConfig, StreamMapping

@@ -17,12 +17,6 @@ def geodetic(x_m: Any, y_m: Any, z_m: Any) -> dict[str, Any]:
     return {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
 
 
-def earth_fixed(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float, float]:
-    """Back from `geodetic` [m]."""
-    x_m, y_m, z_m = _transformer().transform(longitude_deg, latitude_deg, height_m, direction="INVERSE")
-    return x_m, y_m, z_m
-
-
 def local_velocity(
     latitude_deg: float, longitude_deg: float, velocity_mps: tuple[float, float, float]
 ) -> dict[str, Any]:

@@ -41,14 +41,14 @@ class Epoch:
         """Whether messages said what kind of fix the epoch has and where, or that it has none."""
         return "fix" in self.gnss and (bool(self.positions) or self.gnss["fix"] == Fix.NONE)
 
-    def tell(self, what: str, rank: int, columns: dict[str, Any]) -> None:
+    def put(self, what: str, rank: int, columns: dict[str, Any]) -> None:
         """Columns that several messages give: those of the highest rank stay, whichever comes first."""
         if rank >= self._ranks.get(what, rank):
             self._ranks[what] = rank
             self.gnss |= columns
 
-    def tell_time(self, rank: int, t_ns: int) -> None:
-        """As `tell`, the time [ns since 1970]."""
+    def put_time(self, rank: int, t_ns: int) -> None:
+        """As `put`, the time [ns since 1970]."""
         if rank >= self._ranks.get("time", rank):
             self._ranks["time"] = rank
             self.t_ns = t_ns
@@ -92,9 +92,9 @@ class Gathered:
 
     def settled(self) -> Epochs:
         """The epochs whose time and kind of fix are known; the others are counted."""
-        told = [epoch for epoch in self.epochs if epoch.gnss or epoch.satellites]
-        known = [epoch for epoch in told if epoch.has_fix]
-        self.drop("epoch without its position message", len(told) - len(known))
+        filled = [epoch for epoch in self.epochs if epoch.gnss or epoch.satellites]
+        known = [epoch for epoch in filled if epoch.has_fix]
+        self.drop("epoch without its position message", len(filled) - len(known))
         timed = [epoch for epoch in known if epoch.t_ns is not None and 0 <= epoch.t_ns <= LATEST_NS]
         self.drop("time not valid", len(known) - len(timed))
         return Epochs(timed)
@@ -115,8 +115,8 @@ class Epochs:
         """`gnss`, and `satellites` where any epoch has them."""
         fixes = [{"t": epoch.t_ns, "solution": "primary", **_of_fix(epoch.gnss)} for epoch in self.epochs]
         ranges = [{"t": epoch.t_ns, "solution": "primary", **row} for epoch in self.epochs for row in epoch.satellites]
-        found: dict[Stream, pl.DataFrame] = {"gnss": frame_of(fixes, Gnss)}
-        return found | ({"satellites": frame_of(ranges, Satellites)} if ranges else {})
+        streams: dict[Stream, pl.DataFrame] = {"gnss": frame_of(fixes, Gnss)}
+        return streams | ({"satellites": frame_of(ranges, Satellites)} if ranges else {})
 
 
 def _of_fix(gnss: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Whole messages of a receiver log: UBX, SBF, NMEA, NovAtel and RTCM 3, told by their start, length and checksum.
+"""Whole messages of a receiver log: UBX, SBF, NMEA, NovAtel and RTCM 3, by their start, length and checksum.
 
 A start whose message does not prove whole counts as damaged, and the search goes on right behind that start: a
 damaged length hides nothing of what follows it.
@@ -37,12 +37,15 @@ _START = re.compile(
 )
 _SENTENCE = re.compile(rb"\$([ -#%-)+-~]+)\*([0-9A-Fa-f]{2})\r?\n?")
 _NOVATEL_LINE = re.compile(rb"[#%]([ -)+-~]+)\*([0-9A-Fa-f]{8})\r?\n?")
-_NOVATEL_SHORT_HEAD, _NOVATEL_CRC = 12, 4
+_NOVATEL_SHORT_HEAD = 12
+_NOVATEL_CRC = 4
 # Of binary messages that are decoded.
 NOVATEL_NAMES = {
     42: "BESTPOS", 47: "PSRPOS", 99: "BESTVEL", 507: "INSPVA", 508: "INSPVAS", 1429: "BESTGNSSPOS", 1465: "INSPVAX",
 }  # fmt: skip
-_UBX_OVERHEAD, _SBF_HEAD, _RTCM_OVERHEAD = 8, 8, 6
+_UBX_OVERHEAD = 8
+_SBF_HEAD = 8
+_RTCM_OVERHEAD = 6
 
 
 def frames(content: bytes, on_damage: Callable[[], None]) -> Iterator[Frame]:

@@ -24,7 +24,9 @@ _MODES = {
     "E": Fix.ESTIMATED,
 }  # fmt: skip
 # Differential corrections whose station is an SBAS satellite: 120-158 as PRN, 33-64 as NMEA satellite number.
-_SBAS_PRNS, _SBAS_NUMBERS, _NUMBER_TO_PRN = range(120, 159), range(33, 65), 87
+_SBAS_PRNS = range(120, 159)
+_SBAS_NUMBERS = range(33, 65)
+_NUMBER_TO_PRN = 87
 _DAY_NS = 86_400 * NS_PER_S
 
 
@@ -48,19 +50,21 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
         epoch.t_ns = _time_ns(message.date, message.time)
     elif message.msgID == "ZDA" and (day := _date_of(message)):
         epoch.t_ns = _time_ns(day, message.time)
-    _DECODERS[message.msgID](epoch, message)
+    if message.msgID in _DECODERS:
+        _DECODERS[message.msgID](epoch, message)
 
 
-def settle_days(gathered: Gathered, told: date | None = None) -> None:
+def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
     """Give the epochs without a date theirs: past midnight the next, before the first date counted back from it.
 
-    Where no sentence tells a date, the first epoch is of the day `told`. A time with neither date nor position before
+    Where no sentence has a date, the first epoch is of `first_day`. A time with neither date nor position before
     the first date may be that of a receiver just switched on, whose clock is not set yet: it is dropped.
     """
     epochs = gathered.epochs
     first = next((number for number, epoch in enumerate(epochs) if epoch.t_ns is not None), None)
-    if first is None and told is not None and epochs:
-        first, epochs[0].t_ns = 0, _time_ns(told, epochs[0].key)
+    if first is None and first_day is not None and epochs:
+        first = 0
+        epochs[0].t_ns = _time_ns(first_day, epochs[0].key)
     early = epochs[:first]
     if first is not None:
         early = [epoch for epoch in early if epoch.gnss.get("fix", Fix.NONE.value) == Fix.NONE.value]
@@ -98,7 +102,7 @@ def _position(epoch: Epoch, m: Any) -> None:
 
 
 def _position_of_systems(epoch: Epoch, m: Any) -> None:
-    """GNS: a letter of `posMode` per satellite system; where a GGA has told its kind of fix, that stands."""
+    """GNS: a letter of `posMode` per satellite system; the kind of fix of a GGA stands."""
     if epoch.gnss.get("satellites") is None:
         _put(epoch, m, next((fix for mode, fix in _MODES.items() if mode in str(m.posMode)), Fix.NONE))
 
@@ -125,7 +129,8 @@ def _motion(epoch: Epoch, m: Any) -> None:
     place = {"latitude_deg": m.lat, "longitude_deg": m.lon} if m.lat != "" and m.lon != "" else {}
     epoch.gnss = {"fix": fix.value, **place} | epoch.gnss
     if valid and isinstance(m.spd, float) and isinstance(m.cog, float):
-        course, speed = np.radians(m.cog), m.spd * UNITS["knots"]
+        course = np.radians(m.cog)
+        speed = m.spd * UNITS["knots"]
         epoch.gnss |= {"vel_e_mps": float(speed * np.sin(course)), "vel_n_mps": float(speed * np.cos(course))}
 
 
@@ -145,10 +150,6 @@ def _correlation(m: Any) -> dict[str, float]:
     return {"cov_en_m2": shared if abs(shared) <= m.stdLat * m.stdLong else 0.0}
 
 
-def _nothing(_epoch: Epoch, _m: Any) -> None:
-    """ZDA gives only the date."""
-
-
 _POSITIONS = ("GGA", "GNS", "RMC")
 _WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA")
 _DECODERS = {
@@ -156,5 +157,4 @@ _DECODERS = {
     "GNS": _position_of_systems,
     "RMC": _motion,
     "GST": _accuracy,
-    "ZDA": _nothing,
 }

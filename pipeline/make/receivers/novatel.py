@@ -68,7 +68,7 @@ def decode(gathered: Gathered, m: Any, raw: bytes) -> None:
     else:
         fix = FIX_BY_CODE.get(int(m.position_type), Fix.NONE) if int(m.solution_status) == 0 else Fix.NONE
         _place(epoch, m, _RANKS[name], fix)
-        epoch.tell("satellites", _RANKS[name], {"satellites": int(m.num_soln_svs)})
+        epoch.put("satellites", _RANKS[name], {"satellites": int(m.num_soln_svs)})
 
 
 def settle_source(gathered: Gathered) -> None:
@@ -94,7 +94,7 @@ def _inertial(epoch: Epoch, m: Any, rank: int) -> None:
     solved = int(m.ins_solution_status) in _SOLVED
     kind = FIX_BY_CODE.get(int(m.position_type), Fix.NONE) if hasattr(m, "position_type") else Fix.ESTIMATED
     _place(epoch, m, rank, kind if solved else Fix.NONE)
-    epoch.tell("velocity", rank, velocity(m.east_vel, m.north_vel, m.up_vel))
+    epoch.put("velocity", rank, velocity(m.east_vel, m.north_vel, m.up_vel))
 
 
 def _place(epoch: Epoch, m: Any, rank: int, fix: Fix) -> None:
@@ -103,11 +103,11 @@ def _place(epoch: Epoch, m: Any, rank: int, fix: Fix) -> None:
     The field of the height has one name in old definitions of a message, and another in new ones.
     """
     height = (m.height if hasattr(m, "height") else m.orthometric_height) + getattr(m, "undulation", 0.0)
-    epoch.tell("fix", rank, {"fix": fix.value})
-    epoch.tell("place", rank, {"latitude_deg": m.latitude, "longitude_deg": m.longitude, "height_m": height})
+    epoch.put("fix", rank, {"fix": fix.value})
+    epoch.put("place", rank, {"latitude_deg": m.latitude, "longitude_deg": m.longitude, "height_m": height})
     if hasattr(m, "latitude_std_dev"):
         east, north, up = m.longitude_std_dev**2, m.latitude_std_dev**2, m.height_std_dev**2
-        epoch.tell("accuracy", rank, covariance(east, 0.0, 0.0, north, 0.0, up))
+        epoch.put("accuracy", rank, covariance(east, 0.0, 0.0, north, 0.0, up))
 
 
 def _velocity(m: Any) -> dict[str, float]:
@@ -120,11 +120,12 @@ def _give(velocities: list[Epoch], epochs: list[Epoch]) -> None:
     """The velocity of each epoch between the two of BESTVEL around it: "latency" is how much older it is."""
     if not velocities or not epochs:
         return
-    told = sorted((epoch.t_ns or 0, *(epoch.gnss[name] for name in _VELOCITY)) for epoch in velocities)
-    at, wanted = np.array([row[0] for row in told]), np.array([epoch.t_ns for epoch in epochs])
+    rows = sorted((epoch.t_ns or 0, *(epoch.gnss[name] for name in _VELOCITY)) for epoch in velocities)
+    at = np.array([row[0] for row in rows])
+    wanted = np.array([epoch.t_ns for epoch in epochs])
     before = at[np.maximum(np.searchsorted(at, wanted, side="right") - 1, 0)]
     after = at[np.minimum(np.searchsorted(at, wanted), len(at) - 1)]
     near = (before <= wanted) & (wanted <= after) & (after - before <= _LONGEST_BETWEEN_NS)
-    between = [np.interp((wanted - at[0]) * 1e-9, (at - at[0]) * 1e-9, [row[i] for row in told]) for i in (1, 2, 3)]
+    between = [np.interp((wanted - at[0]) * 1e-9, (at - at[0]) * 1e-9, [row[i] for row in rows]) for i in (1, 2, 3)]
     for number in np.flatnonzero(near):
         epochs[number].gnss |= velocity(*(v[number] for v in between))

@@ -1,7 +1,7 @@
 """RTKLIB solutions (`.pos`): one row per epoch, what its columns are in the header.
 
-Read are all forms of the RTKLIB manual 2.4.3, appendix B.1: GPST, UTC and JST as calendar or week and seconds;
-degrees, degrees with minutes and seconds, earth-fixed places, and baselines from the reference in the header.
+Read are the forms of the RTKLIB manual 2.4.3, appendix B.1, in degrees or earth-fixed metres: GPST, UTC and JST as
+calendar or week and seconds. Degrees with minutes and baselines are refused: RTKLIB writes the others on request.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.make.receivers.earth_fixed import earth_fixed, east_north_up, geodetic
+from pipeline.make.receivers.earth_fixed import east_north_up, geodetic
 from pipeline.read.ingest.csv_text import CUT_ROW
 from pipeline.read.ingest.stamps import gps_ns_of_weeks, utc_of, within
 from pipeline.read.numbers import numbers_of
@@ -31,8 +31,7 @@ _QUALITY = {
 }  # fmt: skip
 _AHEAD_NS = {"GPST": 0, "UTC": 0, "JST": 9 * 3600 * NS_PER_S}  # of UTC, GPS time beside its leap seconds
 _TOGETHER = (
-    ("latitude", "longitude", "height"), ("x-ecef", "y-ecef", "z-ecef"), ("e-baseline", "n-baseline", "u-baseline"),
-    ("vx", "vy", "vz"),
+    ("latitude", "longitude", "height"), ("x-ecef", "y-ecef", "z-ecef"), ("vx", "vy", "vz"),
 )  # fmt: skip
 _DATE = re.compile(r"[0-9]{4}/[0-9]{1,2}/[0-9]{1,2}")
 _GEOID = "height over the geoid: left empty, since the file has no separation"
@@ -44,13 +43,12 @@ class _Layout:
 
     scale: str
     columns: tuple[str, ...]
-    sexagesimal: bool
     comments: str
 
     @property
     def tokens(self) -> int:
-        """Words in a row: time takes two, and a coordinate in degrees, minutes and seconds takes three."""
-        return 2 + len(self.columns) + (4 if self.sexagesimal else 0)
+        """Words in a row, of which time takes two."""
+        return 2 + len(self.columns)
 
 
 def is_solution(content: bytes) -> bool:
@@ -96,14 +94,16 @@ def _layout(comments: list[str], path: Path) -> _Layout:
     names = tuple(re.sub(r"\(.*\)$", "", word) for word in units)
     lacking = [name for group in _TOGETHER if {*group} & {*names} for name in group if name not in names]
     if lacking:
-        found, remedy = ", ".join(names), "Let RTKLIB write the file again."
-        raise InputError(f"has no column {', '.join(lacking)}", place=str(path), found=found, remedy=remedy)
-    places = {line for line in comments if "e-baseline" in names and re.match(r"%\s*ref pos\s*:", line)}
-    if any(words != headers[0] for words in headers) or len(places) > 1:
-        found = ", ".join(sorted({" ".join(words[:3]) for words in headers} | places))
+        message = f"has no column {', '.join(lacking)}"
+        raise InputError(message, place=str(path), found=", ".join(names), remedy="Let RTKLIB write the file again.")
+    if any(words != headers[0] for words in headers):
+        forms = ", ".join(sorted({" ".join(words[:3]) for words in headers}))
         remedy = "Give the files that were joined one by one."
-        raise InputError("holds solutions of several forms", place=str(path), found=found, remedy=remedy)
-    return _Layout(scale, names, any("(d'" in word for word in units), "\n".join(comments))
+        raise InputError("holds solutions of several forms", place=str(path), found=forms, remedy=remedy)
+    if any("(d'" in word for word in units):
+        remedy = "Let RTKLIB write decimal degrees (out-degform = deg)."
+        raise InputError("holds degrees with minutes and seconds", place=str(path), remedy=remedy)
+    return _Layout(scale, names, "\n".join(comments))
 
 
 def _rows(lines: list[str], layout: _Layout, ended: bool, path: Path) -> tuple[list[list[str]], dict[str, int]]:
@@ -149,22 +149,13 @@ def _times(words: Any, layout: _Layout, path: Path) -> pl.Series:
 
 
 def _numbers(words: Any, layout: _Layout, path: Path) -> dict[str, Floats]:
-    """The columns by name; degrees, minutes and seconds made degrees."""
+    """The columns by name."""
     rest = words[:, 2:]
     try:
         values = numbers_of(rest.ravel()).reshape(rest.shape)
     except ValueError as error:
         raise InputError(f"holds a value that is no number: {error}", place=str(path)) from None
-    if layout.sexagesimal:
-        values = np.hstack([_degrees(rest[:, :6]), values[:, 6:]])
     return dict(zip(layout.columns, values.T, strict=True))
-
-
-def _degrees(words: Any) -> Floats:
-    """Latitude and longitude of two times degrees, minutes and seconds; -0 degrees have a sign as well."""
-    signs = np.where(np.char.startswith(words[:, [0, 3]], "-"), -1.0, 1.0)
-    degrees: Floats = signs * (np.abs(numbers_of(words.ravel())).reshape(-1, 2, 3) @ np.array([1.0, 1 / 60, 1 / 3600]))
-    return degrees
 
 
 def _place(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:
@@ -176,14 +167,13 @@ def _place(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str,
         place = {name: numbers[name.rpartition("_")[0]] for name in names}
     elif "x-ecef" in numbers:
         place = geodetic(*(numbers[f"{axis}-ecef"] for axis in "xyz"))
-    elif "e-baseline" in numbers:
-        place = _at_baseline(numbers, layout, path)
     else:
         raise InputError(
             "holds no places",
             place=str(path),
             found=", ".join(numbers),
-            expected="latitude and longitude, x/y/z-ecef, or e/n/u-baseline",
+            expected="latitude and longitude, or x/y/z-ecef",
+            remedy="Let RTKLIB write latitude, longitude and height (out-solformat = llh).",
         )
     return place | _velocity(numbers, place)
 
@@ -194,28 +184,6 @@ def _velocity(numbers: dict[str, Floats], place: dict[str, Floats]) -> dict[str,
         local = np.einsum("ijn,jn->in", turn, np.array([numbers["vx"], numbers["vy"], numbers["vz"]]))
         return dict(zip(("vel_e_mps", "vel_n_mps", "vel_u_mps"), local, strict=True))
     return {f"vel_{axis}_mps": numbers[f"v{axis}"] for axis in "enu" if f"v{axis}" in numbers}
-
-
-def _at_baseline(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:
-    """Places from baselines: the reference stands in the header, in the form that places have."""
-    told = re.search(r"^%\s*ref pos\s*:\s*(.*)$", layout.comments, re.MULTILINE)
-    words = np.array(re.split(r"[\s,;]+", told[1].strip()) if told else [])
-    try:
-        values = numbers_of(words)
-    except ValueError as error:
-        raise InputError(f"holds a base station's position that cannot be read: {error}", place=str(path)) from None
-    if len(values) == 7:  # degrees, minutes and seconds
-        values = np.append(_degrees(words[None, :6]), values[6:])
-    if len(values) != 3:
-        raise InputError(
-            "holds baselines without the base station's position",
-            place=str(path),
-            expected="% ref pos : latitude longitude height in the header",
-            remedy="Let RTKLIB write latitude, longitude and height (out-solformat = llh).",
-        )
-    base = np.array(earth_fixed(*values))
-    baseline = np.array([numbers[f"{axis}-baseline"] for axis in "enu"])
-    return geodetic(*(base[:, None] + east_north_up(values[0], values[1]).T @ baseline))
 
 
 def _covariance(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:

@@ -74,8 +74,10 @@ def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
     if latitude is None or longitude is None or m.Cov_xx == _DO_NOT_USE:
         return
     turn = east_north_up(latitude, longitude)
-    xx, yy, zz, xy, xz, yz = m.Cov_xx, m.Cov_yy, m.Cov_zz, m.Cov_xy, m.Cov_xz, m.Cov_yz
-    local = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+    earth_fixed = np.array(
+        [[m.Cov_xx, m.Cov_xy, m.Cov_xz], [m.Cov_xy, m.Cov_yy, m.Cov_yz], [m.Cov_xz, m.Cov_yz, m.Cov_zz]]
+    )
+    local = turn @ earth_fixed @ turn.T
     epoch.gnss |= _known(covariance(*local[np.triu_indices(3)]))
 
 

@@ -47,10 +47,10 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
         # The same moment of another week: the log was interrupted, or several were joined.
         epoch = gathered.begin(message.iTOW, position, raw)
     if t_ns is not None:
-        epoch.tell_time(rank, t_ns)
-    for what, rank, told_by in _TELLS.get(message.identity, ()):
-        if told := told_by(message):
-            epoch.tell(what, rank, told)
+        epoch.put_time(rank, t_ns)
+    for what, rank, columns_of in _CONTENTS.get(message.identity, ()):
+        if columns := columns_of(message):
+            epoch.put(what, rank, columns)
     if message.identity == "NAV-PL" and not message.plPosValid:
         gathered.drop("protection level not valid")
     _see_satellites(epoch, message)
@@ -173,15 +173,15 @@ def _name(m: Any, index: int) -> str | None:
     if m.identity == "NAV-SVINFO":
         svid = getattr(m, f"svid_{index:02d}")
         known = ((system, svid - low + first) for low, high, system, first in _SVIDS if low <= svid <= high)
-        return next((satellite_name(*one) for one in known), None)
+        return next((satellite_name(*satellite) for satellite in known), None)
     system = getattr(m, f"gnssId_{index:02d}")  # pyubx2 gives systems by name or by number
     letter = _SYSTEMS_BY_NAME.get(str(system), UBX_SYSTEMS.get(system, "X"))
     return satellite_name(letter, getattr(m, f"svId_{index:02d}"))
 
 
-# What messages tell of an epoch, and with which rank: it gives way to what is told with a higher one.
+# What messages say of an epoch, and with which rank: it gives way to a higher one.
 _PVT = (("fix", 3, _pvt_fix), ("place", 3, _place), ("velocity", 3, _velocity), ("accuracy", 3, _accuracy))
-_TELLS: dict[str, tuple[tuple[str, int, Callable[[Any], Columns]], ...]] = {
+_CONTENTS: dict[str, tuple[tuple[str, int, Callable[[Any], Columns]], ...]] = {
     "NAV-PVT": _PVT,
     "NAV-PVAT": _PVT,
     "NAV-HPPOSLLH": (("place", 4, lambda m: {} if m.invalidLlh else _place(m)),),

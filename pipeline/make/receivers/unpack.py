@@ -31,7 +31,7 @@ def unpacked(log: Path) -> Iterator[list[Path]]:
         place = Path(folder)
         try:
             _unpack(log, place)
-            yield [inner for found in sorted(place.iterdir()) for inner in _logs(found, _DEEPEST)]
+            yield [inner for entry in sorted(place.iterdir()) for inner in _logs(entry, _DEEPEST)]
         except (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
             raise InputError(
                 f"cannot be unpacked: {error}",
@@ -47,6 +47,9 @@ def unpacked(log: Path) -> Iterator[list[Path]]:
 def _unpack(log: Path, place: Path) -> None:
     if log.suffix.lower() == ".zip":
         with zipfile.ZipFile(log) as archive:
+            names = archive.namelist()
+            if len(set(names)) < len(names):
+                raise OSError("two of its files have the same name")
             archive.extractall(place)
         return
     with gzip.open(log) as packed, (place / log.stem).open("wb") as plain:
@@ -63,7 +66,8 @@ def _logs(path: Path, deeper: int) -> Iterator[Path]:
         inner = path.with_name(path.name + ".unpacked")
         inner.mkdir()
         _unpack(path, inner)
-        path, deeper = inner, deeper - 1
+        path = inner
+        deeper -= 1
     if path.is_dir() and not (path / BAG_FOLDER).exists():
         for inner in sorted(path.iterdir()):
             yield from _logs(inner, deeper)

@@ -96,7 +96,8 @@ def _may_be_left_out(part: Decoded, unknown: pl.Series, few: float, remarks: lis
 
     They may where a receiver does not know the time yet, and where a few have a date that no trial can have.
     """
-    source, time = part.source, part.source.times["t"]
+    source = part.source
+    time = source.times["t"]
     if source.recipe.time is not None:
         remarks.append(f"{source.channel.topic}: {unknown.sum()} messages without a valid time")
         return True

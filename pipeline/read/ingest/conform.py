@@ -1,14 +1,14 @@
-"""A recorded frame made to fit its stream's contract: lossless conversions, else a breach."""
+"""A recorded frame made to fit its stream's contract: lossless conversions, else a breach, all in one error."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import dataframely as dy
 import polars as pl
 
-from schemas.errors import InputError
+from schemas.errors import InputError, listed
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import Stream
 
@@ -32,10 +32,15 @@ def conform(frame: pl.DataFrame, stream: Stream, place: str, breaches: list[Inpu
     if stream == "odometer" and {"distance_m", "speed_mps"} <= set(result.columns):
         neither = result["distance_m"].is_null() & result["speed_mps"].is_null()
         if neither.any():
-            told = {"found": f"null in {rows_text(neither)}", "expected": "distance or speed in every row"}
-            remedy = "Record one of the two, or leave the stream out."
-            where = f"{place}: columns distance_m, speed_mps"
-            breaches.append(InputError("are both empty", place=where, **told, remedy=remedy))
+            breaches.append(
+                InputError(
+                    "are both empty",
+                    place=f"{place}: columns distance_m, speed_mps",
+                    found=f"null in {rows_text(neither)}",
+                    expected="distance or speed in every row",
+                    remedy="Record one of the two, or leave the stream out.",
+                )
+            )
     return result
 
 
@@ -49,8 +54,8 @@ def conform_to(
         if name in frame.columns:
             series = _converted(frame[name], column)
             if isinstance(series, str):
-                told = {"found": series, "expected": type_name(column), "remedy": "Write the column with that type."}
-                breaches.append(InputError("has the wrong type", place=where, **told))
+                wrong = {"found": series, "expected": type_name(column), "remedy": "Write the column with that type."}
+                breaches.append(InputError("has the wrong type", place=where, **wrong))
                 continue
             conformed[name] = series.fill_null(defaults[name]) if name in defaults and series.null_count() else series
             breaches += _strange_values(conformed[name], column, where)
@@ -58,8 +63,8 @@ def conform_to(
             default = pl.Series(name, [defaults.get(name)], dtype=column.dtype)
             conformed[name] = default.new_from_index(0, frame.height)
         else:
-            told = {"found": ", ".join(frame.columns) or "no columns", "expected": type_name(column)}
-            breaches.append(InputError("is missing", place=where, **told, remedy="Add the column."))
+            absent = {"found": ", ".join(frame.columns) or "no columns", "expected": type_name(column)}
+            breaches.append(InputError("is missing", place=where, **absent, remedy="Add the column."))
     return pl.DataFrame(conformed)
 
 
@@ -80,7 +85,7 @@ def _converted(series: pl.Series, column: dy.Column) -> pl.Series | str:
     return _lossless(series, column, target)
 
 
-# What is told where reading a column would lose something.
+# What is found where reading a column would lose something.
 _LOSSES: dict[type[dy.Column], str] = {
     dy.Float64: " beyond 2^53",
     dy.Int64: " with values that are not 64-bit integers",
@@ -156,5 +161,25 @@ def _out_of_range(where: str, value: object, mask: pl.Series, expected: str) -> 
 
 def rows_text(mask: pl.Series) -> str:
     """Which rows are meant: the first, and how many."""
-    first, count = mask.arg_max(), int(mask.sum())
-    return f"row {first}" if count == 1 else f"{count} rows, first {first}"
+    count = int(mask.sum())
+    return f"row {mask.arg_max()}" if count == 1 else f"{count} rows, first {mask.arg_max()}"
+
+
+def refuse(breaches: Sequence[InputError]) -> None:
+    """Raise one error for all breaches, none if there are none."""
+    if not breaches:
+        return
+    if len(breaches) == 1:
+        raise breaches[0]
+    remedies = list(dict.fromkeys(breach.remedy for breach in breaches if breach.remedy))
+    files = list(dict.fromkeys(str(breach.place).split(": ")[0] for breach in breaches))
+    raise InputError(
+        listed([line_of(breach) for breach in breaches]),
+        place=", ".join(files),
+        remedy=" ".join(remedies) or None,
+    )
+
+
+def line_of(breach: InputError) -> str:
+    """The breach as one line of an error, without its remedy."""
+    return str(InputError(breach.message, place=breach.place, found=breach.found, expected=breach.expected))

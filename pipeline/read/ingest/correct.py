@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.breaches import refuse
-from pipeline.read.ingest.conform import conform
+from pipeline.read.ingest.conform import conform, refuse
 from pipeline.stages.track.geodesy import moved_deg
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import StreamCorrection
@@ -44,8 +43,8 @@ def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -
     _refuse_unknown(correction)
     mended = frame
     if correction.exchange is not None:
-        one, other = correction.exchange
-        mended = mended.with_columns(pl.col(other).alias(one), pl.col(one).alias(other))
+        first, second = correction.exchange
+        mended = mended.with_columns(pl.col(second).alias(first), pl.col(first).alias(second))
     mended = mended.with_columns(pl.col(name) * factor for name, factor in correction.factors.items())
     mended = _later(mended, correction.shift_s) if correction.shift_s else mended
     if correction.shift_east_m or correction.shift_north_m or correction.shift_up_m:

@@ -110,7 +110,8 @@ def _epoch(column: pl.Series) -> tuple[list[str], float | None]:
     """What numbers may count, by their size: a line, and the seconds per unit."""
     if not column.dtype.is_numeric() or column.drop_nulls().is_empty():
         return [], None
-    least, most = float(column.min()), float(column.max())  # type: ignore[arg-type]
+    least = float(column.min())  # type: ignore[arg-type]
+    most = float(column.max())  # type: ignore[arg-type]
     if least >= LEAST_DAY and most <= MOST_DAY:
         return ['time_epoch = "excel"  # days since 1899-12-30'], None
     sizes = {1e-3: 1e12, 1e-6: 1e15}

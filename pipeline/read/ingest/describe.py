@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of
 from pipeline.read.ingest.guesses import COLUMNS, columns_in, mapping_lines, word_of
 from pipeline.read.ingest.mcap_block import Block, Messages
-from pipeline.read.ingest.mcap_model import Channel
+from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
 from pipeline.read.ingest.plan import Sample, sources_of
 from pipeline.read.ingest.run import read_run

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache
-from graphlib import TopologicalSorter
+from functools import lru_cache, partial
 from typing import Any
 
 import polars as pl
+from mcap.records import Schema as McapSchema
 
 from pipeline.read.ingest.mcap_block import Messages
-from pipeline.read.ingest.mcap_model import Channel, Schema
+from pipeline.read.ingest.mcap_records import Channel, Schema
 from pipeline.read.ingest.ros_message import Definition, DefinitionError, RosWalk, parse_definitions, short_name
 from schemas.errors import InputError
 
@@ -37,7 +37,21 @@ def decoder_for(channel: Channel) -> Decode:
             found=channel.encoding or "none",
             expected="json, protobuf or cdr",
         )
-    return _protobuf_decoder(channel) if channel.encoding == "protobuf" else _cdr_decoder(channel)
+    definition = definition_of(channel)
+    decode = definition.FromString if channel.encoding == "protobuf" else partial(_cdr_message, definition)
+
+    def checked(payload: bytes) -> Value:
+        try:
+            return decode(payload)
+        except Exception as error:  # those of decoders share no base class
+            raise UndecodableError(f"not the {channel.encoding} message of its schema: {error}") from None
+
+    return checked
+
+
+def _cdr_message(definition: tuple[Mapping[str, Definition], str], payload: bytes) -> Value:
+    definitions, name = definition
+    return RosWalk(payload, definitions).message(name)
 
 
 def parse_json(payload: bytes) -> Value:
@@ -50,65 +64,30 @@ def parse_json(payload: bytes) -> Value:
 
 def _object(pairs: list[tuple[str, Value]]) -> dict[str, Value]:
     """An object; of two values under one name, nobody can say which is meant."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    members = dict(pairs)
+    if len(members) < len(pairs):
         raise ValueError("a name occurs twice in one object")
-    return found
+    return members
 
 
 def _refuse_literal(literal: str) -> Value:
     raise ValueError(f"the literal {literal}")
 
 
-def _protobuf_decoder(channel: Channel) -> Decode:
-    from google.protobuf.message import DecodeError
-
-    make = definition_of(channel)
-
-    def checked(payload: bytes) -> Value:
-        message = make()
-        try:
-            message.ParseFromString(payload)
-        except DecodeError as error:
-            raise UndecodableError(f"not the protobuf message of its schema: {error}") from None
-        return message
-
-    return checked
-
-
-def _cdr_decoder(channel: Channel) -> Decode:
-    definitions, name = definition_of(channel)
-
-    def checked(payload: bytes) -> Value:
-        try:
-            return RosWalk(payload, definitions).message(name)
-        except DefinitionError as error:
-            raise UndecodableError(f"not the CDR message of its schema: {error}") from None
-
-    return checked
-
-
 # A schema takes as long to parse as ten thousand messages to decode, and the logs of a campaign share theirs.
 @lru_cache(maxsize=64)
 def _protobuf_class(schema: Schema) -> Any:
     """The class of a schema's messages, of the descriptors that it carries."""
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-    from google.protobuf.descriptor_pool import DescriptorPool
-    from google.protobuf.message_factory import GetMessageClass
+    from mcap_protobuf.decoder import DecoderFactory
 
-    found = FileDescriptorSet.FromString(schema.data).file
-    files = {file.name: file for file in found}
-    if len(files) < len(found):
-        raise ValueError("two of its files have the same name")
-    needed = {name: [other for other in file.dependency if other in files] for name, file in files.items()}
-    pool = DescriptorPool()
-    for name in TopologicalSorter(needed).static_order():
-        pool.Add(files[name])
-    return GetMessageClass(pool.FindMessageTypeByName(schema.name))
+    record = McapSchema(schema.id, data=schema.data, encoding=schema.encoding, name=schema.name)
+    decode = DecoderFactory().decoder_for("protobuf", record)
+    return type(decode(b"")) if decode is not None else None
 
 
 def _ros_definitions(schema: Schema) -> tuple[Mapping[str, Definition], str]:
-    definitions, name = parse_definitions(schema.name, schema.data.decode()), short_name(schema.name)
+    definitions = parse_definitions(schema.name, schema.data.decode())
+    name = short_name(schema.name)
     if name not in definitions:
         raise DefinitionError(f"no definition of {schema.name}")
     return definitions, name

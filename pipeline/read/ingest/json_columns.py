@@ -19,7 +19,8 @@ from schemas.arrays import Ints
 
 _ARROW = {pl.Float64: pa.float64(), pl.Int64: pa.int64(), pl.Boolean: pa.bool_(), pl.String: pa.string()}
 # Literals that pyarrow takes and JSON does not know, and `null` after an object, which pyarrow does not survive.
-_LITERALS, _AS_VALUE = (b"NaN", b"Inf"), re.compile(rb"[:,\[]\s*-?(?:NaN|Inf)")
+_LITERALS = (b"NaN", b"Inf")
+_AS_VALUE = re.compile(rb"[:,\[]\s*-?(?:NaN|Inf)")
 _NULL_AFTER = re.compile(rb"\}\s*null")
 
 
@@ -80,7 +81,7 @@ def _joined(messages: Messages) -> bytes | None:
     content = b"\n".join(_payloads(*part) for part in messages.by_piece())
     # A letter is found ten times as fast as a word.
     strange = any(word[:1] in content and word in content for word in _LITERALS) and _AS_VALUE.search(content)
-    if strange or _NULL_AFTER.search(content) or not _is_utf8(content):
+    if strange or (b"null" in content and _NULL_AFTER.search(content)) or not _is_utf8(content):
         return None
     return content if _all_between_braces(messages) else None
 

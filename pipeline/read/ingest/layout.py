@@ -91,8 +91,8 @@ def text(offset: int, length: int) -> Field:
 
 def constant(value: float | str | bool | None, dtype: pl.DataType) -> Field:
     """A field that messages of this layout leave out: its default, or null."""
-    one = pl.Series([value], dtype=dtype, strict=False)
-    return Field(type(dtype), 0, 0, lambda rows: one.new_from_index(0, len(rows)))
+    values = pl.Series([value], dtype=dtype, strict=False)
+    return Field(type(dtype), 0, 0, lambda rows: values.new_from_index(0, len(rows)))
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,8 @@ class Layout:
 
 def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) -> Layout:
     """From one message; `static` masks the bits that shape the layout."""
-    mask, content = np.frombuffer(static, dtype=np.uint8), np.frombuffer(payload, dtype=np.uint8)
+    mask = np.frombuffer(static, dtype=np.uint8)
+    content = np.frombuffer(payload, dtype=np.uint8)
     taken = mask != 0
     for field in fields.values():
         taken[field.start : field.end] = True

@@ -64,7 +64,8 @@ def _coded(kind: str | None, path: str, mapping: StreamMapping) -> tuple[pl.Data
     kinds: dict[object, str] = {code: kind.value for code, kind in mapping.fix_codes.items()}
     dtype: pl.DataType = pl.String()
     if kind != "text" and all(re.fullmatch(r"-?[0-9]+", code) for code in mapping.fix_codes):
-        kinds, dtype = {int(str(code)): kind for code, kind in kinds.items()}, pl.Int64()
+        kinds = {int(str(code)): kind for code, kind in kinds.items()}
+        dtype = pl.Int64()
     known = pl.col(path).replace_strict(kinds, default=None, return_dtype=pl.String)
     return dtype, pl.coalesce(known, pl.format("code {}", pl.col(path)))
 

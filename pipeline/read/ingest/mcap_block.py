@@ -21,9 +21,9 @@ OnRecord = Callable[[int, bytes, int], None]  # opcode, content, offset of its c
 # A message record: opcode, length, channel, sequence, log time, publish time, then the payload.
 MESSAGE_HEAD = np.dtype(
     {
-        "names": ["length", "channel", "log_time"],
-        "formats": ["<u8", "<u2", "<i8"],
-        "offsets": [1, 9, 15],
+        "names": ["opcode", "length", "channel", "log_time"],
+        "formats": ["u1", "<i8", "<u2", "<i8"],
+        "offsets": [0, 1, 9, 15],
         "itemsize": 31,
     }
 )
@@ -100,6 +100,7 @@ class Piece:
 
     data: Bytes
     starts: Ints
+    opcodes: Bytes
     channels: npt.NDArray[np.uint16]
     lengths: Ints
     log_times: Ints
@@ -108,10 +109,12 @@ class Piece:
 
 def _piece(data: Bytes, starts: Ints, offset: int) -> Piece:
     if not len(starts):
-        return Piece(data, starts, starts.astype(np.uint16), starts, starts, offset)
+        return Piece(data, starts, data[:0], starts.astype(np.uint16), starts, starts, offset)
     heads = stretches_of(data, starts, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
-    lengths, log_times = heads["length"].astype(np.int64), heads["log_time"].astype(np.int64)
-    return Piece(data, starts, heads["channel"].astype(np.uint16), lengths, log_times, offset)
+    opcodes, channels, lengths, log_times = (
+        np.ascontiguousarray(heads[name]) for name in ("opcode", "channel", "length", "log_time")
+    )
+    return Piece(data, starts, opcodes, channels, lengths, log_times, offset)
 
 
 @dataclass
@@ -130,21 +133,22 @@ def piece_of_chunk(
 ) -> Piece:
     """The messages of a chunk, which its records must fill exactly; other records go to `on_record`.
 
-    `indexes` are its message indexes, channel and entries. Where all records from the first on that they name are the
-    messages as they tell, these are not walked.
+    `indexes`: its message indexes, channel and entries. Where all records from the first listed one on are the listed
+    messages, these are not walked.
     """
-    view, starts = memoryview(content), array("q")
+    view = memoryview(content)
+    starts = array("q")
     indexes = [(channel, entries) for channel, entries in indexes if entries]  # recovered logs have empty ones
-    named = _named(np.frombuffer(content, dtype=np.uint8), offset, indexes)
-    end = int(named.starts[0]) if named else len(view)
+    listed = _listed(np.frombuffer(content, dtype=np.uint8), offset, indexes)
+    end = int(listed.starts[0]) if listed else len(view)
     at = _walk(view, 0, end, starts, offset, on_record, allowance)
-    if named and at == end and not starts:
-        return named
+    if listed and at == end and not starts:
+        return listed
     at = _walk(view, at, len(view), starts, offset, on_record, allowance)
     if at != len(view):
         how = "is cut off by" if at < len(view) else "runs past"
         raise DamageError(offset, f"a record {how} the end of its chunk")
-    piece = _found(content, starts, offset)
+    piece = _walked(content, starts, offset)
     _check_indexes(piece, indexes)
     return piece
 
@@ -152,38 +156,40 @@ def piece_of_chunk(
 def _check_indexes(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> None:
     """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
     order = np.argsort(piece.channels, kind="stable")
-    channels, found = piece.channels[order], np.column_stack([piece.log_times, piece.starts])[order]
+    channels = piece.channels[order]
+    messages = np.column_stack([piece.log_times, piece.starts])[order]
     for channel, entries in indexes:
         first, end = np.searchsorted(channels, np.array([channel, channel + 1]))
-        told = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
-        if not np.array_equal(told[np.argsort(told[:, 1], kind="stable")], found[first:end]):
+        listed = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
+        if not np.array_equal(listed[np.argsort(listed[:, 1], kind="stable")], messages[first:end]):
             raise DamageError(piece.offset, "a message index disagrees with its chunk")
 
 
-def _named(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> Piece | None:
-    """The messages by their indexes; none unless they follow each other to the end and are as told."""
-    told = np.frombuffer(b"".join(entries for _, entries in indexes), dtype="<i8").reshape(-1, 2)
+def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> Piece | None:
+    """The messages by their indexes; none unless they follow each other to the end and are as the indexes list them."""
+    log_times, starts = np.frombuffer(b"".join(entries for _, entries in indexes), dtype="<i8").reshape(-1, 2).T
     channels = np.repeat([channel for channel, _ in indexes], [len(entries) // 16 for _, entries in indexes])
-    order = np.argsort(told[:, 1], kind="stable")
-    starts = told[order, 1]
+    order = np.argsort(starts, kind="stable")
+    starts = starts[order]
     if not len(starts) or starts[0] < 0 or starts[-1] > len(data) - MESSAGE_HEAD.itemsize:
         return None
     piece = _piece(data, starts, offset)
     ends = starts + HEAD_SIZE + piece.lengths
     tiled = ends[-1] == len(data) and (ends[:-1] == starts[1:]).all() and piece.lengths.min() >= _FIXED_FIELDS
-    as_told = (
-        (data[starts] == int(Opcode.MESSAGE)).all()
+    as_listed = (
+        (piece.opcodes == int(Opcode.MESSAGE)).all()
         and (piece.channels == channels[order]).all()
-        and (piece.log_times == told[order, 0]).all()
+        and (piece.log_times == log_times[order]).all()
     )
-    return piece if as_told and tiled else None
+    return piece if as_listed and tiled else None
 
 
 def _walk(
     view: memoryview, at: int, end: int, starts: array[int], offset: int, on_record: OnRecord, allowance: Allowance
 ) -> int:
     """Record by record to `end` or beyond, or to less than the head of a record; where messages begin into `starts`."""
-    unpack, message, keep = HEAD.unpack_from, int(Opcode.MESSAGE), starts.append
+    unpack = HEAD.unpack_from
+    message = int(Opcode.MESSAGE)
     room = len(view) - HEAD_SIZE
     last = min(end - 1, room)
     for left in range(allowance.left, -1, -1):
@@ -192,7 +198,7 @@ def _walk(
             return at
         opcode, length = unpack(view, at)
         if opcode == message:
-            keep(at)
+            starts.append(at)
         elif at + length <= room:
             on_record(opcode, bytes(view[at + HEAD_SIZE :][:length]), offset)
         at += HEAD_SIZE + length
@@ -201,25 +207,24 @@ def _walk(
 
 def piece_of_messages(content: bytes, offset: int) -> Piece:
     """The whole messages outside of chunks that this part of the file begins with."""
-    unpack, message = HEAD.unpack_from, int(Opcode.MESSAGE)
     starts = array("q")
-    at, room = 0, len(content) - HEAD_SIZE
+    room = len(content) - HEAD_SIZE
+    at = 0
     while at <= room:
-        opcode, length = unpack(content, at)
-        if opcode != message or at + length > room:
+        opcode, length = HEAD.unpack_from(content, at)
+        if opcode != Opcode.MESSAGE or at + length > room:
             break
         starts.append(at)
         at += HEAD_SIZE + length
-    return _found(memoryview(content)[:at], starts, offset)
+    return _walked(memoryview(content)[:at], starts, offset)
 
 
-def _found(content: Any, starts: array[int], offset: int) -> Piece:
+def _walked(content: Any, starts: array[int], offset: int) -> Piece:
     data = np.frombuffer(content, dtype=np.uint8)
-    found = np.frombuffer(starts, dtype=np.int64) if starts else np.empty(0, dtype=np.int64)
-    lengths = stretches_of(data, found + 1, 8).view("<u8") if starts else found
-    if (lengths < _FIXED_FIELDS).any():
+    at = np.array(starts, dtype=np.int64)
+    if len(at) and (stretches_of(data, at + 1, 8).view("<i8") < _FIXED_FIELDS).any():
         raise DamageError(offset, "a message is shorter than its header")
-    return _piece(data, found, offset)
+    return _piece(data, at, offset)
 
 
 def block_of(pieces: list[Piece], before: int) -> Block:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 from io import BytesIO
 from struct import Struct
 from typing import TypeVar
@@ -25,8 +26,40 @@ class DamageError(Exception):
         super().__init__(f"damaged at byte {offset}: {kind}")
 
 
+@dataclass(frozen=True)
+class Schema:
+    id: int
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A channel with its schema; `file` serves error messages."""
+
+    id: int
+    topic: str
+    encoding: str
+    schema: Schema | None
+    file: str
+
+    @property
+    def place(self) -> str:
+        return f"{self.file}: topic {self.topic}"
+
+    @property
+    def schema_name(self) -> str:
+        return self.schema.name if self.schema else ""
+
+    @property
+    def schema_encoding(self) -> str:
+        return self.schema.encoding if self.schema else ""
+
+
 Record = TypeVar("Record", bound=McapRecord)
-_INDEX_HEAD, _INDEX_ENTRY_SIZE = Struct("<HI"), 16
+_INDEX_HEAD = Struct("<HI")
+_INDEX_ENTRY_SIZE = 16
 
 
 class _Stream(ReadDataStream):
@@ -41,7 +74,8 @@ class _Stream(ReadDataStream):
 
 def parse(kind: type[Record], body: bytes, offset: int) -> Record:
     """A record by the reader of the `mcap` package; it must be used up exactly."""
-    stream, name = _Stream(BytesIO(body)), kind.__name__
+    stream = _Stream(BytesIO(body))
+    name = kind.__name__
     try:
         record: Record = kind.read(stream)  # type: ignore[attr-defined]
     except UnicodeDecodeError:

@@ -11,11 +11,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.read.ingest.assemble import Decoded, stream_frames
-from pipeline.read.ingest.breaches import refuse
+from pipeline.read.ingest.conform import refuse
 from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of, undecodable
 from pipeline.read.ingest.mcap_block import Block, Messages
-from pipeline.read.ingest.mcap_model import Channel
-from pipeline.read.ingest.mcap_records import DamageError
+from pipeline.read.ingest.mcap_records import Channel, DamageError
 from pipeline.read.ingest.mcap_walk import McapWalk
 from pipeline.read.ingest.plan import Sample, is_candidate, settle, solution_of, sources_of
 from pipeline.read.ingest.reader import SourceReader
@@ -141,7 +140,7 @@ def _frames(
     path: Address, config: IngestConfig, walk: McapWalk, streams: McapStreams
 ) -> tuple[dict[str, pl.DataFrame], int, tuple[str, ...]]:
     """Frames of all streams, messages decoded one by one, and the topics that fed none."""
-    readers = [reader for found in streams.readers.values() for reader in found]
+    readers = [reader for of_channel in streams.readers.values() for reader in of_channel]
     met = [walk.channels[channel_id] for channel_id in streams.readers]
     settled = settle([reader.source for reader in readers], [c.topic for c in met], config, str(path))
     chosen = [reader for reader in readers if any(reader.source is source for source in settled)]

@@ -53,40 +53,40 @@ class Summary:
         """A record before the footer."""
         self._crc = crc32(whole, self._crc)
         if opcode == Opcode.CHUNK_INDEX:
-            told = parse(ChunkIndex, whole[HEAD_SIZE:], position)
-            span_ns = (told.message_start_time, told.message_end_time)
-            place = (told.chunk_start_offset, told.chunk_length)
-            content = (told.compressed_size, told.uncompressed_size, told.compression)
+            index = parse(ChunkIndex, whole[HEAD_SIZE:], position)
+            span_ns = (index.message_start_time, index.message_end_time)
+            place = (index.chunk_start_offset, index.chunk_length)
+            content = (index.compressed_size, index.uncompressed_size, index.compression)
             self._indexed += 1
             self._index_sum += hash((*span_ns, *place, *content))
         elif opcode == Opcode.STATISTICS:
             self._check_statistics(parse(Statistics, whole[HEAD_SIZE:], position), position)
 
-    def _check_statistics(self, told: Statistics, position: int) -> None:
+    def _check_statistics(self, stated: Statistics, position: int) -> None:
         met = self._met
-        per_channel = {channel: count for channel, count in told.channel_message_counts.items() if count}
+        per_channel = {channel: count for channel, count in stated.channel_message_counts.items() if count}
         pairs: list[tuple[str, object, object]] = [
-            ("messages", told.message_count, met.message_counts.total()),
-            ("chunks", told.chunk_count, met.chunks),
-            ("attachments", told.attachment_count, met.attachments),
-            ("metadata records", told.metadata_count, met.metadata),
+            ("messages", stated.message_count, met.message_counts.total()),
+            ("chunks", stated.chunk_count, met.chunks),
+            ("attachments", stated.attachment_count, met.attachments),
+            ("metadata records", stated.metadata_count, met.metadata),
             ("messages per channel", per_channel or dict(met.message_counts), dict(met.message_counts)),
         ]
         if met.span_ns:
-            # Some writers take a first time of 0 for none yet, and tell of the earliest after it.
-            start_ns = told.message_start_time if met.span_ns[0] else 0
-            pairs.append(("times", (start_ns, told.message_end_time), met.span_ns))
-        for name, expected, found in pairs:
-            if expected != found:
-                raise DamageError(position, f"the statistics record gives {expected} {name}, the file holds {found}")
+            # Some writers take a first time of 0 for none yet, and state the earliest after it.
+            start_ns = stated.message_start_time if met.span_ns[0] else 0
+            pairs.append(("times", (start_ns, stated.message_end_time), met.span_ns))
+        for name, given, counted in pairs:
+            if given != counted:
+                raise DamageError(position, f"the statistics record gives {given} {name}, the file holds {counted}")
 
     def finish(self, footer: bytes, position: int) -> None:
         """The footer. A chunk index lists every chunk once, or there is none."""
-        told = parse(Footer, footer[HEAD_SIZE:], position)
+        stated = parse(Footer, footer[HEAD_SIZE:], position)
         start = self._start if position != self._start else 0
-        if told.summary_start != start:
-            raise DamageError(position, f"the footer places the summary at {told.summary_start}, it is at {start}")
-        if told.summary_crc and crc32(footer[:-4], self._crc) != told.summary_crc:
+        if stated.summary_start != start:
+            raise DamageError(position, f"the footer places the summary at {stated.summary_start}, it is at {start}")
+        if stated.summary_crc and crc32(footer[:-4], self._crc) != stated.summary_crc:
             raise DamageError(position, "the checksum of the summary does not match")
         if self._indexed and (self._indexed, self._index_sum) != (self._met.chunks, self._met.chunk_sum):
             raise DamageError(position, "the chunk index disagrees with the chunks")

@@ -16,8 +16,17 @@ from mcap import records
 from mcap.opcode import Opcode
 
 from pipeline.read.ingest.mcap_block import Allowance, Block, Piece, block_of, piece_of_chunk, piece_of_messages
-from pipeline.read.ingest.mcap_model import Channel, Schema
-from pipeline.read.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, DamageError, parse, parse_message_index, unpacked
+from pipeline.read.ingest.mcap_records import (
+    HEAD,
+    HEAD_SIZE,
+    MAGIC,
+    Channel,
+    DamageError,
+    Schema,
+    parse,
+    parse_message_index,
+    unpacked,
+)
 from pipeline.read.ingest.mcap_summary import Met, Summary
 
 _AFTER_THE_DATA = (
@@ -34,7 +43,7 @@ _SLACK = 1024 * 1024  # what does not compress grows a little
 
 
 class McapWalk:
-    """Walks a log once; `blocks` yields its messages, the attributes tell what was met so far."""
+    """Walks a log once; `blocks` yields its messages, the attributes hold what was met so far."""
 
     def __init__(self, stream: IO[bytes], size: int, file: str, chunk_limit: int) -> None:
         self.channels: dict[int, Channel] = {}
@@ -47,7 +56,6 @@ class McapWalk:
         self._file = file
         self._limit = chunk_limit
         self._schemas: dict[int, Schema] = {}
-        self._definitions: dict[int, records.Channel] = {}
         self._known: set[bytes] = set()
         self._pieces: list[Piece] = []
         self._waiting = 0
@@ -156,14 +164,8 @@ class McapWalk:
 
     def _body(self, opcode: int, length: int, position: int) -> bytes:
         """No record that is loaded whole may be larger than a chunk."""
-        self._check_length(opcode, length, position)
+        _check_size(f"a record of opcode {opcode}", length, self._limit + _SLACK, position)
         return self._read(position + HEAD_SIZE, length)
-
-    def _check_length(self, opcode: int, length: int, position: int) -> None:
-        limit = self._limit + _SLACK
-        if length > limit:
-            told = f"over the limit of {limit} ([ingest] chunk_limit_mib)"
-            raise DamageError(position, f"a record of opcode {opcode} declares {length} bytes, {told}")
 
     def _definition(self, opcode: int, body: bytes, position: int) -> None:
         """A schema or channel; definitions are repeated in every chunk and in the summary."""
@@ -182,26 +184,26 @@ class McapWalk:
 
     def _channel(self, body: bytes, position: int) -> None:
         record = parse(records.Channel, body, position)
-        if self._definitions.setdefault(record.id, record) != record:
-            raise DamageError(position, f"channel {record.id} ({record.topic}) is defined twice with different content")
-        if record.schema_id and record.schema_id not in self._schemas:
-            raise DamageError(position, f"schema {record.schema_id} of topic {record.topic} is missing")
         schema = self._schemas.get(record.schema_id)
-        if record.id not in self.channels:
-            self.channels[record.id] = Channel(record.id, record.topic, record.message_encoding, schema, self._file)
+        channel = Channel(record.id, record.topic, record.message_encoding, schema, self._file)
+        if self.channels.get(record.id, channel) != channel:
+            raise DamageError(position, f"channel {record.id} ({record.topic}) is defined twice with different content")
+        if record.schema_id and schema is None:
+            raise DamageError(position, f"schema {record.schema_id} of topic {record.topic} is missing")
+        self.channels[record.id] = channel
 
     def _chunk(self, body: bytes, position: int) -> int:
         """The messages of a chunk; the position behind it and the message indexes that follow it."""
         chunk = parse(records.Chunk, body, position)
-        if (size := chunk.uncompressed_size) > self._limit:
-            told = f"a chunk declares {size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
-            raise DamageError(position, told)
+        size = chunk.uncompressed_size
+        _check_size("a chunk", size, self._limit, position)
         end = position + HEAD_SIZE + len(body)
         if not chunk.uncompressed_crc and size:  # that of nothing is 0
             self._bare_chunks.extend((end - len(chunk.data), end))
             self.without_crc += 1
         self.met.add_chunk(chunk, position, HEAD_SIZE + len(body))
-        content, (indexes, end) = unpacked(chunk, position), self._indexes(end, position, size)
+        content = unpacked(chunk, position)
+        indexes, end = self._indexes(end, position, size)
         self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes))
         return end
 
@@ -228,7 +230,7 @@ class McapWalk:
 
     def _loose_messages(self, length: int, position: int) -> int:
         """Messages outside of chunks, some at once; the position behind them."""
-        self._check_length(Opcode.MESSAGE, length, position)
+        _check_size("a message", length, self._limit + _SLACK, position)
         several = min(_LOOSE, self._size - position)
         piece = piece_of_messages(self._read(position, max(HEAD_SIZE + length, several)), position)
         self.without_crc += position != self._loose_until  # one for all that follow each other
@@ -242,7 +244,9 @@ class McapWalk:
 
     def _block(self) -> Block:
         """The messages that wait."""
-        pieces, self._pieces, self._waiting = self._pieces, [], 0
+        pieces = self._pieces
+        self._pieces = []
+        self._waiting = 0
         block = block_of(pieces, self._ordinal)
         for channel_id, messages in block.items():
             if channel_id not in self.channels:
@@ -257,7 +261,7 @@ class McapWalk:
     def _data_end(self, crc: int, end: int) -> None:
         """The checksum over the whole data section, which few recorders write.
 
-        The Rust writer leaves the contents of chunks out of it when it is told to give chunks no checksums.
+        The Rust writer leaves the contents of chunks out of it where chunks have no checksums.
         """
         if not crc:
             return
@@ -270,11 +274,12 @@ class McapWalk:
 
     def _crc_of(self, end: int, left_out: array[int]) -> int:
         """CRC-32 of the file up to `end`, without some parts (each from and to)."""
-        crc, at = 0, 0
+        crc = at = 0
         for stop, resume in zip([*left_out[::2], end], [*left_out[1::2], end], strict=True):
             while at < stop:
                 piece = self._read(at, min(stop - at, _SLACK))
-                crc, at = crc32(piece, crc), at + len(piece)
+                crc = crc32(piece, crc)
+                at += len(piece)
             at = resume
         return crc
 
@@ -305,3 +310,9 @@ class McapWalk:
             raise DamageError(
                 end + len(MAGIC), "there is data after the end of the file: two files may have been joined"
             )
+
+
+def _check_size(what: str, size: int, limit: int, position: int) -> None:
+    if size > limit:
+        over = f"over the limit of {limit} ([ingest] chunk_limit_mib)"
+        raise DamageError(position, f"{what} declares {size} bytes, {over}")

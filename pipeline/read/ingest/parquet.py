@@ -7,8 +7,7 @@ from collections.abc import Iterable
 
 import polars as pl
 
-from pipeline.read.ingest.breaches import refuse
-from pipeline.read.ingest.conform import conform
+from pipeline.read.ingest.conform import conform, refuse
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
 from pipeline.storage.parquet import ColumnTypes, ParquetError, read_parquet, without_checksums
@@ -67,9 +66,9 @@ def _read(content: bytes, stream: Stream, place: str, breaches: list[InputError]
     contract = STREAM_SCHEMAS[stream].columns()
     met: ColumnTypes = {}
 
-    def known(found: ColumnTypes) -> list[str]:
-        met.update(found)
-        return [name for name in found if name in contract]
+    def known(types: ColumnTypes) -> list[str]:
+        met.update(types)
+        return [name for name in types if name in contract]
 
     try:
         frame = read_parquet(content, known)

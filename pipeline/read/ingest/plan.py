@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.read.ingest.breaches import refuse
-from pipeline.read.ingest.conform import DEFAULTS
+from pipeline.read.ingest.conform import DEFAULTS, refuse
 from pipeline.read.ingest.generic import definition_of
 from pipeline.read.ingest.mapping import mapped_recipe, mappings_of
-from pipeline.read.ingest.mcap_model import Channel
+from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.recipe import Recipe
 from pipeline.read.ingest.recipes import recipes_for
 from pipeline.read.ingest.stamps import (
@@ -68,13 +67,13 @@ class Source:
 def sources_of(sample: Sample, config: IngestConfig) -> list[Source]:
     """What the channel may feed: by configuration, else by its schema."""
     known = _by_schema(sample)
-    found: list[Source] = []
+    sources: list[Source] = []
     for stream in STREAMS:
         mappings = mappings_of(config, stream)
-        found += [mapped_source(sample, stream, m) for m in mappings if m.topic == sample.channel.topic]
+        sources += [mapped_source(sample, stream, m) for m in mappings if m.topic == sample.channel.topic]
         if known is not None and known.recipe.stream == stream and (not mappings or known.recipe.supplement):
-            found.append(known)
-    return found
+            sources.append(known)
+    return sources
 
 
 def is_candidate(channel: Channel, config: IngestConfig) -> bool:

@@ -59,17 +59,17 @@ class _Walk:
             field = descriptor.fields_by_name.get(step) if isinstance(step, str) else None
             if field is None:
                 raise UnfitError(f"no field {step}")
-            found = met.get(field.number, [])
-            if len(found) > 1:
+            places = met.get(field.number, [])
+            if len(places) > 1:
                 raise UnfitError("a field occurs twice")
-            if not found:
+            if not places:
                 self._absent(field, subtree)
             elif field.is_repeated:
-                self._packed(field, subtree, *found[0])
-            elif field.type == _MESSAGE and found[0][0] == _LEN:
-                self.message(field.message_type, subtree, *found[0][1:])
+                self._packed(field, subtree, *places[0])
+            elif field.type == _MESSAGE and places[0][0] == _LEN:
+                self.message(field.message_type, subtree, *places[0][1:])
             else:
-                self._keep(subtree, _value(field.type, *found[0]))
+                self._keep(subtree, _value(field.type, *places[0]))
 
     def _scan(self, at: int, end: int) -> dict[int, list[Raw]]:
         """All fields of one message by number; tags, lengths and widths of varints are marked as static."""

@@ -13,7 +13,7 @@ from pipeline.read.ingest.generic import decode_columns, definition_of
 from pipeline.read.ingest.json_columns import JsonDecoder
 from pipeline.read.ingest.layout import Columns, LayoutDecoder, Values
 from pipeline.read.ingest.mcap_block import Messages
-from pipeline.read.ingest.mcap_model import Channel
+from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.plan import Source
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import layout_of_cdr
@@ -53,8 +53,8 @@ class SourceReader:
     def add(self, messages: Messages) -> None:
         """Decode these messages."""
         parts, left = self._decoder.decode(messages) if self._decoder else ([], [messages])
-        for found, columns in parts:
-            self._keep(found, columns)
+        for decoded, columns in parts:
+            self._keep(decoded, columns)
         for rest in left:
             self.slow_messages += len(rest)
             columns, numbers = decode_columns(self.source.channel, rest, self.source.types, self.source.recipe.rows)

@@ -67,7 +67,7 @@ def _pos_cov_geodetic() -> Recipe:
 
 
 def _ublox_fix(fix_type: pl.Expr, is_ok: pl.Expr, differential: pl.Expr, carrier: pl.Expr) -> pl.Expr:
-    """u-blox interface description, UBX-NAV-PVT: fixType, flags. SBAS cannot be told from other corrections."""
+    """u-blox interface description, UBX-NAV-PVT: fixType, flags. SBAS looks like other corrections."""
     cases = (
         (~is_ok | ~fix_type.is_in([1, 2, 3, 4]), Fix.NONE),
         (fix_type == 1, Fix.ESTIMATED),

@@ -61,17 +61,17 @@ def parse_definitions(name: str, text: str) -> Mapping[str, Definition]:
 
 def _sections(name: str, text: str) -> list[tuple[str, list[str]]]:
     """Name and lines of each message; lines of `=` part them, and `MSG:` names all but the first."""
-    found: list[tuple[str, list[str]]] = [(name, [])]
+    sections: list[tuple[str, list[str]]] = [(name, [])]
     for line in text.splitlines():
         if line.startswith("===") and not line.strip().strip("="):
-            found.append(("", []))
+            sections.append(("", []))
         elif line.startswith("MSG:"):
-            found[-1] = (line.removeprefix("MSG:").strip(), found[-1][1])
+            sections[-1] = (line.removeprefix("MSG:").strip(), sections[-1][1])
         else:
-            found[-1][1].append(line)
-    if not all(full for full, _ in found):
+            sections[-1][1].append(line)
+    if not all(full for full, _ in sections):
         raise DefinitionError("a part of the definition has no name")
-    return found
+    return sections
 
 
 def short_name(full: str) -> str:
@@ -198,9 +198,11 @@ def layout_of_cdr(
     fields: dict[str, Field] = {}
     for path, dtype in types.items():
         array = re.fullmatch(r"(.*)\[([0-9]+)\]", path)
-        place, index = walk.places.get(path), 0
-        if place is None and array and (found := walk.places.get(array[1])) and int(array[2]) < (found.size or 0):
-            place, index = found, int(array[2])
+        place = walk.places.get(path)
+        index = 0
+        if place is None and array and (whole := walk.places.get(array[1])) and int(array[2]) < (whole.size or 0):
+            place = whole
+            index = int(array[2])
         elif place is None or (place.size is not None and place.kind != "string"):
             raise UnfitError(f"no field {path}")
         fields[path] = _field(place, index, walk.little).as_type(dtype)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import dataframely as dy
 import polars as pl
 
-from pipeline.read.ingest.breaches import line_of
-from pipeline.read.ingest.conform import Defaults, conform_to, rows_text, type_name
+from pipeline.read.ingest.conform import Defaults, conform_to, line_of, rows_text, type_name
 from pipeline.read.ingest.csv_text import comments_of, epsg_in, read_table
 from pipeline.storage.parquet import metadata_of, read_parquet
 from schemas.enums import BaliseDirection, Reaction

@@ -67,7 +67,8 @@ class Counter:
 
     def best_speed_mps(self, t_ns: Ints) -> Floats:
         """Speed over as much of that second as was recorded [m/s]; a best guess over a break."""
-        odometer, at_s = self.odometer, self.odometer.seconds(t_ns)
+        odometer = self.odometer
+        at_s = self.odometer.seconds(t_ns)
         half_s = 0.5 * odometer.config.speed_window_s
         begin_s = np.clip(at_s - half_s, odometer.t_s[0], odometer.t_s[-1])
         end_s = np.clip(at_s + half_s, odometer.t_s[0], odometer.t_s[-1])
@@ -104,7 +105,8 @@ def between_anchors(
     Where the way closes by a vehicle file, the inverse-variance mean of both +- (k roots + closing error): the loss may
     lie at one place. Else the hull of both.
     """
-    factor, clock_m = config.hazards.evidence_factor, [anchor.clock_m for anchor in anchors]
+    factor = config.hazards.evidence_factor
+    clock_m = [anchor.clock_m for anchor in anchors]
     ways = [counter.between(anchor.t_ns, t_ns) for anchor in anchors]
     places = [at + way.distance_m for at, way in zip(at_m, ways, strict=True)]
     variances = [anchor.sigma_m**2 + way.variance_m2 for anchor, way in zip(anchors, ways, strict=True)]

@@ -15,26 +15,27 @@ def chains_between(
     `back`: the train runs them from the goal to the begin. None where there are more than `most`.
     """
     shortest_m, longest_m = lengths_m
-    found: list[Chain] = []
+    chains: list[Chain] = []
     open_chains = [Chain((start,), (-network.track.along_m(start, begin.measure_m),))]
     steps = 0
     while open_chains:
         chain = open_chains.pop()
-        last, entry_m = chain.oriented[-1], chain.entry_m[-1]
+        last = chain.oriented[-1]
+        entry_m = chain.entry_m[-1]
         if last // 2 == goal.element:
             at_m = entry_m + network.track.along_m(last, goal.measure_m)
             if shortest_m <= at_m <= longest_m:
-                found.append(chain)
+                chains.append(chain)
         exit_m = entry_m + network.length_m(last)
         steps += 1
-        if len(found) > most or steps > most**2:
+        if len(chains) > most or steps > most**2:
             return None
         open_chains += [
             Chain((*chain.oriented, edge.to), (*chain.entry_m, exit_m + edge.gap_m))
             for edge in network.successors[last]
             if exit_m + edge.gap_m <= longest_m and (edge.backward if back else edge.forward)
         ]
-    return found
+    return chains
 
 
 def extended(network: Network, chain: Chain, least_m: float, most_m: float, most: int) -> list[Chain] | None:

@@ -11,7 +11,9 @@ from schemas.arrays import NS_PER_S, Floats, Ints
 from schemas.config import HazardConfig
 
 # Numerics: lags are sought so far, in such steps; the rest is regressed, in so many rounds.
-_FARTHEST_S, _STEP_S, _ROUNDS = 30.0, 0.5, 4
+_FARTHEST_S = 30.0
+_STEP_S = 0.5
+_ROUNDS = 4
 # So many ways at least tell a lag, and so many say whether it is one of seconds.
 _FEWEST, _FEWEST_FAR = 6, 12
 # A lag of seconds leaves less than this share of what the ways differ by as recorded.
@@ -62,7 +64,8 @@ def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None)
     if counter is None or begin_ns.size < _FEWEST:
         return Lag()
     coarse_s = _coarse_lag_s(begin_ns, end_ns, way_m, counter) if begin_ns.size >= _FEWEST_FAR else 0.0
-    lag_s, sigma_s = coarse_s, np.inf
+    lag_s = coarse_s
+    sigma_s = np.inf
     for _ in range(_ROUNDS):
         rest_s, sigma_s = _rest_of_lag(begin_ns, end_ns, way_m, counter, lag_s)
         if not np.isfinite(sigma_s) or abs(lag_s + rest_s - coarse_s) > 2.0 * _STEP_S + 3.0 * sigma_s:
@@ -97,7 +100,8 @@ def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter)
 
 def _rest_of_lag(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter, lag_s: float) -> tuple[float, float]:
     """What is left of the lag once `lag_s` is taken off, and its sigma [s]; infinite where nothing tells it."""
-    begin_ns, end_ns = _shifted(begin_ns, lag_s), _shifted(end_ns, lag_s)
+    begin_ns = _shifted(begin_ns, lag_s)
+    end_ns = _shifted(end_ns, lag_s)
     counted = counter.between(begin_ns, end_ns).distance_m
     change = counter.speed_mps(end_ns) - counter.speed_mps(begin_ns)
     # Noise of the odometer is no change of speed, and would look like a lag; nor is where its recording begins or ends.
@@ -105,7 +109,8 @@ def _rest_of_lag(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter, 
     kept = np.isfinite(counted) & np.isfinite(change)
     if kept.sum() < _FEWEST:
         return 0.0, np.inf
-    estimate, sigma = np.array([1.0, 0.0]), np.inf
+    estimate = np.array([1.0, 0.0])
+    sigma = np.inf
     for _ in range(_ROUNDS):
         design = np.column_stack([counted, -change])[kept]
         normal = design.T @ design

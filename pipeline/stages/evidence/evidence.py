@@ -22,7 +22,7 @@ from pipeline.stages.evidence.carrying import Anchor, Counter, Interval, between
 from pipeline.stages.evidence.clock import Clock, Lag, clock_of, lag_of
 from pipeline.stages.evidence.gaps import Gap, Way, gaps_of, unreachable, without_sign
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.reference import Stretch
+from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import Route
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
@@ -109,7 +109,8 @@ class Evidence:
     @property
     def disputed(self) -> int:
         """Reads that exclude the reference beyond k_T roots: at k = 3 noise alone does so in a long run."""
-        t_ns, kind = self.reads_ns, np.full(self.reads_ns.size, NOTHING)
+        t_ns = self.reads_ns
+        kind = np.full(self.reads_ns.size, NOTHING)
         factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
         by_reference = self._covered(t_ns, kind == NOTHING, kind)
         by_reads = self._carried(self.by_reads, t_ns, kind != NOTHING, kind)
@@ -130,20 +131,21 @@ class Evidence:
 
     def at(self, t_ns: Ints) -> EvidenceSet:
         """Evidence at these instants; nothing is carried from one side over a stand of the odometer (`stood`)."""
-        kind, heard = np.full(t_ns.size, NOTHING), ~within_spans(t_ns, self.silent)
-        found = self._covered(t_ns, heard, kind)
-        found += self._carried(self.carried, t_ns, heard & (kind == NOTHING), kind)
+        kind = np.full(t_ns.size, NOTHING)
+        heard = ~within_spans(t_ns, self.silent)
+        alternatives = self._covered(t_ns, heard, kind)
+        alternatives += self._carried(self.carried, t_ns, heard & (kind == NOTHING), kind)
         if not self.stretches or not self.by_reads:
-            return EvidenceSet(kind, tuple(found))
+            return EvidenceSet(kind, tuple(alternatives))
         of_reads = np.full(t_ns.size, NOTHING)
         by_reads = self._carried(self.by_reads, t_ns, heard, of_reads)
-        both, disputed = common(found, by_reads, t_ns.size)
+        both, disputed = common(alternatives, by_reads, t_ns.size)
         return EvidenceSet(np.where(kind == NOTHING, of_reads, kind), tuple(both), disputed=disputed)
 
     def _covered(self, t_ns: Ints, heard: Bools, kind: Ints) -> list[Alternative]:
         """By the reference: straight lines between samples, each +- (k sigma + speed times clock)."""
         factor = self.config.hazards.evidence_factor
-        found: list[Alternative] = []
+        alternatives: list[Alternative] = []
         for one in self.stretches:
             rows = np.flatnonzero((t_ns >= one.t_ns[0]) & (t_ns <= one.t_ns[-1]) & heard)
             after = np.searchsorted(one.t_ns, t_ns[rows], side="left")
@@ -152,7 +154,8 @@ class Evidence:
             half = np.maximum(half[before], half[after])
             since = (t_ns[rows] - one.t_ns[0]).astype(np.float64)
             for path in one.paths:
-                leg, stamps = path.path.leg, one.t_ns - one.t_ns[0]
+                leg = path.path.leg
+                stamps = one.t_ns - one.t_ns[0]
                 centre = np.interp(since, stamps, path.at_m)
                 low = np.minimum((path.low_m - path.at_m)[before], (path.low_m - path.at_m)[after])
                 high = np.maximum((path.high_m - path.at_m)[before], (path.high_m - path.at_m)[after])
@@ -160,15 +163,15 @@ class Evidence:
                 stepping = np.where(before != after, path.step_m[before], 0.0)
                 low, high = low - stepping, high + stepping
                 for number in np.unique(leg[before]).tolist():
-                    own = np.flatnonzero((leg[before] == number) & (leg[after] == number))
-                    low_m, high_m = (centre + low - half)[own], (centre + high + half)[own]
-                    found.append(Alternative(rows[own], path.path.legs[number], low_m, high_m))
-                    kind[rows[own]] = KINDS.index(Kind.REFERENCE)
-        return found
+                    on_leg = np.flatnonzero((leg[before] == number) & (leg[after] == number))
+                    low_m, high_m = (centre + low - half)[on_leg], (centre + high + half)[on_leg]
+                    alternatives.append(Alternative(rows[on_leg], path.path.legs[number], low_m, high_m))
+                    kind[rows[on_leg]] = KINDS.index(Kind.REFERENCE)
+        return alternatives
 
     def _carried(self, sources: Sequence[Carried], t_ns: Ints, wanted: Bools, kind: Ints) -> list[Alternative]:
         """By each odometer, from the anchors of its gaps: the train was where one of them says."""
-        found: list[Alternative] = []
+        alternatives: list[Alternative] = []
         for source in sources:
             open_rows = wanted.copy()
             for gap in source.gaps:
@@ -180,11 +183,11 @@ class Evidence:
                     low, high = self._interval(source.counter, gap, way, t_ns[rows])
                     reached = np.isfinite(low)
                     route = way.chain.route(self.network)
-                    found.append(Alternative(rows[reached], route, low[reached], high[reached]))
+                    alternatives.append(Alternative(rows[reached], route, low[reached], high[reached]))
                     open_rows[rows[reached]] = False
                     by_read = any(anchor.kind is Kind.BALISE for anchor in gap.anchors)
                     kind[rows[reached]] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
-        return found
+        return alternatives
 
     def _interval(self, counter: Counter, gap: Gap, way: Way, t_ns: Ints) -> Interval:
         if gap.begin is not None and gap.end is not None:
@@ -244,7 +247,7 @@ def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
 
 
 def evidence_of(
-    reference: tuple[Sequence[Stretch], Sequence[Span]],
+    reference: tuple[Sequence[ReferenceStretch], Sequence[Span]],
     reads: pl.DataFrame | None,
     balises: pl.DataFrame | None,
     odometers: Sequence[Odometry],
@@ -260,16 +263,16 @@ def evidence_of(
     by_file = vehicle.gnss_latency_s is not None
     counters = [Counter.of(odometer) for odometer in odometers]
     main = counters[0] if counters else None
-    found = [sided(stretch, main, config.matching.orientation_distance_m) for stretch in reference[0]]
-    carrier = _Carrier.of(found, network, config)
-    of_reference = clock_of(reference_lag(found, main), by_file, hazards)
+    sides = [sided(stretch, main, config.matching.orientation_distance_m) for stretch in reference[0]]
+    carrier = _Carrier.of(sides, network, config)
+    of_reference = clock_of(reference_lag(sides, main), by_file, hazards)
     reads_found = read_anchors(reads, balises, network.track, hazards)
     lag_of_reads = Lag() if main is None else _lag_of_reads(carrier.by(main, _points(reads_found)))
     of_reads = clock_of(lag_of_reads, by_file, hazards)
     read = [] if main is None else on_clock(reads_found, of_reads, main)
     reads_ns = np.array([one.t_ns for one in read], dtype=np.int64)
     ahead_m = vehicle.gnss_antenna_ahead_m
-    stretches = tuple(known_stretch(one, of_reference, counters, read, ahead_m, config) for one in found)
+    stretches = tuple(known_stretch(one, of_reference, counters, read, ahead_m, config) for one in sides)
     apart = outside(read, stretches)
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return Evidence(
@@ -303,10 +306,10 @@ class _Carrier:
     turned: bool
 
     @classmethod
-    def of(cls, found: Sequence[Sided], network: Network, config: Configuration) -> _Carrier:
+    def of(cls, sides: Sequence[Sided], network: Network, config: Configuration) -> _Carrier:
         least_m = config.matching.orientation_distance_m
-        facing = frozenset(one.facing for one in found if abs(one.with_m - one.against_m) >= least_m)
-        return cls(network, config, facing, any(min(one.with_m, one.against_m) >= least_m for one in found))
+        facing = frozenset(one.facing for one in sides if abs(one.with_m - one.against_m) >= least_m)
+        return cls(network, config, facing, any(min(one.with_m, one.against_m) >= least_m for one in sides))
 
     def by(self, counter: Counter, borders: list[tuple[Anchor, Anchor]]) -> Carried:
         """The gaps between what is known; an odometer that counts up in both directions carries over no stand."""

@@ -69,13 +69,13 @@ def gaps_of(
     `facing`: oriented net elements over which the train ran, by the reference, as the odometer counted up.
     """
     first, last = borders[0][0], borders[-1][1]
-    found = [Gap(min(counter.odometer.begin_ns, first.t_ns), first.t_ns, None, first, [])]
+    gaps = [Gap(min(counter.odometer.begin_ns, first.t_ns), first.t_ns, None, first, [])]
     for (_, a), (b, _) in pairwise(borders):
-        found += _between(a, b, counter, network, config)
-    found.append(Gap(last.t_ns, max(counter.odometer.end_ns, last.t_ns), last, None, []))
-    found = _without_contradicted(found)
-    sheets = _sheets(found, facing, network) or {True, False}
-    return [_reaching(gap, sheets, counter, network, config) for gap in found]
+        gaps += _between(a, b, counter, network, config)
+    gaps.append(Gap(last.t_ns, max(counter.odometer.end_ns, last.t_ns), last, None, []))
+    gaps = _without_contradicted(gaps)
+    sheets = _sheets(gaps, facing, network) or {True, False}
+    return [_reaching(gap, sheets, counter, network, config) for gap in gaps]
 
 
 def without_sign(gaps: Sequence[Gap], facing: Set[int], network: Network) -> bool:
@@ -135,10 +135,10 @@ def _ways_of_length(
     for begins, goals, way_m, back in ((a.places, b.places, length_m, False), (b.places, a.places, -length_m, True)):
         lengths = (max(way_m - slack_m, 0.0), way_m + slack_m)
         for begin, side, goal in product(begins, (0, 1), goals):
-            found = chains_between(network, 2 * begin.element + side, begin, goal, lengths, back, most)
-            if found is None:
+            chains = chains_between(network, 2 * begin.element + side, begin, goal, lengths, back, most)
+            if chains is None:
                 return None
-            for chain in found:
+            for chain in chains:
                 end_m = chain.entry_m[-1] + network.track.along_m(chain.oriented[-1], goal.measure_m)
                 ways.append(Way(chain, (end_m, 0.0) if back else (0.0, end_m)))
     return _distinct(ways)

@@ -9,19 +9,19 @@ from pipeline.stages.evidence.evidence import Alternative, EvidenceSet
 from pipeline.stages.track.survey import Track
 
 
-def true_places(found: EvidenceSet, track: Track) -> pl.DataFrame:
+def true_places(evidence: EvidenceSet, track: Track) -> pl.DataFrame:
     """Per instant `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m`.
 
     Null where nothing is known; the measures also where there are several net elements.
     """
-    parts = [_touched(one) for one in found.alternatives]
+    parts = [_touched(one) for one in evidence.alternatives]
     touched = pl.concat([pl.DataFrame(schema=_TOUCHED), *parts])
     places = touched.group_by("row").agg(
         pl.col("element").unique().sort(), low=pl.col("low").min(), high=pl.col("high").max()
     )
     alone = pl.col("element").list.len() == 1
     names = pl.Series(track.ids, dtype=pl.String)
-    rows = pl.DataFrame({"row": np.arange(found.kind.size)})
+    rows = pl.DataFrame({"row": np.arange(evidence.kind.size)})
     return rows.join(places, on="row", how="left", maintain_order="left").select(
         true_netelement_ids=pl.col("element").list.eval(pl.element().replace_strict(_numbers(names), names)),
         true_measure_low_m=pl.when(alone).then("low"),
@@ -43,15 +43,17 @@ def _touched(one: Alternative) -> pl.DataFrame:
     last = np.searchsorted(route.entry_m, one.high_m, side="right") - 1
     first, last = np.maximum(first, 0), np.maximum(last, 0)
     count = last - first + 1
-    own = np.repeat(np.arange(one.rows.size), count)
+    numbers = np.repeat(np.arange(one.rows.size), count)
     visit = np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
-    entry, low, high = route.entry_m[visit], route.low_m[visit], route.high_m[visit]
-    begin = np.clip(one.low_m[own] - entry, 0.0, high - low)
-    end = np.clip(one.high_m[own] - entry, 0.0, high - low)
+    entry = route.entry_m[visit]
+    low = route.low_m[visit]
+    high = route.high_m[visit]
+    begin = np.clip(one.low_m[numbers] - entry, 0.0, high - low)
+    end = np.clip(one.high_m[numbers] - entry, 0.0, high - low)
     forward = route.forward[visit]
     return pl.DataFrame(
         {
-            "row": one.rows[own],
+            "row": one.rows[numbers],
             "element": route.element[visit],
             "low": np.where(forward, low + begin, high - end),
             "high": np.where(forward, low + end, high - begin),

@@ -44,7 +44,8 @@ def alarms_table(
 
 def healthy_across(epochs: pl.DataFrame, config: HazardConfig) -> dict[str, Bools]:
     """Per axis of the monitors, epochs whose error by the reference is within the noise of both."""
-    factor, healthy = config.evidence_factor, {}
+    factor = config.evidence_factor
+    healthy = {}
     reference_m = np.nan_to_num(Judgements.of(epochs).half_m / factor)
     for axis in ("cross", "up"):
         noise_m = np.hypot(np.nan_to_num(floats(epochs, f"sigma_{axis}_m")), reference_m)

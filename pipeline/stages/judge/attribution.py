@@ -27,7 +27,8 @@ def suspect_of(epochs: pl.DataFrame, begin_ns: int, end_ns: int, config: Configu
     t_ns = times_ns(epochs)
     first = int(np.searchsorted(t_ns, begin_ns - round(config.hazards.suspect_lookback_s * NS_PER_S)))
     part = epochs[first : max(first, int(np.searchsorted(t_ns, end_ns, side="right")))]
-    judged, margin_m = Judgements.of(part), margins_m(floats(part, "sigma_along_m"), config.hazards)
+    judged = Judgements.of(part)
+    margin_m = margins_m(floats(part, "sigma_along_m"), config.hazards)
     with np.errstate(invalid="ignore"):
         left = (judged.least_m > margin_m) | judged.wrong_track
     if (left & (judged.kind != ODOMETER)).any():
@@ -42,7 +43,8 @@ def suspect_of(epochs: pl.DataFrame, begin_ns: int, end_ns: int, config: Configu
 
 def _parted_together(part: pl.DataFrame, margin_m: Floats, config: Configuration) -> bool:
     """Position and Doppler agree with each other where both left the odometer, by half the margin of the position."""
-    path_m, odometer_m = floats(part, "path_m"), floats(part, "odometer_m")
+    path_m = floats(part, "path_m")
+    odometer_m = floats(part, "odometer_m")
     velocity_mps = floats(part, "velocity_along_mps")
     known = np.flatnonzero(np.isfinite(path_m) & np.isfinite(odometer_m) & np.isfinite(velocity_mps))
     if known.size < 2:
@@ -51,7 +53,8 @@ def _parted_together(part: pl.DataFrame, margin_m: Floats, config: Configuration
     mean_mps = 0.5 * (velocity_mps[known][1:] + velocity_mps[known][:-1])
     near = dt_s <= config.monitors.doppler_gap_s
     doppler_m = np.concatenate([[0.0], np.cumsum(np.where(near, mean_mps * dt_s, 0.0))])
-    position_m, odometer_m = path_m[known] - path_m[known[0]], odometer_m[known] - odometer_m[known[0]]
+    position_m = path_m[known] - path_m[known[0]]
+    odometer_m = odometer_m[known] - odometer_m[known[0]]
     margin_m = 0.5 * margin_m[known]
     both = (np.abs(position_m - odometer_m) > margin_m) & (np.abs(doppler_m - odometer_m) > margin_m)
     return bool((both & (np.abs(position_m - doppler_m) <= margin_m)).any())

@@ -16,7 +16,9 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
     Null where the reference is silent, and where the position is farther ahead or behind than the failure limit: a
     curve goes aside by metres over such a way, and a slope up.
     """
-    fixes, reference, at_ns = case.solution.fixes, case.reference, case.instants_of_epochs()
+    fixes = case.solution.fixes
+    reference = case.reference
+    at_ns = case.instants_of_epochs()
     across, up = np.full(at_ns.size, np.nan), np.full(at_ns.size, np.nan)
     if reference is not None and reference.height >= 2:
         stamps = times_ns(reference)

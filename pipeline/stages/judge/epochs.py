@@ -18,7 +18,9 @@ from schemas.arrays import Ints, flags, floats, ints
 
 def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
     """The epochs of the solution with evidence, judgement, direction, movement, time in use and state of the LDS."""
-    epochs, config, at_ns = case.solution.epochs, case.config, case.instants_of_epochs()
+    epochs = case.solution.epochs
+    config = case.config
+    at_ns = case.instants_of_epochs()
     positions = MatchedPositions.of(case, epochs, met(epochs, unambiguous(config)))
     evidence = case.evidence.at(at_ns)
     along = judgements_of(case, positions, at_ns, evidence)
@@ -51,7 +53,8 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
 
 
 def _direction(case: Case, positions: MatchedPositions, at_ns: Ints, along: Judgements) -> pl.Series:
-    given, hazards = ints(case.solution.epochs["direction"], 1), case.config.hazards
+    given = ints(case.solution.epochs["direction"], 1)
+    hazards = case.config.hazards
     direction = travel_direction(given, along, at_ns, positions.path_m, case.odometry is not None, hazards)
     return pl.Series("direction", direction, dtype=pl.Int8)
 

@@ -65,7 +65,8 @@ _POSITION_COLUMNS = (
 
 
 def course_of(positions: pl.DataFrame, offers: pl.DataFrame, jumps: Sequence[Jump], config: HazardConfig) -> Course:
-    t_ns, judged = times_ns(positions), Judgements.of(positions)
+    t_ns = times_ns(positions)
+    judged = Judgements.of(positions)
     return Course(
         positions=positions,
         t_ns=t_ns,

@@ -56,7 +56,8 @@ def _of_episode(episode: Episode, course: Course, config: HazardConfig) -> list[
     back = episode.jump_back
     crossed_back = [] if back is None else crossed_by(back, course)
     if crossed_back:
-        hazard, cause = _class_of(crossed_back, course.offers), next(iter(rows), None)
+        hazard = _class_of(crossed_back, course.offers)
+        cause = next(iter(rows), None)
         rows.append(HazardRow(hazard, episode, back, crossed_back, crossed_back, cause))
     return rows
 
@@ -114,7 +115,8 @@ def size_m(row: HazardRow, course: Course) -> float | None:
 
     The step of a jump serves where no place along the track can be compared with the evidence.
     """
-    episode, jump = row.episode, row.jump
+    episode = row.episode
+    jump = row.jump
     if jump is not None and jump is episode.jump_back:
         return jump.step_m
     of_positions = course.judged.middle_m[episode.onset : episode.end]
@@ -196,7 +198,8 @@ def _evidence(row: HazardRow, course: Course) -> Evidence:
 
 def instants(row: HazardRow, course: Course, config: Configuration) -> Row:
     """When it began, hit, failed, was detected and ended, and the times between (DIAG, T_D and T_dsf)."""
-    episode, detected_ns = row.episode, row.episode.detection.t_ns
+    episode = row.episode
+    detected_ns = row.episode.detection.t_ns
     failed_ns = None if episode.failed is None else int(course.t_ns[episode.failed])
     reaction_ns = round(reaction_s(course.t_ns, config) * NS_PER_S)
     return {

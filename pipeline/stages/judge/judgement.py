@@ -155,7 +155,8 @@ def judge_positions(
 
     The interval spans the tracks on which the place along the track can be compared.
     """
-    size, limit_m = positions.element.size, config.failure_limit_m
+    size = positions.element.size
+    limit_m = config.failure_limit_m
     low_m, high_m = np.full(size, np.inf), np.full(size, -np.inf)
     right, ahead, behind, elsewhere = (np.ones(size, dtype=np.bool_) for _ in range(4))
     judged = np.zeros(size, dtype=np.bool_)
@@ -217,9 +218,11 @@ def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence
 
     If the track of the evidence covers the place so far ahead or behind, the position is on another track.
     """
-    rows, middle_m = there.rows, there.middle_m
+    rows = there.rows
+    middle_m = there.middle_m
     element, measure_m, sense = there.route.locate(middle_m)
-    path_m, train_m = positions.path_m[rows], np.full(rows.size, np.nan)
+    path_m = positions.path_m[rows]
+    train_m = np.full(rows.size, np.nan)
     along = np.zeros(rows.size, dtype=np.int64)
     for number, leg in enumerate(legs):
         part = np.flatnonzero(positions.leg[rows] == number)

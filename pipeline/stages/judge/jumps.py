@@ -35,7 +35,8 @@ class Jump:
 
 def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: int, config: HazardConfig) -> list[Jump]:
     """All jumps of the positions, in order of time; numbers are rows of `positions`."""
-    at_ns, path_m = times_ns(positions, "at"), floats(positions, "path_m")
+    at_ns = times_ns(positions, "at")
+    path_m = floats(positions, "path_m")
     counted_m = np.full(max(at_ns.size - 1, 0), np.nan)
     if odometry is not None:
         counted_m = odometry.between(at_ns[:-1], at_ns[1:]).distance_m
@@ -66,7 +67,8 @@ def find_jumps(steps: Steps, direction: Ints, config: HazardConfig) -> list[Jump
 
 def _largest_step(steps: Steps, config: HazardConfig) -> Floats:
     """The largest signed change up to each position within the window; that since the one before always counts."""
-    excess_m, size = steps.excess_m, steps.t_ns.size
+    excess_m = steps.excess_m
+    size = steps.t_ns.size
     largest_m = np.zeros(size)
     if size < 2 or np.ptp(excess_m) <= config.jump_limit_m:
         return largest_m

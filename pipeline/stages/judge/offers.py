@@ -18,8 +18,10 @@ def judged_offers(case: Case, epochs: pl.DataFrame) -> pl.DataFrame:
 
     The place judged is that of the balise; of a virtual one at the instant at which a position of that stamp was true.
     """
-    offers, limits = case.solution.offers, case.config.hazards
-    t_ns, before = times_ns(offers), ints(offers["before"])
+    offers = case.solution.offers
+    limits = case.config.hazards
+    t_ns = times_ns(offers)
+    before = ints(offers["before"])
     sure = flags(epochs, "unambiguous")
     positions = MatchedPositions.of(case, offers, sure[before] & sure[ints(offers["epoch"])])
     at_ns = np.where(flags(offers, "virtual"), case.instants(t_ns), t_ns)

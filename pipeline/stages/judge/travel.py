@@ -28,13 +28,15 @@ class OdometerSteps:
 
 
 def odometer_steps(case: Case) -> OdometerSteps:
-    at_ns, odometry = case.instants_of_epochs(), case.odometry
+    at_ns = case.instants_of_epochs()
+    odometry = case.odometry
     if odometry is None:
         nothing = np.zeros(at_ns.size, dtype=np.bool_)
         return OdometerSteps(nothing, nothing)
     moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
     counts = _to_the_next(np.isfinite(odometry.between(at_ns[:-1], at_ns[1:]).distance_m), at_ns.size)
-    path_m, limit_m = floats(case.solution.epochs, "path_m"), case.config.hazards.failure_limit_m
+    path_m = floats(case.solution.epochs, "path_m")
+    limit_m = case.config.hazards.failure_limit_m
     stood: list[Span] = []
     for first, last in spans_of(counts & ~moves):
         rows = slice(first, min(last + 2, at_ns.size))
@@ -103,7 +105,8 @@ def _to_the_next(steps: Bools, size: int) -> Bools:
 def odometer_wrong(case: Case, train_m: Floats, half_m: Floats) -> Bools:
     """Epochs at which the distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""
     epochs = case.solution.epochs
-    odometer_m, accepted_ns = floats(epochs, "odometer_m"), times_ns(case.solution.accepted)
+    odometer_m = floats(epochs, "odometer_m")
+    accepted_ns = times_ns(case.solution.accepted)
     return beyond_confidence(times_ns(epochs), odometer_m, train_m, half_m, accepted_ns, case.config.lds)
 
 
@@ -134,7 +137,8 @@ def beyond_confidence(
 
 def speed_at(epochs: pl.DataFrame, t_ns: Ints) -> Floats:
     """Speed [m/s] by the epochs around each instant; NaN where no epoch knows it."""
-    speed_mps, stamps_ns = np.abs(floats(epochs, "speed_mps")), times_ns(epochs)
+    speed_mps = np.abs(floats(epochs, "speed_mps"))
+    stamps_ns = times_ns(epochs)
     known = np.isfinite(speed_mps)
     if not known.any():
         return np.full(t_ns.size, np.nan)

@@ -13,7 +13,7 @@ from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration
 
-# So many instants before and after its own a track is looked at, for where the train came from and went on to.
+# So many instants before and after a track are looked at, for where the train came from and went on to.
 _BESIDE = 100
 
 
@@ -72,10 +72,12 @@ def true_crossings(
         if track.rows.size == 0:
             continue
         rows, at_m = _with_beside(track, train)
-        own, least_m, most_m = np.isin(rows, track.rows), at_m.min(), at_m.max()
+        on_track = np.isin(rows, track.rows)
+        least_m = at_m.min()
+        most_m = at_m.max()
         for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
             if least_m <= visit_m <= most_m:
-                found = _crossed(train, rows, own, at_m - visit_m, config)
+                found = _crossed(train, rows, on_track, at_m - visit_m, config)
                 crossings[names[balise]] += [one._replace(sense=int(one.sense * sense)) for one in found]
     return {name: sorted(found) for name, found in crossings.items()}
 
@@ -112,8 +114,8 @@ def _with_beside(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
     return both[order], np.concatenate([track.middle_m, there_m[known]])[order]
 
 
-def _crossed(train: _Train, rows: Ints, own: Bools, away_m: Floats, config: Configuration) -> list[TrueCrossing]:
-    """Instants, up to one of the track's `own`, at which the train went from one side of the balise to the other.
+def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config: Configuration) -> list[TrueCrossing]:
+    """Instants, the later one `on_track`, at which the train went from one side of the balise to the other.
 
     A train that came no farther than `rearm_m` from a balise since it passed it has not passed it again.
     """
@@ -130,7 +132,7 @@ def _crossed(train: _Train, rows: Ints, own: Bools, away_m: Floats, config: Conf
         if not clear and not (close[change - 1 : change + 1].all() and (armed or not passed)):
             continue
         armed_from, passed = change, True
-        if own[change]:
+        if on_track[change]:
             before_m, after_m = away_m[change - 1 : change + 1].tolist()
             begin_ns, end_ns = train.t_ns[rows[change - 1 : change + 1]].tolist()
             instant_ns = begin_ns + round((end_ns - begin_ns) * before_m / (before_m - after_m))

@@ -109,12 +109,12 @@ def _ambiguous(found: Match) -> str:
         "t_end",
         "gate_probability",
         "path_probability",
-        "told_by",
+        "resolved_by",
     )
     return ", ".join(
         f"{one} ({gate:.2f} at the time, {path:.2f} in hindsight) or {other} from {start:{clock}} to {end:{clock}} "
-        f"(told apart by {told_by})"
-        for one, other, start, end, gate, path, told_by in found.ambiguous.select(columns).iter_rows()
+        f"(told apart by {resolved_by})"
+        for one, other, start, end, gate, path, resolved_by in found.ambiguous.select(columns).iter_rows()
     )
 
 

@@ -88,7 +88,8 @@ def placed(areas: pl.DataFrame | None, netelement_id: pl.Series, measure_m: pl.S
         .join_asof(there.sort("at_m"), on="at_m", by="netelement_id", check_sortedness=False)
         .filter(pl.col("at_m") <= pl.col("to_m"))
     )
-    area, speed = np.full(size, NO_AREA), np.full(size, np.nan)
+    area = np.full(size, NO_AREA)
+    speed = np.full(size, np.nan)
     rows = found["row"].to_numpy()
     numbers = {kind.value: number for number, kind in enumerate(AREA_TYPES)}
     area[rows] = found["area_type"].replace_strict(numbers, return_dtype=pl.Int64).to_numpy()

@@ -93,15 +93,18 @@ def front_of(
     over, under = (np.where(gnss, floats(epochs, "confidence_m"), floats(epochs, name)) for name in _DOUBTS)
     late_over, late_under = _latency_s(epochs, run, config)
     shift = np.where(gnss, 0.0, direction * (estimate - path))
-    low, high = floats(epochs, "error_low_m") + shift, floats(epochs, "error_high_m") + shift
+    low = floats(epochs, "error_low_m") + shift
+    high = floats(epochs, "error_high_m") + shift
     right, wrong, elsewhere = _judged(epochs, config.hazards.failure_limit_m)
     train_m = np.stack(train_path_m(epochs, stretches_of(epochs)))
     # Without a position nothing was judged: the report is compared with the place of the train itself.
     silent = np.isnan(path) & np.isfinite(train_m).all(axis=0)
     ends = np.where(silent, direction * (estimate - train_m), np.stack([low, high]))
-    low, high = np.where(silent, ends.min(axis=0), low), np.where(silent, ends.max(axis=0), high)
+    low = np.where(silent, ends.min(axis=0), low)
+    high = np.where(silent, ends.max(axis=0), high)
     right |= silent
-    there, known = np.isfinite(estimate), np.isfinite(low) & np.isfinite(high)
+    there = np.isfinite(estimate)
+    known = np.isfinite(low) & np.isfinite(high)
     # A train that has not moved yet has no direction of travel: its front end is looked up at the antenna.
     front = estimate + np.nan_to_num(direction) * ahead_m
     return Front(
@@ -149,9 +152,11 @@ def _latency_s(epochs: pl.DataFrame, run: dict[str, Any], config: Configuration)
 def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
     """Path position by the last relevant balise and the odometer's way since then."""
     accepted = passages.filter(pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value).drop_nulls("path_m")
-    odometer, distance = floats(epochs, "odometer_m"), floats(epochs, "distance_from_lrvb_m")
+    odometer = floats(epochs, "odometer_m")
+    distance = floats(epochs, "distance_from_lrvb_m")
     origin_m = odometer - floats(epochs, "direction") * distance
-    path, names = floats(epochs, "path_m"), epochs["lrvb_id"]
+    path = floats(epochs, "path_m")
+    names = epochs["lrvb_id"]
     changed = np.flatnonzero((names.is_not_null() & names.ne_missing(names.shift())).to_numpy())
     base = np.full(epochs.height, np.nan)
     for first, last in pairwise([*changed.tolist(), epochs.height]):
@@ -203,7 +208,8 @@ def speed_errors(front: Front, window_s: float) -> SpeedErrors:
     estimated = sense * (way[last] - way[first])
     # The evidence calls the position itself right at both ends.
     known = front.proved[first] & front.proved[last]
-    begin_m, end_m = _train_m(front, first), _train_m(front, last)
+    begin_m = _train_m(front, first)
+    end_m = _train_m(front, last)
     # The estimate is a mean over the time before each epoch: how late that is while the speed changes is not known.
     late_m = front.speed_late_s * np.abs(front.speed_mps[last] - front.speed_mps[first])
     least = end_m[0] - begin_m[1] - late_m
@@ -215,13 +221,16 @@ def speed_errors(front: Front, window_s: float) -> SpeedErrors:
 
 def _train_m(front: Front, rows: Ints) -> Floats:
     """Least and largest place of the train in its direction of travel [m]; at joints the estimate less its error."""
-    sense, evidence = front.direction[rows], np.sort(front.direction[rows] * front.train_m[:, rows], axis=0)
+    sense = front.direction[rows]
+    evidence = np.sort(front.direction[rows] * front.train_m[:, rows], axis=0)
     by_error = sense * front.path_m[rows] - np.stack([front.high_m[rows], front.low_m[rows]])
     return np.where(np.isfinite(evidence).all(axis=0), evidence, by_error)
 
 
 def _windows(front: Front, window_ns: int) -> list[tuple[int, int]]:
-    held, t_ns, sense = front.clock.held_s, front.clock.t_ns, front.direction
+    held = front.clock.held_s
+    t_ns = front.clock.t_ns
+    sense = front.direction
     usable = np.isfinite(front.speed_mps) & np.isfinite(sense) & (sense != 0)
     joined = usable[:-1] & usable[1:] & (held[:-1] > 0) & (sense[:-1] == sense[1:])
     found: list[tuple[int, int]] = []

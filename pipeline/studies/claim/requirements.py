@@ -42,7 +42,8 @@ class Ride:
 
     def tally(self, code: Ints, where: Bools, size: Floats | None = None) -> Tally:
         """Of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
-        clock, silent = self.front.clock, self.front.silent_s
+        clock = self.front.clock
+        silent = self.front.silent_s
         rows = np.flatnonzero(where | ((silent > 0) & np.append(where[1:], False)))
         here = where[rows]
         held = np.where(here, clock.held_s[rows], 0.0)
@@ -67,7 +68,9 @@ class Ride:
     @cached_property
     def beyond(self) -> dict[str, tuple[Ints, Floats]]:
         """The intervals claimed, and the errors known, against MAPO and MAPU: codes and sizes."""
-        front, limit_m, none = self.front, self.limit_m, np.inf
+        front = self.front
+        limit_m = self.limit_m
+        none = np.inf
         with np.errstate(invalid="ignore"):
             claimed = [codes(width <= limit_m, width > limit_m) for width in (front.over_m, front.under_m)]
         return {
@@ -151,10 +154,12 @@ def _of_area(kind: AreaType, area: AreaLimits, profile: Profile) -> list[Require
         code = ride.front.within(area.accuracy_m, area.accuracy_m)
         return ride.tally(code, ride.inside(kind), ride.front.least_m)
 
-    of, rate = kind.value, profile.failure_rate
+    of = kind.value
+    rate = profile.failure_rate
     aim = Demand(Kind.RATE, rate.aim_per_h)
     limit = f"{area.limit_m:g} m" if not area.way_s else f"{area.limit_m:g} m/{area.way_s:g} s"
-    near, often = f"{area.accuracy_m:g} m", Demand(Kind.SHARE, area.accuracy_share)
+    near = f"{area.accuracy_m:g} m"
+    often = Demand(Kind.SHARE, area.accuracy_share)
     return [
         *(
             Requirement(name, of, limit, ALWAYS, area.limit_clause, partial(exceeded, name=name))
@@ -167,7 +172,8 @@ def _of_area(kind: AreaType, area: AreaLimits, profile: Profile) -> list[Require
 
 def _slow(kind: AreaType, profile: Profile) -> list[Requirement]:
     """Safe and precise operation at low speed: claimed and known."""
-    slow, of = profile.slow, kind.value
+    slow = profile.slow
+    of = kind.value
 
     def here(ride: Ride) -> Bools:
         return ride.inside(kind) & (np.abs(ride.front.speed_mps) * KMH_PER_MPS < slow.below_kmh)
@@ -179,7 +185,8 @@ def _slow(kind: AreaType, profile: Profile) -> list[Requirement]:
     def known(ride: Ride, limit_m: float) -> Tally:
         return ride.tally(ride.front.within(limit_m, limit_m), here(ride))
 
-    limit, close = f"{slow.limit_m:g} m", f"{slow.accuracy_m:g} m"
+    limit = f"{slow.limit_m:g} m"
+    close = f"{slow.accuracy_m:g} m"
     safe, accurate = (partial(known, limit_m=one) for one in (slow.limit_m, slow.accuracy_m))
     return [
         Requirement("slow_claimed", of, limit, ALWAYS, slow.clause, claimed),
@@ -196,19 +203,23 @@ def _after_balise(profile: Profile) -> list[Requirement]:
     after = profile.after_balise
 
     def count(ride: Ride, kind: BaliseKind) -> Tally:
-        front, limit = ride.front, after.limit_m(ride.front.speed_mps)
+        front = ride.front
+        limit = after.limit_m(ride.front.speed_mps)
         code = np.append(_asked(front.within(limit, limit), limit), NOT_KNOWN)
         faster = np.append(np.abs(front.speed_mps) * KMH_PER_MPS > after.to_kmh, False)
         at_ns = _passed(ride.passages, kind)
         rows = _first_after(front, at_ns)
-        at_ns, rows = at_ns[~faster[rows]], rows[~faster[rows]]
+        at_ns = at_ns[~faster[rows]]
+        rows = rows[~faster[rows]]
         # Each balise weighs the same, whatever time its epoch holds.
         counts = counted(ride.name, at_ns, np.zeros(rows.size), code[rows], profile.method.event_gap_s)
-        held, known = np.append(front.clock.held_s, 0.0)[rows], code[rows] != NOT_KNOWN
+        held = np.append(front.clock.held_s, 0.0)[rows]
+        known = code[rows] != NOT_KNOWN
         return replace(counts, held_s=float(held.sum()), known_s=float(held[known].sum()))
 
     near = f"{after.fixed_m:g} m, from {after.below_kmh:g} km/h {after.offset_m:g} m + {after.per_mps_s:g} s·v"
-    often, kinds = Demand(Kind.SHARE, after.share), (BaliseKind.PHYSICAL, BaliseKind.VIRTUAL)
+    often = Demand(Kind.SHARE, after.share)
+    kinds = (BaliseKind.PHYSICAL, BaliseKind.VIRTUAL)
     return [
         Requirement("after_balise", kind.value, near, often, after.clause, partial(count, kind=kind)) for kind in kinds
     ]
@@ -231,7 +242,8 @@ def _first_after(front: Front, at_ns: Ints) -> Ints:
 
 
 def _speed(profile: Profile) -> list[Requirement]:
-    safe, speed = profile.safe_speed, profile.speed
+    safe = profile.safe_speed
+    speed = profile.speed
 
     def count(ride: Ride, limit_kmh: Callable[[Floats], Floats], over: bool = True, under: bool = True) -> Tally:
         limit = limit_kmh(ride.speeds.fastest_kmh)
@@ -252,8 +264,10 @@ def _speed(profile: Profile) -> list[Requirement]:
 
 def _of_windows(ride: Ride, code: Ints, where: Bools) -> Tally:
     """Of windows of speed, and of the gaps of the log between them, in order of time."""
-    found, gaps = ride.speeds, np.flatnonzero(ride.front.silent_s > 0)
-    gap_s, nothing = ride.front.silent_s[gaps], np.zeros(gaps.size)
+    found = ride.speeds
+    gaps = np.flatnonzero(ride.front.silent_s > 0)
+    gap_s = ride.front.silent_s[gaps]
+    nothing = np.zeros(gaps.size)
     t_ns = np.concatenate((found.t_ns, ride.front.clock.t_ns[gaps]))
     held_s = np.concatenate((found.length_s, nothing))
     silent_s = np.concatenate((np.zeros(found.t_ns.size), gap_s))
@@ -297,7 +311,8 @@ def _one(broken: bool) -> Tally:
 
 def _operation(profile: Profile) -> list[Requirement]:
     """Availability, and ways without physical balises: none is ever proved."""
-    asked, way_m = profile.availability, profile.way.without_balise_m
+    asked = profile.availability
+    way_m = profile.way.without_balise_m
     outside = f"{asked.outside_s:g} s in {asked.within_s / S_PER_H:g} h"
     demand = Demand(Kind.AVAILABILITY, asked.share, outside_s=asked.outside_s)
     return [
@@ -311,7 +326,8 @@ def _availability(ride: Ride) -> Tally:
 
     Lost is no output, or an interval wider than MAPCI; gaps of the log, where nobody knows, are left out.
     """
-    front, asked = ride.front, ride.profile.availability
+    front = ride.front
+    asked = ride.profile.availability
     with np.errstate(invalid="ignore"):
         lost: Bools = ~front.output | (front.over_m + front.under_m > 2.0 * ride.limit_m)
     held = front.clock.held_s * (np.cumsum(front.output) > 0)

@@ -25,7 +25,9 @@ from pipeline.studies.trials import Trials
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
 S_PER_H = 3600.0
-KEPT, NOT_KNOWN, BROKEN = 1, 0, -1
+KEPT = 1
+NOT_KNOWN = 0
+BROKEN = -1
 
 _COUNTS = ("trials", "kept", "broken", "events", "possible", "held_s", "known_s")
 
@@ -124,7 +126,8 @@ def _trial(run: str, held_s: Floats, silent_s: Floats, code: Ints) -> int:
     lengths = np.column_stack([held_s, silent_s]).ravel()
     codes_of = np.column_stack([code, np.full(code.size, NOT_KNOWN)]).ravel()
     if not lengths.any():
-        lengths, codes_of = np.ones(code.size), code
+        lengths = np.ones(code.size)
+        codes_of = code
     until = np.cumsum(lengths)
     return int(codes_of[np.searchsorted(until, drawn(run) * until[-1], side="right")])
 
@@ -192,7 +195,8 @@ def of_share(tally: Tally, share: float) -> Shown:
         return Shown(Finding.NOT_SHOWN)
     judged = tally.kept + tally.broken
     trials = Trials(judged, tally.broken, tally.trials - judged)
-    broken, measured = trials.share(), clopper_pearson(tally.kept, judged)
+    broken = trials.share()
+    measured = clopper_pearson(tally.kept, judged)
     if broken.high is not None and 1.0 - broken.high >= share:
         return Shown(Finding.MET, measured, 0.0)
     finding = Finding.NOT_MET if broken.low is not None and 1.0 - broken.low < share else Finding.NOT_SHOWN
@@ -207,7 +211,8 @@ def of_rate(tally: Tally, rate_per_h: float) -> Shown:
     measured = poisson_rate(tally.events, tally.known_s / S_PER_H)
     if hours <= 0.0:
         return Shown(Finding.NOT_SHOWN, needed_h=hours_still_needed(rate_per_h, tally.possible, 0.0))
-    low, high = poisson_rate(tally.events, hours).low, poisson_rate_upper(tally.possible, hours)
+    low = poisson_rate(tally.events, hours).low
+    high = poisson_rate_upper(tally.possible, hours)
     needed_h = hours_still_needed(rate_per_h, tally.possible, hours)
     if high is not None and high <= rate_per_h:
         return Shown(Finding.MET, measured, 0.0)

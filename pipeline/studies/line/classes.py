@@ -53,7 +53,8 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
         day=pl.col("t").dt.date(), judged=pl.when(pl.col("state") >= int(FIRST_LOSS)).then(3).otherwise(state)
     )
     # Of passes as bad as each other the one with the fewest satellites, those without a number last.
-    order, falling = ("judged", "state", "cause", "satellites"), [True, True, False, False]
+    order = ("judged", "state", "cause", "satellites")
+    falling = [True, True, False, False]
     worst = dated.sort(order, descending=falling, nulls_last=True).group_by(*KEYS, "day", maintain_order=True)
     claimed = dated.group_by(*KEYS, "day").agg(pl.col("claimed").any())
     return worst.first().drop("claimed").join(claimed, on=[*KEYS, "day"])
@@ -61,10 +62,12 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
 
 def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Counts per piece and direction; hours of the day are those of all right passes."""
-    state, cause = pl.col("state"), pl.col("cause")
+    state = pl.col("state")
+    cause = pl.col("cause")
     usual = pl.col("satellites").filter(state == int(State.RIGHT)).median().over("run_id")
     passes = passes.with_columns(few=pl.col("satellites") <= criteria.satellites_share * usual)
-    right, wrong = state == int(State.RIGHT), state == int(State.WRONG_IN_USE)
+    right = state == int(State.RIGHT)
+    wrong = state == int(State.WRONG_IN_USE)
     lost = (state >= int(FIRST_LOSS)) & ~wrong
     hour = pl.col("t").dt.strftime("%H").unique()
     hours = passes.filter(right).group_by(KEYS).agg(hours=hour.len(), hours_of_day=hour.sort().str.join(" "))
@@ -155,5 +158,6 @@ def _bounds(
 ) -> tuple[float | None, float | None, float | None, float | None, int | None]:
     """Share lost with its bounds, upper bound of the share wrong in use, further right passes needed."""
     passes = Trials(number, bad, unjudged)
-    lost, unsafe = passes.share(criteria.confidence), Trials(number, wrong, unjudged).share(criteria.confidence)
+    lost = passes.share(criteria.confidence)
+    unsafe = Trials(number, wrong, unjudged).share(criteria.confidence)
     return lost.value, lost.low, lost.high, unsafe.high, passes.needed(criteria.loss_limit, criteria.confidence)

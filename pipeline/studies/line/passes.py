@@ -79,7 +79,8 @@ def passes_of(
     epochs = epochs.sort("t")
     if epochs.height < 2:
         return pl.DataFrame(schema=_PASSES)
-    legs, states = stretches_of(epochs), states_of(epochs, alarms["t_start"], config)
+    legs = stretches_of(epochs)
+    states = states_of(epochs, alarms["t_start"], config)
     spans = spans_of(epochs, states, legs, config)
     hits = laid_on(spans, legs, ground.pieces)
     parts = [_worst(hits, ground.pieces, criteria), _unsafe(passages, epochs, legs, ground.pieces)]
@@ -100,18 +101,18 @@ def laid_on(spans: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataF
             continue
         at = _measures(spans, sign, offset_m)
         rows = pieces.track.vertices(element)
-        first_m, last_m = pieces.track.measure_m[rows][0], pieces.track.measure_m[rows][-1]
+        first_m = pieces.track.measure_m[rows][0]
+        last_m = pieces.track.measure_m[rows][-1]
         own = pl.col("state").is_in(_ANYWHERE) | pl.col("elements").list.contains(name)
         kept = at.filter((pl.col("high") >= first_m) & (pl.col("low") <= last_m) & own.fill_null(value=False))
-        begin, end = pieces.at(element, floats(kept, "low")), pieces.at(element, floats(kept, "high"))
+        begin = pieces.at(element, floats(kept, "low"))
+        end = pieces.at(element, floats(kept, "high"))
         index = np.repeat(np.arange(kept.height), end - begin + 1)
         ahead = np.arange(len(index)) - np.repeat(np.cumsum(end - begin + 1) - (end - begin + 1), end - begin + 1)
         piece = begin[index] + ahead
         hit = kept[index].with_columns(piece=pl.Series(piece, dtype=pl.Int64))
-        begin_m, end_m = (
-            np.maximum(floats(hit, "begin"), pieces.from_m[piece]),
-            np.minimum(floats(hit, "end"), pieces.to_m[piece]),
-        )
+        begin_m = np.maximum(floats(hit, "begin"), pieces.from_m[piece])
+        end_m = np.minimum(floats(hit, "end"), pieces.to_m[piece])
         found.append(hit.with_columns(begin_m=begin_m, end_m=end_m))
     empty = _measures(spans.clear(), 1, 0.0).with_columns(piece=pl.lit(0), begin_m=pl.lit(0.0), end_m=pl.lit(0.0))
     return pl.concat(found) if found else empty

@@ -42,7 +42,8 @@ def pieces_of(site: Site, piece_m: float) -> Pieces:
     element = np.repeat(np.arange(len(counts)), counts)
     first = np.concatenate([[0], np.cumsum(counts)])
     number = np.arange(len(element)) - first[element]
-    begin_m, step_m = track.measure_m[track.first[:-1]][element], (track.length_m / counts)[element]
+    begin_m = track.measure_m[track.first[:-1]][element]
+    step_m = (track.length_m / counts)[element]
     return Pieces(track, first, element, begin_m + number * step_m, begin_m + (number + 1) * step_m)
 
 

@@ -26,7 +26,7 @@ MODES = {"both": (True, False), "ahead": (True,), "back": (False,)}
 
 
 @dataclass(frozen=True)
-class Line:
+class LineEvidence:
     """What a proposal is made of: classes and counts per piece, the ways, the points to serve."""
 
     site: Site
@@ -48,7 +48,7 @@ class _Place:
 
 
 @dataclass(frozen=True)
-class _Set:
+class _Placed:
     """A balise that was placed; `distance_m` from the one before on the way, over the pieces `since` that one.
 
     `direction`: along its net element, in which it is valid; a physical one in both.
@@ -62,9 +62,10 @@ class _Set:
     since: tuple[int, ...]
 
 
-def proposals(line: Line) -> tuple[pl.DataFrame, pl.DataFrame]:
+def proposals(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
     """`LineProposals` and `LineBalises`; none where no piece is suitable."""
-    rows, balises = [], []
+    rows = []
+    balises = []
     ways = _ways(line)
     growing = np.ones(len(line.pieces.element), dtype=np.bool_)
     for place in (place for way in ways for place in way):
@@ -102,7 +103,7 @@ def site_balises(balises: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     )
 
 
-def _travelled(line: Line) -> Bools:
+def _travelled(line: LineEvidence) -> Bools:
     """Pieces that some run passed, whatever was found there; `[piece, 0 growing 1 falling]`."""
     seen = np.zeros((len(line.pieces.element), 2), dtype=np.bool_)
     rows = line.passes.filter(line.passes["state"] != int(State.WRONG_TRACK)).select("piece", "growing").unique()
@@ -110,16 +111,17 @@ def _travelled(line: Line) -> Bools:
     return seen
 
 
-def _allowed(line: Line, sides: Sequence[bool], growing: Bools) -> Bools:
+def _allowed(line: LineEvidence, sides: Sequence[bool], growing: Bools) -> Bools:
     """Pieces suitable in every one of these directions along their ways."""
     suitable = (line.table["piece_class"].cast(pl.String) == PieceClass.SUITABLE.value).to_numpy()
-    rising, falling = suitable[0::2], suitable[1::2]
+    rising = suitable[0::2]
+    falling = suitable[1::2]
     good = {True: np.where(growing, rising, falling), False: np.where(growing, falling, rising)}
     allowed: Bools = np.logical_and.reduce([good[ahead] for ahead in sides])
     return allowed
 
 
-def _ways(line: Line) -> list[list[_Place]]:
+def _ways(line: LineEvidence) -> list[list[_Place]]:
     """The pieces of the travelled net elements in chains that trains can run, each element once."""
     network = network_of(line.pieces.track, line.site.links)
     seen = _travelled(line).any(axis=1)
@@ -144,7 +146,8 @@ def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> It
         element = oriented // 2
         wanted.discard(element)
         numbers = range(int(pieces.first[element]), int(pieces.first[element + 1]))
-        begin_m, end_m = float(pieces.from_m[numbers[0]]), float(pieces.to_m[numbers[-1]])
+        begin_m = float(pieces.from_m[numbers[0]])
+        end_m = float(pieces.to_m[numbers[-1]])
         for number in numbers if oriented % 2 == 0 else reversed(numbers):
             middle_m = 0.5 * float(pieces.from_m[number] + pieces.to_m[number])
             at_m = middle_m - begin_m if oriented % 2 == 0 else end_m - middle_m
@@ -154,7 +157,9 @@ def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> It
         oriented = edges[0].to if edges else None
 
 
-def _walk(line: Line, way: Sequence[_Place], allowed: Bools, sides: Sequence[bool], spacing_m: float) -> Iterator[_Set]:
+def _walk(
+    line: LineEvidence, way: Sequence[_Place], allowed: Bools, sides: Sequence[bool], spacing_m: float
+) -> Iterator[_Placed]:
     """At each step the best piece about a spacing on; where none is allowed a physical one.
 
     Best is near a station or signal, then at the spacing itself.
@@ -162,9 +167,12 @@ def _walk(line: Line, way: Sequence[_Place], allowed: Bools, sides: Sequence[boo
     at_m = np.array([place.at_m for place in way])
     good = allowed[[place.piece for place in way]]
     spacing_m = min(spacing_m, line.criteria.longest_m)
-    near, play_m = _near(line), line.criteria.spacing_play * spacing_m
+    near = _near(line)
+    play_m = line.criteria.spacing_play * spacing_m
     longest_m = min(spacing_m + play_m, line.criteria.longest_m)
-    last_m, begun, limit_m = float(at_m[0]) - spacing_m, False, float(at_m[-1])
+    last_m = float(at_m[0]) - spacing_m
+    begun = False
+    limit_m = float(at_m[-1])
     while last_m + spacing_m <= limit_m:
         inside = (at_m >= last_m + spacing_m - play_m) & (at_m <= last_m + longest_m)
         choice = _best(way, np.flatnonzero(inside & good), last_m + spacing_m, near)
@@ -173,8 +181,9 @@ def _walk(line: Line, way: Sequence[_Place], allowed: Bools, sides: Sequence[boo
         distance_m = float(at_m[index]) - last_m if begun else None
         since = tuple(place.piece for place in way if last_m < place.at_m <= at_m[index])
         direction = _direction(way[index], sides) if virtual else BaliseDirection.BOTH
-        yield _Set(way[index].piece, virtual, direction, distance_m, near.get(way[index].piece, ("", 0.0))[0], since)
-        last_m, begun = max(float(at_m[index]), last_m + spacing_m - play_m), True
+        yield _Placed(way[index].piece, virtual, direction, distance_m, near.get(way[index].piece, ("", 0.0))[0], since)
+        last_m = max(float(at_m[index]), last_m + spacing_m - play_m)
+        begun = True
 
 
 def _direction(place: _Place, sides: Sequence[bool]) -> BaliseDirection:
@@ -197,7 +206,7 @@ def _best(
     return min((int(index) for index in candidates), key=worth, default=None)
 
 
-def _near(line: Line) -> dict[int, tuple[str, float]]:
+def _near(line: LineEvidence) -> dict[int, tuple[str, float]]:
     """Pieces near stations and signals of the same net element: name and distance [m]."""
     found: dict[int, tuple[str, float]] = {}
     middle_m = 0.5 * (line.pieces.from_m + line.pieces.to_m)
@@ -210,7 +219,7 @@ def _near(line: Line) -> dict[int, tuple[str, float]]:
     return found
 
 
-def _disjoint(line: Line, placed: list[_Set]) -> list[_Set]:
+def _disjoint(line: LineEvidence, placed: list[_Placed]) -> list[_Placed]:
     """Without balises whose windows linking cannot tell apart, as where ways meet; the later one goes."""
     while True:
         named = {f"B{one.piece}": one for one in placed}
@@ -224,7 +233,7 @@ def _disjoint(line: Line, placed: list[_Set]) -> list[_Set]:
         placed = [one for name, one in named.items() if name not in gone]
 
 
-def _named(line: Line, placed: Sequence[_Set]) -> pl.DataFrame:
+def _named(line: LineEvidence, placed: Sequence[_Placed]) -> pl.DataFrame:
     """Place, kind and direction of each balise."""
     piece = [one.piece for one in placed]
     middle_m = 0.5 * (line.pieces.from_m + line.pieces.to_m)[piece]
@@ -239,7 +248,7 @@ def _named(line: Line, placed: Sequence[_Set]) -> pl.DataFrame:
     return pl.DataFrame(columns, schema={name: LineBalises.columns()[name].dtype for name in columns})
 
 
-def _balises(line: Line, name: str, placed: Sequence[_Set]) -> pl.DataFrame:
+def _balises(line: LineEvidence, name: str, placed: Sequence[_Placed]) -> pl.DataFrame:
     why = pl.format("{} {}: {}", "direction", "piece_class", "cause").str.join(", ")
     worst = dict(line.table.group_by("piece").agg(why).iter_rows())
     proved = _allowed(line, MODES["both"], np.ones(len(line.pieces.element), dtype=np.bool_))
@@ -266,13 +275,13 @@ def _balises(line: Line, name: str, placed: Sequence[_Set]) -> pl.DataFrame:
     )
 
 
-def _largest(errors: dict[int, float | None], one: _Set) -> float | None:
+def _largest(errors: dict[int, float | None], one: _Placed) -> float | None:
     known = (errors.get(piece) for piece in one.since)
     return max((error for error in known if error is not None), default=None)
 
 
 def _figures(
-    line: Line, name: str, spacing_m: float, mode: str, placed: Sequence[_Set], growing: Bools
+    line: LineEvidence, name: str, spacing_m: float, mode: str, placed: Sequence[_Placed], growing: Bools
 ) -> dict[str, object]:
     virtual = [one.piece for one in placed if one.virtual]
     sides = [(piece, bool(growing[piece]) == ahead, ahead) for piece in virtual for ahead in MODES[mode]]

@@ -39,7 +39,8 @@ EPOCH_COLUMNS = (
 
 def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configuration) -> Ints:
     """`State` per epoch of one solution. An alarm counts where it begins; what it blocks after that does not."""
-    in_use, wrong = flags(epochs, "in_use"), _is(epochs, "wrong")
+    in_use = flags(epochs, "in_use")
+    wrong = _is(epochs, "wrong")
     starts = epochs["t"].is_in(alarm_starts.implode()).to_numpy()
     conditions = [
         (wrong & in_use, State.WRONG_IN_USE),
@@ -71,9 +72,11 @@ def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Con
     """
     low, high = train_path_m(epochs, legs)
     placed = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
-    t_ns, satellites = times_ns(epochs), floats(epochs, "satellites")
+    t_ns = times_ns(epochs)
+    satellites = floats(epochs, "satellites")
     possible = epochs["true_netelement_ids"].to_list()
-    here, there = placed[:-1], placed[1:]
+    here = placed[:-1]
+    there = placed[1:]
     state = np.maximum(states[here], states[there])
     silent = (t_ns[there] - t_ns[here] > crossing_gap_ns(t_ns, config.lds)) & (there == here + 1)
     between = np.flatnonzero(there > here + 1)

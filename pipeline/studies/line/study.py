@@ -12,7 +12,7 @@ from pipeline.results.store import check_site, complete_runs, completed_runs, re
 from pipeline.studies.line.classes import piece_classes
 from pipeline.studies.line.passes import Ground, passes_of
 from pipeline.studies.line.pieces import Pieces, middles, pieces_of
-from pipeline.studies.line.proposals import Line, proposals
+from pipeline.studies.line.proposals import LineEvidence, proposals
 from pipeline.studies.line.remarks import remarks
 from pipeline.studies.line.spans import EPOCH_COLUMNS, State
 from pipeline.studies.trials import distinct
@@ -30,7 +30,7 @@ POINT_COLUMNS = {"name": pl.String, "netelement_id": pl.String, "measure_m": pl.
 class LineResult:
     """What the runs say of a line: classes per piece, proposals and their balises, what cannot be said."""
 
-    line: Line
+    line: LineEvidence
     proposals: pl.DataFrame
     balises: pl.DataFrame
     remarks: tuple[str, ...]
@@ -60,7 +60,7 @@ def study_line(
     passes, undetected = passes_of_runs(out, runs, ground, criteria)
     table = piece_classes(passes, undetected, pieces, criteria)
     lds = (read_config(out) or Configuration()).lds
-    line = Line(site, pieces, table, passes, _known_points(points, pieces), criteria, lds)
+    line = LineEvidence(site, pieces, table, passes, _known_points(points, pieces), criteria, lds)
     figures, balises = proposals(line)
     return LineResult(line, figures, balises, (*twice, *remarks(runs, passes, table, figures, criteria)))
 
@@ -97,7 +97,8 @@ def passes_of_runs(
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
     """The passes of all runs with `run_id`; and the largest undetected error by piece, where the tables have it."""
     config = read_config(out) or Configuration()
-    parts, errors = [], []
+    parts = []
+    errors = []
     for run, solution, evidence in runs.select("run_id", "solution", "evidence").iter_rows():
         own = pl.col("solution") == solution
         epochs = read_table(out, "epochs", run).select(EPOCH_COLUMNS).filter(own).collect()

@@ -113,7 +113,8 @@ class CoordinateMistake:
     def mended(self, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
         """Latitude and longitude [deg] without it."""
         first, second = (longitude_deg, latitude_deg) if self.exchanged else (latitude_deg, longitude_deg)
-        first, second = first * self.factors.get("latitude_deg", 1.0), second * self.factors.get("longitude_deg", 1.0)
+        first = first * self.factors.get("latitude_deg", 1.0)
+        second = second * self.factors.get("longitude_deg", 1.0)
         return (_from_minutes(first), _from_minutes(second)) if self.minutes else (first, second)
 
 
@@ -137,7 +138,9 @@ class Datum(Shift):
 
     def explains(self, shift: Shift, one_heading: bool) -> bool:
         """Whether it is this shift; of a single heading only the part across it is known."""
-        east_m, north_m, size_m = shift.east_m, shift.north_m, shift.shift_m
+        east_m = shift.east_m
+        north_m = shift.north_m
+        size_m = shift.shift_m
         across_m = abs((self.east_m - east_m) * east_m + (self.north_m - north_m) * north_m) / size_m
         off_m = across_m if one_heading else self.off_m(shift)
         return off_m < max(_DATUM_NEAR_M, _DATUM_NEAR_SHARE * size_m)

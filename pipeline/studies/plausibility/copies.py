@@ -54,17 +54,21 @@ def copy_check(of: Recording) -> Check | None:
 
     An exact, a rounded or a thinned copy is seen, and one with other stamps.
     """
-    config, fixes, reference = of.config, of.fixes, of.run.reference
+    config = of.config
+    fixes = of.fixes
+    reference = of.run.reference
     if reference is None or of.reference is None:
         return None
-    own, other = _track(fixes, of.seconds(fixes)), _track(reference, of.seconds(reference))
+    own = _track(fixes, of.seconds(fixes))
+    other = _track(reference, of.seconds(reference))
     other = other.take(of.reference.moves(other.t_s))
     other = other.take(np.arange(other.t_s.size) % max(1, other.t_s.size // _ROWS) == 0)
     if min(own.t_s.size, other.t_s.size) < _FEWEST:
         return None
     digit_deg = max(_digit_deg(own.degrees), _digit_deg(other.degrees), _LEAST_DEG)
     to_m = np.radians(1.0) * SEMI_MAJOR_AXIS_M * np.array([1.0, np.cos(np.radians(own.degrees[0, 0]))])
-    digit_m, sigma_m = digit_deg * to_m, _sigma_m(fixes)
+    digit_m = digit_deg * to_m
+    sigma_m = _sigma_m(fixes)
     # Of a normal error, so much lies within a digit on either side.
     chance = float(np.prod(np.minimum(1.0, 2.0 * digit_m / (np.sqrt(2.0 * np.pi) * sigma_m))))
     lag_s = _lag_s(own, other, 2.0 * float(digit_m[0])) if chance <= config.copy_chance else None

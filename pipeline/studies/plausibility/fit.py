@@ -72,7 +72,8 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
         of_reference, checks, beside_reference = reference_checks(of)
         lags.append(of_reference)
     of_odometer, odometer_lags = odometer_checks(of, lags[0] if lags else None)
-    checks, lags = [*of_odometer, *checks], [*odometer_lags, *lags]
+    checks = [*of_odometer, *checks]
+    lags = [*odometer_lags, *lags]
     if run.balise_reads is not None and run.balise_reads.height and site is not None:
         lags.append(reads_lag(of, run.balise_reads, site))
         checks += read_stamp_checks(of, run.balise_reads)

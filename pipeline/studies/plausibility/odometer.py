@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+import polars as pl
 
 from pipeline.studies.plausibility.causes import explain_factor
 from pipeline.studies.plausibility.check import VEHICLE_FILE, Cause, Check, State, correction, fits, misfit, not_checked
@@ -13,7 +14,7 @@ from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.records import MOVING_MPS, Places, Record
 from pipeline.studies.plausibility.robust import LEAST
 from pipeline.studies.plausibility.witnesses import Lag
-from schemas.arrays import runs_of
+from schemas.arrays import floats, runs_of
 from schemas.config import PlausibilityConfig
 from schemas.enums import MisfitCause
 
@@ -29,14 +30,19 @@ _PULSES_FACTOR = 1.5
 _HEADING_S = 20.0
 _HEADING_WAY = 0.3
 _HEADING_COSINE = 0.7
+# Rows of two counters leap to and fro by turns: so large a share of so many rows is no noise of one.
+_BY_TURNS = 0.5
+_LEAST_BY_TURNS = 30
 
 
 def odometer_checks(of: Recording, reference: Lag | None) -> tuple[list[Check], list[Lag]]:
     """All checks of the odometer, and its clock for comparison with those of the others."""
-    config, pairs = of.config, of.pairs
+    config = of.config
+    pairs = of.pairs
     if not pairs:
         return ([not_checked("odometer against the GNSS", "hardly any row")] if of.run.odometer is not None else []), []
-    checks = [_factor_check(name, pairs, config) for name in pairs] + sign_check(of.counters)
+    checks = _interleaved(of.run.odometer) + [_factor_check(name, pairs, config) for name in pairs]
+    checks += sign_check(of.counters)
     name = next((name for name, pair in pairs.items() if pair.known), next(iter(pairs)))
     pair = pairs[name]
     if not pair.known:
@@ -51,7 +57,8 @@ def odometer_checks(of: Recording, reference: Lag | None) -> tuple[list[Check], 
         fit = fit_pair(of.reference, of.counters[name])
         return fit if fit.known else None
 
-    scale, latency = _scale_check(pair, of), _latency_check(pair, reference, of)
+    scale = _scale_check(pair, of)
+    latency = _latency_check(pair, reference, of)
     if scale is not None and scale.state in (State.MISFIT, State.IMPOSSIBLE):
         # Where there is a reference it has to contradict the file too: else it is the positions that drift.
         other = by_reference()
@@ -65,6 +72,22 @@ def odometer_checks(of: Recording, reference: Lag | None) -> tuple[list[Check], 
     if other is not None and other.lag_known and not other.other_lag(0.0, config.lag_told_s):
         return checks, [Lag("odometer", reason=f"{lag.lag_s:+.2f} s, but none against the reference")]
     return checks, [lag]
+
+
+def _interleaved(odometer: pl.DataFrame | None) -> list[Check]:
+    """Rows of two counters by turns: they leap to and fro, and each second row goes on where the last but one was."""
+    way = np.zeros(0) if odometer is None else floats(odometer.drop_nulls("distance_m"), "distance_m")
+    if way.size < _LEAST_BY_TURNS:
+        return []
+    leaps = np.diff(way)
+    steps = np.abs(way[2:] - way[:-2])
+    to_and_fro = (leaps[1:] * leaps[:-1] < 0) & (np.minimum(np.abs(leaps[1:]), np.abs(leaps[:-1])) > 10.0 * steps)
+    share = float(np.mean(to_and_fro))
+    if share < _BY_TURNS:
+        return []
+    words = f"{share:.0%} of its rows leap to and fro by about {np.median(np.abs(leaps)):.3g}"
+    advice = "Record each counter under a name of its own, and use one of them."
+    return [misfit("odometer distance from row to row", words, MisfitCause.TWO_COUNTERS, advice=advice)]
 
 
 def _lag(pair: PairFit, of: Recording) -> Lag:
@@ -86,7 +109,8 @@ def _metres(pair: PairFit, config: PlausibilityConfig) -> bool:
 
 
 def _factor_check(name: str, pairs: dict[str, PairFit], config: PlausibilityConfig) -> Check:
-    what, pair = f"odometer {name} against the positions", pairs[name]
+    what = f"odometer {name} against the positions"
+    pair = pairs[name]
     if not pair.known:
         return misfit(what, pair.reason) if pair.stands else not_checked(what, pair.reason)
     factor = abs(pair.factor)
@@ -125,10 +149,12 @@ def _unit(pair: PairFit, config: PlausibilityConfig) -> float | None:
 
 def _scale_check(pair: PairFit, of: Recording, unit: float | None = None) -> Check | None:
     """The file's odometer scale against what the run shows, in metres."""
-    config, file_scale = of.config, of.vehicle.odometer_scale
+    config = of.config
+    file_scale = of.vehicle.odometer_scale
     if file_scale is None:
         return None
-    what, unit = "odometer scale of the vehicle file", unit or _unit(pair, config)
+    what = "odometer scale of the vehicle file"
+    unit = unit or _unit(pair, config)
     if unit is None:
         return not_checked(what, "the unit of the odometer is not known")
     least = max(config.file_scale, config.file_sigmas * (of.vehicle.odometer_scale_sigma or 0.0))
@@ -140,7 +166,8 @@ def _scale_check(pair: PairFit, of: Recording, unit: float | None = None) -> Che
 
 def _latency_check(pair: PairFit, reference: Lag | None, of: Recording) -> Check | None:
     """The file's GNSS latency against what the run shows; a reference that agrees with it is believed."""
-    config, file_s = of.config, of.vehicle.gnss_latency_s
+    config = of.config
+    file_s = of.vehicle.gnss_latency_s
     if file_s is None or pair.shifted:
         return None
     if not pair.lag_known:
@@ -166,7 +193,8 @@ def sign_check(counters: dict[str, Record]) -> list[Check]:
     """Speed and distance of one odometer; none where it has not both."""
     if len(counters) < 2:
         return []
-    begin_s, end_s = max(one.t_s[0] for one in counters.values()), min(one.t_s[-1] for one in counters.values())
+    begin_s = max(one.t_s[0] for one in counters.values())
+    end_s = min(one.t_s[-1] for one in counters.values())
     starts = np.linspace(begin_s, max(end_s - 10.0, begin_s), 300)
     gained = np.array([counters[name].gained(starts, starts + 10.0) for name in ("distance", "speed")])
     # By the median of what moves: a counter that is reset seems to run far, once.
@@ -201,9 +229,11 @@ def turn_check(gnss: Places, counter: Record, pair: PairFit) -> Check:
         cosine = np.einsum("ij,ij->i", *moved) / sizes.prod(axis=0)
         sure = np.isfinite(cosine) & (sizes.min(axis=0) > 2.0 * MOVING_MPS * _HEADING_S)
         sure &= np.all(np.abs(np.abs(gained) - sizes) < _HEADING_WAY * sizes, axis=0)
-    reversal, onward = sure & (cosine < -_HEADING_COSINE), sure & (cosine > _HEADING_COSINE)
+    reversal = sure & (cosine < -_HEADING_COSINE)
+    onward = sure & (cosine > _HEADING_COSINE)
     turns = gained.prod(axis=0) < 0
-    never, wrongly = int((reversal & ~turns).sum()), int((onward & turns).sum())
+    never = int((reversal & ~turns).sum())
+    wrongly = int((onward & turns).sum())
     if never and never == reversal.sum():
         words = f"the train reverses {never} times, the counter never does"
         advice = "Let the recorder write the distance falling, and the speed negative, while the train reverses."

@@ -132,7 +132,8 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     if way.size < LEAST:
         reason = "the odometer stands while the positions move" if stands else "hardly any movement in common"
         return PairFit(reason=reason, stands=stands)
-    sign, size = -1.0 if np.median(counted) < 0 else 1.0, np.abs(counted)
+    sign = -1.0 if np.median(counted) < 0 else 1.0
+    size = np.abs(counted)
     ratio = size / way
     unit = float(np.median(ratio))
     off = np.abs(np.log(ratio / unit))
@@ -240,7 +241,8 @@ def _correlations(first: Floats, second: Floats) -> Floats:
         apart = np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0)
         return [np.fft.rfft(part, size) for part in (np.isfinite(values).astype(np.float64), apart, apart**2)]
 
-    left, right = spectra(first), spectra(second[::-1])
+    left = spectra(first)
+    right = spectra(second[::-1])
 
     def sums(one: int, other: int) -> Floats:
         return np.asarray(np.fft.irfft(left[one] * right[other], size)[: first.size + second.size - 1])

@@ -49,7 +49,8 @@ def reference_checks(of: Recording) -> tuple[Lag, list[Check], bool]:
     if not agrees:
         words = "no one lag or shift explains them; the positions may be wrong"
         return lag, [not_checked(_REFERENCE, words)], False
-    near, words = found.shift_m <= config.shift_told_m, f"{found.towards} of them"
+    near = found.shift_m <= config.shift_told_m
+    words = f"{found.towards} of them"
     # No lines: the judge believes the reference, and nobody should shift it to where the positions want it.
     beside = misfit(_REFERENCE, words, MisfitCause.OFFSET_OF_REFERENCE, advice="Find out which of the two is off.")
     beside = fits(_REFERENCE, words) if near or not found.shift_is_steady else beside
@@ -57,7 +58,8 @@ def reference_checks(of: Recording) -> tuple[Lag, list[Check], bool]:
 
 
 def _reference_heights(of: Recording, lag_s: float) -> Iterator[Check]:
-    gnss, record = of.gnss, of.reference
+    gnss = of.gnss
+    record = of.reference
     known = np.zeros(0) if record is None else np.isfinite(record.height_m)
     if record is None or known.sum() < 2 or not np.isfinite(gnss.height_m).any():
         return
@@ -90,16 +92,15 @@ def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
     """
     if of.reference is not None or reads.height < _FEWEST_READS or (times_ns(reads) % NS_PER_S).any():
         return []
-    words, advice = (
-        f"all {reads.height} are whole seconds",
-        "Record the reads with finer stamps: until then nothing is proved.",
-    )
+    words = f"all {reads.height} are whole seconds"
+    advice = "Record the reads with finer stamps: until then nothing is proved."
     return [misfit("stamps of the balise reads", words, MisfitCause.WHOLE_SECONDS, advice=advice, of_evidence=True)]
 
 
 def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:
     """Latitude and longitude of the balises on their net elements [deg]."""
-    track, places = track_of(site.track), {}
+    track = track_of(site.track)
+    places = {}
     rows = () if site.balises is None else site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
     for name, element, measure_m in rows:
         if (number := track.element_at(element, measure_m)) is not None:
@@ -112,7 +113,8 @@ def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:
 def survey_checks(of: Recording, line: SurveyLine, beside_reference: bool) -> Iterator[Check]:
     """Positions and heights against the survey; `beside_reference`: the reference lies where the positions do."""
     near_m = 1.5 * of.config.shift_told_m
-    fit, datum = fit_survey(of.gnss, line, near_m), None
+    fit = fit_survey(of.gnss, line, near_m)
+    datum = None
     if fit.aside_m >= of.config.shift_told_m:
         fit, datum = _by_datum(fit, of, line, near_m)
     yield _beside(fit, datum, of, ("gnss", "reference") if beside_reference else ("gnss",))

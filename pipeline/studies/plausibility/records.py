@@ -46,12 +46,14 @@ class Record:
 
     def instants(self, step_s: float, begin_s: float = -np.inf, end_s: float = np.inf) -> Floats:
         """Instants a step apart from the first row (or `begin_s`) on, those inside long pauses left out."""
-        origin_s, last_s = max(self.t_s[0], begin_s), min(self.t_s[-1], end_s)
+        origin_s = max(self.t_s[0], begin_s)
+        last_s = min(self.t_s[-1], end_s)
         rows = self.t_s[(self.t_s >= origin_s - self.limit_s) & (self.t_s <= last_s + self.limit_s)]
         if rows.size < 2 or last_s <= origin_s:
             return np.zeros(0)
         edges = np.flatnonzero(np.diff(rows) > self.limit_s)
-        firsts, lasts = rows[np.append(0, edges + 1)], rows[np.append(edges, rows.size - 1)]
+        firsts = rows[np.append(0, edges + 1)]
+        lasts = rows[np.append(edges, rows.size - 1)]
         begins = np.floor((np.maximum(firsts, origin_s) - origin_s) / step_s).astype(np.int64)
         ends = np.ceil((np.minimum(lasts, last_s) - origin_s) / step_s).astype(np.int64)
         number = np.concatenate([np.arange(begin, end + 1) for begin, end in zip(begins, ends, strict=True)])
@@ -109,7 +111,8 @@ class Places(Record):
 
 def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
     """Valid positions of a cleaned stream; None where there are hardly any."""
-    latitude, longitude = floats(frame, "latitude_deg"), floats(frame, "longitude_deg")
+    latitude = floats(frame, "latitude_deg")
+    longitude = floats(frame, "longitude_deg")
     valid = np.isfinite(latitude) & np.isfinite(longitude)
     if "fix" in frame.columns:
         valid &= (frame["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
@@ -117,7 +120,9 @@ def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
     rows = _thinned(t_s, np.flatnonzero(valid))
     if rows.size < _LEAST_ROWS:
         return None
-    t_s, latitude, longitude = t_s[rows], latitude[rows], longitude[rows]
+    t_s = t_s[rows]
+    latitude = latitude[rows]
+    longitude = longitude[rows]
     height = floats(frame, "height_m")[rows] if "height_m" in frame.columns else np.full(rows.size, np.nan)
     level_m = float(np.nanmedian(height)) if np.isfinite(height).any() else 0.0
     flat = np.full(rows.size, level_m if abs(level_m) < 9000.0 else 0.0)
@@ -128,9 +133,11 @@ def counters_of(odometer: pl.DataFrame, epoch_ns: int) -> dict[str, Record]:
     """`distance`, and `speed` summed up, of an odometer, each where enough rows have it."""
     counters: dict[str, Record] = {}
     for name, column in ("distance", "distance_m"), ("speed", "speed_mps"):
-        t_s, values = seconds_since(epoch_ns, odometer), floats(odometer, column)
+        t_s = seconds_since(epoch_ns, odometer)
+        values = floats(odometer, column)
         rows = np.flatnonzero(np.isfinite(values))
-        t_s, way = t_s[rows], values[rows]
+        t_s = t_s[rows]
+        way = values[rows]
         if name == "speed" and rows.size:
             way = np.concatenate([[0.0], np.cumsum(0.5 * (way[1:] + way[:-1]) * np.diff(t_s))])
         kept = _thinned(t_s, np.arange(rows.size))

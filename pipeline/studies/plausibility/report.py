@@ -23,16 +23,16 @@ class FitReport:
 
     def lines(self) -> list[str]:
         """The same as plain lines, without what fits or could not be checked."""
-        told = [f"does not fit: {problem}" for problem in self.problems]
+        lines = [f"does not fit: {problem}" for problem in self.problems]
         if "Fit" in self.tables:
             misfits = self.tables["Fit"].filter(pl.col("state") == State.MISFIT.value)
-            told += [
+            lines += [
                 f"does not fit: {row['check']}: {row['found']} {row['cause']}".rstrip()
                 for row in misfits.iter_rows(named=True)
             ]
         if "Lines that mend it" in self.tables:
-            told += self.tables["Lines that mend it"]["toml"].to_list()
-        return told
+            lines += self.tables["Lines that mend it"]["toml"].to_list()
+        return lines
 
 
 def fit_report(
@@ -43,8 +43,10 @@ def fit_report(
     try:
         cleaned, counts = clean(run, config, clock_advice)
     except InputError as error:
-        # Recorders of different times: what moves one to the other is told all the same.
-        cleaned, counts, problems = _in_order(run), CleanCounts(), (str(error),)
+        # Recorders of different times: what moves one to the other is said all the same.
+        cleaned = _in_order(run)
+        counts = CleanCounts()
+        problems = (str(error),)
         if cleaned.gnss.height < 2:
             return FitReport({}, problems)
     found = {

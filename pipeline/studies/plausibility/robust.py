@@ -86,7 +86,8 @@ def _solved(
     design: Floats, target: Floats, floor: float, least_known: float, start: tuple[float, ...] | None
 ) -> Regression:
     count, each = target.shape
-    equations, goal = design.reshape(count * each, -1), target.ravel()
+    equations = design.reshape(count * each, -1)
+    goal = target.ravel()
     weight = np.ones(count)
     left = np.zeros(count) if start is None else np.linalg.norm(target - design @ np.array(start), axis=1)
     for number in range(_ROUNDS):

@@ -66,17 +66,21 @@ def passes(track: Places, places: Points, within_m: float) -> tuple[Ints, Floats
     """Which places a moving record passes, and when [s]; a place as often as it is passed."""
     surface = track.points.surface
     centre = surface.mean(axis=0)
-    points, near_to = surface - centre, places.surface - centre
+    points = surface - centre
+    near_to = places.surface - centre
     squares = (near_to**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * near_to @ points.T
     inner = squares[:, 1:-1]
     # Between two rows the train may be half their distance away from both.
     step_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     near = inner < (within_m + np.maximum(step_m[:-1], step_m[1:])) ** 2
     place, row = np.nonzero(near & (inner <= squares[:, :-2]) & (inner < squares[:, 2:]))
-    away_m, at_s = np.full(place.size, np.inf), np.full(place.size, np.nan)
-    line, passed = Polyline(surface[:-1], surface[1:]), places.take(place)
+    away_m = np.full(place.size, np.inf)
+    at_s = np.full(place.size, np.nan)
+    line = Polyline(surface[:-1], surface[1:])
+    passed = places.take(place)
     for begin in (row, row + 1):
-        foot, period_s = on_segments(passed, line, begin), track.t_s[begin + 1] - track.t_s[begin]
+        foot = on_segments(passed, line, begin)
+        period_s = track.t_s[begin + 1] - track.t_s[begin]
         better = (foot.distance_m < away_m) & (period_s <= track.limit_s)
         at_s = np.where(better, track.t_s[begin] + np.clip(foot.fraction, 0.0, 1.0) * period_s, at_s)
         away_m = np.where(better, foot.distance_m, away_m)
@@ -111,7 +115,8 @@ def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityCon
     moves = np.linalg.norm(velocity, axis=1) > MOVING_MPS
     if moves.sum() < 3 * LEAST:
         return PlaceFit(reason="hardly any movement in common")
-    velocity, apart = velocity[moves], apart[moves]
+    velocity = velocity[moves]
+    apart = apart[moves]
     design = np.concatenate([velocity[:, :, None], np.broadcast_to(np.eye(2), (len(apart), 2, 2))], axis=2)
     # Along one heading at constant speed a lag and a shift look alike: it is taken for a lag.
     fit = regressed(design, apart, floor=0.2, least_known=1e-4)
@@ -183,7 +188,8 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float, start_m: tuple[flo
         along = np.einsum("ijk,ik->ij", axes, line.end[nearest] - line.start[nearest])
         across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
         feet = on_segments(points, line, nearest)
-        part, low_m = np.clip(feet.fraction, 0.0, 1.0), line.height_start_m[nearest]
+        part = np.clip(feet.fraction, 0.0, 1.0)
+        low_m = line.height_start_m[nearest]
         return across, -feet.offset_m, low_m + part * (line.height_end_m[nearest] - low_m)
 
     aside_m = float(np.median(np.abs(beside(np.zeros(2))[1])))
@@ -193,8 +199,10 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float, start_m: tuple[flo
         fit = regressed(across[:, None, :], apart[:, None], floor=1.0, least_known=_ONE_HEADING, halves=False)
         shift = fit.estimate
     left = np.abs(apart - across @ shift)
-    left_m, half = float(np.median(left)), len(apart) // 2
-    toward, whole = (across @ shift) * apart, (across @ shift) ** 2
+    left_m = float(np.median(left))
+    half = len(apart) // 2
+    toward = (across @ shift) * apart
+    whole = (across @ shift) ** 2
     steady = all(toward[part].sum() > 0.5 * whole[part].sum() for part in (slice(half), slice(half, None)))
     # By metres, not by what is left elsewhere: a shift brings no run onto a network that it left.
     near = float(np.mean(left < near_m)) > _SHIFT_POSITIONS

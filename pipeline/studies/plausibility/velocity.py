@@ -85,7 +85,9 @@ def fit_velocity(fixes: pl.DataFrame, gnss: Places, epoch_ns: int) -> VelocityFi
     fast = size > _FAST_MPS
     if fast.sum() < 2 * LEAST:
         return None
-    moved, recorded, size = moved[fast], recorded[fast], size[fast]
+    moved = moved[fast]
+    recorded = recorded[fast]
+    size = size[fast]
     flat = recorded[:, :2]
     ratio = float(np.median(np.linalg.norm(flat, axis=1) / size))
     left = [np.linalg.norm(way.turned(flat) / max(ratio, 1e-9) - moved, axis=1) / size for way in ARRANGEMENTS]
@@ -127,14 +129,16 @@ def _horizontal(fit: VelocityFit, config: PlausibilityConfig) -> Check:
 
 def _vertical(gnss: Places, fit: VelocityFit) -> list[Check]:
     """Up against down."""
-    known, up_mps = np.isfinite(gnss.height_m), fit.recorded[:, 2]
+    known = np.isfinite(gnss.height_m)
+    up_mps = fit.recorded[:, 2]
     if not np.isfinite(up_mps).all() or known.sum() < 2 * LEAST:
         return []
     ends = np.interp([fit.begin_s, fit.begin_s + SPEED_S], gnss.t_s[known], gnss.height_m[known])
     climbed = (ends[1] - ends[0]) / SPEED_S
     # Jumps of the height are no climbing.
     kept = np.abs(climbed) < 4.0 * np.median(np.abs(climbed)) + _CLIMB_MPS
-    climbed, up_mps = climbed[kept], up_mps[kept]
+    climbed = climbed[kept]
+    up_mps = up_mps[kept]
     agreement = 0.0
     if kept.sum() >= 2 * LEAST and np.std(climbed) >= _CLIMB_MPS and np.any(up_mps != up_mps[0]):
         agreement = float(np.corrcoef(climbed, up_mps)[0, 1])

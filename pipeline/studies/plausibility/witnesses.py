@@ -67,8 +67,10 @@ def clock_checks(of: Recording, lags: list[Lag], latency_s: float) -> list[Check
 
 
 def _check(of: Recording, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
-    name, config = NAMES[lag.stream], of.config
-    what, size_s = f"clock of the {name} against the GNSS", abs(lag.lag_s)
+    name = NAMES[lag.stream]
+    config = of.config
+    what = f"clock of the {name} against the GNSS"
+    size_s = abs(lag.lag_s)
     if lag.reason:
         return not_checked(what, lag.reason)
     if not lag.sure and size_s > max(config.lag_told_s, SIGNIFICANT_SIGMAS * lag.sigma_s):

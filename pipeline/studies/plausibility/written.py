@@ -21,7 +21,8 @@ _WHAT = "positions as written"
 
 def written_checks(of: Recording) -> list[Check]:
     """What keeps positions from being compared at all, empty where nothing does."""
-    line, same_m = of.line, of.config.same_line_m
+    line = of.line
+    same_m = of.config.same_line_m
     far_m = 0.0 if line is None else line.far_m(of.gnss.latitude_deg, of.gnss.longitude_deg)
     if line is not None and far_m <= same_m:
         return []
@@ -35,7 +36,8 @@ def written_checks(of: Recording) -> list[Check]:
             continue
         if sum(_witnesses(mended).values()) >= sum(recorded.values()):
             return [_mistaken(mistake, words)]
-        causes, advice = (Cause(mistake.code),), "Mend the columns of the site's track."
+        causes = (Cause(mistake.code),)
+        advice = "Mend the columns of the site's track."
         return [Check(_WHAT, State.IMPOSSIBLE, words, causes, advice=advice, whose=Whose(MisfitPlace.IN_SURVEY))]
     advice = "Check that run and site belong together, and axes and datum of both."
     return [misfit(_WHAT, words, MisfitCause.OTHER_PLACE, advice=advice)]
@@ -52,7 +54,8 @@ def _without_survey(of: Recording, recorded: dict[str, bool]) -> list[Check]:
         if "odometer" in found and not recorded.get("odometer", False):
             return [_mistaken(mistake, words)]
         # Signs leave the ways as they are: the velocity alone says that they differ.
-        causes, advice = (Cause(mistake.code),), "A site tells which: name it with --site."
+        causes = (Cause(mistake.code),)
+        advice = "A site tells which: name it with --site."
         return [Check(_WHAT, State.IMPOSSIBLE, words, causes, advice=advice, whose=Whose(MisfitPlace.OR_VELOCITY))]
     return []
 
@@ -97,14 +100,17 @@ def _apart_m(gnss: Places, latitude_deg: Floats, longitude_deg: Floats) -> float
 
 def reference_elsewhere(of: Recording) -> list[Check]:
     """A reference far away: perhaps its axes or signs are wrong; empty where it is near."""
-    record, limit_m = of.reference, 10.0 * of.config.same_line_m
+    record = of.reference
+    limit_m = 10.0 * of.config.same_line_m
     if record is None or (far_m := _apart_m(of.gnss, record.latitude_deg, record.longitude_deg)) < limit_m:
         return []
-    what, words = "places of the reference against the positions", f"it is {far_m / 1000:.0f} km from the positions"
+    what = "places of the reference against the positions"
+    words = f"it is {far_m / 1000:.0f} km from the positions"
     for mistake in COORDINATE_MISTAKES:
         latitude, longitude = mistake.mended(record.latitude_deg, record.longitude_deg)
         if np.max(np.abs(latitude)) <= 90.0 and _apart_m(of.gnss, latitude, longitude) < limit_m:
             advice = "Convert its positions." if mistake.minutes else ""
-            whose, lines = Whose(MisfitPlace.IN_REFERENCE), _lines("reference", mistake)
+            whose = Whose(MisfitPlace.IN_REFERENCE)
+            lines = _lines("reference", mistake)
             return [Check(what, State.IMPOSSIBLE, words, (Cause(mistake.code),), lines, advice=advice, whose=whose)]
     return [not_checked(what, words)]

@@ -43,7 +43,9 @@ def architectures_table(config: SafetyConfig) -> pl.DataFrame:
     """
     speeds_kmh = (40.0, 80.0, 120.0, 160.0, 200.0, 300.0)
     table = each(levels_table(config), spacing_m=(400.0, 2000.0, 2500.0), speed_kmh=speeds_kmh)
-    rate, detect_s, link_s = pl.col("rate"), pl.col("detect_s"), pl.col("linking_time_s")
+    rate = pl.col("rate")
+    detect_s = pl.col("detect_s")
+    link_s = pl.col("linking_time_s")
     linked = hazard_rate_with_linking_per_h(rate, pl.col("spacing_m"), pl.col("speed_kmh"))
     return table.with_columns(linking_time_s=linking_time_s(pl.col("spacing_m"), pl.col("speed_kmh"))).select(
         *("service_level", "spacing_m", "speed_kmh", "linking_time_s"),

@@ -62,7 +62,9 @@ def tolerable_gnss_rate_per_h(thr_per_h: float, time_to_detect_s: Figure, demand
 
 def tolerable_table(config: SafetyConfig) -> pl.DataFrame:
     """The other way round: which hazard rate of GNSS a diagnosis of this speed could live with (TVB eq. 7)."""
-    thr, demands, time_s = config.thr_vb_per_h, config.demands_per_hour, pl.col("time_to_detect_s")
+    thr = config.thr_vb_per_h
+    demands = config.demands_per_hour
+    time_s = pl.col("time_to_detect_s")
     # The first is two periods of a receiver of 10 Hz (TVB section 5).
     return pl.DataFrame({"time_to_detect_s": [0.2, 1.0, 10.0, 30.0, 100.0]}).with_columns(
         tolerable_published_per_h=tolerable_gnss_rate_per_h(thr, time_s),

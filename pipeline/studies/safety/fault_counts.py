@@ -24,7 +24,8 @@ def faults_of_pair(one: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
     `common`: a failure of each solution at the same time.
     """
     both = pl.concat([_beside(one, other), _beside(other, one)]).sort("begin")
-    end_ns, begin_ns = pl.col("t_end").to_physical().fill_null(_OPEN_END_NS), pl.col("begin").to_physical()
+    end_ns = pl.col("t_end").to_physical().fill_null(_OPEN_END_NS)
+    begin_ns = pl.col("begin").to_physical()
     apart = begin_ns > end_ns.cum_max().shift(1)
     return both.group_by(fault=apart.fill_null(value=False).cum_sum(), maintain_order=True).agg(
         pl.col("begin", "t_failure").min(),
@@ -52,10 +53,13 @@ def _overlaps(faults: pl.DataFrame, begin_ns: int, last_ns: int) -> bool:
 
 def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
     """Counts of `pipeline.studies.safety.tally`; those of common faults only where `faults` has `common`."""
-    last, kind = int(fails.t_ns[-1]), faults.schema["begin"]
+    last = int(fails.t_ns[-1])
+    kind = faults.schema["begin"]
     ends = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(last)).rows()
     found = [_detected_ns(fails, *span) for span in ends]
-    failed, missed, judged = pl.col("failed"), pl.col("missed"), pl.col("with_truth")
+    failed = pl.col("failed")
+    missed = pl.col("missed")
+    judged = pl.col("with_truth")
     seen = faults.with_columns(t_detected=pl.Series(found, dtype=pl.Int64).cast(kind))
     seen = seen.with_columns(missed=missed_detection())
     counts = {

@@ -68,7 +68,9 @@ def approximation_error(model: LdsModel, t_h: float) -> float:
 def generator(model: LdsModel) -> NDArray[np.float64]:
     """Rates from row state to column state [1/h]; rows sum to zero."""
     rates = np.zeros((4, 4))
-    rates[0, 1], rates[0, 3], rates[1, 2] = model.hr_sbas_per_h, model.hr_diag_per_h, model.mu_per_h
+    rates[0, 1] = model.hr_sbas_per_h
+    rates[0, 3] = model.hr_diag_per_h
+    rates[1, 2] = model.mu_per_h
     np.fill_diagonal(rates, -rates.sum(axis=1))
     return rates
 
@@ -97,7 +99,8 @@ def markov_table(config: SafetyConfig) -> pl.DataFrame:
 
 
 def _markov_row(level: str, model: LdsModel, t_h: float, thr_per_h: float) -> dict[str, object]:
-    state, solved = exact(model, t_h), numeric(model, t_h)
+    state = exact(model, t_h)
+    solved = numeric(model, t_h)
     difference = max(abs(a - b) for a, b in zip(astuple(state), astuple(solved), strict=True))
     return {
         "service_level": level,

@@ -116,7 +116,8 @@ def _statement(row: dict[str, Any]) -> str:
 
 
 def _failures(row: dict[str, Any]) -> str:
-    within, beyond = row["failures_within_budget"], row["failures_beyond_budget"]
+    within = row["failures_within_budget"]
+    beyond = row["failures_beyond_budget"]
     unknown = row["failures"] - within - beyond
     beside = f", {unknown} unknown" if unknown else ""
     return (
@@ -127,7 +128,8 @@ def _failures(row: dict[str, Any]) -> str:
 
 
 def _missed(row: dict[str, Any]) -> str:
-    known, missed = row["missed_known"], row["missed_judged"]
+    known = row["missed_known"]
+    missed = row["missed_judged"]
     said = f"No monitor found {missed} of {known} faults with a failure that a truth judged"
     if row["missed"] > missed:
         said += f"; {row['missed'] - missed} more are known by the odometer alone, and shares leave them out"
@@ -135,7 +137,9 @@ def _missed(row: dict[str, Any]) -> str:
 
 
 def _acceptances(row: dict[str, Any]) -> str:
-    judged, unsafe, seen = row["accepted_judged"], row["unsafe_judged"], row["unsafe_accepted"]
+    judged = row["accepted_judged"]
+    unsafe = row["unsafe_judged"]
+    seen = row["unsafe_accepted"]
     said = f"Of {judged} accepted virtual balises judged by a truth {unsafe} were accepted despite a wrong position"
     if seen > unsafe:
         said += f", and {seen - unsafe} more by the odometer alone"

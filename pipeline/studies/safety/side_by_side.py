@@ -176,7 +176,8 @@ def _at_risk_s(channel: _Channel) -> float:
 
 
 def _working(channel: _Channel) -> Row:
-    clock, held = channel.clock, channel.clock.held_s
+    clock = channel.clock
+    held = channel.clock.held_s
     up = uptime(clock.t_ns, channel.working, clock.limit_s)
     return {
         "working_s": float(held[channel.working & channel.moving].sum()),

@@ -42,7 +42,9 @@ def added(parts: Iterable[pl.DataFrame]) -> pl.DataFrame:
 
 def architecture_figures(counts: pl.DataFrame) -> pl.DataFrame:
     """Figures with exact 95 % bounds, one row per architecture and solution or pair."""
-    delays, moving, truth = pl.col("delays_s"), pl.col("moving_s"), pl.col("truth_s")
+    delays = pl.col("delays_s")
+    moving = pl.col("moving_s")
+    truth = pl.col("truth_s")
     order = {name: number for number, name in enumerate((REACTIVE, COMPOSITE, REDUNDANT))}
     table = counts.with_columns(
         detected=pl.when(pl.col("hazards").is_not_null()).then(delays.list.len().cast(pl.Int64)),
@@ -50,7 +52,7 @@ def architecture_figures(counts: pl.DataFrame) -> pl.DataFrame:
         time_to_detect_max_s=delays.list.max(),
         judged_h=pl.col("judged_s") / 3600.0,
         up_h=pl.col("up_s") / 3600.0,
-        told=pl.when(pl.col("open_alarms") == 0).then(pl.col("false_alarms")),
+        false_where_all_known=pl.when(pl.col("open_alarms") == 0).then(pl.col("false_alarms")),
         availability=pl.when(moving > 0.0).then(pl.min_horizontal(pl.col("working_s") / moving, 1.0)),
         wrong_in_use_s=pl.when(truth > 0.0).then(pl.col("wrong_s")),
         wrong_in_use_share=pl.when(truth > 0.0).then(pl.col("wrong_s") / truth),
@@ -58,7 +60,7 @@ def architecture_figures(counts: pl.DataFrame) -> pl.DataFrame:
     table = with_estimates(
         table,
         ("missed_share", "", clopper_pearson, "missed_judged", "failures_judged"),
-        ("false_alarm_rate", "_per_h", poisson_rate, "told", "judged_h"),
+        ("false_alarm_rate", "_per_h", poisson_rate, "false_where_all_known", "judged_h"),
         ("mtbf", "_h", mtbf, "losses", "up_h"),
         ("continuity_15s", "", continuity_15s, "losses", "up_h"),
     )

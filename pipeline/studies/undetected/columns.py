@@ -13,7 +13,7 @@ from pipeline.stages.lds.relink import Held
 from pipeline.stages.monitors.bank import AxisRecord
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
-from pipeline.studies.undetected.levels import bounded, range_bounds, with_channel
+from pipeline.studies.undetected.position_tests import bounded, range_bounds, with_channel
 from pipeline.studies.undetected.spacing import largest_spacing
 from pipeline.studies.undetected.watched import Watched, Window, watched, windows
 from schemas.arrays import Bools, Floats, Ints, floats, ints, times_ns
@@ -57,7 +57,7 @@ class Undetected:
 
 
 @dataclass(frozen=True)
-class _Both:
+class _BothWays:
     """Errors along growing path and against it at each row [m] (2, rows), NaN at the first row.
 
     `since_ns`: when they began at the earliest, else -1. `paid_m`, `outright`: what holds the larger (`error.Errors`).
@@ -84,9 +84,10 @@ def undetected_of(
     epochs = diagnosis.epochs
     if not config.undetected.compute:
         return Undetected(_nothing(Epochs, epochs.height), _nothing(Passages, passages.height))
-    rows, t_ns = rows_of(diagnosis, vehicle, config), times_ns(epochs)
+    rows = rows_of(diagnosis, vehicle, config)
+    t_ns = times_ns(epochs)
     parts = windows(rows, t_ns, diagnosis.fixes_ns)
-    found = _both(rows, parts, config.undetected)
+    errors = _both(rows, parts, config.undetected)
     ranges = diagnosis.satellites
     of_range = None
     if ranges is not None:
@@ -95,11 +96,12 @@ def undetected_of(
     spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
     facing = ints(epochs["direction"], unknown=1)
-    names, least = _names(diagnosis.bank, config), config.undetected.holding_share
+    names = _names(diagnosis.bank, config)
+    least = config.undetected.holding_share
     before = np.where(at >= 0, np.append(before_m, np.nan)[at], np.nan)
-    of_passages = _at_passages(at, rows, found, of_range, facing, names, least)
+    of_passages = _at_passages(at, rows, errors, of_range, facing, names, least)
     return Undetected(
-        _at_epochs(rows, found, facing),
+        _at_epochs(rows, errors, facing),
         of_passages.with_columns(physical_before_m=pl.Series(before, nan_to_null=True)),
         spacing,
     )
@@ -113,18 +115,21 @@ def rows_of(diagnosis: Diagnosis, vehicle: Vehicle, config: Configuration) -> Wa
     return with_channel(rows, diagnosis.epochs, diagnosis.channel, diagnosis.other, config.lds)
 
 
-def _both(rows: Watched, parts: list[Window], config: UndetectedConfig) -> _Both:
+def _both(rows: Watched, parts: list[Window], config: UndetectedConfig) -> _BothWays:
     error = np.full((2, rows.rows), np.nan)
     since_ns = np.full(rows.rows, -1)
-    paid, outright = np.zeros((rows.rows, 1 + rows.weight.shape[1])), np.zeros(rows.rows, dtype=np.bool_)
+    paid = np.zeros((rows.rows, 1 + rows.weight.shape[1]))
+    outright = np.zeros(rows.rows, dtype=np.bool_)
     for window in parts:
         seen = rows.since(window.start, window.end, window.since_s)
         ahead, behind = (largest_errors(one, config) for one in (seen, seen.mirrored()))
-        part, worse = slice(window.start + 1, window.end + 1), ahead.most_m >= behind.most_m
-        error[:, part], since_ns[part] = (ahead.most_m, behind.most_m), window.since_ns
+        part = slice(window.start + 1, window.end + 1)
+        worse = ahead.most_m >= behind.most_m
+        error[:, part] = (ahead.most_m, behind.most_m)
+        since_ns[part] = window.since_ns
         paid[part] = np.where(worse[:, None], ahead.paid_m, behind.paid_m)
         outright[part] = np.where(worse, ahead.outright, behind.outright)
-    return _Both(error, since_ns, paid, outright)
+    return _BothWays(error, since_ns, paid, outright)
 
 
 def _way_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
@@ -140,18 +145,18 @@ def _names(bank: AxisRecord, config: Configuration) -> list[str]:
     return [*along, "channel" if config.undetected.solutions_at_fault == "one" else "link_distance"]
 
 
-def _at_epochs(rows: Watched, found: _Both, facing: Ints) -> pl.DataFrame:
+def _at_epochs(rows: Watched, errors: _BothWays, facing: Ints) -> pl.DataFrame:
     """Ahead and behind in the direction of travel, row for row with all epochs."""
     columns = np.full((2, facing.size), np.nan)
-    columns[:, rows.epoch] = _faced(found, facing[rows.epoch])
+    columns[:, rows.epoch] = _faced(errors, facing[rows.epoch])
     return pl.DataFrame(
         [pl.Series(name, values, nan_to_null=True) for name, values in zip(EPOCH_COLUMNS, columns, strict=True)]
     )
 
 
-def _faced(found: _Both, facing: Ints) -> Floats:
+def _faced(errors: _BothWays, facing: Ints) -> Floats:
     """Ahead and behind, shape (2, rows), for these directions of travel along growing path."""
-    return np.where(facing > 0, found.error_m, found.error_m[::-1])
+    return np.where(facing > 0, errors.error_m, errors.error_m[::-1])
 
 
 def rows_of_passages(
@@ -162,47 +167,49 @@ def rows_of_passages(
     Of a virtual balise the epoch that offered it. Of a physical one the last row before its telegram, no longer before
     than a crossing may be seen over: that is how wrong the position can have become since the read before.
     """
-    found = passages.join(crossings.select("crossing_id", "epoch"), on="crossing_id", how="left", maintain_order="left")
+    seen = passages.join(crossings.select("crossing_id", "epoch"), on="crossing_id", how="left", maintain_order="left")
     stamps = t_ns[rows.epoch]
-    wanted = ints(found["epoch"])
+    wanted = ints(seen["epoch"])
     row = np.searchsorted(rows.epoch, wanted).clip(max=max(rows.rows - 1, 0))
     offered = (wanted >= 0) & (rows.epoch[row] == wanted) if rows.rows else np.zeros(wanted.size, dtype=np.bool_)
-    read_ns = ints(found["t_offered"].dt.timestamp("ns"))
+    read_ns = ints(seen["t_offered"].dt.timestamp("ns"))
     before = np.searchsorted(stamps, read_ns, side="right") - 1
     near = offered
     if rows.rows:
         near = (before >= 0) & (read_ns - stamps[before.clip(0)] <= crossing_gap_ns(t_ns, config.lds))
-    physical = (found["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
+    physical = (seen["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
     return np.where(physical, np.where(near, before, -1), np.where(offered, row, -1))
 
 
 def _at_passages(
-    at: Ints, rows: Watched, found: _Both, of_range: _Both | None, facing: Ints, names: list[str], least: float
+    at: Ints, rows: Watched, errors: _BothWays, of_range: _BothWays | None, facing: Ints, names: list[str], least: float
 ) -> pl.DataFrame:
-    known = (at >= 0) & (found.since_ns[at] >= 0) if rows.rows else np.zeros(at.size, dtype=np.bool_)
+    known = (at >= 0) & (errors.since_ns[at] >= 0) if rows.rows else np.zeros(at.size, dtype=np.bool_)
     at = np.where(known, at, 0)
-    values = dict(zip(EPOCH_COLUMNS, _taken(found, at, known, rows, facing), strict=True))
+    values = dict(zip(EPOCH_COLUMNS, _taken(errors, at, known, rows, facing), strict=True))
     nothing = np.full((2, at.size), np.nan)
     ranges = nothing if of_range is None else _taken(of_range, at, known, rows, facing)
     values |= dict(zip(RANGE_COLUMNS, ranges, strict=True))
-    since = [int(found.since_ns[row]) if yes else None for row, yes in zip(at, known, strict=True)]
-    holding = [_holding(found, row, names, least) if yes else None for row, yes in zip(at.tolist(), known, strict=True)]
+    since = [int(errors.since_ns[row]) if yes else None for row, yes in zip(at, known, strict=True)]
+    holding = [
+        _holding(errors, row, names, least) if yes else None for row, yes in zip(at.tolist(), known, strict=True)
+    ]
     return pl.DataFrame([pl.Series(name, one, nan_to_null=True) for name, one in values.items()]).with_columns(
         undetected_since=pl.Series(since, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
         undetected_monitors=pl.Series(holding, dtype=pl.List(pl.String)),
     )
 
 
-def _taken(found: _Both, at: Ints, known: Bools, rows: Watched, facing: Ints) -> Floats:
+def _taken(errors: _BothWays, at: Ints, known: Bools, rows: Watched, facing: Ints) -> Floats:
     if not rows.rows:
         return np.full((2, at.size), np.nan)
-    return np.where(known, _faced(found, facing[rows.epoch])[:, at], np.nan)
+    return np.where(known, _faced(errors, facing[rows.epoch])[:, at], np.nan)
 
 
-def _holding(found: _Both, row: int, names: list[str], least: float) -> list[str]:
+def _holding(errors: _BothWays, row: int, names: list[str], least: float) -> list[str]:
     """Monitors that hold the larger error at a row, first what holds most of it; none where the bank was blind."""
-    if found.outright[row]:
+    if errors.outright[row]:
         return [names[-1]]
-    paid = found.paid_m[row]
+    paid = errors.paid_m[row]
     order = np.argsort(-paid, kind="stable")
     return [names[which] for which in order.tolist() if paid[which] > least * paid.sum()]

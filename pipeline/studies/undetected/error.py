@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.studies.undetected.shares import Growth, best_shares, growth_of, horizons
+from pipeline.studies.undetected.splits import Growth, best_shares, growth_of, horizons
 from pipeline.studies.undetected.stretch import Stretch, stretch_after
 from pipeline.studies.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Bools, Floats, Ints
@@ -113,7 +113,8 @@ def _growth_at(window: Watched, begins: Ints, lag: int, shares: Floats) -> Float
     carried = np.zeros_like(threshold)  # part of the row after, as it falls to the averages here
     for row in range(lag, 0, -1):
         at = begins + row
-        way, weight = window.way_s[at], window.weight[at]
+        way = window.way_s[at]
+        weight = window.weight[at]
         raw = shares[row - 1, 0]
         total += way * raw * (window.most_mps[at] if raw > 0.0 else window.least_mps[at])
         part = shares[row - 1, 1:] * way[:, None] / weight

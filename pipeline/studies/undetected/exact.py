@@ -83,19 +83,23 @@ def _program(window: Watched, margin: float) -> _Program:
     """A_i - (1-w) A_(i-1) - w y_i = 0 for each average, and f_i - f_(i-1) - way (y_i - u_i) - unseen_i = 0."""
     from scipy import sparse
 
-    count, averages = window.rows - 1, window.weight.shape[1]
-    seen, one = ~window.fresh[1:], sparse.identity(count)
+    count = window.rows - 1
+    averages = window.weight.shape[1]
+    seen = ~window.fresh[1:]
+    one = sparse.identity(count)
     scale = np.maximum(np.maximum(np.abs(window.most_mps), np.abs(window.least_mps)), 1e-9)[1:]
     limits = np.where(np.isfinite(window.threshold_mps), window.threshold_mps, 1e6) * (1.0 - margin)
     # Blocks of the matrix: an equation each, over y, each average, the fault and the unseen growth.
     blocks: list[list[sparse.spmatrix | None]] = []
     right: list[Floats] = []
     for average in range(averages):
-        limit, weight = limits[:, average], np.where(seen, window.weight[1:, average], 0.0)
+        limit = limits[:, average]
+        weight = np.where(seen, window.weight[1:, average], 0.0)
         keep = np.where(seen, 1.0 - window.weight[1:, average], 0.0)
         carried = sparse.diags(keep[1:] * limit[1:-1] / limit[2:], -1, shape=(count, count))
         row: list[sparse.spmatrix | None] = [None] * (averages + 3)
-        row[0], row[1 + average] = sparse.diags(-weight * scale / limit[1:]), one - carried
+        row[0] = sparse.diags(-weight * scale / limit[1:])
+        row[1 + average] = one - carried
         blocks.append(row)
         begin = np.zeros(count)
         begin[0] = keep[0] * window.average_mps[0, average] / limit[1]
@@ -106,7 +110,8 @@ def _program(window: Watched, margin: float) -> _Program:
     right.append(way_s * window.rate_mps[1:])
     order = np.arange((averages + 3) * count).reshape(-1, count).T.ravel()
     relinks, relink_bounds = _relinks(window, averages + 1)
-    inside, most = 1.0 - margin, (window.learned_m + np.where(window.fresh, window.fastest_m, 0.0))[1:]
+    inside = 1.0 - margin
+    most = (window.learned_m + np.where(window.fresh, window.fastest_m, 0.0))[1:]
     ones = [np.ones(count)] * averages
     low, high = (
         np.array(
@@ -152,7 +157,9 @@ def _relinks(window: Watched, before: int) -> tuple[sparse.csc_matrix | None, Fl
 
 def _binding(window: Watched, program: _Program, solution: Floats) -> tuple[int, ...]:
     """Which bounds the profile reaches, by how many rows do."""
-    low, high, averages = program.low, program.high, window.weight.shape[1]
+    low = program.low
+    high = program.high
+    averages = window.weight.shape[1]
     margin = MARGIN * np.maximum(1.0, np.abs(np.where(np.isfinite(low) & np.isfinite(high), high, 1.0)))
     reached = ((solution >= high - margin) | (solution <= low + margin)).reshape(window.rows - 1, -1)
     counts = {which: int((reached[:, which] & ~window.fresh[1:]).sum()) for which in range(averages + 1)}

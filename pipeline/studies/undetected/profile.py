@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.studies.undetected.columns import Diagnosis, rows_of, rows_of_passages
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.exact import MARGIN, largest_profile
-from pipeline.studies.undetected.shapes import largest_of_shape
+from pipeline.studies.undetected.steps_and_ramps import largest_of_shape
 from pipeline.studies.undetected.watched import windows
 from schemas.arrays import NS_PER_S, ints, times_ns
 from schemas.config import Configuration, Vehicle
@@ -38,7 +38,8 @@ class Profile:
 
 def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle, config: Configuration) -> Profile:
     """The largest unnoticed fault at an epoch, ahead or behind in the direction of travel there."""
-    rows, t_ns = rows_of(diagnosis, vehicle, config), times_ns(diagnosis.epochs)
+    rows = rows_of(diagnosis, vehicle, config)
+    t_ns = times_ns(diagnosis.epochs)
     row = int(np.searchsorted(rows.epoch, epoch))
     window = next((one for one in windows(rows, t_ns, diagnosis.fixes_ns) if one.start < row <= one.end), None)
     if window is None or row >= rows.rows or rows.epoch[row] != epoch:
@@ -75,7 +76,8 @@ def epoch_of(
     at_s: float | None,
 ) -> int:
     """The epoch that is asked for: of the first passage of a balise, the last one up to a time, or the last one."""
-    rows, t_ns = rows_of(diagnosis, vehicle, config), times_ns(diagnosis.epochs)
+    rows = rows_of(diagnosis, vehicle, config)
+    t_ns = times_ns(diagnosis.epochs)
     if balise is None:
         stamps = t_ns[rows.epoch]
         latest = stamps[-1:].sum() if at_s is None else t_ns[0] + round(at_s * NS_PER_S)

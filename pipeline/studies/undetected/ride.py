@@ -9,13 +9,15 @@ from pipeline.studies.undetected.watched import fixes_ns
 
 def unnoticed_of(ride: Ride) -> Undetected:
     """The largest error at each epoch and passage of a ride that no monitor would have noticed."""
-    prepared, lds = ride.prepared, ride.lds
+    prepared = ride.prepared
+    lds = ride.lds
     return undetected_of(diagnosis_of(ride), lds.passages, lds.crossings, prepared.vehicle, prepared.config)
 
 
 def diagnosis_of(ride: Ride) -> Diagnosis:
     """What watched the solution of a ride."""
-    run, config = ride.prepared.run, ride.prepared.config
+    run = ride.prepared.run
+    config = ride.prepared.config
     return Diagnosis(
         epochs=ride.solution.epochs,
         bank=ride.bank.along(),

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.studies.undetected.error import Errors, largest_errors, splits_after
 from pipeline.studies.undetected.figures import Spacing
-from pipeline.studies.undetected.shares import growth_with, splits_of
+from pipeline.studies.undetected.splits import growth_with, splits_of
 from pipeline.studies.undetected.stretch import stretch_after
 from pipeline.studies.undetected.watched import Watched
 from schemas.arrays import Floats
@@ -28,7 +28,8 @@ def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tupl
     if rows.rows < 2:
         return Spacing(), np.full(rows.rows, np.nan)
     step_s = config.undetected.spacing_step_s
-    both, grow = (rows, rows.mirrored()), partial(growth_with, splits=splits_anywhere(rows))
+    both = (rows, rows.mirrored())
+    grow = partial(growth_with, splits=splits_anywhere(rows))
     errors = partial(largest_errors, config=config.undetected, grow=grow, after=splits_after(rows, config.undetected))
     search = partial(_first_beyond, both, errors=errors, limit_m=config.hazards.failure_limit_m, ahead_s=step_s)
     starts = np.unique(np.searchsorted(rows.t_s, np.arange(rows.t_s[0], rows.t_s[-1], step_s))).tolist()

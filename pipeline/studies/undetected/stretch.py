@@ -46,8 +46,10 @@ class Stretch:
 
 def stretch_after(rows: Watched, start: int, end: int, known: bool) -> Stretch:
     """The rows (start, end]; without `known` the averages at the start are only known to have been silent."""
-    averages, silent = rows.average_mps[start], rows.threshold_mps[start]
-    nothing, seen = np.zeros_like(averages), rows.between(start + 1, end + 1)
+    averages = rows.average_mps[start]
+    silent = rows.threshold_mps[start]
+    nothing = np.zeros_like(averages)
+    seen = rows.between(start + 1, end + 1)
     if known or rows.fresh[start]:
         return Stretch(seen, averages, nothing)
     return Stretch(seen, nothing, silent)

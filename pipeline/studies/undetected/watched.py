@@ -97,7 +97,9 @@ class Watched:
         window = self.between(start, end + 1)
         if window.rows < 2 or fix_s <= window.t_s[0]:
             return window
-        fastest, least, most = window.fastest_m.copy(), window.least_mps.copy(), window.most_mps.copy()
+        fastest = window.fastest_m.copy()
+        least = window.least_mps.copy()
+        most = window.most_mps.copy()
         fastest[1] *= (window.t_s[1] - fix_s) / (window.t_s[1] - window.t_s[0])
         change_mps = fastest[1] / window.way_s[1]
         least[1] = max(least[1], window.rate_mps[1] - change_mps)
@@ -121,7 +123,8 @@ def watched(
     fresh = series.fresh[kept] | (np.diff(kept, prepend=-1) != 1)
     fastest_m = config.undetected.max_rate_mps * np.diff(t_s, prepend=t_s[:1])
     way_s = series.dt_s[kept] / _share_seen(epochs, epoch, config.undetected.hidden_share)
-    rate, threshold = series.rate_mps[kept], _thresholds(bank, epoch, config.undetected.max_rate_mps)
+    rate = series.rate_mps[kept]
+    threshold = _thresholds(bank, epoch, config.undetected.max_rate_mps)
     alphas = np.array(config.monitors.ewma_alphas)[bank.enabled[1:]]
     learned_m, learned_late_m = _learned(epochs, epoch, vehicle, config)
     rows = Watched(
@@ -181,14 +184,19 @@ def _learned(epochs: pl.DataFrame, epoch: Ints, vehicle: Vehicle, config: Config
         scale = factor * config.align.scale_prior_sigma + np.abs(floats(epochs, "odometer_scale")[epoch] - 1.0)
     if vehicle.gnss_latency_s is None:
         late_s = factor * config.align.latency_prior_sigma_s + np.abs(floats(epochs, "latency_s")[epoch])
-    odometer_m, speed_mps = floats(epochs, "odometer_m")[epoch], np.abs(floats(epochs, "speed_mps")[epoch])
+    odometer_m = floats(epochs, "odometer_m")[epoch]
+    speed_mps = np.abs(floats(epochs, "speed_mps")[epoch])
     return scale * np.abs(np.diff(odometer_m, prepend=odometer_m[:1])), late_s * speed_mps
 
 
 def _with_relinks(rows: Watched, held: tuple[Held, ...]) -> Watched:
     """Re-links that held: fault here minus fault at the anchor (none at a telegram) within the bound as recorded."""
-    anchor, low, high = rows.anchor.copy(), rows.low_m.copy(), rows.high_m.copy()
-    held_low, held_high, free = rows.held_low_m.copy(), rows.held_high_m.copy(), rows.free.copy()
+    anchor = rows.anchor.copy()
+    low = rows.low_m.copy()
+    high = rows.high_m.copy()
+    held_low = rows.held_low_m.copy()
+    held_high = rows.held_high_m.copy()
+    free = rows.free.copy()
     for one in held:
         row = int(np.searchsorted(rows.epoch, one.epoch))
         if row >= rows.rows or rows.epoch[row] != one.epoch:
@@ -196,11 +204,13 @@ def _with_relinks(rows: Watched, held: tuple[Held, ...]) -> Watched:
         late_m = rows.learned_late_m[row]
         bounds = -one.bound_m - one.moved_m - late_m, one.bound_m - one.moved_m + late_m
         if one.anchor_epoch is None:
-            low[row], high[row] = max(low[row], bounds[0]), min(high[row], bounds[1])
+            low[row] = max(low[row], bounds[0])
+            high[row] = min(high[row], bounds[1])
         else:
             anchor[row] = int(np.searchsorted(rows.epoch, one.anchor_epoch))
             late_m = rows.learned_late_m[anchor[row]]
-            held_low[row], held_high[row] = bounds[0] - late_m, bounds[1] + late_m
+            held_low[row] = bounds[0] - late_m
+            held_high[row] = bounds[1] + late_m
         free[row] = not rows.fresh[row]
     return replace(rows, anchor=anchor, low_m=low, high_m=high, held_low_m=held_low, held_high_m=held_high, free=free)
 

@@ -10,6 +10,8 @@ from schemas.errors import InputError
 HEAD = "% program   : RTKLIB ver.2.4.3 b34\n% ref pos   :  50.000000000   4.000000000   100.0000\n%\n"
 LLH = "(lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)"
 PLANE = "latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m)  sdeu(m)  sdun(m) age(s)  ratio"
+DEGREES = PLANE.replace("(deg)", "(d'\")")
+BASELINE = "e-baseline(m) n-baseline(m) u-baseline(m) Q ns"
 END = "1   8   0.0100   0.0200   0.0300  -0.0050   0.0060   0.0000   1.00   50.0\n"
 
 
@@ -51,12 +53,6 @@ def test_deviations_are_variances_with_the_sign_of_their_covariance(row_of):
     assert found == pytest.approx([1e-4, 4e-4, 9e-4, -2.5e-5, 3.6e-5, 0.0], abs=1e-12)
 
 
-def test_degrees_minutes_and_seconds_keep_the_sign_of_no_degrees(row_of):
-    head = PLANE.replace("(deg)", "(d'\")")
-    row = row_of(f"% {LLH}\n%  GPST {head}\n", f"2021/03/19 13:00:00.000  50 30 36.00000  -0 15 18.00000 120.5 {END}")
-    assert (row["latitude_deg"], row["longitude_deg"]) == pytest.approx((50.51, -0.255), abs=1e-12)
-
-
 def test_earth_fixed_places_velocities_and_covariances_are_turned(row_of):
     """On the equator at 90 degrees east: x points west, y up, z north."""
     columns = "x-ecef(m) y-ecef(m) z-ecef(m) Q ns sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m) age(s) ratio"
@@ -68,17 +64,6 @@ def test_earth_fixed_places_velocities_and_covariances_are_turned(row_of):
     found = [row[f"cov_{axes}_m2"] for axes in ("ee", "nn", "uu", "eu", "en", "nu")]
     assert found == pytest.approx([1, 9, 4, -0.25, 0.49, 0], abs=1e-9)
     assert row["fix"] == "rtk_float"
-
-
-def test_baselines_start_at_the_reference_of_the_header(row_of):
-    columns = "e-baseline(m) n-baseline(m) u-baseline(m) Q ns sde(m) sdn(m) sdu(m) sden(m) sdnu(m) sdue(m) age(s) ratio"
-    line = f"2021/03/19 13:00:00.000 1000.0 2000.0 5.0 {END}"
-    row = row_of(f"% (e/n/u-baseline=WGS84)\n%  GPST {columns}\n", line)
-    # One minute of latitude is 1853.5 m here, one degree of longitude 71.696 km: WGS 84 at 50 degrees.
-    assert row["latitude_deg"] == pytest.approx(50 + 2000 / 111_229.0, abs=2e-6)
-    assert row["longitude_deg"] == pytest.approx(4 + 1000 / 71_696.0, abs=1e-5)
-    assert row["height_m"] == pytest.approx(105.0 + (1000**2 + 2000**2) / 2 / 6.38e6, abs=0.01)
-    assert row["cov_en_m2"] == pytest.approx(-2.5e-5)
 
 
 def test_a_height_over_the_geoid_is_none_over_the_ellipsoid(row_of):
@@ -96,6 +81,8 @@ def test_a_height_over_the_geoid_is_none_over_the_ellipsoid(row_of):
         ([f"%  GPST {PLANE}\n", f"2021/03/19 13:00:00.000 50.5 4.5 120.5 9{END[1:]}"], "column Q: holds a quality"),
         (["% (WGS84->Tokyo)\n", f"%  GPST {PLANE}\n", f"2021/03/19 13:00:00.000 50 4 1 {END}"], "Tokyo datum"),
         ([f"%  GPST {PLANE}\n"], "holds no epoch"),
+        ([f"%  GPST {DEGREES}\n", f"2021/03/19 13:00:00.000 50 30 36 -0 15 18 9 {END}"], "out-degform = deg"),
+        ([f"%  GPST {BASELINE}\n", "2021/03/19 13:00:00.000 1000.0 2000.0 5.0 1 8\n"], "out-solformat = llh"),
     ],
 )
 def test_what_the_header_does_not_explain_is_refused(row_of, lines, message):

@@ -119,6 +119,12 @@ def test_packed_logs_and_damaged_archives(tmp_path):
     (tmp_path / "c.gz").write_bytes(gzip.compress(bestposa())[:40])
     with pytest.raises(InputError, match=r"c\.gz: cannot be unpacked"):
         convert([tmp_path / "c.gz"], "r")
+    with zipfile.ZipFile(tmp_path / "d.zip", "w") as archive:
+        archive.writestr("d.gps", bestposa())
+        with pytest.warns(UserWarning, match="Duplicate name"):
+            archive.writestr("d.gps", bestposa(506713.0))
+    with pytest.raises(InputError, match="two of its files have the same name"):
+        convert([tmp_path / "d.zip"], "r")
 
 
 def sentence(body: str) -> bytes:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pipeline.read.ingest.generic import UndecodableError, decode_columns, parse_json
 from pipeline.read.ingest.json_columns import JsonDecoder
 from pipeline.read.ingest.mcap_block import Messages
-from pipeline.read.ingest.mcap_model import Channel
+from pipeline.read.ingest.mcap_records import Channel
 from schemas.errors import InputError
 
 CHANNEL = Channel(1, "/x", "json", None, "x.mcap")

@@ -264,3 +264,12 @@ def test_recorders_of_different_hours_are_told_with_lines(trips: list[Trip]) -> 
     assert "shift_s = -7200.0" in report.lines()
     (inline,) = re.findall(r"ingest\.correct = .*\]", report.problems[0])
     assert tomllib.loads(inline)["ingest"]["correct"] == [{"stream": "odometer", "shift_s": -7200.0}]
+
+
+def test_two_counters_under_one_name_are_reported(trips: list[Trip]) -> None:
+    run = trips[0].run
+    assert run.odometer is not None
+    second = pl.when(pl.int_range(pl.len()) % 2 == 1).then(pl.col("distance_m") + 500.0).otherwise("distance_m")
+    found = _fit(run.with_streams(odometer=run.odometer.with_columns(distance_m=second)), trips[0].site)
+    (check,) = [check for check in found.misfits if Cause(MisfitCause.TWO_COUNTERS) in check.causes]
+    assert "leap to and fro by about 5" in check.found

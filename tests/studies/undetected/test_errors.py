@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.exact import largest_profile
-from pipeline.studies.undetected.shapes import Shape, largest_of_shape
-from pipeline.studies.undetected.shares import growth_with
 from pipeline.studies.undetected.spacing import largest_spacing, splits_anywhere
+from pipeline.studies.undetected.splits import growth_with
+from pipeline.studies.undetected.steps_and_ramps import Shape, largest_of_shape
 from pipeline.studies.undetected.stretch import paid_m, stretch_after
 from schemas.arrays import Floats
 from schemas.config import Configuration, UndetectedConfig

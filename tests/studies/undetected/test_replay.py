@@ -17,7 +17,7 @@ from datasets.trial import build_run, build_site
 from pipeline.one_run import replay, ride_alone
 from pipeline.studies.undetected.columns import Diagnosis, rows_of
 from pipeline.studies.undetected.error import largest_errors
-from pipeline.studies.undetected.levels import range_bounds
+from pipeline.studies.undetected.position_tests import range_bounds
 from pipeline.studies.undetected.ride import diagnosis_of
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, Vehicle

@@ -70,7 +70,8 @@ def range_bounds(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configu
     """
     from scipy.special import chdtri  # most replays have no ranges
 
-    low, high = np.full(epochs.height, -np.inf), np.full(epochs.height, np.inf)
+    low = np.full(epochs.height, -np.inf)
+    high = np.full(epochs.height, np.inf)
     for part in equations_of(epochs, satellites, config):
         tested = part.freedom > 0
         threshold = np.full(part.epoch.size, np.inf)
@@ -91,7 +92,8 @@ def _worst(part: Equations, threshold: Floats) -> tuple[Floats, Floats]:
     ends = [np.where(seen, (-linear + sign * root) / safe, sign * reach) for sign in (-1.0, 1.0)]
     # A range without any say in the position moves nothing, however wrong.
     moved = np.stack([np.where(np.abs(gain) > _UNSEEN, gain * end, 0.0) for end in ends])
-    low, high = moved.min(axis=(0, 2)), moved.max(axis=(0, 2))
+    low = moved.min(axis=(0, 2))
+    high = moved.max(axis=(0, 2))
     untested = ~np.isfinite(threshold)
     return np.where(untested, -np.inf, low), np.where(untested, np.inf, high)
 

@@ -35,15 +35,18 @@ class _Blocks(NamedTuple):
         edges = [0]
         while edges[-1] < rows:
             edges.append(min(edges[-1] + max(1, int(GROWTH * edges[-1])), rows))
-        first, end = np.array(edges[:-1]), np.array(edges[1:])
+        first = np.array(edges[:-1])
+        end = np.array(edges[1:])
         return cls(first, end - 1, np.repeat(np.arange(first.size), end - first))
 
     def lines(self, row: Ints) -> Floats:
         """What the shares at both ends of the blocks, two columns each, are at these rows: straight lines between."""
-        block, each = self.of_row[row], np.arange(row.size)
+        block = self.of_row[row]
+        each = np.arange(row.size)
         along = (row - self.first[block]) / np.maximum(self.last[block] - self.first[block], 1)
         found = np.zeros((row.size, 2 * self.first.size))
-        found[each, 2 * block], found[each, 2 * block + 1] = 1.0 - along, along
+        found[each, 2 * block] = 1.0 - along
+        found[each, 2 * block + 1] = along
         return found
 
 
@@ -52,13 +55,17 @@ def best_shares(stretch: Stretch) -> Floats:
     from scipy.linalg import block_diag  # most replays solve nothing
     from scipy.optimize import linprog
 
-    blocks, monitors = _Blocks.over(stretch.rows), 1 + stretch.seen.weight.shape[1]
+    blocks = _Blocks.over(stretch.rows)
+    monitors = 1 + stretch.seen.weight.shape[1]
     ends = 2 * blocks.first.size
     parts = [_raw(stretch, blocks), *(_average(stretch, blocks, one) for one in range(monitors - 1))]
-    costs, linear = np.concatenate([part.cost for part in parts]), np.concatenate([part.linear for part in parts])
-    gauge, each = max(float(costs.max()), 1e-12), np.eye(costs.size)
+    costs = np.concatenate([part.cost for part in parts])
+    linear = np.concatenate([part.linear for part in parts])
+    gauge = max(float(costs.max()), 1e-12)
+    each = np.eye(costs.size)
     # Each term is what it has above zero less what it has below; shares add up to one at both ends of each block.
-    whole, nothing = np.tile(np.eye(ends), monitors), np.zeros((ends, 2 * costs.size))
+    whole = np.tile(np.eye(ends), monitors)
+    nothing = np.zeros((ends, 2 * costs.size))
     found = linprog(
         np.concatenate([linear, costs, costs]) / gauge,
         A_eq=np.block([[block_diag(*(part.terms for part in parts)), -each, each], [whole, nothing]]),
@@ -97,10 +104,12 @@ def _average(stretch: Stretch, blocks: _Blocks, average: int) -> _Part:
     at, cost = _paid_at(blocks, _tested(stretch.seen.threshold_mps[:, average]))
     following = np.minimum(at + 1, stretch.rows - 1)
     terms = part[at, None] * blocks.lines(at) - after[at, None] * blocks.lines(following)
-    start, linear = np.eye(1, terms.shape[1]) * part[0] * (1.0 - weight[0]), np.zeros(terms.shape[1])
+    start = np.eye(1, terms.shape[1]) * part[0] * (1.0 - weight[0])
+    linear = np.zeros(terms.shape[1])
     linear -= start[0] * stretch.start_mps[average]
     if (free := stretch.start_free_mps[average]) > 0.0:
-        terms, cost = np.vstack([terms, start]), np.append(cost, free)
+        terms = np.vstack([terms, start])
+        cost = np.append(cost, free)
     return _Part(terms, cost, linear)
 
 
@@ -110,7 +119,8 @@ def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
     Payments inside a block run along a straight line: the mean of both ends stands for them.
     """
     inner = blocks.last > blocks.first
-    first, last = blocks.first[inner], blocks.last[inner]
+    first = blocks.first[inner]
+    last = blocks.last[inner]
     half = 0.5 * (np.add.reduceat(threshold, blocks.first)[inner] - threshold[last])
     return np.concatenate([first, last - 1, blocks.last]), np.concatenate([half, half, threshold[blocks.last]])
 
@@ -147,7 +157,8 @@ def growth_with(stretch: Stretch, splits: Iterable[Floats]) -> Growth:
         bills = paid_m(part, shares[: part.rows])
         total = bills.sum(axis=1)
         better = np.flatnonzero(total < most[: total.size])
-        most[better], paid[better] = total[better], bills[better]
+        most[better] = total[better]
+        paid[better] = bills[better]
     return Growth(most - stretch.recorded_m, paid)
 
 
