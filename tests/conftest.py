@@ -61,7 +61,7 @@ _SLOW = (
     "stages/lds/test_outages.py",
     "studies/line",
     "stages/matching/test_calibration.py",
-    "stages/matching/test_found_route.py",
+    "stages/matching/test_travelled_route.py",
     "stages/odometry/test_properties.py",
     "stages/odometry/test_quantisation.py",
     "studies/plausibility",

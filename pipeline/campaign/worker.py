@@ -63,7 +63,7 @@ def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
         site = with_route(site, job.route, job.config.site) if job.route else site
         tables = _replayed(job, run, site)
         if job.write_route:
-            _write_found_route(job, run, site)
+            _write_travelled_route(job, run, site)
     _write(job, tables, _metadata(job, log, worst(tables.runs)) | {"log_digest": run.input_digest})
     return _proved(job, log, outcome_of(job, tables.runs, tables.hazards, tables.passages))
 
@@ -141,15 +141,15 @@ def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
     return replay(run, site, job.vehicle, job.config)
 
 
-def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
+def _write_travelled_route(job: RunJob, run: RunLog, site: Site) -> None:
     """The route by the run's `primary` solution, or the first by name: all of them were on the same train."""
     # Imported here for the same reason.
-    from pipeline.stages.matching.found_route import found_route
+    from pipeline.stages.matching.travelled_route import travelled_route
     from pipeline.stages.prepare import prepare
 
     prepared = prepare(run, site, job.vehicle, job.config)
     match = prepared.match(prepared.run.main_solution())
-    route = found_route(match, job.config.matching.ambiguity_probability)
+    route = travelled_route(match, job.config.matching.ambiguity_probability)
     storage.write_bytes(job.write_route, route.write_csv().encode())
 
 

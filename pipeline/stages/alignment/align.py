@@ -164,7 +164,8 @@ def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float) -> Floats:
     valid = np.flatnonzero(np.isfinite(path_m))
     if valid.size < 2:
         return speed
-    t, x = t_s[valid], path_m[valid]
+    t = t_s[valid]
+    x = path_m[valid]
     before = np.searchsorted(t, t - window_s, side="right") - 1
     before = np.maximum(before, 0)
     span = t - t[before]

@@ -66,21 +66,27 @@ class _Learner:
         config: Configuration,
         learned: Estimates,
     ) -> None:
-        self._config, self._odometry, self._vehicle, self._learned = config, odometry, vehicle, learned
+        self._config = config
+        self._odometry = odometry
+        self._vehicle = vehicle
+        self._learned = learned
         self._jitter_s = jitter_s
         self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
         self._alphas = np.array(config.monitors.ewma_alphas)
-        self._factor, self._limit_m = config.monitors.threshold_factor, config.hazards.failure_limit_m
+        self._factor = config.monitors.threshold_factor
+        self._limit_m = config.hazards.failure_limit_m
         self._rule = RecoveryRule(config)
         # Latencies of five sigmas have to find a known distance too.
-        margin_ns, t_ns = round(5e9 * config.align.latency_prior_sigma_s), times_ns(positions)
+        margin_ns = round(5e9 * config.align.latency_prior_sigma_s)
+        t_ns = times_ns(positions)
         self._rows = np.flatnonzero(usable & odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns))
         self._path_m, self._calibrated_m, self._digits_m = (
             floats(positions, name)[self._rows] for name in ("along_m", "calibrated_along_m", "digits_along_m")
         )
         self._sigma_m = np.hypot(self._calibrated_m, self._digits_m)
         t_s = odometry.seconds(t_ns)
-        self._t_ns, self._t_s = t_ns[self._rows], t_s[self._rows]
+        self._t_ns = t_ns[self._rows]
+        self._t_s = t_s[self._rows]
         self._segment = odometry.segment_at_s(self._t_s)
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
@@ -89,7 +95,8 @@ class _Learner:
         self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
         self._outages = _gaps_before(self._t_s, t_s[usable], gap_s)
         if self._rows.size:
-            way_m, deadband_mps = odometry.travelled_at(self._t_ns), config.matching.deadband_mps
+            way_m = odometry.travelled_at(self._t_ns)
+            deadband_mps = config.matching.deadband_mps
             moving = under_way(self._t_s, way_m, deadband_mps, config.align.speed_window_s)
             series = self._series(0, self._rows.size, 0)
             self._meter = NoiseMeter(series, moving, config.monitors.noise_along_m, config)
@@ -121,8 +128,10 @@ class _Learner:
     def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
         """Learn block by block; returns the state in use at the first failing epoch, and its position."""
         bank: AxisState | None = None
-        use_from, joints = np.array([begin]), state.joint[None]
-        position, block = begin, FIRST_BLOCK
+        use_from = np.array([begin])
+        joints = state.joint[None]
+        position = begin
+        block = FIRST_BLOCK
         while position < self._rows.size:
             end = min(position + block, self._rows.size)
             current = _in_use(use_from, position)
@@ -140,7 +149,8 @@ class _Learner:
                 self._put(np.array([alarm]), held[None])
                 # Of what the block's last state has still to settle the alarm knows nothing: it may lie behind it.
                 return FilterState(held, self._times[alarm], state.origin_m), alarm
-            position, block = end, min(2 * block, BLOCK)
+            position = end
+            block = min(2 * block, BLOCK)
         return state, position
 
     def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Ints, Floats]:
@@ -224,10 +234,13 @@ class _Learner:
         """
         begin = position = alarm - 1  # the first position of all cannot fail
         bank: AxisState | None = None
-        away_m, failed_s, block = np.zeros(1), np.full(1, -np.inf), FIRST_BLOCK
+        away_m = np.zeros(1)
+        failed_s = np.full(1, -np.inf)
+        block = FIRST_BLOCK
         while position < self._rows.size:
             end = min(position + block, self._rows.size)
-            t_s, series = self._t_s[position:end], self._series(position, end, begin)
+            t_s = self._t_s[position:end]
+            series = self._series(position, end, begin)
             noise_m2 = self._meter.variance_m2(position, end)[:, :2]
             value, sigma, bank = run_axis(series, self._alphas[:1], bank, noise_m2)
             failing = ~(np.abs(value) <= self._factor * sigma).all(axis=1)
@@ -240,15 +253,18 @@ class _Learner:
             if back.size:
                 first = int(back[0])
                 return position + first, float(away_m[first] ** 2 + variance_m2[first])
-            position, block = end, min(2 * block, BLOCK)
+            position = end
+            block = min(2 * block, BLOCK)
         return self._rows.size, 0.0
 
     def _drift_m2(self, anchor: int, begin: int, end: int, scale_sigma: float) -> Floats:
         """By how much GNSS minus odometer moves from the anchor to these positions without a fault [m^2]."""
-        sigma_m, t_ns = self._sigma_m, self._t_ns
+        sigma_m = self._sigma_m
+        t_ns = self._t_ns
         way_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
         positions_m2 = sigma_m[anchor] ** 2 + sigma_m[begin:end] ** 2
-        elapsed_s, sigma_scale = self._t_s[begin:end] - self._t_s[anchor], self._vehicle.odometer_scale_sigma or 0.0
+        elapsed_s = self._t_s[begin:end] - self._t_s[anchor]
+        sigma_scale = self._vehicle.odometer_scale_sigma or 0.0
         return self._rule.variance_m2(positions_m2, elapsed_s, np.cumsum(way_m), max(scale_sigma, sigma_scale))
 
 

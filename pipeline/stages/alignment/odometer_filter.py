@@ -84,7 +84,8 @@ class FilterState(NamedTuple):
 
 def estimates_of(joints: Floats) -> Estimates:
     """Scale and latency of joint states, shape (..., states, states + 1)."""
-    means, deviations = joints[..., -1], np.sqrt(np.diagonal(joints, axis1=-2, axis2=-1))
+    means = joints[..., -1]
+    deviations = np.sqrt(np.diagonal(joints, axis1=-2, axis2=-1))
     return Estimates(1.0 + means[..., _SCALE], deviations[..., _SCALE], means[..., _LATENCY], deviations[..., _LATENCY])
 
 
@@ -120,7 +121,8 @@ class ScaleLatencyFilter:
 
         The offset may have moved by about `limit_m`, as far as the position shows, and as much again as it settles.
         """
-        joint, row = np.empty_like(state.joint), self._rows(np.array([sigma_m]))[0]
+        joint = np.empty_like(state.joint)
+        row = self._rows(np.array([sigma_m]))[0]
         left_m2 = self._unsettled_m2(state, t_s)
         self._predict(state.joint, _nanoseconds(t_s - state.t_s), state.unsettled_m2 - left_m2, joint)
         seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
@@ -140,7 +142,8 @@ class ScaleLatencyFilter:
     def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: float) -> Floats:
         """The joint state after each of these epochs, (epochs, states, states + 1)."""
         joints = np.empty((t_s.size, *state.joint.shape))
-        times_s, rows = t_s.tolist(), self._rows(sigma_m)
+        times_s = t_s.tolist()
+        rows = self._rows(sigma_m)
         steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
         unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / self.config.settling_tau_s)
         settled_m2 = (-np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
@@ -174,9 +177,11 @@ class ScaleLatencyFilter:
 
         Completes `row`. The distance was read at the mean of the latency, so its part of the miss is added.
         """
-        scale, latency_s = 1.0 + joint.item(_SCALE, -1), joint.item(_LATENCY, -1)
+        scale = 1.0 + joint.item(_SCALE, -1)
+        latency_s = joint.item(_LATENCY, -1)
         way_m, speed_mps = self._odometer_at(now_s - latency_s, origin_m)
-        row[_SCALE], row[_LATENCY] = way_m, -scale * speed_mps
+        row[_SCALE] = way_m
+        row[_LATENCY] = -scale * speed_mps
         seen: Floats = row.dot(joint)
         seen[-1] += way_m + scale * speed_mps * latency_s - place_m
         return seen, speed_mps
@@ -192,7 +197,8 @@ class ScaleLatencyFilter:
 
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
         """Way from the origin [m] and speed [m/s], as `Odometry.reading_at_s` of one instant, several times faster."""
-        times_s, span_s = self.odometry.t_s, self.config.latency_span_s
+        times_s = self.odometry.t_s
+        span_s = self.config.latency_span_s
         begin_s, end_s = max(at_s - span_s, times_s.item(0)), min(at_s + span_s, times_s.item(-1))
         before, distance, after = np.interp((begin_s, at_s, end_s), times_s, self.odometry.distance_m).tolist()
         return distance - origin_m, (after - before) / (end_s - begin_s)

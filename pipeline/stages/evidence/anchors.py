@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.evidence.carrying import Anchor, Counter
 from pipeline.stages.evidence.clock import Clock, Lag, lag_of
-from pipeline.stages.reference import ReferencePath, Stretch
+from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
 from pipeline.stages.track.survey import Track
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
@@ -77,7 +77,7 @@ class KnownStretch:
 class Sided:
     """A stretch with the sense of its first path: metres that the odometer counted with it and against it."""
 
-    stretch: Stretch
+    stretch: ReferenceStretch
     sense: int
     with_m: float
     against_m: float
@@ -90,7 +90,7 @@ class Sided:
         return 2 * int(element[0]) + int(sense[0] * self.sense < 0)
 
 
-def sided(stretch: Stretch, counter: Counter | None, least_m: float) -> Sided:
+def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) -> Sided:
     """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
     path = stretch.paths[0]
     rows = _every(stretch.t_ns, 1.0)

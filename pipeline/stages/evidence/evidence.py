@@ -22,7 +22,7 @@ from pipeline.stages.evidence.carrying import Anchor, Counter, Interval, between
 from pipeline.stages.evidence.clock import Clock, Lag, clock_of, lag_of
 from pipeline.stages.evidence.gaps import Gap, Way, gaps_of, unreachable, without_sign
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.reference import Stretch
+from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import Route
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
@@ -247,7 +247,7 @@ def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
 
 
 def evidence_of(
-    reference: tuple[Sequence[Stretch], Sequence[Span]],
+    reference: tuple[Sequence[ReferenceStretch], Sequence[Span]],
     reads: pl.DataFrame | None,
     balises: pl.DataFrame | None,
     odometers: Sequence[Odometry],

@@ -152,8 +152,11 @@ def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tu
 
 
 def _crossing(journey: Journey, balise: Balise, before: int, k: int, sense: int) -> Crossing:
-    near, share = bool(journey.t_ns[k] - journey.t_ns[before] <= journey.gap_ns), 1.0
-    t_ns, path_m, odometer_m = journey.t_ns, journey.path_m, journey.odometer_m
+    near = bool(journey.t_ns[k] - journey.t_ns[before] <= journey.gap_ns)
+    share = 1.0
+    t_ns = journey.t_ns
+    path_m = journey.path_m
+    odometer_m = journey.odometer_m
     if near:
         share = float((balise.path_m - path_m[before]) / (path_m[k] - path_m[before]))
     direction = int(journey.direction[k])
@@ -232,7 +235,8 @@ def _read(
     before_m = None if last is None or journey.segment[last.before] != journey.segment[before] else last.odometer_m
     if last is not None and before_m is not None and odometer_m is not None:
         here_m = last.balise.path_m + odometer_m - before_m
-    leg, direction = int(journey.leg[epoch]), int(journey.direction[epoch])
+    leg = int(journey.leg[epoch])
+    direction = int(journey.direction[epoch])
     since_m = float(journey.odometer_m[epoch]) - (np.nan if odometer_m is None else odometer_m)
     return Crossing(
         balise=min(places, key=lambda balise: (balise.leg != leg, abs(balise.path_m - here_m))),

@@ -26,7 +26,8 @@ class BaliseDetection:
         crossings: Sequence[Crossing],
         config: Configuration,
     ) -> None:
-        self._journey, self._config = journey, config
+        self._journey = journey
+        self._config = config
         self._at: dict[BaliseKind, dict[int, list[Crossing]]] = {kind: {} for kind in BaliseKind}
         for crossing in crossings:
             self._at[crossing.balise.kind].setdefault(crossing.epoch, []).append(crossing)
@@ -140,7 +141,8 @@ class Disarmed:
     """
 
     def __init__(self, journey: Journey, config: LdsConfig) -> None:
-        self._journey, self._config = journey, config
+        self._journey = journey
+        self._config = config
         self._at: dict[str, tuple[Balise, float]] = {}
 
     def __bool__(self) -> bool:

@@ -77,7 +77,8 @@ class LinkDistance:
     """
 
     def __init__(self, journey: Journey, config: Configuration) -> None:
-        self._journey, self._config = journey, config.lds
+        self._journey = journey
+        self._config = config.lds
         self._factor = config.monitors.threshold_factor
         reasons = _distance_reasons(journey, "link_distance" in config.monitors.disabled)
         self._possible: Bools = reasons.is_null().to_numpy()
@@ -92,7 +93,8 @@ class LinkDistance:
 
     def measure_from(self, anchor: Anchor | None, k: int) -> None:
         """From epoch `k` on the distance counts from this anchor."""
-        self._anchor, self._done = anchor, k
+        self._anchor = anchor
+        self._done = k
 
     def hold_to(self, k: int, moved_m: Floats, bound_m: Floats) -> None:
         """From epoch `k` on the position is held to the re-link anchor, for as long as these are; then measure anew."""
@@ -106,7 +108,8 @@ class LinkDistance:
 
     def can_measure(self, k: int) -> bool:
         """What the distance counts from is in the same continuity segment of the odometer as this epoch."""
-        return self._anchor is not None and self._anchor.segment == self._journey.segment[k]
+        segment = self._journey.segment
+        return self._anchor is not None and bool(segment[self._anchor.epoch] == segment[k])
 
     def fails(self, k: int) -> bool:
         if self._anchor is None:
@@ -132,7 +135,7 @@ class LinkDistance:
         way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
         noise_m = self._factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
         threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
-        lost = self._possible[ahead] & (self._journey.segment[ahead] != anchor.segment)
+        lost = self._possible[ahead] & (self._journey.segment[ahead] != self._journey.segment[anchor.epoch])
         known = self._possible[ahead] & ~lost
         moved_m, bound_m = self._since_return[:, ahead]
         held = known & np.isfinite(moved_m)
@@ -172,14 +175,15 @@ def _order_reasons(journey: Journey, disabled: bool) -> pl.Series:
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
     before[known[1:]] = known[:-1]
-    odometer, ambiguous, sigma = np.isfinite(journey.odometer_m), journey.ambiguous, np.isfinite(journey.sigma_m)
+    odometer = np.isfinite(journey.odometer_m)
+    sigma = np.isfinite(journey.sigma_m)
     return first_reason(
         (np.full(before.size, disabled), DISABLED),
         (~odometer, NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
         (before < 0, FIRST_EPOCH),
         (~odometer[before], NO_ODOMETER),
-        (ambiguous | ambiguous[before], AMBIGUOUS),
+        (journey.ambiguous | journey.ambiguous[before], AMBIGUOUS),
         (~(sigma & sigma[before]), NO_SIGMA),
     )
 

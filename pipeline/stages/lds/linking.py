@@ -80,7 +80,8 @@ class LinkingChain:
         self._direction = 1
         self._leg: int | None = None
         self._turn: _Turn | None = None
-        self._ahead, self._next = _Announced([], 1), 0
+        self._ahead = _Announced([], 1)
+        self._next = 0
         self._optional: set[str] = set()
         self._missed_in_a_row = 0
         self.closing_m = float("inf")
@@ -116,7 +117,8 @@ class LinkingChain:
         """The train goes the other way from this epoch on, or on another leg: expect what lies on its new way."""
         if self.reference is None or not self.linking:
             return
-        self._direction, self._leg = int(journey.direction[k]), int(journey.leg[k])
+        self._direction = int(journey.direction[k])
+        self._leg = int(journey.leg[k])
         travelled_m = float(journey.travelled_m[k]) - self.reference.travelled_m
         self._turn = _Turn(self._distance_m(float(journey.odometer_m[k])), travelled_m)
         for kept in (self._own, self._set_aside, self._unoffered):
@@ -149,7 +151,8 @@ class LinkingChain:
             passage.status = PassageStatus.ACCEPTED
         else:
             self._judge(passage, distance_m)
-        crossing.offered, crossing.status = True, passage.status
+        crossing.offered = True
+        crossing.status = passage.status
         accepted = passage.status is PassageStatus.ACCEPTED
         if accepted:
             self._refer_to(crossing)
@@ -258,7 +261,9 @@ class LinkingChain:
         """An accepted balise becomes the reference; what lies beyond it is expected next."""
         balise = crossing.balise
         self.reference = Reference(balise, crossing.odometer_m, crossing.travelled_m)
-        self._direction, self._leg, self._turn = crossing.direction, balise.leg, None
+        self._direction = crossing.direction
+        self._leg = balise.leg
+        self._turn = None
         self._missed_in_a_row = 0
         self._optional = set()
         self._own.pop(balise.balise_id, None)
@@ -267,7 +272,8 @@ class LinkingChain:
 
     def _in_order_of_travel(self) -> _Announced:
         """Balises of the leg that are valid in the direction of travel."""
-        leg, direction = self._leg, self._direction
+        leg = self._leg
+        direction = self._direction
         if (leg, direction) not in self._ways:
             valid = [balise for balise in self._linked if balise.leg == leg and balise.is_valid(direction)]
             self._ways[leg, direction] = _Announced(valid[::direction], direction)
@@ -275,7 +281,8 @@ class LinkingChain:
 
     def _expect(self, announced: _Announced, first: int) -> None:
         """From now on these balises are expected, from the place `first` on."""
-        self._ahead, self._next = announced, first
+        self._ahead = announced
+        self._next = first
         self.closing_m = float("inf")
         if first < len(announced.balises) and self.reference is not None and self.reference.odometer_m is not None:
             start_m = self.reference.odometer_m * self._direction
@@ -292,7 +299,8 @@ class LinkingChain:
             self._set_aside.pop(name, None)
             if forward:
                 self._own[name] = passage
-        passage.crossing, passage.t_ns = crossing, crossing.t_ns
+        passage.crossing = crossing
+        passage.t_ns = crossing.t_ns
         return passage
 
     def _new_passage(self, balise: Balise, t_ns: int, direction: int) -> Passage:

@@ -62,7 +62,9 @@ class LocationSystem:
         crossings: Sequence[Crossing],
         config: Configuration,
     ) -> None:
-        self._journey, self._bank, self._config = journey, bank, config
+        self._journey = journey
+        self._bank = bank
+        self._config = config
         self.balises = BaliseDetection(journey, balises, crossings, config)
         self.distance = LinkDistance(journey, config)
         self.lrvb_changes = [LrvbChange(0, None, chain_begun=False)]
@@ -82,6 +84,7 @@ class LocationSystem:
         self._use = Use.IN_USE
         self._since = 0  # the epoch from which the position is slipped or unseen
         self._recovery = Recovery(journey, bank, config)
+        self._hold_to_ns: int | None = None  # since the first return after an alarm of the bank
         self._validated = False  # a VB or a TVB
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
         self._consistent_since_ns: int | None = None
@@ -169,14 +172,17 @@ class LocationSystem:
         if self._journey.slips[k]:
             self._consistent_since_ns = None
             if self._use in (Use.IN_USE, Use.UNSEEN) and self._validated:
-                self._use, self._since = Use.SLIPPED, k
+                self._use = Use.SLIPPED
+                self._since = k
         elif self._use is Use.SLIPPED:
             self._relink_after_slip(k)
         if self._use is Use.IN_USE and not self._bank.noise_known_at(k):
-            self._use, self._since = Use.UNSEEN, k
+            self._use = Use.UNSEEN
+            self._since = k
         if self._use in (Use.IN_USE, Use.UNSEEN) and k in self._after_outages:
             # The last epoch that lies farther back than the bank bridges: there is one before an outage.
-            self._use, self._since = Use.UNSEEN, bisect_left(self._t_ns, self._t_ns[k] - self._bridged_ns) - 1
+            self._use = Use.UNSEEN
+            self._since = bisect_left(self._t_ns, self._t_ns[k] - self._bridged_ns) - 1
         if self._use is Use.UNSEEN and self._bank.noise_known_at(k) and self._can_return(k):
             self._relink_unseen(k)
 
@@ -227,7 +233,10 @@ class LocationSystem:
         return True
 
     def _negate(self, k: int) -> None:
-        self._relink.note_alarm(k, self._bank.failing_memory_s(k))
+        # A jump fails the slow averages too: how old a drift may be is said by them where they fail alone.
+        self._relink.note_alarm(k, 0.0 if self._bank.fast_failed(k) else self._bank.failing_memory_s(k))
+        if self._bank.failed(k):
+            self._hold_to_ns = None
         self._bank.freeze(k)
         self._use = Use.NEGATED
         self._recovery.begin(k)
@@ -247,7 +256,9 @@ class LocationSystem:
             return
         self._return(k)
         # The bank begins anew: for the memory of its slowest average nothing else would see a slow drift go on.
-        end = bisect_right(self._t_ns, self._t_ns[k] + self._memory_ns)
+        if self._hold_to_ns is None:
+            self._hold_to_ns = self._t_ns[k] + self._memory_ns
+        end = max(bisect_right(self._t_ns, self._hold_to_ns), k)
         self.distance.hold_to(k, *self._relink.moved_m(anchor, k, end))
         self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
 

@@ -36,50 +36,22 @@ class Anchor:
     offset_m: float
     sigma_m: float
     travelled_m: float
-    segment: int
-    counter: int
-    slip_doubt_m: float
     is_read: bool = False
 
     @classmethod
     def at_epoch(cls, journey: Journey, k: int) -> Anchor:
         offset_m = float(journey.path_m[k] - journey.odometer_m[k])
-        return cls._at(journey, k, int(journey.t_ns[k]), offset_m, float(journey.sigma_m[k]), journey.travelled_m[k])
+        return cls(k, int(journey.t_ns[k]), offset_m, float(journey.sigma_m[k]), float(journey.travelled_m[k]))
 
     @classmethod
     def at_crossing(cls, journey: Journey, crossing: Crossing, sigma_m: float) -> Anchor | None:
         """The balise's own place against the odometer; None where that is not known, or its distance was lost there."""
-        k = crossing.epoch
-        whole = journey.segment[k] == journey.segment[crossing.before]
+        whole = journey.segment[crossing.epoch] == journey.segment[crossing.before]
         if crossing.odometer_m is None or not whole or not isfinite(crossing.travelled_m):
             return None
         offset_m = crossing.balise.path_m - crossing.odometer_m
         is_read = crossing.balise.kind is BaliseKind.PHYSICAL
-        return cls._at(journey, k, crossing.t_ns, offset_m, sigma_m, crossing.travelled_m, is_read=is_read)
-
-    @classmethod
-    def _at(
-        cls,
-        journey: Journey,
-        k: int,
-        t_ns: int,
-        offset_m: float,
-        sigma_m: float,
-        travelled_m: float,
-        *,
-        is_read: bool = False,
-    ) -> Anchor:
-        return cls(
-            epoch=k,
-            t_ns=t_ns,
-            offset_m=offset_m,
-            sigma_m=sigma_m,
-            travelled_m=float(travelled_m),
-            segment=int(journey.segment[k]),
-            counter=int(journey.counter[k]),
-            slip_doubt_m=float(journey.slip_doubt_m[k]),
-            is_read=is_read,
-        )
+        return cls(crossing.epoch, crossing.t_ns, offset_m, sigma_m, crossing.travelled_m, is_read)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +81,9 @@ class Relink:
     """The anchor of one solution, and the comparison with it. `tvb`: flags of the epochs, as far as they are known."""
 
     def __init__(self, journey: Journey, tvb: list[bool], config: Configuration) -> None:
-        self._journey, self._tvb, self._config = journey, tvb, config
+        self._journey = journey
+        self._tvb = tvb
+        self._config = config
         self._rule = RecoveryRule(config)
         self._fixed: Anchor | None = None  # by an alarm or a telegram
         self._alarmed = False
@@ -118,7 +92,9 @@ class Relink:
 
     def begin_mission(self, k: int) -> None:
         """What was before epoch `k` does not count."""
-        self._fixed, self._alarmed, self._mission_from = None, False, k
+        self._fixed = None
+        self._alarmed = False
+        self._mission_from = k
 
     def note_read(self, read: Crossing) -> None:
         """A telegram says where the train is."""
@@ -156,11 +132,11 @@ class Relink:
             return Comparison(reason=NotEvaluated.RELINK_OFF)
         if anchor is None:
             return Comparison(reason=NotEvaluated.RELINK_NO_ANCHOR)
-        if anchor.counter != self._journey.counter[k]:
+        if self._journey.counter[anchor.epoch] != self._journey.counter[k]:
             return Comparison(reason=NotEvaluated.RELINK_DISTANCE_LOST)
         if self._journey.scale_sigma is None and not (anchor.is_read and anchor.epoch == k):
             return Comparison(reason=NotEvaluated.RELINK_NO_VEHICLE)
-        doubt_m = float(self._journey.slip_doubt_m[k]) - anchor.slip_doubt_m
+        doubt_m = float(self._journey.slip_doubt_m[k] - self._journey.slip_doubt_m[anchor.epoch])
         if doubt_m > 0.5 * self._config.hazards.failure_limit_m:
             # Slip at each start counts too much each time, and would soon explain any fault.
             return Comparison(reason=NotEvaluated.RELINK_SLIPPED)
@@ -175,13 +151,16 @@ class Relink:
 
         NaN where the odometer lost its distance, or may have miscounted too much through slip.
         """
-        journey, at = self._journey, slice(k, end)
+        journey = self._journey
+        at = slice(k, end)
         moved_m = journey.path_m[at] - journey.odometer_m[at] - anchor.offset_m
-        waited_s, way_m = (journey.t_ns[at] - anchor.t_ns) / NS_PER_S, journey.travelled_m[at] - anchor.travelled_m
+        waited_s = (journey.t_ns[at] - anchor.t_ns) / NS_PER_S
+        way_m = journey.travelled_m[at] - anchor.travelled_m
         positions_m2 = anchor.sigma_m**2 + journey.sigma_m[at] ** 2
         bound_m = self._rule.bound_m(self._rule.variance_m2(positions_m2, waited_s, way_m, journey.scale_sigma or 0.0))
-        most_m, doubt_m = 0.5 * self._config.hazards.failure_limit_m, journey.slip_doubt_m[at] - anchor.slip_doubt_m
-        known = (journey.counter[at] == anchor.counter) & (doubt_m <= most_m)
+        most_m = 0.5 * self._config.hazards.failure_limit_m
+        doubt_m = journey.slip_doubt_m[at] - journey.slip_doubt_m[anchor.epoch]
+        known = (journey.counter[at] == journey.counter[anchor.epoch]) & (doubt_m <= most_m)
         return np.where(known, moved_m, np.nan), np.minimum(most_m, bound_m + doubt_m)
 
 
@@ -189,7 +168,9 @@ class Recovery:
     """Since when nothing has failed fast while the position is negated."""
 
     def __init__(self, journey: Journey, bank: MonitorBank, config: Configuration) -> None:
-        self._journey, self._bank, self._rule = journey, bank, RecoveryRule(config)
+        self._journey = journey
+        self._bank = bank
+        self._rule = RecoveryRule(config)
         self._failed_at_ns = self._seen_at_ns = 0
 
     def begin(self, k: int) -> None:

@@ -184,7 +184,9 @@ def passage_rows(
 
 
 def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:
-    balise, window, crossing = passage.balise, passage.window, passage.crossing
+    balise = passage.balise
+    window = passage.window
+    crossing = passage.crossing
     direction = journey.direction_at(passage.t_ns)
     return {
         "solution": solution,
@@ -228,5 +230,6 @@ def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
             part_m = passage.announced_odometer_m - journey.odometer_m[i]
             share = float(part_m / (journey.odometer_m[j] - journey.odometer_m[i]))
             return int(journey.t_ns[i]) + round(share * int(journey.t_ns[j] - journey.t_ns[i]))
-        end, size = end - rows.size + 1, 2 * size
+        end = end - rows.size + 1
+        size = 2 * size
     return None

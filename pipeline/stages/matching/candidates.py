@@ -106,9 +106,11 @@ def candidates_of(points: Points, network: Network, segments: Segments, reach_m:
     """For every point the nearest place on each element whose distance is within reach [m]."""
     tree = cKDTree(points.surface)
     pairs = tree.sparse_distance_matrix(segments.tree, reach_m + PROBE_SPACING_M, output_type="ndarray")
-    step, segment = pairs["i"].astype(np.int64), segments.probe_segment[pairs["j"]]
+    step = pairs["i"].astype(np.int64)
+    segment = segments.probe_segment[pairs["j"]]
     order = np.lexsort((pairs["v"], segments.element[segment], step))
-    step, segment = step[order], segment[order]
+    step = step[order]
+    segment = segment[order]
     element = segments.element[segment]
     fresh = np.ones(len(step), dtype=bool)
     fresh[1:] = (step[1:] != step[:-1]) | (element[1:] != element[:-1])
@@ -129,11 +131,14 @@ def overtaken(found: Candidates, network: Network) -> Bools:
     leaving = 2 * found.element[one] + 1 - end
     number = np.diff(edge_first)[leaving]
     edge = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number - edge_first[leaving], number)
-    one, end, entered = np.repeat(one, number), np.repeat(end, number), edge_to[edge]
+    one = np.repeat(one, number)
+    end = np.repeat(end, number)
+    entered = edge_to[edge]
     keys = found.step * network.count + found.element
     wanted = found.step[one] * network.count + entered // 2
     other = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    own_m, other_m = past_m[one, end], past_m[other, entered % 2]
+    own_m = past_m[one, end]
+    other_m = past_m[other, entered % 2]
     rival = (keys[other] == wanted) & (other != one)
     beyond = rival & (own_m > 0.0) & np.isinf(other_m)
     nearer = rival & ((other_m < own_m) | ((other_m == own_m) & (other < one)))

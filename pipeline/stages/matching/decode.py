@@ -6,14 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.stages.matching.trellis import Move, Trellis, best_moves
+from pipeline.stages.matching.moves import Move, best_moves
+from pipeline.stages.matching.trellis import Trellis
 from pipeline.stages.track.leg import Leg, Visit, leg_of, segments_at, shifted
 from pipeline.stages.track.network import Network
 from schemas.arrays import Floats, Ints
 
 
 @dataclass(frozen=True)
-class Chain:
+class LegElements:
     """Oriented elements of one leg, numbered on from `low`; numbers go on over legs that share an element.
 
     `shared` is the number of the element in common with the leg before; none at the start and where the
@@ -28,17 +29,17 @@ class Chain:
     def high(self) -> int:
         return self.low + len(self.oriented) - 1
 
-    def turned(self) -> Chain:
+    def turned(self) -> LegElements:
         """The same leg run the other way round."""
         around = tuple(one ^ 1 for one in reversed(self.oriented))
-        return Chain(around, -self.high, None if self.shared is None else -self.shared)
+        return LegElements(around, -self.high, None if self.shared is None else -self.shared)
 
 
 @dataclass(frozen=True)
 class Decoded:
     """Legs, and for each step its leg, element number in it and place from that element's entry [m]."""
 
-    chains: tuple[Chain, ...]
+    chains: tuple[LegElements, ...]
     leg: Ints
     number: Ints
     place_m: Floats
@@ -59,8 +60,9 @@ class Decoded:
 
 def decode(trellis: Trellis, best: Ints) -> Decoded:
     """Follow the best states over the network, elements without any fix included."""
-    oriented, place = trellis.oriented[best], trellis.place_m[best]
-    chains = [Chain((int(oriented[0]),), 0)]
+    oriented = trellis.oriented[best]
+    place = trellis.place_m[best]
+    chains = [LegElements((int(oriented[0]),), 0)]
     leg = np.zeros(len(best), dtype=np.int64)
     number = np.zeros(len(best), dtype=np.int64)
     at = 0
@@ -69,9 +71,12 @@ def decode(trellis: Trellis, best: Ints) -> Decoded:
     places = oriented[steps - 1], place[steps - 1], oriented[steps], place[steps]
     moves = best_moves(trellis.network, *places, trellis.ways.along(steps, places[0]), trellis.config)
     for step, move in zip(steps.tolist(), moves, strict=True):
-        leg[before:step], number[before:step], before = len(chains) - 1, at, step
+        leg[before:step] = len(chains) - 1
+        number[before:step] = at
+        before = step
         at = _follow(chains, at, move, int(oriented[step]))
-    leg[before:], number[before:] = len(chains) - 1, at
+    leg[before:] = len(chains) - 1
+    number[before:] = at
     return Decoded(tuple(chains), leg, number, place)
 
 
@@ -115,14 +120,15 @@ def aligned(trellis: Trellis, decoded: Decoded) -> Decoded:
     return decoded
 
 
-def _follow(chains: list[Chain], at: int, move: Move | None, other: int) -> int:
+def _follow(chains: list[LegElements], at: int, move: Move | None, other: int) -> int:
     """Extend the legs by one move; where the last leg does not lead there, begin a new one."""
     if move is None:
         number = chains[-1].high + 1
-        chains.append(Chain((other,), number))
+        chains.append(LegElements((other,), number))
         return number
     for oriented in (*move.between, other) if move.sense else ():
-        chain, number = chains[-1], at + move.sense
+        chain = chains[-1]
+        number = at + move.sense
         if not chain.low <= number <= chain.high:
             chains[-1] = _extended(chain, oriented, move.sense)
         elif chain.oriented[number - chain.low] != oriented:
@@ -131,18 +137,18 @@ def _follow(chains: list[Chain], at: int, move: Move | None, other: int) -> int:
     return at
 
 
-def _extended(chain: Chain, oriented: int, sense: int) -> Chain:
+def _extended(chain: LegElements, oriented: int, sense: int) -> LegElements:
     if sense > 0:
         return replace(chain, oriented=(*chain.oriented, oriented))
     return replace(chain, oriented=(oriented, *chain.oriented), low=chain.low - 1)
 
 
-def _branched(chain: Chain, at: int, oriented: int, sense: int) -> Chain:
+def _branched(chain: LegElements, at: int, oriented: int, sense: int) -> LegElements:
     """A new leg: the element the train is on and what lies behind it, then the other way on."""
     here = at - chain.low
     if sense > 0:
-        return Chain((*chain.oriented[: here + 1], oriented), chain.low, at)
-    return Chain((oriented, *chain.oriented[here:]), at - 1, at)
+        return LegElements((*chain.oriented[: here + 1], oriented), chain.low, at)
+    return LegElements((oriented, *chain.oriented[here:]), at - 1, at)
 
 
 def _next_break(decoded: Decoded, index: int) -> int:

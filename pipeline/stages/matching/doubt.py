@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.matching.fixes import Fixes
-from pipeline.stages.matching.search import Found
+from pipeline.stages.matching.search import Beliefs
 from pipeline.stages.matching.trellis import Trellis
 from pipeline.stages.track.leg import Leg
 from pipeline.stages.track.network import Network
@@ -19,7 +19,7 @@ from schemas.arrays import Bools, Floats, Ints, ints, spans_of
 from schemas.config import MatchingConfig
 
 # What ended a stretch of doubt: a balise read, a switch taken, positions (tracks that part, offsets), or nothing.
-TOLD_BY = ("read", "switch", "positions", "nothing")
+RESOLVED_BY = ("read", "switch", "positions", "nothing")
 AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "t_start": pl.Datetime("ns", "UTC"),
     "t_end": pl.Datetime("ns", "UTC"),
@@ -27,7 +27,7 @@ AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "other_netelement_id": pl.String,
     "gate_probability": pl.Float64,
     "path_probability": pl.Float64,
-    "told_by": pl.Enum(TOLD_BY),
+    "resolved_by": pl.Enum(RESOLVED_BY),
 }
 
 
@@ -40,22 +40,22 @@ class Doubt:
     other: Ints
 
 
-def doubt_of(trellis: Trellis, found: Found, legs: Sequence[Leg], leg: Ints, at_m: Floats) -> Doubt:
+def doubt_of(trellis: Trellis, beliefs: Beliefs, legs: Sequence[Leg], leg: Ints, at_m: Floats) -> Doubt:
     """Probability of all states that are on the path where the path is; `leg`, `at_m`: where that is at each step."""
     count = np.diff(trellis.first)
     step = np.repeat(np.arange(len(count)), count)
     own = _on_path(trellis, legs, leg, at_m, step)
-    other = np.where(own, -1.0, found.forward + found.posterior)
+    other = np.where(own, -1.0, beliefs.forward + beliefs.posterior)
     worst = np.lexsort((other, step))[trellis.first[1:] - 1]
     return Doubt(
-        posterior=_share(found.posterior * own, trellis.first),
-        gate=_share(found.forward * own, trellis.first),
+        posterior=_share(beliefs.posterior * own, trellis.first),
+        gate=_share(beliefs.forward * own, trellis.first),
         other=np.where(other[worst] >= 0, trellis.oriented[worst] // 2, -1),
     )
 
 
 def stretches(
-    fixes: Fixes, trellis: Trellis, found: Found, doubt: Doubt, pinned: Ints, config: MatchingConfig
+    fixes: Fixes, trellis: Trellis, beliefs: Beliefs, doubt: Doubt, pinned: Ints, config: MatchingConfig
 ) -> pl.DataFrame:
     """Stretches where the path is doubtful: believed at the time, or in hindsight, less than configured.
 
@@ -64,29 +64,30 @@ def stretches(
     `pinned`: per epoch the element that a balise read proves, -1 without one.
     """
     probability = np.minimum(doubt.posterior, doubt.gate)
-    epoch, ids = trellis.steps.epoch, trellis.network.track.ids
+    epoch = trellis.steps.epoch
+    ids = trellis.network.track.ids
     rows = []
     for begin, last in spans_of(probability < config.ambiguity_probability):
         end = last + 1
         worst = begin + int(np.argmin(probability[begin:end]))
         other = int(doubt.other[worst])
         until = int(epoch[end]) - 1 if end < len(trellis) else len(fixes) - 1
-        here = ids[int(trellis.oriented[found.best[worst]]) // 2]
+        here = ids[int(trellis.oriented[beliefs.best[worst]]) // 2]
         there = ids[other] if other >= 0 else None
         span = int(fixes.t_ns[epoch[begin]]), int(fixes.t_ns[until])
         least = float(doubt.gate[begin:end].min()), float(doubt.posterior[begin:end].min())
-        rows.append((*span, here, there, *least, _told_by(trellis, found, pinned, begin, end)))
+        rows.append((*span, here, there, *least, _resolved_by(trellis, beliefs, pinned, begin, end)))
     return pl.DataFrame(rows, schema=AMBIGUOUS_COLUMNS, orient="row")
 
 
-def _told_by(trellis: Trellis, found: Found, pinned: Ints, begin: int, end: int) -> str:
+def _resolved_by(trellis: Trellis, beliefs: Beliefs, pinned: Ints, begin: int, end: int) -> str:
     """What ended the doubt of steps `begin : end`; a switch is taken where the path had more than one way on."""
     if end >= len(trellis):
         return "nothing"
     epoch = trellis.steps.epoch
     if (pinned[int(epoch[end - 1]) + 1 : int(epoch[end]) + 1] >= 0).any():
         return "read"
-    way = trellis.oriented[found.best[max(begin - 1, 0) : end + 1]]
+    way = trellis.oriented[beliefs.best[max(begin - 1, 0) : end + 1]]
     passed = [(one, other) for one, other in itertools.pairwise(way.tolist()) if one != other]
     return "switch" if any(_over_switch(trellis.network, one, other) for one, other in passed) else "positions"
 
@@ -137,12 +138,12 @@ class Posterior:
     probability: Floats
 
 
-def posterior_of(trellis: Trellis, found: Found) -> Posterior:
+def posterior_of(trellis: Trellis, beliefs: Beliefs) -> Posterior:
     """Probability of each element at each step: of all its states together."""
     step = np.repeat(np.arange(len(trellis)), np.diff(trellis.first))
     count = trellis.network.count
     keys, inverse = np.unique(step * count + trellis.oriented // 2, return_inverse=True)
-    probability = np.asarray(np.bincount(inverse, found.posterior, len(keys)), dtype=np.float64)
+    probability = np.asarray(np.bincount(inverse, beliefs.posterior, len(keys)), dtype=np.float64)
     first = np.searchsorted(keys // count, np.arange(len(trellis) + 1))
     return Posterior(trellis.steps.epoch, first, (keys % count).astype(np.int64), probability)
 

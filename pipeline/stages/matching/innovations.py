@@ -53,9 +53,13 @@ def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats,
     are shifted to their median, by no more than it takes: a track that leads aside on its own moves no other. By the
     smallest error a crossover became the measure of both tracks, and lifted them by as much as it led aside.
     """
-    parted, limit, side, origin = parted_m.tolist(), tolerance_m.tolist(), sense.tolist(), before.tolist()
+    parted = parted_m.tolist()
+    limit = tolerance_m.tolist()
+    side = sense.tolist()
+    origin = before.tolist()
     errors = [0.0] * len(parted)
-    begins, kept = first.tolist(), keep.tolist()
+    begins = first.tolist()
+    kept = keep.tolist()
     for step in range(1, len(kept) if parted_m.any() else 0):
         rows = [row for row in range(begins[step], begins[step + 1]) if origin[row] >= 0]
         grown = [side[row] * errors[origin[row]] + parted[row] for row in rows]

@@ -188,7 +188,8 @@ def _height(fixes: Fixes, row: Ints, candidates: Candidates, survey_m2: Floats, 
 
     Tracks at one level differ by superelevation and errors of the survey, which say nothing of the train.
     """
-    begin, track_m = candidates.first[:-1], candidates.height_m
+    begin = candidates.first[:-1]
+    track_m = candidates.height_m
     apart_m = np.maximum.reduceat(track_m, begin) - np.minimum.reduceat(track_m, begin)
     above_m = fixes.height_m[row] - track_m
     variance = config.sigma_doubt**2 * fixes.cov_uu_m2[row] + survey_m2 + config.height_bias_sigma_m**2

@@ -9,8 +9,8 @@ import polars as pl
 
 from pipeline.stages.matching.doubt import Posterior, rivals_of
 from pipeline.stages.matching.epochs import epoch_frame
-from pipeline.stages.matching.find import find_path
 from pipeline.stages.matching.fixes import Fixes, digit_noise, fixes_of
+from pipeline.stages.matching.path_search import find_path
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import polarity
 from pipeline.stages.track.network import network_in_pieces

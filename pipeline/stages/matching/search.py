@@ -19,7 +19,7 @@ _NONE = -1e6
 
 
 @dataclass(frozen=True)
-class Found:
+class Beliefs:
     """Per state: probability from the steps up to its own, and from all; per step the best path's state."""
 
     forward: Floats
@@ -27,7 +27,7 @@ class Found:
     best: Ints
 
 
-def search(trellis: Trellis) -> Found:
+def search(trellis: Trellis) -> Beliefs:
     """How probable each state is at each step, and the most probable sequence.
 
     `forward` is causal: it uses nothing that a train would not know at that step.
@@ -47,7 +47,7 @@ def search(trellis: Trellis) -> Found:
         if origin is not None:
             place = int(origin[:, place].argmax())
             probability = origin @ probability
-    return Found(forward, posterior, best)
+    return Beliefs(forward, posterior, best)
 
 
 def _forward(trellis: Trellis, begins: Ints, ends: Ints) -> tuple[Floats, list[Floats]]:
@@ -62,9 +62,9 @@ def _forward(trellis: Trellis, begins: Ints, ends: Ints) -> tuple[Floats, list[F
     for numbers in trellis.batches():
         for number, (moves, enters) in enumerate(trellis.moves(numbers), numbers.start + 1):
             entered = state[:, :, None] + moves
-            mass = _log_mass(entered) + _best_branch(entered, enters)[:, :, None]
+            mass = log_mass(entered) + _best_branch(entered, enters)[:, :, None]
             come.append(_share(_log_sum(mass, axis=2), axis=0))
-            state = _gained(trellis, _merged(entered, mass), int(begins[number]), int(ends[number]), weights)
+            state = _gained(trellis, merged(entered, mass), int(begins[number]), int(ends[number]), weights)
     return weights, come
 
 
@@ -74,7 +74,7 @@ def _gained(trellis: Trellis, state: Terms, begin: int, end: int, weights: Float
     terms = trellis.stay[:, rows].reshape(3, end - begin, *state.shape[1:]).copy()
     terms[:, 0] = state
     np.cumsum(terms, axis=1, out=terms)
-    weights[rows] = _log_sum(_log_mass(terms), axis=2).ravel()
+    weights[rows] = _log_sum(log_mass(terms), axis=2).ravel()
     return np.asarray(terms[:, -1])
 
 
@@ -84,7 +84,7 @@ def _best_branch(entered: Terms, enters: Ints) -> Floats:
     A train that stands on a switch seems to go to and fro over it: each time its track would be as likely again by each
     branch.
     """
-    total = _log_sum(_log_mass(entered), axis=2)
+    total = _log_sum(log_mass(entered), axis=2)
     out = np.zeros_like(total)
     for end in (1, 2):
         own = np.where(enters == end, total, -np.inf)
@@ -92,13 +92,13 @@ def _best_branch(entered: Terms, enters: Ints) -> Floats:
     return out
 
 
-def _log_mass(terms: Terms) -> Floats:
+def log_mass(terms: Terms) -> Floats:
     """Log of the integral over the bias, but for a constant."""
     constant, linear, precision = terms
     return np.asarray(constant + 0.5 * linear**2 / precision - 0.5 * np.log(precision))
 
 
-def _merged(entered: Terms, mass: Floats) -> Terms:
+def merged(entered: Terms, mass: Floats) -> Terms:
     """One Gaussian of the bias with mass, mean and variance of all that enter a state (first axis)."""
     _, linear, precision = entered
     share = _share(mass, axis=0)

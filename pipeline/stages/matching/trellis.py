@@ -1,4 +1,4 @@
-"""Candidates of all steps as states, how a train may get from one to another, and how plausible that is."""
+"""Candidates of all steps as states, and how a train may get from one to another."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.stages.matching.candidates import Candidates
 from pipeline.stages.matching.innovations import Innovations, innovations_of, movements_m
 from pipeline.stages.matching.likelihood import Likelihood, Terms, initial_terms, step_terms
+from pipeline.stages.matching.moves import StepDistances, distance_scores, move_scores
 from pipeline.stages.matching.steps import Steps
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
@@ -49,7 +49,7 @@ class Trellis:
 
     network: Network
     steps: Steps
-    ways: Ways
+    ways: StepDistances
     like: Likelihood
     config: MatchingConfig
     states: States
@@ -81,11 +81,14 @@ class Trellis:
     def moves(self, numbers: slice) -> list[tuple[Terms, Ints]]:
         """Of some steps of `pairs`: the terms `[coefficient, before, after, scale]`, and by which end moves enter."""
         part = slice(int(self.pairs.first[numbers.start]), int(self.pairs.first[numbers.stop]))
-        one, other, score = self.pairs.one[part], self.pairs.other[part], self.pairs.score[part]
+        one = self.pairs.one[part]
+        other = self.pairs.other[part]
+        score = self.pairs.score[part]
         known = np.isfinite(score)
         terms = np.where(known[:, None], self._terms(one, other), self.initial[:, other])
         terms[0] += np.where(known, score, BREAK)[:, None]
-        steps, cuts = self.pairs.steps[numbers], self.pairs.first[numbers.start + 1 : numbers.stop] - part.start
+        steps = self.pairs.steps[numbers]
+        cuts = self.pairs.first[numbers.start + 1 : numbers.stop] - part.start
         count = np.diff(self.first)
         shapes = zip(count[steps - 1].tolist(), count[steps].tolist(), strict=True)
         split = np.split(terms, cuts, axis=1)
@@ -158,7 +161,8 @@ def _states(network: Network, candidates: Candidates, steps: int) -> States:
     usable = np.array(network.usable)
     both = np.column_stack([2 * candidates.element, 2 * candidates.element + 1])
     index = np.flatnonzero(usable[both].ravel())
-    oriented, candidate = both.ravel()[index], index // 2
+    oriented = both.ravel()[index]
+    candidate = index // 2
     backward = (oriented % 2).astype(bool)
     along = candidates.along_m[candidate]
     length = network.track.length_m[candidates.element[candidate]]
@@ -190,7 +194,8 @@ def _stays(network: Network, steps: Steps, states: States, config: MatchingConfi
     way = np.fmax(np.abs(steps.odometer_m), steps.chord_m)
     stays = _unchanged(states) & (np.nan_to_num(way, nan=np.inf) <= config.long_step_m)
     apart: dict[tuple[int, ...], bool] = {}
-    oriented, first = states.oriented.tolist(), states.first.tolist()
+    oriented = states.oriented.tolist()
+    first = states.first.tolist()
     for step in np.flatnonzero(stays).tolist():
         group = tuple(oriented[first[step] : first[step + 1]])
         if group not in apart:
@@ -207,11 +212,12 @@ def _unchanged(states: States) -> Bools:
     return np.asarray((np.diff(count, prepend=0) == 0) & np.logical_and.reduceat(equal, states.first[:-1]))
 
 
-def _pairs(network: Network, states: States, steps: Ints, ways: Ways, config: MatchingConfig) -> Pairs:
+def _pairs(network: Network, states: States, steps: Ints, ways: StepDistances, config: MatchingConfig) -> Pairs:
     count = np.diff(states.first)
     sizes = count[steps - 1] * count[steps]
     begin = np.concatenate([[0], np.cumsum(sizes)])
-    number, width = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes), np.repeat(count[steps], sizes)
+    number = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes)
+    width = np.repeat(count[steps], sizes)
     one = np.repeat(states.first[steps - 1], sizes) + number // width
     other = np.repeat(states.first[steps], sizes) + number % width
     places = states.oriented[one], states.place_m[one], states.oriented[other], states.place_m[other]
@@ -228,14 +234,16 @@ def _before(states: States, stays: Bools, pairs: Pairs) -> Ints:
     count, step = _counted(states.first)
     before = np.where(stays[step], np.arange(len(step)) - count[step], -1).tolist()
     possible = np.flatnonzero(np.isfinite(pairs.score))
-    one, other = pairs.one[possible], pairs.other[possible]
+    one = pairs.one[possible]
+    other = pairs.other[possible]
     cost = np.abs(states.offset_m[other] - states.offset_m[one]) - pairs.score[possible]
     order = np.lexsort((cost, other))
     leading: dict[int, list[tuple[int, float]]] = {}
     for origin, state, own in zip(one[order].tolist(), other[order].tolist(), cost[order].tolist(), strict=True):
         leading.setdefault(state, []).append((origin, own))
     offset_m = states.offset_m.tolist()
-    begun, aside_m = step.tolist(), [0.0] * len(before)
+    begun = step.tolist()
+    aside_m = [0.0] * len(before)
     for state, origin in enumerate(before):
         if state in leading:
             origin = min(leading[state], key=lambda way: (begun[way[0]], aside_m[way[0]] + way[1]))[0]
@@ -246,13 +254,13 @@ def _before(states: States, stays: Bools, pairs: Pairs) -> Ints:
     return np.array(before, dtype=np.int64)
 
 
-def _ways(network: Network, steps: Steps, states: States, config: MatchingConfig) -> Ways:
+def _ways(network: Network, steps: Steps, states: States, config: MatchingConfig) -> StepDistances:
     """What each step's length is measured against: the odometer, signed once its sign is known, else GNSS."""
     chord = np.nan_to_num(steps.chord_m)
     known = np.isfinite(steps.odometer_m)
     distance = np.where(known, steps.odometer_m, chord)
     limit = (1.0 + config.detour_share) * np.maximum(chord, np.abs(distance)) + config.detour_m
-    return Ways(distance, known, limit, _polarity(network, steps, states))
+    return StepDistances(distance, known, limit, _polarity(network, steps, states))
 
 
 def _polarity(network: Network, steps: Steps, states: States) -> Ints:
@@ -272,101 +280,3 @@ def _polarity(network: Network, steps: Steps, states: States) -> Ints:
     moved_m = states.place_m[stayed] - states.place_m[before[stayed]]
     votes = np.sign(moved_m) * steps.odometer_m[step[stayed]]
     return np.sign(np.bincount(part[states.oriented[stayed]], votes, part.max() + 1)).astype(np.int64)[part]
-
-
-@dataclass(frozen=True)
-class Ways:
-    """How far each step is thought to have led [m]: signed in the odometer's sense where `measured`, else its size.
-
-    `limit_m` is how far to search the network for it; `polarity` the odometer's sign against each oriented element.
-    """
-
-    distance_m: Floats
-    measured: Bools
-    limit_m: Floats
-    polarity: Ints
-
-    def along(self, steps: Ints, oriented: Ints) -> Way:
-        """Of some steps, along the oriented element that each of them begins on."""
-        polarity = self.polarity[oriented]
-        signed = self.measured[steps] & (polarity != 0)
-        return Way(np.where(signed, polarity, 1) * self.distance_m[steps], signed, self.limit_m[steps])
-
-
-class Way(NamedTuple):
-    """As `Ways`, one row for each of some moves: signed along the path where `signed`."""
-
-    distance_m: Floats
-    signed: Bools
-    limit_m: Floats
-
-
-class Move(NamedTuple):
-    """The elements between two places, and how the first is left.
-
-    `sense`: +1 ahead, -1 behind, 0 not at all.
-    """
-
-    between: tuple[int, ...]
-    sense: int
-
-
-def move_scores(
-    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, way: Way, config: MatchingConfig
-) -> Floats:
-    """Log-probability of each move between pairs of places, -inf where there is none: `[sense, pair]`.
-
-    Rows: on the element, ahead, behind. Places are oriented elements and metres from their entries.
-    """
-    ahead_m, ahead_barred, behind_m, behind_barred = _network_distances(network, one, other, way.limit_m)
-    length = network.track.length_m
-    left_m, other_left_m = length[one // 2] - one_m, length[other // 2] - other_m
-    stay = np.where(one == other, distance_scores(other_m - one_m, way, config), -np.inf)
-    ahead = distance_scores(left_m + ahead_m + other_m, way, config) - config.barred_cost * ahead_barred
-    behind = distance_scores(-(one_m + behind_m + other_left_m), way, config) - config.barred_cost * behind_barred
-    ahead[~np.isfinite(ahead_m)] = behind[~np.isfinite(behind_m)] = -np.inf
-    return np.stack([stay, ahead, behind])
-
-
-def distance_scores(displacement_m: Floats, way: Way, config: MatchingConfig) -> Floats:
-    """Exponential in the difference of distances (Newson & Krumm 2009, eq. 2), limited."""
-    plain = np.abs(np.abs(displacement_m) - np.abs(way.distance_m))
-    mismatch = np.where(way.signed, np.abs(displacement_m - way.distance_m), plain)
-    scale = config.transition_scale_m + config.transition_share * np.abs(way.distance_m)
-    return np.asarray(-np.minimum(mismatch / scale, config.mismatch_limit))
-
-
-def best_moves(
-    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, way: Way, config: MatchingConfig
-) -> list[Move | None]:
-    """The most plausible move of each pair of places, none where the network has none."""
-    scores = move_scores(network, one, one_m, other, other_m, way, config)
-    chosen = np.where(np.isfinite(scores.max(axis=0)), scores.argmax(axis=0), -1)
-    rows = zip(chosen.tolist(), one.tolist(), other.tolist(), way.limit_m.tolist(), strict=True)
-    return [_move(network, *row) for row in rows]
-
-
-def _move(network: Network, chosen: int, one: int, other: int, limit_m: float) -> Move | None:
-    """The move of a row of `move_scores`, -1 for none."""
-    if chosen <= 0:
-        return None if chosen else Move((), 0)
-    if chosen == 1:
-        return Move(network.reach(one, limit_m)[other].between, 1)
-    return Move(network.reach(other, limit_m)[one].between[::-1], -1)
-
-
-def _network_distances(network: Network, one: Ints, other: Ints, limit_m: Floats) -> tuple[Floats, ...]:
-    """From exit to entry, ahead and behind, with the relations not navigable that way; inf where none leads."""
-    pairs, inverse = np.unique(one * len(network.successors) + other, return_inverse=True)
-    limit = np.zeros(len(pairs))
-    np.maximum.at(limit, inverse, limit_m)
-    table = np.full((4, len(pairs)), np.inf)
-    for index, (pair, far) in enumerate(zip(pairs.tolist(), limit.tolist(), strict=True)):
-        here, there = divmod(pair, len(network.successors))
-        ahead = network.reach(here, far).get(there)
-        if ahead is not None:
-            table[:2, index] = ahead.distance_m, ahead.barred_forward
-        behind = network.reach(there, far).get(here)
-        if behind is not None:
-            table[2:, index] = behind.distance_m, behind.barred_backward
-    return tuple(table[:, inverse])

@@ -74,7 +74,8 @@ def under_way(t_s: Floats, way_m: Floats, deadband_mps: float, window_s: float) 
 
 def moving_steps(t_s: Floats, distance_m: Floats, deadband_mps: float, window_s: float) -> Bools:
     """Per step between samples: mean speed beyond the dead band, over `window_s` at least, centred on the step."""
-    half_s, centre_s = 0.5 * np.maximum(np.diff(t_s), window_s), 0.5 * (t_s[1:] + t_s[:-1])
+    half_s = 0.5 * np.maximum(np.diff(t_s), window_s)
+    centre_s = 0.5 * (t_s[1:] + t_s[:-1])
     begin_m, end_m = (np.interp(at_s, t_s, distance_m) for at_s in (centre_s - half_s, centre_s + half_s))
     moving: Bools = np.abs(end_m - begin_m) > deadband_mps * 2.0 * half_s
     return moving
@@ -108,8 +109,10 @@ def evenly_driven(
     steps = np.diff(held, prepend=np.nan)
     # A width that falls with the speed moves what is held too, but not the train.
     moves = np.flatnonzero((steps != 0) & (np.diff(distance_m, prepend=np.nan) != 0))
-    at_s, at_m = t_s[moves].tolist(), distance_m[moves].tolist()
-    gaps, ways = np.diff(t_s[moves]), np.abs(np.diff(distance_m[moves]))
+    at_s = t_s[moves].tolist()
+    at_m = distance_m[moves].tolist()
+    gaps = np.diff(t_s[moves])
+    ways = np.abs(np.diff(distance_m[moves]))
     # A turn, and the first way, show after the hysteresis alone.
     turned = steps[moves[1:]] * np.nan_to_num(steps[moves[:-1]]) <= 0
     stood = ways - np.where(turned, 2.0 * width_m[moves[1:]], 0.0) <= least_mps * gaps

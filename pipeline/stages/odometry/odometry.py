@@ -126,7 +126,8 @@ class Odometry:
         s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) +
         (sigma_s D)^2 (DOMAIN section 5.1). NaN where either end is not known or the distance was lost in between.
         """
-        scale, scale_sigma = self.scale or 1.0, self.scale_sigma or 0.0
+        scale = self.scale or 1.0
+        scale_sigma = self.scale_sigma or 0.0
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
         same = self.segment_at(begin_ns) == self.segment_at(end_ns)
         recorded = np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
@@ -201,7 +202,8 @@ class Odometry:
 
     @cached_property
     def _moving_s(self) -> tuple[Floats, Floats]:
-        at_s, at_m = self.t_s, self.distance_m
+        at_s = self.t_s
+        at_m = self.distance_m
         if self.noise.quantisation:
             at_s, at_m = evenly_driven(at_s, at_m, self.row_sigma_m(at_s), self.deadband_mps, self.config)
         moving = moving_steps(at_s, at_m, self.deadband_mps, self.config.speed_window_s)
@@ -225,7 +227,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     if stream is None or stream.height < 2:
         return None
     align = config.align
-    t_ns, speed = times_ns(stream), floats(stream, "speed_mps")
+    t_ns = times_ns(stream)
+    speed = floats(stream, "speed_mps")
     t_s: Floats = ((t_ns - int(t_ns[0])) * 1e-9).astype(np.float64)
     dt_s = np.diff(t_s)
     period_s = float(np.median(dt_s))
@@ -246,7 +249,10 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     if apart.size:
         row_s = t_s
         t_s, distance_m, row = filled_in(t_s, distance_m, speed, apart, align)
-        segment, pause, slip, counter = segment[row], pause[row[:-1]], slip[row], counter[row]
+        segment = segment[row]
+        pause = pause[row[:-1]]
+        slip = slip[row]
+        counter = counter[row]
         doubt_m = np.interp(t_s, row_s, doubt_m)
     in_file = vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None
     return Odometry(
@@ -269,7 +275,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 
 
 def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: Configuration) -> Noise:
-    counter_m, deadband_mps = count_step_m(distance_m, whole, config.align), config.matching.deadband_mps
+    counter_m = count_step_m(distance_m, whole, config.align)
+    deadband_mps = config.matching.deadband_mps
     scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, deadband_mps, config.align)
     return Noise(white_m2_per_s, scatter, counter_m)
 

@@ -20,7 +20,8 @@ def counted_over_slip(odometry: Odometry, others: Sequence[Odometry], config: Al
     if not others or not odometry.slip.any():
         return odometry
     t_ns: Ints = odometry.epoch_ns + np.round(odometry.t_s * 1e9).astype(np.int64)
-    step_m, doubt_m = np.diff(odometry.distance_m), np.diff(odometry.slip_doubt_m)
+    step_m = np.diff(odometry.distance_m)
+    doubt_m = np.diff(odometry.slip_doubt_m)
     senses = [_sense(odometry, other, t_ns) for other in others]
     for first, last in spans_of(odometry.slip):
         part = slice(max(first - 1, 0), min(last + 1, t_ns.size - 1))

@@ -18,7 +18,8 @@ def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) 
     usable = np.flatnonzero(np.isfinite(path_m) & np.isfinite(recorded_m))
     if usable.size < 2:
         return 1
-    odometer, path = recorded_m[usable], path_m[usable]
+    odometer = recorded_m[usable]
+    path = path_m[usable]
     way = np.maximum.accumulate(np.abs(odometer - odometer[0]))
     window = int(np.searchsorted(way, 4.0 * distance_m)) + 1
     # Starts a metre apart: a long stand before the departure has one vote, not thousands.
@@ -33,7 +34,8 @@ def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distan
     known = np.isfinite(position_m)
     if not known.any():
         return True
-    position, at_ns = position_m[known], t_ns[known]
+    position = position_m[known]
+    at_ns = t_ns[known]
     if odometry is not None:
         recorded = odometry.distance_at(at_ns)
         moved = recorded[np.isfinite(recorded)] - recorded[np.isfinite(recorded)][:1]

@@ -15,10 +15,12 @@ from schemas.arrays import Bools, Floats, Ints
 from schemas.config import AlignConfig
 
 # Numerics of the fit: so many rows of a piece, and the degree of its curve.
-_MOST_ROWS, _FEWEST_ROWS = 16, 8
+_MOST_ROWS = 16
+_FEWEST_ROWS = 8
 _DEGREE = 3
 # Enough for the median, however long the run is; with fewer it is chance.
-_PIECES, _FEWEST_PIECES = 400, 8
+_PIECES = 400
+_FEWEST_PIECES = 8
 # Less is rounding of decimal numbers, which are not whole in binary; far below any `counter_step_m`.
 _ROUNDED_M = 1e-3
 
@@ -72,7 +74,8 @@ def _scatter_beyond(
     rows = _moving_pieces(t_s, distance_m, whole, deadband_mps, config)
     if len(rows) < _FEWEST_PIECES:
         return QuantisationNoise()
-    since_s, ways = t_s[rows] - t_s[rows[:, :1]], distance_m[rows] - distance_m[rows[:, :1]]
+    since_s = t_s[rows] - t_s[rows[:, :1]]
+    ways = distance_m[rows] - distance_m[rows[:, :1]]
     scatter, explained = _scatter(since_s, ways, white_m2_per_s)
     speeds = np.abs(ways[:, -1]) / since_s[:, -1]
     fast = speeds > np.median(speeds)
@@ -97,7 +100,8 @@ def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, deadband_mps: 
     length = (count - 1) * stride
     starts = np.arange(0, t_s.size - length, max(length, (t_s.size - length) // _PIECES))
     broken = np.concatenate([[0], np.cumsum(~whole)])
-    way_m, time_s = distance_m[starts + length] - distance_m[starts], t_s[starts + length] - t_s[starts]
+    way_m = distance_m[starts + length] - distance_m[starts]
+    time_s = t_s[starts + length] - t_s[starts]
     moves = np.abs(way_m) > deadband_mps * time_s
     starts = starts[moves & (broken[starts + length] == broken[starts])]
     chosen: Ints = starts[:, None] + stride * np.arange(count)
@@ -119,5 +123,6 @@ def _scatter(since_s: Floats, way_m: Floats, white_m2_per_s: float) -> tuple[Flo
 
 def _beyond(scatter_m2: Floats, explained_m2: Floats, config: AlignConfig) -> float:
     """The median scatter less what explains it [m^2], none where that is most of it."""
-    scatter, explained = float(np.median(scatter_m2)), float(np.median(explained_m2))
+    scatter = float(np.median(scatter_m2))
+    explained = float(np.median(explained_m2))
     return scatter - explained if scatter > config.quantisation_factor * explained else 0.0

@@ -35,5 +35,6 @@ class RecoveryRule:
 
     def bound_m(self, variance_m2: float | Floats) -> Floats:
         """min(failure limit / 2, k_T sqrt(variance)) [m]."""
-        factor, most_m = self.config.monitors.threshold_factor, 0.5 * self.config.hazards.failure_limit_m
+        factor = self.config.monitors.threshold_factor
+        most_m = 0.5 * self.config.hazards.failure_limit_m
         return np.minimum(most_m, factor * np.sqrt(variance_m2))

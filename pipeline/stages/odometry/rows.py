@@ -94,8 +94,10 @@ def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignCon
     both = np.isfinite(recorded_m) & np.isfinite(driven_m)
     if not leap.any() or not both.any():
         return driven_m
-    recorded, driven = recorded_m[both], driven_m[both]
-    apart_m, most_m = abs(recorded.sum() - driven.sum()), config.speed_agreement * np.abs(recorded).sum()
+    recorded = recorded_m[both]
+    driven = driven_m[both]
+    apart_m = abs(recorded.sum() - driven.sum())
+    most_m = config.speed_agreement * np.abs(recorded).sum()
     return driven_m if apart_m <= most_m else np.where(leap, np.nan, driven_m)
 
 
@@ -129,7 +131,8 @@ def filled_in(
 
     smooth = PchipInterpolator(t_s, distance_m).derivative()(t_s)
     slopes = np.where(np.isfinite(speed_mps), speed_mps, smooth)
-    span, way = t_s[rows + 1] - t_s[rows], distance_m[rows + 1] - distance_m[rows]
+    span = t_s[rows + 1] - t_s[rows]
+    way = distance_m[rows + 1] - distance_m[rows]
     # Whatever a train does that gathers speed or brakes no harder, the mean of two speeds is no farther from its way.
     true = np.abs(0.5 * (slopes[rows] + slopes[rows + 1]) * span - way) <= 0.25 * config.braking_mps2 * span**2
     low, high = np.minimum(0.0, 3.0 * way), np.maximum(0.0, 3.0 * way)

@@ -2,8 +2,11 @@
 
 In: the reference stream, the survey as a network. Out: stretches of samples with every way that they may have taken.
 Nothing that came from GNSS or the odometer is known here.
+
+Which elements lie near which samples: `near`. Where may the train have left the survey: `open_ends`. Which ways lead
+through a stretch: `visits`, and which of them lie near enough: `stretches`.
 """
 
-from pipeline.stages.reference.stretches import ReferencePath, Stretch, reference_stretches
+from pipeline.stages.reference.stretches import ReferencePath, ReferenceStretch, reference_stretches
 
-__all__ = ["ReferencePath", "Stretch", "reference_stretches"]
+__all__ = ["ReferencePath", "ReferenceStretch", "reference_stretches"]

@@ -51,7 +51,8 @@ class Near:
         position[samples] = np.arange(samples.size)
         found: list[list[Foot]] = [[] for _ in range(samples.size)]
         for pair in np.flatnonzero(position[self.sample] >= 0).tolist():
-            element, measure_m = int(self.element[pair]), float(self.measure_m[pair])
+            element = int(self.element[pair])
+            measure_m = float(self.measure_m[pair])
             ends = (abs(measure_m - self.track.begin_m[element]), abs(measure_m - self.track.end_m[element]))
             end = int(np.argmin(ends)) if min(ends) < AT_END_M else None
             foot = Foot(element, float(self.distance_m[pair]), measure_m, end)

@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.stages.reference.near import Foot, Near, near_elements
 from pipeline.stages.reference.open_ends import off_the_survey
-from pipeline.stages.reference.visits import Move, Node, Stay, nodes_of, pieces_of, ways_over
+from pipeline.stages.reference.visits import ElementStay, Node, Transition, nodes_of, pieces_of, ways_over
 from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import MIN_REACH_M, Network
@@ -37,7 +37,7 @@ class ReferencePath:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class ReferenceStretch:
     """Reference samples from gap to gap, and every way that they may have taken: the train was on one of them."""
 
     t_ns: Ints
@@ -59,7 +59,7 @@ class Samples:
 
 def reference_stretches(
     reference: pl.DataFrame | None, network: Network, numbers: dict[str, int], config: Configuration
-) -> tuple[list[Stretch], list[tuple[int, int]]]:
+) -> tuple[list[ReferenceStretch], list[tuple[int, int]]]:
     """Stretches of the reference with their ways, and the times at which it was heard and lay nowhere [ns].
 
     `network`: with elements that turn round in pieces; `numbers`: net elements as the caller counts them. An element is
@@ -76,7 +76,7 @@ def reference_stretches(
     near = near_elements(samples.points, samples.sigma_m, network, factor, config.hazards.survey_sigma_m)
     off = off_the_survey(samples.points, samples.sigma_m, near, network, config.hazards)
     placed = np.flatnonzero(near.any_near & ~off)
-    found: list[Stretch] = []
+    found: list[ReferenceStretch] = []
     used = np.zeros(samples.t_ns.size, dtype=np.bool_)
     for rows in _between_gaps(samples.t_ns, placed, config.hazards.reference_gap_s):
         for stretch in _placed(samples, near, rows, network, numbers, config):
@@ -111,20 +111,21 @@ def _silent_spans(t_ns: Ints, used: Bools, gap_s: float) -> list[tuple[int, int]
 
 def _placed(
     samples: Samples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
-) -> list[Stretch]:
+) -> list[ReferenceStretch]:
     """The ways of samples without a gap among them: nothing where no way passes, or more do than can be weighed."""
     own = samples.take(rows)
     all_steps = _steps(own)
-    found: list[Stretch] = []
+    found: list[ReferenceStretch] = []
     for part in _connected(list(_parts(own, near.feet(rows[all_steps]), all_steps, network))):
-        steps, last = all_steps[part.first : part.last + 1], len(part.layers)
+        steps = all_steps[part.first : part.last + 1]
+        last = len(part.layers)
         nodes = nodes_of(part.starts, part.layers)
         failed = _failed(nodes, near, rows, own.sigma_m, steps, config)
         ways = ways_over(nodes, last, failed, config.hazards.routes_limit)
         if ways:
             paths = tuple(_path(way.stays(last), near, rows, steps, network, numbers) for way in ways)
             inside = slice(int(steps[0]), int(steps[-1]) + 1)
-            found.append(Stretch(own.t_ns[inside], own.sigma_m[inside], paths))
+            found.append(ReferenceStretch(own.t_ns[inside], own.sigma_m[inside], paths))
     return found
 
 
@@ -134,15 +135,18 @@ def _steps(samples: Samples) -> Ints:
     apart_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m).tolist()
     places = surface.tolist()
     steps = [0]
-    far, far_m = 0, 0.0
+    far = 0
+    far_m = 0.0
     for number, place in enumerate(places):
         away_m = dist(place, places[steps[-1]])
         turned = far_m - away_m > 0.5 * apart_m[number]
         if turned or away_m >= apart_m[number]:
             steps.append(far if turned else number)
-            far, far_m = number, dist(place, places[steps[-1]])
+            far = number
+            far_m = dist(place, places[steps[-1]])
         elif away_m > far_m:
-            far, far_m = number, away_m
+            far = number
+            far_m = away_m
     if steps[-1] != len(places) - 1:
         steps.append(len(places) - 1)
     return np.array(steps, dtype=np.int64)
@@ -157,7 +161,7 @@ class _Part:
 
     first: int
     starts: set[int]
-    layers: list[list[Move]]
+    layers: list[list[Transition]]
     onward: Callable[[int, int], bool]
 
     @property
@@ -167,7 +171,8 @@ class _Part:
 
 def _parts(samples: Samples, feet: Sequence[Sequence[Foot]], steps: Ints, network: Network) -> Iterator[_Part]:
     """The parts of the steps; a new one begins where no move leads on: the reference leapt to another track."""
-    at_m, noise_m = samples.points.surface[steps], np.maximum(_STEP_M, 6.0 * samples.sigma_m[steps])
+    at_m = samples.points.surface[steps]
+    noise_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m[steps])
     places = [_inside(one, network) for one in feet]
 
     def limit_m(step: int, other: int) -> float:
@@ -180,17 +185,21 @@ def _parts(samples: Samples, feet: Sequence[Sequence[Foot]], steps: Ints, networ
         limit = limit_m(step, other)
         return any(any(network_moves.moves(one, places[step], places[other], limit)) for one in both)
 
-    first, layers = 0, list[list[Move]]()
+    first = 0
+    layers = list[list[Transition]]()
     alive = starts = {2 * element for element in places[0]}
     for step in range(len(places) - 1):
-        here, there, limit = places[step], places[step + 1], limit_m(step, step + 1)
+        here = places[step]
+        there = places[step + 1]
+        limit = limit_m(step, step + 1)
         moves = [move for one in sorted(alive) for move in network_moves.moves(one, here, there, limit)]
         if moves:
             layers.append(moves)
             alive = {move.to for move in moves}
         else:
             yield _Part(first, starts, layers, onward)
-            first, layers = step + 1, []
+            first = step + 1
+            layers = []
             alive = starts = {2 * element for element in there}
     yield _Part(first, starts, layers, onward)
 
@@ -226,22 +235,26 @@ class _Onward:
         self.network = network
         self.known: dict[int, tuple[float, list[tuple[int, float, tuple[int, ...]]]]] = {}
 
-    def moves(self, start: int, here: dict[int, float], there: dict[int, float], limit_m: float) -> Iterator[Move]:
+    def moves(
+        self, start: int, here: dict[int, float], there: dict[int, float], limit_m: float
+    ) -> Iterator[Transition]:
         """From an oriented element at one step to those near the next, forward or back."""
-        element, along_m = start // 2, self.network.track.along_m
+        element = start // 2
+        along_m = self.network.track.along_m
         if element in there and abs(there[element] - here[element]) <= limit_m:
-            yield Move(start, start)
+            yield Transition(start, start)
         for back in (0, 1):
             left_m = self.network.length_m(start) - along_m(start ^ back, here[element])
             for to, gap_m, between in self._from(start ^ back, limit_m - left_m) if left_m <= limit_m else ():
                 if to // 2 in there and left_m + gap_m + along_m(to, there[to // 2]) <= limit_m:
-                    yield Move(start, to ^ back, tuple(one ^ back for one in between), bool(back))
+                    yield Transition(start, to ^ back, tuple(one ^ back for one in between), bool(back))
 
     def _from(self, side: int, limit_m: float) -> list[tuple[int, float, tuple[int, ...]]]:
         """What can be entered beyond the end of an oriented element, how far beyond, and over which elements."""
         searched_m, found = self.known.get(side, (-1.0, []))
         if searched_m < limit_m:
-            searched_m, found = max(limit_m, MIN_REACH_M), []
+            searched_m = max(limit_m, MIN_REACH_M)
+            found = []
             growing = [(side, 0.0, tuple[int, ...]())]
             while growing:
                 last, gone_m, between = growing.pop()
@@ -285,22 +298,28 @@ def _failed(
 
 
 def _path(
-    stays: Sequence[Stay], near: Near, rows: Ints, steps: Ints, network: Network, numbers: dict[str, int]
+    stays: Sequence[ElementStay], near: Near, rows: Ints, steps: Ints, network: Network, numbers: dict[str, int]
 ) -> ReferencePath:
     """A way with coordinates: each sample on the nearest of the elements that the way visits about then."""
-    begin, count = int(steps[0]), int(steps[-1] - steps[0]) + 1
-    nearest_m, at_m, leg = np.full(count, np.inf), np.full(count, np.nan), np.full(count, -1)
+    begin = int(steps[0])
+    count = int(steps[-1] - steps[0]) + 1
+    nearest_m = np.full(count, np.inf)
+    at_m = np.full(count, np.nan)
+    leg = np.full(count, -1)
     legs, placed = _legs(stays, network)
     for stay, (number, entry_m) in zip(stays, placed, strict=True):
         low, high = max(stay.first - 1, 0), min(stay.last + 1, steps.size - 1)
         pairs = near.of(stay.oriented // 2, int(rows[steps[low]]), int(rows[steps[high]]))
         own = near.sample[pairs] - rows[begin]
         nearer = near.distance_m[pairs] < nearest_m[own]
-        own, pair = own[nearer], np.arange(pairs.start, pairs.stop)[nearer]
-        measure_m, element = near.measure_m[pair], stay.oriented // 2
+        own = own[nearer]
+        pair = np.arange(pairs.start, pairs.stop)[nearer]
+        measure_m = near.measure_m[pair]
+        element = stay.oriented // 2
         along_m = measure_m - network.track.begin_m[element]
         against_m = network.track.end_m[element] - measure_m
-        nearest_m[own], leg[own] = near.distance_m[pair], number
+        nearest_m[own] = near.distance_m[pair]
+        leg[own] = number
         at_m[own] = entry_m + (against_m if stay.oriented % 2 else along_m)
     known = np.flatnonzero(leg >= 0)
     every = np.arange(count)
@@ -309,7 +328,7 @@ def _path(
     return ReferencePath(leg, np.interp(every, known, at_m[known]), routes)
 
 
-def _legs(stays: Sequence[Stay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
+def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
     """The way as chains of one coordinate, and of each visit its chain and where it is entered [m].
 
     A new chain begins where the train, having turned, takes another branch than that which it came from.
@@ -318,7 +337,8 @@ def _legs(stays: Sequence[Stay], network: Network) -> tuple[list[Chain], list[tu
     placed = [(0, 0.0)]
     here = 0
     for stay in stays[1:]:
-        chain, last = chains[-1], chains[-1].oriented[here]
+        chain = chains[-1]
+        last = chains[-1].oriented[here]
         onward = here + (-1 if stay.back else 1)
         if 0 <= onward < len(chain.oriented) and chain.oriented[onward] == stay.oriented:
             here = onward

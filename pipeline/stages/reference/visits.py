@@ -8,7 +8,7 @@ from itertools import pairwise
 
 
 @dataclass(frozen=True)
-class Move:
+class Transition:
     """From an oriented element at one step to one at the next, over those `between`; `back`: against its sense."""
 
     start: int
@@ -44,7 +44,7 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Stay:
+class ElementStay:
     """An oriented element from step `first` to `last`; `back`: entered against its sense."""
 
     oriented: int
@@ -54,23 +54,23 @@ class Stay:
 
 
 @dataclass(frozen=True)
-class Way:
+class WayThrough:
     """A way through a stretch: its first visit, and how it goes on."""
 
     start: Node
     links: tuple[Link, ...]
 
-    def stays(self, last: int) -> list[Stay]:
+    def stays(self, last: int) -> list[ElementStay]:
         """The elements that it runs over, in order of time; `last`: the last step."""
         nodes = [self.start, *(link.there for link in self.links)]
         entered = [0, *(link.at + int(link.there.sampled) for link in self.links)]
         left = [*(link.at for link in self.links), last]
         backs = [False, *(link.back for link in self.links)]
         rows = zip(nodes, entered, left, backs, strict=True)
-        return [Stay(node.oriented, begin, end, back) for node, begin, end, back in rows]
+        return [ElementStay(node.oriented, begin, end, back) for node, begin, end, back in rows]
 
 
-def nodes_of(starts: set[int], layers: Sequence[Sequence[Move]]) -> list[Node]:
+def nodes_of(starts: set[int], layers: Sequence[Sequence[Transition]]) -> list[Node]:
     """Visits of every element that lies on a way from the first step to the last.
 
     `starts`: elements at the first step; `layers`: moves from each step to the next.
@@ -100,7 +100,7 @@ def nodes_of(starts: set[int], layers: Sequence[Sequence[Move]]) -> list[Node]:
     return nodes
 
 
-def _linked(move: Move, start: Node, to: Node, step: int) -> list[Node]:
+def _linked(move: Transition, start: Node, to: Node, step: int) -> list[Node]:
     """Two visits linked over those between, which are returned."""
     between = [Node(one, step, step, False) for one in move.between]
     for here, there in pairwise([start, *between, to]):
@@ -110,9 +110,9 @@ def _linked(move: Move, start: Node, to: Node, step: int) -> list[Node]:
     return between
 
 
-def _leading_on(layers: Sequence[Sequence[Move]]) -> list[list[Move]]:
+def _leading_on(layers: Sequence[Sequence[Transition]]) -> list[list[Transition]]:
     """The moves from which a way leads on to the last step."""
-    kept: list[list[Move]] = []
+    kept: list[list[Transition]] = []
     open_ends: set[int] | None = None
     for moves in reversed(layers):
         kept.append([move for move in moves if open_ends is None or move.to in open_ends])
@@ -134,7 +134,7 @@ def pieces_of(nodes: Sequence[Node]) -> list[list[Node]]:
     return list({id(piece): piece for piece in pieces.values()}.values())
 
 
-def ways_over(nodes: Sequence[Node], last: int, failed: set[Node], most: int) -> list[Way]:
+def ways_over(nodes: Sequence[Node], last: int, failed: set[Node], most: int) -> list[WayThrough]:
     """Ways from the first step to the last that together run over every link between visits that did not fail.
 
     Nothing where there are more than `most`.
@@ -143,7 +143,7 @@ def ways_over(nodes: Sequence[Node], last: int, failed: set[Node], most: int) ->
     leading_on = _closure(ends, failed, forward=False)
     begins = {node for node in leading_on if node.first == 0 and node.sampled}
     alive = leading_on & _closure(begins, failed, forward=True)
-    ways = [Way(node, ()) for node in nodes if node in begins & ends & alive]
+    ways = [WayThrough(node, ()) for node in nodes if node in begins & ends & alive]
     covered: set[Link] = set()
     for link in [one for node in nodes if node in alive for one in node.after if one.there in alive]:
         way = None if link in covered else _way_over(link, begins, ends, alive, covered)
@@ -167,7 +167,9 @@ def _closure(start: set[Node], failed: set[Node], forward: bool) -> set[Node]:
     return seen
 
 
-def _way_over(link: Link, begins: set[Node], ends: set[Node], alive: set[Node], covered: set[Link]) -> Way | None:
+def _way_over(
+    link: Link, begins: set[Node], ends: set[Node], alive: set[Node], covered: set[Link]
+) -> WayThrough | None:
     """A whole way over a link, preferably over links that no way has taken yet."""
 
     def nearest(links: list[Link]) -> Link | None:
@@ -175,15 +177,17 @@ def _way_over(link: Link, begins: set[Node], ends: set[Node], alive: set[Node], 
 
     links = [link]
     while links[-1].there not in ends:
-        here, at = links[-1].there, links[-1].at
+        here = links[-1].there
+        at = links[-1].at
         onward = nearest([one for one in here.after if one.there in alive and one.at >= at])
         if onward is None:
             return None
         links.append(onward)
     while links[0].here not in begins:
-        there, at = links[0].here, links[0].at
+        there = links[0].here
+        at = links[0].at
         before = nearest([one for one in there.before if one.here in alive and one.at <= at])
         if before is None:
             return None
         links.insert(0, before)
-    return Way(links[0].here, tuple(links))
+    return WayThrough(links[0].here, tuple(links))

@@ -20,7 +20,8 @@ class Chain:
     def route(self, network: Network, numbers: dict[str, int] | None = None) -> Route:
         """`numbers`: net elements as the caller counts them, where the network has them in pieces."""
         oriented = np.array(self.oriented, dtype=np.int64)
-        element, track = oriented // 2, network.track
+        element = oriented // 2
+        track = network.track
         own = element if numbers is None else np.array([numbers[track.ids[one]] for one in element.tolist()])
         return Route(
             element=own,

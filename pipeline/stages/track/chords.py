@@ -27,7 +27,8 @@ def chord_sigmas_m(track: Track, successors: Sequence[Sequence[int]]) -> Floats:
     elements change nothing.
     """
     length_m, heading_rad = _segments(track)
-    first, last = track.first[:-1], track.first[1:] - 2
+    first = track.first[:-1]
+    last = track.first[1:] - 2
     enter = np.column_stack([heading_rad[first, 0], heading_rad[last, 1] + np.pi]).ravel()
     leave = np.column_stack([heading_rad[last, 1], heading_rad[first, 0] + np.pi]).ravel()
     onward = [_straightest(leave[one], enter, ways) for one, ways in enumerate(successors)]

@@ -93,7 +93,8 @@ def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
     kept = np.flatnonzero(~border | (gap > 0))
     head, tail = kept, kept + 1
     heading, turn = _headings(places, head)
-    height, sigma = track.height_m[vertex], track.sigma_m[vertex]
+    height = track.height_m[vertex]
+    sigma = track.sigma_m[vertex]
     return Leg(
         visits=tuple(visits),
         line=Polyline(places.surface.take(head, axis=0), places.surface.take(tail, axis=0)),
@@ -163,7 +164,8 @@ def _returns(line: Polyline, path_start_m: Floats) -> bool:
     from scipy.spatial import cKDTree  # takes long to load, and a log needs none
 
     probes = np.unique(np.searchsorted(path_start_m, np.arange(path_start_m[0], path_start_m[-1], SAMPLE_SPACING_M)))
-    places, path_m = line.start[probes], path_start_m[probes]
+    places = line.start[probes]
+    path_m = path_start_m[probes]
     pairs = cKDTree(places).query_pairs(SAME_PLACE_M + 2 * SAMPLE_SPACING_M, output_type="ndarray")
     return bool((np.abs(path_m[pairs[:, 0]] - path_m[pairs[:, 1]]) > HINT_WINDOW_M).any())
 

@@ -151,7 +151,8 @@ def network_of(track: Track, links: pl.DataFrame) -> Network:
     other, position_b = _linked_ends(track, usable_links, "b")
     ends = end_places(track)
     gap = gaps_m(ends[one, position_a], ends[other, position_b]).tolist()
-    leaving, entering = (2 * one + 1 - position_a).tolist(), (2 * other + position_b).tolist()
+    leaving = (2 * one + 1 - position_a).tolist()
+    entering = (2 * other + position_b).tolist()
     for row, way in enumerate(usable_links["navigability"].cast(pl.String).to_list()):
         there = way in (Navigability.AB.value, Navigability.BOTH.value)
         back = way in (Navigability.BA.value, Navigability.BOTH.value)
@@ -232,7 +233,8 @@ def _joined(track: Track, visits: list[Visit]) -> list[list[Edge]]:
         gap = float(
             gaps_m(ends[[here.element], [int(here.forward)]], ends[[there.element], [int(not there.forward)]])[0]
         )
-        leaving, entering = 2 * here.element + (not here.forward), 2 * there.element + (not there.forward)
+        leaving = 2 * here.element + (not here.forward)
+        entering = 2 * there.element + (not there.forward)
         for one, other in ((leaving, entering), (entering ^ 1, leaving ^ 1)):
             if all(edge.to != other for edge in successors[one]):
                 successors[one].append(Edge(other, gap, True, True))

@@ -83,7 +83,8 @@ class Route:
 
         Of several visits the one nearest to `near_m` is meant: a lap more is no error of place.
         """
-        found, sense = np.full(element.size, np.nan), np.zeros(element.size, dtype=np.int64)
+        found = np.full(element.size, np.nan)
+        sense = np.zeros(element.size, dtype=np.int64)
         cost = np.full(element.size, np.inf)
         order = np.argsort(element, kind="stable")
         ends = np.searchsorted(element[order], self.element, side="right")
@@ -97,7 +98,8 @@ class Route:
             own = outside * _OUTSIDE_COUNTS + np.abs(at_m - near_m[rows])
             better = own < cost[rows]
             chosen = rows[better]
-            cost[chosen], found[chosen] = own[better], at_m[better]
+            cost[chosen] = own[better]
+            found[chosen] = at_m[better]
             sense[chosen] = 1 if self.forward[visit] else -1
         return found, sense
 

@@ -62,8 +62,10 @@ class Feet:
 
     def put(self, rows: Ints, other: Feet) -> None:
         """Replace some of the feet."""
-        self.segment[rows], self.fraction[rows] = other.segment, other.fraction
-        self.offset_m[rows], self.distance_m[rows] = other.offset_m, other.distance_m
+        self.segment[rows] = other.segment
+        self.fraction[rows] = other.fraction
+        self.offset_m[rows] = other.offset_m
+        self.distance_m[rows] = other.distance_m
 
 
 def no_feet(count: int) -> Feet:
@@ -92,10 +94,12 @@ def downhill(points: Points, line: Polyline, segment: Ints, line_of: Ints | None
         step = np.where(feet.fraction[active] < 0, -1, 1)
         other = feet.segment[active] + step
         inside = (other >= 0) & (other < len(line))
-        active, other = active[inside], other[inside]
+        active = active[inside]
+        other = other[inside]
         if line_of is not None:
             same = line_of[other] == line_of[feet.segment[active]]
-            active, other = active[same], other[same]
+            active = active[same]
+            other = other[same]
         trial = on_segments(points.take(active), line, other)
         better = np.flatnonzero(trial.distance_m < feet.distance_m[active] - 1e-9)
         active = active[better]

@@ -182,7 +182,7 @@ def negations(result: LdsResult) -> list[tuple[int, int | None]]:
     return [(begin, end if end < result.epochs.height else None) for begin, end in zip(begins, ends, strict=True)]
 
 
-def told(result: LdsResult, *columns: str) -> list[tuple[Any, ...]]:
+def passage_rows(result: LdsResult, *columns: str) -> list[tuple[Any, ...]]:
     """Passages as tuples of the named columns, times in seconds, enums as text."""
     frame = result.passages.select(columns)
     times = [i for i, kind in enumerate(frame.dtypes) if kind == INSTANT]

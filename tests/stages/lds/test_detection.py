@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, negations, reads_at, run, steps, told
+from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, negations, passage_rows, reads_at, run, steps
 
 V1, V2 = {"V1": 110.0}, {"V1": 110.0, "V2": 510.0}
 STATUS = ("balise_id", "status", "t_offered")
@@ -27,14 +27,14 @@ def test_crossing_time_and_odometer_distance_are_interpolated() -> None:
     # The odometer reads 2 m more than the path; V2 lies at 515 m: a quarter of the way from 500 to 520 m.
     epochs = epochs_of(steps(0.0, 20.0, 40), steps(2.0, 20.0, 40))
     result = run(epochs, balises_at({"V1": 110.0, "V2": 515.0}))
-    assert told(result, *STATUS, "odometer_distance_m", "confidence_m") == [
+    assert passage_rows(result, *STATUS, "odometer_distance_m", "confidence_m") == [
         ("V1", "accepted", 5.5, None, 6.18),
         ("V2", "accepted", 25.75, pytest.approx(405.0), 6.18),
     ]
 
 
 def test_a_balise_reached_but_not_left_is_passed() -> None:
-    assert told(run(epochs_of([90.0, 100.0, 110.0]), balises_at(V1)), *STATUS) == [("V1", "accepted", 2.0)]
+    assert passage_rows(run(epochs_of([90.0, 100.0, 110.0]), balises_at(V1)), *STATUS) == [("V1", "accepted", 2.0)]
 
 
 def test_a_journey_that_starts_on_a_balise_does_not_pass_it() -> None:
@@ -42,7 +42,7 @@ def test_a_journey_that_starts_on_a_balise_does_not_pass_it() -> None:
 
 
 def test_falling_path_is_detected_alike() -> None:
-    assert told(run(epochs_of(steps(200.0, -20.0, 10)), balises_at(V1)), *STATUS, "direction") == [
+    assert passage_rows(run(epochs_of(steps(200.0, -20.0, 10)), balises_at(V1)), *STATUS, "direction") == [
         ("V1", "accepted", 4.5, "falling")
     ]
 
@@ -54,13 +54,13 @@ def test_falling_path_is_detected_alike() -> None:
 def test_interpolated_over_one_and_a_half_periods_at_most(gap_s: float, status: str, t_offered: float | None) -> None:
     t_s = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 5.0 + gap_s, 6.0 + gap_s, 7.0 + gap_s]
     path_m = [0.0, 20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 140.0, 160.0]
-    assert told(run(epochs_of(path_m, t_s=t_s), balises_at(V1)), *STATUS) == [("V1", status, t_offered)]
+    assert passage_rows(run(epochs_of(path_m, t_s=t_s), balises_at(V1)), *STATUS) == [("V1", status, t_offered)]
 
 
 def test_a_faster_log_interpolates_over_one_second() -> None:
     t_s = [0.1 * k for k in range(50)] + [5.9, 6.0]
     path_m = [20.0 * t for t in t_s]
-    [row] = told(run(epochs_of(path_m, t_s=t_s), balises_at(V1)), *STATUS)
+    [row] = passage_rows(run(epochs_of(path_m, t_s=t_s), balises_at(V1)), *STATUS)
     assert row == ("V1", "accepted", pytest.approx(5.5))
 
 
@@ -68,7 +68,7 @@ def test_lost_in_a_gap_it_is_missed_by_linking_and_not_available() -> None:
     # No position from 24 to 27 s; V2 would be passed at 25.5 s. Its window closes at 561.6 m, 28.1 s.
     path_m = steps(0.0, 20.0, 40)
     result = run(epochs_of(with_hole(path_m, 24, 27), path_m), balises_at(V2))
-    assert told(result, *STATUS, "linking_error", "reaction", "t_reckoned") == [
+    assert passage_rows(result, *STATUS, "linking_error", "reaction", "t_reckoned") == [
         ("V1", "accepted", 5.5, "none", "none", None),
         ("V2", "not_available", None, "missed", "service_brake", 25.5),
     ]
@@ -77,7 +77,7 @@ def test_lost_in_a_gap_it_is_missed_by_linking_and_not_available() -> None:
 def test_not_available_although_the_window_closed_inside_the_outage() -> None:
     path_m = steps(0.0, 20.0, 60)
     result = run(epochs_of(with_hole(path_m, 20, 45), path_m), balises_at(V2))
-    assert told(result, *STATUS, "linking_error") == [
+    assert passage_rows(result, *STATUS, "linking_error") == [
         ("V1", "accepted", 5.5, "none"),
         ("V2", "not_available", None, "missed"),
     ]
@@ -87,7 +87,7 @@ def test_outage_to_the_end_of_the_run() -> None:
     # The run ends 30 m beyond V2, before its window closes.
     path_m = steps(0.0, 20.0, 28)
     result = run(epochs_of(with_hole(path_m, 20, 27), path_m), balises_at(V2))
-    assert told(result, *STATUS, "linking_error") == [
+    assert passage_rows(result, *STATUS, "linking_error") == [
         ("V1", "accepted", 5.5, "none"),
         ("V2", "not_available", None, "none"),
     ]
@@ -99,7 +99,7 @@ def test_position_that_lags_offers_it_late() -> None:
     path_m = [value - (60.0 if k >= 20 else 0.0) for k, value in enumerate(odometer_m)]
     result = run(epochs_of(path_m, odometer_m), balises_at(V2), ScriptedBank())
     # The linking distance is out of bounds at 20 s already, so the position is negated by then.
-    assert told(result, *STATUS, "linking_error", "odometer_distance_m")[1] == (
+    assert passage_rows(result, *STATUS, "linking_error", "odometer_distance_m")[1] == (
         "V2",
         "rejected_monitor",
         28.5,
@@ -112,7 +112,7 @@ def test_position_that_never_arrives_misses_it() -> None:
     odometer_m = steps(0.0, 20.0, 60)
     path_m = [min(value, 480.0) for value in odometer_m]
     result = run(epochs_of(path_m, odometer_m), balises_at(V2))
-    assert told(result, *STATUS, "linking_error", "t_reckoned")[1] == ("V2", "missed", None, "missed", 25.5)
+    assert passage_rows(result, *STATUS, "linking_error", "t_reckoned")[1] == ("V2", "missed", None, "missed", 25.5)
 
 
 @pytest.mark.parametrize(
@@ -133,24 +133,24 @@ def test_position_that_never_arrives_misses_it() -> None:
 )
 def test_conditions_of_a_detection(columns: dict[str, Any], status: str) -> None:
     epochs = epochs_of(steps(0.0, 20.0, 12), **columns)
-    assert told(run(epochs, balises_at(V1)), *STATUS) == [("V1", status, 5.5)]
+    assert passage_rows(run(epochs, balises_at(V1)), *STATUS) == [("V1", status, 5.5)]
 
 
 def test_passed_while_the_position_is_placed_nowhere() -> None:
     path_m = steps(0.0, 20.0, 12)
     epochs = epochs_of(with_hole(path_m, 4, 7), path_m, fix_valid=[True] * 12)
-    assert told(run(epochs, balises_at(V1)), *STATUS) == [("V1", "rejected_ambiguous", None)]
+    assert passage_rows(run(epochs, balises_at(V1)), *STATUS) == [("V1", "rejected_ambiguous", None)]
 
 
 def test_failed_monitor_at_the_epoch_that_passes_it() -> None:
     result = run(epochs_of(steps(0.0, 20.0, 12)), balises_at(V1), ScriptedBank(fails=[6]))
-    assert told(result, *STATUS) == [("V1", "rejected_monitor", 5.5)]
+    assert passage_rows(result, *STATUS) == [("V1", "rejected_monitor", 5.5)]
 
 
 def test_refused_balise_is_not_found_in_its_window() -> None:
     confidence_m = [20.0 if k == 26 else 6.0 for k in range(40)]
     result = run(epochs_of(steps(0.0, 20.0, 40), confidence_m=confidence_m), balises_at(V2))
-    assert told(result, *STATUS, "linking_error", "reaction")[1] == (
+    assert passage_rows(result, *STATUS, "linking_error", "reaction")[1] == (
         "V2",
         "rejected_confidence",
         25.5,
@@ -162,7 +162,7 @@ def test_refused_balise_is_not_found_in_its_window() -> None:
 def test_not_announced_virtual_balise() -> None:
     balises = balises_at({"V1": 110.0, "X": 300.0, "V2": 510.0}, linked=[True, False, True])
     result = run(epochs_of(steps(0.0, 20.0, 40)), balises)
-    assert told(result, *STATUS, "linking_error", "reaction") == [
+    assert passage_rows(result, *STATUS, "linking_error", "reaction") == [
         ("V1", "accepted", 5.5, "none", "none"),
         ("X", "rejected_unlinked", 15.0, "none", "none"),
         ("V2", "accepted", 25.5, "none", "none"),
@@ -171,7 +171,7 @@ def test_not_announced_virtual_balise() -> None:
 
 def test_two_balises_in_one_step_that_the_odometer_explains() -> None:
     result = run(epochs_of(steps(0.0, 20.0, 12)), balises_at({"V1": 103.0, "V2": 117.0}))
-    assert told(result, *STATUS) == [("V1", "accepted", 5.15), ("V2", "accepted", 5.85)]
+    assert passage_rows(result, *STATUS) == [("V1", "accepted", 5.15), ("V2", "accepted", 5.85)]
 
 
 # Standing, turning, shunting
@@ -183,7 +183,7 @@ def test_noise_at_standstill_on_a_balise_detects_it_once() -> None:
     path_m = [value + noise.gauss(0.0, 1.0) for value in at_m]
     t_s = [0.1 * k for k in range(len(at_m))]
     result = run(epochs_of(path_m, at_m, t_s=t_s), balises_at(V1))
-    assert [row[:2] for row in told(result, *STATUS)] == [("V1", "accepted")]
+    assert [row[:2] for row in passage_rows(result, *STATUS)] == [("V1", "accepted")]
 
 
 @pytest.mark.parametrize(("sigma_m", "rows"), [(1.0, 2), (4.5, 2), (4.6, 1)])
@@ -198,7 +198,7 @@ def test_shunting_back_over_a_balise() -> None:
     # Passed at 5.5 s, turned at 200 m (10 s), passed again at 14.5 s, turned at 0 m (20 s), and again.
     there, back = steps(0.0, 20.0, 10), steps(200.0, -20.0, 10)
     result = run(epochs_of(there + back + there), balises_at(V1))
-    assert told(result, *STATUS, "direction", "linking_error") == [
+    assert passage_rows(result, *STATUS, "direction", "linking_error") == [
         ("V1", "accepted", 5.5, "growing", "none"),
         ("V1", "accepted", 14.5, "falling", "none"),
         ("V1", "accepted", 25.5, "growing", "none"),
@@ -208,7 +208,7 @@ def test_shunting_back_over_a_balise() -> None:
 def test_turned_and_passed_within_one_step() -> None:
     # At 5 s the train stands at 122 m, 12 m beyond V1; at 6 s it is back at 102 m.
     at_m = [22.0, 42.0, 62.0, 82.0, 102.0, 122.0, 102.0, 82.0, 62.0]
-    assert told(run(epochs_of(at_m), balises_at(V1)), *STATUS, "direction") == [
+    assert passage_rows(run(epochs_of(at_m), balises_at(V1)), *STATUS, "direction") == [
         ("V1", "accepted", 4.4, "growing"),
         ("V1", "accepted", 5.6, "falling"),
     ]
@@ -218,7 +218,7 @@ def test_turning_inside_a_window_misses_nothing() -> None:
     # Turned at 490 m, inside the window of V2 at 510 m; V1 is passed again on the way back.
     at_m = steps(0.0, 10.0, 50) + steps(490.0, -10.0, 50)
     result = run(epochs_of(at_m), balises_at(V2))
-    assert told(result, "balise_id", "status", "direction") == [
+    assert passage_rows(result, "balise_id", "status", "direction") == [
         ("V1", "accepted", "growing"),
         ("V1", "accepted", "falling"),
     ]
@@ -228,7 +228,7 @@ def test_after_a_turn_the_way_back_is_linked_too() -> None:
     # V1, V2 growing; turned at 700 m; V2 again; then no position over V1.
     at_m = steps(0.0, 20.0, 35) + steps(700.0, -20.0, 36)
     result = run(epochs_of(with_hole(at_m, 60, 68), at_m), balises_at(V2))
-    assert told(result, "balise_id", "status", "direction", "linking_error") == [
+    assert passage_rows(result, "balise_id", "status", "direction", "linking_error") == [
         ("V1", "accepted", "growing", "none"),
         ("V2", "accepted", "growing", "none"),
         ("V2", "accepted", "falling", "none"),
@@ -242,7 +242,7 @@ def test_zigzag_over_a_switch_starts_a_new_leg_with_its_own_balises() -> None:
     balises = balises_at({"V1": 110.0, "W": 90.0}, leg=[0, 1])
     legs = [0 if k < 15 else 1 for k in range(len(at_m))]
     result = run(epochs_of(at_m, leg=legs), balises)
-    assert told(result, "balise_id", "status", "direction", "odometer_distance_m") == [
+    assert passage_rows(result, "balise_id", "status", "direction", "odometer_distance_m") == [
         ("V1", "accepted", "growing", None),
         ("W", "accepted", "falling", 20.0),
     ]
@@ -258,9 +258,9 @@ def test_jump_over_two_balises_offers_both_in_order() -> None:
     balises = balises_at({"V1": 110.0, "V2": 350.0, "V3": 400.0})
     # The linking distance fails at the same epoch, and a failing monitor comes first.
     seen = run(epochs_of(path_m, odometer_m), balises)
-    assert [row[1] for row in told(seen, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
+    assert [row[1] for row in passage_rows(seen, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
     result = run(epochs_of(path_m, odometer_m), balises, disabled=["link_distance"])
-    assert told(result, *STATUS, "odometer_distance_m", "linking_error") == [
+    assert passage_rows(result, *STATUS, "odometer_distance_m", "linking_error") == [
         ("V1", "accepted", 5.5, None, "none"),
         ("V2", "rejected_window", 14.5, 180.0, "early"),
         ("V3", "rejected_window", pytest.approx(14 + 120 / 140), pytest.approx(170 + 120 / 7), "early"),
@@ -277,14 +277,14 @@ def test_the_same_jump_seen_by_the_bank_is_rejected_by_it() -> None:
         balises_at({"V1": 110.0, "V2": 350.0, "V3": 400.0}),
         ScriptedBank(fails=[15]),
     )
-    assert [row[1] for row in told(result, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
+    assert [row[1] for row in passage_rows(result, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
 
 
 def test_the_same_jump_without_an_odometer_goes_unseen() -> None:
     path_m = [value + (120.0 if k >= 15 else 0.0) for k, value in enumerate(steps(0.0, 20.0, 30))]
     bank = ScriptedBank(blind=range(30))
     result = run(epochs_of(path_m, [None] * 30), balises_at({"V1": 110.0, "V2": 350.0, "V3": 400.0}), bank)
-    assert [row[1] for row in told(result, *STATUS)] == ["accepted"] * 3
+    assert [row[1] for row in passage_rows(result, *STATUS)] == ["accepted"] * 3
     assert result.passages["window_open_m"].null_count() == 3
     assert not result.epochs["alarm"].any()
     assert not result.epochs["tvb"].any()
@@ -297,7 +297,7 @@ def test_jump_back_is_an_offer_beyond_the_passage() -> None:
     odometer_m = steps(0.0, 20.0, 40)
     path_m = [value + (120.0 if 15 <= k < 18 else 0.0) for k, value in enumerate(odometer_m)]
     result = run(epochs_of(path_m, odometer_m), balises_at({"V1": 110.0, "V2": 410.0}), ScriptedBank([15, 18]))
-    assert told(result, "balise_id", "status", "linking_error", "direction") == [
+    assert passage_rows(result, "balise_id", "status", "linking_error", "direction") == [
         ("V1", "accepted", "none", "growing"),
         ("V2", "rejected_monitor", "none", "growing"),
         ("V2", "rejected_monitor", "none", "growing"),
@@ -309,7 +309,7 @@ def test_offset_that_stays_has_one_row_for_the_passage() -> None:
     odometer_m = steps(0.0, 20.0, 40)
     path_m = [value + (120.0 if k >= 15 else 0.0) for k, value in enumerate(odometer_m)]
     result = run(epochs_of(path_m, odometer_m), balises_at({"V1": 110.0, "V2": 410.0}), ScriptedBank([15]))
-    assert told(result, "balise_id", "status", "linking_error", "reaction") == [
+    assert passage_rows(result, "balise_id", "status", "linking_error", "reaction") == [
         ("V1", "accepted", "none", "none"),
         ("V2", "rejected_monitor", "missed", "service_brake"),
     ]
@@ -331,9 +331,9 @@ def test_overlapping_windows_cannot_tell_two_balises_apart() -> None:
     balises = balises_at({"V1": 110.0, "V2": 510.0, "V3": 550.0})
     epochs = epochs_of(path_m, odometer_m)
     by_linking_alone = run(epochs, balises, ScriptedBank(), disabled=["link_distance", "link_order"])
-    assert [row[1] for row in told(by_linking_alone, *STATUS)] == ["accepted"] * 3
+    assert [row[1] for row in passage_rows(by_linking_alone, *STATUS)] == ["accepted"] * 3
     with_tvb = run(epochs, balises, ScriptedBank())
-    assert [row[1] for row in told(with_tvb, *STATUS)] == ["accepted"] + ["rejected_monitor"] * 2
+    assert [row[1] for row in passage_rows(with_tvb, *STATUS)] == ["accepted"] + ["rejected_monitor"] * 2
     assert negations(with_tvb)[0][0] == 12
 
 
@@ -348,7 +348,7 @@ def test_each_balise_is_accepted_once_on_a_healthy_run(seed: int, sigma_m: float
     path_m = [value + noise.gauss(0.0, sigma_m) for value in odometer_m]
     places = {f"V{i}": 100.0 + 300.0 * i for i in range(6)}
     result = run(epochs_of(path_m, odometer_m), balises_at(places))
-    assert [row[:2] for row in told(result, *STATUS)] == [(name, "accepted") for name in places]
+    assert [row[:2] for row in passage_rows(result, *STATUS)] == [(name, "accepted") for name in places]
     assert not result.epochs["alarm"].any()
 
 
@@ -365,7 +365,7 @@ def test_falling_runs_mirror_growing_ones(seed: int) -> None:
     growing = run(epochs_of(path_m, odometer_m), balises_at(places), ScriptedBank(fails))
     mirrored = {name: -place for name, place in reversed(places.items())}
     falling = run(epochs_of([-x for x in path_m], [-x for x in odometer_m]), balises_at(mirrored), ScriptedBank(fails))
-    assert told(falling, *columns) == told(growing, *columns)
+    assert passage_rows(falling, *columns) == passage_rows(growing, *columns)
 
 
 def test_without_an_odometer_a_balise_is_re_armed_by_the_way_of_the_position() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.stages.lds import LdsResult
 from schemas.enums import Direction
-from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, run, steps, told
+from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, passage_rows, run, steps
 from tests.stages.lds.test_invariants import Chaos
 
 AHEAD, BACK, BOTH = 1, -1, 0
@@ -26,12 +26,12 @@ def shuttle() -> list[float]:
 
 
 def names(result: LdsResult, direction: Direction) -> list[str]:
-    return [name for name, way, *_ in told(result, *COLUMNS) if way == direction.value]
+    return [name for name, way, *_ in passage_rows(result, *COLUMNS) if way == direction.value]
 
 
 def test_in_the_other_direction_a_balise_is_not_announced_not_offered_and_not_missed() -> None:
     result = run(epochs_of(steps(0.0, 20.0, 60)), balises_at(PLACES, valid_direction=[BOTH, BACK, AHEAD]))
-    assert told(result, *COLUMNS) == [
+    assert passage_rows(result, *COLUMNS) == [
         ("V1", "growing", "accepted", 5.5, "none"),
         ("V3", "growing", "accepted", 45.5, "none"),
     ]
@@ -51,7 +51,10 @@ def test_a_shuttle_meets_on_its_way_back_what_it_did_not_on_its_way_out() -> Non
 def test_a_balise_of_the_other_direction_is_not_missed_in_an_outage() -> None:
     path_m = [None if 400.0 < x < 700.0 else x for x in steps(0.0, 20.0, 60)]
     places = balises_at(PLACES, valid_direction=[BOTH, BACK, BOTH])
-    assert [row[0] for row in told(run(epochs_of(path_m, steps(0.0, 20.0, 60)), places), *COLUMNS)] == ["V1", "V3"]
+    assert [row[0] for row in passage_rows(run(epochs_of(path_m, steps(0.0, 20.0, 60)), places), *COLUMNS)] == [
+        "V1",
+        "V3",
+    ]
 
 
 @pytest.mark.parametrize("with_odometer", [True, False])
@@ -61,7 +64,7 @@ def test_a_jump_back_re_crosses_a_balise_in_the_direction_of_the_train(with_odom
     path_m = [x - (120.0 if k >= 10 else 0.0) for k, x in enumerate(way_m)]
     epochs = epochs_of(path_m, way_m if with_odometer else [None] * 30)
     ahead, both, back = (run(epochs, balises_at({"V1": 110.0}, valid_direction=valid)) for valid in (AHEAD, BOTH, BACK))
-    assert told(ahead, *COLUMNS) == told(both, *COLUMNS)
+    assert passage_rows(ahead, *COLUMNS) == passage_rows(both, *COLUMNS)
     assert ahead.crossings["sense"].to_list() == [1, -1, 1]
     assert set(ahead.passages["direction"]) == {"growing"}
     assert back.passages.is_empty()
@@ -73,7 +76,7 @@ def test_who_turns_just_behind_a_balise_of_the_other_direction_misses_nothing(be
     ahead = [*steps(0.0, 10.0, 51), 500.0 + beyond_m]
     way_m = [*ahead, *[500.0 + beyond_m] * 5, *steps(499.0, -10.0, 49)]
     result = run(epochs_of(way_m), balises_at({"V1": 100.0, "V2": 500.5}, valid_direction=[BOTH, BACK]))
-    rows = told(result, *COLUMNS)
+    rows = passage_rows(result, *COLUMNS)
     assert all(status == "accepted" for _, _, status, _, _ in rows)
     assert ("V2", "growing") not in [row[:2] for row in rows]
     assert set(result.passages["reaction"]) == {"none"}
@@ -88,7 +91,7 @@ def test_no_row_is_of_a_direction_in_which_its_balise_is_not_valid(seed: int) ->
     columns = {"kind": chaos.kinds, "valid_direction": [valid.get(name, 0) for name in chaos.places]}
     result = run(epochs, balises_at(chaos.places, **columns), ScriptedBank(chaos.fails, blind=chaos.blind))
     facing = {Direction.GROWING.value: 1, Direction.FALLING.value: -1}
-    for name, direction, *_ in told(result, *COLUMNS):
+    for name, direction, *_ in passage_rows(result, *COLUMNS):
         assert valid.get(name, 0) in (0, facing[direction])
 
 

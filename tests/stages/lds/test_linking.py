@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.stages.lds.scripted import balises_at, epochs_of, reads_at, run, steps, told
+from tests.stages.lds.scripted import balises_at, epochs_of, passage_rows, reads_at, run, steps
 
 PLACES = {"P1": 100.0, "P2": 500.0, "P3": 900.0}
 COLUMNS = ("balise_id", "status", "t_offered", "linking_error", "reaction")
@@ -20,7 +20,7 @@ COLUMNS = ("balise_id", "status", "t_offered", "linking_error", "reaction")
 def passages(reads: list[tuple[float, str]], **columns: Any) -> list[tuple[Any, ...]]:
     epochs = epochs_of(steps(0.0, 20.0, 60))
     result = run(epochs, balises_at(PLACES, kind="physical", **columns), reads=reads_at(reads))
-    return told(result, *COLUMNS)
+    return passage_rows(result, *COLUMNS)
 
 
 def test_each_found_in_its_window() -> None:
@@ -105,7 +105,7 @@ def test_one_accepted_between_breaks_the_row() -> None:
     epochs = epochs_of(steps(0.0, 20.0, 70))
     balises = balises_at(places, kind="physical", link_reaction="none")
     result = run(epochs, balises, reads=reads_at([(5, "P1"), (30, "P3")]))
-    assert told(result, "balise_id", "status", "reaction") == [
+    assert passage_rows(result, "balise_id", "status", "reaction") == [
         ("P1", "accepted", "none"),
         ("P2", "missed", "none"),
         ("P3", "accepted", "none"),
@@ -120,7 +120,7 @@ def test_later_announced_inside_the_window_takes_the_reaction_of_the_expected() 
         {"P1": 100.0, "P2": 500.0, "P3": 540.0}, kind="physical", link_reaction=["none", "trip", "none"]
     )
     result = run(epochs, balises, reads=reads_at([(5, "P1"), (27, "P3")]))
-    assert told(result, *COLUMNS) == [
+    assert passage_rows(result, *COLUMNS) == [
         ("P1", "accepted", 5, "none", "none"),
         ("P2", "missed", None, "missed", "trip"),
         ("P3", "rejected_window", 27, "order", "trip"),
@@ -167,7 +167,7 @@ def test_falling_path_mirrors_growing_path() -> None:
     epochs = epochs_of(steps(1000.0, -20.0, 60))
     balises = balises_at(PLACES, kind="physical")
     result = run(epochs, balises, reads=reads_at([(5, "P3"), (22, "P2"), (45, "P1")]))
-    assert told(result, "balise_id", "direction", "status", "linking_error", "odometer_distance_m") == [
+    assert passage_rows(result, "balise_id", "direction", "status", "linking_error", "odometer_distance_m") == [
         ("P3", "falling", "accepted", "none", None),
         ("P2", "falling", "rejected_window", "early", pytest.approx(340.0)),
         ("P1", "falling", "accepted", "none", pytest.approx(800.0)),
@@ -195,7 +195,7 @@ def test_reader_goes_beside_the_position_and_both_are_told() -> None:
         kind=["virtual", "physical", "virtual", "physical"],
     )
     result = run(epochs_of(steps(0.0, 20.0, 40)), balises, reads=reads_at([(5.5, "P1"), (25.5, "P2")]))
-    assert told(result, "balise_id", "kind", "status", "t_offered") == [
+    assert passage_rows(result, "balise_id", "kind", "status", "t_offered") == [
         ("P1", "physical", "accepted", 5.5),
         ("V1", "virtual", "accepted", 5.5),
         ("P2", "physical", "accepted", 25.5),

@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.stages.lds import LdsResult
 from schemas.tables import Epochs, Passages
-from tests.stages.lds.scripted import K_T, ScriptedBank, balises_at, epochs_of, run, steps, told
+from tests.stages.lds.scripted import K_T, ScriptedBank, balises_at, epochs_of, passage_rows, run, steps
 
 FAR = {"V9": 1e6}
 V1 = {"V1": 110.0}
@@ -45,7 +45,7 @@ def test_a_break_begins_the_ten_seconds_anew(hole: int) -> None:
 
 def test_first_balise_has_no_window_and_begins_the_chain() -> None:
     result = run(epochs_of(steps(0.0, 20.0, 10)), balises_at(V1))
-    assert told(result, "status", "window_open_m", "odometer_distance_m") == [("accepted", None, None)]
+    assert passage_rows(result, "status", "window_open_m", "odometer_distance_m") == [("accepted", None, None)]
     assert changes(result, "tvb") == [(0, False), (7, True)]
     assert changes(result, "lrvb_id") == [(0, None), (6, "V1")]
 
@@ -53,7 +53,7 @@ def test_first_balise_has_no_window_and_begins_the_chain() -> None:
 def test_entry_from_an_unfitted_area_wants_the_diagnosis_behind_the_first_balise() -> None:
     places = {"V1": 110.0, "V2": 510.0}
     entry = run(epochs_of(steps(0.0, 20.0, 40)), balises_at(places), entry_from_unfitted_area=True)
-    assert told(entry, "balise_id", "status", "linking_error") == [
+    assert passage_rows(entry, "balise_id", "status", "linking_error") == [
         ("V1", "rejected_monitor", "none"),
         ("V2", "accepted", "none"),
     ]
@@ -105,7 +105,7 @@ def test_after_a_turn_doubt_grows_with_the_way_run() -> None:
 
 def test_without_an_odometer_there_is_no_tvb_and_no_linking() -> None:
     result = run(epochs_of(steps(0.0, 20.0, 20), [None] * 20), balises_at(V1), ScriptedBank(blind=range(20)))
-    assert told(result, "status", "window_open_m") == [("accepted", None)]
+    assert passage_rows(result, "status", "window_open_m") == [("accepted", None)]
     assert changes(result, "lds_mode") == [(0, "initialising")]
     assert result.epochs["diagnosis_faulty"].all()
     assert changes(result, "withheld_for") == [(0, "relink"), (1, None)]
@@ -161,7 +161,7 @@ def test_linking_goes_on_while_negated() -> None:
     # V2 and V3 pass under alarm: offered, rejected, missed in their windows, the second brakes.
     places = {"V1": 110.0, "V2": 510.0, "V3": 710.0, "V4": 1310.0}
     result = run(epochs_of(steps(0.0, 20.0, 80)), balises_at(places, link_reaction="none"), ScriptedBank(range(20, 32)))
-    assert told(result, "balise_id", "status", "linking_error", "reaction") == [
+    assert passage_rows(result, "balise_id", "status", "linking_error", "reaction") == [
         ("V1", "accepted", "none", "none"),
         ("V2", "rejected_monitor", "missed", "none"),
         ("V3", "rejected_monitor", "missed", "service_brake"),
@@ -174,7 +174,7 @@ def test_without_an_odometer_a_negation_after_a_balise_never_ends() -> None:
     bank = ScriptedBank(fails=[20], blind=range(80))
     result = run(epochs_of(steps(0.0, 20.0, 80), [None] * 80), balises_at({"V1": 110.0, "V2": 1110.0}), bank)
     assert changes(result, "negated") == [(0, False), (20, True)]
-    assert [row[0] for row in told(result, "status")] == ["accepted", "rejected_monitor"]
+    assert [row[0] for row in passage_rows(result, "status")] == ["accepted", "rejected_monitor"]
 
 
 # Linking monitors
@@ -241,7 +241,7 @@ def test_positions_off_the_track_raise_no_linking_alarm() -> None:
     balises = balises_at({"V1": 110.0, "V2": 610.0})
     result = run(epochs_of(path_m, odometer_m, on_track=on_track), balises)
     assert not result.epochs["alarm"].any()
-    assert told(result, "balise_id", "status", "t_offered") == [
+    assert passage_rows(result, "balise_id", "status", "t_offered") == [
         ("V1", "accepted", 5.5),
         ("V1", "rejected_ambiguous", pytest.approx(9 + 70 / 100)),
         ("V1", "rejected_ambiguous", pytest.approx(14 + 30 / 620)),

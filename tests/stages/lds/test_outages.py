@@ -49,30 +49,20 @@ def test_without_a_vehicle_file_a_long_outage_ends_the_use_of_the_position(gap_s
 
 
 def test_slow_drifts_after_a_return() -> None:
-    """16 random drifts (six without re-link: none is in use again): by the rule fewer than with the last TVB as anchor.
+    """16 random drifts (six without re-link: none is in use again): after a return none is in use beyond 20 m."""
 
-    Of drifts that come to 10 m within the lag of the anchor none is in use beyond 20 m for longer than 93 s. The noise
-    is measured in each run.
-    """
-
-    def found(config: LdsConfig, drifts: int = 16) -> list[Outcome]:
+    def outcomes(config: LdsConfig, drifts: int) -> list[Outcome]:
         return [outcome(ramp(seed, 1.0 + seed % 2), Configuration(lds=config)) for seed in range(drifts)]
 
-    def beyond(outcomes: list[Outcome]) -> int:
-        return sum(one.beyond_s > 0 for one in outcomes)
-
-    assert not any(one.returned for one in found(LdsConfig(relink=False), 6))
+    assert not any(one.returned for one in outcomes(LdsConfig(relink=False), 6))
     rule = LdsConfig()
-    by_rule = found(rule)
-    fast = [one for one in by_rule if is_fast(one, rule)]
-    assert sum(one.negated for one in fast) >= 10
-    assert beyond(fast) <= 1
-    assert max(one.beyond_s for one in fast) <= 93.0
-    assert beyond(by_rule) <= 1
-    assert beyond(found(LdsConfig(anchor_lag_s=0.0))) >= 2 * beyond(by_rule) + 3
+    by_rule = outcomes(rule, 16)
+    assert sum(one.negated for one in by_rule if is_fast(one, rule)) >= 10
+    assert any(one.returned for one in by_rule)
+    assert max(one.beyond_s for one in by_rule) == 0.0
 
 
-@pytest.mark.parametrize("seed", [1036, 1052, 2009, 2012])
+@pytest.mark.parametrize("seed", [32, 1036, 1052, 2009, 2012])
 def test_a_drift_found_late_does_not_come_back(seed: int) -> None:
     """0.029 to 0.037 m/s: with an anchor 300 s before the alarm all are in use again beyond 20 m, for 335 s or more."""
     found = outcome(ramp(seed, 1.0 + seed % 2), CONFIG)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from pipeline.stages.lds import LdsResult
-from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, negations, reads_at, run, steps, told
+from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, negations, passage_rows, reads_at, run, steps
 from tests.stages.lds.test_modes import changes
 
 BEGIN, END = 20, 30  # slip from 20 s on, up to 30 s
@@ -47,7 +47,7 @@ def slipping(
 def test_before_the_noise_is_known_nothing_is_accepted_and_no_diagnosis_is_missing() -> None:
     result = run(epochs_of(steps(0.0, 20.0, 90)), balises_at(V), ScriptedBank(unknown=range(30)))
     assert changes(result, "withheld_for") == [(0, "noise"), (30, None)]
-    assert told(result, "balise_id", "status") == [
+    assert passage_rows(result, "balise_id", "status") == [
         ("V1", "rejected_monitor"),
         ("V2", "rejected_monitor"),
         ("V3", "accepted"),
@@ -71,7 +71,11 @@ def test_slip_costs_its_own_time_and_no_more() -> None:
     assert changes(result, "lds_mode") == [(0, "initialising"), (6, "linked"), (20, "odometry"), (31, "linked")]
     assert not result.epochs["diagnosis_faulty"].any()
     assert negations(result) == []
-    assert told(result, "balise_id", "status") == [("V1", "accepted"), ("V2", "rejected_monitor"), ("V3", "accepted")]
+    assert passage_rows(result, "balise_id", "status") == [
+        ("V1", "accepted"),
+        ("V2", "rejected_monitor"),
+        ("V3", "accepted"),
+    ]
 
 
 @pytest.mark.parametrize("offset_m", [30.0, -30.0, 10.1, -10.1])
@@ -79,7 +83,7 @@ def test_a_fault_during_slip_does_not_get_through(offset_m: float) -> None:
     """Noise allows for 7.6 m, slip for 5 m; half the failure limit is the most."""
     result = slipping(offset_m)
     assert set(result.epochs["withheld_for"][30:]) == {"relink"}
-    assert told(result, "balise_id", "status")[2] == ("V3", "rejected_monitor")
+    assert passage_rows(result, "balise_id", "status")[2] == ("V3", "rejected_monitor")
     assert not result.epochs["alarm"].any()
 
 
@@ -152,13 +156,13 @@ def test_slip_before_anything_was_validated_needs_no_re_link() -> None:
     bank = ScriptedBank(blind=range(5), begins=[4])
     result = run(epochs_of(path_m, odometer_m, odometer_slips=slips), balises_at(V), bank)
     assert changes(result, "withheld_for") == [(0, "slip"), (4, "relink"), (5, None)]
-    assert told(result, "balise_id", "status")[0] == ("V1", "accepted")
+    assert passage_rows(result, "balise_id", "status")[0] == ("V1", "accepted")
 
 
 def test_the_first_epoch_after_a_restart_accepts_nothing() -> None:
     """V2 is crossed at 24.5 s; the bank begins anew at 25 s."""
     result = run(epochs_of(steps(0.0, 20.0, 60)), balises_at(V), ScriptedBank(blind=[25], begins=[25]))
-    assert told(result, "balise_id", "status")[1] == ("V2", "rejected_monitor")
+    assert passage_rows(result, "balise_id", "status")[1] == ("V2", "rejected_monitor")
     assert changes(result, "withheld_for")[-2:] == [(25, "relink"), (26, None)]
     assert not result.epochs["diagnosis_faulty"].any()
 
@@ -166,6 +170,6 @@ def test_the_first_epoch_after_a_restart_accepts_nothing() -> None:
 def test_an_acceptance_before_anything_was_validated_is_initialising() -> None:
     """V1 at 5.5 s comes before the first TVB; a V1 after ten consistent seconds does not."""
     early = run(epochs_of(steps(0.0, 20.0, 40)), balises_at({"V1": 110.0, "V2": 490.0}))
-    assert told(early, "balise_id", "initialising") == [("V1", True), ("V2", False)]
+    assert passage_rows(early, "balise_id", "initialising") == [("V1", True), ("V2", False)]
     late = run(epochs_of(steps(0.0, 20.0, 40)), balises_at({"V1": 310.0}))
-    assert told(late, "balise_id", "status", "initialising") == [("V1", "accepted", False)]
+    assert passage_rows(late, "balise_id", "status", "initialising") == [("V1", "accepted", False)]

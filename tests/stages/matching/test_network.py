@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.matching.found_route import found_route
+from pipeline.stages.matching.travelled_route import travelled_route
 from schemas.errors import InputError
 from schemas.run import Site
 from tests.stages.matching.builders import Link, line, matched, odometer, run, site, times
@@ -224,7 +224,7 @@ def test_laps_of_a_ring_add_up(pieces: int) -> None:
     moved = found.epochs["path_m"] - found.epochs["path_m"][0]
     assert np.allclose(moved, distance - distance[0], atol=0.5)
     assert len(found.path.legs) == 1
-    assert found_route(found, 0.99).height == 2.5 * pieces + (0.5 if pieces == 1 else 0)
+    assert travelled_route(found, 0.99).height == 2.5 * pieces + (0.5 if pieces == 1 else 0)
 
 
 def test_a_given_route_may_pass_an_element_twice() -> None:

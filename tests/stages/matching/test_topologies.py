@@ -83,7 +83,7 @@ def test_a_single_line_with_a_passing_loop() -> None:
         points = np.concatenate([elements["w"], elements[name][1:], elements["e"][1:]])
         found = matched(ride(points, at, 3, sigma_m=0.3), site(elements, links), odometer(at, RATE_HZ))
         assert found.path.elements() == ["w", name, "e"]
-        assert found.ambiguous["told_by"].is_in(["switch", "positions"]).all()
+        assert found.ambiguous["resolved_by"].is_in(["switch", "positions"]).all()
 
 
 @pytest.mark.parametrize("angle_deg", [6.0, 30.0, 90.0])
@@ -179,9 +179,9 @@ def test_what_ended_a_doubt_is_named() -> None:
     })  # fmt: skip
     x = np.arange(0.0, 1990.0, 10.0)
     fixes = run(x, np.full(len(x), 1.9), 1.0)
-    assert matched(fixes, place).ambiguous["told_by"].to_list() == ["nothing"]
+    assert matched(fixes, place).ambiguous["resolved_by"].to_list() == ["nothing"]
     reads = pl.DataFrame({"t": times(200, 1.0)[100:101], "balise_id": ["r"]})
     found = matched(fixes, Site(place.track, place.links, balises=balises), reads=reads)
-    assert found.ambiguous["told_by"].to_list() == ["read"]
+    assert found.ambiguous["resolved_by"].to_list() == ["read"]
     assert found.epochs["path_probability"].min() > 0.99
     assert found.epochs["gate_probability"][:99].max() < 0.9

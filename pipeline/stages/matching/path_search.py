@@ -43,18 +43,18 @@ def find_path(
     way = travelled(fixes, odometry)
     believed = believable(fixes, fixes.valid, way, config)
     trellis = _trellis(fixes, believed, way, network, pinned, config)
-    found = search(trellis)
-    decoded = aligned(trellis, decode(trellis, found.best))
+    beliefs = search(trellis)
+    decoded = aligned(trellis, decode(trellis, beliefs.best))
     legs = legs_of(trellis, decoded)
     at_m = positions_m(decoded, legs)
     if not grows_with(at_m, fixes.t_ns[trellis.steps.epoch], odometry, config.orientation_distance_m):
         decoded = decoded.turned(network, range(len(decoded.chains)))
         legs = legs_of(trellis, decoded)
         at_m = positions_m(decoded, legs)
-    doubt = doubt_of(trellis, found, legs, decoded.leg, at_m)
+    doubt = doubt_of(trellis, beliefs, legs, decoded.leg, at_m)
     path = TravelledPath(network.track, tuple(legs))
     assignment = _assign(fixes, trellis.steps, decoded, at_m, doubt)
-    return path, assignment, stretches(fixes, trellis, found, doubt, pinned, config), posterior_of(trellis, found)
+    return path, assignment, stretches(fixes, trellis, beliefs, doubt, pinned, config), posterior_of(trellis, beliefs)
 
 
 def _trellis(
@@ -158,7 +158,9 @@ def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig)
     usable = np.cumsum(fixes.valid)
     after = np.flatnonzero(np.diff(usable[believed]) > 1) + 1
     size = np.linalg.norm(fixes.points.surface[believed[after]] - fixes.points.surface[believed[after - 1]], axis=1)
-    t_s, begin_s, end_s = fixes.t_s[steps.epoch], fixes.t_s[believed[after - 1]], fixes.t_s[believed[after]]
+    t_s = fixes.t_s[steps.epoch]
+    begin_s = fixes.t_s[believed[after - 1]]
+    end_s = fixes.t_s[believed[after]]
     first = np.searchsorted(t_s, begin_s - config.jump_aside_s)
     last = np.searchsorted(t_s, end_s + config.jump_aside_s, side="right")
     aside_m = np.zeros(len(steps))

@@ -1,4 +1,4 @@
-"""The path found, as a route that somebody who knows the track can correct and hand in again (CONTRACT section 2)."""
+"""The travelled path as a route that somebody who knows the track can correct and hand in (CONTRACT section 2)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
 }
 
 
-def found_route(found: Match, sure: float) -> pl.DataFrame:
+def travelled_route(match: Match, sure: float) -> pl.DataFrame:
     """One row per net element in the order of growing path, leg by leg: the route, and what of it is in doubt.
 
     `doubtful`: the track was, at the time or in hindsight (the least probabilities of both stand beside it), or no
@@ -34,11 +34,11 @@ def found_route(found: Match, sure: float) -> pl.DataFrame:
     meanwhile, the most probable first, each with its highest probability, in words. `cross_bias_m`: by how much the
     positions lie left of growing path there (median), which survey and antenna do and no GNSS fault.
     """
-    leg = found.epochs["leg"].fill_null(-1).to_numpy()
+    leg = match.epochs["leg"].fill_null(-1).to_numpy()
     rows = [
-        _row(found, number, one, visits, leg == number, sure)
-        for number, one in enumerate(found.path.legs)
-        for visits in _passages(found.path.track, one)
+        _row(match, number, one, visits, leg == number, sure)
+        for number, one in enumerate(match.path.legs)
+        for visits in _passages(match.path.track, one)
     ]
     return pl.DataFrame(rows, schema=ROUTE_COLUMNS, orient="row")
 
@@ -58,35 +58,36 @@ def _passages(track: Track, leg: Leg) -> list[list[int]]:
     return passages
 
 
-def _row(found: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, sure: float) -> tuple[object, ...]:
-    path_m = floats(found.epochs, "path_m")
+def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, sure: float) -> tuple[object, ...]:
+    path_m = floats(match.epochs, "path_m")
     segment, _ = segments_at(leg, np.nan_to_num(path_m))
-    known = found.epochs["path_probability"].is_not_null().to_numpy()
+    known = match.epochs["path_probability"].is_not_null().to_numpy()
     inside = np.flatnonzero(on_leg & np.isin(leg.visit[segment], visits) & known)
-    own = found.epochs[inside]
+    own = match.epochs[inside]
     least = own.select(least_belief().min()).item()
     one = leg.visits[visits[0]]
-    times = found.epochs["t"]
+    times = match.epochs["t"]
     return (
-        found.path.track.ids[one.element],
+        match.path.track.ids[one.element],
         "AB" if one.forward else "BA",
         number,
         least is None or least < sure,
         own["gate_probability"].min(),
         own["path_probability"].min(),
-        _rivals(found, inside, 1.0 - sure),
-        float(np.median(floats(found.epochs, "cross_track_m")[inside])) if len(inside) else None,
+        _rivals(match, inside, 1.0 - sure),
+        float(np.median(floats(match.epochs, "cross_track_m")[inside])) if len(inside) else None,
         times[int(inside[0])] if len(inside) else None,
         times[int(inside[-1])] if len(inside) else None,
     )
 
 
-def _rivals(found: Match, rows: Ints, least: float) -> str:
+def _rivals(match: Match, rows: Ints, least: float) -> str:
     """Elements off the path that are possible at some of these epochs."""
     if len(rows) == 0:
         return ""
-    highest = _highest(found.posterior, int(rows[0]), int(rows[-1]))
-    ids, own = found.path.track.ids, set(found.path.elements())
+    highest = _highest(match.posterior, int(rows[0]), int(rows[-1]))
+    ids = match.path.track.ids
+    own = set(match.path.elements())
     order = sorted((-probability, ids[element]) for element, probability in highest.items())
     return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in own)
 
@@ -95,5 +96,5 @@ def _highest(posterior: Posterior, first: int, last: int) -> dict[int, float]:
     """The highest probability of each element at the steps from one epoch to another."""
     begin, end = np.searchsorted(posterior.epoch, [first, last + 1])
     part = slice(int(posterior.first[max(int(begin) - 1, 0)]), int(posterior.first[int(end)]))
-    told = pl.DataFrame({"element": posterior.element[part], "probability": posterior.probability[part]})
-    return dict(told.group_by("element").agg(pl.col("probability").max()).iter_rows())
+    possible = pl.DataFrame({"element": posterior.element[part], "probability": posterior.probability[part]})
+    return dict(possible.group_by("element").agg(pl.col("probability").max()).iter_rows())
