@@ -106,7 +106,8 @@ def _replay_solution(prepared: PreparedRun, solution: str, placed: _Placed, evid
 
 def _case(ride: Ride, unnoticed: Undetected, evidence: Evidence) -> Case:
     """The solution before the judge."""
-    taken, run = ride.solution, ride.prepared.run
+    taken = ride.solution
+    run = ride.prepared.run
     epochs = pl.concat([taken.epochs, unnoticed.epochs], how="horizontal")
     return Case(
         solution=replace(taken, epochs=epochs, passages=taken.passages.with_columns(unnoticed.passages)),
@@ -123,8 +124,10 @@ def _results(
     ride: Ride, judged: Judged, epochs: pl.DataFrame, unnoticed: Undetected, fit: Fit, evidence: Evidence
 ) -> SolutionResults:
     """All that the `runs` row is made of."""
-    prepared, name = ride.prepared, ride.solution.name
-    run, counts = prepared.run, prepared.counts.solutions[name]
+    prepared = ride.prepared
+    name = ride.solution.name
+    run = prepared.run
+    counts = prepared.counts.solutions[name]
     return SolutionResults(
         solution=name,
         epochs=epochs,

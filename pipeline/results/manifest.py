@@ -95,9 +95,10 @@ def note_settings(out: Address, config_digest: str, given: SettingsFiles) -> Non
 
 
 def note_pages(out: Address, pages: Mapping[str, bytes]) -> None:
-    """Keep the digests of the pages of this result, by their names in `OUT/report`."""
+    """Keep the digests of the pages of this result, by their names in `OUT/report`, where it has a manifest."""
     manifest = earlier(out)
-    _write(out, manifest | {"pages": {name: _digested(content) for name, content in sorted(pages.items())}})
+    if manifest["runs"]:
+        _write(out, manifest | {"pages": {name: _digested(content) for name, content in sorted(pages.items())}})
 
 
 def write_manifest(out: Address) -> None:

@@ -57,7 +57,8 @@ class PreparedRun:
 
     def match(self, solution: str) -> Match:
         """The solution on the track network; raises `InputError` where it comes near no track."""
-        config, reads = self.config, self.run.balise_reads
+        config = self.config
+        reads = self.run.balise_reads
         fixes = self.fixes(solution)
         return match(fixes, self.odometry, self.site, self.vehicle, config.matching, config.fix_sigma, reads)
 
@@ -66,7 +67,8 @@ class PreparedRun:
         network = site_network(self.site)
         pieces = network_in_pieces(self.site)
         reference = reference_stretches(self.run.reference, pieces, network.track.index, self.config)
-        reads, balises = self.run.balise_reads, self.site.balises
+        reads = self.run.balise_reads
+        balises = self.site.balises
         return evidence_of(reference, reads, balises, self.odometers, network, self.vehicle, self.config)
 
     @property

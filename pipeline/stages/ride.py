@@ -49,7 +49,8 @@ class Ride:
 
 def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: Evidence) -> Ride:
     """Align one matched solution with the odometer, monitor it, detect balises."""
-    config, matched = prepared.config, matches[solution]
+    config = prepared.config
+    matched = matches[solution]
     odometry = None if prepared.odometry is None else prepared.odometry.oriented(matched.odometer_sign)
     aligned = align(matched.epochs, odometry, prepared.vehicle, config)
     if odometry is None:

@@ -13,7 +13,7 @@ import pytest
 from pipeline.campaign import make_plan, run_campaign
 from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.verify import recompute, verify
-from pipeline.results.manifest import settings_files
+from pipeline.results.manifest import note_pages, settings_files
 from pipeline.results.store import table_address
 from pipeline.show.report import write_report
 from schemas.config import Configuration, Vehicle, load_settings
@@ -157,6 +157,8 @@ def test_a_manifest_of_any_content_stops_nothing(out: Path, tmp_path: Path, cont
     (copy / "manifest.json").write_text(content)
     with pytest.raises(UsageError, match="is not a manifest"):
         verify(copy)
+    note_pages(copy, {"index.html": b""})
+    assert (copy / "manifest.json").read_text() == content, "pages alone make no manifest"
     write_campaign(copy, Configuration())
     assert manifest_of(copy)["runs"] == expected
 

@@ -43,13 +43,15 @@ class Calibration:
     """`vehicle`: the vehicle file; `runs`: scale and latency run by run; `sigmas`: regression by monitor.
 
     The vehicle has no latency where the runs show none. `monitors`: what was measured for `[monitors]` of the
-    configuration, by key; a key without a measurement is left out.
+    configuration, by key; a key without a measurement is left out. `alarms`: by run the monitors that failed beyond its
+    noise: such a run is hardly without fault.
     """
 
     vehicle: Vehicle
     runs: pl.DataFrame
     sigmas: pl.DataFrame
     monitors: Mapping[str, float | tuple[float, ...]]
+    alarms: Mapping[str, tuple[str, ...]]
 
     def monitors_toml(self) -> str:
         """The part of a configuration file that was measured."""
@@ -158,6 +160,7 @@ def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configura
         runs=_run_table(runs),
         sigmas=sigma_table(sigmas),
         monitors={**noise_m, **sigma_keys(sigmas, noisy=noisy), **velocity},
+        alarms={run.run_id: run.alarms for run in runs if run.alarms},
     )
 
 

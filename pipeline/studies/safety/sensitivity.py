@@ -14,7 +14,8 @@ from typing import Any
 import polars as pl
 
 from pipeline.results import store
-from pipeline.stages.run_row.verdict import failures_in, head_of, level_counts, reasons_of, run_verdicts, verdict_of
+from pipeline.results.figures.head import head_of, run_verdicts
+from pipeline.stages.run_row.verdict import failures_in, level_counts, reasons_of, verdict_of
 from schemas.config import Configuration
 from schemas.enums import RunStatus
 
