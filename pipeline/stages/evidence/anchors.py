@@ -55,10 +55,10 @@ class KnownStretch:
 
     def anchor(self, sample: int) -> Anchor:
         """The places of one sample; what a step left open widens it like the clock."""
-        open_m = max(float((one.high_m - one.low_m)[sample]) for one in self.paths)
+        open_m = max(float((known.high_m - known.low_m)[sample]) for known in self.paths)
         return Anchor(
             t_ns=int(self.t_ns[sample]),
-            places=tuple(dict.fromkeys(one.place(sample) for one in self.paths)),
+            places=tuple(dict.fromkeys(known.place(sample) for known in self.paths)),
             sigma_m=float(self.sigma_m[sample]),
             kind=Evidence.REFERENCE,
             clock_m=float(self.clock_m[sample]) + open_m,
@@ -116,22 +116,22 @@ def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> Lag:
     """The reference's clock against the odometer's, by its ways of ten seconds."""
     if not sides:
         return Lag()
-    begins, ends, ways = (np.concatenate(column) for column in zip(*(_ways(one) for one in sides), strict=True))
+    begins, ends, ways = (np.concatenate(column) for column in zip(*(_ways(side) for side in sides), strict=True))
     return lag_of(begins, ends, ways, counter)
 
 
-def _ways(one: Sided) -> tuple[Ints, Ints, Floats]:
+def _ways(side: Sided) -> tuple[Ints, Ints, Floats]:
     """Begins, ends and lengths of the ways of ten seconds, as the odometer counts up."""
-    path = one.stretch.paths[0]
-    t_ns = one.stretch.t_ns
+    path = side.stretch.paths[0]
+    t_ns = side.stretch.t_ns
     rows = _every(t_ns, _LAG_WINDOW_S)
     whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
     begin, end = rows[:-1][whole], rows[1:][whole]
-    return t_ns[begin], t_ns[end], one.sense * (path.at_m[end] - path.at_m[begin])
+    return t_ns[begin], t_ns[end], side.sense * (path.at_m[end] - path.at_m[begin])
 
 
 def known_stretch(
-    one: Sided,
+    side: Sided,
     clock: Clock,
     counters: Sequence[Counter],
     reads: Sequence[Anchor],
@@ -139,15 +139,15 @@ def known_stretch(
     config: Configuration,
 ) -> KnownStretch:
     """The stretch as evidence; `reads` close a step of the reference where they confirm it."""
-    stretch = one.stretch
+    stretch = side.stretch
     t_ns = stretch.t_ns - round(clock.shift_s * NS_PER_S)
     paths: list[KnownPath] = []
     speed_mps = np.zeros(t_ns.size)
     for path in stretch.paths:
-        at_m = path.at_m - one.sense * ahead_m
+        at_m = path.at_m - side.sense * ahead_m
         own_mps = _speed_mps(t_ns, at_m, path.leg)
         speed_mps = np.maximum(speed_mps, own_mps)
-        known = KnownPath(path, one.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
+        known = KnownPath(path, side.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
         reads_ns = _confirming_ns(known, t_ns, stretch.sigma_m, own_mps * clock.delta_s, reads, config.hazards)
         low_m, high_m, step_m = _left_open(known, t_ns, stretch.sigma_m, counters, reads_ns, config)
         paths.append(replace(known, low_m=at_m + low_m, high_m=at_m + high_m, step_m=step_m))
@@ -269,6 +269,6 @@ def outside(anchors: Sequence[Anchor], stretches: Sequence[KnownStretch]) -> lis
     """Anchors at times that no stretch covers."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
     inside: Bools = np.zeros(t_ns.size, dtype=np.bool_)
-    for one in stretches:
-        inside |= (t_ns >= one.t_ns[0]) & (t_ns <= one.t_ns[-1])
+    for stretch in stretches:
+        inside |= (t_ns >= stretch.t_ns[0]) & (t_ns <= stretch.t_ns[-1])
     return [anchor for anchor, within in zip(anchors, inside.tolist(), strict=True) if not within]

@@ -155,11 +155,11 @@ def carried_forward(
     if used.size:
         last = np.searchsorted(accepted_ns[used], t_ns, side="right") - 1
         rows = np.flatnonzero(last >= 0)
-        own = used[last[rows]]
-        interval = _since_accepted(counter, accepted_ns[own], path_m[own], t_ns[rows], config)
+        since_vb = used[last[rows]]
+        interval = _since_accepted(counter, accepted_ns[since_vb], path_m[since_vb], t_ns[rows], config)
         void = np.zeros(rows.size, dtype=np.bool_)
         for begin_ns, end_ns in stood:
-            void |= (t_ns[rows] >= begin_ns) & (accepted_ns[own] <= end_ns)
+            void |= (t_ns[rows] >= begin_ns) & (accepted_ns[since_vb] <= end_ns)
         low[rows], high[rows] = (np.where(void, np.nan, values) for values in interval)
     return low, high
 

@@ -130,8 +130,9 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing
         passed_after = np.searchsorted(at_m, journey.path_m[after], side="right")
         passing = np.flatnonzero(passed_before != passed_after)
         for step in passing.tolist():
-            i, k, first, last = (int(rows[step]) for rows in (before, after, passed_before, passed_after))
-            crossings += [_crossing(journey, balise, i, k, sense) for balise, sense in _in_order(on_leg, first, last)]
+            begin, end = int(before[step]), int(after[step])
+            passed = _in_order(on_leg, int(passed_before[step]), int(passed_after[step]))
+            crossings += [_crossing(journey, balise, begin, end, sense) for balise, sense in passed]
     return [crossing for crossing in crossings if _is_valid(crossing, journey)]
 
 
@@ -145,6 +146,7 @@ def _is_valid(crossing: Crossing, journey: Journey) -> bool:
 
 
 def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tuple[Balise, int]]:
+    """The balises passed by a step, with its sense; `before`, `after`: how many balises lie behind it at its ends."""
     if after > before:
         yield from ((balise, 1) for balise in balises[before:after])
     else:
@@ -152,6 +154,7 @@ def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tu
 
 
 def _crossing(journey: Journey, balise: Balise, before: int, k: int, sense: int) -> Crossing:
+    """The step from epoch `before` to `k` passes a balise: interpolated, in a gap as at `k`."""
     near = bool(journey.t_ns[k] - journey.t_ns[before] <= journey.gap_ns)
     share = 1.0
     t_ns = journey.t_ns
@@ -231,7 +234,7 @@ def _read(
     epoch = min(int(np.searchsorted(journey.t_ns, t_ns)), journey.t_ns.size - 1)
     before = max(int(np.searchsorted(journey.t_ns, t_ns, side="right")) - 1, 0)
     here_m = float(np.nan_to_num(journey.path_m[epoch]))
-    # Where the train is, the telegram before and the odometer tell; the position only where these do not tell it.
+    # The place of the last telegram plus the odometer since then; the matched position only where there is none.
     before_m = None if last is None or journey.segment[last.before] != journey.segment[before] else last.odometer_m
     if last is not None and before_m is not None and odometer_m is not None:
         here_m = last.balise.path_m + odometer_m - before_m

@@ -123,7 +123,7 @@ class BaliseDetection:
         return refusal
 
     def _absence(self, k: int) -> PassageStatus:
-        """What to say of a balise that the train has passed and the position has not."""
+        """The status of a balise passed by the train, but not by the position."""
         return self._journey.absence(slice(k, k + 1)) if self._journey.blind[k] else PassageStatus.MISSED
 
     def _order_fails(self, k: int, offered: list[Crossing], overdue: int) -> bool:

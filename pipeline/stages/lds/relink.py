@@ -118,6 +118,7 @@ class Relink:
         return self._last_validated(k, 0.0)
 
     def _last_validated(self, k: int, lag_s: float) -> Anchor | None:
+        """The last TVB at least `lag_s` before epoch `k`, else the first of the mission; or a later telegram."""
         tvbs = self._mission_from + np.flatnonzero(self._tvb[self._mission_from : k])
         if not tvbs.size:
             return self._fixed
@@ -165,30 +166,31 @@ class Relink:
 
 
 class Recovery:
-    """Since when nothing has failed fast while the position is negated."""
+    """While the position is negated: for how long no fast monitor has failed."""
 
     def __init__(self, journey: Journey, bank: MonitorBank, config: Configuration) -> None:
         self._journey = journey
         self._bank = bank
         self._rule = RecoveryRule(config)
-        self._failed_at_ns = self._seen_at_ns = 0
+        self._failed_at_ns = self._observed_at_ns = 0
 
     def begin(self, k: int) -> None:
         """The position is negated at epoch `k`."""
-        self._failed_at_ns = self._seen_at_ns = int(self._journey.t_ns[k])
+        self._failed_at_ns = self._observed_at_ns = int(self._journey.t_ns[k])
 
     def is_over(self, k: int, evaluated: bool, failing: bool) -> bool:
-        """`recovery_s` without a failure of the raw and fastest monitors, all of it seen, and a usable position now.
+        """`recovery_s` without a failure of the raw and fastest monitors, observed without a gap, and usable now.
 
-        Without an odometer there is no along bank to look on; the position itself has to do.
+        Observed is an epoch with a verdict of `along_raw` (`evaluated`); without an odometer, with a usable position.
         """
         t_ns = int(self._journey.t_ns[k])
-        seen = evaluated if self._journey.has_odometer else bool(self._journey.usable[k])
-        if seen:
-            if t_ns - self._seen_at_ns > self._journey.gap_ns:
+        usable = bool(self._journey.usable[k])
+        observed = evaluated if self._journey.has_odometer else usable
+        if observed:
+            if t_ns - self._observed_at_ns > self._journey.gap_ns:
                 self._failed_at_ns = t_ns
-            self._seen_at_ns = t_ns
+            self._observed_at_ns = t_ns
         if failing or self._bank.fast_failed(k):
             self._failed_at_ns = t_ns
         quiet = bool(self._rule.is_quiet((t_ns - self._failed_at_ns) / NS_PER_S))
-        return seen and bool(self._journey.usable[k]) and quiet
+        return observed and usable and quiet
