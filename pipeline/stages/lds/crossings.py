@@ -153,28 +153,28 @@ def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tu
         yield from ((balise, -1) for balise in reversed(balises[after:before]))
 
 
-def _crossing(journey: Journey, balise: Balise, before: int, k: int, sense: int) -> Crossing:
-    """The step from epoch `before` to `k` passes a balise: interpolated, in a gap as at `k`."""
-    near = bool(journey.t_ns[k] - journey.t_ns[before] <= journey.gap_ns)
+def _crossing(journey: Journey, balise: Balise, before: int, epoch: int, sense: int) -> Crossing:
+    """The step from `before` to `epoch` passes a balise: interpolated, in a gap as at `epoch`."""
+    near = bool(journey.t_ns[epoch] - journey.t_ns[before] <= journey.gap_ns)
     share = 1.0
     t_ns = journey.t_ns
     path_m = journey.path_m
     odometer_m = journey.odometer_m
     if near:
-        share = float((balise.path_m - path_m[before]) / (path_m[k] - path_m[before]))
-    direction = int(journey.direction[k])
-    back_m = 0.0 if share == 1.0 else (1.0 - share) * float(odometer_m[k] - odometer_m[before])
+        share = float((balise.path_m - path_m[before]) / (path_m[epoch] - path_m[before]))
+    direction = int(journey.direction[epoch])
+    back_m = 0.0 if share == 1.0 else (1.0 - share) * float(odometer_m[epoch] - odometer_m[before])
     return Crossing(
         balise=balise,
         before=before,
-        epoch=k,
-        t_ns=int(t_ns[before]) + round(share * int(t_ns[k] - t_ns[before])),
+        epoch=epoch,
+        t_ns=int(t_ns[before]) + round(share * int(t_ns[epoch] - t_ns[before])),
         sense=sense,
         direction=direction,
-        odometer_m=_known(float(odometer_m[k]) - back_m),
-        travelled_m=float(journey.travelled_m[k]) - back_m * direction,
-        confidence_m=_known(float(journey.confidence_m[k])),
-        absence=None if near else journey.absence(slice(before + 1, k)),
+        odometer_m=_known(float(odometer_m[epoch]) - back_m),
+        travelled_m=float(journey.travelled_m[epoch]) - back_m * direction,
+        confidence_m=_known(float(journey.confidence_m[epoch])),
+        absence=None if near else journey.absence(slice(before + 1, epoch)),
     )
 
 

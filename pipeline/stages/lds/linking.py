@@ -113,17 +113,17 @@ class LinkingChain:
         if self.linking:
             self._close_windows(self._distance_m(odometer_m), t_ns, absence)
 
-    def turn(self, journey: Journey, k: int) -> None:
-        """From epoch `k` on the train goes the other way, or on another leg: expect the balises on its new way.
+    def turn(self, journey: Journey, epoch: int) -> None:
+        """From `epoch` on the train goes the other way, or on another leg: expect the balises on its new way.
 
         Balises whose window covers the place of the turn may have been passed or not: they are optional.
         """
         if self.reference is None or not self.linking:
             return
-        self._direction = int(journey.direction[k])
-        self._leg = int(journey.leg[k])
-        travelled_m = float(journey.travelled_m[k]) - self.reference.travelled_m
-        self._turn = _Turn(self._distance_m(float(journey.odometer_m[k])), travelled_m)
+        self._direction = int(journey.direction[epoch])
+        self._leg = int(journey.leg[epoch])
+        travelled_m = float(journey.travelled_m[epoch]) - self.reference.travelled_m
+        self._turn = _Turn(self._distance_m(float(journey.odometer_m[epoch])), travelled_m)
         for passages in (self._own, self._set_aside, self._unoffered):
             passages.clear()
         windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel().balises]

@@ -109,10 +109,9 @@ class LocationSystem:
             self.balises.finish(self._t_ns[-1])
 
     def _uneventful_until(self, k: int) -> int:
-        """The first epoch from `k` on that `_step` has to look at; those before it are TVBs where evaluated and usable.
+        """The first epoch from `k` on that has to be stepped through; those before it can only be TVBs.
 
-        Uneventful is a position in use, in a begun chain, up to the next event (balise, read, turn, outage, loss of
-        distance), alarm or end of a window.
+        So it is on linked way where no balise, read, turn, outage, loss of distance, alarm or end of a window is near.
         """
         if self._use is not Use.IN_USE or self._withheld_for(k) is not None:
             return k
@@ -161,7 +160,7 @@ class LocationSystem:
             self._validate(k)
 
     def _withheld_for(self, k: int) -> LostTo | None:
-        """Why the diagnosis withholds the position here, None where it does not (DOMAIN section 5.2)."""
+        """Why the diagnosis cannot stand behind a position here, as it says itself (DOMAIN section 5.2)."""
         if not self._bank.noise_known_at(k):
             return LostTo.NOISE
         if self._journey.slips[k]:
@@ -169,7 +168,7 @@ class LocationSystem:
         return LostTo.RELINK if self._use is Use.SLIPPED or self._bank.begins_at(k) else None
 
     def _watch(self, k: int) -> None:
-        """Leave or re-enter use: slip and its end, noise that hides the position, outages, the return from them."""
+        """Whether anybody looks on at the position, or has looked on until now."""
         if self._journey.slips[k]:
             self._consistent_since_ns = None
             if self._use in (Use.IN_USE, Use.UNSEEN) and self._validated:
@@ -181,7 +180,7 @@ class LocationSystem:
             self._use = Use.UNSEEN
             self._since = k
         if self._use in (Use.IN_USE, Use.UNSEEN) and k in self._after_outages:
-            # The last epoch before the time that the bank bridges; an outage is longer, so there is one.
+            # The last epoch that lies farther back than the bank bridges: there is one before an outage.
             self._use = Use.UNSEEN
             self._since = bisect_left(self._t_ns, self._t_ns[k] - self._bridged_ns) - 1
         if self._use is Use.UNSEEN and self._bank.noise_known_at(k) and self._can_return(k):
@@ -196,7 +195,7 @@ class LocationSystem:
             self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
 
     def _relink_unseen(self, k: int) -> None:
-        """The first usable position after an outage or the noise: it re-links, or is negated."""
+        """The first usable position after an outage or the noise: where it moved meanwhile, that is an alarm."""
         self._use = Use.IN_USE
         if self._validated and self._t_ns[k] - self._t_ns[self._since] > self._bridged_ns:
             comparison = self._relink.compare(k, self._relink.anchor_at(k))
@@ -205,7 +204,6 @@ class LocationSystem:
                 self._negate(k)
 
     def _accept(self, crossing: Crossing, k: int) -> None:
-        """An accepted virtual balise is the LRVB and begins the chain of TVBs; the linking distance counts from it."""
         self.accepted_at_ns[k] = crossing.t_ns
         crossing.initialising = not self._validated
         self._validated = True
@@ -216,7 +214,7 @@ class LocationSystem:
         self._note_lrvb(k)
 
     def _validate(self, k: int) -> None:
-        """A usable position not withheld is a TVB, once the chain has begun; else it may begin it."""
+        """A usable position that the diagnosis stands behind is a TVB once the chain has begun."""
         if self._has_initialised(k) if self._chain_from is None else k > self._chain_from:
             self.tvb[k] = self._validated = True
             if not self.distance.can_measure(k):
@@ -235,8 +233,7 @@ class LocationSystem:
         return True
 
     def _negate(self, k: int) -> None:
-        """An alarm: fix the re-link anchor, freeze the noise, wait for recovery."""
-        # Slow averages that fail alone show a drift as old as their memory; after a jump they fail too, but it is new.
+        # A jump fails the slow averages too: how old a drift may be is said by them where they fail alone.
         self._relink.note_alarm(k, 0.0 if self._bank.fast_failed(k) else self._bank.failing_memory_s(k))
         if self._bank.failed(k):
             self._hold_to_ns = None
@@ -247,7 +244,6 @@ class LocationSystem:
         self._consistent_since_ns = None
 
     def _seek_return(self, k: int, disordered: bool) -> None:
-        """Negated: return after recovery if the position re-links, or anew where nothing was validated before."""
         self.negated[k] = True
         if not self._recovery.is_over(k, self.evaluated[k], disordered):
             return
@@ -259,7 +255,7 @@ class LocationSystem:
             self.withheld_for[k] = LostTo.RELINK
             return
         self._return(k)
-        # The restarted bank cannot see a slow drift go on until its slowest average is full: the anchor stays for it.
+        # The bank begins anew: for the memory of its slowest average nothing else would see a slow drift go on.
         if self._hold_to_ns is None:
             self._hold_to_ns = self._t_ns[k] + self._memory_ns
         end = max(bisect_right(self._t_ns, self._hold_to_ns), k)
@@ -278,12 +274,11 @@ class LocationSystem:
         self._note_lrvb(k)
 
     def _return(self, k: int) -> None:
-        """The position is in use again, but withheld at this epoch, from which the bank restarts."""
         self._use = Use.IN_USE
         self.negated[k] = False
         self._bank.restart(k)
         self.withheld_for[k] = LostTo.RELINK
-        # Verdicts before the restart were of the fault that is over.
+        # What still rang at this epoch belonged to the fault that is over.
         self.evaluated[k] = self._bank.along_evaluated(k)
         self.alarm[k] = self._bank.failed(k)
 
