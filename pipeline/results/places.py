@@ -17,7 +17,7 @@ _POINTS = 3000
 
 
 @dataclass(frozen=True)
-class Ground:
+class GroundPositions:
     """Positions in degrees and metres, NaN where not known; `heading_deg` of growing measure, clockwise from north."""
 
     latitude_deg: Floats
@@ -26,7 +26,7 @@ class Ground:
     heading_deg: Floats
 
 
-def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) -> Ground:
+def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) -> GroundPositions:
     """Places on the rails. Between survey points position is linear; beyond the ends the last chord goes on."""
     survey = track_of(track)
     columns = [np.full(len(measure_m), np.nan) for _ in range(4)]
@@ -38,10 +38,10 @@ def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) 
         index = rows["row"].to_numpy()
         for column, values in zip(columns, _on_element(survey, number, measure_m[index]), strict=True):
             column[index] = values
-    return Ground(*columns)
+    return GroundPositions(*columns)
 
 
-def beside(ground: Ground, sign: Floats, left_m: Floats, above_m: Floats) -> Ground:
+def beside(ground: GroundPositions, sign: Floats, left_m: Floats, above_m: Floats) -> GroundPositions:
     """Places `left_m` to the left of growing path and `above_m` over the rails.
 
     `sign` is +1 where path and measure grow together, -1 where against each other. For metres, not kilometres.
@@ -51,7 +51,7 @@ def beside(ground: Ground, sign: Floats, left_m: Floats, above_m: Floats) -> Gro
     level = np.nan_to_num(ground.height_m)
     latitude, longitude = moved_deg(ground.latitude_deg, ground.longitude_deg, level, east, north)
     height = ground.height_m + np.nan_to_num(above_m)
-    return Ground(latitude, longitude, height, ground.heading_deg)
+    return GroundPositions(latitude, longitude, height, ground.heading_deg)
 
 
 def stretches_of(epochs: pl.DataFrame) -> pl.DataFrame:
@@ -109,7 +109,7 @@ def train_path_m(epochs: pl.DataFrame, stretches: pl.DataFrame) -> tuple[Floats,
     return low, high
 
 
-def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, margin_m: float = 50.0) -> Ground:
+def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, margin_m: float = 50.0) -> GroundPositions:
     """Places of path positions on the stretches; NaN further than `margin_m` beyond what was travelled."""
     best, measure_m = np.full(len(path_m), np.inf), np.full(len(path_m), np.nan)
     names = np.full(len(path_m), None, dtype=object)
@@ -140,7 +140,7 @@ def sign_of(epochs: pl.DataFrame, stretches: pl.DataFrame) -> Floats:
     return fitting["sign"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
-def plane_m(ground: Ground, origin: tuple[float, float]) -> tuple[Floats, Floats]:
+def plane_m(ground: GroundPositions, origin: tuple[float, float]) -> tuple[Floats, Floats]:
     """East and north of an origin (latitude, longitude) in its tangent plane [m], for drawing."""
     plane = points_of(np.array([origin[0]]), np.array([origin[1]]))
     offset = points_of(ground.latitude_deg, ground.longitude_deg).surface - plane.surface[0]
@@ -157,7 +157,7 @@ def element_lines_m(site: Site) -> Iterator[tuple[str, Floats, Floats]]:
     """Each net element as a line east and north of the origin [m], of no more points than a screen shows."""
     survey = track_of(site.track)
     nothing = np.full(len(survey.latitude_deg), np.nan)
-    east, north = plane_m(Ground(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))
+    east, north = plane_m(GroundPositions(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))
     for _, name, rows in survey.elements():
         yield name, _thinned(east[rows]), _thinned(north[rows])
 

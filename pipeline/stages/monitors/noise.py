@@ -35,7 +35,7 @@ class NoiseMeter:
         sampler = _Sampler(series, moving, self._config)
         self._renewal = sampler.renewal
         self._lags_s: list[float] = []
-        self._samples: list[_Samples] = []
+        self._samples: list[_SecondDifferences] = []
         if given_m is None and series.dt_s.size > 2:
             self._lags_s = _lags_s(sampler.period_s, self._memories_s)
             longest_s = max(self._config.noise_longest_lag_s, sampler.period_s)
@@ -126,7 +126,7 @@ class NoiseMeter:
 
 
 @dataclass(frozen=True)
-class _Samples:
+class _SecondDifferences:
     """Second differences over one lag, in order of time.
 
     `row`, `oldest`: of t and of t - 2 L; `renewal`: number of the renewal period of t; `noise_m2` (quantiles, samples):
@@ -191,7 +191,7 @@ class _Sampler:
         self._white_m2 = np.cumsum(series.white_m2)
         self._lasting_m = [np.cumsum(rate_mps * series.dt_s) for rate_mps in series.lasting_mps.T if rate_mps.any()]
 
-    def over(self, lag_s: float) -> _Samples:
+    def over(self, lag_s: float) -> _SecondDifferences:
         config = self._config
         spacing_s = max(self.period_s, 0.1 * lag_s, config.noise_spacing_s)
         rows = self._triples(lag_s, spacing_s)
@@ -201,7 +201,7 @@ class _Sampler:
         quantiles = config.noise_quantiles if lag_s < config.noise_longest_lag_s else config.noise_quantiles[:-1]
         gaussian_m2 = ndtri(0.5 + 0.5 * np.array(quantiles)[:, None]) ** 2
         ready_s = max(config.noise_first_s, config.noise_ready_lags * lag_s) - 2.0 * lag_s
-        return _Samples(
+        return _SecondDifferences(
             row=rows.last,
             oldest=rows.oldest,
             renewal=self.renewal[rows.last],

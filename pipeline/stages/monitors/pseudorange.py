@@ -70,7 +70,7 @@ class _Ranges:
 
 
 @dataclass(frozen=True)
-class _Track:
+class _TrackFrame:
     """The track at each epoch: unit vectors east, north, up and offset of the position from it [m]."""
 
     along: Floats
@@ -103,7 +103,7 @@ def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame, apart_s: fl
     )
 
 
-def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
+def _track_of(epochs: pl.DataFrame, config: Configuration) -> _TrackFrame:
     names = ("heading_deg", "slope", "cross_track_m", "vertical_m", "survey_sigma_m", "interpolation_error_m")
     heading, slope, cross_m, vertical_m, survey_m, chord_m = (floats(epochs, name) for name in names)
     angle, rise = np.radians(heading), np.arctan(np.nan_to_num(slope))
@@ -116,7 +116,7 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
     known = np.isfinite(vertical_m)
     left = np.stack([-np.cos(angle), np.sin(angle), zero], axis=-1)
     offset = cross_m[:, None] * left + np.where(known, vertical_m, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
-    return _Track(
+    return _TrackFrame(
         along=np.stack([level * np.sin(angle), level * np.cos(angle), np.sin(rise)], axis=-1),
         cross=left,
         offset_m=offset,
@@ -153,14 +153,14 @@ def equations_of(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configu
     return _chunks(ranges, _track_of(epochs, config))
 
 
-def _chunks(ranges: _Ranges, track: _Track) -> Iterator[Equations]:
+def _chunks(ranges: _Ranges, track: _TrackFrame) -> Iterator[Equations]:
     usable = np.flatnonzero(track.usable)
     chosen = usable[np.isin(usable, ranges.epoch)]
     for begin in range(0, chosen.size, BLOCK):
         yield _equations(ranges, track, chosen[begin : begin + BLOCK])
 
 
-def _equations(ranges: _Ranges, track: _Track, epochs: Ints) -> Equations:
+def _equations(ranges: _Ranges, track: _TrackFrame, epochs: Ints) -> Equations:
     """Of these epochs, which all have satellites."""
     first = np.searchsorted(ranges.epoch, epochs)
     count = np.searchsorted(ranges.epoch, epochs, side="right") - first
@@ -178,7 +178,7 @@ def _equations(ranges: _Ranges, track: _Track, epochs: Ints) -> Equations:
     return Equations(epochs, held, rows, clocks, weight, residual, design, prior, count - free, track.along[epochs])
 
 
-def _priors(track: _Track, epochs: Ints, present: Bools) -> tuple[Floats, Ints]:
+def _priors(track: _TrackFrame, epochs: Ints, present: Bools) -> tuple[Floats, Ints]:
     """Prior precision of along, cross, up and clocks [1/m^2], and how many of them are free.
 
     Nothing is known of the error along the track and of clocks, the survey's sigma holds the others; without

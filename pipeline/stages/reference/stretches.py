@@ -46,15 +46,15 @@ class ReferenceStretch:
 
 
 @dataclass(frozen=True)
-class Samples:
+class ReferenceSamples:
     """The samples of a run in order of time."""
 
     t_ns: Ints
     points: Points
     sigma_m: Floats
 
-    def take(self, rows: Ints) -> Samples:
-        return Samples(self.t_ns[rows], self.points.take(rows), self.sigma_m[rows])
+    def take(self, rows: Ints) -> ReferenceSamples:
+        return ReferenceSamples(self.t_ns[rows], self.points.take(rows), self.sigma_m[rows])
 
 
 def reference_stretches(
@@ -70,7 +70,7 @@ def reference_stretches(
         return [], []
     stated = reference["sigma_m"].fill_null(config.hazards.reference_sigma_m).to_numpy()
     points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))
-    samples = Samples(times_ns(reference), points, stated)
+    samples = ReferenceSamples(times_ns(reference), points, stated)
     # A sample beyond k_T roots of every track is no sample of the track.
     factor = config.align.sure_sigmas
     near = near_elements(samples.points, samples.sigma_m, network, factor, config.hazards.survey_sigma_m)
@@ -110,7 +110,7 @@ def _silent_spans(t_ns: Ints, used: Bools, gap_s: float) -> list[tuple[int, int]
 
 
 def _placed(
-    samples: Samples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
+    samples: ReferenceSamples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
 ) -> list[ReferenceStretch]:
     """The ways of samples without a gap among them: nothing where no way passes, or more do than can be weighed."""
     own = samples.take(rows)
@@ -129,7 +129,7 @@ def _placed(
     return found
 
 
-def _steps(samples: Samples) -> Ints:
+def _steps(samples: ReferenceSamples) -> Ints:
     """Samples some metres apart, those where the train turned, the first and the last."""
     surface = samples.points.surface
     apart_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m).tolist()
@@ -153,7 +153,7 @@ def _steps(samples: Samples) -> Ints:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _PassableSteps:
     """Steps with a way through: the first of them, oriented elements there, and the moves to each next step.
 
     `onward`: whether a train may have gone from the last step of one part to the first of another.
@@ -169,7 +169,9 @@ class _Part:
         return self.first + len(self.layers)
 
 
-def _parts(samples: Samples, feet: Sequence[Sequence[Foot]], steps: Ints, network: Network) -> Iterator[_Part]:
+def _parts(
+    samples: ReferenceSamples, feet: Sequence[Sequence[Foot]], steps: Ints, network: Network
+) -> Iterator[_PassableSteps]:
     """The parts of the steps; a new one begins where no move leads on: the reference leapt to another track."""
     at_m = samples.points.surface[steps]
     noise_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m[steps])
@@ -197,14 +199,14 @@ def _parts(samples: Samples, feet: Sequence[Sequence[Foot]], steps: Ints, networ
             layers.append(moves)
             alive = {move.to for move in moves}
         else:
-            yield _Part(first, starts, layers, onward)
+            yield _PassableSteps(first, starts, layers, onward)
             first = step + 1
             layers = []
             alive = starts = {2 * element for element in there}
-    yield _Part(first, starts, layers, onward)
+    yield _PassableSteps(first, starts, layers, onward)
 
 
-def _connected(parts: list[_Part]) -> list[_Part]:
+def _connected(parts: list[_PassableSteps]) -> list[_PassableSteps]:
     """The longest part, and those that a train can have come from or gone on to: where else it was nobody knows."""
     longest = max(range(len(parts)), key=lambda number: len(parts[number].layers))
     kept = [parts[longest]]
