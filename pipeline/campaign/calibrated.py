@@ -137,7 +137,8 @@ def _require_one_vehicle(sources: Sequence[_CalibrationRun], config: Configurati
     if not estimates:
         return
     by_scale = sorted(estimates, key=lambda estimate: estimate.scale)
-    least, most = by_scale[0], by_scale[-1]
+    least = by_scale[0]
+    most = by_scale[-1]
     noise = config.monitors.threshold_factor * (least.scale_sigma**2 + most.scale_sigma**2) ** 0.5
     if most.scale - least.scale <= config.calibration.same_vehicle_scale + noise:
         return

@@ -47,7 +47,8 @@ def beside(ground: GroundPositions, sign: Floats, left_m: Floats, above_m: Float
     `sign` is +1 where path and measure grow together, -1 where against each other. For metres, not kilometres.
     """
     heading = np.radians(ground.heading_deg)
-    east, north = -left_m * sign * np.cos(heading), left_m * sign * np.sin(heading)
+    east = -left_m * sign * np.cos(heading)
+    north = left_m * sign * np.sin(heading)
     level = np.nan_to_num(ground.height_m)
     latitude, longitude = moved_deg(ground.latitude_deg, ground.longitude_deg, level, east, north)
     height = ground.height_m + np.nan_to_num(above_m)
@@ -87,7 +88,8 @@ def train_path_m(epochs: pl.DataFrame, stretches: pl.DataFrame) -> tuple[Floats,
     It is known where the evidence leaves one net element and the path leads over it (`stretches_of`). Of several
     visits to the element the one nearest to the position counts, without a position to the last one before.
     """
-    names, position = pl.col("true_netelement_ids"), pl.col("path_m").fill_nan(None)
+    names = pl.col("true_netelement_ids")
+    position = pl.col("path_m").fill_nan(None)
     ends = [
         pl.col("offset_m") + pl.col("sign") * pl.col(name) for name in ("true_measure_low_m", "true_measure_high_m")
     ]
@@ -105,13 +107,15 @@ def train_path_m(epochs: pl.DataFrame, stretches: pl.DataFrame) -> tuple[Floats,
         .unique("row", keep="first", maintain_order=True)
     )
     low, high = np.full((2, epochs.height), np.nan)
-    low[visits["row"]], high[visits["row"]] = visits["low"], visits["high"]
+    low[visits["row"]] = visits["low"]
+    high[visits["row"]] = visits["high"]
     return low, high
 
 
 def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, margin_m: float = 50.0) -> GroundPositions:
     """Places of path positions on the stretches; NaN further than `margin_m` beyond what was travelled."""
-    best, measure_m = np.full(len(path_m), np.inf), np.full(len(path_m), np.nan)
+    best = np.full(len(path_m), np.inf)
+    measure_m = np.full(len(path_m), np.nan)
     names = np.full(len(path_m), None, dtype=object)
     survey = track_of(track)
     for name, sign, offset_m, first_m, last_m in stretches.iter_rows():
@@ -122,7 +126,8 @@ def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, marg
             ends += list(offset_m + sign * measures)
         away = np.maximum(np.maximum(min(ends) - path_m, path_m - max(ends)), 0.0)
         nearer = (away < best) & (away <= margin_m)
-        best[nearer], names[nearer] = away[nearer], name
+        best[nearer] = away[nearer]
+        names[nearer] = name
         measure_m[nearer] = sign * (path_m[nearer] - offset_m)
     return ground_of(track, pl.Series(names, dtype=pl.String), measure_m)
 

@@ -28,7 +28,8 @@ class WalkCounts:
 
     def add_chunk(self, chunk: Chunk, offset: int, length: int) -> None:
         """A chunk whose record has this offset and length."""
-        start_ns, end_ns = chunk.message_start_time, chunk.message_end_time
+        start_ns = chunk.message_start_time
+        end_ns = chunk.message_end_time
         self.chunks += 1
         self.chunk_sum += hash(
             (start_ns, end_ns, offset, length, len(chunk.data), chunk.uncompressed_size, chunk.compression)

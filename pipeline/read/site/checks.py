@@ -141,7 +141,8 @@ def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.Dat
 def outward(track: Track) -> np.ndarray:
     """Direction from each end into its element, earth-centred and not normed: `[element, 0 start or 1 end]`."""
     surface = points_of(track.latitude_deg, track.longitude_deg).surface
-    start, stop = track.first[:-1], track.first[1:]
+    start = track.first[:-1]
+    stop = track.first[1:]
     directions = np.zeros((len(track.ids), 2, 3))
     for position, end in ((0, start), (1, stop - 1)):
         away_m = np.linalg.norm(surface - np.repeat(surface[end], stop - start, axis=0), axis=1)

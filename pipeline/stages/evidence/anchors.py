@@ -126,7 +126,8 @@ def _ways(one: Sided) -> tuple[Ints, Ints, Floats]:
     t_ns = one.stretch.t_ns
     rows = _every(t_ns, _LAG_WINDOW_S)
     whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
-    begin, end = rows[:-1][whole], rows[1:][whole]
+    begin = rows[:-1][whole]
+    end = rows[1:][whole]
     return t_ns[begin], t_ns[end], one.sense * (path.at_m[end] - path.at_m[begin])
 
 
@@ -235,13 +236,15 @@ def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
 def _contradicted(known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter]) -> tuple[Floats, Floats]:
     """Per step to the next sample: its difference from the nearest odometer, and the root of both variances [m]."""
     whole = np.diff(known.path.leg) == 0
-    least, root = np.full(t_ns.size - 1, np.inf), np.ones(t_ns.size - 1)
+    least = np.full(t_ns.size - 1, np.inf)
+    root = np.ones(t_ns.size - 1)
     for counter in counters:
         way = counter.between(t_ns[:-1], t_ns[1:])
         own_m = np.sqrt(sigma_m[1:] ** 2 + sigma_m[:-1] ** 2 + way.variance_m2)
         off_m = np.diff(known.at_m) - known.sense * way.distance_m
         nearer = np.isfinite(off_m) & (np.abs(off_m) / own_m < np.abs(least) / root)
-        least, root = np.where(nearer, off_m, least), np.where(nearer, own_m, root)
+        least = np.where(nearer, off_m, least)
+        root = np.where(nearer, own_m, root)
     return np.where(whole & np.isfinite(least), least, 0.0), root
 
 

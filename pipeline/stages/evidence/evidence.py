@@ -161,10 +161,12 @@ class Evidence:
                 high = np.maximum((path.high_m - path.at_m)[before], (path.high_m - path.at_m)[after])
                 # No straight line leads over a contradicted step: its moment is not known.
                 stepping = np.where(before != after, path.step_m[before], 0.0)
-                low, high = low - stepping, high + stepping
+                low = low - stepping
+                high = high + stepping
                 for number in np.unique(leg[before]).tolist():
                     on_leg = np.flatnonzero((leg[before] == number) & (leg[after] == number))
-                    low_m, high_m = (centre + low - half)[on_leg], (centre + high + half)[on_leg]
+                    low_m = (centre + low - half)[on_leg]
+                    high_m = (centre + high + half)[on_leg]
                     alternatives.append(Alternative(rows[on_leg], path.path.legs[number], low_m, high_m))
                     kind[rows[on_leg]] = KINDS.index(Kind.REFERENCE)
         return alternatives
@@ -193,7 +195,8 @@ class Evidence:
         if gap.begin is not None and gap.end is not None:
             begin_m, end_m = way.at_m
             return between_anchors(counter, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.config)
-        (anchor,), (at_m,) = gap.anchors, way.at_m
+        (anchor,) = gap.anchors
+        (at_m,) = way.at_m
         return carried(counter, anchor, at_m, t_ns, self.config)
 
 

@@ -68,7 +68,8 @@ def gaps_of(
 
     `facing`: oriented net elements over which the train ran, by the reference, as the odometer counted up.
     """
-    first, last = borders[0][0], borders[-1][1]
+    first = borders[0][0]
+    last = borders[-1][1]
     gaps = [Gap(min(counter.odometer.begin_ns, first.t_ns), first.t_ns, None, first, [])]
     for (_, a), (b, _) in pairwise(borders):
         gaps += _between(a, b, counter, network, config)
@@ -235,9 +236,11 @@ def _from_one_anchor(gap: Gap, network: Network) -> list[GapChain]:
 def _reach_m(gap: Gap, way: GapChain, counter: Counter, config: Configuration) -> tuple[float, float]:
     """Least and largest coordinate that the train may have come to in the gap [m]."""
     t_ns = _looks(gap, counter)
-    least, most = min(way.at_m), max(way.at_m)
+    least = min(way.at_m)
+    most = max(way.at_m)
     for anchor, at_m in zip(gap.anchors, way.at_m, strict=True):
         low, high = carried(counter, anchor, at_m, t_ns, config)
         if np.isfinite(low).any():
-            least, most = min(least, float(np.nanmin(low))), max(most, float(np.nanmax(high)))
+            least = min(least, float(np.nanmin(low)))
+            most = max(most, float(np.nanmax(high)))
     return least, most

@@ -41,7 +41,8 @@ def _touched(one: Alternative) -> pl.DataFrame:
     route = one.route
     first = np.searchsorted(route.entry_m, one.low_m, side="right") - 1
     last = np.searchsorted(route.entry_m, one.high_m, side="right") - 1
-    first, last = np.maximum(first, 0), np.maximum(last, 0)
+    first = np.maximum(first, 0)
+    last = np.maximum(last, 0)
     count = last - first + 1
     numbers = np.repeat(np.arange(one.rows.size), count)
     visit = np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())

@@ -157,7 +157,8 @@ def judge_positions(
     """
     size = positions.element.size
     limit_m = config.failure_limit_m
-    low_m, high_m = np.full(size, np.inf), np.full(size, -np.inf)
+    low_m = np.full(size, np.inf)
+    high_m = np.full(size, -np.inf)
     right, ahead, behind, elsewhere = (np.ones(size, dtype=np.bool_) for _ in range(4))
     judged = np.zeros(size, dtype=np.bool_)
     sense = _path_sense(positions, legs)
@@ -244,7 +245,8 @@ def with_own_anchors(
     `train_m`: least and largest path position of the train.
     """
     rows = (judged.kind == NOTHING) & positions.known & np.isfinite(train_m[0])
-    low_m, high_m = positions.path_m - train_m[1], positions.path_m - train_m[0]
+    low_m = positions.path_m - train_m[1]
+    high_m = positions.path_m - train_m[0]
     beyond = rows & ((low_m > config.failure_limit_m) | (high_m < -config.failure_limit_m))
     return Judgements(
         code=np.where(beyond, WRONG, judged.code),

@@ -81,7 +81,8 @@ def segments_of(track: Track) -> Segments:
     places = points_of(track.latitude_deg, track.longitude_deg)
     owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
     head = np.flatnonzero(owner[:-1] == owner[1:])
-    start, end = places.surface[head], places.surface[head + 1]
+    start = places.surface[head]
+    end = places.surface[head + 1]
     along = end - start
     east = np.einsum("ij,ij->i", along, places.east[head])
     north = np.einsum("ij,ij->i", along, places.north[head])

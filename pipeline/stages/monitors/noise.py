@@ -105,7 +105,8 @@ class NoiseMeter:
 
     def _measured(self, index: int, renewals: Ints, row: Ints) -> tuple[Floats, Bools]:
         """M of one lag from the samples before each renewal, which begins at `row`; and whether they are enough."""
-        samples, entering = self._samples[index], self._entering[index]
+        samples = self._samples[index]
+        entering = self._entering[index]
         before = np.searchsorted(samples.renewal[entering], renewals)
         # The onset of a drift touches samples over 2 L: they wait so long again, and it meets the thresholds before it.
         waiting = round(self._config.noise_wait_spans * samples.span)
@@ -176,7 +177,8 @@ class _Sampler:
     """Second differences of a series, by running sums whose differences are what happened between two rows."""
 
     def __init__(self, series: AxisSeries, moving: Bools, config: MonitorConfig) -> None:
-        self._series, self._config = series, config
+        self._series = series
+        self._config = config
         self._t_s = np.cumsum(series.dt_s) - series.dt_s[:1]
         self.renewal: Ints = (self._t_s // config.noise_renewal_s).astype(np.int64)
         # Of the time in which the noise is not known anyway: no lag hangs on what comes later.
@@ -215,7 +217,8 @@ class _Sampler:
 
     def _triples(self, lag_s: float, spacing_s: float) -> _Triples:
         """Rows t, one such in every `spacing_s`, and the rows nearest to t - L and t - 2 L, where near enough."""
-        t_s, reach_s = self._t_s, max(0.1 * lag_s, 0.5 * self.period_s)
+        t_s = self._t_s
+        reach_s = max(0.1 * lag_s, 0.5 * self.period_s)
         cell = np.floor(t_s / spacing_s + 1e-6)
         last = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1.0) > 0.0)
         between_s = 0.5 * (t_s[1:] + t_s[:-1])

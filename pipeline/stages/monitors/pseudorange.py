@@ -41,9 +41,11 @@ def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, c
         return no_verdicts(epochs.height, NO_RANGES)
     ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
     track = _track_of(epochs, config)
-    value, freedom = np.full(epochs.height, np.nan), np.zeros(epochs.height, dtype=np.int64)
+    value = np.full(epochs.height, np.nan)
+    freedom = np.zeros(epochs.height, dtype=np.int64)
     for part in _chunks(ranges, track):
-        value[part.epoch], freedom[part.epoch] = _left_over(part), part.freedom
+        value[part.epoch] = _left_over(part)
+        freedom[part.epoch] = part.freedom
     tested = freedom > 0
     threshold = np.full(epochs.height, np.nan)
     threshold[tested] = chdtri(freedom[tested], config.monitors.false_alarm_probability)
@@ -106,7 +108,8 @@ def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame, apart_s: fl
 def _track_of(epochs: pl.DataFrame, config: Configuration) -> _TrackFrame:
     names = ("heading_deg", "slope", "cross_track_m", "vertical_m", "survey_sigma_m", "interpolation_error_m")
     heading, slope, cross_m, vertical_m, survey_m, chord_m = (floats(epochs, name) for name in names)
-    angle, rise = np.radians(heading), np.arctan(np.nan_to_num(slope))
+    angle = np.radians(heading)
+    rise = np.arctan(np.nan_to_num(slope))
     level = np.cos(rise)
     zero = np.zeros_like(angle)
     survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
@@ -167,7 +170,8 @@ def _equations(ranges: _Ranges, track: _TrackFrame, epochs: Ints) -> Equations:
     slot = np.arange(int(count.max()))
     held = slot < count[:, None]
     place = np.where(held, first[:, None] + slot, first[:, None])
-    rows, system = ranges.rows[place], ranges.system[place]
+    rows = ranges.rows[place]
+    system = ranges.system[place]
     weight = np.where(held, 1.0 / ranges.variance_m2[place], 0.0)
     clocks = (system[:, :, None] == np.arange(ranges.systems)).astype(np.float64)
     residual = ranges.residual_m[place] + np.einsum("eni,ei->en", rows, track.offset_m[epochs])

@@ -71,7 +71,8 @@ def near_elements(points: Points, sigma_m: Floats, network: Network, factor: flo
     sample, segment = _candidates(points, line, factor * np.hypot(sigma_m, segment_sigma_m.max(initial=0.0)))
     feet = on_segments(points.take(sample), line, segment)
     part = np.clip(feet.fraction, 0.0, 1.0)
-    low_m, high_m = track.measure_m[begin[segment]], track.measure_m[begin[segment] + 1]
+    low_m = track.measure_m[begin[segment]]
+    high_m = track.measure_m[begin[segment] + 1]
     within = feet.distance_m <= factor * np.hypot(sigma_m[sample], segment_sigma_m[segment])
     element = owner[begin[segment]]
     order = np.lexsort((feet.distance_m, sample, element))

@@ -102,7 +102,8 @@ def _silent_spans(t_ns: Ints, used: Bools, gap_s: float) -> list[tuple[int, int]
         after = int(np.searchsorted(known_ns, at_ns))
         before_ns = int(known_ns[after - 1]) if after else at_ns - gap_ns
         after_ns = int(known_ns[after]) if after < known_ns.size else at_ns + gap_ns
-        begin_ns, end_ns = max(before_ns, at_ns - gap_ns) + 1, min(after_ns, at_ns + gap_ns)
+        begin_ns = max(before_ns, at_ns - gap_ns) + 1
+        end_ns = min(after_ns, at_ns + gap_ns)
         if spans and begin_ns <= spans[-1][1]:
             begin_ns = spans.pop()[0]
         spans.append((begin_ns, end_ns))
@@ -310,7 +311,8 @@ def _path(
     leg = np.full(count, -1)
     legs, placed = _legs(stays, network)
     for stay, (number, entry_m) in zip(stays, placed, strict=True):
-        low, high = max(stay.first - 1, 0), min(stay.last + 1, steps.size - 1)
+        low = max(stay.first - 1, 0)
+        high = min(stay.last + 1, steps.size - 1)
         pairs = near.of(stay.oriented // 2, int(rows[steps[low]]), int(rows[steps[high]]))
         own = near.sample[pairs] - rows[begin]
         nearer = near.distance_m[pairs] < nearest_m[own]

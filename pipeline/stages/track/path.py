@@ -91,7 +91,8 @@ class Route:
         begins = np.searchsorted(element[order], self.element, side="left")
         for visit in np.flatnonzero(ends > begins).tolist():
             rows = order[begins[visit] : ends[visit]]
-            low, high = self.low_m[visit], self.high_m[visit]
+            low = self.low_m[visit]
+            high = self.high_m[visit]
             measure = measure_m[rows]
             at_m = self.entry_m[visit] + (measure - low if self.forward[visit] else high - measure)
             outside = np.maximum(np.maximum(low - measure, measure - high), 0.0)

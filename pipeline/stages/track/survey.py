@@ -91,7 +91,8 @@ class Track:
         """The net element of a name if it holds the measure, as `holding` has it; none where it does not."""
         if (element := self.index.get(name)) is None:
             return None
-        low_m, high_m = float(self.begin_m[element]), float(self.end_m[element])
+        low_m = float(self.begin_m[element])
+        high_m = float(self.end_m[element])
         return element if low_m - MEASURE_TOLERANCE_M <= measure_m <= high_m + MEASURE_TOLERANCE_M else None
 
     def elements(self) -> Iterator[tuple[int, str, slice]]:
@@ -126,7 +127,8 @@ def places_along(track: Track, spacing_m: float) -> Along:
     """Places about so far apart on every element, its two ends among them."""
     columns: list[list[Floats]] = [[], [], [], []]
     for number, _, part in track.elements():
-        low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
+        low = float(track.measure_m[part][0])
+        high = float(track.measure_m[part][-1])
         at_m = np.linspace(low, high, max(2, round((high - low) / spacing_m) + 1))
         degrees = (np.interp(at_m, track.measure_m[part], of[part]) for of in (track.latitude_deg, track.longitude_deg))
         for column, values in zip(columns, (np.full(len(at_m), float(number)), at_m, *degrees), strict=True):
