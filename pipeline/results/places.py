@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import moved_deg, points_of
-from pipeline.stages.track.survey import Track, track_of
+from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.arrays import Floats
 from schemas.run import Site
 
@@ -172,7 +172,7 @@ def _thinned(values: Floats) -> Floats:
     return np.append(values[: -1 : max(1, -(-len(values) // _POINTS))], values[-1:])
 
 
-def _on_element(track: Track, number: int, measure_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def _on_element(track: SurveyedTrack, number: int, measure_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Latitude, longitude, height, heading of measures on one element."""
     rows = track.vertices(number)
     measures = track.measure_m[rows]

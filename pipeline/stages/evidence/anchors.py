@@ -13,7 +13,7 @@ from pipeline.stages.evidence.carrying import Counter, TrueAnchor
 from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, lag_of
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import BaliseKind, Evidence
@@ -249,7 +249,7 @@ def _contradicted(known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Seque
 
 
 def read_anchors(
-    reads: pl.DataFrame | None, balises: pl.DataFrame | None, track: Track, config: HazardConfig
+    reads: pl.DataFrame | None, balises: pl.DataFrame | None, track: SurveyedTrack, config: HazardConfig
 ) -> list[TrueAnchor]:
     """Reads of physical balises that the site knows, in order of time."""
     if reads is None or balises is None or reads.is_empty():

@@ -24,7 +24,7 @@ from pipeline.stages.evidence.gaps import Gap, GapChain, gaps_of, unreachable, w
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
-from pipeline.stages.track.path import Route
+from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Evidence as Kind
@@ -39,7 +39,7 @@ class Alternative:
     """One track that the train may have been on at some of the instants, and where on it [m]."""
 
     rows: Ints
-    route: Route
+    route: RoutePath
     low_m: Floats
     high_m: Floats
 
@@ -77,7 +77,7 @@ class Carried:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class TrainEvidence:
     """All evidence of a run.
 
     `silent`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends of
@@ -257,7 +257,7 @@ def evidence_of(
     network: Network,
     vehicle: Vehicle,
     config: Configuration,
-) -> Evidence:
+) -> TrainEvidence:
     """Everything that is known of where the train was, except from GNSS.
 
     `reference`: as from `reference_stretches`; `odometers`: that of the LDS first.
@@ -278,7 +278,7 @@ def evidence_of(
     stretches = tuple(known_stretch(one, of_reference, counters, read, ahead_m, config) for one in sides)
     apart = outside(read, stretches)
     shift_ns = round(of_reference.shift_s * NS_PER_S)
-    return Evidence(
+    return TrainEvidence(
         stretches=stretches,
         silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]),
         carried=tuple(

@@ -6,10 +6,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.evidence.evidence import Alternative, EvidenceSet
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 
 
-def true_places(evidence: EvidenceSet, track: Track) -> pl.DataFrame:
+def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> pl.DataFrame:
     """Per instant `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m`.
 
     Null where nothing is known; the measures also where there are several net elements.

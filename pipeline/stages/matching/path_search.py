@@ -20,7 +20,7 @@ from pipeline.stages.odometry.polarity import grows_with
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import TravelledPath
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 from schemas.errors import InputError
@@ -170,7 +170,7 @@ def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig)
     return aside_m
 
 
-def off_the_network(fixes: Fixes, track: Track, config: MatchingConfig) -> InputError:
+def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) -> InputError:
     """The error for a run of which no epoch is within reach of any track."""
     tree = cKDTree(points_of(track.latitude_deg, track.longitude_deg).surface)
     rows = np.flatnonzero(fixes.valid)

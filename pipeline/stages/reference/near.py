@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.segments import SAMPLE_SPACING_M, Polyline, on_segments
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
 
 # Numerics: so near an end a foot lies at it [m].
@@ -37,7 +37,7 @@ class Near:
     survey_sigma_m: Floats
     first: Ints
     any_near: Bools
-    track: Track
+    track: SurveyedTrack
 
     def of(self, element: int, begin: int, end: int) -> slice:
         """The pairs of an element with samples from `begin` to `end`."""

@@ -15,7 +15,7 @@ from pipeline.stages.reference.visits import ElementStay, Node, Transition, node
 from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import MIN_REACH_M, Network
-from pipeline.stages.track.path import Route
+from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
 
@@ -33,7 +33,7 @@ class ReferencePath:
 
     leg: Ints
     at_m: Floats
-    legs: tuple[Route, ...]
+    legs: tuple[RoutePath, ...]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.results.places import GroundPositions, ground_of, origin_of, plane_m
-from pipeline.stages.track.survey import Track, track_of
+from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.arrays import Floats, Ints
 from schemas.run import Site
 
@@ -17,7 +17,7 @@ from schemas.run import Site
 class Pieces:
     """Pieces of all net elements, numbered in the order of the survey; element e has `first[e] : first[e + 1]`."""
 
-    track: Track
+    track: SurveyedTrack
     first: Ints
     element: Ints
     from_m: Floats
