@@ -34,7 +34,7 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
     position accounts for time only in a gap.
     """
     known = met(epochs, pl.col("path_m").is_not_null())
-    steps = _Steps.of(epochs, known, config)
+    steps = _StepTimes.of(epochs, known, config)
     usable = met(epochs.filter(known), trusted(config) & ~pl.col("withheld"))
     in_use = usable & (steps.left_s(steps.alone_s) > _LEAST_S)
     judged = code[known]
@@ -50,7 +50,7 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
 
 
 @dataclass(frozen=True)
-class _Steps:
+class _StepTimes:
     """The time from the position before to each, ending at `end_s`.
 
     `step_s`: whole; `near_s`: one period where it is a gap; `alone_s`: one period at most. `blocked_s`: total time
@@ -67,7 +67,7 @@ class _Steps:
     blocked_s: Floats
 
     @classmethod
-    def of(cls, epochs: pl.DataFrame, known: Bools, config: Configuration) -> _Steps:
+    def of(cls, epochs: pl.DataFrame, known: Bools, config: Configuration) -> _StepTimes:
         all_ns = times_ns(epochs)
         t_ns = all_ns[known]
         all_s = (all_ns - all_ns[:1]) / NS_PER_S
@@ -102,7 +102,7 @@ def negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) 
     return np.column_stack([np.minimum(from_s, until_s), until_s])
 
 
-def _counted_s(t_ns: Ints, known: Bools, steps: _Steps) -> Floats:
+def _counted_s(t_ns: Ints, known: Bools, steps: _StepTimes) -> Floats:
     """Time since the epoch before [s], of a gap one period.
 
     Of epochs between two near positions the later position accounts for all, the others for none.

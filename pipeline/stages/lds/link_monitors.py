@@ -39,7 +39,8 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Co
     Two or more at once, or one against the direction of travel, are out of order where the
     odometer's step does not explain the position's; `overdue` ones, whose window has closed, always.
     """
-    before, after = offered[0].before, offered[0].epoch
+    before = offered[0].before
+    after = offered[0].epoch
     odometer_step_m = journey.odometer_m[after] - journey.odometer_m[before]
     excess_m = abs(journey.path_m[after] - journey.path_m[before] - odometer_step_m)
     noise_m = config.monitors.threshold_factor * sqrt(journey.sigma_m[before] ** 2 + journey.sigma_m[after] ** 2)

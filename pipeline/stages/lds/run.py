@@ -227,7 +227,8 @@ def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
         beyond = journey.odometer_m[rows] >= passage.announced_odometer_m
         steps = np.flatnonzero(beyond[1:] != beyond[:-1])
         if steps.size:
-            before, after = rows[steps[-1]], rows[steps[-1] + 1]
+            before = rows[steps[-1]]
+            after = rows[steps[-1] + 1]
             part_m = passage.announced_odometer_m - journey.odometer_m[before]
             share = float(part_m / (journey.odometer_m[after] - journey.odometer_m[before]))
             return int(journey.t_ns[before]) + round(share * int(journey.t_ns[after] - journey.t_ns[before]))

@@ -89,7 +89,8 @@ def variance_of_ewma(
         c <- b phi r c + alpha g s_k (s_k - phi s_p)
     """
     carried, fresh_m2, change = _memory(sigma_m, sigma_before_m, decorrelation)
-    coupling, covariances = np.empty_like(gain), np.empty_like(state.covariance)
+    coupling = np.empty_like(gain)
+    covariances = np.empty_like(state.covariance)
     for index, before in enumerate(state.covariance):
         drive = np.asfortranarray(gain[:, index, None] * fresh_m2)
         covariance = _solved(keep[:, index, None] * carried, drive, before)
