@@ -114,10 +114,9 @@ class TrainEvidence:
         factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
         by_reference = self._covered(t_ns, kind == NOTHING, kind)
         by_reads = self._carried(self.by_reads, t_ns, kind != NOTHING, kind)
-        wide_reference, narrow_reads = (
-            [one.widened(factor) for one in alternatives] for alternatives in (by_reference, by_reads)
-        )
-        return int(common(wide_reference, narrow_reads, t_ns.size)[1].size)
+        wide_reference = [alternative.widened(factor) for alternative in by_reference]
+        wide_reads = [alternative.widened(factor) for alternative in by_reads]
+        return int(common(wide_reference, wide_reads, t_ns.size)[1].size)
 
     @property
     def clock_assumed(self) -> bool:
