@@ -414,10 +414,14 @@ def calibrate(
     logs = [_log(address, settings) for address in find_runs(runs).values()]
     found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
-    measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors}
+    measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors, "alarms": found.alarms}
     tables = {"Scale and latency": found.runs, "Sigma of the monitors": found.sigmas}
     none = "\nNo latency in the vehicle file: only changes of speed show it, and these runs have too few."
     words = [none] if found.vehicle.gnss_latency_s is None else []
+    words += [
+        f"\n{run_id}: {', '.join(monitors)} failed beyond its noise. Leave it out unless nothing was wrong."
+        for run_id, monitors in found.alarms.items()
+    ]
     words.append(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
     _tell(as_json, {**measured, "runs": found.runs, "sigmas": found.sigmas}, tables, *words)
 

@@ -10,7 +10,7 @@ import polars as pl
 
 from datasets.expectation import ExpectedHazard, ExpectedRun
 from datasets.scenario import RunSpec
-from pipeline.stages.run_row.verdict import word_of, worst_verdict
+from pipeline.results.figures.head import word_of, worst_verdict
 from schemas.errors import ConfigError
 from schemas.run import RunLog, RunTables
 

@@ -15,11 +15,11 @@ from datasets.trial import write_trial
 from pipeline.campaign import RunOutcome, make_plan, run_campaign
 from pipeline.read.ingest.run import read_run as read_log
 from pipeline.read.site.read import read_site
+from pipeline.results.figures.head import CampaignHead, head_of, word_of, worst_verdict
 from pipeline.results.manifest import settings_files
 from pipeline.results.store import read_run
 from pipeline.show.progress import CampaignWatch
 from pipeline.show.report import write_report
-from pipeline.stages.run_row.verdict import CampaignHead, head_of, word_of, worst_verdict
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunTables
 

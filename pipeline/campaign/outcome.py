@@ -11,10 +11,10 @@ import polars as pl
 
 from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.hazard_words import hazard_words
+from pipeline.results.figures.head import worst_verdict
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.results.outcome import RunOutcome
 from pipeline.stages.provenance import Provenance
-from pipeline.stages.run_row.verdict import worst_verdict
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import BaliseError, InputError

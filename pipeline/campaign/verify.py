@@ -18,10 +18,10 @@ from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
 from pipeline.results import catalogue, store
+from pipeline.results.figures.head import word_of
 from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest, sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
-from pipeline.stages.run_row.verdict import word_of
 from pipeline.storage.address import Address, join, redacted
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.enums import RunStatus

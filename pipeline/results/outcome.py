@@ -8,7 +8,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.stages.run_row.verdict import CampaignHead, figures_beside, head_of
+from pipeline.results.figures.head import CampaignHead, figures_beside, head_of
 from schemas.enums import RunStatus, RunVerdict
 
 _BESIDE = {

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import polars as pl
 
+from pipeline.results.figures.head import word_of
 from pipeline.results.outcome import CampaignSummary, RunOutcome
 from pipeline.show.terminal import duration_text
-from pipeline.stages.run_row.verdict import word_of
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
 from schemas.words import beside_words, remedy_words

@@ -13,9 +13,9 @@ from pipeline.read.ingest.csv_draft import draft_mapping
 from pipeline.read.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.read.site.read import is_geojson, read_site
 from pipeline.results import store
+from pipeline.results.figures.head import head_of, run_verdicts
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.show.terminal import show_tables
-from pipeline.stages.run_row.verdict import head_of, run_verdicts
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
 from pipeline.studies.plausibility.report import FitReport, fit_report

@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pipeline import storage
+from pipeline.results.figures.head import word_of
 from pipeline.results.outcome import CampaignSummary, RunOutcome, UnderWay
 from pipeline.show.campaign import ending_rows, outcome_line, outcome_rows, remedy_lines, summary_line
 from pipeline.show.terminal import duration_text, show_table, to_json
-from pipeline.stages.run_row.verdict import word_of
 from pipeline.storage.address import is_url, join, redacted
 from schemas.enums import RunStatus
 from schemas.errors import visible

@@ -15,7 +15,7 @@ from pipeline.stages.clean.clean import (
     require_one_journey,
     require_two_times,
 )
-from pipeline.stages.evidence import Evidence, evidence_of
+from pipeline.stages.evidence import TrainEvidence, evidence_of
 from pipeline.stages.matching import Match, match
 from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of
 from pipeline.stages.provenance import Provenance, provenance
@@ -57,16 +57,18 @@ class PreparedRun:
 
     def match(self, solution: str) -> Match:
         """The solution on the track network; raises `InputError` where it comes near no track."""
-        config, reads = self.config, self.run.balise_reads
+        config = self.config
+        reads = self.run.balise_reads
         fixes = self.fixes(solution)
         return match(fixes, self.odometry, self.site, self.vehicle, config.matching, config.fix_sigma, reads)
 
-    def evidence(self) -> Evidence:
+    def evidence(self) -> TrainEvidence:
         """What is known of where the train was; knows of no solution."""
         network = site_network(self.site)
         pieces = network_in_pieces(self.site)
         reference = reference_stretches(self.run.reference, pieces, network.track.index, self.config)
-        reads, balises = self.run.balise_reads, self.site.balises
+        reads = self.run.balise_reads
+        balises = self.site.balises
         return evidence_of(reference, reads, balises, self.odometers, network, self.vehicle, self.config)
 
     @property

@@ -32,7 +32,7 @@ from pipeline.stages.run_row.independent import DETECTION_TIMES, independent_epi
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform, dtypes
-from schemas.enums import TRUTH, Judgement, RunStatus, RunVerdict
+from schemas.enums import TRUTH, RunStatus, RunVerdict
 
 _STATES = ("p0", "p1", "p2", "p3")
 _ROUNDING = 1e-9
@@ -96,7 +96,8 @@ def _of_open_cases(sums: pl.DataFrame, figure: Callable[[int, float], float | No
 
 def _sums() -> dict[str, pl.Expr]:
     """What is added up over the runs of one solution."""
-    evidence, judged = pl.col("evidence"), pl.col("false_alarm_rate_per_h").is_not_null()
+    evidence = pl.col("evidence")
+    judged = pl.col("false_alarm_rate_per_h").is_not_null()
     truth = evidence.is_in(TRUTH)
     sums = {name: pl.col(name).sum() for name in (*_SUMMED, *_NAMES.values())}
     sums |= {
@@ -125,7 +126,8 @@ def _shares() -> dict[str, pl.Expr]:
     P0 and P1 need a truth, so that the time is that of the runs with one. What the odometer alone tells of the error is
     not good enough to call a position right. Without a truth P2 and P3 are those of all runs.
     """
-    held, truth = pl.col("held_s").fill_null(0.0), pl.col("truth_held_s") > 0.0
+    held = pl.col("held_s").fill_null(0.0)
+    truth = pl.col("truth_held_s") > 0.0
     counted = truth | ~truth.any()
     whole = held.filter(counted).sum()
     shares: dict[str, pl.Expr] = {}
@@ -138,52 +140,44 @@ def _shares() -> dict[str, pl.Expr]:
     return shares | {"share_unknown": unknown}
 
 
-def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFrame:
+def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, levels: pl.DataFrame) -> pl.DataFrame:
     """Hazardous time of every failure, and T_D of the faults, against the allowed T_D of each level (TVB eq. 7).
 
     Eq. 7 limits how long a hazardous position may be in use, so the hazardous time is compared. The quantiles of T_D
-    and of both bounds of T_dsf leave out faults that were not detected.
+    and of both bounds of T_dsf leave out faults that were not detected. `levels`: of the same runs (`campaign_levels`).
     """
-    failures, episodes = failures_of(runs), independent_episodes(hazards)
-    spent, may, detected = pl.col("hazardous_s"), pl.col("hazardous_may_s"), pl.col("time_to_detect_s")
-    of_failures = failures.group_by("solution").agg(
-        failures=pl.len(), hazardous_may_max_s=may.max(), **_quantiles(spent, "hazardous")
+    spent = pl.col("hazardous_s")
+    may = pl.col("hazardous_may_s")
+    of_failures = (
+        failures_of(runs)
+        .group_by("solution")
+        .agg(failures=pl.len(), hazardous_may_max_s=may.max(), **_quantiles(spent, "hazardous"))
     )
     times = {key: value for name in DETECTION_TIMES for key, value in _quantiles(pl.col(name), name[:-2]).items()}
-    of_episodes = episodes.group_by("solution").agg(detected=detected.count(), **times)
-    told = of_failures.join(of_episodes, on="solution", how="full", coalesce=True)
-    levels = [(level, config.allowed_time_to_detect_s(level)) for level in config.service_levels]
-    allowed = pl.DataFrame(levels, {"service_level": pl.String, "allowed_s": pl.Float64}, orient="row")
-    accepted = pl.col("accepted").cast(pl.String)
-    within = (may <= pl.col("allowed_s")) & (accepted == Judgement.RIGHT.value)
-    exceeded = (spent > pl.col("allowed_s")) | (accepted == Judgement.WRONG.value)
+    detected = pl.col("time_to_detect_s").count()
+    of_episodes = independent_episodes(hazards).group_by("solution").agg(detected=detected, **times)
+    measured = of_failures.join(of_episodes, on="solution", how="full", coalesce=True).sort("solution")
+    within = pl.col("within")
+    exceeded = pl.col("exceeded")
+    by_truth = pl.col("evidence").is_in(TRUTH)
     counts = {
         "within": within.sum(),
         "exceeded": exceeded.sum(),
-        "failures_judged": ((within | exceeded) & pl.col("by_truth")).sum(),
-        "within_judged": (within & pl.col("by_truth")).sum(),
+        "failures_judged": (within + exceeded).filter(by_truth).sum(),
+        "within_judged": within.filter(by_truth).sum(),
     }
-    keys = ["solution", "service_level"]
-    counted = failures.join(allowed, how="cross").group_by(keys).agg(**counts)
-    table = told.sort("solution").join(allowed, how="cross", maintain_order="left_right")
-    table = table.join(counted, on=keys, how="left", maintain_order="left")
-    table = table.with_columns(pl.col("failures", "detected", *counts).fill_null(0).cast(pl.Int64))
+    keys = ["solution", "service_level", "allowed_s"]
+    counted = levels.group_by(keys, maintain_order=True).agg(**counts)
+    table = measured.join(counted, on="solution", how="left", maintain_order="left_right")
+    table = table.with_columns(pl.col("failures", "detected").fill_null(0).cast(pl.Int64))
     share: Estimator = ("within_share", "", clopper_pearson, "within_judged", "failures_judged")
     return conform(with_estimates(table, share), CampaignDetection)
 
 
 def failures_of(runs: pl.DataFrame) -> pl.DataFrame:
-    """One row per failure of all runs: `run_id, solution, by_truth, hazardous_s, hazardous_may_s, accepted`."""
-    by_truth = pl.col("evidence").is_in(TRUTH).fill_null(value=False)
-    listed = runs.filter(pl.col("failures") > 0).select(
-        "run_id",
-        "solution",
-        by_truth=by_truth,
-        hazardous_s="failure_hazardous_s",
-        hazardous_may_s="failure_hazardous_may_s",
-        accepted="failure_accepted",
-    )
-    return listed.explode("hazardous_s", "hazardous_may_s", "accepted")
+    """One row per failure of all runs: `run_id, solution, hazardous_s, hazardous_may_s`."""
+    columns = {"hazardous_s": "failure_hazardous_s", "hazardous_may_s": "failure_hazardous_may_s"}
+    return runs.filter(pl.col("failures") > 0).select("run_id", "solution", **columns).explode(*columns)
 
 
 def _quantiles(values: pl.Expr, name: str) -> dict[str, pl.Expr]:
@@ -203,13 +197,14 @@ def derived_tables(
     """
     once = without_copies(runs)
     of_once = hazards.join(once, on=["run_id", "solution"], how="semi")
-    told = with_truth(passages.join(once, on=["run_id", "solution"], how="semi"), once)
+    passed = with_truth(passages.join(once, on=["run_id", "solution"], how="semi"), once)
+    levels = campaign_levels(runs, config)
     return {
         "runs": campaign_runs(runs, hazards, config),
-        "balises": campaign_balises(told),
-        "accuracy": campaign_accuracy(told, config),
+        "balises": campaign_balises(passed),
+        "accuracy": campaign_accuracy(passed, config),
         "figures": measured_figures(once, of_once, config.safety),
-        "detection": detection_by_level(once, of_once, config.safety),
-        "levels": campaign_levels(runs, config),
+        "detection": detection_by_level(once, of_once, levels.join(once, on=["run_id", "solution"], how="semi")),
+        "levels": levels,
         "map": map_places(alarms, config.hazards.map_reach_m),
     }

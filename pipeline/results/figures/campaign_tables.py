@@ -11,7 +11,7 @@ from pipeline.results.figures.undetected import undetected_spread
 from pipeline.stages.run_row.bounds import Estimator, clopper_pearson, poisson_rate, with_estimates
 from pipeline.stages.run_row.independent import independent_episodes
 from pipeline.stages.run_row.run_figures import acceptances, accepted, is_passage, outcomes, spread
-from pipeline.stages.run_row.verdict import DECISIVE, level_rows
+from pipeline.stages.run_row.verdict import DECISIVE, level_rows, reaction_of
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
@@ -58,7 +58,8 @@ def counted_runs(runs: pl.DataFrame, hazards: pl.DataFrame) -> pl.DataFrame:
 
 def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """Every `runs` row with rates, exact bounds and the verdict per service level (CONTRACT section 3)."""
-    table, levels = with_estimates(counted_runs(runs, hazards), *RATES), campaign_levels(runs, config)
+    table = with_estimates(counted_runs(runs, hazards), *RATES)
+    levels = campaign_levels(runs, config)
     for level in config.safety.service_levels:
         named = {f"allowed_{level}_s": "allowed_s"}
         named |= {f"{part}_{level}": part for part in ("within", "exceeded", "verdict")}
@@ -72,11 +73,11 @@ def campaign_levels(runs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     With the reaction time of the configuration (none: one epoch) the period of the epochs is the least that any fault
     takes.
     """
-    reaction_s, period_s = config.hazards.reaction_s, 1.0 / pl.col("gnss_rate_hz")
+    period_s = 1.0 / pl.col("gnss_rate_hz")
     needed = runs.select(
         *(*RUN, "evidence", "failures", "hazardous_max_s", *DECISIVE),
         hazardous_may_max_s=pl.col("failure_hazardous_may_s").list.max(),
-        receiver_needs_s=period_s + (period_s if reaction_s is None else reaction_s),
+        receiver_needs_s=period_s + reaction_of(period_s, config),
     )
     rows = [run | level for run in needed.iter_rows(named=True) for level in level_rows(run, config)]
     quick = pl.col("receiver_needs_s") <= pl.col("allowed_s")
@@ -86,7 +87,8 @@ def campaign_levels(runs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
 
 
 def _faults_per_run(hazards: pl.DataFrame) -> pl.DataFrame:
-    missed, truth = pl.col("missed"), pl.col("with_truth")
+    missed = pl.col("missed")
+    truth = pl.col("with_truth")
     counts = {
         "faults": pl.len(),
         "missed": missed.sum(),
@@ -115,7 +117,9 @@ def _spread() -> dict[str, pl.Expr]:
 
 def _counts() -> dict[str, pl.Expr]:
     """Conditions on passages (`with_truth`): in how many rows each holds."""
-    mode, passage, judged = pl.col("failure_mode"), is_passage(), acceptances()
+    mode = pl.col("failure_mode")
+    passage = is_passage()
+    judged = acceptances()
     counts = {
         **outcomes(),
         **judged,
@@ -188,11 +192,13 @@ def _speed_band() -> pl.Expr:
     return band.fill_null("unknown")
 
 
-def _accuracy(found: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def _accuracy(offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     keys = ["grouped_by", "solution", "group"]
-    size, own_m, limit_m = pl.col("location_error_m").abs(), pl.col("location_accuracy_m"), config.lds.ci_limit_m
+    size = pl.col("location_error_m").abs()
+    own_m = pl.col("location_accuracy_m")
+    limit_m = config.lds.ci_limit_m
     counted = (
-        found.group_by(keys, maintain_order=True)
+        offers.group_by(keys, maintain_order=True)
         .agg(
             **_spread(),
             location_error_median_m=pl.col("location_error_m").median(),

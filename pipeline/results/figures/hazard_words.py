@@ -73,7 +73,8 @@ def _phrase(row: Row, wrong: Row | None) -> str:
 
 
 def _wrongly_accepted(row: Row, wrong: Row) -> str:
-    error_m, others = wrong["location_error_m"], len(row["accepted_ids"] or []) - 1
+    error_m = wrong["location_error_m"]
+    others = len(row["accepted_ids"] or []) - 1
     more = _say("more", others) if others > 0 else ""
     if error_m is None:
         return _say("wrongly_accepted", wrong["balise_id"]) + more
@@ -94,7 +95,8 @@ def _off(size_m: float | None, timing: Timing | str | None) -> str:
 
 
 def _accepted(row: Row) -> str:
-    accepted, hit = row["accepted_ids"] or [], row["balise_ids"] or []
+    accepted = row["accepted_ids"] or []
+    hit = row["balise_ids"] or []
     if not accepted:
         return _say("not_accepted")
     return _say("accepted") if set(accepted) == set(hit) else f"{_some(accepted)} {_say('accepted')}"

@@ -23,7 +23,8 @@ def known_counts(runs: pl.DataFrame) -> pl.DataFrame:
 
     Columns as in `runs`, or some of them with `status` and `evidence`.
     """
-    failed, blind = pl.col("status") == RunStatus.FAILED, pl.col("evidence").is_null()
+    failed = pl.col("status") == RunStatus.FAILED
+    blind = pl.col("evidence").is_null()
     counts = [name for name, dtype in runs.schema.items() if dtype == pl.Int64]
     return runs.with_columns(
         pl.when(failed | blind if name in JUDGED_COUNTS else failed).then(None).otherwise(pl.col(name)).alias(name)

@@ -9,7 +9,8 @@ from pipeline.stages.run_row.bounds import CONFIDENCE
 
 def undetected_spread() -> dict[str, pl.Expr]:
     """Of the passages of one balise: the larger of both directions, and how far before a physical one may lie."""
-    larger, before = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m"), pl.col("physical_before_m")
+    larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
+    before = pl.col("physical_before_m")
     return {
         "undetected_count": larger.count().cast(pl.Int64),
         "undetected_median_m": larger.median(),

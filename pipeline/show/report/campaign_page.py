@@ -10,6 +10,7 @@ from html import escape
 import polars as pl
 
 from pipeline.results.figures.campaign_figures import failures_of
+from pipeline.results.figures.head import head_of, run_verdicts, word_of
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.show.report.columns import Row, figures, frame_table
@@ -31,7 +32,6 @@ from pipeline.show.report.markup import (
 )
 from pipeline.show.report.run_page import ALLOWED, Made, configuration, hazard_cell
 from pipeline.show.report.words import plots_of, plural
-from pipeline.stages.run_row.verdict import head_of, run_verdicts, word_of
 from pipeline.studies.safety.sentences import level_statements, plain_statements
 from schemas.campaign import CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
 from schemas.enums import TRUTH, Hazard, RunVerdict

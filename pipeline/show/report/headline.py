@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.results.figures.hazard_words import hazard_words, withstood
+from pipeline.results.figures.head import figures_beside, head_of, run_verdicts, word_of, worst_verdict
 from pipeline.show.report.columns import Row
 from pipeline.show.report.markup import Cell, cell, number, table
 from pipeline.show.report.words import WORDS, plural, some_of
-from pipeline.stages.run_row.verdict import figures_beside, head_of, run_verdicts, word_of, worst_verdict
 from schemas.enums import Reason, RunVerdict
 from schemas.run import RunTables
 from schemas.words import beside_words, part_words, reason_words

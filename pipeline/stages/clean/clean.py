@@ -54,7 +54,7 @@ class StreamCounts:
 
 @dataclass(frozen=True)
 class CleanCounts:
-    """What cleaning found, per GNSS solution and per other stream."""
+    """What cleaning mended, per GNSS solution and per other stream."""
 
     solutions: dict[str, StreamCounts] = field(default_factory=dict)
     streams: dict[str, StreamCounts] = field(default_factory=dict)
@@ -167,8 +167,8 @@ def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame
     counts: dict[str, int] = {}
     marked: list[pl.DataFrame] = []
     for part in gnss.with_row_index("_row").partition_by("solution", maintain_order=True):
-        found, count = without_placeholders(part, config.ingest, config.align.fastest_mps)
-        marked.append(found)
+        part, count = without_placeholders(part, config.ingest, config.align.fastest_mps)
+        marked.append(part)
         counts[part["solution"][0]] = count
     return (pl.concat(marked).sort("_row").drop("_row") if any(counts.values()) else gnss), counts
 
@@ -274,7 +274,8 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
 
 def _require_common_time(run: RunLog, clock_advice: ClockAdvice) -> None:
     """Refuse an odometer of another time than the GNSS: not one position could be held against it."""
-    gnss, odometer = run.gnss, run.odometer
+    gnss = run.gnss
+    odometer = run.odometer
     if gnss.is_empty() or odometer is None:
         return
     begin, end = gnss["t"].to_physical()[[0, -1]]

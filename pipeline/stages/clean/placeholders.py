@@ -17,35 +17,37 @@ def without_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps:
     They are 0/0; places repeated to the last digit and farther than `placeholder_far_m` from the rest; and what comes
     before the first fix, where the run goes on so far away that no train can have gone there, at `fastest_mps`.
     """
-    latitude, longitude = floats(fixes, "latitude_deg"), floats(fixes, "longitude_deg")
+    latitude = floats(fixes, "latitude_deg")
+    longitude = floats(fixes, "longitude_deg")
     valid = np.isfinite(latitude) & np.isfinite(longitude)
     valid &= (fixes["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
     origin = valid & (np.maximum(np.abs(latitude), np.abs(longitude)) < config.placeholder_origin_deg)
     rows = np.flatnonzero(valid & ~origin)
-    found = origin
+    placeholder = origin
     if rows.size > 2:
         places = points_of(latitude[rows], longitude[rows]).surface
         centre = np.median(places, axis=0)
         # Cheap first: a run without any far place, which is nearly every run, is done here.
         if np.max(np.abs(places - centre)) > config.placeholder_far_m / np.sqrt(3.0):
-            found = origin.copy()
-            found[rows] = _far(times_ns(fixes)[rows], places, config, fastest_mps)
-    count = int(found.sum())
+            placeholder = origin.copy()
+            placeholder[rows] = _far(times_ns(fixes)[rows], places, config, fastest_mps)
+    count = int(placeholder.sum())
     if not count:
         return fixes, 0
     none = pl.lit(Fix.NONE.value).cast(fixes["fix"].dtype)
-    marked = pl.when(pl.Series(found)).then(none).otherwise(pl.col("fix")).alias("fix")
+    marked = pl.when(pl.Series(placeholder)).then(none).otherwise(pl.col("fix")).alias("fix")
     return fixes.with_columns(marked), count
 
 
 def _far(t_ns: Ints, places: Floats, config: IngestConfig, fastest_mps: float) -> Bools:
     """Placeholders among valid positions: pieces of the run between leaps that no train can make."""
-    step_m, step_s = np.linalg.norm(np.diff(places, axis=0), axis=1), np.diff(t_ns) / NS_PER_S
+    step_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    step_s = np.diff(t_ns) / NS_PER_S
     leap = step_m > config.placeholder_far_m + fastest_mps * step_s
     piece = np.concatenate([[0], np.cumsum(leap)])
-    found = np.zeros(t_ns.size, dtype=np.bool_)
+    placeholder = np.zeros(t_ns.size, dtype=np.bool_)
     if not leap.any():
-        return found
+        return placeholder
     sizes = np.bincount(piece)
     main = int(np.argmax(sizes))
     home = np.median(places[piece == main], axis=0)
@@ -57,13 +59,14 @@ def _far(t_ns: Ints, places: Floats, config: IngestConfig, fastest_mps: float) -
         same = rows.size > 1 and np.ptp(places[rows], axis=0).max() == 0.0
         first = rows[0] == 0 and number < main and _is_brief(t_ns, rows[-1] + 1, config)
         far = np.linalg.norm(np.median(places[rows], axis=0) - home) > config.placeholder_far_m
-        found[rows] = far and (same or first)
-    return found
+        placeholder[rows] = far and (same or first)
+    return placeholder
 
 
 def _is_brief(t_ns: Ints, until: int, config: IngestConfig) -> bool:
     """Whether the run up to this row is short enough to be the search for a first fix."""
-    spent_s, whole_s = (t_ns[until - 1] - t_ns[0]) / NS_PER_S, (t_ns[-1] - t_ns[0]) / NS_PER_S
+    spent_s = (t_ns[until - 1] - t_ns[0]) / NS_PER_S
+    whole_s = (t_ns[-1] - t_ns[0]) / NS_PER_S
     return bool(
         spent_s <= config.first_fix_share * whole_s or (spent_s <= config.first_fix_s and spent_s < 0.5 * whole_s)
     )

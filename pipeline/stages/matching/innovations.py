@@ -68,13 +68,23 @@ def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats,
             # As far as no other leaves its tolerance: that would be a parting that counts nowhere.
             lowest = max(error - limit[row] for row, error in zip(rows, taken, strict=True))
             highest = min(error + limit[row] for row, error in zip(rows, taken, strict=True))
-            ordered = sorted(taken)
-            lower, upper = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
-            common = min(max(0.0, lower), upper)
-            shift = min(max(common, lowest), highest)
+            shift = min(max(_common_m(taken, limit[rows[0]]), lowest), highest)
             for row, error in zip(rows, taken, strict=True):
                 errors[row] = kept[step] * side[row] * (error - shift)
     return np.array(errors)
+
+
+def _common_m(errors_m: list[float], limit_m: float) -> float:
+    """What of these errors counts as common: their median, as near to nothing as it may be.
+
+    Off every track (no limit) errors are as large as the yard is wide, and its middle measures nothing: the smallest.
+    """
+    if np.isinf(limit_m):
+        return min(errors_m, key=abs)
+    ordered = sorted(errors_m)
+    lower = ordered[(len(ordered) - 1) // 2]
+    upper = ordered[len(ordered) // 2]
+    return min(max(0.0, lower), upper)
 
 
 def movements_m(innovations: Innovations, offset_m: Floats, tolerance_m: Floats, one: Ints, other: Ints) -> Floats:

@@ -1,5 +1,10 @@
-"""The `runs` row of a solution: figures of the run with their bounds, verdict, remedies, notes.
+"""The `runs` row of one solution: figures, verdict, what time was lost to, remedies, notes.
 
-In: judged tables of a solution. Out: one `runs` row; the notes of a run.
+In: judged tables of one run. Out: its `runs` row (`summarise`).
 Touches no file. What is unknown stays unknown here: it counts neither as right nor as wrong.
+
+- `run_figures.py`: availability, accuracy, balises, hazards, alarms, states; `bounds.py`: how certain they are;
+  `independent.py`: what counts as one event.
+- `verdict.py`: reasons and verdict, by service level too. `lost_time.py`: what moving time was lost to.
+- `remedies.py`: what would mend the run. `notes.py`: what a reader should know (`noise.py`: wider thresholds).
 """

@@ -139,6 +139,6 @@ def mtbf(losses: int, up_h: float) -> Estimate:
 
 def continuity_15s(losses: int, up_h: float) -> Estimate:
     """Continuity over 15 s at the MTBF of so many losses."""
-    found = mtbf(losses, up_h)
-    parts = (found.value, found.low, found.high)
+    hours = mtbf(losses, up_h)
+    parts = (hours.value, hours.low, hours.high)
     return Estimate(*(None if part is None else continuity(CONTINUITY_S, part) for part in parts))

@@ -25,7 +25,8 @@ def missed_detection() -> pl.Expr:
 
     Missed for certain counts from `t_failure`, found for certain from `t_failure_may`; between them null.
     """
-    failed, may = pl.col("t_failure"), pl.col("t_failure_may")
+    failed = pl.col("t_failure")
+    may = pl.col("t_failure_may")
     return pl.when(failed.is_not_null() & _late(failed)).then(True).when(may.is_not_null() & ~_late(may)).then(False)
 
 
@@ -49,7 +50,8 @@ def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
     counted one by one they would make the bounds too narrow. Shares are of faults `with_truth` (reference or balise
     reads): the odometer alone mostly sees what was detected.
     """
-    failed, t_end = pl.col("t_failure").is_not_null(), pl.col("t_end")
+    failed = pl.col("t_failure").is_not_null()
+    t_end = pl.col("t_end")
     keys = [*(name for name in ("run_id", "solution") if name in hazards.columns), "begin"]
     return (
         hazards.filter(pl.col("caused_by").is_null())

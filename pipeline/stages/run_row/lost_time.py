@@ -11,11 +11,9 @@ import polars as pl
 from pipeline.stages.epochs.clock import Clock, confident, may_move, met, unambiguous, usable
 from schemas.arrays import NS_PER_S, Bools, Ints, times_ns
 from schemas.config import Configuration
-from schemas.enums import LdsMode, LostTo, MonitorState, NotEvaluated, Verdict
+from schemas.enums import LdsMode, LostTo, MonitorState, Verdict
 from schemas.tables import MONITORS
 from schemas.words import lost_words
-
-_NOISE = [NotEvaluated.NOISE_UNKNOWN.value, NotEvaluated.NOISE_TOO_LARGE.value]
 
 
 @dataclass(frozen=True)
@@ -57,14 +55,15 @@ def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, clock: Clock, config: 
         return LostTime()
     gap = clock.held_s < steps_s
     lost = moving & (gap | ~met(epochs, pl.col("tvb") & pl.col("moving").is_not_null()))
-    share, left = float(steps_s[lost].sum()) / whole_s, lost
-    found: dict[LostTo, Bools] = {}
+    share = float(steps_s[lost].sum()) / whole_s
+    left = lost
+    by_cause: dict[LostTo, Bools] = {}
     for cause, applies in _causes(epochs, gap, clock.t_ns, config).items():
-        found[cause] = left & applies
+        by_cause[cause] = left & applies
         left = left & ~applies
-    parts = {cause: float(steps_s[rows].sum()) / whole_s for cause, rows in found.items()}
+    parts = {cause: float(steps_s[rows].sum()) / whole_s for cause, rows in by_cause.items()}
     ranked = sorted((cause for cause, part in parts.items() if part > 0.0), key=lambda cause: -parts[cause])
-    alarmed = found[LostTo.ALARM]
+    alarmed = by_cause[LostTo.ALARM]
     unexplained = alarmed & ~_explained(alarms, clock.t_ns, config.lds.recovery_s)
     unfounded = bool(2.0 * steps_s[unexplained].sum() > steps_s[alarmed].sum())
     return LostTime(share, {cause: parts[cause] for cause in ranked}, _loudest(epochs.filter(alarmed)), unfounded)
@@ -74,13 +73,12 @@ def _causes(epochs: pl.DataFrame, gap: Bools, t_ns: Ints, config: Configuration)
     """Conditions in the order in which they apply."""
     negated = met(epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.FAIL_SAFE.value)
     withheld = pl.col("withheld_for").cast(pl.String)
-    noise = (withheld == LostTo.NOISE.value) | pl.col("along_raw_reason").is_in(_NOISE)
     waiting = met(epochs, withheld == LostTo.RELINK.value)
     return {
         LostTo.NO_POSITION: gap | ~met(epochs, usable()),
         LostTo.CONFIDENCE: ~met(epochs, confident(config)),
         LostTo.TRACK_AMBIGUOUS: ~met(epochs, unambiguous(config)),
-        LostTo.NOISE: met(epochs, noise),
+        LostTo.NOISE: met(epochs, withheld == LostTo.NOISE.value),
         LostTo.SLIP: met(epochs, withheld == LostTo.SLIP.value),
         LostTo.RELINK: waiting | (negated & ~_alarmed(epochs, t_ns, config.lds.recovery_s)),
         LostTo.ALARM: negated,

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, met
-from pipeline.stages.evidence import Evidence as TrainEvidence
+from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.lds.run import LdsResult
 from pipeline.stages.matching import Match
 from pipeline.stages.matching.fixes import contradictory_covariances
@@ -21,7 +21,7 @@ from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import Configuration
 from schemas.enums import NO_RELINK, BaliseKind, Evidence, LostTo, Note, NotEvaluated, PassageStatus, VehicleFigures
 from schemas.run import IngestNotes, RunLog
-from schemas.words import Remark, noise_words, remarks
+from schemas.words import Remark, noise_words, remarks, say
 
 # How much a note says, no figure: so many names stand in one, and neither a scatter of less than the positions
 # themselves have nor thresholds wider by less than this are worth a word.
@@ -32,7 +32,7 @@ _WITHOUT_ODOMETER = (NotEvaluated.NO_ODOMETER, NotEvaluated.BEYOND_SPAN, NotEval
 
 
 def ingest_notes(ingest: IngestNotes) -> list[Remark]:
-    """What reading the log found out about it."""
+    """What reading the log showed of it."""
     corrected = [Remark(Note.CORRECTED, (text,)) for text in ingest.corrections]
     return corrected + remarks(
         {
@@ -46,7 +46,9 @@ def ingest_notes(ingest: IngestNotes) -> list[Remark]:
 def ride_notes(ride: Ride, evidence: TrainEvidence) -> list[Remark]:
     """What went in, and what matching, alignment and the LDS made of it."""
     prepared = ride.prepared
-    run, config, counts = prepared.run, prepared.config, prepared.counts.solutions[ride.solution.name]
+    run = prepared.run
+    config = prepared.config
+    counts = prepared.counts.solutions[ride.solution.name]
     telegrams = sorted(set(ride.lds.unknown_reads["balise_id"].to_list()))
     reverses = ride.match.odometer_sign < 0 and prepared.vehicle.gnss_antenna_ahead_m
     return remarks(
@@ -99,23 +101,9 @@ def _of_odometer(odometry: Odometry | None, straight_s: float) -> dict[Note, obj
     }
 
 
-def _ambiguous(found: Match) -> str:
+def _ambiguous(match: Match) -> str:
     """Parts of the run where another path is nearly as likely."""
-    clock = "%H:%M:%S"
-    columns = (
-        "netelement_id",
-        "other_netelement_id",
-        "t_start",
-        "t_end",
-        "gate_probability",
-        "path_probability",
-        "resolved_by",
-    )
-    return ", ".join(
-        f"{one} ({gate:.2f} at the time, {path:.2f} in hindsight) or {other} from {start:{clock}} to {end:{clock}} "
-        f"(told apart by {resolved_by})"
-        for one, other, start, end, gate, path, resolved_by in found.ambiguous.select(columns).iter_rows()
-    )
+    return ", ".join(say("ambiguity", "stretch", **row) for row in match.ambiguous.iter_rows(named=True))
 
 
 def _unlinked(lds: LdsResult) -> tuple[int, str] | None:
@@ -127,7 +115,8 @@ def _unlinked(lds: LdsResult) -> tuple[int, str] | None:
 
 def _scatter(aligned: pl.DataFrame, config: Configuration) -> dict[Note, object]:
     """What the recorder's digits and the odometer's rows add to the thresholds, where that is much."""
-    most_m, digits = most_scatter_m(config), pl.max_horizontal(pl.col(r"^digits_(along|cross|up)_m$").max())
+    most_m = most_scatter_m(config)
+    digits = pl.max_horizontal(pl.col(r"^digits_(along|cross|up)_m$").max())
     rows_m, digits_m = aligned.select(pl.max("odometer_rows_m").fill_null(0.0), digits.fill_null(0.0)).row(0)
     return {
         Note.ROWS_SCATTER: rows_m if _WORTH_M < rows_m < most_m else None,

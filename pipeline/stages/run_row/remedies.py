@@ -11,6 +11,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import may_move, met
 from pipeline.stages.run_row.lost_time import LostTime
+from pipeline.stages.run_row.verdict import reaction_of
 from schemas.arrays import Bools, floats
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, LostTo, Reason, Remedy, RunVerdict, VehicleFigures
@@ -88,8 +89,7 @@ def _too_slow(run: Row, config: Configuration) -> bool:
     if not run["gnss_rate_hz"]:
         return False
     period_s = 1.0 / run["gnss_rate_hz"]
-    reaction_s = config.hazards.reaction_s
-    needs_s = period_s + (period_s if reaction_s is None else reaction_s)
+    needs_s = period_s + reaction_of(period_s, config)
     failures = zip(run["failure_hazardous_may_s"] or (), run["failure_accepted"] or (), strict=True)
     return any(
         accepted == Judgement.RIGHT and config.budget_s < spent_s <= needs_s + _STAMPS_S

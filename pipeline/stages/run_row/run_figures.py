@@ -72,9 +72,11 @@ def time_in_use(epochs: pl.DataFrame, recovery_s: float) -> Row:
 
     `epochs`: with the columns of `JudgedEpochs`. Shares are of the moving time in use, null without any.
     """
-    used_s, moves = floats(epochs, "used_s"), met(epochs, may_move())
+    used_s = floats(epochs, "used_s")
+    moves = met(epochs, may_move())
     seen = met(epochs, judged())
-    moving_s, unknown = used_s[moves], ~seen & moves & (used_s > 0.0)
+    moving_s = used_s[moves]
+    unknown = ~seen & moves & (used_s > 0.0)
     return {
         "in_use_s": float(used_s.sum()) if epochs.height else None,
         "in_use_judged_s": float(used_s[seen].sum()) if epochs.height else None,
@@ -210,10 +212,12 @@ def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence 
     The rate counts the time in use in which the along-track bank judged and the position was judged (DOMAIN 6).
     """
     false = alarms.filter(pl.col("verdict") == Verdict.FALSE).height
-    monitored, seen = met(epochs, _along_evaluated()), met(epochs, judged())
+    monitored = met(epochs, _along_evaluated())
+    seen = met(epochs, judged())
     truth = evidence in TRUTH and bool(seen.any())
     complete = truth and not (alarms["verdict"] == Verdict.UNKNOWN).any()
-    counted_s, in_use = floats(epochs, "counted_s"), met(epochs, pl.col("in_use"))
+    counted_s = floats(epochs, "counted_s")
+    in_use = met(epochs, pl.col("in_use"))
     judged_s = float(counted_s[monitored & seen & in_use].sum())
     rate: Estimate = poisson_rate(false, judged_s / 3600.0) if complete else UNKNOWN
     times = {
@@ -264,7 +268,8 @@ def state_shares(epochs: pl.DataFrame) -> Row:
 def stanford_counts(epochs: pl.DataFrame, limit_m: float, bound: str = "confidence_m") -> Row:
     """Epochs whose error is known to 5 m, by error and bound along the track (CONTRACT section 3, `stanford_*`)."""
     known = epochs.select(error=pl.col("error_along_m").abs(), bound=pl.col(bound)).drop_nulls()
-    error, claimed = known["error"].to_numpy(), known["bound"].to_numpy()
+    error = known["error"].to_numpy()
+    claimed = known["bound"].to_numpy()
     offered = claimed <= limit_m
     return {
         "stanford_nominal": int(np.sum(offered & (error <= claimed))),

@@ -32,7 +32,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class SolutionResults:
-    """All that the stages found out about one solution; `epochs` as in `schemas.tables`.
+    """What the stages say of one solution; `epochs` as in `schemas.tables`.
 
     `odometer_contradicted`: gaps between anchors that the odometer does not close (DOMAIN section 5.1). `alignment`:
     latency and odometer scale at the end of the run. `white_noise`: its columns of `runs`.
@@ -61,7 +61,9 @@ class SolutionResults:
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
     """One row of the `runs` table (CONTRACT section 3)."""
-    epochs, clock, judged = results.epochs, Clock.of(results.epochs, config), results.judged
+    epochs = results.epochs
+    clock = Clock.of(results.epochs, config)
+    judged = results.judged
     lost = lost_time(epochs, judged.alarms, clock, config)
     row = (
         _identity(results)
@@ -115,7 +117,8 @@ def _part(results: SolutionResults, row: Row, config: Configuration) -> Row:
     if share is None or not 0.0 < share < 1.0:
         return {}
     part = results.epochs.filter(inside)
-    begin, end = part["epoch"].item(0), part["epoch"].item(-1)
+    begin = part["epoch"].item(0)
+    end = part["epoch"].item(-1)
     offers = results.judged.offers.filter(pl.col("epoch").is_between(begin, end))
     passages = results.judged.passages.join(offers.select("crossing_id"), on="crossing_id", how="semi")
     decisive = _decisive(part, passages, failures_within(part, offers, config), config)
@@ -171,7 +174,7 @@ def _notes(
     config: Configuration,
 ) -> str | None:
     """What the reader should know beside the figures."""
-    found = (
+    noted = (
         *ingest_notes(results.ingest),
         *results.notes,
         *judged_notes(results.judged.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
@@ -180,7 +183,7 @@ def _notes(
         *time_notes(results.epochs, clock, lost, config),
         *(Remark(Note.REMEDY, (remedy_words(cure),)) for cure in cures),
     )
-    return notes_text(found)
+    return notes_text(noted)
 
 
 def _extent(epochs: pl.DataFrame, clock: Clock, distance_m: float | None) -> Row:

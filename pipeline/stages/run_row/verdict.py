@@ -1,19 +1,19 @@
-"""The verdict of a run (DOMAIN section 5.4), by service level too (TVB eq. 7), and what heads several runs."""
+"""The verdict of a run (DOMAIN section 5.4), by service level too (TVB eq. 7)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import polars as pl
 
 from pipeline.stages.judge.failures import within_budget
 from schemas.config import Configuration
-from schemas.enums import Judgement, Reason, RunStatus, RunVerdict, ThrVerdict
+from schemas.enums import Judgement, Reason, RunVerdict, ThrVerdict
 
 Row = Mapping[str, Any]
+Time = TypeVar("Time", float, pl.Expr)
 Failure = tuple[float, float, str]
 """Hazardous time [s], the same with what is unknown, and the worst judgement of the VBs accepted meanwhile."""
 
@@ -57,72 +57,10 @@ def reasons_of(run: Row, allowed_s: float, undiagnosed_share: float) -> list[Rea
 
 def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
     """The worst that applies; an assumed clock alone changes nothing (DOMAIN section 5.4)."""
-    found = set(reasons) - {Reason.CLOCK_ASSUMED}
-    if found & _UNSAFE:
+    against = set(reasons) - {Reason.CLOCK_ASSUMED}
+    if against & _UNSAFE:
         return RunVerdict.UNSAFE
-    return RunVerdict.UNPROVEN if found else RunVerdict.SAFE
-
-
-def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
-    """The verdict that heads several; None stands for one that failed, and proves nothing beside others."""
-    found = {None if verdict is None else RunVerdict(verdict) for verdict in verdicts}
-    if RunVerdict.UNSAFE in found:
-        return RunVerdict.UNSAFE
-    if not found - {None}:
-        return None
-    return RunVerdict.SAFE if found == {RunVerdict.SAFE} else RunVerdict.UNPROVEN
-
-
-@dataclass(frozen=True)
-class CampaignHead:
-    """The verdict of a campaign, and how many runs have which; `failed`: no solution could be replayed."""
-
-    verdict: RunVerdict | None
-    unsafe: int
-    unproven: int
-    safe: int
-    failed: int
-
-    @property
-    def word(self) -> str:
-        return word_of(self.verdict)
-
-    def counts(self) -> dict[str, int]:
-        """Runs by verdict, worst first; failed ones last."""
-        return {"unsafe": self.unsafe, "unproven": self.unproven, "safe": self.safe, "failed": self.failed}
-
-    def __str__(self) -> str:
-        return f"{self.word}: " + ", ".join(f"{count} {name}" for name, count in self.counts().items())
-
-
-def word_of(verdict: RunVerdict | str | None) -> str:
-    """The first word of every report, table and summary."""
-    return RunStatus.FAILED.value if verdict is None else str(verdict)
-
-
-def head_of(verdicts: Iterable[RunVerdict | None]) -> CampaignHead:
-    """The head of a campaign from the verdicts of its runs."""
-    found = list(verdicts)
-    counts = {verdict.value: found.count(verdict) for verdict in RunVerdict}
-    return CampaignHead(worst_verdict(found), **counts, failed=found.count(None))
-
-
-def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
-    """Each run's verdict, the worst of its solutions, from `runs` with `run_id`."""
-    listed = runs.group_by("run_id").agg(pl.col("verdict").cast(pl.String)).sort("run_id")
-    return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}
-
-
-def figures_beside(runs: pl.DataFrame) -> Row:
-    """The figures beside a campaign's verdict: sums, availability by time, and the least margin."""
-    weight_s = pl.col("held_s").filter(pl.col("availability").is_not_null()).sum()
-    available = (pl.col("availability") * pl.col("held_s")).sum() / weight_s
-    figures = runs.select(
-        pl.col("balises_accepted", "balises_on_path").sum(),
-        pl.col("proof_margin_m").min(),
-        availability=pl.when(weight_s > 0.0).then(available),
-    )
-    return figures.row(0, named=True)
+    return RunVerdict.UNPROVEN if against else RunVerdict.SAFE
 
 
 LEVEL_LISTS = {
@@ -132,14 +70,14 @@ LEVEL_LISTS = {
     "exceeded": "level_exceeded",
     "verdict": "level_verdict",
 }
-"""What `level_rows` tells of each service level, and the list of the `runs` table that holds it."""
+"""What `level_rows` gives for each service level, and the list of the `runs` table that holds it."""
 
 
 _OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVerdict.UNKNOWN}
 
 
 def level_rows(run: Row, config: Configuration) -> list[dict[str, object]]:
-    """One `runs` row against the allowed T_D of each service level, by the rules of its own verdict."""
+    """One `runs` row against the allowed T_D of each service level, by the rules of the run's verdict."""
     failures = failures_in(run)
     in_time = ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
     rows: list[dict[str, object]] = []
@@ -150,6 +88,13 @@ def level_rows(run: Row, config: Configuration) -> list[dict[str, object]]:
         values = (level, allowed_s, within, exceeded, _OF_LEVEL.get(verdict, in_time).value)
         rows.append(dict(zip(LEVEL_LISTS, values, strict=True)))
     return rows
+
+
+def reaction_of(period_s: Time, config: Configuration) -> Time | float:
+    """Time from detection to the block [s]: that of the configuration, else one epoch; with the period of the epochs
+    the least time that any fault is in use.
+    """
+    return period_s if config.hazards.reaction_s is None else config.hazards.reaction_s
 
 
 def failures_in(run: Row) -> list[Failure]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.stages.run_row.verdict import figures_beside, head_of, run_verdicts
+from pipeline.results.figures.head import figures_beside, head_of, run_verdicts
 from pipeline.studies.reservations import failed_runs, several_settings
 from schemas.enums import RunStatus, Verdict
 from schemas.words import beside_words

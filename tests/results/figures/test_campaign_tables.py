@@ -246,7 +246,11 @@ class TestLevels:
         )
         levels = campaign_levels(catalogue, CONFIG).select("within", "exceeded", "verdict").rows()
         assert set(levels) == {expected}
-        detection = detection_by_level(catalogue, faults([]), CONFIG.safety).select("within", "exceeded").rows()
+        detection = (
+            detection_by_level(catalogue, faults([]), campaign_levels(catalogue, CONFIG))
+            .select("within", "exceeded")
+            .rows()
+        )
         assert set(detection) == {expected[:2]}
 
     def test_every_run_against_every_level(self) -> None:

@@ -64,8 +64,7 @@ def test_after_an_alarm_the_recovery_is_the_alarms_and_the_wait_is_the_re_links(
     ("columns", "cause"),
     [
         ({"confidence_m": 20.0}, LostTo.CONFIDENCE),
-        ({"along_raw_reason": "no position", "withheld_for": "noise"}, LostTo.NOISE),
-        ({"along_raw_reason": "noise too large"}, LostTo.NOISE),
+        ({"along_raw_reason": "noise too large", "withheld_for": "noise"}, LostTo.NOISE),
         ({"withheld_for": "slip"}, LostTo.SLIP),
         ({"odometer_reason": "no odometer"}, LostTo.NO_ODOMETER),
         ({"lds_mode": "fail_safe"}, LostTo.RELINK),

@@ -6,14 +6,9 @@ from typing import Any
 import polars as pl
 import pytest
 
+from pipeline.results.figures.head import head_of, run_verdicts, worst_verdict
 from pipeline.stages.run_row.independent import independent_episodes, missed_detection
-from pipeline.stages.run_row.verdict import (
-    head_of,
-    reasons_of,
-    run_verdicts,
-    verdict_of,
-    worst_verdict,
-)
+from pipeline.stages.run_row.verdict import reasons_of, verdict_of
 from schemas.enums import Reason, RunVerdict
 from schemas.tables import Runs
 from schemas.words import part_words, reason_words

@@ -105,6 +105,7 @@ def test_calibration_finds_the_simulated_vehicle(result: Calibration) -> None:
     assert 0 < (vehicle.odometer_scale_sigma or 0) < 2e-4
     assert 0 < (vehicle.gnss_latency_sigma_s or 0) < 0.03
     assert result.runs["run_id"].to_list() == ["clean0", "clean1"]
+    assert result.alarms == {}
     assert result.sigmas.height == 12
     assert result.monitors["sigma_slope"] == pytest.approx(1.0, abs=0.1)
     settings = tomllib.loads(result.monitors_toml())
@@ -120,8 +121,13 @@ def test_sigmas_of_an_earlier_calibration_do_not_count(
     assert again.monitors == result.monitors
 
 
-def seen(run_id: str, noise_m: dict[str, tuple[float, ...]]) -> Observed:
-    return Observed(run_id, RunEstimate(1.0, 1e-4, 0.0, 0.01, 1.0, 100), noise_m, None, ())
+def seen(run_id: str, noise_m: dict[str, tuple[float, ...]], alarms: tuple[str, ...] = ()) -> Observed:
+    return Observed(run_id, RunEstimate(1.0, 1e-4, 0.0, 0.01, 1.0, 100), noise_m, None, alarms)
+
+
+def test_runs_that_failed_beyond_their_noise_are_named() -> None:
+    runs = [seen("good", {}), seen("bad", {}, ("along_ewma_0p01",))]
+    assert calibration_of(runs, Vehicle(), Configuration()).alarms == {"bad": ("along_ewma_0p01",)}
 
 
 def test_the_loudest_run_counts_monitor_by_monitor_and_an_axis_unknown_to_all_stays_unset() -> None:

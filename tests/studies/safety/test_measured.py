@@ -7,10 +7,11 @@ import polars as pl
 import pytest
 
 from pipeline.results.figures.campaign_figures import detection_by_level, measured_figures
+from pipeline.results.figures.campaign_tables import campaign_levels
 from pipeline.stages.run_row.bounds import clopper_pearson, poisson_rate, poisson_rate_upper
 from pipeline.stages.run_row.independent import independent_episodes
 from pipeline.studies.safety.sentences import plain_statements
-from schemas.config import SafetyConfig
+from schemas.config import Configuration, SafetyConfig
 from schemas.tables import Runs
 from tests.tables import NS, hazards, table
 
@@ -151,7 +152,7 @@ def test_a_position_wrong_between_balises_is_not_kept_quiet() -> None:
 def test_no_runs_no_rows() -> None:
     assert measured_figures(runs(0), NO_HAZARDS, CONFIG).height == 0
     assert measured_figures(runs(2, status="failed"), NO_HAZARDS, CONFIG).height == 0
-    assert detection_by_level(runs(0), NO_HAZARDS, CONFIG).height == 0
+    assert detection_by_level(runs(0), NO_HAZARDS, campaign_levels(runs(0), Configuration())).height == 0
 
 
 def test_solutions_are_counted_apart() -> None:
@@ -180,7 +181,9 @@ def test_shares_are_of_failures_that_a_truth_judged() -> None:
     assert (found["stanford_nominal"], found["stanford_hpl_nominal"]) == (5, None)
     (sentence,) = plain_statements(figures)
     assert "No monitor found 1 of 2 faults with a failure that a truth judged; 1 more are known by the" in sentence
-    row = detection_by_level(catalogue, faults, CONFIG).row(1, named=True)  # LPV-200, 0.5025 s
+    row = detection_by_level(catalogue, faults, campaign_levels(catalogue, Configuration())).row(
+        1, named=True
+    )  # LPV-200, 0.5025 s
     assert (row["failures"], row["within"], row["exceeded"]) == (4, 1, 2)
     assert (row["failures_judged"], row["within_judged"]) == (2, 1)
     assert (row["within_share"], row["within_share_high"]) == (0.5, share.high)
@@ -199,7 +202,7 @@ def test_measured_times_against_every_level() -> None:
     """Hazardous times 0.2, 1.0, 20 s and 0.3 s that may be 30 s, against 24.12, 0.5025, 1.675 and 100.5 s."""
     faults = fault(5, time_to_detect_s=[5.2, 6.0, 25.0, None, 2.0])
     catalogue = failed([[(0.2, 0.2), (1.0, 1.0)], [(20.0, 20.0), (0.3, 30.0)]])
-    table = detection_by_level(catalogue, faults, CONFIG)
+    table = detection_by_level(catalogue, faults, campaign_levels(catalogue, Configuration()))
     assert table["service_level"].to_list() == ["npa", "lpv200", "egnos_observed", "horizontal_sis"]
     assert table["within"].to_list() == [3, 1, 2, 4]
     assert table["exceeded"].to_list() == [0, 2, 1, 0]

@@ -1,0 +1,73 @@
+"""What heads several runs: the worst verdict, how many have which, and the figures beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import polars as pl
+
+from schemas.enums import RunStatus, RunVerdict
+
+
+def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
+    """The verdict that heads several; None stands for one that failed, and proves nothing beside others."""
+    known = {None if verdict is None else RunVerdict(verdict) for verdict in verdicts}
+    if RunVerdict.UNSAFE in known:
+        return RunVerdict.UNSAFE
+    if not known - {None}:
+        return None
+    return RunVerdict.SAFE if known == {RunVerdict.SAFE} else RunVerdict.UNPROVEN
+
+
+@dataclass(frozen=True)
+class CampaignHead:
+    """The verdict of a campaign, and how many runs have which; `failed`: no solution could be replayed."""
+
+    verdict: RunVerdict | None
+    unsafe: int
+    unproven: int
+    safe: int
+    failed: int
+
+    @property
+    def word(self) -> str:
+        return word_of(self.verdict)
+
+    def counts(self) -> dict[str, int]:
+        """Runs by verdict, worst first; failed ones last."""
+        return {"unsafe": self.unsafe, "unproven": self.unproven, "safe": self.safe, "failed": self.failed}
+
+    def __str__(self) -> str:
+        return f"{self.word}: " + ", ".join(f"{count} {name}" for name, count in self.counts().items())
+
+
+def word_of(verdict: RunVerdict | str | None) -> str:
+    """The first word of every report, table and summary."""
+    return RunStatus.FAILED.value if verdict is None else str(verdict)
+
+
+def head_of(verdicts: Iterable[RunVerdict | None]) -> CampaignHead:
+    """The head of a campaign from the verdicts of its runs."""
+    listed = list(verdicts)
+    counts = {verdict.value: listed.count(verdict) for verdict in RunVerdict}
+    return CampaignHead(worst_verdict(listed), **counts, failed=listed.count(None))
+
+
+def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
+    """Each run's verdict, the worst of its solutions, from `runs` with `run_id`."""
+    listed = runs.group_by("run_id").agg(pl.col("verdict").cast(pl.String)).sort("run_id")
+    return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}
+
+
+def figures_beside(runs: pl.DataFrame) -> Mapping[str, Any]:
+    """The figures beside a campaign's verdict: sums, availability by time, and the least margin."""
+    weight_s = pl.col("held_s").filter(pl.col("availability").is_not_null()).sum()
+    available = (pl.col("availability") * pl.col("held_s")).sum() / weight_s
+    figures = runs.select(
+        pl.col("balises_accepted", "balises_on_path").sum(),
+        pl.col("proof_margin_m").min(),
+        availability=pl.when(weight_s > 0.0).then(available),
+    )
+    return figures.row(0, named=True)
