@@ -192,7 +192,7 @@ def test_a_train_that_turns_at_a_balise_has_not_surely_passed_it(turn_m: float, 
     there_m = np.arange(5.0, turn_m, 10.0)
     at_m = np.concatenate([there_m, there_m[::-1]])
     rows = np.arange(at_m.size)
-    route =     rows = np.arange(at_m.size)(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
+    route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
     evidence = EvidenceSet(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - 40.0, at_m + 40.0),))
     found = true_crossings(rows * NS, evidence, {"V": Place(0, 100.0)}, Configuration())
     assert [crossing.t_ns / NS for crossing in found["V"]] == passed_s
