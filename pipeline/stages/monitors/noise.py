@@ -211,7 +211,8 @@ class _Sampler:
             noise_m2=(shown_m2 / gaussian_m2 - self._model_m2(lag_s, rows)) / _OF_WALK,
             stated_m2=_stated_m2(self._series, rows.last, config),
             window=round(max(config.noise_window_s, config.noise_window_lags * lag_s) / spacing_s),
-            ready=max(round(ready_s / spacing_s), 1),
+            # No sample begins where the run does: rounded up, logs faster than 2 Hz waited for a renewal more.
+            ready=max(int(ready_s / spacing_s + 1e-6), 1),
             span=max(2.0 * lag_s / spacing_s, 1.0),
         )
 
