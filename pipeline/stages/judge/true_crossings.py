@@ -133,8 +133,8 @@ def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config:
     armed_from = 0
     passed = False
     for change, later in zip(changes.tolist(), [*changes[1:].tolist(), away_m.size], strict=False):
-        armed = bool(beyond[armed_from:change].any())
-        clear = armed and bool(beyond[change:later].any())
+        armed = bool((beyond & (ahead != ahead[change]))[armed_from:change].any())
+        clear = armed and bool((beyond & (ahead == ahead[change]))[change:later].any())
         if not clear and not (close[change - 1 : change + 1].all() and (armed or not passed)):
             continue
         armed_from = change
