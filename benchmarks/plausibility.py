@@ -18,7 +18,7 @@ from benchmarks.plausibility_trips import Trip, trip
 from benchmarks.plausibility_wrongs import WRONGS, Wrong
 from benchmarks.results import Figure
 from pipeline.stages.clean.clean import clean
-from pipeline.studies.plausibility.check import Check, State
+from pipeline.studies.plausibility.check import Check, FitState
 from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
@@ -121,7 +121,7 @@ def _plausible(count: int) -> int:
             said = fit if isinstance(fit, str) else "; ".join(check.sentence for check in fit.impossible)
             print(f"plausible run {seed} fails: {said}", flush=True)
         else:
-            noted.update(check.what for check in fit.checks if check.state is State.MISFIT)
+            noted.update(check.what for check in fit.checks if check.state is FitState.MISFIT)
     print(
         f"{count} plausible runs, {refused} fail; {1e3 * np.median(seconds):.0f} ms each, at most {max(seconds):.2f} s"
     )

@@ -27,7 +27,7 @@ from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.one_run import replay, ride_alone
 from pipeline.studies.undetected.columns import Diagnosis, rows_of
-from pipeline.studies.undetected.profile import Profile, profile_at
+from pipeline.studies.undetected.profile import FaultProfile, profile_at
 from pipeline.studies.undetected.ride import diagnosis_of
 from pipeline.studies.undetected.watched import windows
 from schemas.arrays import floats, times_ns
@@ -202,7 +202,7 @@ def _some_epoch(diagnosis: Diagnosis, trial: Trial, config: Configuration, rng: 
     return int(rows.epoch[int(rng.integers(chosen.start + 1, chosen.end + 1))])
 
 
-def _injected(trial: Trial, found: Profile, scale: float, folder: Path) -> pl.DataFrame:
+def _injected(trial: Trial, found: FaultProfile, scale: float, folder: Path) -> pl.DataFrame:
     """Epochs of the run with the profile, times a scale."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "profile.csv"
@@ -211,7 +211,7 @@ def _injected(trial: Trial, found: Profile, scale: float, folder: Path) -> pl.Da
     return replay(inject(trial.run, fault, trial.site), trial.site, trial.vehicle, _NOISE_GIVEN).epochs
 
 
-def _held_by_rate(found: Profile, config: Configuration) -> bool:
+def _held_by_rate(found: FaultProfile, config: Configuration) -> bool:
     """Every step of the profile is as fast as a fault may be."""
     rate_mps = found.fault["size_m"].diff() / found.fault["t_s"].diff()
     return bool((rate_mps.drop_nulls().abs() > 0.999 * config.undetected.max_rate_mps).all())

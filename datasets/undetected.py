@@ -7,7 +7,7 @@ from pathlib import Path
 import tomli_w
 
 from pipeline.one_run import ride_alone
-from pipeline.studies.undetected.profile import Profile, epoch_of, profile_at
+from pipeline.studies.undetected.profile import FaultProfile, epoch_of, profile_at
 from pipeline.studies.undetected.ride import diagnosis_of
 from schemas.config import Configuration, Vehicle
 from schemas.errors import OutputError
@@ -26,7 +26,7 @@ def largest_fault(
     balise: str | None = None,
     at_s: float | None = None,
     behind: bool = False,
-) -> Profile:
+) -> FaultProfile:
     """The largest fault that no monitor would have noticed, at a balise, a time after the first epoch, or the end."""
     ride = ride_alone(run, site, vehicle, config, solution)
     diagnosis = diagnosis_of(ride)
@@ -34,7 +34,7 @@ def largest_fault(
     return profile_at(diagnosis, epoch, behind, vehicle, config)
 
 
-def sentence_of(found: Profile) -> str:
+def sentence_of(found: FaultProfile) -> str:
     """The fault in words: how large, since when, and what a ramp and a step would have reached."""
     began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
     return (
@@ -44,7 +44,7 @@ def sentence_of(found: Profile) -> str:
     )
 
 
-def write_fault(profile: Profile, solution: str | None, out: Path) -> Path:
+def write_fault(profile: FaultProfile, solution: str | None, out: Path) -> Path:
     """`fault.toml` and its `profile.csv` in a folder; `solution`: the only one that is hit, None for all."""
     fault = {"kind": "profile", "target": "along", "profile": PROFILE}
     if solution is not None:

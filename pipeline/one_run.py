@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import polars as pl
 
-from pipeline.stages.evidence import Evidence
+from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.judge import Judged, judge
 from pipeline.stages.matching import Match
@@ -93,7 +93,7 @@ def _fit(prepared: PreparedRun, solution: str) -> Fit:
     return fit
 
 
-def _replay_solution(prepared: PreparedRun, solution: str, placed: _Placed, evidence: Evidence) -> Tables:
+def _replay_solution(prepared: PreparedRun, solution: str, placed: _Placed, evidence: TrainEvidence) -> Tables:
     """What the train made of one solution, what nobody would have noticed, and what the judge says of it."""
     ride = ride_of(prepared, solution, placed.matches, evidence)
     unnoticed = unnoticed_of(ride)
@@ -104,7 +104,7 @@ def _replay_solution(prepared: PreparedRun, solution: str, placed: _Placed, evid
     return {**tables, "runs": summarise(results, prepared.config, prepared.provenance)}
 
 
-def _case(ride: Ride, unnoticed: Undetected, evidence: Evidence) -> Case:
+def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence) -> Case:
     """The solution before the judge."""
     taken = ride.solution
     run = ride.prepared.run
@@ -121,7 +121,7 @@ def _case(ride: Ride, unnoticed: Undetected, evidence: Evidence) -> Case:
 
 
 def _results(
-    ride: Ride, judged: Judged, epochs: pl.DataFrame, unnoticed: Undetected, fit: Fit, evidence: Evidence
+    ride: Ride, judged: Judged, epochs: pl.DataFrame, unnoticed: Undetected, fit: Fit, evidence: TrainEvidence
 ) -> SolutionResults:
     """All that the `runs` row is made of."""
     prepared = ride.prepared
@@ -148,7 +148,7 @@ def _results(
     )
 
 
-def _reasons(evidence: Evidence, doubtful: bool) -> list[Reason]:
+def _reasons(evidence: TrainEvidence, doubtful: bool) -> list[Reason]:
     """What stands against a verdict whatever was judged (DOMAIN section 5.4)."""
     applies = {
         Reason.EVIDENCE_DISPUTED: evidence.disputed > 0,

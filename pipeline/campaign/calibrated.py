@@ -25,7 +25,7 @@ AUTO = "auto"
 
 
 @dataclass(frozen=True)
-class _Source:
+class _CalibrationRun:
     """A run that may calibrate others; `reason`: why it does not, empty where it does."""
 
     run_id: str
@@ -77,7 +77,7 @@ def _jobs_of(plan: Plan, runs: Sequence[str], automatic: bool) -> list[RunJob]:
     return [replace(model, run_id=run_id, address=address) for run_id, address in addresses.items()]
 
 
-def _source(job: RunJob) -> _Source:
+def _source(job: RunJob) -> _CalibrationRun:
     """What a run shows, or why it shows nothing; no error of a log ends the campaign here."""
     from pipeline.studies.calibration.calibrate import observe  # replays, which the parent of a campaign need not load
 
@@ -89,15 +89,15 @@ def _source(job: RunJob) -> _Source:
         site = with_route(site, job.route, job.config.site) if job.route else site
         seen = observe(run, site, job.vehicle, job.config, run.main_solution())
     except InputError as error:
-        return _Source(job.run_id, log.digest, reason=str(error))
+        return _CalibrationRun(job.run_id, log.digest, reason=str(error))
     if seen.estimate is None:
-        return _Source(job.run_id, log.digest, reason="GNSS and odometer cannot be compared")
+        return _CalibrationRun(job.run_id, log.digest, reason="GNSS and odometer cannot be compared")
     if seen.alarms:
-        return _Source(job.run_id, log.digest, reason=f"alarms beyond its noise ({', '.join(seen.alarms)})")
-    return _Source(job.run_id, log.digest, seen)
+        return _CalibrationRun(job.run_id, log.digest, reason=f"alarms beyond its noise ({', '.join(seen.alarms)})")
+    return _CalibrationRun(job.run_id, log.digest, seen)
 
 
-def _calibrated(job: RunJob, sources: Sequence[_Source]) -> RunJob:
+def _calibrated(job: RunJob, sources: Sequence[_CalibrationRun]) -> RunJob:
     from pipeline.studies.calibration.calibrate import calibration_of
 
     seen = [source.observed for source in sources if source.observed is not None]
@@ -117,7 +117,7 @@ def _with_calibration(config: Configuration, measured: Calibration, runs: tuple[
     return config.model_copy(update={"monitors": monitors, "calibration": calibration})
 
 
-def _require_enough(job: RunJob, sources: Sequence[_Source], refused: Sequence[_Source]) -> None:
+def _require_enough(job: RunJob, sources: Sequence[_CalibrationRun], refused: Sequence[_CalibrationRun]) -> None:
     least = job.config.calibration.least_runs
     if len(sources) >= least:
         return
@@ -131,13 +131,14 @@ def _require_enough(job: RunJob, sources: Sequence[_Source], refused: Sequence[_
     )
 
 
-def _require_one_vehicle(sources: Sequence[_Source], config: Configuration) -> None:
+def _require_one_vehicle(sources: Sequence[_CalibrationRun], config: Configuration) -> None:
     """Scales that differ by more than wear are of different vehicles, whose mean fits none."""
     estimates = {run.observed.estimate: run.run_id for run in sources if run.observed and run.observed.estimate}
     if not estimates:
         return
     by_scale = sorted(estimates, key=lambda estimate: estimate.scale)
-    least, most = by_scale[0], by_scale[-1]
+    least = by_scale[0]
+    most = by_scale[-1]
     noise = config.monitors.threshold_factor * (least.scale_sigma**2 + most.scale_sigma**2) ** 0.5
     if most.scale - least.scale <= config.calibration.same_vehicle_scale + noise:
         return

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import moved_deg, points_of
-from pipeline.stages.track.survey import Track, track_of
+from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.arrays import Floats
 from schemas.run import Site
 
@@ -17,7 +17,7 @@ _POINTS = 3000
 
 
 @dataclass(frozen=True)
-class Ground:
+class GroundPositions:
     """Positions in degrees and metres, NaN where not known; `heading_deg` of growing measure, clockwise from north."""
 
     latitude_deg: Floats
@@ -26,7 +26,7 @@ class Ground:
     heading_deg: Floats
 
 
-def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) -> Ground:
+def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) -> GroundPositions:
     """Places on the rails. Between survey points position is linear; beyond the ends the last chord goes on."""
     survey = track_of(track)
     columns = [np.full(len(measure_m), np.nan) for _ in range(4)]
@@ -38,20 +38,21 @@ def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) 
         index = rows["row"].to_numpy()
         for column, values in zip(columns, _on_element(survey, number, measure_m[index]), strict=True):
             column[index] = values
-    return Ground(*columns)
+    return GroundPositions(*columns)
 
 
-def beside(ground: Ground, sign: Floats, left_m: Floats, above_m: Floats) -> Ground:
+def beside(ground: GroundPositions, sign: Floats, left_m: Floats, above_m: Floats) -> GroundPositions:
     """Places `left_m` to the left of growing path and `above_m` over the rails.
 
     `sign` is +1 where path and measure grow together, -1 where against each other. For metres, not kilometres.
     """
     heading = np.radians(ground.heading_deg)
-    east, north = -left_m * sign * np.cos(heading), left_m * sign * np.sin(heading)
+    east = -left_m * sign * np.cos(heading)
+    north = left_m * sign * np.sin(heading)
     level = np.nan_to_num(ground.height_m)
     latitude, longitude = moved_deg(ground.latitude_deg, ground.longitude_deg, level, east, north)
     height = ground.height_m + np.nan_to_num(above_m)
-    return Ground(latitude, longitude, height, ground.heading_deg)
+    return GroundPositions(latitude, longitude, height, ground.heading_deg)
 
 
 def stretches_of(epochs: pl.DataFrame) -> pl.DataFrame:
@@ -87,7 +88,8 @@ def train_path_m(epochs: pl.DataFrame, stretches: pl.DataFrame) -> tuple[Floats,
     It is known where the evidence leaves one net element and the path leads over it (`stretches_of`). Of several
     visits to the element the one nearest to the position counts, without a position to the last one before.
     """
-    names, position = pl.col("true_netelement_ids"), pl.col("path_m").fill_nan(None)
+    names = pl.col("true_netelement_ids")
+    position = pl.col("path_m").fill_nan(None)
     ends = [
         pl.col("offset_m") + pl.col("sign") * pl.col(name) for name in ("true_measure_low_m", "true_measure_high_m")
     ]
@@ -105,13 +107,15 @@ def train_path_m(epochs: pl.DataFrame, stretches: pl.DataFrame) -> tuple[Floats,
         .unique("row", keep="first", maintain_order=True)
     )
     low, high = np.full((2, epochs.height), np.nan)
-    low[visits["row"]], high[visits["row"]] = visits["low"], visits["high"]
+    low[visits["row"]] = visits["low"]
+    high[visits["row"]] = visits["high"]
     return low, high
 
 
-def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, margin_m: float = 50.0) -> Ground:
+def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, margin_m: float = 50.0) -> GroundPositions:
     """Places of path positions on the stretches; NaN further than `margin_m` beyond what was travelled."""
-    best, measure_m = np.full(len(path_m), np.inf), np.full(len(path_m), np.nan)
+    best = np.full(len(path_m), np.inf)
+    measure_m = np.full(len(path_m), np.nan)
     names = np.full(len(path_m), None, dtype=object)
     survey = track_of(track)
     for name, sign, offset_m, first_m, last_m in stretches.iter_rows():
@@ -122,7 +126,8 @@ def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, marg
             ends += list(offset_m + sign * measures)
         away = np.maximum(np.maximum(min(ends) - path_m, path_m - max(ends)), 0.0)
         nearer = (away < best) & (away <= margin_m)
-        best[nearer], names[nearer] = away[nearer], name
+        best[nearer] = away[nearer]
+        names[nearer] = name
         measure_m[nearer] = sign * (path_m[nearer] - offset_m)
     return ground_of(track, pl.Series(names, dtype=pl.String), measure_m)
 
@@ -140,7 +145,7 @@ def sign_of(epochs: pl.DataFrame, stretches: pl.DataFrame) -> Floats:
     return fitting["sign"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
-def plane_m(ground: Ground, origin: tuple[float, float]) -> tuple[Floats, Floats]:
+def plane_m(ground: GroundPositions, origin: tuple[float, float]) -> tuple[Floats, Floats]:
     """East and north of an origin (latitude, longitude) in its tangent plane [m], for drawing."""
     plane = points_of(np.array([origin[0]]), np.array([origin[1]]))
     offset = points_of(ground.latitude_deg, ground.longitude_deg).surface - plane.surface[0]
@@ -157,7 +162,7 @@ def element_lines_m(site: Site) -> Iterator[tuple[str, Floats, Floats]]:
     """Each net element as a line east and north of the origin [m], of no more points than a screen shows."""
     survey = track_of(site.track)
     nothing = np.full(len(survey.latitude_deg), np.nan)
-    east, north = plane_m(Ground(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))
+    east, north = plane_m(GroundPositions(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))
     for _, name, rows in survey.elements():
         yield name, _thinned(east[rows]), _thinned(north[rows])
 
@@ -167,7 +172,7 @@ def _thinned(values: Floats) -> Floats:
     return np.append(values[: -1 : max(1, -(-len(values) // _POINTS))], values[-1:])
 
 
-def _on_element(track: Track, number: int, measure_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def _on_element(track: SurveyedTrack, number: int, measure_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Latitude, longitude, height, heading of measures on one element."""
     rows = track.vertices(number)
     measures = track.measure_m[rows]

@@ -32,7 +32,9 @@ _SIGNS = {
     LineCause.ALARM: "A",
     LineCause.FEW_SATELLITES: "S",
 }
-_WIDTH, _LANE, _ROW_PIECES = 1100.0, 22.0, 100
+_WIDTH = 1100.0
+_LANE = 22.0
+_ROW_PIECES = 100
 _OPEN = ("piece_class", "cause", "netelement_id", "from_m", "to_m", "direction", "passes", "right", "lost")
 _COLUMNS = (*_OPEN, "wrong_in_use", "few_satellites", "claimed_wrongly", "unknown", "unjudged", "after_alarm",
             "loss_share", "unsafe_high",

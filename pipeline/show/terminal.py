@@ -20,7 +20,8 @@ from schemas.errors import visible
 
 _SAID_EVERY_S = 5.0
 _CHANGED_EVERY_S = 0.2
-_BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
+_BOLD = "\x1b[1m"
+_PLAIN = "\x1b[0m"
 # Right is green, wrong red, not known grey; the word itself says it where there are no colours.
 _COLOURS = {"unsafe": "\x1b[1;31m", "failed": "\x1b[31m", "unproven": "\x1b[90m", "safe": "\x1b[32m"}
 _VERDICT_WORD = re.compile(r"(?<![\w-])(?:unsafe|failed|unproven|safe)(?![\w-])")

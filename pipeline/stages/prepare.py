@@ -15,7 +15,7 @@ from pipeline.stages.clean.clean import (
     require_one_journey,
     require_two_times,
 )
-from pipeline.stages.evidence import Evidence, evidence_of
+from pipeline.stages.evidence import TrainEvidence, evidence_of
 from pipeline.stages.matching import Match, match
 from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of
 from pipeline.stages.provenance import Provenance, provenance
@@ -62,7 +62,7 @@ class PreparedRun:
         fixes = self.fixes(solution)
         return match(fixes, self.odometry, self.site, self.vehicle, config.matching, config.fix_sigma, reads)
 
-    def evidence(self) -> Evidence:
+    def evidence(self) -> TrainEvidence:
         """What is known of where the train was; knows of no solution."""
         network = site_network(self.site)
         pieces = network_in_pieces(self.site)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.stages.alignment.align import align, odometer_at
-from pipeline.stages.evidence import Evidence
+from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.case import Case, Solution
 from pipeline.stages.judge.epochs import direction_by_evidence
 from pipeline.stages.lds.run import LdsResult, run_lds
@@ -47,7 +47,7 @@ class Ride:
         return self.aligned.select(*columns, odometer_scale_sigma="scale_sigma").row(-1, named=True)
 
 
-def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: Evidence) -> Ride:
+def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: TrainEvidence) -> Ride:
     """Align one matched solution with the odometer, monitor it, detect balises."""
     config = prepared.config
     matched = matches[solution]
@@ -70,7 +70,7 @@ def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], 
 
 
 def _direction(
-    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matched: Match, evidence: Evidence
+    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matched: Match, evidence: TrainEvidence
 ) -> pl.Series:
     """The direction of travel by the evidence, of a solution of which nothing is decided yet."""
     nothing = pl.DataFrame()

@@ -69,7 +69,8 @@ def version_in(listing: Listing) -> str | None:
 
 def check_copy(store: Any, place: str, info: Mapping[str, Any], copy: Path) -> None:
     """Raises `AlteredError` unless the copy has the size, and where its entity tag is a digest also the content."""
-    size, listed = copy.stat().st_size, info.get("size")
+    size = copy.stat().st_size
+    listed = info.get("size")
     if listed is not None and size != listed:
         raise AlteredError(f"{name_of(place)} came with {size} bytes, and {listed} are listed")
     tag = _MD5.fullmatch(str(info.get("ETag", "")))

@@ -18,7 +18,7 @@ from datasets.trial import build_run, build_site
 from pipeline.one_run import replay
 from pipeline.results.store import write_run
 from pipeline.show.inspection import inspect_result
-from pipeline.studies.line.passes import Ground, passes_of
+from pipeline.studies.line.passes import PieceIndex, passes_of
 from pipeline.studies.line.pieces import middles, pieces_of
 from pipeline.studies.safety.assessment import assess
 from schemas import words
@@ -56,7 +56,7 @@ def tables_of(out: Path) -> dict[str, pl.DataFrame]:
     found = replay(build_run(scenario, scenario.runs[0]), site, VEHICLE, config)
     write_run(found, out, {})
     pieces = pieces_of(site, LineCriteria().piece_m)
-    ground = Ground.of(site, pieces, middles(site, pieces))
+    ground = PieceIndex.of(site, pieces, middles(site, pieces))
     passes = passes_of(found.epochs, found.passages, found.alarms, ground, LineCriteria(), config)
     tables = {name: getattr(found, name) for name in ("hazards", "passages", "alarms", "epochs")}
     assessed = assess(str(out))

@@ -27,7 +27,8 @@ def local_velocity(
 
 def east_north_up(latitude_deg: Any, longitude_deg: Any) -> Floats:
     """Rotation from earth-fixed axes to east, north, up; shape (3, 3), of n places (3, 3, n)."""
-    lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
+    lat = np.radians(latitude_deg)
+    lon = np.radians(longitude_deg)
     return np.array(
         [
             [-np.sin(lon), np.cos(lon), np.zeros_like(lon)],

@@ -53,7 +53,8 @@ def decode(gathered: Gathered, m: Any, raw: bytes) -> None:
     if name not in ("INSPVAS", "INSPVA") and int(m.header.time_status) < _COARSE:
         gathered.drop("time not valid")
         return
-    week, ms = int(m.header.week), round(float(m.header.milliseconds))
+    week = int(m.header.week)
+    ms = round(float(m.header.milliseconds))
     if name == "BESTVEL" and int(m.status):
         return
     epoch = gathered.at((name if name == "BESTVEL" else "", week, ms), name if name in _RANKS else "", raw)
@@ -106,7 +107,9 @@ def _place(epoch: Epoch, m: Any, rank: int, fix: Fix) -> None:
     epoch.put("fix", rank, {"fix": fix.value})
     epoch.put("place", rank, {"latitude_deg": m.latitude, "longitude_deg": m.longitude, "height_m": height})
     if hasattr(m, "latitude_std_dev"):
-        east, north, up = m.longitude_std_dev**2, m.latitude_std_dev**2, m.height_std_dev**2
+        east = m.longitude_std_dev**2
+        north = m.latitude_std_dev**2
+        up = m.height_std_dev**2
         epoch.put("accuracy", rank, covariance(east, 0.0, 0.0, north, 0.0, up))
 
 

@@ -38,7 +38,7 @@ _GEOID = "height over the geoid: left empty, since the file has no separation"
 
 
 @dataclass(frozen=True)
-class _Layout:
+class _RtklibHeader:
     """What the header says: scale of the times, names of the columns without units, and the comments themselves."""
 
     scale: str
@@ -80,7 +80,7 @@ def read_solution(content: bytes, path: Path) -> tuple[dict[Stream, pl.DataFrame
     return {"gnss": fixes.with_columns(pl.when(is_placed).then(pl.exclude(kept)))}, dropped
 
 
-def _layout(comments: list[str], path: Path) -> _Layout:
+def _layout(comments: list[str], path: Path) -> _RtklibHeader:
     headers = [re.split(r"[\s,;]+", line.lstrip("% ").strip()) for line in comments]
     headers = [words for words in headers if words[0] in _AHEAD_NS and {"Q", "ns"} <= set(words)]
     if not headers:
@@ -103,10 +103,10 @@ def _layout(comments: list[str], path: Path) -> _Layout:
     if any("(d'" in word for word in units):
         remedy = "Let RTKLIB write decimal degrees (out-degform = deg)."
         raise InputError("holds degrees with minutes and seconds", place=str(path), remedy=remedy)
-    return _Layout(scale, names, "\n".join(comments))
+    return _RtklibHeader(scale, names, "\n".join(comments))
 
 
-def _rows(lines: list[str], layout: _Layout, ended: bool, path: Path) -> tuple[list[list[str]], dict[str, int]]:
+def _rows(lines: list[str], layout: _RtklibHeader, ended: bool, path: Path) -> tuple[list[list[str]], dict[str, int]]:
     """The words of each row; a last row without its end is left out."""
     rows: list[list[str]] = []
     for number, line in enumerate(lines, 1):
@@ -127,7 +127,7 @@ def _rows(lines: list[str], layout: _Layout, ended: bool, path: Path) -> tuple[l
     return rows, {}
 
 
-def _times(words: Any, layout: _Layout, path: Path) -> pl.Series:
+def _times(words: Any, layout: _RtklibHeader, path: Path) -> pl.Series:
     """UTC of the first two words of each row."""
     if _DATE.fullmatch(words[0, 0]):
         text = pl.Series(np.char.add(np.char.add(words[:, 0], "T"), words[:, 1]))
@@ -148,7 +148,7 @@ def _times(words: Any, layout: _Layout, path: Path) -> pl.Series:
     return utc_of(t_ns - _AHEAD_NS[layout.scale], "gps" if layout.scale == "GPST" else "utc")
 
 
-def _numbers(words: Any, layout: _Layout, path: Path) -> dict[str, Floats]:
+def _numbers(words: Any, layout: _RtklibHeader, path: Path) -> dict[str, Floats]:
     """The columns by name."""
     rest = words[:, 2:]
     try:
@@ -158,7 +158,7 @@ def _numbers(words: Any, layout: _Layout, path: Path) -> dict[str, Floats]:
     return dict(zip(layout.columns, values.T, strict=True))
 
 
-def _place(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:
+def _place(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -> dict[str, Any]:
     """Place and, where given, velocity."""
     if "Tokyo" in layout.comments:
         raise InputError("is in the Tokyo datum", place=str(path), expected="WGS 84", remedy="Set out-datum = wgs84.")
@@ -186,7 +186,7 @@ def _velocity(numbers: dict[str, Floats], place: dict[str, Floats]) -> dict[str,
     return {f"vel_{axis}_mps": numbers[f"v{axis}"] for axis in "enu" if f"v{axis}" in numbers}
 
 
-def _covariance(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:
+def _covariance(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -> dict[str, Any]:
     """Deviations, and of two axes the signed root of their covariance, as variances [m2]."""
     axes = "xyz" if "sdx" in numbers else "enu"
     matrix = np.zeros((3, 3, len(numbers["Q"])))

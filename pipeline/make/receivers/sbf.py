@@ -70,7 +70,8 @@ def _geodetic_covariance(epoch: Epoch, m: Any) -> None:
 
 def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
     """Turned into east, north, up where the epoch's position is known (SBF writes it first)."""
-    latitude, longitude = epoch.gnss.get("latitude_deg"), epoch.gnss.get("longitude_deg")
+    latitude = epoch.gnss.get("latitude_deg")
+    longitude = epoch.gnss.get("longitude_deg")
     if latitude is None or longitude is None or m.Cov_xx == _DO_NOT_USE:
         return
     turn = east_north_up(latitude, longitude)

@@ -18,7 +18,7 @@ from pipeline.read.site.tables import RawTable, typed_table
 from pipeline.stages.matching.candidates import candidates_of, segments_of
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import network_of
-from pipeline.stages.track.survey import Track, track_of
+from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.config import Configuration, SurveyConfig
 from schemas.enums import BaliseDirection, TravelAlong
 from schemas.errors import SiteError
@@ -104,7 +104,9 @@ def balises_of_list(
 class _Placer:
     """Where on the track a row of a list is."""
 
-    def __init__(self, place: str, network: SurveyNetwork, track: Track, survey: Survey, config: SurveyConfig) -> None:
+    def __init__(
+        self, place: str, network: SurveyNetwork, track: SurveyedTrack, survey: Survey, config: SurveyConfig
+    ) -> None:
         self.place = place
         self.network = network
         self.track = track

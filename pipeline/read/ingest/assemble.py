@@ -16,7 +16,7 @@ from schemas.run import STREAMS, Stream
 
 
 @dataclass(frozen=True)
-class Decoded:
+class DecodedRows:
     """Fields of all messages of a source, one row per message, with its times and place in the file."""
 
     source: Source
@@ -25,7 +25,7 @@ class Decoded:
 
 
 def stream_frames(
-    decoded: Sequence[Decoded], breaches: list[InputError], few: float, remarks: list[str]
+    decoded: Sequence[DecodedRows], breaches: list[InputError], few: float, remarks: list[str]
 ) -> dict[str, pl.DataFrame]:
     """One frame per stream that has a source, rows in order of the file; `remarks` tells what was left out.
 
@@ -40,7 +40,7 @@ def stream_frames(
 
 
 def _stream(
-    stream: Stream, parts: Sequence[Decoded], breaches: list[InputError], few: float, remarks: list[str]
+    stream: Stream, parts: Sequence[DecodedRows], breaches: list[InputError], few: float, remarks: list[str]
 ) -> pl.DataFrame:
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
     breaches += [
@@ -56,7 +56,7 @@ def _stream(
     return conform(frame, stream, place, breaches)
 
 
-def _supplemented(frame: pl.DataFrame, part: Decoded, supplements: Sequence[Decoded]) -> pl.DataFrame:
+def _supplemented(frame: pl.DataFrame, part: DecodedRows, supplements: Sequence[DecodedRows]) -> pl.DataFrame:
     """With the columns that other messages of the same receiver hold for the same epochs."""
     key = list(part.source.recipe.key)
     for other in supplements:
@@ -69,12 +69,12 @@ def _supplemented(frame: pl.DataFrame, part: Decoded, supplements: Sequence[Deco
     return frame
 
 
-def _same_receiver(part: Decoded, other: Decoded) -> bool:
+def _same_receiver(part: DecodedRows, other: DecodedRows) -> bool:
     """Drivers publish the messages of one receiver side by side."""
     return part.source.channel.topic.rpartition("/")[0] == other.source.channel.topic.rpartition("/")[0]
 
 
-def _rows(part: Decoded, supplements: Sequence[Decoded], few: float, remarks: list[str]) -> pl.DataFrame:
+def _rows(part: DecodedRows, supplements: Sequence[DecodedRows], few: float, remarks: list[str]) -> pl.DataFrame:
     source = part.source
     columns = part.frame.select(ORDINAL, **source.columns)
     try:
@@ -91,7 +91,7 @@ def _rows(part: Decoded, supplements: Sequence[Decoded], few: float, remarks: li
     return _stamped(frame, source, remarks)
 
 
-def _may_be_left_out(part: Decoded, unknown: pl.Series, few: float, remarks: list[str]) -> bool:
+def _may_be_left_out(part: DecodedRows, unknown: pl.Series, few: float, remarks: list[str]) -> bool:
     """Whether messages without time may be left out, which is counted.
 
     They may where a receiver does not know the time yet, and where a few have a date that no trial can have.
@@ -164,7 +164,7 @@ def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.Data
     return frame.filter(~unset.fill_null(False))
 
 
-def _named(frame: pl.DataFrame, part: Decoded) -> pl.DataFrame:
+def _named(frame: pl.DataFrame, part: DecodedRows) -> pl.DataFrame:
     """With the solution: what the messages say, else the source's."""
     if part.solution is None:
         return frame

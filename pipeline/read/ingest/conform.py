@@ -139,7 +139,8 @@ def _strange_values(series: pl.Series, column: dy.Column, where: str) -> Iterato
         least = -_LARGEST if column.min is None else column.min
         most = _LARGEST if column.max is None else column.max
         over = getattr(column, "min_exclusive", None)
-        low, high = series.min(), series.max()
+        low = series.min()
+        high = series.max()
         if low < least:  # type: ignore[operator]
             yield _out_of_range(where, low, series < least, f"at least {least:g}")
         if over is not None and low <= over:

@@ -135,7 +135,7 @@ def _summary(stream: Stream, frame: pl.DataFrame) -> StreamSummary:
 
 
 @dataclass
-class _Met:
+class _ChannelCounts:
     """What the walk has met of one channel."""
 
     channel: Channel
@@ -148,13 +148,13 @@ class _Census:
     """Counts messages of all channels and looks at the first of each."""
 
     def __init__(self) -> None:
-        self.met: dict[int, _Met] = {}
+        self.met: dict[int, _ChannelCounts] = {}
 
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
         for channel_id, messages in block.items():
             if channel_id not in self.met:
                 fields = _fields(channels[channel_id], messages) if len(self.met) < _MOST_SAMPLES else {}
-                self.met[channel_id] = _Met(channels[channel_id], fields)
+                self.met[channel_id] = _ChannelCounts(channels[channel_id], fields)
             met = self.met[channel_id]
             times = messages.log_time
             met.messages += len(messages)
@@ -182,7 +182,7 @@ def _topics(path: Address, config: IngestConfig) -> tuple[TopicSummary, ...]:
     return tuple(_topic(census.met[channel_id], config) for channel_id in sorted(census.met))
 
 
-def _topic(met: _Met, config: IngestConfig) -> TopicSummary:
+def _topic(met: _ChannelCounts, config: IngestConfig) -> TopicSummary:
     sample = Sample(met.channel, met.fields)
     span_s = (max(met.span_ns) - min(met.span_ns)) / 1e9
     sources = sources_of(sample, config) if met.fields else []

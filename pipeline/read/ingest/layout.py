@@ -96,7 +96,7 @@ def constant(value: float | str | bool | None, dtype: pl.DataType) -> Field:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class ByteStretch:
     """Bytes of a message that are taken together; those `at` some places among them must agree under a mask."""
 
     start: int
@@ -111,7 +111,7 @@ class Layout:
     """Of messages of one length: the fields, and the stretches that hold them and all that shapes the layout."""
 
     fields: Mapping[str, Field]
-    stretches: Sequence[Stretch]
+    stretches: Sequence[ByteStretch]
 
     def rows(self, messages: Messages) -> list[Bytes]:
         """Each stretch of each message."""
@@ -147,7 +147,7 @@ def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) ->
     for part in np.split(places, np.flatnonzero(np.diff(places) > _NEAR) + 1):
         start, end = (int(part[0]), int(part[-1]) + 1) if len(part) else (0, 0)
         at = np.flatnonzero(mask[start:end])
-        stretches.append(Stretch(start, end, at, mask[start:end][at], (content & mask)[start:end][at]))
+        stretches.append(ByteStretch(start, end, at, mask[start:end][at], (content & mask)[start:end][at]))
     return Layout(fields, stretches)
 
 

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.assemble import Decoded, stream_frames
+from pipeline.read.ingest.assemble import DecodedRows, stream_frames
 from pipeline.read.ingest.conform import refuse
 from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of, undecodable
 from pipeline.read.ingest.mcap_block import Block, Messages
@@ -144,7 +144,7 @@ def _frames(
     met = [walk.channels[channel_id] for channel_id in streams.readers]
     settled = settle([reader.source for reader in readers], [c.topic for c in met], config, str(path))
     chosen = [reader for reader in readers if any(reader.source is source for source in settled)]
-    decoded = [Decoded(r.source, solution_of(r.source, settled), r.frame()) for r in chosen]
+    decoded = [DecodedRows(r.source, solution_of(r.source, settled), r.frame()) for r in chosen]
     used = {source.channel.topic for source in settled}
     unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))

@@ -13,7 +13,7 @@ from pipeline.read.ingest.mcap_records import HEAD_SIZE, DamageError, parse
 
 
 @dataclass
-class Met:
+class WalkCounts:
     """What the walk counted on its way.
 
     `chunk_sum` adds up what a chunk index must say of each chunk, in any order: a log may have a million of them.
@@ -28,7 +28,8 @@ class Met:
 
     def add_chunk(self, chunk: Chunk, offset: int, length: int) -> None:
         """A chunk whose record has this offset and length."""
-        start_ns, end_ns = chunk.message_start_time, chunk.message_end_time
+        start_ns = chunk.message_start_time
+        end_ns = chunk.message_end_time
         self.chunks += 1
         self.chunk_sum += hash(
             (start_ns, end_ns, offset, length, len(chunk.data), chunk.uncompressed_size, chunk.compression)
@@ -42,7 +43,7 @@ class Met:
 class Summary:
     """The summary section, record by record; raises where it contradicts what was met."""
 
-    def __init__(self, start: int, met: Met) -> None:
+    def __init__(self, start: int, met: WalkCounts) -> None:
         self._start = start
         self._met = met
         self._crc = 0

@@ -27,7 +27,7 @@ from pipeline.read.ingest.mcap_records import (
     parse_message_index,
     unpacked,
 )
-from pipeline.read.ingest.mcap_summary import Met, Summary
+from pipeline.read.ingest.mcap_summary import Summary, WalkCounts
 
 _AFTER_THE_DATA = (
     Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.FOOTER, Opcode.SUMMARY_OFFSET,
@@ -47,7 +47,7 @@ class McapWalk:
 
     def __init__(self, stream: IO[bytes], size: int, file: str, chunk_limit: int) -> None:
         self.channels: dict[int, Channel] = {}
-        self.met = Met()
+        self.met = WalkCounts()
         self.cut_at: int | None = None
         self.without_crc = 0  # blocks of messages whose content no checksum covers
         self._bare_chunks = array("q")  # contents of chunks without checksum, from and to

@@ -14,7 +14,10 @@ from pipeline.read.ingest.layout import Field, Layout, UnfitError, Values, const
 from pipeline.read.ingest.mcap_block import Bytes
 
 # Wire types (protobuf encoding guide).
-_VARINT, _I64, _LEN, _I32 = 0, 1, 2, 5
+_VARINT = 0
+_I64 = 1
+_LEN = 2
+_I32 = 5
 _LONGEST_TAG = 5  # bytes: tags and lengths are numbers of 32 bits
 # descriptor.proto: FieldDescriptorProto.Type
 _BOOL, _STRING, _MESSAGE = 8, 9, 11
@@ -76,7 +79,8 @@ class _Walk:
         met: dict[int, list[Raw]] = {}
         while at < end:
             tag, start = self._varint(at, end, 0xFF, _LONGEST_TAG)
-            number, wire = tag >> 3, tag & 7
+            number = tag >> 3
+            wire = tag & 7
             if wire == _VARINT:
                 _, at = self._varint(start, end, 0x80)
             elif wire == _LEN:

@@ -96,7 +96,7 @@ def _member(line: str, package: str) -> Member | None:
     return Member(match["name"], kind, int(size[1:-1]) if size[1:-1].isdigit() else 0)
 
 
-class Place(NamedTuple):
+class FieldPlace(NamedTuple):
     """Where a field lies: a number or flag, `size` of them in an array, or the bytes of a text."""
 
     kind: str
@@ -115,7 +115,7 @@ class RosWalk:
         if len(payload) < HEADER_SIZE or payload[0] != 0 or payload[1] not in (0, 1):
             raise DefinitionError(f"encapsulation 0x{payload[:2].hex()} is not plain CDR")
         self.little = bool(payload[1])
-        self.places: dict[str, Place] = {}
+        self.places: dict[str, FieldPlace] = {}
         self.lengths: list[int] = []
         self._payload = payload
         self._definitions = definitions
@@ -150,7 +150,7 @@ class RosWalk:
         code = PRIMITIVES[kind]
         size = int(code[1])
         offset = self._take(size * (1 if count is None else count), size)
-        self.places[path] = Place(kind, offset, count)
+        self.places[path] = FieldPlace(kind, offset, count)
         values = array(_CODES[code], self._payload[offset : self._at])
         if self.little != (sys.byteorder == "little"):
             values.byteswap()
@@ -160,7 +160,7 @@ class RosWalk:
         """A text with its closing zero, which programs leave out where there is no text."""
         length = self._length()
         offset = self._take(length, 1)
-        self.places[path] = Place("string", offset, length)
+        self.places[path] = FieldPlace("string", offset, length)
         content = self._payload[offset : self._at]
         if content and content[-1]:
             raise DefinitionError("a text has no closing zero")
@@ -211,7 +211,7 @@ def layout_of_cdr(
     return layout_of(payload, static, fields)
 
 
-def _field(place: Place, index: int, little: bool) -> Field:
+def _field(place: FieldPlace, index: int, little: bool) -> Field:
     if place.kind == "string":
         if not place.size:
             raise UnfitError("a text without its closing zero")

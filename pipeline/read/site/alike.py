@@ -14,7 +14,7 @@ from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Network, network_of
 from pipeline.stages.track.path import valid_along_measure
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
-from pipeline.stages.track.survey import Track, places_along, track_of
+from pipeline.stages.track.survey import SurveyedTrack, places_along, track_of
 from schemas.arrays import Floats
 from schemas.config import LdsConfig, MatchingConfig, SiteConfig
 from schemas.enums import BaliseKind
@@ -201,7 +201,7 @@ def _remedy(site: Site, network: Network, stretch: _ParallelStretch) -> str:
     return f"To tell the two apart: {', '.join(ways)}."
 
 
-def _survey_m(track: Track, config: MatchingConfig) -> Floats:
+def _survey_m(track: SurveyedTrack, config: MatchingConfig) -> Floats:
     """Per element the survey's sigma, the least of its points; the configured one where it states none."""
     stated = np.where(np.isfinite(track.sigma_m), track.sigma_m, config.survey_sigma_default_m)
     return np.asarray(np.minimum.reduceat(stated, track.first[:-1]))

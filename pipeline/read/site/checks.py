@@ -15,7 +15,7 @@ from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import (
     GAP_COUNTS_M,
     MEASURE_TOLERANCE_M,
-    Track,
+    SurveyedTrack,
     end_places,
     geometric_m,
     track_of,
@@ -80,7 +80,7 @@ def drop_repeated_points(file: str, frame: pl.DataFrame, breaches: list[str]) ->
     return marked.filter(~pl.col("_repeats")).drop("_repeats"), notes
 
 
-def relations_to_nowhere(track: Track, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+def relations_to_nowhere(track: SurveyedTrack, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
     """The relations between elements that there are; of each other one a finding."""
     ids = list(track.ids)
     known = links["netelement_a"].is_in(ids) & links["netelement_b"].is_in(ids)
@@ -106,7 +106,7 @@ def _relations_that_differ(links: pl.DataFrame) -> Iterator[Finding]:
             yield Finding("warning", "links", f"{text}: what either allows counts", "Correct the relations.")
 
 
-def _related_ends(track: Track, links: pl.DataFrame) -> tuple[Ints, Ints]:
+def _related_ends(track: SurveyedTrack, links: pl.DataFrame) -> tuple[Ints, Ints]:
     """The two ends of each relation, as rows of `[element, 0 start or 1 end]` taken flat."""
     numbers = pl.DataFrame({"name": track.ids, "number": np.arange(len(track.ids))})
     sides = []
@@ -116,7 +116,7 @@ def _related_ends(track: Track, links: pl.DataFrame) -> tuple[Ints, Ints]:
     return sides[0], sides[1]
 
 
-def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+def _relations_that_turn_back(track: SurveyedTrack, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
     """No train gets round a corner of less than a right angle: such a relation, as between the two branches of a
     switch, is not navigable, whatever it says.
     """
@@ -138,10 +138,11 @@ def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.Dat
     return links.with_columns(navigability=closed.otherwise("navigability")), findings
 
 
-def outward(track: Track) -> np.ndarray:
+def outward(track: SurveyedTrack) -> np.ndarray:
     """Direction from each end into its element, earth-centred and not normed: `[element, 0 start or 1 end]`."""
     surface = points_of(track.latitude_deg, track.longitude_deg).surface
-    start, stop = track.first[:-1], track.first[1:]
+    start = track.first[:-1]
+    stop = track.first[1:]
     directions = np.zeros((len(track.ids), 2, 3))
     for position, end in ((0, start), (1, stop - 1)):
         away_m = np.linalg.norm(surface - np.repeat(surface[end], stop - start, axis=0), axis=1)
@@ -158,7 +159,7 @@ def outward(track: Track) -> np.ndarray:
     return directions
 
 
-def _check_elements(track: Track, declared_length_m: dict[str, float], found: Remarks) -> None:
+def _check_elements(track: SurveyedTrack, declared_length_m: dict[str, float], found: Remarks) -> None:
     """Length, declared length, height and vertex spacing of each element."""
     geometric = geometric_m(track)
     length_m = geometric[track.first[1:] - 1]
@@ -184,7 +185,7 @@ def _check_elements(track: Track, declared_length_m: dict[str, float], found: Re
     _check_heights(track, found)
 
 
-def _check_heights(track: Track, found: Remarks) -> None:
+def _check_heights(track: SurveyedTrack, found: Remarks) -> None:
     # An element has all heights or none.
     flat = [track.ids[element] for element in np.flatnonzero(np.isnan(track.height_m[track.first[:-1]])).tolist()]
     if flat and len(flat) < len(track.ids):
@@ -195,7 +196,7 @@ def _check_heights(track: Track, found: Remarks) -> None:
         found.findings.append(Finding("warning", "track: column height_m", text, remedy))
 
 
-def chord_errors_m(track: Track) -> Floats:
+def chord_errors_m(track: SurveyedTrack) -> Floats:
     """How far the curve may lie off the chord that begins at each vertex [m]: length times turn over 8 (sagitta).
 
     Of the turns at its two ends the smaller one: the other may be that of a curve which only begins there. 0 for an
@@ -217,7 +218,7 @@ def chord_errors_m(track: Track) -> Floats:
     return np.asarray(errors)
 
 
-def _check_gaps(track: Track, found: Remarks) -> None:
+def _check_gaps(track: SurveyedTrack, found: Remarks) -> None:
     """Ends that a relation joins must meet, in place and, where both have one, in height."""
     one, other = _related_ends(track, found.links)
     places = end_places(track).reshape(-1, 3)
@@ -238,7 +239,7 @@ def _check_gaps(track: Track, found: Remarks) -> None:
             found.findings.append(Finding("warning", "links", text, "Correct the heights."))
 
 
-def _near_misses(track: Track, links: pl.DataFrame, config: SiteConfig) -> Iterator[Finding]:
+def _near_misses(track: SurveyedTrack, links: pl.DataFrame, config: SiteConfig) -> Iterator[Finding]:
     """Free ends from which a train could go on: to a near end of another element, or to one that faces it."""
     ends = [(name, position) for name in track.ids for position in (0, 1)]
     joined = {(row[0], row[1]) for row in links.iter_rows()} | {(row[2], row[3]) for row in links.iter_rows()}
@@ -301,7 +302,7 @@ def _nearly_met(places: Floats, inward: Floats, free: np.ndarray, config: SiteCo
     return [(one, other, float(np.linalg.norm(places[one] - places[other]))) for one, other in pairs]
 
 
-def _check_balises(track: Track, balises: pl.DataFrame, found: Remarks) -> None:
+def _check_balises(track: SurveyedTrack, balises: pl.DataFrame, found: Remarks) -> None:
     repeated = balises.filter(pl.col("balise_id").is_duplicated())["balise_id"].unique().sort().to_list()
     if repeated:
         found.breaches.append(f"balises: column balise_id: {', '.join(repeated[:3])} occur more than once")
@@ -315,7 +316,7 @@ def _check_balises(track: Track, balises: pl.DataFrame, found: Remarks) -> None:
         found.breaches.append(f"balises: none lies on a net element of the track; {off[0].place} {off[0].message}")
 
 
-def _off_the_track(track: Track, element: str, measure_m: float) -> tuple[str, str] | None:
+def _off_the_track(track: SurveyedTrack, element: str, measure_m: float) -> tuple[str, str] | None:
     """Why no run will pass a balise, and what to mend."""
     if element not in track.index:
         return f"lies on element {element}, which is not in the track: no run will pass it", "Correct netelement_id."
@@ -328,7 +329,7 @@ def _off_the_track(track: Track, element: str, measure_m: float) -> tuple[str, s
     return text, "Correct measure_m."
 
 
-def route_breaches(track: Track, route: pl.DataFrame, config: SiteConfig) -> list[str]:
+def route_breaches(track: SurveyedTrack, route: pl.DataFrame, config: SiteConfig) -> list[str]:
     """A route must be one continuous run over elements that exist, within each `leg` where it has that column."""
     columns = ["netelement_id", "direction"]
     rows = route.select(*columns, leg="leg" if "leg" in route.columns else pl.lit(0)).rows()

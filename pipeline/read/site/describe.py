@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.network import Network, network_of
-from pipeline.stages.track.survey import Track, track_of
+from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.run import Finding, Site
 
 
@@ -81,7 +81,7 @@ def elements_table(site: Site) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=list(columns), orient="row")
 
 
-def _dimensions(track: Track) -> str:
+def _dimensions(track: SurveyedTrack) -> str:
     flat = [bool(np.isnan(track.height_m[part]).any()) for _, _, part in track.elements()]
     if all(flat):
         return "2-D"

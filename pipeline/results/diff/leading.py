@@ -37,9 +37,11 @@ def balise_counts(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
 def passage_changes(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
     """`VB04 VB05: accepted became rejected_monitor`, from two `passages` tables of one run."""
     moved: dict[tuple[str, str, str], list[str]] = {}
-    before, after = _statuses(a), _statuses(b)
+    before = _statuses(a)
+    after = _statuses(b)
     for key in dict.fromkeys([*before, *after]):
-        one, other = before.get(key, "no passage"), after.get(key, "no passage")
+        one = before.get(key, "no passage")
+        other = after.get(key, "no passage")
         if one != other:
             moved.setdefault((key[0], one, other), []).append(key[1])
     return tuple(

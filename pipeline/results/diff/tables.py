@@ -91,7 +91,8 @@ def _paired(
     """The rows that stand in both, in the order of `a`; a key that stands twice counts by its turn."""
     by = [*keys, "_turn"]
     a, b = (frame.with_columns(_turn=pl.int_range(pl.len()).over(list(keys))) for frame in (a, b))
-    lost, new = _joined(a, b, by, "anti"), _joined(b, a, by, "anti")
+    lost = _joined(a, b, by, "anti")
+    new = _joined(b, a, by, "anti")
     differences = []
     for word, rows in (("lost", lost), ("new", new)):
         if rows.height:

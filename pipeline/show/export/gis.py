@@ -10,7 +10,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import polars as pl
 
-from pipeline.results.places import Ground, ground_of
+from pipeline.results.places import GroundPositions, ground_of
 from pipeline.show.export.events import hazard_text
 from pipeline.show.export.positions import positions_of
 from schemas.arrays import Floats
@@ -96,7 +96,7 @@ def _stretches(matched: pl.DataFrame) -> Iterator[pl.DataFrame]:
 def _placed(frame: pl.DataFrame, site: Site) -> Iterator[tuple[dict[str, Any], tuple[float, float, float]]]:
     """Rows with a place on the track, and the place."""
     measure: Floats = frame["measure_m"].fill_null(float("nan")).to_numpy()
-    ground: Ground = ground_of(site.track, frame["netelement_id"], measure)
+    ground: GroundPositions = ground_of(site.track, frame["netelement_id"], measure)
     columns = (ground.latitude_deg, ground.longitude_deg, ground.height_m)
     for number, row in enumerate(frame.iter_rows(named=True)):
         latitude, longitude, height = (float(column[number]) for column in columns)

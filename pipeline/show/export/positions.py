@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.results.places import Ground, beside, ground_of, sign_of, stretches_of
+from pipeline.results.places import GroundPositions, beside, ground_of, sign_of, stretches_of
 from schemas.arrays import floats
 from schemas.config import HazardConfig
 from schemas.run import Site
@@ -16,7 +16,7 @@ _COVARIANCE = ("ee", "en", "eu", "nn", "nu", "uu")
 
 
 @dataclass(frozen=True)
-class Positions:
+class ExportedPositions:
     """Frames of `t, latitude_deg, longitude_deg, height_m`, rows without a position left out.
 
     `gnss` is the corrected position that was matched (of the balise antenna, at its time of validity), `matched`
@@ -29,7 +29,7 @@ class Positions:
     truth: pl.DataFrame
 
 
-def positions_of(epochs: pl.DataFrame, site: Site) -> Positions:
+def positions_of(epochs: pl.DataFrame, site: Site) -> ExportedPositions:
     """Positions of one solution's epochs; the truth is the middle of what the evidence leaves of one net element."""
     column = {name: floats(epochs, name) for name in _NEEDED}
     rails = ground_of(site.track, epochs["netelement_id"], column["measure_m"])
@@ -39,7 +39,7 @@ def positions_of(epochs: pl.DataFrame, site: Site) -> Positions:
     high_m = column["true_measure_high_m"]
     middle_m = np.where(high_m - low_m <= 2.0 * HazardConfig().known_error_m, 0.5 * (low_m + high_m), np.nan)
     truth = ground_of(site.track, epochs["true_netelement_ids"].list.first(), middle_m)
-    return Positions(_frame(epochs["t"], gnss), _frame(epochs["t"], rails), _frame(epochs["t"], truth))
+    return ExportedPositions(_frame(epochs["t"], gnss), _frame(epochs["t"], rails), _frame(epochs["t"], truth))
 
 
 _NEEDED = ("measure_m", "cross_track_m", "vertical_m", "true_measure_low_m", "true_measure_high_m")
@@ -51,7 +51,7 @@ def as_gnss(frame: pl.DataFrame) -> pl.DataFrame:
     return frame.with_columns(*unknown, fix=pl.lit("estimated"))
 
 
-def _frame(t: pl.Series, ground: Ground) -> pl.DataFrame:
+def _frame(t: pl.Series, ground: GroundPositions) -> pl.DataFrame:
     columns = {
         "latitude_deg": ground.latitude_deg,
         "longitude_deg": ground.longitude_deg,

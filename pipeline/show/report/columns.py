@@ -108,7 +108,8 @@ def _tone(name: str, value: object) -> str:
 
 
 def _text(row: Row, name: str, bounds: tuple[str, str] | None) -> str:
-    value, unit = row[name], _UNITS.get(_parts(name)[1], "")
+    value = row[name]
+    unit = _UNITS.get(_parts(name)[1], "")
     if bounds:
         text = _bounded(value, row[bounds[0]], row[bounds[1]], "not known")
     else:

@@ -90,7 +90,8 @@ def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
     """Each monitor's statistic over its threshold, signed: beyond -1 and 1 it fails."""
     ratios = {}
     for monitor in MONITORS:
-        value, threshold = floats(epochs, f"{monitor}_value"), floats(epochs, f"{monitor}_threshold")
+        value = floats(epochs, f"{monitor}_value")
+        threshold = floats(epochs, f"{monitor}_threshold")
         evaluated = (epochs[f"{monitor}_state"] != MonitorState.NOT_EVALUATED).to_numpy() & (threshold > 0)
         ratios[f"ratio_{monitor}"] = np.divide(value, threshold, out=np.full(len(value), np.nan), where=evaluated)
     return ratios

@@ -64,7 +64,10 @@ def stamp_jitter_s(t_s: Floats, clock_periods: float) -> float:
     return float(np.sqrt(np.mean(away**2) / 2.0)) if away.size else 0.0
 
 
-_OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
+_OFFSET = 0
+_SCALE = 1
+_LATENCY = 2
+_ERRORS = 3
 _OFFSET_PRIOR_M2 = 1e6
 # Half the square of so many sigmas that no doubt is left; beyond it the exponential would overflow.
 _CERTAIN = 100.0
@@ -199,7 +202,8 @@ class ScaleLatencyFilter:
         """Way from the origin [m] and speed [m/s], as `Odometry.reading_at_s` of one instant, several times faster."""
         times_s = self.odometry.t_s
         span_s = self.config.latency_span_s
-        begin_s, end_s = max(at_s - span_s, times_s.item(0)), min(at_s + span_s, times_s.item(-1))
+        begin_s = max(at_s - span_s, times_s.item(0))
+        end_s = min(at_s + span_s, times_s.item(-1))
         before, distance, after = np.interp((begin_s, at_s, end_s), times_s, self.odometry.distance_m).tolist()
         return distance - origin_m, (after - before) / (end_s - begin_s)
 

@@ -17,7 +17,8 @@ def without_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps:
     They are 0/0; places repeated to the last digit and farther than `placeholder_far_m` from the rest; and what comes
     before the first fix, where the run goes on so far away that no train can have gone there, at `fastest_mps`.
     """
-    latitude, longitude = floats(fixes, "latitude_deg"), floats(fixes, "longitude_deg")
+    latitude = floats(fixes, "latitude_deg")
+    longitude = floats(fixes, "longitude_deg")
     valid = np.isfinite(latitude) & np.isfinite(longitude)
     valid &= (fixes["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
     origin = valid & (np.maximum(np.abs(latitude), np.abs(longitude)) < config.placeholder_origin_deg)

@@ -79,7 +79,8 @@ def _alarms(
     breaks = np.flatnonzero(np.diff(t_ns[rows]) >= recovery_s * NS_PER_S) + 1
     alarms = []
     for part in np.split(np.arange(rows.size), breaks):
-        first, last = int(rows[part[0]]), int(rows[part[-1]])
+        first = int(rows[part[0]])
+        last = int(rows[part[-1]])
         names = _in_order(matrix[part], monitors)
         peak = _peak(epochs[first : last + 1], names)
         alarms.append(AlarmEpisode(first, last, int(t_ns[first]), int(t_ns[last]), names, peak))

@@ -4,7 +4,7 @@ In: reference, balise reads, odometer, survey, figures of the vehicle file. Out:
 Nothing that came from GNSS is known here, and nothing of matching, alignment, monitors, LDS or judge is imported.
 """
 
-from pipeline.stages.evidence.evidence import Evidence, EvidenceSet, evidence_of
+from pipeline.stages.evidence.evidence import EvidenceSet, TrainEvidence, evidence_of
 from pipeline.stages.evidence.places import true_places
 
-__all__ = ["Evidence", "EvidenceSet", "evidence_of", "true_places"]
+__all__ = ["EvidenceSet", "TrainEvidence", "evidence_of", "true_places"]

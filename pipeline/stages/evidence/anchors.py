@@ -9,11 +9,11 @@ import numpy as np
 import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.stages.evidence.carrying import Anchor, Counter
-from pipeline.stages.evidence.clock import Clock, Lag, lag_of
+from pipeline.stages.evidence.carrying import Counter, TrueAnchor
+from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, lag_of
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import BaliseKind, Evidence
@@ -53,10 +53,10 @@ class KnownStretch:
     clock_m: Floats
     paths: tuple[KnownPath, ...]
 
-    def anchor(self, sample: int) -> Anchor:
+    def anchor(self, sample: int) -> TrueAnchor:
         """The places of one sample; what a step left open widens it like the clock."""
         open_m = max(float((one.high_m - one.low_m)[sample]) for one in self.paths)
-        return Anchor(
+        return TrueAnchor(
             t_ns=int(self.t_ns[sample]),
             places=tuple(dict.fromkeys(one.place(sample) for one in self.paths)),
             sigma_m=float(self.sigma_m[sample]),
@@ -64,7 +64,7 @@ class KnownStretch:
             clock_m=float(self.clock_m[sample]) + open_m,
         )
 
-    def ends(self, counter: Counter | None) -> tuple[Anchor, Anchor]:
+    def ends(self, counter: Counter | None) -> tuple[TrueAnchor, TrueAnchor]:
         """The outermost samples at which the odometer counted: only from these is a place carried."""
         ends = np.array([0, self.t_ns.size - 1])
         if counter is not None:
@@ -112,10 +112,10 @@ def _every(t_ns: Ints, step_s: float) -> Ints:
     return np.unique(np.searchsorted(t_ns, instants))
 
 
-def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> Lag:
+def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> RecorderLag:
     """The reference's clock against the odometer's, by its ways of ten seconds."""
     if not sides:
-        return Lag()
+        return RecorderLag()
     begins, ends, ways = (np.concatenate(column) for column in zip(*(_ways(one) for one in sides), strict=True))
     return lag_of(begins, ends, ways, counter)
 
@@ -126,15 +126,16 @@ def _ways(one: Sided) -> tuple[Ints, Ints, Floats]:
     t_ns = one.stretch.t_ns
     rows = _every(t_ns, _LAG_WINDOW_S)
     whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
-    begin, end = rows[:-1][whole], rows[1:][whole]
+    begin = rows[:-1][whole]
+    end = rows[1:][whole]
     return t_ns[begin], t_ns[end], one.sense * (path.at_m[end] - path.at_m[begin])
 
 
 def known_stretch(
     one: Sided,
-    clock: Clock,
+    clock: RecorderClock,
     counters: Sequence[Counter],
-    reads: Sequence[Anchor],
+    reads: Sequence[TrueAnchor],
     ahead_m: float,
     config: Configuration,
 ) -> KnownStretch:
@@ -168,7 +169,12 @@ def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
 
 
 def _confirming_ns(
-    known: KnownPath, t_ns: Ints, sigma_m: Floats, clock_m: Floats, reads: Sequence[Anchor], config: HazardConfig
+    known: KnownPath,
+    t_ns: Ints,
+    sigma_m: Floats,
+    clock_m: Floats,
+    reads: Sequence[TrueAnchor],
+    config: HazardConfig,
 ) -> Ints:
     """Reads of balises that lie where the reference was, within k roots and both clocks."""
     confirming: list[int] = []
@@ -230,19 +236,21 @@ def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
 def _contradicted(known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter]) -> tuple[Floats, Floats]:
     """Per step to the next sample: its difference from the nearest odometer, and the root of both variances [m]."""
     whole = np.diff(known.path.leg) == 0
-    least, root = np.full(t_ns.size - 1, np.inf), np.ones(t_ns.size - 1)
+    least = np.full(t_ns.size - 1, np.inf)
+    root = np.ones(t_ns.size - 1)
     for counter in counters:
         way = counter.between(t_ns[:-1], t_ns[1:])
         own_m = np.sqrt(sigma_m[1:] ** 2 + sigma_m[:-1] ** 2 + way.variance_m2)
         off_m = np.diff(known.at_m) - known.sense * way.distance_m
         nearer = np.isfinite(off_m) & (np.abs(off_m) / own_m < np.abs(least) / root)
-        least, root = np.where(nearer, off_m, least), np.where(nearer, own_m, root)
+        least = np.where(nearer, off_m, least)
+        root = np.where(nearer, own_m, root)
     return np.where(whole & np.isfinite(least), least, 0.0), root
 
 
 def read_anchors(
-    reads: pl.DataFrame | None, balises: pl.DataFrame | None, track: Track, config: HazardConfig
-) -> list[Anchor]:
+    reads: pl.DataFrame | None, balises: pl.DataFrame | None, track: SurveyedTrack, config: HazardConfig
+) -> list[TrueAnchor]:
     """Reads of physical balises that the site knows, in order of time."""
     if reads is None or balises is None or reads.is_empty():
         return []
@@ -251,12 +259,12 @@ def read_anchors(
     known = physical[rows].select("balise_id", "measure_m", element=elements)
     read = reads.select("t", "balise_id").join(known, on="balise_id").sort("t", "balise_id")
     return [
-        Anchor(t_ns, (Place(element, measure_m),), config.balise_read_sigma_m, Evidence.BALISE)
+        TrueAnchor(t_ns, (Place(element, measure_m),), config.balise_read_sigma_m, Evidence.BALISE)
         for t_ns, element, measure_m in zip(times_ns(read).tolist(), read["element"], read["measure_m"], strict=True)
     ]
 
 
-def on_clock(anchors: Sequence[Anchor], clock: Clock, counter: Counter) -> list[Anchor]:
+def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Counter) -> list[TrueAnchor]:
     """The reads on the odometer's clock, with what that clock may add at their speed."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
     clock_m = clock.delta_s * np.abs(counter.best_speed_mps(t_ns))
@@ -265,7 +273,7 @@ def on_clock(anchors: Sequence[Anchor], clock: Clock, counter: Counter) -> list[
     return [replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=own_m) for anchor, own_m in rows]
 
 
-def outside(anchors: Sequence[Anchor], stretches: Sequence[KnownStretch]) -> list[Anchor]:
+def outside(anchors: Sequence[TrueAnchor], stretches: Sequence[KnownStretch]) -> list[TrueAnchor]:
     """Anchors at times that no stretch covers."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
     inside: Bools = np.zeros(t_ns.size, dtype=np.bool_)

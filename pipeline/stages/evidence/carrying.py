@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.odometry.odometry import Way as Counted
+from pipeline.stages.odometry.odometry import OdometerWay as Counted
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Floats, Ints, runs_of
 from schemas.config import Configuration
@@ -18,7 +18,7 @@ Interval = tuple[Floats, Floats]
 
 
 @dataclass(frozen=True)
-class Anchor:
+class TrueAnchor:
     """At an instant the train was at one of `places`; `clock_m`: what the clock may add [m]."""
 
     t_ns: int
@@ -89,7 +89,7 @@ def beside_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
     return half
 
 
-def carried(counter: Counter, anchor: Anchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
+def carried(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
     """Least and largest coordinate on one side of an anchor at `at_m`; NaN where the odometer is silent."""
     centre = at_m + counter.between(anchor.t_ns, t_ns).distance_m
     known_m = config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m
@@ -98,7 +98,11 @@ def carried(counter: Counter, anchor: Anchor, at_m: float, t_ns: Ints, config: C
 
 
 def between_anchors(
-    counter: Counter, anchors: tuple[Anchor, Anchor], at_m: tuple[float, float], t_ns: Ints, config: Configuration
+    counter: Counter,
+    anchors: tuple[TrueAnchor, TrueAnchor],
+    at_m: tuple[float, float],
+    t_ns: Ints,
+    config: Configuration,
 ) -> Interval:
     """Least and largest coordinate between two anchors at these coordinates (DOMAIN section 5.1, carrying).
 
@@ -123,7 +127,7 @@ def between_anchors(
     return low, np.maximum(places[0] + halves[0], places[1] + halves[1])
 
 
-def closes(counter: Counter, anchors: tuple[Anchor, Anchor], apart_m: float, config: Configuration) -> bool:
+def closes(counter: Counter, anchors: tuple[TrueAnchor, TrueAnchor], apart_m: float, config: Configuration) -> bool:
     """The odometer's way is the anchors' distance: within k roots, without a vehicle file within 5 m + 5 %."""
     begin, end = anchors
     end_ns = np.array([end.t_ns])

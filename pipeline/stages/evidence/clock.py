@@ -23,7 +23,7 @@ _USUAL = 4.0
 
 
 @dataclass(frozen=True)
-class Lag:
+class RecorderLag:
     """Stamp of a moment by the recorder minus that by the odometer [s]; an infinite sigma: not known."""
 
     lag_s: float = 0.0
@@ -31,16 +31,16 @@ class Lag:
 
 
 @dataclass(frozen=True)
-class Clock:
+class RecorderClock:
     """How a recorder's clock is taken: its stamps less `shift_s`, +- `delta_s`; `assumed`: it could not be measured."""
 
-    lag: Lag
+    lag: RecorderLag
     shift_s: float
     delta_s: float
     assumed: bool
 
 
-def clock_of(lag: Lag, vehicle_file: bool, config: HazardConfig) -> Clock:
+def clock_of(lag: RecorderLag, vehicle_file: bool, config: HazardConfig) -> RecorderClock:
     """DOMAIN section 5.1: delta = k sigma on the odometer's clock with a vehicle file, else |lag| + k sigma.
 
     `vehicle_file`: it gives the latency of the GNSS against the odometer, whose clock the judge uses then.
@@ -48,28 +48,28 @@ def clock_of(lag: Lag, vehicle_file: bool, config: HazardConfig) -> Clock:
     noise_s = config.evidence_factor * lag.sigma_s
     if noise_s <= config.evidence_clock_s:
         if vehicle_file:
-            return Clock(lag, lag.lag_s, noise_s, assumed=False)
-        return Clock(lag, 0.0, abs(lag.lag_s) + noise_s, assumed=False)
+            return RecorderClock(lag, lag.lag_s, noise_s, assumed=False)
+        return RecorderClock(lag, 0.0, abs(lag.lag_s) + noise_s, assumed=False)
     if abs(lag.lag_s) > noise_s:
-        return Clock(lag, 0.0, abs(lag.lag_s) + noise_s, assumed=False)
-    return Clock(lag, 0.0, config.evidence_clock_s, assumed=True)
+        return RecorderClock(lag, 0.0, abs(lag.lag_s) + noise_s, assumed=False)
+    return RecorderClock(lag, 0.0, config.evidence_clock_s, assumed=True)
 
 
-def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None) -> Lag:
+def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None) -> RecorderLag:
     """The lag of a recorder that saw the train go these ways from some stamps to others, as the odometer counts up.
 
     way = scale * counted - lag * change of speed, by least squares without outliers; sigma is that of the fit, or half
     of what both halves of the run differ by.
     """
     if counter is None or begin_ns.size < _FEWEST:
-        return Lag()
+        return RecorderLag()
     coarse_s = _coarse_lag_s(begin_ns, end_ns, way_m, counter) if begin_ns.size >= _FEWEST_FAR else 0.0
     lag_s = coarse_s
     sigma_s = np.inf
     for _ in range(_ROUNDS):
         rest_s, sigma_s = _rest_of_lag(begin_ns, end_ns, way_m, counter, lag_s)
         if not np.isfinite(sigma_s) or abs(lag_s + rest_s - coarse_s) > 2.0 * _STEP_S + 3.0 * sigma_s:
-            return Lag()
+            return RecorderLag()
         lag_s += rest_s
     half = begin_ns.size // 2
     parts = (slice(None, half), slice(half, None))
@@ -77,7 +77,7 @@ def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None)
     apart_s = [rest_s for rest_s, own_s in halves if own_s < 3.0 * sigma_s]
     if len(apart_s) == 2:
         sigma_s = max(sigma_s, 0.5 * abs(apart_s[0] - apart_s[1]))
-    return Lag(float(lag_s), float(sigma_s))
+    return RecorderLag(float(lag_s), float(sigma_s))
 
 
 def _shifted(t_ns: Ints, lag_s: float) -> Ints:

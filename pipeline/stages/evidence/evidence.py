@@ -18,13 +18,13 @@ from pipeline.stages.evidence.anchors import (
     reference_lag,
     sided,
 )
-from pipeline.stages.evidence.carrying import Anchor, Counter, Interval, between_anchors, carried
-from pipeline.stages.evidence.clock import Clock, Lag, clock_of, lag_of
-from pipeline.stages.evidence.gaps import Gap, Way, gaps_of, unreachable, without_sign
+from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried
+from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, clock_of, lag_of
+from pipeline.stages.evidence.gaps import Gap, GapChain, gaps_of, unreachable, without_sign
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
-from pipeline.stages.track.path import Route
+from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Evidence as Kind
@@ -39,7 +39,7 @@ class Alternative:
     """One track that the train may have been on at some of the instants, and where on it [m]."""
 
     rows: Ints
-    route: Route
+    route: RoutePath
     low_m: Floats
     high_m: Floats
 
@@ -77,7 +77,7 @@ class Carried:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class TrainEvidence:
     """All evidence of a run.
 
     `silent`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends of
@@ -90,7 +90,7 @@ class Evidence:
     carried: tuple[Carried, ...]
     by_reads: tuple[Carried, ...]
     reads_ns: Ints
-    clocks: tuple[Clock, ...]
+    clocks: tuple[RecorderClock, ...]
     network: Network
     config: Configuration
     stood: tuple[Span, ...] = ()
@@ -161,10 +161,12 @@ class Evidence:
                 high = np.maximum((path.high_m - path.at_m)[before], (path.high_m - path.at_m)[after])
                 # No straight line leads over a contradicted step: its moment is not known.
                 stepping = np.where(before != after, path.step_m[before], 0.0)
-                low, high = low - stepping, high + stepping
+                low = low - stepping
+                high = high + stepping
                 for number in np.unique(leg[before]).tolist():
                     on_leg = np.flatnonzero((leg[before] == number) & (leg[after] == number))
-                    low_m, high_m = (centre + low - half)[on_leg], (centre + high + half)[on_leg]
+                    low_m = (centre + low - half)[on_leg]
+                    high_m = (centre + high + half)[on_leg]
                     alternatives.append(Alternative(rows[on_leg], path.path.legs[number], low_m, high_m))
                     kind[rows[on_leg]] = KINDS.index(Kind.REFERENCE)
         return alternatives
@@ -189,11 +191,12 @@ class Evidence:
                     kind[rows[reached]] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
         return alternatives
 
-    def _interval(self, counter: Counter, gap: Gap, way: Way, t_ns: Ints) -> Interval:
+    def _interval(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints) -> Interval:
         if gap.begin is not None and gap.end is not None:
             begin_m, end_m = way.at_m
             return between_anchors(counter, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.config)
-        (anchor,), (at_m,) = gap.anchors, way.at_m
+        (anchor,) = gap.anchors
+        (at_m,) = way.at_m
         return carried(counter, anchor, at_m, t_ns, self.config)
 
 
@@ -254,7 +257,7 @@ def evidence_of(
     network: Network,
     vehicle: Vehicle,
     config: Configuration,
-) -> Evidence:
+) -> TrainEvidence:
     """Everything that is known of where the train was, except from GNSS.
 
     `reference`: as from `reference_stretches`; `odometers`: that of the LDS first.
@@ -267,7 +270,7 @@ def evidence_of(
     carrier = _Carrier.of(sides, network, config)
     of_reference = clock_of(reference_lag(sides, main), by_file, hazards)
     reads_found = read_anchors(reads, balises, network.track, hazards)
-    lag_of_reads = Lag() if main is None else _lag_of_reads(carrier.by(main, _points(reads_found)))
+    lag_of_reads = RecorderLag() if main is None else _lag_of_reads(carrier.by(main, _points(reads_found)))
     of_reads = clock_of(lag_of_reads, by_file, hazards)
     read = [] if main is None else on_clock(reads_found, of_reads, main)
     reads_ns = np.array([one.t_ns for one in read], dtype=np.int64)
@@ -275,7 +278,7 @@ def evidence_of(
     stretches = tuple(known_stretch(one, of_reference, counters, read, ahead_m, config) for one in sides)
     apart = outside(read, stretches)
     shift_ns = round(of_reference.shift_s * NS_PER_S)
-    return Evidence(
+    return TrainEvidence(
         stretches=stretches,
         silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]),
         carried=tuple(
@@ -289,7 +292,7 @@ def evidence_of(
     )
 
 
-def _points(anchors: Sequence[Anchor]) -> list[tuple[Anchor, Anchor]]:
+def _points(anchors: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
     return [(anchor, anchor) for anchor in anchors]
 
 
@@ -311,7 +314,7 @@ class _Carrier:
         facing = frozenset(one.facing for one in sides if abs(one.with_m - one.against_m) >= least_m)
         return cls(network, config, facing, any(min(one.with_m, one.against_m) >= least_m for one in sides))
 
-    def by(self, counter: Counter, borders: list[tuple[Anchor, Anchor]]) -> Carried:
+    def by(self, counter: Counter, borders: list[tuple[TrueAnchor, TrueAnchor]]) -> Carried:
         """The gaps between what is known; an odometer that counts up in both directions carries over no stand."""
         if not borders:
             return Carried(counter, ())
@@ -323,7 +326,7 @@ class _Carrier:
         return Carried(counter, tuple(gaps))
 
 
-def _lag_of_reads(source: Carried) -> Lag:
+def _lag_of_reads(source: Carried) -> RecorderLag:
     """The clock of the reads against the odometer's, by the ways between reads that one closed chain leaves."""
     between = [(gap.begin_ns, gap.end_ns, way.at_m[1] - way.at_m[0]) for gap in source.gaps for way in gap.alone]
     begins, ends, ways = zip(*between, strict=True) if between else ((), (), ())

@@ -8,7 +8,7 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from pipeline.stages.evidence.carrying import Anchor, Counter, beside_m, carried, closes
+from pipeline.stages.evidence.carrying import Counter, TrueAnchor, beside_m, carried, closes
 from pipeline.stages.evidence.chains import chains_between, extended
 from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.network import Network
@@ -17,7 +17,7 @@ from schemas.config import Configuration
 
 
 @dataclass(frozen=True)
-class Way:
+class GapChain:
     """A chain through a gap, in the sense in which the odometer counts up, with its anchors at `at_m`.
 
     `closed`: the odometer counted its length within its own noise.
@@ -37,12 +37,12 @@ class Gap:
 
     begin_ns: int
     end_ns: int
-    begin: Anchor | None
-    end: Anchor | None
-    ways: list[Way] | None
+    begin: TrueAnchor | None
+    end: TrueAnchor | None
+    ways: list[GapChain] | None
 
     @property
-    def anchors(self) -> list[Anchor]:
+    def anchors(self) -> list[TrueAnchor]:
         return [anchor for anchor in (self.begin, self.end) if anchor is not None]
 
     @property
@@ -50,7 +50,7 @@ class Gap:
         return any(way.closed for way in self.ways or [])
 
     @property
-    def alone(self) -> list[Way]:
+    def alone(self) -> list[GapChain]:
         """The one closed way between two anchors; nothing where ways of several lengths close."""
         closed = [way for way in self.ways or [] if way.closed]
         lengths = {round(way.at_m[-1] - way.at_m[0], 2) for way in closed}
@@ -58,7 +58,7 @@ class Gap:
 
 
 def gaps_of(
-    borders: Sequence[tuple[Anchor, Anchor]],
+    borders: Sequence[tuple[TrueAnchor, TrueAnchor]],
     facing: Set[int],
     counter: Counter,
     network: Network,
@@ -68,7 +68,8 @@ def gaps_of(
 
     `facing`: oriented net elements over which the train ran, by the reference, as the odometer counted up.
     """
-    first, last = borders[0][0], borders[-1][1]
+    first = borders[0][0]
+    last = borders[-1][1]
     gaps = [Gap(min(counter.odometer.begin_ns, first.t_ns), first.t_ns, None, first, [])]
     for (_, a), (b, _) in pairwise(borders):
         gaps += _between(a, b, counter, network, config)
@@ -83,7 +84,7 @@ def without_sign(gaps: Sequence[Gap], facing: Set[int], network: Network) -> boo
     return not _sheets(gaps, facing, network)
 
 
-def _between(a: Anchor, b: Anchor, counter: Counter, network: Network, config: Configuration) -> list[Gap]:
+def _between(a: TrueAnchor, b: TrueAnchor, counter: Counter, network: Network, config: Configuration) -> list[Gap]:
     """Where the odometer lost distance in a gap, it is two halves that know nothing of each other."""
     if b.t_ns < a.t_ns:
         return []
@@ -128,10 +129,10 @@ def _without_contradicted(gaps: list[Gap]) -> list[Gap]:
 
 
 def _ways_of_length(
-    a: Anchor, b: Anchor, length_m: float, slack_m: float, network: Network, most: int
-) -> list[Way] | None:
+    a: TrueAnchor, b: TrueAnchor, length_m: float, slack_m: float, network: Network, most: int
+) -> list[GapChain] | None:
     """Chains from anchor to anchor of the odometer's length +- the slack, either way round."""
-    ways: list[Way] = []
+    ways: list[GapChain] = []
     for begins, goals, way_m, back in ((a.places, b.places, length_m, False), (b.places, a.places, -length_m, True)):
         lengths = (max(way_m - slack_m, 0.0), way_m + slack_m)
         for begin, side, goal in product(begins, (0, 1), goals):
@@ -140,13 +141,13 @@ def _ways_of_length(
                 return None
             for chain in chains:
                 end_m = chain.entry_m[-1] + network.track.along_m(chain.oriented[-1], goal.measure_m)
-                ways.append(Way(chain, (end_m, 0.0) if back else (0.0, end_m)))
+                ways.append(GapChain(chain, (end_m, 0.0) if back else (0.0, end_m)))
     return _distinct(ways)
 
 
-def _distinct(ways: list[Way]) -> list[Way]:
+def _distinct(ways: list[GapChain]) -> list[GapChain]:
     """Each chain once: a gap of hardly any length is found from both sides."""
-    kept: dict[tuple[object, ...], Way] = {}
+    kept: dict[tuple[object, ...], GapChain] = {}
     for way in ways:
         apart_m = way.at_m[-1] - way.at_m[0]
         kept.setdefault((way.chain.oriented, round(apart_m, 2)), way)
@@ -188,7 +189,7 @@ def _reaching(gap: Gap, sheets: set[bool], counter: Counter, network: Network, c
         return gap
     turned = _turned(gap, counter, config)
     ways = gap.ways if len(gap.anchors) == 2 else _from_one_anchor(gap, network)
-    reached: list[Way] = []
+    reached: list[GapChain] = []
     for way in ways:
         if network.usable[way.chain.oriented[0]] not in sheets:
             continue
@@ -222,22 +223,24 @@ def _looks(gap: Gap, counter: Counter) -> Ints:
     return np.linspace(gap.begin_ns, gap.end_ns, count).astype(np.int64)
 
 
-def _from_one_anchor(gap: Gap, network: Network) -> list[Way]:
+def _from_one_anchor(gap: Gap, network: Network) -> list[GapChain]:
     """Both ways round."""
     (anchor,) = gap.anchors
     return [
-        Way(Chain((one,), (-network.track.along_m(one, place.measure_m),)), (0.0,))
+        GapChain(Chain((one,), (-network.track.along_m(one, place.measure_m),)), (0.0,))
         for place in anchor.places
         for one in (2 * place.element, 2 * place.element + 1)
     ]
 
 
-def _reach_m(gap: Gap, way: Way, counter: Counter, config: Configuration) -> tuple[float, float]:
+def _reach_m(gap: Gap, way: GapChain, counter: Counter, config: Configuration) -> tuple[float, float]:
     """Least and largest coordinate that the train may have come to in the gap [m]."""
     t_ns = _looks(gap, counter)
-    least, most = min(way.at_m), max(way.at_m)
+    least = min(way.at_m)
+    most = max(way.at_m)
     for anchor, at_m in zip(gap.anchors, way.at_m, strict=True):
         low, high = carried(counter, anchor, at_m, t_ns, config)
         if np.isfinite(low).any():
-            least, most = min(least, float(np.nanmin(low))), max(most, float(np.nanmax(high)))
+            least = min(least, float(np.nanmin(low)))
+            most = max(most, float(np.nanmax(high)))
     return least, most

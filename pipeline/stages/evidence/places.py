@@ -6,10 +6,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.evidence.evidence import Alternative, EvidenceSet
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 
 
-def true_places(evidence: EvidenceSet, track: Track) -> pl.DataFrame:
+def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> pl.DataFrame:
     """Per instant `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m`.
 
     Null where nothing is known; the measures also where there are several net elements.
@@ -41,7 +41,8 @@ def _touched(one: Alternative) -> pl.DataFrame:
     route = one.route
     first = np.searchsorted(route.entry_m, one.low_m, side="right") - 1
     last = np.searchsorted(route.entry_m, one.high_m, side="right") - 1
-    first, last = np.maximum(first, 0), np.maximum(last, 0)
+    first = np.maximum(first, 0)
+    last = np.maximum(last, 0)
     count = last - first + 1
     numbers = np.repeat(np.arange(one.rows.size), count)
     visit = np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())

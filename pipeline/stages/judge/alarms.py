@@ -72,7 +72,8 @@ def verdict_of(alarm: AlarmEpisode, epochs: pl.DataFrame, healthy: dict[str, Boo
     if (judged.wrong_track & positioned).any():
         return Verdict.TRUE
     margin_m = margins_m(floats(part, "sigma_along_m"), config)
-    low_m, high_m = judged.low_m[positioned], judged.high_m[positioned]
+    low_m = judged.low_m[positioned]
+    high_m = judged.high_m[positioned]
     return verdict_within(low_m, high_m, margin_m[positioned], can_say_false[positioned])
 
 

@@ -7,9 +7,9 @@ from functools import cached_property
 
 import polars as pl
 
-from pipeline.stages.evidence import Evidence
+from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.track.path import Route, TravelledPath
+from pipeline.stages.track.path import RoutePath, TravelledPath
 from schemas.arrays import NS_PER_S, Ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, PassageStatus
@@ -47,7 +47,7 @@ class Case:
     """One solution with the evidence of its run; `odometry` grows with its path, `faults` were injected."""
 
     solution: Solution
-    evidence: Evidence
+    evidence: TrainEvidence
     odometry: Odometry | None
     vehicle: Vehicle
     config: Configuration
@@ -61,7 +61,7 @@ class Case:
     def instants_of_epochs(self) -> Ints:
         return self.instants(times_ns(self.solution.epochs))
 
-    def legs(self) -> list[Route]:
+    def legs(self) -> list[RoutePath]:
         return self.solution.path.routes(self.evidence.network.track.index)
 
     def element_numbers(self, names: pl.Series) -> Ints:

@@ -19,7 +19,8 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
     fixes = case.solution.fixes
     reference = case.reference
     at_ns = case.instants_of_epochs()
-    across, up = np.full(at_ns.size, np.nan), np.full(at_ns.size, np.nan)
+    across = np.full(at_ns.size, np.nan)
+    up = np.full(at_ns.size, np.nan)
     if reference is not None and reference.height >= 2:
         stamps = times_ns(reference)
         since_s = (stamps - stamps[0]) / NS_PER_S
@@ -33,7 +34,8 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
         rows = np.flatnonzero(covered & np.isfinite(floats(fixes, "latitude_deg")))
         points = points_of(floats(fixes, "latitude_deg")[rows], floats(fixes, "longitude_deg")[rows])
         away = points.surface - points_of(latitude[rows], longitude[rows]).surface
-        east, north = np.einsum("ij,ij->i", away, points.east), np.einsum("ij,ij->i", away, points.north)
+        east = np.einsum("ij,ij->i", away, points.east)
+        north = np.einsum("ij,ij->i", away, points.north)
         heading = np.radians(heading_deg[rows])
         along_m = east * np.sin(heading) + north * np.cos(heading)
         left_m = north * np.sin(heading) - east * np.cos(heading)

@@ -33,7 +33,7 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
     shares of time, `wrong_s` where there is any. Epochs without a position stand for time in a gap only.
     """
     known = met(epochs, pl.col("path_m").is_not_null())
-    steps = _Steps.of(epochs, known, config)
+    steps = _StepTimes.of(epochs, known, config)
     usable = met(epochs.filter(known), trusted(config) & ~pl.col("withheld"))
     in_use = usable & (steps.left_s(steps.alone_s) > _LEAST_S)
     judged = code[known]
@@ -49,7 +49,7 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
 
 
 @dataclass(frozen=True)
-class _Steps:
+class _StepTimes:
     """From the position before to each: `step_s`; `near_s` with one period for a gap; `alone_s` one period at most.
 
     `blocked_s`: time negated up to `edge_s`, linear between.
@@ -65,7 +65,7 @@ class _Steps:
     blocked_s: Floats
 
     @classmethod
-    def of(cls, epochs: pl.DataFrame, known: Bools, config: Configuration) -> _Steps:
+    def of(cls, epochs: pl.DataFrame, known: Bools, config: Configuration) -> _StepTimes:
         all_ns = times_ns(epochs)
         t_ns = all_ns[known]
         all_s = (all_ns - all_ns[:1]) / NS_PER_S
@@ -100,7 +100,7 @@ def negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) 
     return np.column_stack([np.minimum(from_s, until_s), until_s])
 
 
-def _counted_s(t_ns: Ints, known: Bools, steps: _Steps) -> Floats:
+def _counted_s(t_ns: Ints, known: Bools, steps: _StepTimes) -> Floats:
     """Time since the epoch before [s], one period of a gap; nothing between near positions, where the later has all."""
     since_s = np.diff(t_ns, prepend=t_ns[:1] - round(steps.period_s * NS_PER_S)) / NS_PER_S
     since_s = np.where(since_s <= max(steps.gap_s, steps.period_s), since_s, steps.period_s)

@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.stages.evidence.carrying import carried_forward
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.stages.judge.case import Case
-from pipeline.stages.track.path import Route
+from pipeline.stages.track.path import RoutePath
 from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import HazardConfig
 from schemas.enums import Evidence, Judgement
@@ -149,7 +149,7 @@ def judgements_of(case: Case, positions: MatchedPositions, at_ns: Ints, evidence
 
 
 def judge_positions(
-    positions: MatchedPositions, evidence: EvidenceSet, legs: Sequence[Route], config: HazardConfig
+    positions: MatchedPositions, evidence: EvidenceSet, legs: Sequence[RoutePath], config: HazardConfig
 ) -> Judgements:
     """Wrong, or right, where it is so wherever the train may have been; `legs`: of the path, coordinate `path_m`.
 
@@ -157,7 +157,8 @@ def judge_positions(
     """
     size = positions.element.size
     limit_m = config.failure_limit_m
-    low_m, high_m = np.full(size, np.inf), np.full(size, -np.inf)
+    low_m = np.full(size, np.inf)
+    high_m = np.full(size, -np.inf)
     right, ahead, behind, elsewhere = (np.ones(size, dtype=np.bool_) for _ in range(4))
     judged = np.zeros(size, dtype=np.bool_)
     sense = _path_sense(positions, legs)
@@ -185,7 +186,7 @@ def judge_positions(
     )
 
 
-def _path_sense(positions: MatchedPositions, legs: Sequence[Route]) -> Ints:
+def _path_sense(positions: MatchedPositions, legs: Sequence[RoutePath]) -> Ints:
     """+1 where the path of the solution grows with the measure of the position's net element, else -1."""
     sense = np.ones(positions.element.size, dtype=np.int64)
     for number, leg in enumerate(legs):
@@ -199,7 +200,7 @@ _Relative = tuple[Floats, Floats, Bools]
 """Error interval along growing path (NaN: not known), and where the position is on another track."""
 
 
-def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs: Sequence[Route]) -> _Relative:
+def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs: Sequence[RoutePath]) -> _Relative:
     """Positions against one alternative: on its track, else by their own path where that leads to the train."""
     rows = there.rows
     at_m, along = there.route.coordinate(positions.element[rows], positions.measure_m[rows], there.middle_m)
@@ -213,7 +214,7 @@ def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs
     return low_m, high_m, off_track
 
 
-def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence[Route]) -> _Relative:
+def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence[RoutePath]) -> _Relative:
     """Where the train's place lies on the path of the solution too.
 
     If the track of the evidence covers the place so far ahead or behind, the position is on another track.
@@ -244,7 +245,8 @@ def with_own_anchors(
     `train_m`: least and largest path position of the train.
     """
     rows = (judged.kind == NOTHING) & positions.known & np.isfinite(train_m[0])
-    low_m, high_m = positions.path_m - train_m[1], positions.path_m - train_m[0]
+    low_m = positions.path_m - train_m[1]
+    high_m = positions.path_m - train_m[0]
     beyond = rows & ((low_m > config.failure_limit_m) | (high_m < -config.failure_limit_m))
     return Judgements(
         code=np.where(beyond, WRONG, judged.code),

@@ -13,7 +13,7 @@ from schemas.config import HazardConfig
 
 
 @dataclass(frozen=True)
-class Steps:
+class PositionChanges:
     """Per position: sum of the changes of position minus evidence up to it [m], along growing path.
 
     `linked`: the change since the position before is known, and no gap lies between.
@@ -44,16 +44,16 @@ def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: int, co
     return find_jumps(steps, ints(positions["direction"]), config)
 
 
-def steps_of(t_ns: Ints, path_m: Floats, reference_m: Floats, counted_m: Floats, gap_ns: int) -> Steps:
+def steps_of(t_ns: Ints, path_m: Floats, reference_m: Floats, counted_m: Floats, gap_ns: int) -> PositionChanges:
     """`reference_m`: path position by the reference, NaN elsewhere; there the odometer's steps `counted_m` serve."""
     by_reference_m = np.diff(path_m - reference_m)
     change_m = np.where(np.isfinite(by_reference_m), by_reference_m, np.diff(path_m) - counted_m)
     linked = np.isfinite(change_m) & (np.diff(t_ns) <= gap_ns)
     excess_m = np.concatenate([[0.0], np.cumsum(np.where(linked, change_m, 0.0))])
-    return Steps(t_ns, excess_m[: t_ns.size], np.concatenate([[False], linked])[: t_ns.size])
+    return PositionChanges(t_ns, excess_m[: t_ns.size], np.concatenate([[False], linked])[: t_ns.size])
 
 
-def find_jumps(steps: Steps, direction: Ints, config: HazardConfig) -> list[Jump]:
+def find_jumps(steps: PositionChanges, direction: Ints, config: HazardConfig) -> list[Jump]:
     """All jumps in order of time."""
     largest_m = _largest_step(steps, config)
     jumps: list[Jump] = []
@@ -65,7 +65,7 @@ def find_jumps(steps: Steps, direction: Ints, config: HazardConfig) -> list[Jump
     return sorted(jumps, key=lambda jump: (jump.first, jump.last))
 
 
-def _largest_step(steps: Steps, config: HazardConfig) -> Floats:
+def _largest_step(steps: PositionChanges, config: HazardConfig) -> Floats:
     """The largest signed change up to each position within the window; that since the one before always counts."""
     excess_m = steps.excess_m
     size = steps.t_ns.size
@@ -86,7 +86,7 @@ def _largest_step(steps: Steps, config: HazardConfig) -> Floats:
     return largest_m
 
 
-def _extent(steps: Steps, begin: int, end: int, sign: float, config: HazardConfig) -> tuple[int, int]:
+def _extent(steps: PositionChanges, begin: int, end: int, sign: float, config: HazardConfig) -> tuple[int, int]:
     """First and last position of the increments that make the jump seen at positions `begin..end`."""
     window_ns = round(config.jump_window_s * NS_PER_S)
     earliest = int(np.searchsorted(steps.t_ns, steps.t_ns[begin] - window_ns, side="left"))

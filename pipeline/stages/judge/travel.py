@@ -120,7 +120,8 @@ def beyond_confidence(
     beyond = np.zeros(t_ns.size, dtype=np.bool_)
     rows = np.flatnonzero(np.isfinite(odometer_m) & np.isfinite(train_m))
     last = np.searchsorted(accepted_ns, t_ns[rows], side="right") - 1
-    rows, last = rows[last >= 0], last[last >= 0]
+    rows = rows[last >= 0]
+    last = last[last >= 0]
     if rows.size == 0:
         return beyond
     since = (t_ns[rows] - t_ns[rows[0]]).astype(np.float64)

@@ -125,13 +125,15 @@ def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config:
     ahead = away_m >= 0.0
     changes = np.flatnonzero((ahead[1:] != ahead[:-1]) & (np.diff(rows) == 1)) + 1
     crossings: list[TrueCrossing] = []
-    armed_from, passed = 0, False
+    armed_from = 0
+    passed = False
     for change, later in zip(changes.tolist(), [*changes[1:].tolist(), away_m.size], strict=False):
-        armed = bool(beyond[armed_from:change].any())
-        clear = armed and bool(beyond[change:later].any())
+        armed = bool((beyond & (ahead != ahead[change]))[armed_from:change].any())
+        clear = armed and bool((beyond & (ahead == ahead[change]))[change:later].any())
         if not clear and not (close[change - 1 : change + 1].all() and (armed or not passed)):
             continue
-        armed_from, passed = change, True
+        armed_from = change
+        passed = True
         if on_track[change]:
             before_m, after_m = away_m[change - 1 : change + 1].tolist()
             begin_ns, end_ns = train.t_ns[rows[change - 1 : change + 1]].tolist()

@@ -125,7 +125,8 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing
         on_leg = [balise for balise in balises if balise.leg == leg]
         at_m = np.array([balise.path_m for balise in on_leg])
         steps = np.flatnonzero(journey.leg[known[1:]] == leg)
-        before, after = known[steps], known[steps + 1]
+        before = known[steps]
+        after = known[steps + 1]
         passed_before = np.searchsorted(at_m, journey.path_m[before], side="right")
         passed_after = np.searchsorted(at_m, journey.path_m[after], side="right")
         passing = np.flatnonzero(passed_before != passed_after)

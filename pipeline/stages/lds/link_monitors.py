@@ -39,7 +39,8 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Co
     Two or more at once, or one against the direction of travel, are out of order where the
     odometer's step does not explain the position's; `overdue` ones, whose window has closed, always.
     """
-    i, j = offered[0].before, offered[0].epoch
+    i = offered[0].before
+    j = offered[0].epoch
     odometer_step_m = journey.odometer_m[j] - journey.odometer_m[i]
     excess_m = abs(journey.path_m[j] - journey.path_m[i] - odometer_step_m)
     noise_m = config.monitors.threshold_factor * sqrt(journey.sigma_m[i] ** 2 + journey.sigma_m[j] ** 2)

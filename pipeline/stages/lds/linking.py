@@ -21,7 +21,7 @@ MISSED_IN_A_ROW = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
+class LinkingReference:
     """The last relevant balise: where odometer and way run stood when it was detected."""
 
     balise: Balise
@@ -34,7 +34,7 @@ class LrvbChange:
     """From `epoch` on: the LRVB, and whether the TVB chain has begun."""
 
     epoch: int
-    lrvb: Reference | None
+    lrvb: LinkingReference | None
     chain_begun: bool
 
 
@@ -73,7 +73,7 @@ class LinkingChain:
 
     def __init__(self, balises: Sequence[Balise], config: LdsConfig) -> None:
         self.passages: list[Passage] = []
-        self.reference: Reference | None = None
+        self.reference: LinkingReference | None = None
         self._linked = [balise for balise in balises if balise.linked]
         self._ways: dict[tuple[int | None, int], _Announced] = {}
         self._config = config
@@ -260,7 +260,7 @@ class LinkingChain:
     def _refer_to(self, crossing: Crossing) -> None:
         """An accepted balise becomes the reference; what lies beyond it is expected next."""
         balise = crossing.balise
-        self.reference = Reference(balise, crossing.odometer_m, crossing.travelled_m)
+        self.reference = LinkingReference(balise, crossing.odometer_m, crossing.travelled_m)
         self._direction = crossing.direction
         self._leg = balise.leg
         self._turn = None

@@ -226,7 +226,8 @@ def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
         beyond = journey.odometer_m[rows] >= passage.announced_odometer_m
         steps = np.flatnonzero(beyond[1:] != beyond[:-1])
         if steps.size:
-            i, j = rows[steps[-1]], rows[steps[-1] + 1]
+            i = rows[steps[-1]]
+            j = rows[steps[-1] + 1]
             part_m = passage.announced_odometer_m - journey.odometer_m[i]
             share = float(part_m / (journey.odometer_m[j] - journey.odometer_m[i]))
             return int(journey.t_ns[i]) + round(share * int(journey.t_ns[j] - journey.t_ns[i]))

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.segments import Feet, Polyline, downhill
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
 
 # Every place on an element has a search point within this distance along it. Numerics: it decides how many points are
@@ -76,12 +76,13 @@ class Candidates:
 _COLUMNS = tuple(column.name for column in fields(Candidates) if column.name != "first")
 
 
-def segments_of(track: Track) -> Segments:
+def segments_of(track: SurveyedTrack) -> Segments:
     """Segments of all elements with probes for the search."""
     places = points_of(track.latitude_deg, track.longitude_deg)
     owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
     head = np.flatnonzero(owner[:-1] == owner[1:])
-    start, end = places.surface[head], places.surface[head + 1]
+    start = places.surface[head]
+    end = places.surface[head + 1]
     along = end - start
     east = np.einsum("ij,ij->i", along, places.east[head])
     north = np.einsum("ij,ij->i", along, places.north[head])

@@ -122,7 +122,9 @@ def shape_at(path: TravelledPath, leg: Ints, path_m: Floats) -> Shape:
 def track_sigmas_m(fixes: Fixes, shape: Shape) -> tuple[Floats, Floats]:
     """The horizontal covariance turned into the track's frame: sigma along and across [m]."""
     sin, cos = shape.direction
-    ee, en, nn = fixes.cov_ee_m2, fixes.cov_en_m2, fixes.cov_nn_m2
+    ee = fixes.cov_ee_m2
+    en = fixes.cov_en_m2
+    nn = fixes.cov_nn_m2
     along = sin * sin * ee + 2.0 * sin * cos * en + cos * cos * nn
     cross = cos * cos * ee - 2.0 * sin * cos * en + sin * sin * nn
     return np.sqrt(np.maximum(along, 0.0)), np.sqrt(np.maximum(cross, 0.0))

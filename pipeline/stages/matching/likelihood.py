@@ -161,8 +161,11 @@ def _time_off(steps: Steps, candidates: Candidates, off: Bools, config: Matching
 
 def _cross_m2(fixes: Fixes, row: Ints, heading_rad: Floats) -> Floats:
     """Variance of the position across an element's axis."""
-    sin, cos = np.sin(heading_rad), np.cos(heading_rad)
-    ee, en, nn = fixes.cov_ee_m2[row], fixes.cov_en_m2[row], fixes.cov_nn_m2[row]
+    sin = np.sin(heading_rad)
+    cos = np.cos(heading_rad)
+    ee = fixes.cov_ee_m2[row]
+    en = fixes.cov_en_m2[row]
+    nn = fixes.cov_nn_m2[row]
     return np.maximum(cos * cos * ee - 2.0 * sin * cos * en + sin * sin * nn, 1e-6)
 
 

@@ -15,7 +15,7 @@ from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import polarity
 from pipeline.stages.track.network import network_in_pieces
 from pipeline.stages.track.path import TravelledPath
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Ints, floats, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
@@ -82,7 +82,7 @@ def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: Matc
     return polarity(odometry, times_ns(epochs), path_m, config.orientation_distance_m)
 
 
-def pins_of(fixes: Fixes, site: Site, track: Track, balise_reads: pl.DataFrame | None) -> Ints:
+def pins_of(fixes: Fixes, site: Site, track: SurveyedTrack, balise_reads: pl.DataFrame | None) -> Ints:
     """Per epoch the element of the balise read then (at the first epoch not before the read), else -1."""
     pinned = np.full(len(fixes), -1, dtype=np.int64)
     if balise_reads is None or site.balises is None:

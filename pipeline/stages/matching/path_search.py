@@ -20,7 +20,7 @@ from pipeline.stages.odometry.polarity import grows_with
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import TravelledPath
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 from schemas.errors import InputError
@@ -118,7 +118,8 @@ def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: D
     last = np.maximum(last, 0)
     leg = np.where(exact, decoded.leg[last], decoded.leg[following])
     # Until positions are believed again after a jump, steps are hundreds of metres apart: both tell passages apart.
-    begin_s, end_s = fixes.t_s[steps.epoch[last]], fixes.t_s[steps.epoch[following]]
+    begin_s = fixes.t_s[steps.epoch[last]]
+    end_s = fixes.t_s[steps.epoch[following]]
     elapsed = np.clip(fixes.t_s - begin_s, 0.0, np.maximum(end_s - begin_s, 0.0))
     share = np.divide(elapsed, end_s - begin_s, out=np.zeros(len(fixes)), where=end_s > begin_s)
     moved_m = np.where(decoded.leg[last] == decoded.leg[following], at_m[following] - at_m[last], 0.0)
@@ -169,7 +170,7 @@ def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig)
     return aside_m
 
 
-def off_the_network(fixes: Fixes, track: Track, config: MatchingConfig) -> InputError:
+def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) -> InputError:
     """The error for a run of which no epoch is within reach of any track."""
     tree = cKDTree(points_of(track.latitude_deg, track.longitude_deg).surface)
     rows = np.flatnonzero(fixes.valid)
@@ -177,7 +178,8 @@ def off_the_network(fixes: Fixes, track: Track, config: MatchingConfig) -> Input
     row = int(np.argmin(nearest_m))
     swapped = points_of(fixes.longitude_deg[rows], fixes.latitude_deg[rows]).surface
     swapped_m, _ = tree.query(swapped)
-    latitude, longitude = fixes.latitude_deg[rows[row]], fixes.longitude_deg[rows[row]]
+    latitude = fixes.latitude_deg[rows[row]]
+    longitude = fixes.longitude_deg[rows[row]]
     at = int(vertex[row])
     if float(np.min(swapped_m)) < min(10 * config.reach_m + 1000.0, float(nearest_m[row])):
         remedy = "Latitude and longitude are swapped, in the log or in the site: exchange them."

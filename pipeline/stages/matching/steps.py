@@ -106,7 +106,8 @@ def _span_before(t_s: Floats, span_s: float) -> Ints:
 
 def _velocity_mps(fixes: Fixes, rows: Ints, since: Ints, until: Ints, most_s: float) -> Floats:
     """Mean velocity between numbers of `rows`, one vector each, NaN where they are too far apart to say."""
-    begin, end = rows[np.maximum(since, 0)], rows[until]
+    begin = rows[np.maximum(since, 0)]
+    end = rows[until]
     elapsed = np.where(since >= 0, fixes.t_s[end] - fixes.t_s[begin], np.nan)
     elapsed[elapsed > most_s] = np.nan
     return np.asarray((fixes.points.surface[end] - fixes.points.surface[begin]) / elapsed[:, None])
@@ -141,7 +142,8 @@ def steps_of(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
     east = np.einsum("ij,ij->i", moved, fixes.points.east[rows])
     north = np.einsum("ij,ij->i", moved, fixes.points.north[rows])
     # The receiver's own velocity where there is one; else the way between steps.
-    vel_e, vel_n = fixes.vel_e_mps[rows], fixes.vel_n_mps[rows]
+    vel_e = fixes.vel_e_mps[rows]
+    vel_n = fixes.vel_n_mps[rows]
     doppler = np.isfinite(vel_e) & np.isfinite(vel_n)
     with np.errstate(invalid="ignore", divide="ignore"):
         speed = np.where(doppler, np.hypot(vel_e, vel_n), chord / elapsed)

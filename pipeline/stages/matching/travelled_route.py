@@ -9,7 +9,7 @@ from pipeline.stages.epochs.clock import least_belief
 from pipeline.stages.matching.doubt import Posterior
 from pipeline.stages.matching.match import Match
 from pipeline.stages.track.leg import Leg, segments_at
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Ints, floats
 
 ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
@@ -43,7 +43,7 @@ def travelled_route(match: Match, sure: float) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=ROUTE_COLUMNS, orient="row")
 
 
-def _passages(track: Track, leg: Leg) -> list[list[int]]:
+def _passages(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
     """Visits that are one passage of an element: its pieces, one after the other. Each lap of a ring is another."""
     passages: list[list[int]] = []
     ended: object = None

@@ -71,7 +71,9 @@ class _AxisBank:
 
     def _begin_at(self, row: int, state: AxisState | None, block: int) -> None:
         """Rows from this one on are evaluated next, from this state of the recursions on."""
-        self._done, self._state, self._block = row, state, block
+        self._done = row
+        self._state = state
+        self._block = block
         self._last_block = row, state
 
     def advance(self, epoch: int) -> int:
@@ -80,7 +82,8 @@ class _AxisBank:
         while self._done < rows.size and rows[self._done] <= epoch:
             end = min(self._done + self._block, rows.size)
             self._last_block = self._done, self._state
-            part, noise_m2 = self.series.between(self._done, end), self._meter.variance_m2(self._done, end)
+            part = self.series.between(self._done, end)
+            noise_m2 = self._meter.variance_m2(self._done, end)
             value, sigma, self._state = run_axis(part, self._alphas, self._state, noise_m2)
             self._store(part, value, self._config.monitors.threshold_factor * sigma, np.sqrt(noise_m2))
             self._done, self._block = end, min(2 * self._block, BLOCK)

@@ -35,7 +35,7 @@ class NoiseMeter:
         sampler = _Sampler(series, moving, self._config)
         self._renewal = sampler.renewal
         self._lags_s: list[float] = []
-        self._samples: list[_Samples] = []
+        self._samples: list[_SecondDifferences] = []
         if given_m is None and series.dt_s.size > 2:
             self._lags_s = _lags_s(sampler.period_s, self._memories_s)
             longest_s = max(self._config.noise_longest_lag_s, sampler.period_s)
@@ -105,7 +105,8 @@ class NoiseMeter:
 
     def _measured(self, index: int, renewals: Ints, row: Ints) -> tuple[Floats, Bools]:
         """M of one lag from the samples before each renewal, which begins at `row`; and whether they are enough."""
-        samples, entering = self._samples[index], self._entering[index]
+        samples = self._samples[index]
+        entering = self._entering[index]
         before = np.searchsorted(samples.renewal[entering], renewals)
         # The onset of a drift touches samples over 2 L: they wait so long again, and it meets the thresholds before it.
         waiting = round(self._config.noise_wait_spans * samples.span)
@@ -126,7 +127,7 @@ class NoiseMeter:
 
 
 @dataclass(frozen=True)
-class _Samples:
+class _SecondDifferences:
     """Second differences over one lag, in order of time.
 
     `row`, `oldest`: of t and of t - 2 L; `renewal`: number of the renewal period of t; `noise_m2` (quantiles, samples):
@@ -176,7 +177,8 @@ class _Sampler:
     """Second differences of a series, by running sums whose differences are what happened between two rows."""
 
     def __init__(self, series: AxisSeries, moving: Bools, config: MonitorConfig) -> None:
-        self._series, self._config = series, config
+        self._series = series
+        self._config = config
         self._t_s = np.cumsum(series.dt_s) - series.dt_s[:1]
         self.renewal: Ints = (self._t_s // config.noise_renewal_s).astype(np.int64)
         # Of the time in which the noise is not known anyway: no lag hangs on what comes later.
@@ -191,7 +193,7 @@ class _Sampler:
         self._white_m2 = np.cumsum(series.white_m2)
         self._lasting_m = [np.cumsum(rate_mps * series.dt_s) for rate_mps in series.lasting_mps.T if rate_mps.any()]
 
-    def over(self, lag_s: float) -> _Samples:
+    def over(self, lag_s: float) -> _SecondDifferences:
         config = self._config
         spacing_s = max(self.period_s, 0.1 * lag_s, config.noise_spacing_s)
         rows = self._triples(lag_s, spacing_s)
@@ -201,7 +203,7 @@ class _Sampler:
         quantiles = config.noise_quantiles if lag_s < config.noise_longest_lag_s else config.noise_quantiles[:-1]
         gaussian_m2 = ndtri(0.5 + 0.5 * np.array(quantiles)[:, None]) ** 2
         ready_s = max(config.noise_first_s, config.noise_ready_lags * lag_s) - 2.0 * lag_s
-        return _Samples(
+        return _SecondDifferences(
             row=rows.last,
             oldest=rows.oldest,
             renewal=self.renewal[rows.last],
@@ -209,13 +211,15 @@ class _Sampler:
             noise_m2=(shown_m2 / gaussian_m2 - self._model_m2(lag_s, rows)) / _OF_WALK,
             stated_m2=_stated_m2(self._series, rows.last, config),
             window=round(max(config.noise_window_s, config.noise_window_lags * lag_s) / spacing_s),
-            ready=max(round(ready_s / spacing_s), 1),
+            # No sample begins where the run does: rounded up, logs faster than 2 Hz waited for a renewal more.
+            ready=max(int(ready_s / spacing_s + 1e-6), 1),
             span=max(2.0 * lag_s / spacing_s, 1.0),
         )
 
     def _triples(self, lag_s: float, spacing_s: float) -> _Triples:
         """Rows t, one such in every `spacing_s`, and the rows nearest to t - L and t - 2 L, where near enough."""
-        t_s, reach_s = self._t_s, max(0.1 * lag_s, 0.5 * self.period_s)
+        t_s = self._t_s
+        reach_s = max(0.1 * lag_s, 0.5 * self.period_s)
         cell = np.floor(t_s / spacing_s + 1e-6)
         last = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1.0) > 0.0)
         between_s = 0.5 * (t_s[1:] + t_s[:-1])

@@ -41,9 +41,11 @@ def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, c
         return no_verdicts(epochs.height, NO_RANGES)
     ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
     track = _track_of(epochs, config)
-    value, freedom = np.full(epochs.height, np.nan), np.zeros(epochs.height, dtype=np.int64)
+    value = np.full(epochs.height, np.nan)
+    freedom = np.zeros(epochs.height, dtype=np.int64)
     for part in _chunks(ranges, track):
-        value[part.epoch], freedom[part.epoch] = _left_over(part), part.freedom
+        value[part.epoch] = _left_over(part)
+        freedom[part.epoch] = part.freedom
     tested = freedom > 0
     threshold = np.full(epochs.height, np.nan)
     threshold[tested] = chdtri(freedom[tested], config.monitors.false_alarm_probability)
@@ -70,7 +72,7 @@ class _Ranges:
 
 
 @dataclass(frozen=True)
-class _Track:
+class _TrackFrame:
     """The track at each epoch: unit vectors east, north, up and offset of the position from it [m]."""
 
     along: Floats
@@ -103,10 +105,11 @@ def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame, apart_s: fl
     )
 
 
-def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
+def _track_of(epochs: pl.DataFrame, config: Configuration) -> _TrackFrame:
     names = ("heading_deg", "slope", "cross_track_m", "vertical_m", "survey_sigma_m", "interpolation_error_m")
     heading, slope, cross_m, vertical_m, survey_m, chord_m = (floats(epochs, name) for name in names)
-    angle, rise = np.radians(heading), np.arctan(np.nan_to_num(slope))
+    angle = np.radians(heading)
+    rise = np.arctan(np.nan_to_num(slope))
     level = np.cos(rise)
     zero = np.zeros_like(angle)
     survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
@@ -116,7 +119,7 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
     known = np.isfinite(vertical_m)
     left = np.stack([-np.cos(angle), np.sin(angle), zero], axis=-1)
     offset = cross_m[:, None] * left + np.where(known, vertical_m, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
-    return _Track(
+    return _TrackFrame(
         along=np.stack([level * np.sin(angle), level * np.cos(angle), np.sin(rise)], axis=-1),
         cross=left,
         offset_m=offset,
@@ -153,21 +156,22 @@ def equations_of(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configu
     return _chunks(ranges, _track_of(epochs, config))
 
 
-def _chunks(ranges: _Ranges, track: _Track) -> Iterator[Equations]:
+def _chunks(ranges: _Ranges, track: _TrackFrame) -> Iterator[Equations]:
     usable = np.flatnonzero(track.usable)
     chosen = usable[np.isin(usable, ranges.epoch)]
     for begin in range(0, chosen.size, BLOCK):
         yield _equations(ranges, track, chosen[begin : begin + BLOCK])
 
 
-def _equations(ranges: _Ranges, track: _Track, epochs: Ints) -> Equations:
+def _equations(ranges: _Ranges, track: _TrackFrame, epochs: Ints) -> Equations:
     """Of these epochs, which all have satellites."""
     first = np.searchsorted(ranges.epoch, epochs)
     count = np.searchsorted(ranges.epoch, epochs, side="right") - first
     slot = np.arange(int(count.max()))
     held = slot < count[:, None]
     place = np.where(held, first[:, None] + slot, first[:, None])
-    rows, system = ranges.rows[place], ranges.system[place]
+    rows = ranges.rows[place]
+    system = ranges.system[place]
     weight = np.where(held, 1.0 / ranges.variance_m2[place], 0.0)
     clocks = (system[:, :, None] == np.arange(ranges.systems)).astype(np.float64)
     residual = ranges.residual_m[place] + np.einsum("eni,ei->en", rows, track.offset_m[epochs])
@@ -178,7 +182,7 @@ def _equations(ranges: _Ranges, track: _Track, epochs: Ints) -> Equations:
     return Equations(epochs, held, rows, clocks, weight, residual, design, prior, count - free, track.along[epochs])
 
 
-def _priors(track: _Track, epochs: Ints, present: Bools) -> tuple[Floats, Ints]:
+def _priors(track: _TrackFrame, epochs: Ints, present: Bools) -> tuple[Floats, Ints]:
     """Prior precision of along, cross, up and clocks [1/m^2], and how many of them are free.
 
     Nothing is known of the error along the track and of clocks, the survey's sigma holds the others; without

@@ -89,7 +89,8 @@ def variance_of_ewma(
         c <- b phi r c + alpha g s_k (s_k - phi s_p)
     """
     carried, fresh_m2, change = _memory(sigma_m, sigma_before_m, decorrelation)
-    coupling, covariances = np.empty_like(gain), np.empty_like(state.covariance)
+    coupling = np.empty_like(gain)
+    covariances = np.empty_like(state.covariance)
     for index, before in enumerate(state.covariance):
         drive = np.asfortranarray(gain[:, index, None] * fresh_m2)
         covariance = _solved(keep[:, index, None] * carried, drive, before)
@@ -140,7 +141,8 @@ def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Float
     before = sigma_m
     for source, (now, lost) in enumerate(zip(sigma_m.T, decorrelation.T, strict=True)):
         earlier = np.concatenate([now[:1], now[:-1]])
-        low, high = np.minimum(now, earlier), np.maximum(now, earlier)
+        low = np.minimum(now, earlier)
+        high = np.maximum(now, earlier)
         steps = (high > factor * low) & (lost < 1.0)
         if steps.any():
             before = before.copy(order="F") if before is sigma_m else before

@@ -53,7 +53,8 @@ def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Ax
 
 def _moving(epochs: pl.DataFrame, t_s: Floats, config: Configuration) -> Bools:
     """Whether the train moves, by its odometer: noise of the rows at a stand is no way driven."""
-    way_m, deadband_mps = floats(epochs, "travelled_m"), config.matching.deadband_mps
+    way_m = floats(epochs, "travelled_m")
+    deadband_mps = config.matching.deadband_mps
     known = np.isfinite(way_m)
     if not known.any():
         return np.asarray(np.abs(np.nan_to_num(floats(epochs, "speed_mps"))) > deadband_mps)
@@ -131,11 +132,14 @@ class _Builder:
         configuration says over which length it changes.
         """
         config = self._config.monitors
-        survey, way = self._column("survey_sigma_m", rows), self._way(rows)
+        survey = self._column("survey_sigma_m", rows)
+        way = self._way(rows)
         unstated = np.isnan(survey) & np.isnan(self._column("vertical_m", rows))
-        stated_m, length_m = np.nan_to_num(survey), config.survey_length_m
+        stated_m = np.nan_to_num(survey)
+        length_m = config.survey_length_m
         if length_m is None:
-            stated_m, length_m = np.zeros(rows.size), config.survey_wander_length_m
+            stated_m = np.zeros(rows.size)
+            length_m = config.survey_wander_length_m
         error = np.where(unstated, config.survey_wander_m, stated_m)
         return error, -np.expm1(-way / np.where(unstated, config.survey_wander_length_m, length_m))
 

@@ -20,7 +20,8 @@ _ZENITH_TROPOSPHERE_M = 0.12
 
 def line_of_sight_rows(azimuth_deg: Floats, elevation_deg: Floats) -> Floats:
     """Change of range per metre of receiver movement east, north, up; shape (..., 3)."""
-    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    azimuth = np.radians(azimuth_deg)
+    elevation = np.radians(elevation_deg)
     return np.stack(
         [-np.cos(elevation) * np.sin(azimuth), -np.cos(elevation) * np.cos(azimuth), -np.sin(elevation)],
         axis=-1,

@@ -114,7 +114,8 @@ def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.
     the measure says how far apart they are; elsewhere the paths stand to each other as they did there before (at
     the beginning: as they will).
     """
-    mine, theirs = _with_sense(epochs), _with_sense(other).with_row_index("row")
+    mine = _with_sense(epochs)
+    theirs = _with_sense(other).with_row_index("row")
     pairs = theirs.join_asof(
         mine, on="t_ns", strategy="nearest", tolerance=crossing_gap_ns(times_ns(epochs), lds), suffix="_mine"
     )

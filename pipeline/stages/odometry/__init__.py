@@ -4,7 +4,7 @@ In: the cleaned odometer stream, vehicle file, configuration. Out: one `Odometry
 Touches no file, and knows no position: only the sign against the path is set from one (`polarity`).
 """
 
-from pipeline.stages.odometry.odometry import Odometry, Way, odometry_of
+from pipeline.stages.odometry.odometry import OdometerWay, Odometry, odometry_of
 from pipeline.stages.odometry.over_slip import counted_over_slip
 
-__all__ = ["Odometry", "Way", "counted_over_slip", "odometry_of"]
+__all__ = ["Odometry", "OdometerWay", "counted_over_slip", "odometry_of"]

@@ -27,7 +27,8 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
     if rows.size == 0:
         return held
     at = float(distance_m[rows[0]])
-    low, high = (distance_m - width_m)[rows].tolist(), (distance_m + width_m)[rows].tolist()
+    low = (distance_m - width_m)[rows].tolist()
+    high = (distance_m + width_m)[rows].tolist()
     values = []
     for least, most in zip(low, high, strict=True):
         at = min(max(at, least), most)

@@ -16,7 +16,7 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, trut
 from schemas.config import AlignConfig, Configuration, Vehicle
 
 
-class Way(NamedTuple):
+class OdometerWay(NamedTuple):
     """True distance between two instants, signed [m], and its variance [m^2]; NaN where it is not known."""
 
     distance_m: Floats
@@ -120,7 +120,7 @@ class Odometry:
         """Whether the train moved for more than half of each step (DOMAIN section 2), shape (n - 1,)."""
         return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
 
-    def between(self, begin_ns: Ints | int, end_ns: Ints) -> Way:
+    def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
         """True distance from some instants, or from one, to others, and its variance.
 
         s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) +
@@ -134,7 +134,7 @@ class Odometry:
         moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))
         rows_m2 = self.row_sigma_m(self.seconds(begin_ns)) ** 2 + self.row_sigma_m(self.seconds(end_ns)) ** 2
         variance = scale**2 * (self.noise.white_m2_per_s * moving_s + rows_m2) + (scale_sigma * recorded) ** 2
-        return Way(scale * recorded, variance)
+        return OdometerWay(scale * recorded, variance)
 
     def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
         """Increments between consecutive instants, both ends with the scale and latency in use at the later one."""

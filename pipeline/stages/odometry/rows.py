@@ -65,9 +65,12 @@ def _resets(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
     moves = np.flatnonzero(np.diff(distance_m[rows]))
     if moves.size < 3:
         return resets
-    first, last = rows[moves], rows[moves + 1]
+    first = rows[moves]
+    last = rows[moves + 1]
     way_m = distance_m[last] - distance_m[first]
-    before_m, back_m, after_m = way_m[:-2], way_m[1:-1], way_m[2:]
+    before_m = way_m[:-2]
+    back_m = way_m[1:-1]
+    after_m = way_m[2:]
     most_m = config.reset_back_m + 0.25 * config.braking_mps2 * (t_s[last] - t_s[first])[1:-1] ** 2
     against = (back_m * before_m < 0.0) & (back_m * after_m < 0.0) & (np.abs(back_m) > most_m)
     for move in (np.flatnonzero(against & (np.abs(after_m - before_m) <= most_m)) + 1).tolist():
@@ -135,7 +138,8 @@ def filled_in(
     way = distance_m[rows + 1] - distance_m[rows]
     # Whatever a train does that gathers speed or brakes no harder, the mean of two speeds is no farther from its way.
     true = np.abs(0.5 * (slopes[rows] + slopes[rows + 1]) * span - way) <= 0.25 * config.braking_mps2 * span**2
-    low, high = np.minimum(0.0, 3.0 * way), np.maximum(0.0, 3.0 * way)
+    low = np.minimum(0.0, 3.0 * way)
+    high = np.maximum(0.0, 3.0 * way)
     start, end = (np.clip(np.where(true, slopes[at], smooth[at]) * span, low, high) for at in (rows, rows + 1))
     # A third of the span in which a straight line is near enough: within a ninth of that.
     fine = np.ceil(3.0 * span / config.straight_s).astype(np.int64)

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.segments import SAMPLE_SPACING_M, Polyline, on_segments
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
 
 # Numerics: so near an end a foot lies at it [m].
@@ -37,7 +37,7 @@ class Near:
     survey_sigma_m: Floats
     first: Ints
     any_near: Bools
-    track: Track
+    track: SurveyedTrack
 
     def of(self, element: int, begin: int, end: int) -> slice:
         """The pairs of an element with samples from `begin` to `end`."""
@@ -71,7 +71,8 @@ def near_elements(points: Points, sigma_m: Floats, network: Network, factor: flo
     sample, segment = _candidates(points, line, factor * np.hypot(sigma_m, segment_sigma_m.max(initial=0.0)))
     feet = on_segments(points.take(sample), line, segment)
     part = np.clip(feet.fraction, 0.0, 1.0)
-    low_m, high_m = track.measure_m[begin[segment]], track.measure_m[begin[segment] + 1]
+    low_m = track.measure_m[begin[segment]]
+    high_m = track.measure_m[begin[segment] + 1]
     within = feet.distance_m <= factor * np.hypot(sigma_m[sample], segment_sigma_m[segment])
     element = owner[begin[segment]]
     order = np.lexsort((feet.distance_m, sample, element))

@@ -15,7 +15,7 @@ from pipeline.stages.reference.visits import ElementStay, Node, Transition, node
 from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import MIN_REACH_M, Network
-from pipeline.stages.track.path import Route
+from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
 
@@ -33,7 +33,7 @@ class ReferencePath:
 
     leg: Ints
     at_m: Floats
-    legs: tuple[Route, ...]
+    legs: tuple[RoutePath, ...]
 
 
 @dataclass(frozen=True)
@@ -46,15 +46,15 @@ class ReferenceStretch:
 
 
 @dataclass(frozen=True)
-class Samples:
+class ReferenceSamples:
     """The samples of a run in order of time."""
 
     t_ns: Ints
     points: Points
     sigma_m: Floats
 
-    def take(self, rows: Ints) -> Samples:
-        return Samples(self.t_ns[rows], self.points.take(rows), self.sigma_m[rows])
+    def take(self, rows: Ints) -> ReferenceSamples:
+        return ReferenceSamples(self.t_ns[rows], self.points.take(rows), self.sigma_m[rows])
 
 
 def reference_stretches(
@@ -70,7 +70,7 @@ def reference_stretches(
         return [], []
     stated = reference["sigma_m"].fill_null(config.hazards.reference_sigma_m).to_numpy()
     points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))
-    samples = Samples(times_ns(reference), points, stated)
+    samples = ReferenceSamples(times_ns(reference), points, stated)
     # A sample beyond k_T roots of every track is no sample of the track.
     factor = config.align.sure_sigmas
     near = near_elements(samples.points, samples.sigma_m, network, factor, config.hazards.survey_sigma_m)
@@ -102,7 +102,8 @@ def _silent_spans(t_ns: Ints, used: Bools, gap_s: float) -> list[tuple[int, int]
         after = int(np.searchsorted(known_ns, at_ns))
         before_ns = int(known_ns[after - 1]) if after else at_ns - gap_ns
         after_ns = int(known_ns[after]) if after < known_ns.size else at_ns + gap_ns
-        begin_ns, end_ns = max(before_ns, at_ns - gap_ns) + 1, min(after_ns, at_ns + gap_ns)
+        begin_ns = max(before_ns, at_ns - gap_ns) + 1
+        end_ns = min(after_ns, at_ns + gap_ns)
         if spans and begin_ns <= spans[-1][1]:
             begin_ns = spans.pop()[0]
         spans.append((begin_ns, end_ns))
@@ -110,7 +111,7 @@ def _silent_spans(t_ns: Ints, used: Bools, gap_s: float) -> list[tuple[int, int]
 
 
 def _placed(
-    samples: Samples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
+    samples: ReferenceSamples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
 ) -> list[ReferenceStretch]:
     """The ways of samples without a gap among them: nothing where no way passes, or more do than can be weighed."""
     own = samples.take(rows)
@@ -129,7 +130,7 @@ def _placed(
     return found
 
 
-def _steps(samples: Samples) -> Ints:
+def _steps(samples: ReferenceSamples) -> Ints:
     """Samples some metres apart, those where the train turned, the first and the last."""
     surface = samples.points.surface
     apart_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m).tolist()
@@ -153,7 +154,7 @@ def _steps(samples: Samples) -> Ints:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _PassableSteps:
     """Steps with a way through: the first of them, oriented elements there, and the moves to each next step.
 
     `onward`: whether a train may have gone from the last step of one part to the first of another.
@@ -169,7 +170,9 @@ class _Part:
         return self.first + len(self.layers)
 
 
-def _parts(samples: Samples, feet: Sequence[Sequence[Foot]], steps: Ints, network: Network) -> Iterator[_Part]:
+def _parts(
+    samples: ReferenceSamples, feet: Sequence[Sequence[Foot]], steps: Ints, network: Network
+) -> Iterator[_PassableSteps]:
     """The parts of the steps; a new one begins where no move leads on: the reference leapt to another track."""
     at_m = samples.points.surface[steps]
     noise_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m[steps])
@@ -197,14 +200,14 @@ def _parts(samples: Samples, feet: Sequence[Sequence[Foot]], steps: Ints, networ
             layers.append(moves)
             alive = {move.to for move in moves}
         else:
-            yield _Part(first, starts, layers, onward)
+            yield _PassableSteps(first, starts, layers, onward)
             first = step + 1
             layers = []
             alive = starts = {2 * element for element in there}
-    yield _Part(first, starts, layers, onward)
+    yield _PassableSteps(first, starts, layers, onward)
 
 
-def _connected(parts: list[_Part]) -> list[_Part]:
+def _connected(parts: list[_PassableSteps]) -> list[_PassableSteps]:
     """The longest part, and those that a train can have come from or gone on to: where else it was nobody knows."""
     longest = max(range(len(parts)), key=lambda number: len(parts[number].layers))
     kept = [parts[longest]]
@@ -308,7 +311,8 @@ def _path(
     leg = np.full(count, -1)
     legs, placed = _legs(stays, network)
     for stay, (number, entry_m) in zip(stays, placed, strict=True):
-        low, high = max(stay.first - 1, 0), min(stay.last + 1, steps.size - 1)
+        low = max(stay.first - 1, 0)
+        high = min(stay.last + 1, steps.size - 1)
         pairs = near.of(stay.oriented // 2, int(rows[steps[low]]), int(rows[steps[high]]))
         own = near.sample[pairs] - rows[begin]
         nearer = near.distance_m[pairs] < nearest_m[own]

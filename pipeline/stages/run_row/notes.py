@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, met
-from pipeline.stages.evidence import Evidence as TrainEvidence
+from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.lds.run import LdsResult
 from pipeline.stages.matching import Match
 from pipeline.stages.matching.fixes import contradictory_covariances

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.stages.track.network import Network
-from pipeline.stages.track.path import Route
+from pipeline.stages.track.path import RoutePath
 
 
 @dataclass(frozen=True)
@@ -17,13 +17,13 @@ class Chain:
     oriented: tuple[int, ...]
     entry_m: tuple[float, ...]
 
-    def route(self, network: Network, numbers: dict[str, int] | None = None) -> Route:
+    def route(self, network: Network, numbers: dict[str, int] | None = None) -> RoutePath:
         """`numbers`: net elements as the caller counts them, where the network has them in pieces."""
         oriented = np.array(self.oriented, dtype=np.int64)
         element = oriented // 2
         track = network.track
         own = element if numbers is None else np.array([numbers[track.ids[one]] for one in element.tolist()])
-        return Route(
+        return RoutePath(
             element=own,
             forward=oriented % 2 == 0,
             entry_m=np.array(self.entry_m),

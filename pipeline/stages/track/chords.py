@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.stages.track.geodesy import points_of
-from pipeline.stages.track.survey import Track
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Floats, Ints
 
 # Numerics [m]: turns of points so close together are one; smaller sigmas count as none; no longer chord is looked for.
@@ -20,7 +20,7 @@ _LEAST_M = 0.02
 _LONGEST_M = 2000.0
 
 
-def chord_sigmas_m(track: Track, successors: Sequence[Sequence[int]]) -> Floats:
+def chord_sigmas_m(track: SurveyedTrack, successors: Sequence[Sequence[int]]) -> Floats:
     """Sigma of the distance between chord and curve [m] for the segment that begins at each vertex.
 
     `successors`: of each oriented element. It follows from the shape alone: points on a chord and borders of net
@@ -51,7 +51,7 @@ def chord_sigmas_m(track: Track, successors: Sequence[Sequence[int]]) -> Floats:
     return out
 
 
-def _segments(track: Track) -> tuple[Floats, Floats]:
+def _segments(track: SurveyedTrack) -> tuple[Floats, Floats]:
     """Length [m] of the segment that begins at each vertex, and its heading [rad] as seen from its start and end."""
     places = points_of(track.latitude_deg, track.longitude_deg)
     along = np.diff(places.surface, axis=0, append=places.surface[-1:])
@@ -85,7 +85,7 @@ def _chains(onward: Sequence[int]) -> list[list[int]]:
     return chains
 
 
-def _points(track: Track, chains: Sequence[Sequence[int]]) -> tuple[Ints, Ints, Ints]:
+def _points(track: SurveyedTrack, chains: Sequence[Sequence[int]]) -> tuple[Ints, Ints, Ints]:
     """Vertices at which the segments of chains begin, whether they are run against their measure, ends of chains."""
     parts: list[Ints] = []
     senses: list[int] = []

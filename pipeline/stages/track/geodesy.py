@@ -88,7 +88,8 @@ def moved_deg(
 
 
 def _sines(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    latitude = np.radians(latitude_deg)
+    longitude = np.radians(longitude_deg)
     return np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
 
 

@@ -17,7 +17,7 @@ from pipeline.stages.track.segments import (
     nearest,
     on_segments,
 )
-from pipeline.stages.track.survey import GAP_COUNTS_M, Track
+from pipeline.stages.track.survey import GAP_COUNTS_M, SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
 
 # A hint further than this from the nearest place may mean another passage of the same place,
@@ -75,7 +75,7 @@ class Leg:
         return float(self.path_start_m[own + (self.measure_start_m[own] == self.measure_end_m[own])])
 
 
-def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
+def leg_of(track: SurveyedTrack, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
     """A leg over oriented elements, `path_m` beginning at `start_m`.
 
     Gaps that the site check let pass count as straight track, so that path and odometer agree; a survey that only
@@ -91,7 +91,8 @@ def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
     grown = np.where(border, gap, np.abs(np.diff(measure)))
     path = start_m + np.concatenate([[0.0], np.cumsum(grown)])
     kept = np.flatnonzero(~border | (gap > 0))
-    head, tail = kept, kept + 1
+    head = kept
+    tail = kept + 1
     heading, turn = _headings(places, head)
     height = track.height_m[vertex]
     sigma = track.sigma_m[vertex]
@@ -185,7 +186,7 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0))
 
 
-def _vertices(track: Track, visit: Visit) -> Ints:
+def _vertices(track: SurveyedTrack, visit: Visit) -> Ints:
     part = np.arange(track.first[visit.element], track.first[visit.element + 1])
     return part if visit.forward else part[::-1]
 

@@ -18,7 +18,15 @@ import polars as pl
 
 from pipeline.stages.track.chords import chord_sigmas_m
 from pipeline.stages.track.leg import Visit
-from pipeline.stages.track.survey import Track, end_places, gaps_m, in_pieces, pieces_of, track_in_parts, track_of
+from pipeline.stages.track.survey import (
+    SurveyedTrack,
+    end_places,
+    gaps_m,
+    in_pieces,
+    pieces_of,
+    track_in_parts,
+    track_of,
+)
 from schemas.arrays import Bools, Floats, Ints
 from schemas.enums import Navigability
 from schemas.run import Site
@@ -46,7 +54,7 @@ class Reach(NamedTuple):
 class Network:
     """Oriented elements `2 * element` (in the sense of its measure) and `2 * element + 1` (against it)."""
 
-    track: Track
+    track: SurveyedTrack
     successors: list[list[Edge]]
     usable: list[bool]
     orientable: bool
@@ -139,7 +147,7 @@ MIN_REACH_M = 150.0
 BARRED_DETOUR_M = 10_000.0
 
 
-def network_of(track: Track, links: pl.DataFrame) -> Network:
+def network_of(track: SurveyedTrack, links: pl.DataFrame) -> Network:
     """The network of a site; gaps between linked ends count as track. Pieces of one element are joined in order."""
     successors: list[list[Edge]] = [[] for _ in range(2 * len(track.ids))]
     for number in range(1, len(track.ids)):
@@ -162,7 +170,7 @@ def network_of(track: Track, links: pl.DataFrame) -> Network:
     return Network(track, successors, usable, orientable)
 
 
-def _linked_ends(track: Track, links: pl.DataFrame, side: str) -> tuple[Ints, Ints]:
+def _linked_ends(track: SurveyedTrack, links: pl.DataFrame, side: str) -> tuple[Ints, Ints]:
     """Elements of one side of the links and the ends linked; of an element in pieces the first or the last one."""
     last = {name: number for number, name in enumerate(track.ids)}
     position = links[f"position_{side}"].to_numpy().astype(np.int64)
@@ -207,7 +215,7 @@ def connected_parts(successors: list[list[Edge]]) -> Ints:
 _FORWARD = "AB"
 
 
-def visits_of(track: Track, route: pl.DataFrame) -> list[Visit]:
+def visits_of(track: SurveyedTrack, route: pl.DataFrame) -> list[Visit]:
     """The route's elements in order, each in its sense."""
     return [
         Visit(track.index[name], direction == _FORWARD)
@@ -215,7 +223,7 @@ def visits_of(track: Track, route: pl.DataFrame) -> list[Visit]:
     ]
 
 
-def network_along(track: Track, visits: list[Visit]) -> Network:
+def network_along(track: SurveyedTrack, visits: list[Visit]) -> Network:
     """A network of nothing but the route, in pieces; an element passed twice is there twice, one after the other."""
     pieces = pieces_of(track)
     parts = [(visit, part) for visit in visits for part in pieces[visit.element][:: 1 if visit.forward else -1]]
@@ -225,7 +233,7 @@ def network_along(track: Track, visits: list[Visit]) -> Network:
     return Network(split, _joined(split, along), usable, orientable=True)
 
 
-def _joined(track: Track, visits: list[Visit]) -> list[list[Edge]]:
+def _joined(track: SurveyedTrack, visits: list[Visit]) -> list[list[Edge]]:
     """Successors of each oriented element by the relations that the route uses, and no other."""
     successors: list[list[Edge]] = [[] for _ in range(2 * len(track.ids))]
     ends = end_places(track)

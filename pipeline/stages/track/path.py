@@ -13,7 +13,7 @@ import polars as pl
 from pipeline.stages.track.geodesy import Points
 from pipeline.stages.track.leg import Leg, nearest_on_leg, path_at, segments_at
 from pipeline.stages.track.segments import Feet, no_feet
-from pipeline.stages.track.survey import MEASURE_TOLERANCE_M, Track
+from pipeline.stages.track.survey import MEASURE_TOLERANCE_M, SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import BaliseDirection, BaliseKind
 
@@ -61,7 +61,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Route:
+class RoutePath:
     """Net elements in order with one coordinate [m]; arrays per visit.
 
     `forward`: the measure grows with the coordinate; `entry_m`: coordinate at which the element is entered;
@@ -91,7 +91,8 @@ class Route:
         begins = np.searchsorted(element[order], self.element, side="left")
         for visit in np.flatnonzero(ends > begins).tolist():
             rows = order[begins[visit] : ends[visit]]
-            low, high = self.low_m[visit], self.high_m[visit]
+            low = self.low_m[visit]
+            high = self.high_m[visit]
             measure = measure_m[rows]
             at_m = self.entry_m[visit] + (measure - low if self.forward[visit] else high - measure)
             outside = np.maximum(np.maximum(low - measure, measure - high), 0.0)
@@ -128,13 +129,13 @@ class Route:
         return inside
 
 
-def routes_of(track: Track, legs: Sequence[Leg]) -> list[Route]:
+def routes_of(track: SurveyedTrack, legs: Sequence[Leg]) -> list[RoutePath]:
     """Legs as routes whose coordinate is `path_m`; net elements by their numbers in the track."""
     routes = []
     for leg in legs:
         own = np.array([visit.element for visit in leg.visits])
         routes.append(
-            Route(
+            RoutePath(
                 element=own,
                 forward=np.array([visit.forward for visit in leg.visits]),
                 entry_m=np.array([leg.entry_m(number) for number in range(len(own))]),
@@ -149,7 +150,7 @@ def routes_of(track: Track, legs: Sequence[Leg]) -> list[Route]:
 class TravelledPath:
     """The legs of a run in order of time; `path_m` is 0 at the start of the first net element."""
 
-    track: Track
+    track: SurveyedTrack
     legs: tuple[Leg, ...]
 
     def elements(self) -> list[str]:
@@ -207,7 +208,7 @@ class TravelledPath:
             vertical_m[rows] = height_m[rows] - one.height_start_m[part.segment] - part.fraction * rise
         return path_m, vertical_m
 
-    def routes(self, numbers: dict[str, int]) -> list[Route]:
+    def routes(self, numbers: dict[str, int]) -> list[RoutePath]:
         """The legs as routes whose coordinate is `path_m`; `numbers`: net elements as the caller counts them."""
         number = np.array([numbers[name] for name in self.track.ids], dtype=np.int64)
         return [replace(one, element=number[one.element]) for one in routes_of(self.track, self.legs)]

@@ -112,8 +112,10 @@ def on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
     """Each point on its given segment, in the tangent plane of the point; `fraction` is not limited."""
     to_start = line.start.take(segment, axis=0) - points.surface
     to_end = line.end.take(segment, axis=0) - points.surface
-    x, y = _dot(to_start, points.east), _dot(to_start, points.north)
-    dx, dy = _dot(to_end, points.east) - x, _dot(to_end, points.north) - y
+    x = _dot(to_start, points.east)
+    y = _dot(to_start, points.north)
+    dx = _dot(to_end, points.east) - x
+    dy = _dot(to_end, points.north) - y
     square = np.maximum(dx * dx + dy * dy, 1e-18)
     fraction = -(x * dx + y * dy) / square
     held = np.clip(fraction, 0.0, 1.0)

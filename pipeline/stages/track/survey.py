@@ -29,7 +29,7 @@ _DIRECTION_OVER_M = 10.0
 
 
 @dataclass(frozen=True)
-class Track:
+class SurveyedTrack:
     """Net elements, each a run of vertices `first[e] : first[e + 1]`, in the order of the survey.
 
     Degrees, metres; `height_m` is NaN on a 2-D element (as a whole), `sigma_m` NaN where not known.
@@ -91,7 +91,8 @@ class Track:
         """The net element of a name if it holds the measure, as `holding` has it; none where it does not."""
         if (element := self.index.get(name)) is None:
             return None
-        low_m, high_m = float(self.begin_m[element]), float(self.end_m[element])
+        low_m = float(self.begin_m[element])
+        high_m = float(self.end_m[element])
         return element if low_m - MEASURE_TOLERANCE_M <= measure_m <= high_m + MEASURE_TOLERANCE_M else None
 
     def elements(self) -> Iterator[tuple[int, str, slice]]:
@@ -99,7 +100,7 @@ class Track:
             yield element, name, self.vertices(element)
 
 
-def track_of(frame: pl.DataFrame) -> Track:
+def track_of(frame: pl.DataFrame) -> SurveyedTrack:
     """The track of a site's `track` table; points of an element stay in their order."""
     names = frame["netelement_id"].unique(maintain_order=True)
     index = {name: number for number, name in enumerate(names.to_list())}
@@ -109,7 +110,7 @@ def track_of(frame: pl.DataFrame) -> Track:
     columns = {name: floats(frame, name)[order] for name in _NUMBERS}
     columns["height_m"] = _all_or_none(columns["height_m"], first)
     length_m = columns["measure_m"][first[1:] - 1] - columns["measure_m"][first[:-1]]
-    return Track(ids=tuple(index), index=index, first=first, length_m=length_m, **columns)
+    return SurveyedTrack(ids=tuple(index), index=index, first=first, length_m=length_m, **columns)
 
 
 @dataclass(frozen=True)
@@ -122,11 +123,12 @@ class Along:
     longitude_deg: Floats
 
 
-def places_along(track: Track, spacing_m: float) -> Along:
+def places_along(track: SurveyedTrack, spacing_m: float) -> Along:
     """Places about so far apart on every element, its two ends among them."""
     columns: list[list[Floats]] = [[], [], [], []]
     for number, _, part in track.elements():
-        low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
+        low = float(track.measure_m[part][0])
+        high = float(track.measure_m[part][-1])
         at_m = np.linspace(low, high, max(2, round((high - low) / spacing_m) + 1))
         degrees = (np.interp(at_m, track.measure_m[part], of[part]) for of in (track.latitude_deg, track.longitude_deg))
         for column, values in zip(columns, (np.full(len(at_m), float(number)), at_m, *degrees), strict=True):
@@ -142,7 +144,7 @@ def geometric_measures_m(latitude_deg: Floats, longitude_deg: Floats, height_m: 
     return np.concatenate([[0.0], np.cumsum(distances_m(latitude_deg, longitude_deg, heights))])
 
 
-def geometric_m(track: Track) -> Floats:
+def geometric_m(track: SurveyedTrack) -> Floats:
     """Distance of each vertex from the first of its element, along the element [m]: 3-D where it has heights."""
     step_m = distances_m(track.latitude_deg, track.longitude_deg, np.nan_to_num(track.height_m))
     measure_m = np.zeros(len(track.latitude_deg))
@@ -151,7 +153,7 @@ def geometric_m(track: Track) -> Floats:
     return measure_m
 
 
-def end_places(track: Track) -> Floats:
+def end_places(track: SurveyedTrack) -> Floats:
     """Earth-centred places [m] of the ends of elements at height zero: `[element, 0 start or 1 end]`."""
     vertices = np.column_stack([track.first[:-1], track.first[1:] - 1]).ravel()
     places = points_of(track.latitude_deg[vertices], track.longitude_deg[vertices])
@@ -173,7 +175,7 @@ def _all_or_none(height_m: Floats, first: Ints) -> Floats:
     return np.where(np.repeat(unknown, np.diff(first)), np.nan, height_m)
 
 
-def in_pieces(track: Track) -> Track:
+def in_pieces(track: SurveyedTrack) -> SurveyedTrack:
     """The track with its elements in pieces, each of its element's name and measures, in order."""
     pieces = pieces_of(track)
     if all(len(parts) == 1 for parts in pieces):
@@ -181,7 +183,7 @@ def in_pieces(track: Track) -> Track:
     return track_in_parts(track, [(element, part) for element, parts in enumerate(pieces) for part in parts])
 
 
-def pieces_of(track: Track) -> list[list[slice]]:
+def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
     """Per element the vertices of its pieces in order; neighbours share one.
 
     A piece ends where it has turned by more than a right angle since its start.
@@ -206,7 +208,7 @@ def pieces_of(track: Track) -> list[list[slice]]:
     return pieces
 
 
-def _spaced_vertices(track: Track) -> tuple[Ints, Ints]:
+def _spaced_vertices(track: SurveyedTrack) -> tuple[Ints, Ints]:
     """Elements and vertices, the first in every so many metres."""
     owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
     number = np.floor((track.measure_m - track.measure_m[track.first[owner]]) / _DIRECTION_OVER_M)
@@ -214,11 +216,11 @@ def _spaced_vertices(track: Track) -> tuple[Ints, Ints]:
     return owner[kept], kept
 
 
-def track_in_parts(track: Track, parts: Sequence[tuple[int, slice]]) -> Track:
+def track_in_parts(track: SurveyedTrack, parts: Sequence[tuple[int, slice]]) -> SurveyedTrack:
     """Parts of elements in the given order, as elements; `index` gives the first of each name."""
     rows = np.concatenate([np.arange(part.start, part.stop) for _, part in parts])
     names = tuple(track.ids[element] for element, _ in parts)
-    return Track(
+    return SurveyedTrack(
         ids=names,
         index={name: number for number, name in reversed(list(enumerate(names)))},
         first=np.concatenate([[0], np.cumsum([part.stop - part.start for _, part in parts])]),

@@ -85,7 +85,8 @@ def calibrate(
     `vehicle` brings lever arms and heights. Its scale and latency, and noise and sigmas of `config`, are measured anew.
     Raises `InputError` where no run can be compared with an odometer.
     """
-    config, base = config or Configuration(), vehicle or Vehicle()
+    config = config or Configuration()
+    base = vehicle or Vehicle()
     _check_solution(logs, solution)
     return calibration_of([observe(log, site, base, config, solution) for log in logs], base, config)
 
@@ -215,7 +216,8 @@ def _vehicle(base: Vehicle, runs: Sequence[RunEstimate], latency_unknown_s: floa
 
 def _refuse_what_does_not_fit(prepared: PreparedRun, solution: str) -> None:
     """A run with a wrong unit or clock would teach its error to every other run."""
-    run, config = prepared.recorded, prepared.config
+    run = prepared.recorded
+    config = prepared.config
     mounted = Vehicle(antenna_height_m=prepared.vehicle.antenna_height_m)
     fit = fit_run(run, solution, mounted, config.plausibility, prepared.site)
     refuse_impossible(fit, run.run_id, config.ingest)
@@ -223,8 +225,10 @@ def _refuse_what_does_not_fit(prepared: PreparedRun, solution: str) -> None:
 
 def _refuse_figures_of_no_train(vehicle: Vehicle, place: str, config: Configuration) -> None:
     """Figures beyond what wheels and receivers can be off are another error, and a vehicle file would hide it."""
-    scale, latency_s = vehicle.odometer_scale or 1.0, vehicle.gnss_latency_s or 0.0
-    most, most_s = config.plausibility.scale_limit, config.plausibility.lag_limit_s
+    scale = vehicle.odometer_scale or 1.0
+    latency_s = vehicle.gnss_latency_s or 0.0
+    most = config.plausibility.scale_limit
+    most_s = config.plausibility.lag_limit_s
     if abs(scale - 1.0) <= most and abs(latency_s) <= most_s:
         return
     raise InputError(

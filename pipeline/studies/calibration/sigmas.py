@@ -56,7 +56,8 @@ def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float, config: Calibrat
     `factor` is k_T, by which thresholds exceed sigmas. Errors are jackknifed over runs, or over stretches of a
     few runs, as epochs are correlated.
     """
-    fits, least = [], -(-config.left_out_pieces // max(len(runs), 1))
+    fits = []
+    least = -(-config.left_out_pieces // max(len(runs), 1))
     for monitor in BANK_MONITORS:
         axis = next(name for name in AXES if monitor.removeprefix(name + "_") in SCALES)
         pieces = [piece for run in runs for piece in _pieces(run, monitor, axis, factor, least)]
@@ -78,7 +79,8 @@ def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, count: in
 
 def _fit_with_errors(monitor: str, pieces: list[Floats], config: CalibrationConfig) -> SigmaFit:
     count = len(pieces)
-    whole, errors = _fit(np.concatenate(pieces), config), np.full(3, np.nan)
+    whole = _fit(np.concatenate(pieces), config)
+    errors = np.full(3, np.nan)
     if count > 1:
         without = np.array([_fit(np.concatenate(pieces[:left] + pieces[left + 1 :]), config) for left in range(count)])
         errors = np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
@@ -93,7 +95,8 @@ def overall_ratio(ratios: Floats) -> float:
 
 def _fit(samples: Floats, config: CalibrationConfig) -> Floats:
     """Overall ratio, intercept [m] and slope from rows (sigma, ratio): weighted least squares over bins of sigma."""
-    sigma, squares = samples[:, 0], samples[:, 1] ** 2
+    sigma = samples[:, 0]
+    squares = samples[:, 1] ** 2
     overall = overall_ratio(samples[:, 1])
     if sigma.std() < config.sigma_spread_share * sigma.mean():
         return np.array([overall, 0.0, overall])
@@ -116,7 +119,8 @@ def velocity_sigma_mps(runs: Sequence[pl.DataFrame], config: Configuration) -> f
     latency account for is taken off; more odometer noise than assumed is in it. None where the monitor was hardly
     evaluated, or where what is left is below a tenth of what was assumed, which no such difference shows.
     """
-    value, threshold = pl.col("along_doppler_value"), pl.col("along_doppler_threshold")
+    value = pl.col("along_doppler_value")
+    threshold = pl.col("along_doppler_threshold")
     looks = [run.select(value, threshold).drop_nulls() for run in runs]
     if sum(look.height for look in looks) < config.calibration.least_epochs:
         return None

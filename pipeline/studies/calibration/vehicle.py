@@ -137,11 +137,14 @@ def _of_rows(odometry: Odometry, one_s: Floats, other_s: Floats) -> Floats:
     step the correlation of what it leaves out is 1 - 6 x + 6 x^2, by the first terms. Other noise is each row's own.
     """
     sigmas = [odometry.row_sigma_m(at_s) for at_s in (one_s, other_s)]
-    ways, scale = (one_s, other_s), odometry.period_s
+    ways = (one_s, other_s)
+    scale = odometry.period_s
     if odometry.noise.counter_m > 0.0:
         counts = np.flatnonzero(np.diff(odometry.distance_m, prepend=np.nan) != 0)
-        at_s, at_m = odometry.t_s[counts], odometry.distance_m[counts]
-        ways, scale = (np.interp(one_s, at_s, at_m), np.interp(other_s, at_s, at_m)), odometry.noise.counter_m / 6.0
+        at_s = odometry.t_s[counts]
+        at_m = odometry.distance_m[counts]
+        ways = (np.interp(one_s, at_s, at_m), np.interp(other_s, at_s, at_m))
+        scale = odometry.noise.counter_m / 6.0
     apart = np.abs(ways[0][:, None] - ways[1][None, :])
     result: Floats = np.outer(*sigmas) * np.maximum(1.0 - apart / scale, 0.0)
     return result
@@ -154,8 +157,10 @@ def _accumulate(
 
     `factors`: of the covariance of each block, by Cholesky.
     """
-    normal, right = np.zeros((2, 2)), np.zeros(2)
-    left_over, freedom = 0.0, -2
+    normal = np.zeros((2, 2))
+    right = np.zeros(2)
+    left_over = 0.0
+    freedom = -2
     for block, factor in zip(blocks, factors, strict=True):
         way_m, speed_mps = odometry.reading_at_s(block.t_s - latency_s)
         columns = [np.ones(way_m.size), way_m - way_m[0], -speed_mps, block.path_m - block.path_m[0]]

@@ -23,7 +23,7 @@ _NAMES = ("areas.parquet", "areas.csv")
 
 
 @dataclass(frozen=True)
-class Placed:
+class AreaPlaces:
     """Number of the area type in `AREA_TYPES` (`NO_AREA` outside all), and track speed [m/s] (NaN: not known)."""
 
     area: Ints
@@ -75,11 +75,11 @@ def _breaches(file: str, areas: pl.DataFrame, site: Site) -> list[str]:
     return found
 
 
-def placed(areas: pl.DataFrame | None, netelement_id: pl.Series, measure_m: pl.Series) -> Placed:
+def placed(areas: pl.DataFrame | None, netelement_id: pl.Series, measure_m: pl.Series) -> AreaPlaces:
     """The area of each place; at the border of two that of the second."""
     size = len(netelement_id)
     if areas is None or areas.is_empty():
-        return Placed(np.full(size, NO_AREA), np.full(size, np.nan))
+        return AreaPlaces(np.full(size, NO_AREA), np.full(size, np.nan))
     places = pl.DataFrame({"netelement_id": netelement_id, "at_m": measure_m}).with_row_index("row")
     there = areas.with_columns(at_m=pl.col("from_m"), area_type=pl.col("area_type").cast(pl.String))
     found = (
@@ -94,4 +94,4 @@ def placed(areas: pl.DataFrame | None, netelement_id: pl.Series, measure_m: pl.S
     numbers = {kind.value: number for number, kind in enumerate(AREA_TYPES)}
     area[rows] = found["area_type"].replace_strict(numbers, return_dtype=pl.Int64).to_numpy()
     speed[rows] = found["track_speed_kmh"].to_numpy() / 3.6
-    return Placed(area, speed)
+    return AreaPlaces(area, speed)

@@ -11,9 +11,9 @@ import polars as pl
 from pipeline.results import store
 from pipeline.storage.address import Address
 from pipeline.studies.claim.front import front_of
-from pipeline.studies.claim.profile import Profile
-from pipeline.studies.claim.requirements import ALL, Requirement, Ride, Tallies, requirements, tallies
-from pipeline.studies.claim.tally import S_PER_H, Finding, Kind, Tally, drawn
+from pipeline.studies.claim.profile import RequirementProfile
+from pipeline.studies.claim.requirements import ALL, ClaimRide, Requirement, Tallies, requirements, tallies
+from pipeline.studies.claim.tally import S_PER_H, Compliance, Kind, Tally, drawn
 from pipeline.studies.reservations import failed_runs, runs_without_truth, several_settings
 from pipeline.studies.trials import distinct
 from schemas.config import Configuration
@@ -32,14 +32,14 @@ SCHEMA = {
 class Claim:
     """`table`: one row per solution and requirement; `notes`: what the result as a whole cannot say."""
 
-    profile: Profile
+    profile: RequirementProfile
     table: pl.DataFrame
     notes: list[str]
 
 
 def claim(
     out: Address,
-    profile: Profile,
+    profile: RequirementProfile,
     site: Site | None = None,
     areas: pl.DataFrame | None = None,
     ahead_m: float = 0.0,
@@ -82,14 +82,14 @@ def _tallies_of(
     out: Address,
     run: dict[str, Any],
     config: Configuration,
-    profile: Profile,
+    profile: RequirementProfile,
     areas: pl.DataFrame | None,
     ahead_m: float,
 ) -> Tallies:
     of_run = (store.read_table(out, name, run["run_id"]).collect() for name in ("epochs", "passages"))
     epochs, passages = (frame.filter(pl.col("solution") == run["solution"]) for frame in of_run)
     front = front_of(epochs, passages, run, config, profile.method, areas, ahead_m)
-    ride = Ride(_name(run), front, epochs, passages, profile)
+    ride = ClaimRide(_name(run), front, epochs, passages, profile)
     return tallies(ride) | {("no_area", ALL): ride.outside()}
 
 
@@ -103,7 +103,7 @@ def _add(sums: Tallies, more: Tallies) -> None:
         sums[key] = sums.get(key, Tally()) + counts
 
 
-def claim_table(found: dict[str, Tallies], profile: Profile) -> pl.DataFrame:
+def claim_table(found: dict[str, Tallies], profile: RequirementProfile) -> pl.DataFrame:
     """One row per solution and requirement, those of the profile that nothing was recorded for included."""
     rows = [
         _row(solution, one, counts.get(one.key, Tally()))
@@ -151,9 +151,9 @@ _NEVER = {
 }
 
 
-def _reason(one: Requirement, finding: Finding, counts: Tally) -> str | None:
+def _reason(one: Requirement, finding: Compliance, counts: Tally) -> str | None:
     """Why a requirement is not shown, in words."""
-    if finding is not Finding.NOT_SHOWN:
+    if finding is not Compliance.NOT_SHOWN:
         return None
     if one.key in _NEVER:
         return _NEVER[one.key]

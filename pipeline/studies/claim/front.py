@@ -18,7 +18,7 @@ import polars as pl
 
 from pipeline.results.places import stretches_of, train_path_m
 from pipeline.stages.epochs.clock import Clock
-from pipeline.studies.claim.areas import Placed, placed
+from pipeline.studies.claim.areas import AreaPlaces, placed
 from pipeline.studies.claim.profile import KMH_PER_MPS, Method
 from pipeline.studies.claim.tally import codes, within
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
@@ -51,7 +51,7 @@ class Front:
     speed_mps: Floats
     speed_late_s: float
     direction: Floats
-    where: Placed
+    where: AreaPlaces
 
     @property
     def output(self) -> Bools:
@@ -168,7 +168,7 @@ def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
     return base + odometer
 
 
-def _areas_at(front_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None, reach_m: float) -> Placed:
+def _areas_at(front_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None, reach_m: float) -> AreaPlaces:
     """The area of each front end: that of the run's epoch that is nearest on the path, none beyond the reach."""
     known = epochs.select("path_m", "netelement_id", "measure_m").drop_nulls().sort("path_m")
     fronts = pl.DataFrame({"path_m": front_m}, schema={"path_m": pl.Float64}).fill_nan(None).with_row_index("row")

@@ -119,7 +119,7 @@ class Availability(Settings):
     clause: str
 
 
-class Way(Settings):
+class WayLimits(Settings):
     without_balise_m: Positive
     clause: str
 
@@ -130,7 +130,7 @@ class FailureRate(Settings):
     clause: str
 
 
-class Profile(Settings):
+class RequirementProfile(Settings):
     """All requirements; `sources` are the documents that the figures are quoted from."""
 
     name: str
@@ -145,7 +145,7 @@ class Profile(Settings):
     start: Start
     cold_movement: ColdMovement
     availability: Availability
-    way: Way
+    way: WayLimits
     failure_rate: FailureRate
 
 
@@ -154,7 +154,7 @@ def known_profiles() -> list[str]:
     return sorted(path.stem for path in _FOLDER.glob("*.toml"))
 
 
-def load_profile(name: str) -> Profile:
+def load_profile(name: str) -> RequirementProfile:
     """A profile by its name, or from a file of its own. Raises `ConfigError` for one that is neither."""
     file = _FOLDER / f"{name}.toml" if name in known_profiles() else Path(name)
     if not file.is_file():
@@ -162,4 +162,4 @@ def load_profile(name: str) -> Profile:
         raise ConfigError(
             f"is no profile{did_you_mean(name, known)}", place=name, expected=f"{', '.join(known)}, or a TOML file"
         )
-    return settings_from(read_toml(file), Profile, str(file), "`lu-2023.toml` of the package has every key.")
+    return settings_from(read_toml(file), RequirementProfile, str(file), "`lu-2023.toml` of the package has every key.")

@@ -12,7 +12,7 @@ import polars as pl
 
 from pipeline.studies.claim.areas import AREA_TYPES, NO_AREA
 from pipeline.studies.claim.front import Front, SpeedErrors, speed_errors
-from pipeline.studies.claim.profile import KMH_PER_MPS, AreaLimits, Profile
+from pipeline.studies.claim.profile import KMH_PER_MPS, AreaLimits, RequirementProfile
 from pipeline.studies.claim.tally import (
     ALWAYS,
     BROKEN,
@@ -31,14 +31,14 @@ ALL = "all"
 
 
 @dataclass(frozen=True)
-class Ride:
+class ClaimRide:
     """One solution of one run: its front end, and the tables that the requirements ask for beside it."""
 
     name: str
     front: Front
     epochs: pl.DataFrame
     passages: pl.DataFrame
-    profile: Profile
+    profile: RequirementProfile
 
     def tally(self, code: Ints, where: Bools, size: Floats | None = None) -> Tally:
         """Of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
@@ -108,19 +108,19 @@ class Requirement:
     limit: str
     demand: Demand
     clause: str
-    count: Callable[[Ride], Tally] = lambda _: Tally()
+    count: Callable[[ClaimRide], Tally] = lambda _: Tally()
 
     @property
     def key(self) -> Key:
         return self.name, self.applies_to
 
 
-def tallies(ride: Ride) -> Tallies:
+def tallies(ride: ClaimRide) -> Tallies:
     """Every requirement on one ride."""
     return {one.key: one.count(ride) for one in requirements(ride.profile)}
 
 
-def requirements(profile: Profile) -> list[Requirement]:
+def requirements(profile: RequirementProfile) -> list[Requirement]:
     """The requirements of a profile in their order."""
     rate = profile.failure_rate
     return [
@@ -135,7 +135,7 @@ def requirements(profile: Profile) -> list[Requirement]:
     ]
 
 
-def _safe(ride: Ride, kind: AreaType | None = None) -> Tally:
+def _safe(ride: ClaimRide, kind: AreaType | None = None) -> Tally:
     """The train between min and max safe front end, in areas of one type or wherever it is."""
     where = ride.front.output if kind is None else ride.inside(kind)
     return ride.tally(ride.safe, where, ride.front.least_m)
@@ -145,12 +145,12 @@ def _asked(code: Ints, limit: Floats) -> Ints:
     return np.where(np.isfinite(limit), code, NOT_KNOWN)
 
 
-def _of_area(kind: AreaType, area: AreaLimits, profile: Profile) -> list[Requirement]:
-    def exceeded(ride: Ride, name: str) -> Tally:
+def _of_area(kind: AreaType, area: AreaLimits, profile: RequirementProfile) -> list[Requirement]:
+    def exceeded(ride: ClaimRide, name: str) -> Tally:
         code, size = ride.beyond[name]
         return ride.tally(code, ride.inside(kind), size)
 
-    def close(ride: Ride) -> Tally:
+    def close(ride: ClaimRide) -> Tally:
         code = ride.front.within(area.accuracy_m, area.accuracy_m)
         return ride.tally(code, ride.inside(kind), ride.front.least_m)
 
@@ -170,19 +170,19 @@ def _of_area(kind: AreaType, area: AreaLimits, profile: Profile) -> list[Require
     ]
 
 
-def _slow(kind: AreaType, profile: Profile) -> list[Requirement]:
+def _slow(kind: AreaType, profile: RequirementProfile) -> list[Requirement]:
     """Safe and precise operation at low speed: claimed and known."""
     slow = profile.slow
     of = kind.value
 
-    def here(ride: Ride) -> Bools:
+    def here(ride: ClaimRide) -> Bools:
         return ride.inside(kind) & (np.abs(ride.front.speed_mps) * KMH_PER_MPS < slow.below_kmh)
 
-    def claimed(ride: Ride) -> Tally:
+    def claimed(ride: ClaimRide) -> Tally:
         width = np.maximum(ride.front.over_m, ride.front.under_m)
         return ride.tally(codes(width <= slow.limit_m, width > slow.limit_m), here(ride), width)
 
-    def known(ride: Ride, limit_m: float) -> Tally:
+    def known(ride: ClaimRide, limit_m: float) -> Tally:
         return ride.tally(ride.front.within(limit_m, limit_m), here(ride))
 
     limit = f"{slow.limit_m:g} m"
@@ -195,14 +195,14 @@ def _slow(kind: AreaType, profile: Profile) -> list[Requirement]:
     ]
 
 
-def _after_balise(profile: Profile) -> list[Requirement]:
+def _after_balise(profile: RequirementProfile) -> list[Requirement]:
     """The first estimate after each balise accepted; physical ones, and virtual ones as if they were.
 
     Where it comes late or not at all nobody knows what it would have been.
     """
     after = profile.after_balise
 
-    def count(ride: Ride, kind: BaliseKind) -> Tally:
+    def count(ride: ClaimRide, kind: BaliseKind) -> Tally:
         front = ride.front
         limit = after.limit_m(ride.front.speed_mps)
         code = np.append(_asked(front.within(limit, limit), limit), NOT_KNOWN)
@@ -241,11 +241,11 @@ def _first_after(front: Front, at_ns: Ints) -> Ints:
     return np.where(late, t_ns.size, row)
 
 
-def _speed(profile: Profile) -> list[Requirement]:
+def _speed(profile: RequirementProfile) -> list[Requirement]:
     safe = profile.safe_speed
     speed = profile.speed
 
-    def count(ride: Ride, limit_kmh: Callable[[Floats], Floats], over: bool = True, under: bool = True) -> Tally:
+    def count(ride: ClaimRide, limit_kmh: Callable[[Floats], Floats], over: bool = True, under: bool = True) -> Tally:
         limit = limit_kmh(ride.speeds.fastest_kmh)
         code = ride.speeds.within(limit if over else np.inf, limit if under else np.inf)
         return _of_windows(ride, code, np.isfinite(limit))
@@ -262,7 +262,7 @@ def _speed(profile: Profile) -> list[Requirement]:
     ]
 
 
-def _of_windows(ride: Ride, code: Ints, where: Bools) -> Tally:
+def _of_windows(ride: ClaimRide, code: Ints, where: Bools) -> Tally:
     """Of windows of speed, and of the gaps of the log between them, in order of time."""
     found = ride.speeds
     gaps = np.flatnonzero(ride.front.silent_s > 0)
@@ -278,14 +278,14 @@ def _of_windows(ride: Ride, code: Ints, where: Bools) -> Tally:
     return counted(ride.name, t_ns[rows], held_s[rows], codes[rows], gap, silent_s=silent_s[rows])
 
 
-def _start(profile: Profile) -> list[Requirement]:
+def _start(profile: RequirementProfile) -> list[Requirement]:
     """Start of mission: times from the log's begin, which is no switch-on."""
     start = profile.start
 
-    def first(ride: Ride) -> Tally:
+    def first(ride: ClaimRide) -> Tally:
         return Tally(trials=1, worst=_first_s(ride, flags(ride.epochs, "in_use")))
 
-    def nothing(ride: Ride) -> Tally:
+    def nothing(ride: ClaimRide) -> Tally:
         worst = _first_s(ride, flags(ride.epochs, "tvb") | ride.epochs["lrvb_id"].is_not_null().to_numpy())
         waited = (ride.front.clock.duration_s or 0.0) if worst is None else worst
         return replace(_one(broken=waited > start.nothing_s), worst=worst)
@@ -299,7 +299,7 @@ def _start(profile: Profile) -> list[Requirement]:
     ]
 
 
-def _first_s(ride: Ride, there: Bools) -> float | None:
+def _first_s(ride: ClaimRide, there: Bools) -> float | None:
     t_ns = ride.front.clock.t_ns
     return float((t_ns[there][0] - t_ns[0]) / NS_PER_S) if there.any() else None
 
@@ -309,7 +309,7 @@ def _one(broken: bool) -> Tally:
     return Tally(trials=1, broken=int(broken), events=int(broken), possible=1)
 
 
-def _operation(profile: Profile) -> list[Requirement]:
+def _operation(profile: RequirementProfile) -> list[Requirement]:
     """Availability, and ways without physical balises: none is ever proved."""
     asked = profile.availability
     way_m = profile.way.without_balise_m
@@ -321,7 +321,7 @@ def _operation(profile: Profile) -> list[Requirement]:
     ]
 
 
-def _availability(ride: Ride) -> Tally:
+def _availability(ride: ClaimRide) -> Tally:
     """Time lost once there was an output; broken where so much of it lies within so long.
 
     Lost is no output, or an interval wider than MAPCI; gaps of the log, where nobody knows, are left out.
@@ -344,7 +344,7 @@ def _availability(ride: Ride) -> Tally:
     )
 
 
-def _ways(ride: Ride) -> Tally:
+def _ways(ride: ClaimRide) -> Tally:
     """Ways of at least the demanded length between physical balises; broken where MAPO or MAPU was exceeded on one."""
     odometer = ride.epochs["odometer_m"].cast(pl.Float64).to_numpy()
     way = np.cumsum(np.abs(np.nan_to_num(np.diff(odometer, prepend=odometer[:1]))))

@@ -32,7 +32,7 @@ BROKEN = -1
 _COUNTS = ("trials", "kept", "broken", "events", "possible", "held_s", "known_s")
 
 
-class Finding(StrEnum):
+class Compliance(StrEnum):
     """What the data say of a requirement."""
 
     MET = "met"
@@ -141,7 +141,7 @@ def drawn(run: str) -> float:
 class Shown:
     """A finding with its bounds; `needed_h`: hours still to be run, without a further event, to show the demand."""
 
-    finding: Finding
+    finding: Compliance
     measured: Estimate = UNKNOWN
     needed_h: float | None = None
 
@@ -182,7 +182,7 @@ class Demand:
         if self.kind is Kind.ALWAYS:
             return of_always(tally)
         shown = of_share(tally, self.limit)
-        unmet = Finding.NOT_SHOWN if shown.finding is Finding.MET else shown.finding
+        unmet = Compliance.NOT_SHOWN if shown.finding is Compliance.MET else shown.finding
         return replace(shown, finding=unmet, needed_h=None) if self.by_means else shown
 
 
@@ -192,14 +192,14 @@ ALWAYS = Demand(Kind.ALWAYS)
 def of_share(tally: Tally, share: float) -> Shown:
     """At least this share, by exact bounds over runs (Clopper and Pearson)."""
     if tally.trials == 0:
-        return Shown(Finding.NOT_SHOWN)
+        return Shown(Compliance.NOT_SHOWN)
     judged = tally.kept + tally.broken
     trials = Trials(judged, tally.broken, tally.trials - judged)
     broken = trials.share()
     measured = clopper_pearson(tally.kept, judged)
     if broken.high is not None and 1.0 - broken.high >= share:
-        return Shown(Finding.MET, measured, 0.0)
-    finding = Finding.NOT_MET if broken.low is not None and 1.0 - broken.low < share else Finding.NOT_SHOWN
+        return Shown(Compliance.MET, measured, 0.0)
+    finding = Compliance.NOT_MET if broken.low is not None and 1.0 - broken.low < share else Compliance.NOT_SHOWN
     hours = tally.held_s / tally.trials / S_PER_H
     needed = trials.needed(1.0 - share)
     return Shown(finding, measured, needed * hours if hours > 0 and needed is not None else None)
@@ -210,19 +210,23 @@ def of_rate(tally: Tally, rate_per_h: float) -> Shown:
     hours = tally.held_s / S_PER_H
     measured = poisson_rate(tally.events, tally.known_s / S_PER_H)
     if hours <= 0.0:
-        return Shown(Finding.NOT_SHOWN, needed_h=hours_still_needed(rate_per_h, tally.possible, 0.0))
+        return Shown(Compliance.NOT_SHOWN, needed_h=hours_still_needed(rate_per_h, tally.possible, 0.0))
     low = poisson_rate(tally.events, hours).low
     high = poisson_rate_upper(tally.possible, hours)
     needed_h = hours_still_needed(rate_per_h, tally.possible, hours)
     if high is not None and high <= rate_per_h:
-        return Shown(Finding.MET, measured, 0.0)
-    return Shown(Finding.NOT_MET if low is not None and low > rate_per_h else Finding.NOT_SHOWN, measured, needed_h)
+        return Shown(Compliance.MET, measured, 0.0)
+    return Shown(
+        Compliance.NOT_MET if low is not None and low > rate_per_h else Compliance.NOT_SHOWN,
+        measured,
+        needed_h,
+    )
 
 
 def of_always(tally: Tally) -> Shown:
     """A maximum without a probability: one event breaks it, no number of hours shows it."""
     measured = poisson_rate(tally.events, tally.known_s / S_PER_H)
-    return Shown(Finding.NOT_MET if tally.events else Finding.NOT_SHOWN, measured)
+    return Shown(Compliance.NOT_MET if tally.events else Compliance.NOT_SHOWN, measured)
 
 
 def of_availability(tally: Tally, share: float, outside_s: float) -> Shown:
@@ -233,4 +237,4 @@ def of_availability(tally: Tally, share: float, outside_s: float) -> Shown:
     broken = clopper_pearson(tally.broken, tally.trials) if tally.trials else UNKNOWN
     lost = (broken.low or 0.0) * outside_s / tally.longest_s if tally.longest_s > 0 else 0.0
     measured = Estimate(tally.known_s / tally.held_s, None, 1.0 - lost) if tally.held_s > 0 else UNKNOWN
-    return Shown(Finding.NOT_MET if lost > 1.0 - share else Finding.NOT_SHOWN, measured)
+    return Shown(Compliance.NOT_MET if lost > 1.0 - share else Compliance.NOT_SHOWN, measured)

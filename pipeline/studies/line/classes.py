@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.studies.line.pieces import Pieces
-from pipeline.studies.line.spans import FIRST_LOSS, State
+from pipeline.studies.line.spans import FIRST_LOSS, SpanState
 from pipeline.studies.trials import Trials
 from schemas.conform import conform
 from schemas.line import LOSSES, SHORT_OF_SATELLITES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
@@ -48,7 +48,7 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Independent passes: each run, or the worst of a day."""
     if criteria.independent == "pass":
         return passes
-    state = pl.col("state").replace_strict({int(State.UNKNOWN): 2, int(State.RIGHT): 1}, default=0)
+    state = pl.col("state").replace_strict({int(SpanState.UNKNOWN): 2, int(SpanState.RIGHT): 1}, default=0)
     dated = passes.with_columns(
         day=pl.col("t").dt.date(), judged=pl.when(pl.col("state") >= int(FIRST_LOSS)).then(3).otherwise(state)
     )
@@ -64,10 +64,10 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Counts per piece and direction; hours of the day are those of all right passes."""
     state = pl.col("state")
     cause = pl.col("cause")
-    usual = pl.col("satellites").filter(state == int(State.RIGHT)).median().over("run_id")
+    usual = pl.col("satellites").filter(state == int(SpanState.RIGHT)).median().over("run_id")
     passes = passes.with_columns(few=pl.col("satellites") <= criteria.satellites_share * usual)
-    right = state == int(State.RIGHT)
-    wrong = state == int(State.WRONG_IN_USE)
+    right = state == int(SpanState.RIGHT)
+    wrong = state == int(SpanState.WRONG_IN_USE)
     lost = (state >= int(FIRST_LOSS)) & ~wrong
     hour = pl.col("t").dt.strftime("%H").unique()
     hours = passes.filter(right).group_by(KEYS).agg(hours=hour.len(), hours_of_day=hour.sort().str.join(" "))
@@ -79,9 +79,9 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
             lost=lost.sum(),
             wrong_in_use=wrong.sum(),
             claimed_wrongly=pl.col("claimed").sum(),
-            unknown=state.is_between(int(State.UNSEEN), int(State.UNKNOWN)).sum(),
-            unjudged=(state == int(State.UNKNOWN)).sum(),
-            after_alarm=(state == int(State.AFTER_ALARM)).sum(),
+            unknown=state.is_between(int(SpanState.UNSEEN), int(SpanState.UNKNOWN)).sum(),
+            unjudged=(state == int(SpanState.UNKNOWN)).sum(),
+            after_alarm=(state == int(SpanState.AFTER_ALARM)).sum(),
             wrong_track=(cause == LineCause.WRONG_TRACK.value).sum(),
             unsafe=(cause == LineCause.UNSAFE_ACCEPTANCE.value).sum(),
             days=pl.col("t").filter(right | lost | wrong).dt.date().n_unique(),

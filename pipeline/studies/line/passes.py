@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.results.places import ground_of, stretches_of
 from pipeline.studies.line.pieces import Pieces, plane_of
-from pipeline.studies.line.spans import FIRST_LOSS, State, spans_of, states_of
+from pipeline.studies.line.spans import FIRST_LOSS, SpanState, spans_of, states_of
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Judgement, PassageStatus
@@ -18,18 +18,18 @@ from schemas.line import LineCause, LineCriteria
 from schemas.run import Site
 
 CAUSES = {
-    State.UNSEEN: LineCause.NOT_JUDGED,
-    State.UNKNOWN: LineCause.NOT_JUDGED,
-    State.AFTER_ALARM: LineCause.AFTER_ALARM,
-    State.ALARM: LineCause.ALARM,
-    State.CONFIDENCE: LineCause.CONFIDENCE,
-    State.AMBIGUOUS: LineCause.AMBIGUOUS,
-    State.OUTAGE: LineCause.OUTAGE,
-    State.WRONG: LineCause.WRONG,
-    State.WRONG_TRACK: LineCause.WRONG_TRACK,
-    State.WRONG_IN_USE: LineCause.WRONG,
+    SpanState.UNSEEN: LineCause.NOT_JUDGED,
+    SpanState.UNKNOWN: LineCause.NOT_JUDGED,
+    SpanState.AFTER_ALARM: LineCause.AFTER_ALARM,
+    SpanState.ALARM: LineCause.ALARM,
+    SpanState.CONFIDENCE: LineCause.CONFIDENCE,
+    SpanState.AMBIGUOUS: LineCause.AMBIGUOUS,
+    SpanState.OUTAGE: LineCause.OUTAGE,
+    SpanState.WRONG: LineCause.WRONG,
+    SpanState.WRONG_TRACK: LineCause.WRONG_TRACK,
+    SpanState.WRONG_IN_USE: LineCause.WRONG,
 }
-_ANYWHERE = [int(State.OUTAGE), int(State.UNKNOWN)]
+_ANYWHERE = [int(SpanState.OUTAGE), int(SpanState.UNKNOWN)]
 _OUTCOMES: dict[str, pl.DataType | type[pl.DataType]] = {
     "piece": pl.Int64,
     "growing": pl.Boolean,
@@ -42,7 +42,7 @@ _PASSES = _OUTCOMES | {"monitor": pl.String, "satellites": pl.Float64}
 
 
 @dataclass(frozen=True)
-class Ground:
+class PieceIndex:
     """The pieces with their middles in the plane, to find those beside a place."""
 
     site: Site
@@ -50,7 +50,7 @@ class Ground:
     tree: cKDTree
 
     @classmethod
-    def of(cls, site: Site, pieces: Pieces, middles_m: Floats) -> Ground:
+    def of(cls, site: Site, pieces: Pieces, middles_m: Floats) -> PieceIndex:
         return cls(site, pieces, cKDTree(np.nan_to_num(middles_m, nan=1e12)))
 
     def beside(self, rows: pl.DataFrame, reach_m: float) -> Ints:
@@ -66,7 +66,7 @@ def passes_of(
     epochs: pl.DataFrame,
     passages: pl.DataFrame,
     alarms: pl.DataFrame,
-    ground: Ground,
+    ground: PieceIndex,
     criteria: LineCriteria,
     config: Configuration,
 ) -> pl.DataFrame:
@@ -134,8 +134,8 @@ def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.Dat
         t=pl.col("t").min(),
     )
     length_m = (pieces.to_m - pieces.from_m)[worst["piece"].to_numpy()]
-    short = (pl.col("state") == int(State.RIGHT)) & (pl.col("seen_m") < criteria.coverage * pl.Series(length_m))
-    state = pl.when(short).then(int(State.UNSEEN)).otherwise(pl.col("state"))
+    short = (pl.col("state") == int(SpanState.RIGHT)) & (pl.col("seen_m") < criteria.coverage * pl.Series(length_m))
+    state = pl.when(short).then(int(SpanState.UNSEEN)).otherwise(pl.col("state"))
     return _rows(worst.with_columns(state=state))
 
 
@@ -162,17 +162,17 @@ def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, legs: pl.DataFrame, pi
 
 
 def _misleading(
-    epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, ground: Ground, criteria: LineCriteria
+    epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, ground: PieceIndex, criteria: LineCriteria
 ) -> list[pl.DataFrame]:
     """Pieces that wrong positions in use claimed, and those beside a position on a wrong track."""
     placed = epochs.with_columns(state=pl.Series(states), ahead="direction").filter(
         pl.col("netelement_id").is_not_null()
     )
     track = pl.col("error_low_m").is_null()
-    in_use = pl.col("state") == int(State.WRONG_IN_USE)
+    in_use = pl.col("state") == int(SpanState.WRONG_IN_USE)
     claims = _named(placed.filter(in_use & ~track), legs, ground.pieces)
     parts = [_rows(claims, LineCause.CLAIMED_WRONGLY)]
-    for state in (State.WRONG_TRACK, State.WRONG_IN_USE):
+    for state in (SpanState.WRONG_TRACK, SpanState.WRONG_IN_USE):
         rows = placed.filter(track & (pl.col("state") == int(state)))
         if rows.height:
             # On which of these tracks it was, and so which way over each, nobody knows.
@@ -199,7 +199,7 @@ def _named(rows: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFra
         for growing in ways or {True, False}:
             found.setdefault((int(pieces.at(element, np.array([at]))[0]), growing), t)
     schema = {name: _OUTCOMES[name] for name in ("piece", "growing", "state", "t")}
-    table = [(piece, growing, int(State.WRONG_IN_USE), t) for (piece, growing), t in found.items()]
+    table = [(piece, growing, int(SpanState.WRONG_IN_USE), t) for (piece, growing), t in found.items()]
     return pl.DataFrame(table, schema=schema, orient="row")
 
 
@@ -213,7 +213,7 @@ def _merged(rows: pl.DataFrame) -> pl.DataFrame:
     both = worst.join(claims, on=["piece", "growing"], how="left")
     lone = rows.filter("claimed").join(own, on=["piece", "growing"], how="anti").unique(["piece", "growing"])
     kept = both.with_columns(claimed=pl.col("has_claim").fill_null(value=False)).drop("has_claim")
-    return pl.concat([kept, lone.with_columns(state=pl.lit(int(State.UNSEEN)).cast(pl.Int64))])
+    return pl.concat([kept, lone.with_columns(state=pl.lit(int(SpanState.UNSEEN)).cast(pl.Int64))])
 
 
 def _explained(passes: pl.DataFrame, hits: pl.DataFrame, alarms: pl.DataFrame) -> pl.DataFrame:

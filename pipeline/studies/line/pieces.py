@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.results.places import Ground, ground_of, origin_of, plane_m
-from pipeline.stages.track.survey import Track, track_of
+from pipeline.results.places import GroundPositions, ground_of, origin_of, plane_m
+from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.arrays import Floats, Ints
 from schemas.run import Site
 
@@ -17,7 +17,7 @@ from schemas.run import Site
 class Pieces:
     """Pieces of all net elements, numbered in the order of the survey; element e has `first[e] : first[e + 1]`."""
 
-    track: Track
+    track: SurveyedTrack
     first: Ints
     element: Ints
     from_m: Floats
@@ -53,6 +53,6 @@ def middles(site: Site, pieces: Pieces) -> Floats:
     return plane_of(site, ground_of(site.track, pl.Series(pieces.names, dtype=pl.String), middle_m))
 
 
-def plane_of(site: Site, ground: Ground) -> Floats:
+def plane_of(site: Site, ground: GroundPositions) -> Floats:
     """Places as rows of east and north [m]."""
     return np.column_stack(plane_m(ground, origin_of(site)))

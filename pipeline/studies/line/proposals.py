@@ -13,7 +13,7 @@ from pipeline.stages.run_row.bounds import clopper_pearson
 from pipeline.stages.track.network import Network, network_of
 from pipeline.studies.line.classes import KEYS
 from pipeline.studies.line.pieces import Pieces
-from pipeline.studies.line.spans import State
+from pipeline.studies.line.spans import SpanState
 from schemas.arrays import Bools, Floats, floats
 from schemas.config import LdsConfig
 from schemas.conform import conform
@@ -39,7 +39,7 @@ class LineEvidence:
 
 
 @dataclass(frozen=True)
-class _Place:
+class _PieceOnWay:
     """A piece on a way, its middle `at_m` from the begin of the way; `growing`: the way runs with its measure."""
 
     piece: int
@@ -48,7 +48,7 @@ class _Place:
 
 
 @dataclass(frozen=True)
-class _Placed:
+class _Proposed:
     """A balise that was placed; `distance_m` from the one before on the way, over the pieces `since` that one.
 
     `direction`: along its net element, in which it is valid; a physical one in both.
@@ -106,7 +106,7 @@ def site_balises(balises: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
 def _travelled(line: LineEvidence) -> Bools:
     """Pieces that some run passed, whatever was found there; `[piece, 0 growing 1 falling]`."""
     seen = np.zeros((len(line.pieces.element), 2), dtype=np.bool_)
-    rows = line.passes.filter(line.passes["state"] != int(State.WRONG_TRACK)).select("piece", "growing").unique()
+    rows = line.passes.filter(line.passes["state"] != int(SpanState.WRONG_TRACK)).select("piece", "growing").unique()
     seen[rows["piece"].to_numpy(), (~rows["growing"]).cast(pl.Int64).to_numpy()] = True
     return seen
 
@@ -121,7 +121,7 @@ def _allowed(line: LineEvidence, sides: Sequence[bool], growing: Bools) -> Bools
     return allowed
 
 
-def _ways(line: LineEvidence) -> list[list[_Place]]:
+def _ways(line: LineEvidence) -> list[list[_PieceOnWay]]:
     """The pieces of the travelled net elements in chains that trains can run, each element once."""
     network = network_of(line.pieces.track, line.site.links)
     seen = _travelled(line).any(axis=1)
@@ -139,7 +139,7 @@ def _rank(network: Network, oriented: int, wanted: set[int]) -> tuple[int, int]:
     return min(entries, 1), oriented
 
 
-def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> Iterator[_Place]:
+def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> Iterator[_PieceOnWay]:
     oriented: int | None = start
     entry_m = 0.0
     while oriented is not None:
@@ -151,15 +151,15 @@ def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> It
         for number in numbers if oriented % 2 == 0 else reversed(numbers):
             middle_m = 0.5 * float(pieces.from_m[number] + pieces.to_m[number])
             at_m = middle_m - begin_m if oriented % 2 == 0 else end_m - middle_m
-            yield _Place(number, entry_m + at_m, oriented % 2 == 0)
+            yield _PieceOnWay(number, entry_m + at_m, oriented % 2 == 0)
         edges = [edge for edge in network.successors[oriented] if edge.to // 2 in wanted]
         entry_m += network.length_m(oriented) + (edges[0].gap_m if edges else 0.0)
         oriented = edges[0].to if edges else None
 
 
 def _walk(
-    line: LineEvidence, way: Sequence[_Place], allowed: Bools, sides: Sequence[bool], spacing_m: float
-) -> Iterator[_Placed]:
+    line: LineEvidence, way: Sequence[_PieceOnWay], allowed: Bools, sides: Sequence[bool], spacing_m: float
+) -> Iterator[_Proposed]:
     """At each step the best piece about a spacing on; where none is allowed a physical one.
 
     Best is near a station or signal, then at the spacing itself.
@@ -181,12 +181,14 @@ def _walk(
         distance_m = float(at_m[index]) - last_m if begun else None
         since = tuple(place.piece for place in way if last_m < place.at_m <= at_m[index])
         direction = _direction(way[index], sides) if virtual else BaliseDirection.BOTH
-        yield _Placed(way[index].piece, virtual, direction, distance_m, near.get(way[index].piece, ("", 0.0))[0], since)
+        yield _Proposed(
+            way[index].piece, virtual, direction, distance_m, near.get(way[index].piece, ("", 0.0))[0], since
+        )
         last_m = max(float(at_m[index]), last_m + spacing_m - play_m)
         begun = True
 
 
-def _direction(place: _Place, sides: Sequence[bool]) -> BaliseDirection:
+def _direction(place: _PieceOnWay, sides: Sequence[bool]) -> BaliseDirection:
     """In which direction along its net element a balise serves travel ahead along the way, or against it."""
     if len(sides) > 1:
         return BaliseDirection.BOTH
@@ -194,7 +196,7 @@ def _direction(place: _Place, sides: Sequence[bool]) -> BaliseDirection:
 
 
 def _best(
-    way: Sequence[_Place],
+    way: Sequence[_PieceOnWay],
     candidates: np.ndarray[tuple[int], np.dtype[np.int64]],
     target_m: float,
     near: dict[int, tuple[str, float]],
@@ -219,7 +221,7 @@ def _near(line: LineEvidence) -> dict[int, tuple[str, float]]:
     return found
 
 
-def _disjoint(line: LineEvidence, placed: list[_Placed]) -> list[_Placed]:
+def _disjoint(line: LineEvidence, placed: list[_Proposed]) -> list[_Proposed]:
     """Without balises whose windows linking cannot tell apart, as where ways meet; the later one goes."""
     while True:
         named = {f"B{one.piece}": one for one in placed}
@@ -233,7 +235,7 @@ def _disjoint(line: LineEvidence, placed: list[_Placed]) -> list[_Placed]:
         placed = [one for name, one in named.items() if name not in gone]
 
 
-def _named(line: LineEvidence, placed: Sequence[_Placed]) -> pl.DataFrame:
+def _named(line: LineEvidence, placed: Sequence[_Proposed]) -> pl.DataFrame:
     """Place, kind and direction of each balise."""
     piece = [one.piece for one in placed]
     middle_m = 0.5 * (line.pieces.from_m + line.pieces.to_m)[piece]
@@ -248,7 +250,7 @@ def _named(line: LineEvidence, placed: Sequence[_Placed]) -> pl.DataFrame:
     return pl.DataFrame(columns, schema={name: LineBalises.columns()[name].dtype for name in columns})
 
 
-def _balises(line: LineEvidence, name: str, placed: Sequence[_Placed]) -> pl.DataFrame:
+def _balises(line: LineEvidence, name: str, placed: Sequence[_Proposed]) -> pl.DataFrame:
     why = pl.format("{} {}: {}", "direction", "piece_class", "cause").str.join(", ")
     worst = dict(line.table.group_by("piece").agg(why).iter_rows())
     proved = _allowed(line, MODES["both"], np.ones(len(line.pieces.element), dtype=np.bool_))
@@ -275,13 +277,13 @@ def _balises(line: LineEvidence, name: str, placed: Sequence[_Placed]) -> pl.Dat
     )
 
 
-def _largest(errors: dict[int, float | None], one: _Placed) -> float | None:
+def _largest(errors: dict[int, float | None], one: _Proposed) -> float | None:
     known = (errors.get(piece) for piece in one.since)
     return max((error for error in known if error is not None), default=None)
 
 
 def _figures(
-    line: LineEvidence, name: str, spacing_m: float, mode: str, placed: Sequence[_Placed], growing: Bools
+    line: LineEvidence, name: str, spacing_m: float, mode: str, placed: Sequence[_Proposed], growing: Bools
 ) -> dict[str, object]:
     virtual = [one.piece for one in placed if one.virtual]
     sides = [(piece, bool(growing[piece]) == ahead, ahead) for piece in virtual for ahead in MODES[mode]]
@@ -289,10 +291,10 @@ def _figures(
     wanted = pl.DataFrame(sides, schema=schema, orient="row")
     sided = line.table.with_columns(growing=pl.col("direction").cast(pl.String) == LineDirection.GROWING.value)
     lost = wanted.join(sided, on=KEYS).group_by("ahead").agg(pl.col("loss_share").sum(), pl.col("loss_high").sum())
-    decided = (pl.col("state") >= int(State.UNKNOWN)) | (pl.col("state") == int(State.RIGHT))
+    decided = (pl.col("state") >= int(SpanState.UNKNOWN)) | (pl.col("state") == int(SpanState.RIGHT))
     judged = line.passes.filter(decided).join(wanted, on=KEYS)
     # What the evidence should have judged and did not may have been wrong.
-    maybe = pl.col("state").is_in([int(State.UNKNOWN), int(State.WRONG_IN_USE)])
+    maybe = pl.col("state").is_in([int(SpanState.UNKNOWN), int(SpanState.WRONG_IN_USE)])
     journeys = judged.group_by("run_id").agg(wrong=maybe.any())
     distances: Floats = np.array([one.distance_m for one in placed if one.distance_m is not None])
     longest_m = float(distances.max()) if len(distances) else None

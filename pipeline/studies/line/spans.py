@@ -13,7 +13,7 @@ from schemas.arrays import Bools, Ints, flags, floats, times_ns
 from schemas.config import Configuration
 
 
-class State(IntEnum):
+class SpanState(IntEnum):
     """What became of a position, best first: of several the last one counts."""
 
     RIGHT = 0
@@ -29,7 +29,7 @@ class State(IntEnum):
     WRONG_IN_USE = 10
 
 
-FIRST_LOSS = State.ALARM
+FIRST_LOSS = SpanState.ALARM
 EPOCH_COLUMNS = (
     *("t", "solution", "netelement_id", "measure_m", "path_m", "error_low_m", "error_high_m", "direction"),
     *("true_netelement_ids", "true_measure_low_m", "true_measure_high_m"),
@@ -38,22 +38,22 @@ EPOCH_COLUMNS = (
 
 
 def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configuration) -> Ints:
-    """`State` per epoch of one solution. An alarm counts where it begins; what it blocks after that does not."""
+    """`SpanState` per epoch of one solution. An alarm counts where it begins; what it blocks after that does not."""
     in_use = flags(epochs, "in_use")
     wrong = _is(epochs, "wrong")
     starts = epochs["t"].is_in(alarm_starts.implode()).to_numpy()
     conditions = [
-        (wrong & in_use, State.WRONG_IN_USE),
-        (wrong & ~np.isfinite(floats(epochs, "error_low_m")), State.WRONG_TRACK),
-        (wrong, State.WRONG),
-        (~met(epochs, usable() & pl.col("confidence_m").is_not_null()), State.OUTAGE),
-        (~met(epochs, unambiguous(config)), State.AMBIGUOUS),
-        (~met(epochs, confident(config)), State.CONFIDENCE),
-        (starts, State.ALARM),
-        (~in_use, State.AFTER_ALARM),
-        (_is(epochs, "right"), State.RIGHT),
+        (wrong & in_use, SpanState.WRONG_IN_USE),
+        (wrong & ~np.isfinite(floats(epochs, "error_low_m")), SpanState.WRONG_TRACK),
+        (wrong, SpanState.WRONG),
+        (~met(epochs, usable() & pl.col("confidence_m").is_not_null()), SpanState.OUTAGE),
+        (~met(epochs, unambiguous(config)), SpanState.AMBIGUOUS),
+        (~met(epochs, confident(config)), SpanState.CONFIDENCE),
+        (starts, SpanState.ALARM),
+        (~in_use, SpanState.AFTER_ALARM),
+        (_is(epochs, "right"), SpanState.RIGHT),
     ]
-    states = np.select([one for one, _ in conditions], [int(state) for _, state in conditions], int(State.UNKNOWN))
+    states = np.select([one for one, _ in conditions], [int(state) for _, state in conditions], int(SpanState.UNKNOWN))
     return states.astype(np.int64)
 
 
@@ -80,17 +80,17 @@ def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Con
     state = np.maximum(states[here], states[there])
     silent = (t_ns[there] - t_ns[here] > crossing_gap_ns(t_ns, config.lds)) & (there == here + 1)
     between = np.flatnonzero(there > here + 1)
-    state[silent] = State.OUTAGE
+    state[silent] = SpanState.OUTAGE
     for row in between:
         inner = slice(here[row] + 1, there[row])
         way = _way(legs, min(low[here[row]], low[there[row]]), max(high[here[row]], high[there[row]]))
         state[row] = _between(state[row], states[inner], possible[inner], way)
     apart = silent | (there > here + 1)
     ends = np.unique(np.concatenate([here[apart], there[apart]]))
-    ends = ends[states[ends] >= State.WRONG]
+    ends = ends[states[ends] >= SpanState.WRONG]
     here, there, state = (np.concatenate(pair) for pair in ((here, ends), (there, ends), (state, states[ends])))
     wide = np.maximum((high - low)[here], (high - low)[there]) > 2.0 * config.hazards.failure_limit_m
-    state = np.where(wide & (state < State.WRONG), int(State.UNKNOWN), state)
+    state = np.where(wide & (state < SpanState.WRONG), int(SpanState.UNKNOWN), state)
     middle = 0.5 * (low + high)
     return pl.DataFrame(
         {
@@ -114,11 +114,11 @@ def _way(legs: pl.DataFrame, begin_m: float, end_m: float) -> set[str]:
 
 def _between(ends: int, inner: Ints, possible: list[list[str] | None], way: set[str]) -> int:
     """What is known of a way whose inner epochs have no known place; `ends`: the worse of its two ends."""
-    if (inner == State.OUTAGE).all():
-        return int(State.OUTAGE)
+    if (inner == SpanState.OUTAGE).all():
+        return int(SpanState.OUTAGE)
     if all(names and way.issuperset(names) for names in possible):
         return int(max(ends, inner.max()))
-    return int(State.UNKNOWN)
+    return int(SpanState.UNKNOWN)
 
 
 def _elements(possible: list[list[str] | None], here: Ints, there: Ints) -> pl.Series:

@@ -10,11 +10,11 @@ import polars as pl
 
 from pipeline.results.store import check_site, complete_runs, completed_runs, read_config, read_table
 from pipeline.studies.line.classes import piece_classes
-from pipeline.studies.line.passes import Ground, passes_of
+from pipeline.studies.line.passes import PieceIndex, passes_of
 from pipeline.studies.line.pieces import Pieces, middles, pieces_of
 from pipeline.studies.line.proposals import LineEvidence, proposals
 from pipeline.studies.line.remarks import remarks
-from pipeline.studies.line.spans import EPOCH_COLUMNS, State
+from pipeline.studies.line.spans import EPOCH_COLUMNS, SpanState
 from pipeline.studies.trials import distinct
 from schemas.arrays import floats
 from schemas.config import Configuration
@@ -56,7 +56,7 @@ def study_line(
     """
     runs, twice = distinct(_runs(out, site, solution))
     pieces = pieces_of(site, criteria.piece_m)
-    ground = Ground.of(site, pieces, middles(site, pieces))
+    ground = PieceIndex.of(site, pieces, middles(site, pieces))
     passes, undetected = passes_of_runs(out, runs, ground, criteria)
     table = piece_classes(passes, undetected, pieces, criteria)
     lds = (read_config(out) or Configuration()).lds
@@ -93,7 +93,7 @@ def _runs(out: Path, site: Site, solution: str | None) -> pl.DataFrame:
 
 
 def passes_of_runs(
-    out: Path, runs: pl.DataFrame, ground: Ground, criteria: LineCriteria
+    out: Path, runs: pl.DataFrame, ground: PieceIndex, criteria: LineCriteria
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
     """The passes of all runs with `run_id`; and the largest undetected error by piece, where the tables have it."""
     config = read_config(out) or Configuration()
@@ -106,7 +106,7 @@ def passes_of_runs(
         found = passes_of(epochs, passages, alarms, ground, criteria, config)
         if evidence != Evidence.REFERENCE.value:
             # Reads and odometers tell by where they are, not by how good positions are: what they miss hides nothing.
-            found = found.with_columns(pl.col("state").replace(int(State.UNKNOWN), int(State.UNSEEN)))
+            found = found.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.UNSEEN)))
         parts.append(found.with_columns(run_id=pl.lit(run)))
         errors.append(_undetected(passages, ground.pieces))
     return pl.concat(parts), pl.concat(errors).group_by("piece").agg(pl.col("largest_undetected_m").max())

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.studies.plausibility.check import Cause
+from pipeline.studies.plausibility.check import KnownCause
 from pipeline.studies.plausibility.robust import Shift
 from schemas.arrays import Floats
 from schemas.enums import MisfitCause
@@ -35,7 +35,7 @@ _ROLL_OVER_WEEKS = 1024
 class Explained:
     """Causes that explain a figure together, and the exact figure they stand for."""
 
-    causes: tuple[Cause, ...]
+    causes: tuple[KnownCause, ...]
     exact: float
 
 
@@ -45,7 +45,7 @@ def explain_factor(factor: float, speed: bool) -> Explained | None:
     name, exact = min(units.items(), key=lambda unit: abs(factor / unit[1] - 1.0))
     # A unit so near to 1 that a bad odometer could be taken for it has to be met more exactly.
     near = min(_UNIT_SHARE, abs(exact - 1.0) / 3.0)
-    return Explained((Cause(MisfitCause.UNIT, (name,)),), exact) if abs(factor / exact - 1.0) <= near else None
+    return Explained((KnownCause(MisfitCause.UNIT, (name,)),), exact) if abs(factor / exact - 1.0) <= near else None
 
 
 def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> Explained | None:
@@ -59,10 +59,10 @@ def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> Explained | None
 def _lags(size_s: float, t_ns: int) -> Iterator[Explained]:
     """Candidates near a lag, the simplest first."""
     leap_s = leap_seconds(t_ns)
-    gps = Cause(MisfitCause.GPS_AS_UTC)
+    gps = KnownCause(MisfitCause.GPS_AS_UTC)
     yield Explained((gps,), leap_s)
-    yield Explained((Cause(MisfitCause.TAI_AS_GPS),), _TAI_OVER_GPS_S)
-    yield Explained((Cause(MisfitCause.TAI_AS_UTC),), _TAI_OVER_GPS_S + leap_s)
+    yield Explained((KnownCause(MisfitCause.TAI_AS_GPS),), _TAI_OVER_GPS_S)
+    yield Explained((KnownCause(MisfitCause.TAI_AS_UTC),), _TAI_OVER_GPS_S + leap_s)
     for extra_s in (0, leap_s, -leap_s):
         for calendar in _calendar(size_s - extra_s, t_ns):
             yield Explained((*calendar.causes, gps) if extra_s else calendar.causes, calendar.exact + extra_s)
@@ -81,18 +81,18 @@ def _calendar(rest_s: float, t_ns: int) -> Iterator[Explained]:
     date = datetime.fromtimestamp(t_ns // 1_000_000_000, UTC)
     if date.day <= 12 and date.day != date.month:
         swapped = date.replace(month=date.day, day=date.month) - date
-        yield Explained((Cause(MisfitCause.DAY_AND_MONTH),), abs(swapped.total_seconds()))
+        yield Explained((KnownCause(MisfitCause.DAY_AND_MONTH),), abs(swapped.total_seconds()))
     for code, unit, unit_s in (MisfitCause.WRONG_WEEK, "weeks", _WEEK_S), (MisfitCause.WRONG_DAY, "days", _DAY_S):
         if (count := round(rest_s / unit_s)) >= 1:
             whole = _amount(code, f"{count} {unit}", count * unit_s)
             yield whole
             if odd := round((rest_s - whole.exact) / _HOUR_S):
-                zone = Cause(MisfitCause.TIME_ZONE, (f"{odd:+d} h",))
+                zone = KnownCause(MisfitCause.TIME_ZONE, (f"{odd:+d} h",))
                 yield Explained((*whole.causes, zone), whole.exact + odd * _HOUR_S)
 
 
 def _amount(code: MisfitCause, amount: str, exact_s: float) -> Explained:
-    return Explained((Cause(code, (amount,)),), exact_s)
+    return Explained((KnownCause(code, (amount,)),), exact_s)
 
 
 def leap_seconds(t_ns: int) -> int:

@@ -13,7 +13,7 @@ CONFIGURATION = "append to the configuration file"
 VEHICLE_FILE = "append to the vehicle file"
 
 
-class State(StrEnum):
+class FitState(StrEnum):
     """Outcome of a check; `impossible`: a known cause explains it, and no train can have it."""
 
     FITS = "fits"
@@ -23,7 +23,7 @@ class State(StrEnum):
 
 
 @dataclass(frozen=True)
-class Cause:
+class KnownCause:
     """A known cause of a misfit, with the figures and names that its words take: a unit, a datum, an amount."""
 
     code: MisfitCause
@@ -55,9 +55,9 @@ class Check:
     """
 
     what: str
-    state: State
+    state: FitState
     found: str
-    causes: tuple[Cause, ...] = ()
+    causes: tuple[KnownCause, ...] = ()
     lines: str = ""
     into: str = CONFIGURATION
     advice: str = ""
@@ -87,17 +87,17 @@ def misfit(
     of_evidence: bool = False,
 ) -> Check:
     """A misfit of causes that need no figure."""
-    causes = tuple(map(Cause, codes))
-    return Check(what, State.MISFIT, found, causes, lines, into, advice, of_evidence)
+    causes = tuple(map(KnownCause, codes))
+    return Check(what, FitState.MISFIT, found, causes, lines, into, advice, of_evidence)
 
 
 def not_checked(what: str, why: str) -> Check:
     """A check that the data do not allow."""
-    return Check(what, State.NOT_CHECKED, why)
+    return Check(what, FitState.NOT_CHECKED, why)
 
 
 def fits(what: str, found: str) -> Check:
-    return Check(what, State.FITS, found)
+    return Check(what, FitState.FITS, found)
 
 
 def correction(

@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M, points_of
-from pipeline.studies.plausibility.check import Cause, Check, State
+from pipeline.studies.plausibility.check import Check, FitState, KnownCause
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.robust import LEAST
 from pipeline.studies.plausibility.shifts import fit_survey
@@ -39,14 +39,14 @@ _SAME_STAMP_S = 0.002
 _WITHOUT_ERROR = 0.2
 
 
-class _Track(NamedTuple):
+class _StampedTrack(NamedTuple):
     """Stamps [s], and latitude and longitude [deg] in rows."""
 
     t_s: Floats
     degrees: Floats
 
-    def take(self, rows: Bools) -> _Track:
-        return _Track(self.t_s[rows], self.degrees[rows])
+    def take(self, rows: Bools) -> _StampedTrack:
+        return _StampedTrack(self.t_s[rows], self.degrees[rows])
 
 
 def copy_check(of: Recording) -> Check | None:
@@ -90,15 +90,15 @@ def copy_check(of: Recording) -> Check | None:
         f"{sigma_m.max():.2g} m"
     )
     advice = "Leave the reference out of the run, or record one with another, better instrument."
-    return Check(_WHAT, State.IMPOSSIBLE, found, (Cause(MisfitCause.COPY),), advice=advice, of_evidence=True)
+    return Check(_WHAT, FitState.IMPOSSIBLE, found, (KnownCause(MisfitCause.COPY),), advice=advice, of_evidence=True)
 
 
-def _track(frame: pl.DataFrame, t_s: Floats) -> _Track:
+def _track(frame: pl.DataFrame, t_s: Floats) -> _StampedTrack:
     degrees = np.column_stack([floats(frame, name) for name in ("latitude_deg", "longitude_deg")])
-    return _Track(t_s, degrees).take(np.all(np.isfinite(degrees), axis=1))
+    return _StampedTrack(t_s, degrees).take(np.all(np.isfinite(degrees), axis=1))
 
 
-def _lag_s(own: _Track, other: _Track, reach_m: float) -> float | None:
+def _lag_s(own: _StampedTrack, other: _StampedTrack, reach_m: float) -> float | None:
     """The difference of stamps that most places of the other record have which are in the own one too."""
     from scipy.spatial import cKDTree
 

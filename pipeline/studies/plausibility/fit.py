@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.studies.plausibility.check import Check, State, not_checked
+from pipeline.studies.plausibility.check import Check, FitState, not_checked
 from pipeline.studies.plausibility.odometer import odometer_checks
 from pipeline.studies.plausibility.places import read_stamp_checks, reads_lag, reference_checks, survey_checks
 from pipeline.studies.plausibility.recording import recording_of
 from pipeline.studies.plausibility.velocity import velocity_checks
-from pipeline.studies.plausibility.witnesses import Lag, clock_checks
+from pipeline.studies.plausibility.witnesses import StreamLag, clock_checks
 from pipeline.studies.plausibility.written import reference_elsewhere, written_checks
 from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
 from schemas.enums import MisfitCause, Note
@@ -28,7 +28,7 @@ class Fit:
     @property
     def impossible(self) -> tuple[Check, ...]:
         """What no train can have, and a known cause explains."""
-        return tuple(check for check in self.checks if check.state is State.IMPOSSIBLE)
+        return tuple(check for check in self.checks if check.state is FitState.IMPOSSIBLE)
 
     @property
     def unproving(self) -> tuple[Check, ...]:
@@ -38,7 +38,7 @@ class Fit:
     @property
     def misfits(self) -> tuple[Check, ...]:
         """What does not fit, the impossible first."""
-        return (*self.impossible, *(check for check in self.checks if check.state is State.MISFIT))
+        return (*self.impossible, *(check for check in self.checks if check.state is FitState.MISFIT))
 
     @property
     def codes(self) -> list[MisfitCause]:
@@ -66,7 +66,7 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
     if written := written_checks(of):
         return Fit(tuple(written))
     checks = reference_elsewhere(of)
-    lags: list[Lag] = []
+    lags: list[StreamLag] = []
     beside_reference = False
     if not checks and run.reference is not None and run.reference.height:
         of_reference, checks, beside_reference = reference_checks(of)

@@ -8,12 +8,21 @@ import numpy as np
 import polars as pl
 
 from pipeline.studies.plausibility.causes import explain_factor
-from pipeline.studies.plausibility.check import VEHICLE_FILE, Cause, Check, State, correction, fits, misfit, not_checked
+from pipeline.studies.plausibility.check import (
+    VEHICLE_FILE,
+    Check,
+    FitState,
+    KnownCause,
+    correction,
+    fits,
+    misfit,
+    not_checked,
+)
 from pipeline.studies.plausibility.pairs import PairFit, fit_pair
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.records import MOVING_MPS, Places, Record
 from pipeline.studies.plausibility.robust import LEAST
-from pipeline.studies.plausibility.witnesses import Lag
+from pipeline.studies.plausibility.witnesses import StreamLag
 from schemas.arrays import floats, runs_of
 from schemas.config import PlausibilityConfig
 from schemas.enums import MisfitCause
@@ -35,7 +44,7 @@ _BY_TURNS = 0.5
 _LEAST_BY_TURNS = 30
 
 
-def odometer_checks(of: Recording, reference: Lag | None) -> tuple[list[Check], list[Lag]]:
+def odometer_checks(of: Recording, reference: StreamLag | None) -> tuple[list[Check], list[StreamLag]]:
     """All checks of the odometer, and its clock for comparison with those of the others."""
     config = of.config
     pairs = of.pairs
@@ -46,7 +55,7 @@ def odometer_checks(of: Recording, reference: Lag | None) -> tuple[list[Check], 
     name = next((name for name, pair in pairs.items() if pair.known), next(iter(pairs)))
     pair = pairs[name]
     if not pair.known:
-        return checks, [Lag("odometer", reason=pair.reason)]
+        return checks, [StreamLag("odometer", reason=pair.reason)]
     checks.append(turn_check(of.gnss, of.counters[name], pair))
 
     @cache
@@ -59,18 +68,18 @@ def odometer_checks(of: Recording, reference: Lag | None) -> tuple[list[Check], 
 
     scale = _scale_check(pair, of)
     latency = _latency_check(pair, reference, of)
-    if scale is not None and scale.state in (State.MISFIT, State.IMPOSSIBLE):
+    if scale is not None and scale.state in (FitState.MISFIT, FitState.IMPOSSIBLE):
         # Where there is a reference it has to contradict the file too: else it is the positions that drift.
         other = by_reference()
         beside = None if other is None else _scale_check(other, of, _unit(pair, config))
-        scale = fits(scale.what, scale.found) if beside is not None and beside.state is State.FITS else scale
+        scale = fits(scale.what, scale.found) if beside is not None and beside.state is FitState.FITS else scale
     checks += [check for check in (scale, latency) if check is not None]
-    if latency is not None and latency.state is State.MISFIT:
-        return checks, [Lag("odometer", reason="the latency of the vehicle file does not fit")]
+    if latency is not None and latency.state is FitState.MISFIT:
+        return checks, [StreamLag("odometer", reason="the latency of the vehicle file does not fit")]
     lag = _lag(pair, of)
     other = by_reference() if lag.sure and abs(lag.lag_s) <= config.lag_limit_s else None
     if other is not None and other.lag_known and not other.other_lag(0.0, config.lag_told_s):
-        return checks, [Lag("odometer", reason=f"{lag.lag_s:+.2f} s, but none against the reference")]
+        return checks, [StreamLag("odometer", reason=f"{lag.lag_s:+.2f} s, but none against the reference")]
     return checks, [lag]
 
 
@@ -90,17 +99,17 @@ def _interleaved(odometer: pl.DataFrame | None) -> list[Check]:
     return [misfit("odometer distance from row to row", words, MisfitCause.TWO_COUNTERS, advice=advice)]
 
 
-def _lag(pair: PairFit, of: Recording) -> Lag:
+def _lag(pair: PairFit, of: Recording) -> StreamLag:
     """The clock of the odometer; it is sure of what is beyond the latency of the vehicle file."""
     if pair.shifted:
-        return Lag("odometer", pair.lag_s, min(pair.lag_sigma_s, 1.0), sure=True)
+        return StreamLag("odometer", pair.lag_s, min(pair.lag_sigma_s, 1.0), sure=True)
     if pair.clock_reason or not pair.lag_known:
-        return Lag("odometer", reason=pair.clock_reason or "the speed changes too little")
+        return StreamLag("odometer", reason=pair.clock_reason or "the speed changes too little")
     latency_s = of.vehicle.gnss_latency_s
     from_file_s = -(latency_s or 0.0)
     small = abs(pair.lag_s - from_file_s) <= of.config.lag_limit_s
     sure = small and pair.other_lag(from_file_s, of.config.lag_told_s)
-    return Lag("odometer", pair.lag_s, pair.lag_sigma_s, sure, latency_known=latency_s is not None)
+    return StreamLag("odometer", pair.lag_s, pair.lag_sigma_s, sure, latency_known=latency_s is not None)
 
 
 def _metres(pair: PairFit, config: PlausibilityConfig) -> bool:
@@ -127,10 +136,10 @@ def _factor_check(name: str, pairs: dict[str, PairFit], config: PlausibilityConf
     base = next((other for other in others if abs(other - 1.0) <= 2.0 * config.scale_limit), 1.0)
     if (explained := explain_factor(factor / base, name == "speed")) is not None:
         lines = correction("odometer", {column: 1.0 / explained.exact})
-        return Check(what, State.IMPOSSIBLE, words, explained.causes, lines)
+        return Check(what, FitState.IMPOSSIBLE, words, explained.causes, lines)
     if pair.constant >= _PULSES_WINDOWS and max(factor, 1.0 / factor) > _PULSES_FACTOR:
         lines = correction("odometer", {column: float(f"{1.0 / factor:.5g}")})
-        return Check(what, State.IMPOSSIBLE, words, (Cause(MisfitCause.PULSES),), lines)
+        return Check(what, FitState.IMPOSSIBLE, words, (KnownCause(MisfitCause.PULSES),), lines)
     return misfit(what, words)
 
 
@@ -164,7 +173,7 @@ def _scale_check(pair: PairFit, of: Recording, unit: float | None = None) -> Che
     return _of_file(what, words, pair.other_factor(unit / file_scale, least), code, _scale_lines(pair, unit))
 
 
-def _latency_check(pair: PairFit, reference: Lag | None, of: Recording) -> Check | None:
+def _latency_check(pair: PairFit, reference: StreamLag | None, of: Recording) -> Check | None:
     """The file's GNSS latency against what the run shows; a reference that agrees with it is believed."""
     config = of.config
     file_s = of.vehicle.gnss_latency_s
@@ -185,8 +194,8 @@ def _of_file(what: str, words: str, wrong: bool, code: MisfitCause, lines: str) 
     """What a figure of the vehicle file shows; `code`: why, where it is wrong."""
     if not wrong:
         return fits(what, words)
-    state = State.IMPOSSIBLE if code is MisfitCause.IMPOSSIBLE_SCALE else State.MISFIT
-    return Check(what, state, words, (Cause(code),), lines, "write instead in the vehicle file")
+    state = FitState.IMPOSSIBLE if code is MisfitCause.IMPOSSIBLE_SCALE else FitState.MISFIT
+    return Check(what, state, words, (KnownCause(code),), lines, "write instead in the vehicle file")
 
 
 def sign_check(counters: dict[str, Record]) -> list[Check]:
@@ -210,7 +219,7 @@ def sign_check(counters: dict[str, Record]) -> list[Check]:
         name, does = ("distance", "falls") if falls.mean() > 0.5 else ("speed", "grows")
         lines = correction("odometer", {"distance_m" if name == "distance" else "speed_mps": -1.0})
         found = f"the distance {does} at the opposite speed"
-        return [Check(_SIGNS, State.IMPOSSIBLE, found, (Cause(MisfitCause.COUNTS_BACKWARDS, (name,)),), lines)]
+        return [Check(_SIGNS, FitState.IMPOSSIBLE, found, (KnownCause(MisfitCause.COUNTS_BACKWARDS, (name,)),), lines)]
     if against > 0.1 and not back.any() and not falls.all():
         return [misfit(_SIGNS, "the speed has no sign", MisfitCause.SPEED_WITHOUT_SIGN)]
     return [fits(_SIGNS, "the same")]

@@ -10,12 +10,12 @@ import polars as pl
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.survey import track_of
 from pipeline.studies.plausibility.causes import Datum, datums_at, explain_factor
-from pipeline.studies.plausibility.check import Cause, Check, State, correction, fits, misfit, not_checked
+from pipeline.studies.plausibility.check import Check, FitState, KnownCause, correction, fits, misfit, not_checked
 from pipeline.studies.plausibility.copies import copy_check
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.robust import SIGNIFICANT_SIGMAS, explains, steady_median
 from pipeline.studies.plausibility.shifts import SurveyFit, SurveyLine, common_lag, fit_places, fit_survey, passes
-from pipeline.studies.plausibility.witnesses import Lag
+from pipeline.studies.plausibility.witnesses import StreamLag
 from schemas.arrays import NS_PER_S, Floats, times_ns
 from schemas.enums import MisfitCause
 from schemas.run import Site
@@ -31,21 +31,21 @@ _READ_M = 60.0
 _HEIGHT_UNITS = ("feet", "cm", "mm")
 
 
-def reference_checks(of: Recording) -> tuple[Lag, list[Check], bool]:
+def reference_checks(of: Recording) -> tuple[StreamLag, list[Check], bool]:
     """Clock, place and heights of the reference; and whether it lies where the positions do. A copy tells nothing."""
     config = of.config
     if of.reference is None:
-        return Lag("reference", reason="hardly any place"), [], False
+        return StreamLag("reference", reason="hardly any place"), [], False
     if copied := copy_check(of):
-        return Lag("reference", reason="a copy of the positions"), [copied], False
+        return StreamLag("reference", reason="a copy of the positions"), [copied], False
     found = fit_places(of.gnss, of.reference, config)
     if found.reason:
-        return Lag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False
+        return StreamLag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False
     significant = abs(found.lag_s) > max(config.lag_told_s, SIGNIFICANT_SIGMAS * found.lag_sigma_s)
     agrees = explains(found.agreeing, 0.0)
     small = abs(found.lag_s) <= config.lag_limit_s and agrees
     sure = significant and found.lag_is_steady and (small or explains(found.agreeing, found.as_recorded))
-    lag = Lag("reference", found.lag_s, found.lag_sigma_s, sure=sure)
+    lag = StreamLag("reference", found.lag_s, found.lag_sigma_s, sure=sure)
     if not agrees:
         words = "no one lag or shift explains them; the positions may be wrong"
         return lag, [not_checked(_REFERENCE, words)], False
@@ -68,21 +68,21 @@ def _reference_heights(of: Recording, lag_s: float) -> Iterator[Check]:
     yield from _heights("reference", height_m - gnss.height_m, gnss.height_m, of)
 
 
-def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> Lag:
+def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> StreamLag:
     """The clock of the balise reads: where the positions pass a balise that was read."""
     places = _balise_places(site)
     names = reads["balise_id"].to_list()
     known = np.array([name in places for name in names], dtype=np.bool_)
     if known.sum() < _FEWEST_READS:
-        return Lag("balise_reads", reason="fewer than three reads of balises of the site")
+        return StreamLag("balise_reads", reason="fewer than three reads of balises of the site")
     at_deg = np.array([places[name] for name in names if name in places])
     number, passed_s = passes(of.gnss, points_of(*at_deg.T), _READ_M)
     t_s = of.seconds(reads)[known]
     lag_s, sigma_s = common_lag(t_s[number] - passed_s, int(known.sum()))
     if lag_s is None:
-        return Lag("balise_reads", reason="no one lag explains the reads")
+        return StreamLag("balise_reads", reason="no one lag explains the reads")
     # Antennas far from each other pass a balise at other times: what a train can have may be theirs.
-    return Lag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * of.config.lag_limit_s)
+    return StreamLag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * of.config.lag_limit_s)
 
 
 def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
@@ -143,10 +143,10 @@ def _beside(fit: SurveyFit, datum: Datum | None, of: Recording, streams: tuple[s
     words += " (along the track not known: one heading)" if fit.one_heading else ""
     if datum is not None:
         code = MisfitCause.DATUM_LIKELY if fit.one_heading else MisfitCause.DATUM
-        causes = (Cause(code, (datum.name, datum.epsg)),)
+        causes = (KnownCause(code, (datum.name, datum.epsg)),)
         advice = "Name the code in the site's track: first line of track.csv, a column epsg, or crs of GeoJSON."
         lines = f"# epsg: {datum.epsg}\n"
-        return Check(_SURVEY, State.MISFIT, words, causes, lines, "write as first line of track.csv", advice)
+        return Check(_SURVEY, FitState.MISFIT, words, causes, lines, "write as first line of track.csv", advice)
     shift_m = {"east": round(fit.east_m, 1), "north": round(fit.north_m, 1)}
     lines = "".join(correction(stream, shift_m=shift_m) for stream in streams)
     advice = "Name the survey's EPSG code or mend the survey; only where the shift is known to be the map's:"
@@ -169,10 +169,10 @@ def _heights(other: str, up_m: Floats, height_m: Floats, of: Recording) -> Itera
         unit = explain_factor(factor, False)
         name = "" if unit is None else unit.causes[0].figures[0]
         if unit is not None and name in _HEIGHT_UNITS:
-            causes = (Cause(MisfitCause.HEIGHT_UNIT, ("positions" if stream == "gnss" else other, name)),)
+            causes = (KnownCause(MisfitCause.HEIGHT_UNIT, ("positions" if stream == "gnss" else other, name)),)
             lines = "" if stream == "survey" else correction(stream, {"height_m": 1.0 / unit.exact})
             advice = "Write the survey's heights in metres." if stream == "survey" else ""
-            yield Check(what, State.MISFIT, words, causes, lines, advice=advice)
+            yield Check(what, FitState.MISFIT, words, causes, lines, advice=advice)
             return
     if abs(apart_m) > _GEOID_M:
         yield misfit(what, words, MisfitCause.HEIGHT_UNKNOWN)

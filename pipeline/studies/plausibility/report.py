@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.stages.clean.clean import CleanCounts, clean
-from pipeline.studies.plausibility.check import State
+from pipeline.studies.plausibility.check import FitState
 from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run, lines_of
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
@@ -25,7 +25,7 @@ class FitReport:
         """The same as plain lines, without what fits or could not be checked."""
         lines = [f"does not fit: {problem}" for problem in self.problems]
         if "Fit" in self.tables:
-            misfits = self.tables["Fit"].filter(pl.col("state") == State.MISFIT.value)
+            misfits = self.tables["Fit"].filter(pl.col("state") == FitState.MISFIT.value)
             lines += [
                 f"does not fit: {row['check']}: {row['found']} {row['cause']}".rstrip()
                 for row in misfits.iter_rows(named=True)
@@ -79,7 +79,7 @@ def _checks(found: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
         for check in fit.checks
     ]
     rows += [
-        (name, "placeholders", State.MISFIT.value, f"{one.placeholders} taken as no fix", "0/0 or a default place")
+        (name, "placeholders", FitState.MISFIT.value, f"{one.placeholders} taken as no fix", "0/0 or a default place")
         for name, one in counts.solutions.items()
         if one.placeholders
     ]

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.studies.plausibility.causes import explain_factor
-from pipeline.studies.plausibility.check import Cause, Check, State, correction, fits, misfit, not_checked
+from pipeline.studies.plausibility.check import Check, FitState, KnownCause, correction, fits, misfit, not_checked
 from pipeline.studies.plausibility.records import SPEED_S, Places, seconds_since
 from pipeline.studies.plausibility.robust import LEAST, sampled
 from schemas.arrays import Floats, floats
@@ -43,10 +43,10 @@ class Arrangement(NamedTuple):
         return turned
 
     @property
-    def causes(self) -> tuple[Cause, ...]:
+    def causes(self) -> tuple[KnownCause, ...]:
         signs = [name for name, sign in (("east", self.east), ("north", self.north)) if sign < 0]
-        exchanged = (Cause(MisfitCause.VELOCITY_EXCHANGED),) if self.exchanged else ()
-        return exchanged + ((Cause(MisfitCause.VELOCITY_SIGN, (" and ".join(signs),)),) if signs else ())
+        exchanged = (KnownCause(MisfitCause.VELOCITY_EXCHANGED),) if self.exchanged else ()
+        return exchanged + ((KnownCause(MisfitCause.VELOCITY_SIGN, (" and ".join(signs),)),) if signs else ())
 
 
 ARRANGEMENTS = tuple(Arrangement(*parts) for parts in product((False, True), (1.0, -1.0), (1.0, -1.0)))
@@ -109,7 +109,7 @@ def _horizontal(fit: VelocityFit, config: PlausibilityConfig) -> Check:
     as_recorded = f"they point elsewhere, by {fit.misfits[0]:.0%} of the speed"
     if fit.best and fit.misfits[0] <= VELOCITY_SHARE:
         advice = "Look at a run with curves before the velocity is corrected."
-        return Check(_WHAT, State.MISFIT, as_recorded, arrangement.causes, advice=advice)
+        return Check(_WHAT, FitState.MISFIT, as_recorded, arrangement.causes, advice=advice)
     if not fit.best and fit.misfits[0] > VELOCITY_SHARE:
         return misfit(_WHAT, as_recorded, MisfitCause.VELOCITY_FRAME)
     words = f"the recorded speed is {fit.ratio:.4g} times that of the positions"
@@ -124,7 +124,7 @@ def _horizontal(fit: VelocityFit, config: PlausibilityConfig) -> Check:
     exchange = ("vel_e_mps", "vel_n_mps") if arrangement.exchanged else None
     lines = correction("gnss", {name: value for name, value in factors.items() if value != 1.0}, exchange=exchange)
     causes = (explained.causes if explained else ()) + arrangement.causes
-    return Check(_WHAT, State.IMPOSSIBLE, words, causes, lines)
+    return Check(_WHAT, FitState.IMPOSSIBLE, words, causes, lines)
 
 
 def _vertical(gnss: Places, fit: VelocityFit) -> list[Check]:
@@ -148,4 +148,4 @@ def _vertical(gnss: Places, fit: VelocityFit) -> list[Check]:
     if agreement > 0.0:
         return [fits(_UP, words)]
     lines = correction("gnss", {"vel_u_mps": -1.0})
-    return [Check(_UP, State.IMPOSSIBLE, words, (Cause(MisfitCause.VELOCITY_DOWN),), lines)]
+    return [Check(_UP, FitState.IMPOSSIBLE, words, (KnownCause(MisfitCause.VELOCITY_DOWN),), lines)]

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pipeline.studies.plausibility.causes import explain_lag, leap_seconds
 from pipeline.studies.plausibility.check import (
     VEHICLE_FILE,
-    Cause,
     Check,
-    State,
+    FitState,
+    KnownCause,
     Whose,
     correction,
     fits,
@@ -26,7 +26,7 @@ NAMES = {"odometer": "odometer", "reference": "reference", "balise_reads": "bali
 
 
 @dataclass(frozen=True)
-class Lag:
+class StreamLag:
     """Of one stream against the GNSS [s]: its stamp of a moment minus the GNSS's; `reason`: why it is not known.
 
     `sure`: its noise is far below it, and no part of the run contradicts it. `latency_known`: the vehicle file says
@@ -41,7 +41,7 @@ class Lag:
     latency_known: bool = False
 
 
-def clock_checks(of: Recording, lags: list[Lag], latency_s: float) -> list[Check]:
+def clock_checks(of: Recording, lags: list[StreamLag], latency_s: float) -> list[Check]:
     """One check per stream. What two recorders say against the GNSS is the GNSS's own.
 
     `latency_s`: how late the GNSS is by the vehicle file; only what is beyond is reported.
@@ -50,10 +50,10 @@ def clock_checks(of: Recording, lags: list[Lag], latency_s: float) -> list[Check
     lags = [replace(lag, lag_s=lag.lag_s + latency_s) for lag in lags]
     sure_s = [lag.lag_s for lag in lags if lag.sure]
 
-    def large(lag: Lag) -> bool:
+    def large(lag: StreamLag) -> bool:
         return abs(lag.lag_s) > config.lag_limit_s
 
-    def seconded(lag: Lag) -> bool:
+    def seconded(lag: StreamLag) -> bool:
         """Two recorders that show the same lag are surer than each."""
         return lag.sure or (large(lag) and any(abs(lag.lag_s - other_s) < _SAME_CLOCK_S for other_s in sure_s))
 
@@ -66,7 +66,7 @@ def clock_checks(of: Recording, lags: list[Lag], latency_s: float) -> list[Check
     return [_check(of, lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
 
 
-def _check(of: Recording, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
+def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
     name = NAMES[lag.stream]
     config = of.config
     what = f"clock of the {name} against the GNSS"
@@ -85,17 +85,17 @@ def _check(of: Recording, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
     clock = of_gnss or lag
     explained = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0))
     exact_s = round(clock.lag_s if explained is None else explained.exact, 2)
-    causes = (Cause(MisfitCause.CONSTANT_LAG),) if explained is None else explained.causes
+    causes = (KnownCause(MisfitCause.CONSTANT_LAG),) if explained is None else explained.causes
     rolled_over = any(cause.code is MisfitCause.GPS_WEEK for cause in causes)
     at_gnss = of_gnss is not None or (not known and _rather_gnss(lag.lag_s, rolled_over, of.epoch_ns))
     pair = ("GNSS", name) if at_gnss else (name, "GNSS")
     whose = Whose(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
     if not at_gnss:
-        return Check(what, State.IMPOSSIBLE, found, causes, correction(lag.stream, shift_s=-exact_s), whose=whose)
+        return Check(what, FitState.IMPOSSIBLE, found, causes, correction(lag.stream, shift_s=-exact_s), whose=whose)
     streams = ("gnss",) if of.run.satellites is None else ("gnss", "satellites")
     only = of.solution if len(of.run.solutions()) > 1 else None
     lines = "".join(correction(stream, shift_s=exact_s, solution=only) for stream in streams)
-    return Check(what, State.IMPOSSIBLE, found, causes, lines, whose=whose)
+    return Check(what, FitState.IMPOSSIBLE, found, causes, lines, whose=whose)
 
 
 def _rather_gnss(lag_s: float, rolled_over: bool, t_ns: int) -> bool:
@@ -108,7 +108,7 @@ def _rather_gnss(lag_s: float, rolled_over: bool, t_ns: int) -> bool:
     return rolled_over and lag_s > 0
 
 
-def _small(what: str, found: str, lag: Lag) -> Check:
+def _small(what: str, found: str, lag: StreamLag) -> Check:
     """A lag that a train can have, and that costs availability all the same."""
     latency_s = round(-lag.lag_s, 2)
     if lag.stream == "odometer" and latency_s > 0 and not lag.latency_known:

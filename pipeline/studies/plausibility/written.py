@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.stages.track.geodesy import points_of
 from pipeline.studies.plausibility.causes import COORDINATE_MISTAKES, CoordinateMistake
-from pipeline.studies.plausibility.check import Cause, Check, State, Whose, correction, misfit, not_checked
+from pipeline.studies.plausibility.check import Check, FitState, KnownCause, Whose, correction, misfit, not_checked
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.records import Places
 from schemas.arrays import Floats, floats
@@ -36,9 +36,9 @@ def written_checks(of: Recording) -> list[Check]:
             continue
         if sum(_witnesses(mended).values()) >= sum(recorded.values()):
             return [_mistaken(mistake, words)]
-        causes = (Cause(mistake.code),)
+        causes = (KnownCause(mistake.code),)
         advice = "Mend the columns of the site's track."
-        return [Check(_WHAT, State.IMPOSSIBLE, words, causes, advice=advice, whose=Whose(MisfitPlace.IN_SURVEY))]
+        return [Check(_WHAT, FitState.IMPOSSIBLE, words, causes, advice=advice, whose=Whose(MisfitPlace.IN_SURVEY))]
     advice = "Check that run and site belong together, and axes and datum of both."
     return [misfit(_WHAT, words, MisfitCause.OTHER_PLACE, advice=advice)]
 
@@ -54,15 +54,15 @@ def _without_survey(of: Recording, recorded: dict[str, bool]) -> list[Check]:
         if "odometer" in found and not recorded.get("odometer", False):
             return [_mistaken(mistake, words)]
         # Signs leave the ways as they are: the velocity alone says that they differ.
-        causes = (Cause(mistake.code),)
+        causes = (KnownCause(mistake.code),)
         advice = "A site tells which: name it with --site."
-        return [Check(_WHAT, State.IMPOSSIBLE, words, causes, advice=advice, whose=Whose(MisfitPlace.OR_VELOCITY))]
+        return [Check(_WHAT, FitState.IMPOSSIBLE, words, causes, advice=advice, whose=Whose(MisfitPlace.OR_VELOCITY))]
     return []
 
 
 def _mistaken(mistake: CoordinateMistake, words: str) -> Check:
     advice = "Convert the positions: degrees are the whole part plus the rest times 100/60." if mistake.minutes else ""
-    return Check(_WHAT, State.IMPOSSIBLE, words, (Cause(mistake.code),), _lines("gnss", mistake), advice=advice)
+    return Check(_WHAT, FitState.IMPOSSIBLE, words, (KnownCause(mistake.code),), _lines("gnss", mistake), advice=advice)
 
 
 def _lines(stream: str, mistake: CoordinateMistake) -> str:
@@ -112,5 +112,7 @@ def reference_elsewhere(of: Recording) -> list[Check]:
             advice = "Convert its positions." if mistake.minutes else ""
             whose = Whose(MisfitPlace.IN_REFERENCE)
             lines = _lines("reference", mistake)
-            return [Check(what, State.IMPOSSIBLE, words, (Cause(mistake.code),), lines, advice=advice, whose=whose)]
+            return [
+                Check(what, FitState.IMPOSSIBLE, words, (KnownCause(mistake.code),), lines, advice=advice, whose=whose)
+            ]
     return [not_checked(what, words)]

@@ -84,7 +84,7 @@ def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
 
 
 @dataclass(frozen=True)
-class Solution:
+class SolutionTables:
     """Tables of one solution of a run; `faults` one row per fault; `with_truth`: judged by a reference or reads."""
 
     epochs: pl.DataFrame
@@ -93,7 +93,7 @@ class Solution:
     with_truth: bool
 
 
-def verdict_of_both(alarm: AlarmEpisode, sides: tuple[Solution, Solution], config: HazardConfig) -> Verdict:
+def verdict_of_both(alarm: AlarmEpisode, sides: tuple[SolutionTables, SolutionTables], config: HazardConfig) -> Verdict:
     """True where a solution was wrong, false where both were right all along, unknown where the evidence does not say.
 
     The rule of the `alarms` table (DOMAIN section 5.3), asked of both solutions.
@@ -102,7 +102,7 @@ def verdict_of_both(alarm: AlarmEpisode, sides: tuple[Solution, Solution], confi
     return next(verdict for verdict in (Verdict.TRUE, Verdict.UNKNOWN, Verdict.FALSE) if verdict in found)
 
 
-def _of_side(alarm: AlarmEpisode, side: Solution, config: HazardConfig) -> Verdict:
+def _of_side(alarm: AlarmEpisode, side: SolutionTables, config: HazardConfig) -> Verdict:
     since_ns = alarm.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     part = side.epochs.filter(pl.col("t").to_physical().is_between(since_ns, alarm.end_ns))
     known = part.filter(pl.col("path_m").is_not_null())
@@ -112,7 +112,7 @@ def _of_side(alarm: AlarmEpisode, side: Solution, config: HazardConfig) -> Verdi
     return verdict_within(low_m, high_m, margins_m(sigma_m, config), np.full(known.height, side.with_truth))
 
 
-def _known_wrong(alarm: AlarmEpisode, side: Solution) -> bool:
+def _known_wrong(alarm: AlarmEpisode, side: SolutionTables) -> bool:
     """The replay found a fault at that time, or called an alarm then true."""
     fault = side.faults.select(begin=pl.col("begin").to_physical(), end=pl.col("t_end").to_physical())
     true = side.alarms.filter(pl.col("verdict").cast(pl.String) == Verdict.TRUE.value)

@@ -21,7 +21,9 @@ from schemas.enums import RunStatus
 
 # Shares of the configured value: a half and half as much again; two to five sigma round the usual three.
 _VARIED = {"failure_limit_m": (0.5, 1.5), "evidence_factor": (2.0 / 3.0, 4.0 / 3.0, 5.0 / 3.0)}
-_TABLES, _REPLAYED, _NEEDED = "from tables", "replayed", "needs --logs"
+_TABLES = "from tables"
+_REPLAYED = "replayed"
+_NEEDED = "needs --logs"
 
 Row = dict[str, Any]
 Replay = Callable[[Configuration, str], object]

@@ -17,7 +17,7 @@ from pipeline.stages.epochs.failure_log import FailureLog, failure_log
 from pipeline.stages.monitors.single import channel_monitor, on_path_of, paired
 from pipeline.stages.run_row.independent import independent_episodes
 from pipeline.stages.run_row.run_figures import judged as judged_epoch
-from pipeline.studies.safety.fault_counts import Solution, fault_counts, faults_of_pair, verdict_of_both
+from pipeline.studies.safety.fault_counts import SolutionTables, fault_counts, faults_of_pair, verdict_of_both
 from pipeline.studies.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
 from schemas.arrays import NS_PER_S, Bools
 from schemas.config import Configuration
@@ -39,7 +39,7 @@ EPOCH_COLUMNS = (
 
 
 @dataclass(frozen=True)
-class _Channel:
+class _Diagnosed:
     """Epochs under one kind of diagnosis: its fails, where it worked, and where a truth judged."""
 
     clock: Clock
@@ -88,10 +88,10 @@ def _moving_s(epochs: pl.DataFrame) -> float | None:
 
 def _solution(
     name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame
-) -> Solution:
+) -> SolutionTables:
     own = pl.col("solution") == name
     evidence = runs.filter(own)["evidence"].cast(pl.String).to_list()
-    return Solution(
+    return SolutionTables(
         epochs=epochs.filter(own).sort("t"),
         faults=independent_episodes(hazards.filter(own)),
         alarms=alarms.filter(own),
@@ -99,7 +99,7 @@ def _solution(
     )
 
 
-def _reactive(one: Solution, config: Configuration) -> _Channel:
+def _reactive(one: SolutionTables, config: Configuration) -> _Diagnosed:
     judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
     epochs = one.epochs.drop("moving", "path_m").hstack(_states(one, trusted(config)).drop("t"))
     return _channel(epochs, _DIAGNOSIS, judged, config)
@@ -109,7 +109,7 @@ def _evaluated(monitor: str) -> pl.Expr:
     return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
 
 
-def _composite(first: Solution, second: Solution, config: Configuration) -> Row:
+def _composite(first: SolutionTables, second: SolutionTables, config: Configuration) -> Row:
     """Compared at the epochs of the solution that measures less often."""
     one, other = (first, second) if _period_s(first) >= _period_s(second) else (second, first)
     placed = on_path_of(one.epochs, other.epochs, config.lds).with_columns(fix_valid=pl.col("path_m").is_not_null())
@@ -130,11 +130,11 @@ def _composite(first: Solution, second: Solution, config: Configuration) -> Row:
     return faults | _alarms(channel, verdicts) | _working(channel)
 
 
-def _period_s(one: Solution) -> float:
+def _period_s(one: SolutionTables) -> float:
     return nominal_period_s(position_ns(one.epochs)) or 0.0
 
 
-def _states(one: Solution, position: pl.Expr) -> pl.DataFrame:
+def _states(one: SolutionTables, position: pl.Expr) -> pl.DataFrame:
     """`position` may be relied on, a truth judged it, and judged it wrong."""
     known = judged_epoch() & pl.lit(one.with_truth)
     return one.epochs.select(
@@ -147,7 +147,7 @@ def _states(one: Solution, position: pl.Expr) -> pl.DataFrame:
     )
 
 
-def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, config: Configuration) -> _Channel:
+def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, config: Configuration) -> _Diagnosed:
     """`epochs`: `_states`, with the columns of `monitors` and those that `judged` takes."""
     columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
     fails = failure_log(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
@@ -158,10 +158,10 @@ def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, c
         until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
         working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
     known, wrong, moving = (met(epochs, pl.col(name)) for name in ("known", "wrong", "moving"))
-    return _Channel(clock, fails, working, known, known & wrong, moving)
+    return _Diagnosed(clock, fails, working, known, known & wrong, moving)
 
 
-def _alarms(channel: _Channel, verdicts: list[Verdict]) -> Row:
+def _alarms(channel: _Diagnosed, verdicts: list[Verdict]) -> Row:
     return {
         "alarms": len(verdicts),
         "false_alarms": verdicts.count(Verdict.FALSE),
@@ -170,12 +170,12 @@ def _alarms(channel: _Channel, verdicts: list[Verdict]) -> Row:
     }
 
 
-def _at_risk_s(channel: _Channel) -> float:
+def _at_risk_s(channel: _Diagnosed) -> float:
     """Time in work that a truth judged [s]: what rates count (DOMAIN section 6)."""
     return float(channel.clock.held_s[channel.known & channel.working].sum())
 
 
-def _working(channel: _Channel) -> Row:
+def _working(channel: _Diagnosed) -> Row:
     clock = channel.clock
     held = channel.clock.held_s
     up = uptime(clock.t_ns, channel.working, clock.limit_s)
@@ -188,7 +188,7 @@ def _working(channel: _Channel) -> Row:
     }
 
 
-def _redundant(one: _Channel, other: _Channel) -> Row:
+def _redundant(one: _Diagnosed, other: _Diagnosed) -> Row:
     """Time in which at least one of two reactive channels works; an epoch counts at its own time (LOC eq. 11)."""
     parts = [
         pl.DataFrame({"t_ns": channel.clock.t_ns, "working": channel.working, "moving": channel.moving})

@@ -8,7 +8,9 @@ import polars as pl
 
 from pipeline.stages.run_row.bounds import clopper_pearson, continuity_15s, mtbf, poisson_rate, with_estimates
 
-REACTIVE, COMPOSITE, REDUNDANT = "reactive 1oo1", "composite 2oo2", "reactive 1oo2"
+REACTIVE = "reactive 1oo1"
+COMPOSITE = "composite 2oo2"
+REDUNDANT = "reactive 1oo2"
 
 _KEYS = ("architecture", "solution", "other")
 _WHOLE = (

@@ -15,7 +15,7 @@ from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
 from pipeline.studies.undetected.position_tests import bounded, range_bounds, with_channel
 from pipeline.studies.undetected.spacing import largest_spacing
-from pipeline.studies.undetected.watched import Watched, Window, watched, windows
+from pipeline.studies.undetected.watched import FaultWindow, Watched, watched, windows
 from schemas.arrays import Bools, Floats, Ints, floats, ints, times_ns
 from schemas.config import Configuration, UndetectedConfig, Vehicle
 from schemas.conform import dtypes
@@ -115,7 +115,7 @@ def rows_of(diagnosis: Diagnosis, vehicle: Vehicle, config: Configuration) -> Wa
     return with_channel(rows, diagnosis.epochs, diagnosis.channel, diagnosis.other, config.lds)
 
 
-def _both(rows: Watched, parts: list[Window], config: UndetectedConfig) -> _BothWays:
+def _both(rows: Watched, parts: list[FaultWindow], config: UndetectedConfig) -> _BothWays:
     error = np.full((2, rows.rows), np.nan)
     since_ns = np.full(rows.rows, -1)
     paid = np.zeros((rows.rows, 1 + rows.weight.shape[1]))

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.studies.undetected.splits import Growth, best_shares, growth_of, horizons
-from pipeline.studies.undetected.stretch import Stretch, stretch_after
+from pipeline.studies.undetected.stretch import GrowthStretch, stretch_after
 from pipeline.studies.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import UndetectedConfig
 
-Grow = Callable[[Stretch], Growth]
+Grow = Callable[[GrowthStretch], Growth]
 # How many rows to look back over, and the split of these rows.
 After = list[tuple[int, Floats]]
 

@@ -19,7 +19,7 @@ from schemas.tables import SCALES
 
 
 @dataclass(frozen=True)
-class Profile:
+class FaultProfile:
     """`fault`: `t_s` after the first epoch and `size_m` along growing path; `t`: stamps of where it begins and ends.
 
     `error_m`: its size at the end, as the linear program finds it; `bound_m`: as the tables have it; `step_m` and
@@ -36,7 +36,7 @@ class Profile:
     monitors: tuple[str, ...]
 
 
-def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle, config: Configuration) -> Profile:
+def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle, config: Configuration) -> FaultProfile:
     """The largest unnoticed fault at an epoch, ahead or behind in the direction of travel there."""
     rows = rows_of(diagnosis, vehicle, config)
     t_ns = times_ns(diagnosis.epochs)
@@ -53,7 +53,7 @@ def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle,
     seen = part.mirrored() if against else part
     found = largest_profile(seen, MARGIN)
     names = [name for name, on in zip(SCALES, diagnosis.bank.enabled, strict=True) if on or name == "raw"]
-    return Profile(
+    return FaultProfile(
         fault=pl.DataFrame(
             {"t_s": [window.since_s, *part.t_s[1:]], "size_m": -found.fault_m if against else found.fault_m}
         ),

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.studies.undetected.stretch import Stretch, paid_m
+from pipeline.studies.undetected.stretch import GrowthStretch, paid_m
 from schemas.arrays import Floats, Ints
 
 # Blocks are so much longer than the stretch before them; so much farther on lies the next row with a split of its own.
@@ -50,7 +50,7 @@ class _Blocks(NamedTuple):
         return found
 
 
-def best_shares(stretch: Stretch) -> Floats:
+def best_shares(stretch: GrowthStretch) -> Floats:
     """Shares of raw and averages in each row, shape (rows, 1 + averages), that give the least bound at the last row."""
     from scipy.linalg import block_diag  # most replays solve nothing
     from scipy.optimize import linprog
@@ -80,7 +80,7 @@ def best_shares(stretch: Stretch) -> Floats:
     return shares
 
 
-class _Part(NamedTuple):
+class _MonitorCost(NamedTuple):
     """Of one monitor: what is paid for, over its shares at both ends of the blocks; the cost of each; the start's."""
 
     terms: Floats
@@ -88,15 +88,15 @@ class _Part(NamedTuple):
     linear: Floats
 
 
-def _raw(stretch: Stretch, blocks: _Blocks) -> _Part:
+def _raw(stretch: GrowthStretch, blocks: _Blocks) -> _MonitorCost:
     raw_mps = np.maximum(np.abs(stretch.seen.most_mps), np.abs(stretch.seen.least_mps))
     raw_m = np.add.reduceat(stretch.seen.way_s * _tested(raw_mps), blocks.first)
     single = blocks.first == blocks.last
     cost = np.column_stack([np.where(single, raw_m, 0.5 * raw_m), np.where(single, 0.0, 0.5 * raw_m)]).ravel()
-    return _Part(np.eye(cost.size), cost, np.zeros(cost.size))
+    return _MonitorCost(np.eye(cost.size), cost, np.zeros(cost.size))
 
 
-def _average(stretch: Stretch, blocks: _Blocks, average: int) -> _Part:
+def _average(stretch: GrowthStretch, blocks: _Blocks, average: int) -> _MonitorCost:
     weight = stretch.seen.weight[:, average]
     part = stretch.seen.way_s / weight
     # What a row gives to the average, its row before has to pay for in part; the last row has none after it.
@@ -110,7 +110,7 @@ def _average(stretch: Stretch, blocks: _Blocks, average: int) -> _Part:
     if (free := stretch.start_free_mps[average]) > 0.0:
         terms = np.vstack([terms, start])
         cost = np.append(cost, free)
-    return _Part(terms, cost, linear)
+    return _MonitorCost(terms, cost, linear)
 
 
 def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
@@ -141,12 +141,12 @@ class Growth:
     paid_m: Floats
 
 
-def growth_of(stretch: Stretch) -> Growth:
+def growth_of(stretch: GrowthStretch) -> Growth:
     """The growth that no monitor would have noticed, from above, at every row of a stretch."""
     return growth_with(stretch, splits_of(stretch))
 
 
-def growth_with(stretch: Stretch, splits: Iterable[Floats]) -> Growth:
+def growth_with(stretch: GrowthStretch, splits: Iterable[Floats]) -> Growth:
     """The same with given splits, each of shape (some rows, 1 + averages); any of them bounds the growth."""
     most = np.full(stretch.rows, np.inf)
     monitors = 1 + stretch.seen.weight.shape[1]
@@ -162,7 +162,7 @@ def growth_with(stretch: Stretch, splits: Iterable[Floats]) -> Growth:
     return Growth(most - stretch.recorded_m, paid)
 
 
-def splits_of(stretch: Stretch) -> Iterator[Floats]:
+def splits_of(stretch: GrowthStretch) -> Iterator[Floats]:
     """The best up to rows that lie farther and farther on."""
     for rows in horizons(stretch.rows):
         yield best_shares(stretch.first(rows))

@@ -21,7 +21,7 @@ from schemas.arrays import Floats
 
 
 @dataclass(frozen=True)
-class Stretch:
+class GrowthStretch:
     """`seen`: the rows after a start, to be bounded one by one.
 
     `start_mps` (averages,): the averages at the start; `start_free_mps`: how far they may be from that.
@@ -35,7 +35,7 @@ class Stretch:
     def rows(self) -> int:
         return self.seen.rows
 
-    def first(self, rows: int) -> Stretch:
+    def first(self, rows: int) -> GrowthStretch:
         return replace(self, seen=self.seen.between(0, rows))
 
     @property
@@ -44,18 +44,18 @@ class Stretch:
         return np.cumsum(self.seen.way_s * self.seen.rate_mps)
 
 
-def stretch_after(rows: Watched, start: int, end: int, known: bool) -> Stretch:
+def stretch_after(rows: Watched, start: int, end: int, known: bool) -> GrowthStretch:
     """The rows (start, end]; without `known` the averages at the start are only known to have been silent."""
     averages = rows.average_mps[start]
     silent = rows.threshold_mps[start]
     nothing = np.zeros_like(averages)
     seen = rows.between(start + 1, end + 1)
     if known or rows.fresh[start]:
-        return Stretch(seen, averages, nothing)
-    return Stretch(seen, nothing, silent)
+        return GrowthStretch(seen, averages, nothing)
+    return GrowthStretch(seen, nothing, silent)
 
 
-def paid_m(stretch: Stretch, shares: Floats) -> Floats:
+def paid_m(stretch: GrowthStretch, shares: Floats) -> Floats:
     """What raw (first) and each average pay for the sum of way_s y up to each row; shapes (rows, 1 + averages).
 
     `shares`: of each row, raw first; they add up to one. The sum up to a row ends there: what the last row gives to an

@@ -229,7 +229,7 @@ def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...
     return np.unique(np.concatenate(found))
 
 
-class Window(NamedTuple):
+class FaultWindow(NamedTuple):
     """Rows over which a fault may grow: none at `start`, the last row at or before the fix, and free up to `end`.
 
     `since_ns`: the fix, or the first row where the run begins without one; `since_s`: seconds after the first epoch.
@@ -241,7 +241,7 @@ class Window(NamedTuple):
     since_s: float
 
 
-def windows(rows: Watched, t_ns: Ints, fixes: Ints) -> list[Window]:
+def windows(rows: Watched, t_ns: Ints, fixes: Ints) -> list[FaultWindow]:
     """The windows of a run, in order; `t_ns`: stamps of all epochs."""
     if not rows.rows:
         return []
@@ -251,7 +251,7 @@ def windows(rows: Watched, t_ns: Ints, fixes: Ints) -> list[Window]:
     began = {0: int(stamps[0])} | dict(zip(last[last >= 0].tolist(), fixes[last >= 0].tolist(), strict=True))
     ends = [*sorted(began)[1:], rows.rows - 1]
     return [
-        Window(start, end, began[start], (began[start] - int(t_ns[0])) / NS_PER_S)
+        FaultWindow(start, end, began[start], (began[start] - int(t_ns[0])) / NS_PER_S)
         for start, end in zip(sorted(began), ends, strict=True)
         if end > start
     ]

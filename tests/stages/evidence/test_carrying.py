@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.stages.evidence.carrying import Anchor, between_anchors, closes
+from pipeline.stages.evidence.carrying import TrueAnchor, between_anchors, closes
 from pipeline.stages.evidence.gaps import Gap
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Ints
@@ -18,7 +18,8 @@ from schemas.enums import Evidence
 
 CONFIG = Configuration()
 ANCHORS = tuple(
-    Anchor(t_s * NS_PER_S, (Place(0, 10.0 * t_s),), sigma_m, Evidence.BALISE) for t_s, sigma_m in ((0, 1.0), (10, 2.0))
+    TrueAnchor(t_s * NS_PER_S, (Place(0, 10.0 * t_s),), sigma_m, Evidence.BALISE)
+    for t_s, sigma_m in ((0, 1.0), (10, 2.0))
 )
 AT_4_S = np.array([4 * NS_PER_S])
 

@@ -10,7 +10,7 @@ from pipeline.stages.evidence.anchors import read_anchors
 from pipeline.stages.evidence.chains import chains_between, extended
 from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.network import Network, network_of
-from pipeline.stages.track.path import Place, Route
+from pipeline.stages.track.path import Place, RoutePath
 from pipeline.stages.track.survey import track_of
 from schemas.config import HazardConfig
 
@@ -67,7 +67,7 @@ def test_a_chain_goes_on_over_what_trains_may_run_in_either_sense() -> None:
 
 def test_of_two_visits_the_one_that_holds_the_measure_counts_else_the_nearer() -> None:
     """Element 0 is run over to 50 m, and 500 m later from there on."""
-    route = Route(
+    route = RoutePath(
         element=np.array([0, 0]), forward=np.array([True, True]), entry_m=np.array([0.0, 500.0]),
         low_m=np.array([0.0, 50.0]), high_m=np.array([50.0, 100.0]),
     )  # fmt: skip

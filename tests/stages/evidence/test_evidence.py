@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.evidence import evidence_of
-from pipeline.stages.evidence.carrying import Anchor, Counter
+from pipeline.stages.evidence.carrying import Counter, TrueAnchor
 from pipeline.stages.evidence.evidence import KINDS, _after_standing
 from pipeline.stages.evidence.gaps import Gap, gaps_of
 from pipeline.stages.odometry import Odometry, odometry_of
@@ -25,8 +25,8 @@ def seconds(*t_s: float) -> Ints:
     return np.array([round(t * NS_PER_S) for t in t_s], dtype=np.int64)
 
 
-def anchor(t_s: float, at_m: float) -> Anchor:
-    return Anchor(round(t_s * NS_PER_S), (Place(0, at_m),), 1.0, Kind.REFERENCE)
+def anchor(t_s: float, at_m: float) -> TrueAnchor:
+    return TrueAnchor(round(t_s * NS_PER_S), (Place(0, at_m),), 1.0, Kind.REFERENCE)
 
 
 def counting(at_m: Floats) -> Odometry:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import polars as pl
 
-from pipeline.stages.evidence import Evidence, EvidenceSet, evidence_of
+from pipeline.stages.evidence import EvidenceSet, TrainEvidence, evidence_of
 from pipeline.stages.odometry import odometry_of
 from pipeline.stages.reference import reference_stretches
 from pipeline.stages.track.network import network_in_pieces, site_network
@@ -119,7 +119,7 @@ def known(
     of_reference: pl.DataFrame | None = None,
     of_reads: pl.DataFrame | None = None,
     vehicle: Vehicle = KNOWN,
-) -> Evidence:
+) -> TrainEvidence:
     config = Configuration()
     network = site_network(ground)
     stretches = reference_stretches(of_reference, network_in_pieces(ground), network.track.index, config)

@@ -43,7 +43,7 @@ from pipeline.stages.judge.offers import Offers
 from pipeline.stages.judge.passages import _true_times, _with_failures
 from pipeline.stages.judge.travel import OdometerSteps, beyond_confidence, moving, travel_direction
 from pipeline.stages.judge.true_crossings import TrueCrossing, between_far_epochs, true_crossings
-from pipeline.stages.track.path import Place, Route
+from pipeline.stages.track.path import Place, RoutePath
 from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
 from schemas.enums import Evidence, Hazard, Judgement, Suspect, Verdict
 from tests.stages.judge.frames import NS, course, offers, positions
@@ -155,8 +155,8 @@ def test_errors_across_are_left_of_growing_path_and_upwards() -> None:
 
 def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of() -> None:
     """On element 0 alone up to 98 m at 2 s, from 106 m at 3 s on over element 1, which begins at 100 m."""
-    before = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
-    after = Route(
+    before = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
+    after = RoutePath(
         np.array([0, 1]), np.array([True, True]), np.array([0.0, 100.0]), np.array([0.0, 0.0]), np.array([100.0, 100.0])
     )
     alternatives = tuple(
@@ -178,12 +178,25 @@ def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of()
 def test_a_balise_is_passed_where_the_whole_interval_passes_it(half_m: float, last_m: float, crossings: int) -> None:
     """From 5 m on at 10 m/s past a balise at 100 m; a place known to 5 m passes with its middle."""
     at_m = np.arange(5.0, last_m + 1.0, 10.0)
-    route = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
+    route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
     rows = np.arange(at_m.size)
     evidence = EvidenceSet(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - half_m, at_m + half_m),))
     found = true_crossings(rows * NS, evidence, {"V": Place(0, 100.0)}, Configuration())
     # 95 m at 9 s, 105 m at 10 s; it is far enough beyond only where the run goes on.
     assert found == {"V": [TrueCrossing(round(9.5 * NS), 1, half_m > 5.0)] * crossings}
+
+
+@pytest.mark.parametrize(("turn_m", "passed_s"), [(110.0, []), (150.0, [9.5, 19.5])])
+def test_a_train_that_turns_at_a_balise_has_not_surely_passed_it(turn_m: float, passed_s: list[float]) -> None:
+    """From 5 m on at 10 m/s to a turn beyond a balise at 100 m, and back to 5 m, known to 40 m."""
+    there_m = np.arange(5.0, turn_m, 10.0)
+    at_m = np.concatenate([there_m, there_m[::-1]])
+    rows = np.arange(at_m.size)
+    route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
+    evidence = EvidenceSet(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - 40.0, at_m + 40.0),))
+    found = true_crossings(rows * NS, evidence, {"V": Place(0, 100.0)}, Configuration())
+    assert [crossing.t_ns / NS for crossing in found["V"]] == passed_s
+    assert [crossing.sense for crossing in found["V"]] == [1, -1][: len(passed_s)]
 
 
 @pytest.mark.parametrize(("alarm_s", "onset_s", "standing"), [(3, 3, True), (12, 10, False), (None, 10, False)])
@@ -332,7 +345,7 @@ def placed(path_m: list[float], element: int = 0) -> MatchedPositions:
 
 def test_each_alternative_is_weighed_however_few_instants_it_tells_of() -> None:
     """On element 0 the train is at 50 m; at 2 s it is there or at 90 m, and at 3 s the position is not known."""
-    route = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
+    route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
     told = [Alternative(np.array(rows), route, np.array(low), np.array(low) + 2.0) for rows, low in (
         ([0, 1, 2, 3], [49.0] * 4), ([2], [89.0]), ([3], [89.0]))]  # fmt: skip
     evidence = EvidenceSet(np.full(4, KINDS.index(Evidence.BALISE)), tuple(told))
@@ -493,10 +506,10 @@ def test_what_an_interval_of_errors_says() -> None:
 def test_where_the_evidence_ends_the_position_is_held_to_it_by_its_own_path(onward: list[int], code: int) -> None:
     """The train at 95 to 97 m of element 0, the position 10 m on, on element 1; the evidence may go on elsewhere."""
 
-    def route(elements: list[int]) -> Route:
+    def route(elements: list[int]) -> RoutePath:
         size = len(elements)
         entry_m = 100.0 * np.arange(size)
-        return Route(np.array(elements), np.full(size, True), entry_m, np.zeros(size), np.full(size, 100.0))
+        return RoutePath(np.array(elements), np.full(size, True), entry_m, np.zeros(size), np.full(size, 100.0))
 
     at_m, leg, sure = np.array([110.0]), np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool)
     given = MatchedPositions(np.array([1]), at_m - 100.0, leg, at_m, sure)

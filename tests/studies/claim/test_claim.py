@@ -19,9 +19,9 @@ from pipeline.results import store
 from pipeline.studies.claim import claim, load_profile, read_areas
 from pipeline.studies.claim.claim import claim_table
 from pipeline.studies.claim.front import Front, front_of, speed_errors
-from pipeline.studies.claim.requirements import Ride, requirements, tallies
+from pipeline.studies.claim.requirements import ClaimRide, requirements, tallies
 from pipeline.studies.claim.tally import (
-    Finding,
+    Compliance,
     Tally,
     clusters_s,
     counted,
@@ -77,7 +77,7 @@ def ten() -> Front:
 
 def test_ten_epochs_by_hand() -> None:
     found = ten()
-    limit = Ride("run", found, epochs([]), passages(), PROFILE).limit_m
+    limit = ClaimRide("run", found, epochs([]), passages(), PROFILE).limit_m
     assert limit[:9].tolist() == [30.0] * 5 + [10.0] * 4
     # Kept 1, not known 0, broken -1. Epoch 8 is on the wrong track; of epoch 6 the evidence says nothing.
     assert found.within(limit, np.inf)[:9].tolist() == [1, 1, 1, 1, -1, 1, 0, 1, -1]
@@ -89,7 +89,7 @@ def test_ten_epochs_by_hand() -> None:
 
 
 def test_ten_epochs_as_counts() -> None:
-    found = tallies(Ride("run", ten(), epochs([float(second) for second in range(10)]), passages(), PROFILE))
+    found = tallies(ClaimRide("run", ten(), epochs([float(second) for second in range(10)]), passages(), PROFILE))
     hand = {  # events, seconds, seconds known, worst
         ("mapo_claimed", "mainline"): (0, 5.0, 5.0, 8.0),
         ("mapo", "mainline"): (1, 5.0, 5.0, 31.0),
@@ -170,25 +170,25 @@ def test_limits_that_grow_with_speed() -> None:
 
 def test_what_few_runs_show() -> None:
     # 0.025^(1/78) = 0.95381 and 0.025^(1/79) = 0.95439: seventy-nine runs without exception.
-    assert of_share(Tally(trials=78, kept=78, held_s=7800.0), 0.954).finding is Finding.NOT_SHOWN
-    assert of_share(Tally(trials=79, kept=79), 0.954).finding is Finding.MET
+    assert of_share(Tally(trials=78, kept=78, held_s=7800.0), 0.954).finding is Compliance.NOT_SHOWN
+    assert of_share(Tally(trials=79, kept=79), 0.954).finding is Compliance.MET
     assert trials_needed(0, 70, 1.0 - 0.954) == 9
     # One of them not known counts as broken; ten broken of ten cannot be 95.4 %.
-    assert of_share(Tally(trials=79, kept=78), 0.954).finding is Finding.NOT_SHOWN
-    assert of_share(Tally(trials=10, broken=10), 0.954).finding is Finding.NOT_MET
+    assert of_share(Tally(trials=79, kept=78), 0.954).finding is Compliance.NOT_SHOWN
+    assert of_share(Tally(trials=10, broken=10), 0.954).finding is Compliance.NOT_MET
     # Zero events: 2.9957/T one-sided; 1e-10 /h takes 3.0e10 h.
-    assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 1e-10).finding is Finding.NOT_SHOWN
+    assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 1e-10).finding is Compliance.NOT_SHOWN
     assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 1e-10).needed_h == pytest.approx(2.9957e10, rel=1e-4)
-    assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 3.0).finding is Finding.MET
-    assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 2.99).finding is Finding.NOT_SHOWN
-    assert of_rate(Tally(events=1, possible=1, held_s=3600.0, known_s=3600.0), 1e-10).finding is Finding.NOT_MET
-    assert of_always(Tally(held_s=1e12, known_s=1e12)).finding is Finding.NOT_SHOWN
-    assert of_always(Tally(events=1)).finding is Finding.NOT_MET
+    assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 3.0).finding is Compliance.MET
+    assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 2.99).finding is Compliance.NOT_SHOWN
+    assert of_rate(Tally(events=1, possible=1, held_s=3600.0, known_s=3600.0), 1e-10).finding is Compliance.NOT_MET
+    assert of_always(Tally(held_s=1e12, known_s=1e12)).finding is Compliance.NOT_SHOWN
+    assert of_always(Tally(events=1)).finding is Compliance.NOT_MET
     # Five of five runs lost 60 s of at most an hour: at least 0.478 of the runs, 0.8 % of the time.
     lost = of_availability(Tally(trials=5, broken=5, held_s=9000.0, known_s=8000.0, longest_s=3600.0), 0.99998, 60.0)
-    assert lost.finding is Finding.NOT_MET
+    assert lost.finding is Compliance.NOT_MET
     assert lost.measured.high == pytest.approx(1 - 0.47818 / 60, abs=1e-6)
-    assert of_availability(Tally(trials=999, held_s=1e9, known_s=1e9), 0.99998, 60.0).finding is Finding.NOT_SHOWN
+    assert of_availability(Tally(trials=999, held_s=1e9, known_s=1e9), 0.99998, 60.0).finding is Compliance.NOT_SHOWN
 
 
 def test_exceedances_close_to_each_other_are_one_event() -> None:
@@ -208,11 +208,11 @@ def test_a_gap_of_the_log_is_time_of_which_nobody_knows() -> None:
     for one in requirements(PROFILE):
         if one.key not in (("front_accuracy", "mainline"), ("speed_accuracy", "all")):
             continue
-        total = sum((one.count(Ride(str(run), found, frame, passages(), PROFILE)) for run in range(100)), Tally())
+        total = sum((one.count(ClaimRide(str(run), found, frame, passages(), PROFILE)) for run in range(100)), Tally())
         assert total.trials == 100
         assert 25 <= total.kept <= 55, one.key
         assert (total.broken, total.events, total.possible) == (0, 0, 100)
-        assert of_share(total, 0.954).finding is Finding.NOT_SHOWN
+        assert of_share(total, 0.954).finding is Compliance.NOT_SHOWN
 
 
 def test_a_balise_without_a_first_estimate_is_not_known() -> None:
@@ -222,7 +222,7 @@ def test_a_balise_without_a_first_estimate_is_not_known() -> None:
     balises = passages(3, status="accepted", kind="physical", t_offered=[2 * NS, 8 * NS, 30 * NS])
     found = front_of(frame, balises, RUN, Configuration(), PROFILE.method)
     asked = next(one for one in requirements(PROFILE) if one.key == ("after_balise", "physical"))
-    total = sum((asked.count(Ride(str(run), found, frame, balises, PROFILE)) for run in range(60)), Tally())
+    total = sum((asked.count(ClaimRide(str(run), found, frame, balises, PROFILE)) for run in range(60)), Tally())
     assert (total.trials, total.broken) == (60, 0)
     assert 10 <= total.kept <= 30
 
@@ -253,10 +253,13 @@ def test_weaker_evidence_never_shows_what_stronger_refutes(runs: list[list[tuple
     fault_free = Tally(trials=1, kept=1, held_s=3600.0, known_s=3600.0)
     for shown in (lambda c: of_share(c, 0.6), lambda c: of_rate(c, 8.0), of_always):
         findings = (shown(strong).finding, shown(weak).finding)
-        assert findings not in {(Finding.NOT_MET, Finding.MET), (Finding.MET, Finding.NOT_MET)}
+        assert findings not in {
+            (Compliance.NOT_MET, Compliance.MET),
+            (Compliance.MET, Compliance.NOT_MET),
+        }
         for counts in (strong, weak):
             after = shown(counts + fault_free).finding
-            assert shown(counts).finding is not Finding.MET or after is Finding.MET
+            assert shown(counts).finding is not Compliance.MET or after is Compliance.MET
 
 
 TWO_EPOCHS = front([0.0, 1.0], error_low_m=[0.0, 0.0], error_high_m=[0.0, 0.0])
@@ -342,7 +345,7 @@ def test_the_front_end_decides_on_the_area() -> None:
         error_high_m=0.0,
     )
     found = front_of(frame, passages(), RUN, Configuration(), PROFILE.method, AREAS, ahead_m=30.0)
-    assert Ride("run", found, frame, passages(), PROFILE).limit_m.tolist() == [30.0] * 5 + [10.0] * 5
+    assert ClaimRide("run", found, frame, passages(), PROFILE).limit_m.tolist() == [30.0] * 5 + [10.0] * 5
     assert found.output.all()
     assert found.within(5.0, 5.0).tolist() == [1] * 10
 
@@ -406,7 +409,7 @@ def test_means_of_speed_call_no_accuracy_met() -> None:
         columns = {"speed_mps": speed_mps, "error_low_m": -0.1, "error_high_m": 0.1}
         found = front(seconds, **columns)
         frame, nothing = epochs(seconds), passages()
-        rides = [Ride(f"{number}", found, frame, nothing, PROFILE) for number in range(300)]
+        rides = [ClaimRide(f"{number}", found, frame, nothing, PROFILE) for number in range(300)]
         counts = sum((asked.count(ride) for ride in rides), Tally())
         assert (counts.trials, counts.kept, counts.broken) in ((300, 300, 0), (300, 0, 300))
         assert asked.demand.shown(counts).finding == finding
@@ -418,7 +421,9 @@ def test_after_a_balise_start_and_availability() -> None:
     lost = [50 <= second < 140 for second in seconds]
     frame = epochs(seconds, in_use=[not gone for gone in lost], error_low_m=0.29, error_high_m=0.31, tvb=False)
     balise = passages(1, status="accepted", kind="physical", t_offered=[2 * NS])
-    found = tallies(Ride("run", front_of(frame, balise, RUN, Configuration(), PROFILE.method), frame, balise, PROFILE))
+    found = tallies(
+        ClaimRide("run", front_of(frame, balise, RUN, Configuration(), PROFILE.method), frame, balise, PROFILE)
+    )
     assert found["after_balise", "physical"].broken == 1
     assert found["after_balise", "virtual"].trials == 0
     assert (found["availability", "all"].worst, found["availability", "all"].broken) == (90.0, 1)
@@ -430,7 +435,9 @@ def test_after_a_balise_start_and_availability() -> None:
 def test_a_run_without_epochs_says_nothing() -> None:
     nothing = epochs([], t=[], path_m=[], odometer_m=[])
     found = tallies(
-        Ride("run", front_of(nothing, passages(), RUN, Configuration(), PROFILE.method), nothing, passages(), PROFILE)
+        ClaimRide(
+            "run", front_of(nothing, passages(), RUN, Configuration(), PROFILE.method), nothing, passages(), PROFILE
+        )
     )
     table = claim_table({"primary": found}, PROFILE)
     assert set(table["finding"]) == {"not shown"}

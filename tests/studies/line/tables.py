@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import moved_deg
-from pipeline.studies.line.passes import Ground, passes_of
+from pipeline.studies.line.passes import PieceIndex, passes_of
 from pipeline.studies.line.pieces import Pieces, middles, pieces_of
 from schemas.config import Configuration
 from schemas.conform import dtypes
@@ -139,9 +139,9 @@ def no_passages() -> pl.DataFrame:
     return pl.DataFrame(schema=dtypes(Passages))
 
 
-def ground_of_line(site: Site, criteria: LineCriteria = CRITERIA) -> Ground:
+def ground_of_line(site: Site, criteria: LineCriteria = CRITERIA) -> PieceIndex:
     pieces = pieces_of(site, criteria.piece_m)
-    return Ground.of(site, pieces, middles(site, pieces))
+    return PieceIndex.of(site, pieces, middles(site, pieces))
 
 
 def passes_over(epochs: Sequence[pl.DataFrame], site: Site, criteria: LineCriteria = CRITERIA) -> pl.DataFrame:

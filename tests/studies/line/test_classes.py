@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 
 from pipeline.studies.line.classes import piece_classes
-from pipeline.studies.line.spans import State
+from pipeline.studies.line.spans import SpanState
 from pipeline.studies.trials import distinct, trials_needed
 from schemas.line import LineCriteria
 from schemas.run import Site
@@ -130,7 +130,7 @@ def test_what_the_reference_lost_counts_against_a_piece(site: Site) -> None:
     assert found["loss_high"] == pytest.approx(0.2167, abs=1e-4)
     assert found["loss_low"] == 0.0
     # Where the evidence is of reads they are no trials.
-    unseen = many.with_columns(pl.col("state").replace(int(State.UNKNOWN), int(State.UNSEEN)))
+    unseen = many.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.UNSEEN)))
     assert classes(unseen, site).row(by_predicate=place, named=True)["word"] == "suitable"
 
 

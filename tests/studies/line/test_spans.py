@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 
 from pipeline.results.places import stretches_of, train_path_m
-from pipeline.studies.line.spans import State, spans_of, states_of
+from pipeline.studies.line.spans import SpanState, spans_of, states_of
 from tests.studies.line.tables import CONFIG, SPLIT_M, alarms_of, epochs_of, nowhere
 
 
@@ -36,6 +36,6 @@ def test_over_a_joint_the_way_is_known_and_a_track_beside_it_is_not() -> None:
         found = spans(epochs.with_columns(**both).with_columns(true_netelement_ids=set_to))
         return found.filter(pl.col("to_m") - pl.col("from_m") > 30.0)
 
-    assert way(["A", "B"])["state"].to_list() == [int(State.RIGHT)]
+    assert way(["A", "B"])["state"].to_list() == [int(SpanState.RIGHT)]
     assert way(["A", "B"])["elements"].to_list() == [["A", "B"]]
-    assert way(["A", "P"])["state"].to_list() == [int(State.UNKNOWN)]
+    assert way(["A", "P"])["state"].to_list() == [int(SpanState.UNKNOWN)]

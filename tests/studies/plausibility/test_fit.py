@@ -19,7 +19,7 @@ from pipeline.read.ingest.correct import corrected
 from pipeline.stages.clean.clean import clean
 from pipeline.studies.calibration.calibrate import calibrate
 from pipeline.studies.plausibility.causes import explain_factor, explain_lag
-from pipeline.studies.plausibility.check import CONFIGURATION, Cause, State, Whose
+from pipeline.studies.plausibility.check import CONFIGURATION, FitState, KnownCause, Whose
 from pipeline.studies.plausibility.fit import Fit, fit_run, lines_of
 from pipeline.studies.plausibility.report import fit_report
 from schemas.config import Configuration, IngestConfig, PlausibilityConfig, Vehicle, settings_from
@@ -86,8 +86,8 @@ def test_a_run_at_constant_speed_tells_no_clock() -> None:
         check.what: (check.state, check.found)
         for check in fit_run(run, "primary", Vehicle(), PlausibilityConfig()).checks
     }
-    assert states["clock of the odometer against the GNSS"] == (State.NOT_CHECKED, "the speed changes too little")
-    assert states["odometer distance against the positions"][0] is State.FITS
+    assert states["clock of the odometer against the GNSS"] == (FitState.NOT_CHECKED, "the speed changes too little")
+    assert states["odometer distance against the positions"][0] is FitState.FITS
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_leap_seconds_are_those_of_the_day() -> None:
 def test_causes_of_factors(factor: float, speed: bool, cause: str) -> None:
     explained = explain_factor(factor, speed)
     assert explained is not None
-    assert explained.causes == (Cause(MisfitCause.UNIT, (cause,)),)
+    assert explained.causes == (KnownCause(MisfitCause.UNIT, (cause,)),)
 
 
 @pytest.mark.parametrize("factor", [1.03, 0.95, 1.3, 2.6])
@@ -213,7 +213,7 @@ def test_a_survey_with_exchanged_axes_is_not_taken_for_the_positions_fault(trips
     track = trips[0].site.track
     turned = track.with_columns(pl.col(one).alias(other) for one, other in (_AXES, _AXES[::-1]))
     (check,) = _fit(trips[0].run, replace(trips[0].site, track=turned)).misfits
-    assert (check.causes, check.whose) == ((Cause(MisfitCause.AXES_EXCHANGED),), Whose(MisfitPlace.IN_SURVEY))
+    assert (check.causes, check.whose) == ((KnownCause(MisfitCause.AXES_EXCHANGED),), Whose(MisfitPlace.IN_SURVEY))
     assert not check.lines
 
 
@@ -271,5 +271,5 @@ def test_two_counters_under_one_name_are_reported(trips: list[Trip]) -> None:
     assert run.odometer is not None
     second = pl.when(pl.int_range(pl.len()) % 2 == 1).then(pl.col("distance_m") + 500.0).otherwise("distance_m")
     found = _fit(run.with_streams(odometer=run.odometer.with_columns(distance_m=second)), trips[0].site)
-    (check,) = [check for check in found.misfits if Cause(MisfitCause.TWO_COUNTERS) in check.causes]
+    (check,) = [check for check in found.misfits if KnownCause(MisfitCause.TWO_COUNTERS) in check.causes]
     assert "leap to and fro by about 5" in check.found
