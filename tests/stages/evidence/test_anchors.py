@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.stages.evidence.anchors import Sided, known_stretch, reference_lag, sided
-from pipeline.stages.evidence.carrying import Anchor, Counter
-from pipeline.stages.evidence.clock import Clock, Lag
+from pipeline.stages.evidence.carrying import Counter, TrueAnchor
+from pipeline.stages.evidence.clock import RecorderClock, RecorderLag
 from pipeline.stages.odometry import odometry_of
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place, Route
@@ -19,7 +19,7 @@ from schemas.enums import Evidence
 from tests.stages.matching.builders import odometer
 
 CONFIG = Configuration()
-SURE = Clock(Lag(0.0, 0.0), 0.0, 0.0, assumed=False)
+SURE = RecorderClock(RecorderLag(0.0, 0.0), 0.0, 0.0, assumed=False)
 
 
 def ns(t_s: Floats) -> Ints:
@@ -73,7 +73,7 @@ def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     cut = late.t_ns <= 60 * NS_PER_S
     path = replace(late.paths[0], leg=late.paths[0].leg[cut], at_m=late.paths[0].at_m[cut])
     few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (path,))
-    assert reference_lag([Sided(few, 1, 1.0, 0.0)], counted) == Lag()
+    assert reference_lag([Sided(few, 1, 1.0, 0.0)], counted) == RecorderLag()
 
 
 def test_a_clock_counts_by_the_greatest_speed_that_it_leaves_possible() -> None:
@@ -98,7 +98,7 @@ def test_a_step_is_open_until_a_read_confirms_where_the_reference_is(
     counted = counter(10.0 * t_s, 2.0)
     step_m = np.where(t_s >= 9.0, 30.0, 0.0)
     ahead = step_m[-1] if read_s > 9.0 else 0.0
-    read = Anchor(round(read_s * NS_PER_S), (Place(4, read_m + ahead),), 1.0, Evidence.BALISE)
+    read = TrueAnchor(round(read_s * NS_PER_S), (Place(4, read_m + ahead),), 1.0, Evidence.BALISE)
     found = known_stretch(Sided(stretch(t_s, 10.0 * t_s + step_m), 1, 1.0, 0.0), SURE, [counted], [read], 0.0, CONFIG)
     (path,) = found.paths
     assert np.flatnonzero(path.step_m).tolist() == [17]
