@@ -12,7 +12,7 @@ from pipeline.stages.evidence.carrying import Counter, TrueAnchor
 from pipeline.stages.evidence.clock import RecorderClock, RecorderLag
 from pipeline.stages.odometry import odometry_of
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
-from pipeline.stages.track.path import Place, Route
+from pipeline.stages.track.path import Place, RoutePath
 from schemas.arrays import NS_PER_S, Floats, Ints
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Evidence
@@ -28,7 +28,7 @@ def ns(t_s: Floats) -> Ints:
 
 def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch:
     """Samples to 0.1 m along element 4, which is 10 km long and entered at 0 m."""
-    route = Route(np.array([4]), np.array([forward]), np.zeros(1), np.zeros(1), np.array([10_000.0]))
+    route = RoutePath(np.array([4]), np.array([forward]), np.zeros(1), np.zeros(1), np.array([10_000.0]))
     path = ReferencePath(np.zeros(t_s.size, dtype=np.int64), at_m, (route,))
     return ReferenceStretch(ns(t_s), np.full(t_s.size, 0.1), (path,))
 
