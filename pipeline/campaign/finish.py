@@ -29,11 +29,11 @@ def write_campaign(out: Address, config: Configuration, made: Collection[str] = 
     manifest.write_manifest(out, made)
 
 
-def campaign_files(found: Mapping[str, pl.DataFrame], config: Configuration, key: str) -> Iterator[tuple[str, bytes]]:
+def campaign_files(tables: Mapping[str, pl.DataFrame], config: Configuration, key: str) -> Iterator[tuple[str, bytes]]:
     """Name and content of each of these tables, from the small tables of all runs."""
-    tables = derived_tables(found["runs"], found["hazards"], found["passages"], found["alarms"], config)
+    derived = derived_tables(tables["runs"], tables["hazards"], tables["passages"], tables["alarms"], config)
     made = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config), _MADE_FROM: key}
-    for name, table in tables.items():
+    for name, table in derived.items():
         yield f"campaign/{name}.parquet", store.parquet_bytes(table, {"table": f"campaign/{name}", **made})
 
 

@@ -147,11 +147,11 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
         for address in _expand(name):
             run_id = stem_of(address)
             _check_name(run_id, address)
-            other = addresses.setdefault(run_id, storage.absolute(address))
-            if other != storage.absolute(address):
+            first = addresses.setdefault(run_id, storage.absolute(address))
+            if first != storage.absolute(address):
                 raise UsageError(
                     f"and {redacted(str(address))} have the same run id {run_id!r}",
-                    place=redacted(other),
+                    place=redacted(first),
                     remedy="Rename one of them: results are stored by run id.",
                 )
     return dict(sorted(addresses.items()))

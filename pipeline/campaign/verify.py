@@ -91,9 +91,9 @@ def _of_runs(out: Address, runs: Sequence[str], there: dict[str, Any], named: di
     contents = _tables(out, runs)
     of_run = {run: metadata.get("run_id", "") for run, metadata in store.completed_runs(out, runs).items()}
     for run in runs:
-        found = _parts(there[run]) | contents[run]
+        present = _parts(there[run]) | contents[run]
         expected = _parts(named[run]) | named[run]["tables"]
-        yield from _differences(f"run {run}, ", found, expected)
+        yield from _differences(f"run {run}, ", present, expected)
         yield from _differences(f"marker of run {run}, ", there[run]["tables"], named[run]["tables"])
         if of_run[run] != run:
             yield f"tables of run {run}", f"of run {of_run[run] or 'nobody'}", run
@@ -248,17 +248,17 @@ def _settings(config_digest: str, manifest: Manifest) -> str:
     """The settings files that gave this digest, as options of the command."""
     for entry in manifest["settings"].get(config_digest, []):
         named = {"--config": entry["configuration"], "--vehicle": entry["vehicle"]}
-        given = [f"{option} {file['name']}" for option, file in named.items() if file]
-        return " ".join(given) or "no files"
+        options = [f"{option} {file['name']}" for option, file in named.items() if file]
+        return " ".join(options) or "no files"
     return _short(config_digest)
 
 
-def _differences(what: str, found: Mapping[str, str | None], expected: Mapping[str, str | None]) -> list[Problem]:
-    names = dict.fromkeys([*expected, *found])
+def _differences(what: str, present: Mapping[str, str | None], expected: Mapping[str, str | None]) -> list[Problem]:
+    names = dict.fromkeys([*expected, *present])
     return [
-        (f"{what}{name}", _short(found.get(name)), _short(expected.get(name)))
+        (f"{what}{name}", _short(present.get(name)), _short(expected.get(name)))
         for name in names
-        if (found.get(name) or "") != (expected.get(name) or "")
+        if (present.get(name) or "") != (expected.get(name) or "")
     ]
 
 

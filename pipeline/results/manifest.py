@@ -76,8 +76,8 @@ class _Form(_Strict):
 
 def settings_files(configuration: Path | None = None, vehicle: Path | None = None) -> SettingsFiles:
     """The files as they were given."""
-    given = {"configuration": configuration, "vehicle": vehicle}
-    return {name: None if path is None else _file(storage.file_digests(path)[0]) for name, path in given.items()}
+    paths = {"configuration": configuration, "vehicle": vehicle}
+    return {name: None if path is None else _file(storage.file_digests(path)[0]) for name, path in paths.items()}
 
 
 def listing(listed: Iterable[tuple[str, int, str]]) -> str:
@@ -85,12 +85,12 @@ def listing(listed: Iterable[tuple[str, int, str]]) -> str:
     return json.dumps([list(file) for file in listed])
 
 
-def note_settings(out: Address, config_digest: str, given: SettingsFiles) -> None:
+def note_settings(out: Address, config_digest: str, settings: SettingsFiles) -> None:
     """Keep the names of this call's settings files, before any run is made with them."""
     manifest = earlier(out)
     known = manifest["settings"].setdefault(config_digest, [])
-    if given not in known:
-        known.append(given)
+    if settings not in known:
+        known.append(settings)
         _write(out, manifest)
 
 
