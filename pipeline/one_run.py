@@ -106,11 +106,11 @@ def _replay_solution(prepared: PreparedRun, solution: str, placed: _Placed, evid
 
 def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence) -> Case:
     """The solution before the judge."""
-    taken = ride.solution
+    replayed = ride.solution
     run = ride.prepared.run
-    epochs = pl.concat([taken.epochs, unnoticed.epochs], how="horizontal")
+    epochs = pl.concat([replayed.epochs, unnoticed.epochs], how="horizontal")
     return Case(
-        solution=replace(taken, epochs=epochs, passages=taken.passages.with_columns(unnoticed.passages)),
+        solution=replace(replayed, epochs=epochs, passages=replayed.passages.with_columns(unnoticed.passages)),
         evidence=evidence,
         odometry=ride.odometry,
         vehicle=ride.prepared.vehicle,

@@ -141,10 +141,10 @@ def _refuse_shared_names(body: str, separator: str) -> None:
 
 
 def with_points(log: LogTable) -> pl.DataFrame:
-    """The table with its numbers as such: those with a decimal comma where no number of the file has a decimal point,
-    and those with separated thousands.
+    """The table with numbers written another way made numbers: decimal commas, separated thousands.
 
-    Between commas, 1,234 in quotes may be a fraction or a thousand and more: such a file must have other numbers too.
+    Decimal commas only where no number of the file has a decimal point. In a file separated by commas "1,234" may be a
+    fraction or a thousand and more: unless another number decides, the table stays as it is.
     """
     texts = log.table.select(pl.col(pl.String).replace("", None))
     fitting = {mark: _numbers(texts, mark) for mark in _MARKS}

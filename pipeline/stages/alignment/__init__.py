@@ -2,4 +2,6 @@
 
 In: positions of one solution, the odometer, vehicle file, configuration. Out: `schemas.stages.Aligned`.
 Touches no file. Causal: at an epoch only earlier epochs count. For thresholds only: nothing that judges asks here.
+
+`align` makes the columns. Scale and latency in use: `learning`, held under alarm, by the filter of `odometer_filter`.
 """

@@ -2,4 +2,7 @@
 
 In: times of epochs, flags on them, values of monitors. Out: shares of time, outages, verdicts, the failure log.
 Touches no file and knows no other room of the pipeline.
+
+How long, and under which condition: `clock`. Value, threshold, state and reason of a monitor: `verdicts`. First fails
+and alarm episodes: `failure_log`.
 """

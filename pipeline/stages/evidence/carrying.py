@@ -162,10 +162,11 @@ def carried_forward(
         rows = np.flatnonzero(last >= 0)
         since_vb = used[last[rows]]
         interval = _since_accepted(counter, accepted_ns[since_vb], path_m[since_vb], t_ns[rows], config)
-        void = np.zeros(rows.size, dtype=np.bool_)
+        # A stand between balise and instant: the wheel may have stood while the train ran.
+        over_stand = np.zeros(rows.size, dtype=np.bool_)
         for begin_ns, end_ns in stood:
-            void |= (t_ns[rows] >= begin_ns) & (accepted_ns[since_vb] <= end_ns)
-        low[rows], high[rows] = (np.where(void, np.nan, values) for values in interval)
+            over_stand |= (t_ns[rows] >= begin_ns) & (accepted_ns[since_vb] <= end_ns)
+        low[rows], high[rows] = (np.where(over_stand, np.nan, values) for values in interval)
     return low, high
 
 

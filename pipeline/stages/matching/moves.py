@@ -25,7 +25,7 @@ class StepDistances:
     polarity: Ints
 
     def along(self, steps: Ints, oriented: Ints) -> MoveDistances:
-        """Of some steps, along the oriented element that each of them begins on."""
+        """The distances of some steps, signed along the oriented element on which each begins, if the sign is known."""
         polarity = self.polarity[oriented]
         signed = self.measured[steps] & (polarity != 0)
         return MoveDistances(np.where(signed, polarity, 1) * self.distance_m[steps], signed, self.limit_m[steps])

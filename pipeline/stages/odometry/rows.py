@@ -31,10 +31,11 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
     leap = leaps(t_s, distance_m, config)
     recorded = np.where(leap, np.nan, np.diff(distance_m))
     driven = _trusted(_driven(t_s, speed_mps), recorded, leap, config)
-    step = np.where(np.isnan(recorded), driven, recorded)
-    unknown = np.isnan(step)
+    way_m = np.where(np.isnan(recorded), driven, recorded)
+    unknown = np.isnan(way_m)
     if not unknown.any():
-        return Ways(step, ~np.isnan(recorded))
+        return Ways(way_m, ~np.isnan(recorded))
+    # Rows by turns: fill the gaps of either column between its own rows, then decide again.
     carried_m = _carried(t_s, distance_m, limit_s)
     leap = leaps(t_s, carried_m, config) | _resets(t_s, distance_m, config)
     recorded = np.where(unknown & ~leap, np.diff(carried_m), recorded)

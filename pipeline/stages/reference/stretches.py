@@ -221,7 +221,7 @@ def _connected(parts: list[_PassableSteps]) -> list[_PassableSteps]:
 
 
 def _inside(feet: Sequence[Foot], network: Network) -> dict[int, float]:
-    """Net elements and measures of one sample, without those that it lies beyond the end of and on the next one."""
+    """Net elements of one sample with its measure on each, without those past whose end it is nearer to the next."""
     distances = {foot.element: foot.distance_m for foot in feet}
 
     def beyond(foot: Foot) -> bool:

@@ -64,7 +64,8 @@ def estimate_run(
 ) -> RunEstimate | None:
     """Scale and latency of one run, none where too little of it can be compared.
 
-    `odometry` must grow with the path. Solved by Gauss-Newton steps from `latency_s`.
+    `odometry` must grow with the path. Generalised least squares, linear in the scale; in the latency by Gauss-Newton
+    steps from `latency_s`. A misfit above 1 widens the sigmas.
     """
     blocks = _blocks(seen, odometry, config)
     if not blocks:
@@ -153,9 +154,9 @@ def _of_rows(odometry: Odometry, one_s: Floats, other_s: Floats) -> Floats:
 def _accumulate(
     blocks: list[Observations], factors: list[Floats], odometry: Odometry, latency_s: float
 ) -> tuple[Floats, Floats, float, int]:
-    """Normal equations of `scale_and_lag`, offsets eliminated; the chi-square that they leave, and its freedom.
+    """Normal equations of `scale_and_lag` over all blocks; the chi-square of the residuals, and its degrees of freedom.
 
-    `factors`: of the covariance of each block, by Cholesky.
+    Each block has an offset of its own, which is eliminated. `factors`: Cholesky factors of the blocks' covariances.
     """
     normal = np.zeros((2, 2))
     right = np.zeros(2)
@@ -164,6 +165,7 @@ def _accumulate(
     for block, factor in zip(blocks, factors, strict=True):
         way_m, speed_mps = odometry.reading_at_s(block.t_s - latency_s)
         columns = [np.ones(way_m.size), way_m - way_m[0], -speed_mps, block.path_m - block.path_m[0]]
+        # Whitened by the factor; what is left after projection on the whitened offset does not depend on it.
         white = solve_triangular(factor, np.column_stack(columns), lower=True)
         offset = white[:, 0] / np.linalg.norm(white[:, 0])
         free = white[:, 1:] - np.outer(offset, offset @ white[:, 1:])

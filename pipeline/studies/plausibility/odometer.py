@@ -69,10 +69,11 @@ def odometer_checks(of: Recording, reference: StreamLag | None) -> tuple[list[Ch
     scale = _scale_check(pair, of)
     latency = _latency_check(pair, reference, of)
     if scale is not None and scale.state in (FitState.MISFIT, FitState.IMPOSSIBLE):
-        # Where there is a reference it has to contradict the file too: else it is the positions that drift.
+        # The scale by the reference, if there is one, decides: where that fits the file, the positions drift.
         referenced = by_reference()
-        beside = None if referenced is None else _scale_check(referenced, of, _unit(pair, config))
-        scale = fits(scale.what, scale.found) if beside is not None and beside.state is FitState.FITS else scale
+        second_check = None if referenced is None else _scale_check(referenced, of, _unit(pair, config))
+        if second_check is not None and second_check.state is FitState.FITS:
+            scale = fits(scale.what, scale.found)
     checks += [check for check in (scale, latency) if check is not None]
     if latency is not None and latency.state is FitState.MISFIT:
         return checks, [StreamLag("odometer", reason="the latency of the vehicle file does not fit")]

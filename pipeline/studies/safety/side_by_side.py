@@ -100,6 +100,7 @@ def _solution(
 
 
 def _reactive(solution: SolutionTables, config: Configuration) -> _Diagnosed:
+    """One solution under all monitors but the comparison (1oo1); diagnosed where a monitor along has a verdict."""
     judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
     epochs = solution.epochs.drop("moving", "path_m").hstack(_states(solution, trusted(config)).drop("t"))
     return _channel(epochs, _DIAGNOSIS, judged, config)

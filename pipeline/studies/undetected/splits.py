@@ -147,18 +147,21 @@ def growth_of(stretch: GrowthStretch) -> Growth:
 
 
 def growth_with(stretch: GrowthStretch, splits: Iterable[Floats]) -> Growth:
-    """The same with given splits, each of shape (some rows, 1 + averages); any of them bounds the growth."""
+    """The least bound of the growth per row, over these splits, each of shape (some rows, 1 + averages).
+
+    A split shares the fault out among the monitors: any bounds the growth, also one for the first rows only.
+    """
     most = np.full(stretch.rows, np.inf)
     monitors = 1 + stretch.seen.weight.shape[1]
     paid = np.zeros((stretch.rows, monitors))
-    # All to one monitor, and the splits.
-    for shares in (*(np.tile(alone, (stretch.rows, 1)) for alone in np.eye(monitors)), *splits):
+    to_one_monitor = (np.tile(alone, (stretch.rows, 1)) for alone in np.eye(monitors))
+    for shares in (*to_one_monitor, *splits):
         part = stretch.first(len(shares))
-        bills = paid_m(part, shares[: part.rows])
-        total = bills.sum(axis=1)
-        better = np.flatnonzero(total < most[: total.size])
-        most[better] = total[better]
-        paid[better] = bills[better]
+        by_monitor_m = paid_m(part, shares[: part.rows])
+        total_m = by_monitor_m.sum(axis=1)
+        better = np.flatnonzero(total_m < most[: total_m.size])
+        most[better] = total_m[better]
+        paid[better] = by_monitor_m[better]
     return Growth(most - stretch.recorded_m, paid)
 
 
