@@ -59,8 +59,9 @@ def calibrated(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
         if names not in made:
             _require_enough(job, others, refused)
             made[names] = _calibrated(job, others)
-        given = made[names]
-        finished.append(replace(job, config=given.config, vehicle=given.vehicle, config_digest=given.config_digest))
+        calibration = made[names]
+        digest = calibration.config_digest
+        finished.append(replace(job, config=calibration.config, vehicle=calibration.vehicle, config_digest=digest))
     whole = plan if len(made) != 1 else replace(plan, config=finished[0].config, vehicle=finished[0].vehicle)
     return replace(whole, jobs=tuple(finished))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 import polars as pl
 
@@ -20,20 +20,20 @@ from schemas.version import SOFTWARE
 _MADE_FROM = "made_from"
 
 
-def write_campaign(out: Address, config: Configuration) -> None:
-    """Derive the tables of `OUT/campaign/` from all complete runs of the result, and write its manifest."""
+def write_campaign(out: Address, config: Configuration, made: Collection[str] = ()) -> None:
+    """Derive the tables of `OUT/campaign/` from all complete runs, write the manifest; `made`: runs replayed now."""
     key = campaign_key(out, config)
     if not _is_current(out, key):
         for name, content in campaign_files(catalogue.gather(out), config, key):
             storage.write_bytes(join(out, name), content)
-    manifest.write_manifest(out)
+    manifest.write_manifest(out, made)
 
 
-def campaign_files(found: Mapping[str, pl.DataFrame], config: Configuration, key: str) -> Iterator[tuple[str, bytes]]:
+def campaign_files(tables: Mapping[str, pl.DataFrame], config: Configuration, key: str) -> Iterator[tuple[str, bytes]]:
     """Name and content of each of these tables, from the small tables of all runs."""
-    tables = derived_tables(found["runs"], found["hazards"], found["passages"], found["alarms"], config)
+    derived = derived_tables(tables["runs"], tables["hazards"], tables["passages"], tables["alarms"], config)
     made = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config), _MADE_FROM: key}
-    for name, table in tables.items():
+    for name, table in derived.items():
         yield f"campaign/{name}.parquet", store.parquet_bytes(table, {"table": f"campaign/{name}", **made})
 
 

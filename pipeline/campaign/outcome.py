@@ -90,14 +90,16 @@ def worst(runs: pl.DataFrame) -> RunStatus:
     return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in statuses), RunStatus.OK)
 
 
-def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame) -> RunOutcome:
-    """The outcome that a run's own tables show."""
+def outcome_of(
+    run_id: str, log: str, low: float, runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame
+) -> RunOutcome:
+    """The outcome that a run's own tables show; below `low` availability it says what the moving time was lost to."""
     errors = runs["error"].drop_nulls().to_list()
     judged = known_counts(runs).drop_nulls("missed_detections")
     *counts, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
     verdict = worst_verdict(runs["verdict"].to_list())
     return RunOutcome(
-        run_id=job.run_id,
+        run_id=run_id,
         status=worst(runs),
         error=errors[0] if errors else None,
         verdict=verdict,
@@ -105,8 +107,8 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame, passages:
         missed_detections=missed if judged.height else None,
         why=_why(runs, verdict),
         faults=tuple(hazard_words(hazards, passages)),
-        log=redacted(job.address),
-        **_beside(runs, verdict, job.config.advice.low_availability),
+        log=redacted(log),
+        **_beside(runs, verdict, low),
     )
 
 

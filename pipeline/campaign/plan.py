@@ -11,7 +11,7 @@ from pathlib import Path
 from pipeline import storage
 from pipeline.read.site.read import read_site, refuse_unrelated
 from pipeline.results import store
-from pipeline.results.manifest import SettingsFiles, listing, settings_files
+from pipeline.results.manifest import SettingsFiles, listing, settings_files, unaltered
 from pipeline.results.software import software_digest
 from pipeline.storage import files
 from pipeline.storage.address import Address, check_public, is_url, join, name_of, redacted, stem_of
@@ -120,9 +120,12 @@ def _with_routes(job: RunJob, routes: Address | None, write_routes: Address | No
 
 
 def with_previous(plan: Plan, known: Collection[str] = ()) -> Plan:
-    """What is left to do of a plan without the known runs: its jobs with what earlier campaigns completed."""
+    """What is left to do of a plan without the known runs: its jobs with what earlier campaigns completed.
+
+    A run whose marker is not the one that its campaign wrote is not complete.
+    """
     left = [job for job in plan.jobs if job.run_id not in known]
-    complete = store.completed_runs(plan.out, [job.run_id for job in left])
+    complete = unaltered(plan.out, [job.run_id for job in left])
     return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in left))
 
 
@@ -144,11 +147,11 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
         for address in _expand(name):
             run_id = stem_of(address)
             _check_name(run_id, address)
-            other = addresses.setdefault(run_id, storage.absolute(address))
-            if other != storage.absolute(address):
+            first = addresses.setdefault(run_id, storage.absolute(address))
+            if first != storage.absolute(address):
                 raise UsageError(
                     f"and {redacted(str(address))} have the same run id {run_id!r}",
-                    place=redacted(other),
+                    place=redacted(first),
                     remedy="Rename one of them: results are stored by run id.",
                 )
     return dict(sorted(addresses.items()))

@@ -108,8 +108,9 @@ def _finish(plan: Plan, loop: CampaignLoop, summary: CampaignSummary) -> None:
     """The tables over all runs; they too are given up when somebody asks to stop."""
     from pipeline.campaign.finish import write_campaign  # statistics, which take long to load
 
+    made = [outcome.run_id for outcome in summary.outcomes if not outcome.skipped]
     with listening(loop.stop, at_once=True):
         try:
-            write_campaign(plan.out, plan.config)
+            write_campaign(plan.out, plan.config, made)
         except Interrupted as interrupted:
             raise Interrupted(interrupted.signum, summary) from None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,20 +14,28 @@ import polars as pl
 from pipeline import storage
 from pipeline.campaign import lock, resume
 from pipeline.campaign.finish import campaign_files, campaign_key
+from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
 from pipeline.results import catalogue, store
-from pipeline.results.figures.head import word_of, worst_verdict
+from pipeline.results.figures.head import word_of
 from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest, sha256
+from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
 from pipeline.storage.address import Address, join, redacted
 from schemas.config import Configuration, Vehicle, digest_of
+from schemas.enums import RunStatus
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
 Progress = Callable[[int, int], None]
 Problem = tuple[str, str, str]
 _RUNS_AT_ONCE = 50
+# Of the outcome of a run, what its tables say.
+_OF_TABLES = (
+    *("status", "error", "verdict", "hazards", "missed_detections", "why", "faults", "balises_accepted"),
+    *("balises_on_path", "availability", "proof_margin_m", "held_s", "remedies", "lost"),
+)
 _COLUMNS = ("what", "found", "expected")
 # What a campaign leaves beside the files that the manifest names.
 _OWN_FILES = (NAME, lock.NAME, lock.HELD, "replay.log")
@@ -79,11 +89,14 @@ def verify(out: Address, progress: Progress | None = None) -> Verification:
 def _of_runs(out: Address, runs: Sequence[str], there: dict[str, Any], named: dict[str, Any]) -> Iterator[Problem]:
     """Provenance and tables of some runs; and of tables that agree with the manifest, what the marker says of them."""
     contents = _tables(out, runs)
+    of_run = {run: metadata.get("run_id", "") for run, metadata in store.completed_runs(out, runs).items()}
     for run in runs:
-        found = _parts(there[run]) | contents[run]
+        present = _parts(there[run]) | contents[run]
         expected = _parts(named[run]) | named[run]["tables"]
-        yield from _differences(f"run {run}, ", found, expected)
+        yield from _differences(f"run {run}, ", present, expected)
         yield from _differences(f"marker of run {run}, ", there[run]["tables"], named[run]["tables"])
+        if of_run[run] != run:
+            yield f"tables of run {run}", f"of run {of_run[run] or 'nobody'}", run
 
 
 def recompute(
@@ -189,18 +202,17 @@ def _made_again(out: Address, software: set[str]) -> list[Problem]:
 
     The campaign's tables can be made again by the build that made them, with the configuration that lies there.
     """
-    try:
-        tables = {table: store.read_table(out, table).collect() for table in catalogue.CATALOGUED}
-    except UsageError:
-        return []  # written by another build of the program, which alone can read them
-    copies = {table: catalogue.fresh(out, table) for table in tables}
-    stale = [table for table, copy in copies.items() if copy is not None and not copy.equals(tables[table])]
+    tables: dict[str, pl.DataFrame] = {}
+    for table in catalogue.CATALOGUED:
+        # What another build of the program wrote only that build can read; it has no copy here.
+        with contextlib.suppress(UsageError):
+            tables[table] = store.read_table(out, table).collect()
+    copies = {table: catalogue.fresh(out, table) for table in catalogue.CATALOGUED}
+    stale = [t for t, copy in copies.items() if copy is not None and not (t in tables and copy.equals(tables[t]))]
     problems = [(f"{catalogue.FOLDER}/{table}", "other rows", "those of the runs' tables") for table in stale]
-    verdicts = tables["runs"].group_by("run_id").agg(pl.col("verdict").cast(pl.String)).rows()
-    worst = {run: worst_verdict(words) for run, words in verdicts}
-    for run, outcome in resume.kept(str(out)).items():
-        if outcome.verdict != worst.get(run, outcome.verdict):
-            problems.append((f"{catalogue.FOLDER}/complete, {run}", word_of(outcome.verdict), word_of(worst[run])))
+    if len(tables) < len(catalogue.CATALOGUED):
+        return problems
+    problems += _outcomes(out, tables)
     config = store.read_config(out)
     if config is not None and software == {software_digest()}:
         for name, content in campaign_files(tables, config, campaign_key(out, config)):
@@ -208,21 +220,45 @@ def _made_again(out: Address, software: set[str]) -> list[Problem]:
     return problems
 
 
+def _outcomes(out: Address, tables: Mapping[str, pl.DataFrame]) -> Iterator[Problem]:
+    """The outcomes that are kept, with the verdicts and figures that `replay` repeats, against the runs' own tables."""
+    kept = resume.kept(str(out))
+    parts = {name: tables[name].partition_by("run_id", as_dict=True) for name in ("runs", "hazards", "passages")}
+    for run, outcome in kept.items():
+        own = {name: of_runs.get((run,), tables[name].clear()) for name, of_runs in parts.items()}
+        if own["runs"].is_empty():
+            continue
+        # Which availability was low is said by the configuration of that call, which need not be the last one.
+        again = outcome_of(run, outcome.log, math.inf, **own)
+        for name, found, expected in _unequal(outcome, again):
+            yield f"{catalogue.FOLDER}/complete, {run}, {name}", found, expected
+
+
+def _unequal(kept: RunOutcome, again: RunOutcome) -> Iterator[Problem]:
+    failed = again.status is RunStatus.FAILED
+    for name in ("status", "verdict") if failed else _OF_TABLES:
+        found = getattr(kept, name)
+        expected = getattr(again, name)
+        if found != expected and not (name == "lost" and not found):
+            words = word_of if name == "verdict" else str
+            yield name, words(found), words(expected)
+
+
 def _settings(config_digest: str, manifest: Manifest) -> str:
     """The settings files that gave this digest, as options of the command."""
     for entry in manifest["settings"].get(config_digest, []):
         named = {"--config": entry["configuration"], "--vehicle": entry["vehicle"]}
-        given = [f"{option} {file['name']}" for option, file in named.items() if file]
-        return " ".join(given) or "no files"
+        options = [f"{option} {file['name']}" for option, file in named.items() if file]
+        return " ".join(options) or "no files"
     return _short(config_digest)
 
 
-def _differences(what: str, found: Mapping[str, str | None], expected: Mapping[str, str | None]) -> list[Problem]:
-    names = dict.fromkeys([*expected, *found])
+def _differences(what: str, present: Mapping[str, str | None], expected: Mapping[str, str | None]) -> list[Problem]:
+    names = dict.fromkeys([*expected, *present])
     return [
-        (f"{what}{name}", _short(found.get(name)), _short(expected.get(name)))
+        (f"{what}{name}", _short(present.get(name)), _short(expected.get(name)))
         for name in names
-        if (found.get(name) or "") != (expected.get(name) or "")
+        if (present.get(name) or "") != (expected.get(name) or "")
     ]
 
 

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 
+import polars as pl
+
 from pipeline import storage
 from pipeline.campaign import lock
 from pipeline.campaign.interruption import ENDING
@@ -23,6 +25,7 @@ from pipeline.campaign.resume import proof_of
 from pipeline.read.site.read import read_site
 from pipeline.read.site.route import with_route
 from pipeline.results import store
+from pipeline.results.manifest import sha256, tables_noted
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
 from pipeline.storage import files
@@ -32,6 +35,9 @@ from schemas.enums import RunStatus
 from schemas.errors import OutputError, SiteError, UsageError
 from schemas.run import RunLog, RunTables, Site
 from schemas.version import SOFTWARE
+
+# Tables that an outcome is read from, beside the marker.
+_OUTCOME = ("hazards", "passages")
 
 
 def replay_one(job: RunJob) -> RunOutcome:
@@ -65,7 +71,7 @@ def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
         if job.write_route:
             _write_travelled_route(job, run, site)
     _write(job, tables, _metadata(job, log, worst(tables.runs)) | {"log_digest": run.input_digest})
-    return _proved(job, log, outcome_of(job, tables.runs, tables.hazards, tables.passages))
+    return _proved(job, log, _outcome(job, tables.runs, tables.hazards, tables.passages))
 
 
 def fail_run(job: RunJob, failure: RunFailure, log: RecordedLog | None = None) -> RunOutcome:
@@ -124,14 +130,26 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
         return False
     if job.write_route and not files.exists(job.write_route):
         return False
-    return all(job.previous.get(key) == value for key, value in digests(job, files_digest).items())
+    made = digests(job, files_digest)
+    return all(job.previous.get(key) == value for key, value in made.items()) and _is_whole(job, job.previous)
+
+
+def _is_whole(job: RunJob, marker: Mapping[str, str]) -> bool:
+    """The tables that the outcome is read from are those that the marker was written with."""
+    places = {name: str(store.table_address(job.out, name, job.run_id)) for name in _OUTCOME}
+    contents = storage.read_many(list(places.values()))
+    expected = tables_noted(marker)
+    return all(sha256(contents.get(place)) == expected.get(name) for name, place in places.items())
 
 
 def _earlier(job: RunJob, log: RecordedLog) -> RunOutcome:
     """The outcome of a run that is complete already."""
-    names = ("runs", "hazards", "passages")
-    runs, hazards, passages = (store.tables_of(job.out, name, [job.run_id]) for name in names)
-    return _proved(job, log, replace(outcome_of(job, runs, hazards, passages), skipped=True))
+    runs, hazards, passages = (store.tables_of(job.out, name, [job.run_id]) for name in ("runs", *_OUTCOME))
+    return _proved(job, log, replace(_outcome(job, runs, hazards, passages), skipped=True))
+
+
+def _outcome(job: RunJob, *tables: pl.DataFrame) -> RunOutcome:
+    return outcome_of(job.run_id, job.address, job.config.advice.low_availability, *tables)
 
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:

@@ -17,7 +17,7 @@ def numbers_of(texts: Sequence[str] | npt.NDArray[np.str_]) -> Floats:
     Python and numpy also read `1_0` as 10, and Arabic-Indic digits: one such typing error makes a line of 8,700 km.
     """
     written = pl.Series(texts, dtype=pl.String)
-    found = written.str.strip_chars().cast(pl.Float64, strict=False)
-    if found.null_count():
-        raise ValueError(f"{written.filter(found.is_null())[0]!r:.40} is not a decimal number")
-    return found.to_numpy()
+    numbers = written.str.strip_chars().cast(pl.Float64, strict=False)
+    if numbers.null_count():
+        raise ValueError(f"{written.filter(numbers.is_null())[0]!r:.40} is not a decimal number")
+    return numbers.to_numpy()

@@ -11,7 +11,7 @@ import hashlib
 import json
 import platform
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -76,8 +76,8 @@ class _Form(_Strict):
 
 def settings_files(configuration: Path | None = None, vehicle: Path | None = None) -> SettingsFiles:
     """The files as they were given."""
-    given = {"configuration": configuration, "vehicle": vehicle}
-    return {name: None if path is None else _file(storage.file_digests(path)[0]) for name, path in given.items()}
+    paths = {"configuration": configuration, "vehicle": vehicle}
+    return {name: None if path is None else _file(storage.file_digests(path)[0]) for name, path in paths.items()}
 
 
 def listing(listed: Iterable[tuple[str, int, str]]) -> str:
@@ -85,12 +85,12 @@ def listing(listed: Iterable[tuple[str, int, str]]) -> str:
     return json.dumps([list(file) for file in listed])
 
 
-def note_settings(out: Address, config_digest: str, given: SettingsFiles) -> None:
+def note_settings(out: Address, config_digest: str, settings: SettingsFiles) -> None:
     """Keep the names of this call's settings files, before any run is made with them."""
     manifest = earlier(out)
     known = manifest["settings"].setdefault(config_digest, [])
-    if given not in known:
-        known.append(given)
+    if settings not in known:
+        known.append(settings)
         _write(out, manifest)
 
 
@@ -101,9 +101,41 @@ def note_pages(out: Address, pages: Mapping[str, bytes]) -> None:
         _write(out, manifest | {"pages": {name: _digested(content) for name, content in sorted(pages.items())}})
 
 
-def write_manifest(out: Address) -> None:
-    """Gather the manifest from all complete runs and write it."""
-    _write(out, gathered(out, earlier(out)))
+def write_manifest(out: Address, made: Collection[str] = ()) -> None:
+    """Gather the manifest from all complete runs and write it; `made`: those that this call replayed.
+
+    A run that was changed since without being replayed keeps its entry, so that `balise verify` goes on to see it.
+    """
+    before = earlier(out)
+    manifest = gathered(out, before)
+    for run, found in manifest["runs"].items():
+        named = before["runs"].get(run)
+        if run not in made and _is_altered(named, found):
+            manifest["runs"][run] = named
+    _write(out, manifest)
+
+
+def unaltered(out: Address, runs: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Metadata of each complete run among these whose marker is as it was written."""
+    if not runs:
+        return {}
+    named = earlier(out)["runs"]
+    found = ((run, store.metadata_of(content), content) for run, content in store.markers(out, runs))
+    return {
+        run: metadata for run, metadata, content in found if not _is_altered(named.get(run), _run(metadata, content))
+    }
+
+
+def tables_noted(metadata: Mapping[str, str]) -> dict[str, str]:
+    """The digests of the other tables that stand in a marker."""
+    return _parsed(_DIGESTS, metadata.get("tables"), {})
+
+
+def _is_altered(named: Mapping[str, Any] | None, found: Mapping[str, Any]) -> bool:
+    """Other tables of the same sources, settings and program: the same content always gives the same bytes."""
+    if named is None:
+        return False
+    return named["tables"] != found["tables"] and {**named, "tables": None} == {**found, "tables": None}
 
 
 def gathered(out: Address, before: Manifest) -> Manifest:
@@ -191,7 +223,7 @@ def _packages() -> Mapping[str, str]:
 
 def _run(metadata: Mapping[str, str], marker: bytes) -> dict[str, Any]:
     """What one run was made from, and the digests of its tables."""
-    digests = _parsed(_DIGESTS, metadata.get("tables"), {}) | {"runs": sha256(marker)}
+    digests = tables_noted(metadata) | {"runs": sha256(marker)}
     site, _, route = metadata.get("site_digest", "").partition(" ")
     return {
         "status": metadata.get("status"),

@@ -64,9 +64,9 @@ def run_sql(
     try:
         return pl.SQLContext(tables).execute(sql).collect()
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, RecursionError) as error:
-        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        message = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UsageError(
-            f"cannot be answered: {_in_our_words(said, tables, others or {})}",
+            f"cannot be answered: {_in_our_words(message, tables, others or {})}",
             place="SQL",
             expected=_EXPECTED,
             remedy=_REMEDY,
@@ -94,11 +94,11 @@ def _check_query(sql: str, allow_files: bool) -> None:
             expected=f"{_EXPECTED} (WITH ... SELECT, EXPLAIN SELECT); results are only read",
             remedy=_REMEDY,
         )
-    if not allow_files and (found := _FILES.search(sql)):
+    if not allow_files and (call := _FILES.search(sql)):
         raise UsageError(
             "reads files outside the result",
             place="SQL",
-            found=found[0],
+            found=call[0],
             expected=_EXPECTED,
             remedy="If you trust the query, `--allow-files` lets it read files of this machine.",
         )
@@ -145,20 +145,20 @@ def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
     return pl.concat([pl.DataFrame([run_id], schema=columns.schema), columns])
 
 
-def _in_our_words(said: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
+def _in_our_words(message: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
     """What polars says, of a name or a value that it does not know in our words, with the nearest that there is."""
     contracts = _contracts(others)
     columns = {"run_id": None} | {
         name: kind for table in tables for name, kind in contracts[table][1].columns().items()
     }
-    if column := _NO_COLUMN.search(said):
+    if column := _NO_COLUMN.search(message):
         return f"no column is called `{column[1]}`{did_you_mean(column[1], columns)}"
-    if missing := _NO_TABLE.search(said):
+    if missing := _NO_TABLE.search(message):
         return f"no table is called `{missing[1]}`{did_you_mean(missing[1], contracts)}"
-    if value := _NO_VALUE.search(said):
+    if value := _NO_VALUE.search(message):
         values = {word for kind in columns.values() if isinstance(kind, dy.Enum) for word in kind.categories}
         return f"no column has the value `{value[1]}`{did_you_mean(value[1], values)}"
-    return said
+    return message
 
 
 def _campaign_tables(out: Address, names: Iterable[str]) -> dict[str, pl.LazyFrame]:

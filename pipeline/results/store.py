@@ -137,8 +137,8 @@ def tables_of(out: Address, table: str, runs: Sequence[str], columns: Sequence[s
     wanted = ["run_id", *dtypes(TABLES[table])] if columns is None else columns
     run = ""
 
-    def own(found: Mapping[str, pl.DataType]) -> list[str]:
-        _check_columns(table, run, found)
+    def own(recorded: Mapping[str, pl.DataType]) -> list[str]:
+        _check_columns(table, run, recorded)
         return [name for name in wanted if name != "run_id"]
 
     places = [str(table_address(out, table, run)) for run in runs]
@@ -164,12 +164,14 @@ def _unreadable(table: str, run_id: str, reason: str) -> UsageError:
     )
 
 
-def _check_columns(table: str, run_id: str, found: Mapping[str, pl.DataType]) -> None:
+def _check_columns(table: str, run_id: str, recorded: Mapping[str, pl.DataType]) -> None:
     expected = dtypes(TABLES[table])
-    lost = [name for name in expected if name not in found]
-    other = [f"{name} as {found[name]}, not {kind}" for name, kind in expected.items() if found.get(name, kind) != kind]
-    if lost or other:
-        parts = ([f"no {', '.join(lost)}"] if lost else []) + other
+    lost = [name for name in expected if name not in recorded]
+    retyped = [
+        f"{name} as {recorded[name]}, not {kind}" for name, kind in expected.items() if recorded.get(name, kind) != kind
+    ]
+    if lost or retyped:
+        parts = ([f"no {', '.join(lost)}"] if lost else []) + retyped
         raise UsageError(
             "was written by another build of the program",
             place=f"run {run_id}, table `{table}`",

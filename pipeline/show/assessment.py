@@ -17,14 +17,14 @@ from schemas.campaign import CampaignFigures
 from schemas.errors import visible
 
 
-def show(found: Assessment, as_json: bool) -> None:
+def show(assessment: Assessment, as_json: bool) -> None:
     """Print it: the verdict, each table, what it means; or all of it as JSON."""
     if as_json:
-        print(to_json({"statements": found.statements, **found.tables}))
+        print(to_json({"statements": assessment.statements, **assessment.tables}))
         return
-    print(visible(found.statements[0]) + "\n")
-    show_tables(for_reading(found.tables))
-    print(visible("\n".join(found.statements[1:])))
+    print(visible(assessment.statements[0]) + "\n")
+    show_tables(for_reading(assessment.tables))
+    print(visible("\n".join(assessment.statements[1:])))
 
 
 _SHORT = {

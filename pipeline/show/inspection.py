@@ -83,25 +83,25 @@ def inspect_log(
     path: Address, config: Configuration, site: Site | None = None, vehicle: Vehicle | None = None
 ) -> dict[str, pl.DataFrame]:
     """Streams, topics, what is mapped to what, what does not fit, and what keeps the log from being replayed."""
-    found = describe_log(path, config.ingest)
+    log = describe_log(path, config.ingest)
     figures = {
-        "kind": found.kind,
-        "size_bytes": found.size_bytes,
-        "left_over": found.left_over,
-        "damage": found.notes.damage,
-        "chunks_without_crc": found.notes.chunks_without_crc,
-        "files_without_crc": list(found.notes.files_without_crc),
+        "kind": log.kind,
+        "size_bytes": log.size_bytes,
+        "left_over": log.left_over,
+        "damage": log.notes.damage,
+        "chunks_without_crc": log.notes.chunks_without_crc,
+        "files_without_crc": list(log.notes.files_without_crc),
     }
     tables = {"Log": _figures(figures)}
-    tables["Streams"] = pl.DataFrame([_stream_row(stream) for stream in found.streams])
-    if found.topics:
-        tables["Topics"] = pl.DataFrame([_topic_row(topic) for topic in found.topics])
-    fitted = fit_report(found.run, config, site, vehicle) if found.run else FitReport({}, ())
+    tables["Streams"] = pl.DataFrame([_stream_row(stream) for stream in log.streams])
+    if log.topics:
+        tables["Topics"] = pl.DataFrame([_topic_row(topic) for topic in log.topics])
+    fitted = fit_report(log.run, config, site, vehicle) if log.run else FitReport({}, ())
     tables |= fitted.tables
-    if problems := (*found.problems, *fitted.problems):
+    if problems := (*log.problems, *fitted.problems):
         tables["Problems"] = pl.DataFrame({"problem": problems})
-    if found.starting_config:
-        tables[STARTING_CONFIG] = pl.DataFrame({"toml": found.starting_config.splitlines()})
+    if log.starting_config:
+        tables[STARTING_CONFIG] = pl.DataFrame({"toml": log.starting_config.splitlines()})
     return tables
 
 
@@ -135,11 +135,11 @@ def inspect_site(
     config = config or Configuration()
     site = read_site(path, config.site)
     alike = (*window_findings(site, config.lds, config.site), *parallel_findings(site, config.matching))
-    found = (*site.findings, *without_balises(site.balises), *alike)
+    findings = (*site.findings, *without_balises(site.balises), *alike)
     tables = {
         "Site": _figures(describe_site(site)),
         "Elements": elements_table(site),
-        "Findings": findings_table(found),
+        "Findings": findings_table(findings),
     }
     if result is None:
         return tables

@@ -120,10 +120,12 @@ def _tiles(pieces: pl.DataFrame) -> str:
     tones = {PieceClass.SUITABLE: "good", PieceClass.UNSUITABLE: "bad", PieceClass.UNKNOWN: "doubt"}
     rows = []
     for side in LineDirection:
-        own = pieces.filter(pl.col("direction") == side.value)
+        of_side = pieces.filter(pl.col("direction") == side.value)
         for kind, tone in tones.items():
             length_m = (
-                own.filter(pl.col("piece_class") == kind.value).select((pl.col("to_m") - pl.col("from_m")).sum()).item()
+                of_side.filter(pl.col("piece_class") == kind.value)
+                .select((pl.col("to_m") - pl.col("from_m")).sum())
+                .item()
             )
             rows.append((f"{kind.value}, {side.value} measure", f"{length_m / 1000.0:.2f} km", tone))
     return tiles(rows)
@@ -155,9 +157,9 @@ def _strips(pieces: pl.DataFrame, balises: pl.DataFrame) -> list[str]:
     shown = pieces.filter(pl.col("netelement_id").is_in(spoken.implode()))
     first = balises.filter(pl.col("proposal") == balises["proposal"][0]) if balises.height else balises
     drawings = []
-    for (name,), own in shown.group_by("netelement_id", maintain_order=True):
-        start = int(own["piece"].min() or 0)  # type: ignore[arg-type]
-        for (row,), part in own.group_by((pl.col("piece") - start) // _ROW_PIECES, maintain_order=True):
+    for (name,), of_element in shown.group_by("netelement_id", maintain_order=True):
+        start = int(of_element["piece"].min() or 0)  # type: ignore[arg-type]
+        for (row,), part in of_element.group_by((pl.col("piece") - start) // _ROW_PIECES, maintain_order=True):
             drawings.append(_strip(str(name), part, first.filter(pl.col("netelement_id") == name), int(row)))
     return drawings
 
@@ -165,7 +167,7 @@ def _strips(pieces: pl.DataFrame, balises: pl.DataFrame) -> list[str]:
 def _strip(name: str, part: pl.DataFrame, balises: pl.DataFrame, row: int) -> str:
     begin_m, end_m = float(part["from_m"].min()), float(part["to_m"].max())  # type: ignore[arg-type]
     scale = _WIDTH / max(_ROW_PIECES * (end_m - begin_m) / (part.height / 2), 1e-9)
-    marks = [_block(one, begin_m, scale) for one in part.iter_rows(named=True)]
+    marks = [_block(piece, begin_m, scale) for piece in part.iter_rows(named=True)]
     for at_m, kind in (
         balises.filter(pl.col("measure_m").is_between(begin_m, end_m)).select("measure_m", "kind").iter_rows()
     ):
@@ -189,8 +191,8 @@ def _block(piece: dict[str, object], begin_m: float, scale: float) -> str:
     width = max((to_m - from_m) * scale - 0.6, 0.5)
     top = 2.0 if piece["direction"] == LineDirection.GROWING.value else 28.0
     height = _LANE / 2 if kind is PieceClass.UNKNOWN else _LANE
-    found = f"{kind.value}, {cause.value}; {piece['passes']} passes, {piece['lost']} lost"
-    title = f"{from_m:.0f} to {to_m:.0f} m, {piece['direction']}: {found}"
+    summary = f"{kind.value}, {cause.value}; {piece['passes']} passes, {piece['lost']} lost"
+    title = f"{from_m:.0f} to {to_m:.0f} m, {piece['direction']}: {summary}"
     sign = _SIGNS.get(cause, "") if kind is PieceClass.UNSUITABLE else ""
     letter = (
         f'<text class="name" x="{x + width / 2:.1f}" y="{top + 16:.0f}" text-anchor="middle">{sign}</text>'

@@ -64,7 +64,7 @@ def screen_width() -> int | None:
 
 
 def _coloured(line: str) -> str:
-    return _VERDICT_WORD.sub(lambda found: f"{_COLOURS[found[0]]}{found[0]}{_PLAIN}", line)
+    return _VERDICT_WORD.sub(lambda match: f"{_COLOURS[match[0]]}{match[0]}{_PLAIN}", line)
 
 
 def tall(frame: pl.DataFrame, keys: tuple[str, ...]) -> pl.DataFrame:
@@ -78,7 +78,7 @@ def tall(frame: pl.DataFrame, keys: tuple[str, ...]) -> pl.DataFrame:
 def to_json(value: Any) -> str:
     """JSON of frames, instants and plain values; what is not known is null."""
     text = json.dumps(_plain(value), indent=2, sort_keys=False, ensure_ascii=False)
-    return _STEERING.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return _STEERING.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def duration_text(seconds: float) -> str:

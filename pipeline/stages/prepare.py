@@ -80,8 +80,8 @@ class PreparedRun:
         """Where scale and latency come from (DOMAIN section 5.4)."""
         if self.odometry is None:
             return VehicleFigures.NONE
-        given = self.vehicle.odometer_scale is not None and self.vehicle.gnss_latency_s is not None
-        return VehicleFigures.FILE if given else VehicleFigures.LEARNED
+        in_file = self.vehicle.odometer_scale is not None and self.vehicle.gnss_latency_s is not None
+        return VehicleFigures.FILE if in_file else VehicleFigures.LEARNED
 
 
 def prepare(

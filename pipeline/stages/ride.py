@@ -54,10 +54,10 @@ def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], 
     odometry = None if prepared.odometry is None else prepared.odometry.oriented(matched.odometer_sign)
     aligned = align(matched.epochs, odometry, prepared.vehicle, config)
     if odometry is None:
-        # Virtual balises may be valid in one direction, and that is the train's: no position's step (DOMAIN section 4).
+        # A balise valid in one direction means that of the train, not of one step of the positions (DOMAIN section 4).
         aligned = aligned.with_columns(_direction(prepared, solution, aligned, matched, evidence))
-    other = _other_solution(prepared, solution, aligned, matches)
-    singles = _without_memory(prepared, solution, aligned, other)
+    channel = _other_solution(prepared, solution, aligned, matches)
+    singles = _without_memory(prepared, solution, aligned, channel)
     bank = MonitorBank(aligned, singles, config)
     balises = matched.path.balises(prepared.site.balises)
     reads = _reads_on_odometer(prepared.run.balise_reads, aligned, odometry)
@@ -65,35 +65,36 @@ def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], 
     lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)
     monitored = pl.concat([aligned, lds.epochs.drop("t"), pl.DataFrame(bank.columns())], how="horizontal")
     fixes = prepared.fixes(solution)
-    taken = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, matched.path)
-    return Ride(prepared, taken, matched, aligned, odometry, other, singles, bank, lds)
+    replayed = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, matched.path)
+    return Ride(prepared, replayed, matched, aligned, odometry, channel, singles, bank, lds)
 
 
 def _direction(
     prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matched: Match, evidence: TrainEvidence
 ) -> pl.Series:
-    """The direction of travel by the evidence, of a solution of which nothing is decided yet."""
+    """The direction of travel by the evidence, before the solution is monitored."""
     nothing = pl.DataFrame()
-    given = Solution(solution, prepared.fixes(solution), aligned, nothing, nothing, nothing, matched.path)
-    return direction_by_evidence(Case(given, evidence, None, prepared.vehicle, prepared.config))
+    unjudged = Solution(solution, prepared.fixes(solution), aligned, nothing, nothing, nothing, matched.path)
+    return direction_by_evidence(Case(unjudged, evidence, None, prepared.vehicle, prepared.config))
 
 
 def _other_solution(
     prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matches: Mapping[str, Match]
 ) -> pl.DataFrame | None:
-    """The solution to compare with, on this one's path; none where none is named or the run has it not."""
-    other = prepared.config.monitors.channel_reference
-    if other is None or other == solution or other not in matches:
+    """The solution that the channel monitor compares with, on this one's path; None if not named or not recorded."""
+    channel = prepared.config.monitors.channel_reference
+    if channel is None or channel == solution or channel not in matches:
         return None
-    return on_path_of(aligned, matches[other].epochs, prepared.config.lds)
+    return on_path_of(aligned, matches[channel].epochs, prepared.config.lds)
 
 
 def _without_memory(
-    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, other: pl.DataFrame | None
+    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, channel: pl.DataFrame | None
 ) -> dict[str, pl.DataFrame]:
+    """The monitors without memory, each by its name."""
     named = prepared.config.monitors.channel_reference
     absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
-    seen = Seen(aligned, prepared.ranges(solution), other, absent, prepared.config)
+    seen = Seen(aligned, prepared.ranges(solution), channel, absent, prepared.config)
     return {name: monitor(seen) for name, monitor in WITHOUT_MEMORY.items()}
 
 

@@ -64,7 +64,7 @@ def glob_remote(pattern: str) -> list[Address]:
     """Addresses that match a glob in an object store, sorted."""
     return on_store(
         pattern,
-        lambda store, path: sorted(store.unstrip_protocol(found) for found in _globbed(store, path)),
+        lambda store, path: sorted(store.unstrip_protocol(match) for match in _globbed(store, path)),
         kind=InputError,
     )
 

@@ -23,8 +23,8 @@ def failed_runs(runs: pl.DataFrame) -> list[str]:
 def runs_without_truth(runs: pl.DataFrame, consequence: str) -> list[str]:
     """Runs that nothing but the odometer, or nothing at all, can judge."""
     blind = runs.filter(~pl.col("evidence").cast(pl.String).is_in(TRUTH).fill_null(value=False)).height
-    said = f"{blind} of {runs.height} runs have neither a reference nor balise reads: {consequence}"
-    return [said] if blind else []
+    reservation = f"{blind} of {runs.height} runs have neither a reference nor balise reads: {consequence}"
+    return [reservation] if blind else []
 
 
 def several_settings(runs: pl.DataFrame, consequence: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -9,13 +10,17 @@ from pathlib import Path
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
+from pydantic import TypeAdapter
 
 from pipeline import storage
 from pipeline.campaign import run_campaign
 from pipeline.campaign.finish import write_campaign
+from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.verify import verify
 from pipeline.results import catalogue, store
+from pipeline.results.outcome import RunOutcome
 from pipeline.results.query import run_sql
+from pipeline.results.software import software_digest
 from pipeline.storage import parquet
 from pipeline.storage.objects import version_of
 from schemas.config import Configuration
@@ -87,6 +92,36 @@ def test_campaign_tables_come_from_the_runs_and_verify_sees_a_false_entry(out: P
     write_campaign(out, Configuration())
     assert campaign_bytes(out) == before
     assert verify(out).problems == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "lie"), [("hazards", 9), ("balises_accepted", 99), ("why", "all is well"), ("status", "partial")]
+)
+def test_verify_sees_a_false_outcome(small_trial: SmallTrial, tmp_path: Path, name: str, lie: object) -> None:
+    """`replay` repeats what is kept of a run, so every figure of it is the tables'."""
+    run_campaign(plan_of(small_trial, tmp_path, small_trial.paths[:1]))
+    job = plan_of(small_trial, tmp_path, small_trial.paths[:1]).jobs[0]
+    tables = [store.tables_of(tmp_path, table, [job.run_id]) for table in ("runs", "hazards", "passages")]
+    whole = TypeAdapter(RunOutcome).dump_python(outcome_of(job.run_id, "", 0.0, *tables), mode="json")
+    for lies in ({}, {name: lie}):
+        kept = {**whole, "proof": "kept", **lies}
+        catalogue.keep(tmp_path, "complete", software_digest(), json.dumps([kept]).encode())
+        found = [what for what, _, _ in verify(tmp_path).problems]
+        assert found == [f".catalogue/complete, {job.run_id}, {told}" for told in lies]
+
+
+def test_a_copy_of_tables_that_cannot_be_read_is_no_answer(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_campaign(out, Configuration())
+    poison(out)
+
+    def unreadable(of: Path, table: str) -> pl.LazyFrame:
+        if table == "passages":
+            raise UsageError("was written by another build of the program")
+        return read_table(of, table)
+
+    read_table = store.read_table
+    monkeypatch.setattr(store, "read_table", unreadable)
+    assert [what for what, _, _ in verify(out).problems] == [".catalogue/runs", ".catalogue/passages"]
 
 
 @pytest.mark.parametrize("entry", ["runs", "complete", "pages"])

@@ -8,6 +8,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from pipeline.campaign import make_plan, run_campaign
@@ -18,6 +21,7 @@ from pipeline.results.store import table_address
 from pipeline.show.report import write_report
 from schemas.config import Configuration, Vehicle, load_settings
 from schemas.errors import UsageError
+from schemas.tables import TABLES
 from tests.conftest import SmallTrial
 
 
@@ -145,6 +149,57 @@ def test_pages_are_part_of_the_manifest(out: Path, tmp_path: Path) -> None:
     assert [what for what, _, _ in verify(copy).problems] == ["page runs/run0.html"]
     write_report(copy, jobs=1)
     assert verify(copy).problems == ()
+    (copy / "report/runs/notes.txt").write_text("safe")
+    write_report(copy, jobs=1)
+    assert [what for what, _, _ in verify(copy).problems] == ["page runs/notes.txt"]
+
+
+def rewritten(file: Path, verdict: str) -> None:
+    """A marker as it was, but for its verdict."""
+    table = pq.read_table(file)
+    at = table.schema.get_field_index("verdict")
+    field = table.schema.field(at)
+    words = pa.array([verdict] * table.num_rows).dictionary_encode().cast(field.type)
+    pq.write_table(table.set_column(at, field, words).cast(table.schema), file)
+
+
+def test_a_marker_that_was_changed_is_no_complete_run(out: Path, small_trial: SmallTrial, tmp_path: Path) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    marker = Path(table_address(copy, "runs", "run0"))
+    before = marker.read_bytes()
+    rewritten(marker, "unsafe")
+    assert pl.read_parquet_metadata(marker).items() >= {("balise.run_id", "run0")}
+    summary = run_campaign(make_plan([str(small_trial.paths[0])], small_trial.site, copy))
+    assert (summary.skipped, marker.read_bytes() == before) == (0, True)
+    assert verify(copy).problems == ()
+
+
+@pytest.mark.parametrize("table", ["hazards", "passages"])
+def test_a_run_is_not_complete_without_the_tables_that_it_was_written_with(
+    out: Path, small_trial: SmallTrial, tmp_path: Path, table: str
+) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    file = Path(table_address(copy, table, "run0"))
+    before = file.read_bytes()
+    shutil.copyfile(table_address(copy, table, "bad"), file)
+    summary = run_campaign(make_plan([str(small_trial.paths[0])], small_trial.site, copy))
+    assert (summary.skipped, file.read_bytes() == before) == (0, True)
+    assert verify(copy).problems == ()
+
+
+def test_what_was_changed_stays_seen_after_other_calls(out: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    rewritten(Path(table_address(copy, "runs", "run0")), "unsafe")
+    write_campaign(copy, Configuration())
+    assert [what for what, _, _ in verify(copy).problems] == ["run run0, runs", "marker of run run0, runs"]
+
+
+def test_the_tables_of_one_run_under_the_name_of_another(out: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    for table in TABLES:
+        shutil.copytree(copy / table / "run_id=run0", copy / table / "run_id=run1", dirs_exist_ok=True)
+    write_campaign(copy, Configuration())
+    assert verify(copy).problems == (("tables of run run1", "of run run0", "run1"),)
 
 
 @pytest.mark.parametrize(

@@ -41,8 +41,8 @@ def balises_every(network: SurveyNetwork, spacing_m: float, travel: TravelAlong)
         way = np.arange(np.floor(begins / spacing_m) + 1, np.floor((begins + length) / spacing_m) + 1) * spacing_m
         away = bool(at_start <= at_end)
         measures = way - begins if away else length - (way - begins)
-        own = {"netelement_id": name, "direction": _direction(away, travel).value}
-        rows += [{**own, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
+        side = {"netelement_id": name, "direction": _direction(away, travel).value}
+        rows += [{**side, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
     ids = [f"VB{number:0{len(str(len(rows)))}}" for number in range(1, len(rows) + 1)]
     table = pl.DataFrame(rows, schema={"netelement_id": pl.String, "direction": pl.String, "measure_m": pl.Float64})
     return _typed("balises", table.with_columns(pl.Series("balise_id", ids, dtype=pl.String), kind=pl.lit("virtual")))
@@ -73,11 +73,11 @@ def _from_start_m(ends: np.ndarray, length_m: np.ndarray) -> np.ndarray:
     _, first = np.unique(pairs[order], axis=0, return_index=True)
     kept = order[first]
     graph = coo_array((length_m[kept], (pairs[kept, 0], pairs[kept, 1])), shape=(count, count)).tocsr()
-    found = np.full(count, np.inf)
+    distance_m = np.full(count, np.inf)
     for node in ends[:, 0].tolist():
-        if not np.isfinite(found[node]):
-            found = np.minimum(found, dijkstra(graph, directed=False, indices=node))
-    return found
+        if not np.isfinite(distance_m[node]):
+            distance_m = np.minimum(distance_m, dijkstra(graph, directed=False, indices=node))
+    return distance_m
 
 
 def balises_of_list(
@@ -95,9 +95,9 @@ def balises_of_list(
     kind = pl.col("kind").fill_null("virtual") if "kind" in table.columns else pl.lit("virtual")
     table = table.with_columns(kind=kind)
     placer = _Placer(place, network, track, survey, config.survey)
-    found = [placer.placed(row) for row in table.iter_rows(named=True)]
+    places = [placer.placed(row) for row in table.iter_rows(named=True)]
     columns = {"netelement_id": pl.String, "measure_m": pl.Float64}
-    placed = pl.DataFrame(found, schema=columns, orient="row")
+    placed = pl.DataFrame(places, schema=columns, orient="row")
     return _typed(place, table.with_columns(placed))
 
 
@@ -116,12 +116,12 @@ class _Placer:
         self.segments = segments_of(track)
 
     def placed(self, row: dict[str, Any]) -> tuple[str, float]:
-        given = {key for key, value in row.items() if value is not None}
-        if {"netelement_id", "measure_m"} <= given:
+        filled = {key for key, value in row.items() if value is not None}
+        if {"netelement_id", "measure_m"} <= filled:
             return str(row["netelement_id"]), float(row["measure_m"])
-        if {"latitude_deg", "longitude_deg"} <= given:
+        if {"latitude_deg", "longitude_deg"} <= filled:
             return self._at_coordinates(row)
-        if "line_km" in given:
+        if "line_km" in filled:
             return self._at_kilometre(row)
         expected = "latitude_deg and longitude_deg (or x_m and y_m), line_km, or netelement_id and measure_m"
         raise self._refusal(row, "has no place", expected=expected)
@@ -136,25 +136,25 @@ class _Placer:
         ranked = sorted(zip(near.distance_m.tolist(), near.element.tolist(), near.along_m.tolist(), strict=True))
         wanted = row.get("netelement_id")
         if wanted is not None:
-            ranked = [one for one in ranked if self.track.ids[one[1]] == wanted]
+            ranked = [candidate for candidate in ranked if self.track.ids[candidate[1]] == wanted]
         if not ranked or ranked[0][0] > far_m:
-            found = f"{ranked[0][0]:.1f} m" if ranked else f"none within {2 * far_m:g} m"
-            raise self._refusal(row, "lies beside the track", found=found, expected=f"at most {far_m:g} m")
+            nearest = f"{ranked[0][0]:.1f} m" if ranked else f"none within {2 * far_m:g} m"
+            raise self._refusal(row, "lies beside the track", found=nearest, expected=f"at most {far_m:g} m")
         self._report_rival(row, ranked)
         return self.track.ids[ranked[0][1]], ranked[0][2]
 
     def _report_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
-        near = [one for one in ranked[1:] if one[0] < ranked[0][0] + self.config.same_track_m]
+        near = [candidate for candidate in ranked[1:] if candidate[0] < ranked[0][0] + self.config.same_track_m]
         nodes = set(self.network.ends[ranked[0][1]].tolist())
-        for _, other, _ in near:
-            if not nodes & set(self.network.ends[other].tolist()):
-                text = f"may as well lie on {self.track.ids[other]} as on {self.track.ids[ranked[0][1]]}"
+        for _, rival, _ in near:
+            if not nodes & set(self.network.ends[rival].tolist()):
+                text = f"may as well lie on {self.track.ids[rival]} as on {self.track.ids[ranked[0][1]]}"
                 self.survey.report("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
 
     def _at_kilometre(self, row: dict[str, Any]) -> tuple[str, float]:
         wanted = row.get("netelement_id")
         km = float(row["line_km"])
-        found = [
+        hits = [
             (element.name, measure)
             for number, element in enumerate(self.network.elements)
             if wanted in (None, element.name)
@@ -162,11 +162,11 @@ class _Placer:
                 element.line_km, self.track.measure_m[self.track.vertices(number)], km, self.config
             )
         ]
-        if not found:
+        if not hits:
             expected = "a line kilometre of the survey, not one that it jumps over"
             raise self._refusal(row, f"no track has line kilometre {km:g}", expected=expected)
         # A joint is the end of one element and the start of the next: one place.
-        inner = [one for one in found if one[1] > 0] or found
+        inner = [hit for hit in hits if hit[1] > 0] or hits
         if len(inner) > 1:
             places = ", ".join(f"{name} at {measure:.1f} m" for name, measure in sorted(inner))
             remedy = "Name netelement_id in the list; where one element has it twice, give measure_m too."

@@ -25,11 +25,11 @@ def doubts(network: SurveyNetwork, config: SurveyConfig, site: SiteConfig) -> li
     """Kinks, tracks that were surveyed twice, open ends beside other track, heights and kilometres that do not fit."""
     track = track_of(network.track)
     in_parts = network_of(in_pieces(track), network.links)
-    found = [*_heights(network.elements), *_doubled(in_parts, config)]
-    found += _open_ends(network_of(track, network.links), config.same_track_m, site.near_ends_m)
+    findings = [*_heights(network.elements), *_doubled(in_parts, config)]
+    findings += _open_ends(network_of(track, network.links), config.same_track_m, site.near_ends_m)
     for element in network.elements:
-        found += [*_kinks(element, config), *_kilometres(element, config), *_scattered(element, config)]
-    return [*found, *_corners(network, config)]
+        findings += [*_kinks(element, config), *_kilometres(element, config), *_scattered(element, config)]
+    return [*findings, *_corners(network, config)]
 
 
 def _heights(elements: list[LinePiece]) -> Iterator[Finding]:
@@ -71,8 +71,8 @@ def _corners(network: SurveyNetwork, config: SurveyConfig) -> Iterator[Finding]:
     for meeting in arms_of(network.ends).values():
         first = network.elements[meeting[0][0]].name, meeting[0][1]
         if len(meeting) == 2 and meeting[0][0] != meeting[1][0] and first in passed:
-            one, other = (_last_step(network.elements[element], position) for element, position in meeting)
-            corner = replace(one.followed_by(other.take([0])), name=f"{one.name}, {other.name}")
+            inward, onward = (_last_step(network.elements[element], position) for element, position in meeting)
+            corner = replace(inward.followed_by(onward.take([0])), name=f"{inward.name}, {onward.name}")
             yield from _kinks(corner, config)
 
 
@@ -143,15 +143,15 @@ def _doubled(ground: Network, config: SurveyConfig) -> Iterator[Finding]:
     # So many at once as can be held.
     for rows in np.array_split(np.arange(len(along.element)), 1 + len(along.element) // 100_000):
         points = points_of(along.latitude_deg[rows], along.longitude_deg[rows])
-        found = candidates_of(points, ground, segments, config.same_track_m)
-        own = along.element[rows][found.step]
-        both.append(np.column_stack([own, found.element])[own < found.element])
+        candidates = candidates_of(points, ground, segments, config.same_track_m)
+        element = along.element[rows][candidates.step]
+        both.append(np.column_stack([element, candidates.element])[element < candidates.element])
     pairs, count = np.unique(np.concatenate(both), axis=0, return_counts=True)
-    for (one, other), samples in zip(pairs.tolist(), count.tolist(), strict=True):
+    for (first, second), samples in zip(pairs.tolist(), count.tolist(), strict=True):
         if samples * SAMPLE_SPACING_M > config.doubled_m:
-            whom = "itself" if track.ids[one] == track.ids[other] else track.ids[other]
+            whom = "itself" if track.ids[first] == track.ids[second] else track.ids[second]
             text = f"lies within {config.same_track_m:g} m of {whom} over {samples * SAMPLE_SPACING_M:.0f} m"
-            yield Finding("warning", f"track: {track.ids[one]}", text, "Look whether one track was surveyed twice.")
+            yield Finding("warning", f"track: {track.ids[first]}", text, "Look whether one track was surveyed twice.")
 
 
 def _open_ends(ground: Network, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
@@ -161,12 +161,12 @@ def _open_ends(ground: Network, same_track_m: float, near_ends_m: float) -> Iter
     row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)
     points = points_of(track.latitude_deg[row], track.longitude_deg[row])
     # Farther aside is the next track.
-    found = candidates_of(points, ground, segments_of(track), 2 * same_track_m)
-    middle = np.minimum(found.along_m, found.left_m) > near_ends_m
-    for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
-        end = int(found.step[near])
-        other = track.ids[int(found.element[near])]
-        beside = f"{found.distance_m[near]:.1f} m from the middle of {other}"
+    candidates = candidates_of(points, ground, segments_of(track), 2 * same_track_m)
+    middle = np.minimum(candidates.along_m, candidates.left_m) > near_ends_m
+    for near in np.flatnonzero(middle & (candidates.element != element[candidates.step])).tolist():
+        end = int(candidates.step[near])
+        neighbour = track.ids[int(candidates.element[near])]
+        beside = f"{candidates.distance_m[near]:.1f} m from the middle of {neighbour}"
         text = f"end {position[end]} lies {beside} and is not joined to it"
         remedy = "Give both lines a point in common there, if it is a switch."
         yield Finding("warning", f"track: {track.ids[int(element[end])]}", text, remedy)

@@ -70,8 +70,8 @@ def _of_network(place: str, data: bytes, config: SiteConfig) -> Survey:
     if breaches:
         raise SiteError(listed(breaches))
     survey = Survey(declared_m=network.declared_length_m)
-    for (name,), own in points.group_by("netelement_id", maintain_order=True):
-        survey.pieces.append(piece_of(place, str(name), own.drop("netelement_id").to_dict(), whole=True))
+    for (name,), part in points.group_by("netelement_id", maintain_order=True):
+        survey.pieces.append(piece_of(place, str(name), part.drop("netelement_id").to_dict(), whole=True))
     if network.links is not None:
         survey.relations += network.links.frame.rows()
     if network.ignored:

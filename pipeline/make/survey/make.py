@@ -85,13 +85,13 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
     balises = _balises(wish, network, survey, config)
     track = network.track
-    found = remarks(track, network.links, balises, None, survey.declared_m, config.site)
-    if found.breaches:
-        raise SiteError(found.breaches[0], place=", ".join(map(str, wish.surveys)))
+    remarked = remarks(track, network.links, balises, None, survey.declared_m, config.site)
+    if remarked.breaches:
+        raise SiteError(remarked.breaches[0], place=", ".join(map(str, wish.surveys)))
     findings = (
         *survey.findings,
         *doubts(network, config.survey, config.site),
-        *found.findings,
+        *remarked.findings,
         *without_balises(balises),
     )
     # Relations as given: what no train can run over is said, and left out, each time that the site is read.

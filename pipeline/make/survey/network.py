@@ -61,8 +61,8 @@ def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> 
     crossings = _crossings(pieces, nodes, switches, survey, config)
     elements, ends = _cut(pieces, nodes, crossings)
     track = _track_table(elements)
-    given = _of_parts(survey.relations, elements)
-    return SurveyNetwork(elements, ends, _links(track, ends, given, crossings, switches, survey, config), track)
+    relations = _of_parts(survey.relations, elements)
+    return SurveyNetwork(elements, ends, _links(track, ends, relations, crossings, switches, survey, config), track)
 
 
 def _of_parts(relations: list[Relation], elements: list[LinePiece]) -> list[Relation]:
@@ -78,9 +78,9 @@ def _of_parts(relations: list[Relation], elements: list[LinePiece]) -> list[Rela
 
 def _track_table(elements: list[LinePiece]) -> pl.DataFrame:
     """Points of the elements in order, measures along their geometry; null for what is not known."""
-    measures = [geometric_measures_m(one.latitude_deg, one.longitude_deg, one.height_m) for one in elements]
-    columns = {name: np.concatenate([getattr(one, name) for one in elements]) for name in COLUMNS}
-    names = list(itertools.chain.from_iterable([one.name] * len(one) for one in elements))
+    measures = [geometric_measures_m(line.latitude_deg, line.longitude_deg, line.height_m) for line in elements]
+    columns = {name: np.concatenate([getattr(element, name) for element in elements]) for name in COLUMNS}
+    names = list(itertools.chain.from_iterable([element.name] * len(element) for element in elements))
     return pl.DataFrame({"netelement_id": names, "measure_m": np.concatenate(measures), **columns}, nan_to_null=True)
 
 
@@ -125,8 +125,8 @@ def _without_doubles(pieces: list[LinePiece], nodes: list[Ints], survey: Survey)
     seen: set[tuple[int, int]] = set()
     kept = []
     kept_nodes = []
-    for piece, own in zip(pieces, nodes, strict=True):
-        edges = [(min(a, b), max(a, b)) for a, b in zip(own[:-1].tolist(), own[1:].tolist(), strict=True)]
+    for piece, piece_nodes in zip(pieces, nodes, strict=True):
+        edges = [(min(ends), max(ends)) for ends in itertools.pairwise(piece_nodes.tolist())]
         new = np.array([edge not in seen and edge[0] != edge[1] for edge in edges])
         new |= piece.whole
         doubled = 0 if piece.whole else sum(edge in seen for edge in edges)
@@ -136,7 +136,7 @@ def _without_doubles(pieces: list[LinePiece], nodes: list[Ints], survey: Survey)
             survey.report("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")
         for first, last in spans_of(new):
             kept.append(piece.take(np.arange(first, last + 2)))
-            kept_nodes.append(own[first : last + 2])
+            kept_nodes.append(piece_nodes[first : last + 2])
     return kept, kept_nodes
 
 
@@ -148,11 +148,11 @@ def _crossings(
     Nobody can take such a node of two lines for a slip by its geometry; a survey that names it a switch is believed.
     A net element that is whole branches at its ends only.
     """
-    inner = np.concatenate([own[1:-1] for own in nodes])
-    at_ends = np.unique(np.concatenate([own[[0, -1]] for own in nodes]))
+    inner = np.concatenate([piece_nodes[1:-1] for piece_nodes in nodes])
+    at_ends = np.unique(np.concatenate([piece_nodes[[0, -1]] for piece_nodes in nodes]))
     through, count = np.unique(inner, return_counts=True)
     named = _nodes_at(pieces, nodes, survey.crossings_deg, config)
-    lines = [own[1:-1] for piece, own in zip(pieces, nodes, strict=True) if not piece.whole]
+    lines = [piece_nodes[1:-1] for piece, piece_nodes in zip(pieces, nodes, strict=True) if not piece.whole]
     unnamed = np.intersect1d(through[count == 2], np.concatenate([np.zeros(0, dtype=np.int64), *lines]))
     by_form = set(np.setdiff1d(unnamed, at_ends).tolist()) - switches
     _report_crossings(pieces, nodes, by_form - named, survey)
@@ -162,8 +162,8 @@ def _crossings(
 def _report_crossings(pieces: list[LinePiece], nodes: list[Ints], unnamed: set[int], survey: Survey) -> None:
     """One note for each pair of lines that cross."""
     names: dict[int, set[str]] = {node: set() for node in unnamed}
-    for piece, own in zip(pieces, nodes, strict=True):
-        for node in own[np.isin(own, list(unnamed))].tolist():
+    for piece, piece_nodes in zip(pieces, nodes, strict=True):
+        for node in piece_nodes[np.isin(piece_nodes, list(unnamed))].tolist():
             names[node].add(piece.name)
     for pair, count in sorted(Counter(tuple(sorted(both)) for both in names.values()).items()):
         times = f" ({count} times)" if count > 1 else ""
@@ -190,22 +190,23 @@ def _cut(pieces: list[LinePiece], nodes: list[Ints], crossings: set[int]) -> tup
     A net element that is whole is cut by lines of other surveys only, not by net elements.
     """
     passing = _occurrences(nodes, nodes)
-    of_lines = _occurrences([own for piece, own in zip(pieces, nodes, strict=True) if not piece.whole], nodes)
+    lines = [piece_nodes for piece, piece_nodes in zip(pieces, nodes, strict=True) if not piece.whole]
+    of_lines = _occurrences(lines, nodes)
     number: dict[str, int] = {}
-    parts: dict[str, int] = {}
-    found: list[tuple[LinePiece, int, int]] = []
-    for piece, own in zip(pieces, nodes, strict=True):
-        meets = of_lines[own] > 0 if piece.whole else passing[own] > 1
-        inner = [row for row in range(1, len(own) - 1) if meets[row] and int(own[row]) not in crossings]
-        cuts = [0, *inner, len(own) - 1]
-        parts[piece.name] = parts.get(piece.name, 0) + len(cuts) - 1
+    count: dict[str, int] = {}
+    parts: list[tuple[LinePiece, int, int]] = []
+    for piece, piece_nodes in zip(pieces, nodes, strict=True):
+        meets = of_lines[piece_nodes] > 0 if piece.whole else passing[piece_nodes] > 1
+        inner = [row for row in range(1, len(piece_nodes) - 1) if meets[row] and int(piece_nodes[row]) not in crossings]
+        cuts = [0, *inner, len(piece_nodes) - 1]
+        count[piece.name] = count.get(piece.name, 0) + len(cuts) - 1
         for first, last in itertools.pairwise(cuts):
-            found.append((piece.take(np.arange(first, last + 1)), int(own[first]), int(own[last])))
+            parts.append((piece.take(np.arange(first, last + 1)), int(piece_nodes[first]), int(piece_nodes[last])))
     elements = []
     ends = []
-    for piece, first, last in found:
+    for piece, first, last in parts:
         number[piece.name] = number.get(piece.name, 0) + 1
-        name = piece.name if parts[piece.name] == 1 else f"{piece.name}.{number[piece.name]}"
+        name = piece.name if count[piece.name] == 1 else f"{piece.name}.{number[piece.name]}"
         elements.append(replace(piece, name=name))
         ends.append((first, last))
     return elements, np.array(ends, dtype=np.int64).reshape(-1, 2)
@@ -213,7 +214,7 @@ def _cut(pieces: list[LinePiece], nodes: list[Ints], crossings: set[int]) -> tup
 
 def _occurrences(some: list[Ints], nodes: list[Ints]) -> Ints:
     """How often each node occurs in some of the pieces."""
-    count = 1 + max(int(own.max()) for own in nodes)
+    count = 1 + max(int(piece_nodes.max()) for piece_nodes in nodes)
     return np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *some]), minlength=count)
 
 
@@ -228,7 +229,7 @@ def arms_of(ends: Ints) -> dict[int, list[tuple[int, int]]]:
 def _links(
     table: pl.DataFrame,
     ends: Ints,
-    given: list[Relation],
+    relations: list[Relation],
     crossings: set[int],
     switches: set[int],
     survey: Survey,
@@ -241,8 +242,8 @@ def _links(
     track = track_of(table)
     directions = outward(track)
     names = track.ids
-    named = {end for a, a_end, b, b_end, _ in given for end in ((a, a_end), (b, b_end))}
-    rows = list(given)
+    named = {end for a, a_end, b, b_end, _ in relations for end in ((a, a_end), (b, b_end))}
+    rows = list(relations)
     guessed = []
     for node, meeting in arms_of(ends).items():
         here = [(names[element], position) for element, position in meeting]
@@ -253,12 +254,12 @@ def _links(
         pairs = _navigable(units, node in crossings, node in switches, config.switch_deg)
         for pair in unsaid:
             way = Navigability.BOTH if pair in pairs else Navigability.NONE
-            one, other = (here[k] for k in pair)
-            rows.append((*one, *other, way.value))
+            first, second = (here[k] for k in pair)
+            rows.append((*first, *second, way.value))
         guessed += [here] * bool(unsaid)
         if node not in crossings | switches:
             _report_node([name for name, _ in here], pairs, survey)
-    _report_guesses(guessed, len(rows) - len(given), bool(given), survey)
+    _report_guesses(guessed, len(rows) - len(relations), bool(relations), survey)
     links = Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
     known, findings = relations_to_nowhere(track, links)
     survey.findings += findings
@@ -281,8 +282,8 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: fl
     Two arms that meet two are a crossing, unless the survey names a switch (a slip) there.
     """
     turns = {
-        (one, other): float(np.degrees(np.arccos(np.clip(-units[one] @ units[other], -1.0, 1.0))))
-        for one, other in itertools.combinations(range(len(units)), 2)
+        (first, second): float(np.degrees(np.arccos(np.clip(-units[first] @ units[second], -1.0, 1.0))))
+        for first, second in itertools.combinations(range(len(units)), 2)
     }
     # A train bends by its curve alone, 57 degrees over the 20 m that an end's direction is taken from and the sharpest
     # tram curve of 20 m.
@@ -294,7 +295,7 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: fl
         return possible
     straight: set[tuple[int, int]] = set()
     for pair in sorted(possible, key=lambda pair: turns[pair]):
-        if not {arm for taken in straight for arm in taken} & set(pair):
+        if not {arm for joined in straight for arm in joined} & set(pair):
             straight.add(pair)
     return straight
 

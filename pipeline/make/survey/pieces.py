@@ -128,15 +128,15 @@ def piece_of(
 def with_own_names(pieces: list[LinePiece]) -> list[LinePiece]:
     """Each name once: the second of a name gets `#2`, in the order of the files; relations name net elements."""
     reserved = {piece.name for piece in pieces if piece.whole}
-    taken: set[str] = set()
+    used: set[str] = set()
     named = []
     for piece in pieces:
         name = piece.name
         number = 1
-        while name in taken or (name in reserved and not piece.whole):
+        while name in used or (name in reserved and not piece.whole):
             number += 1
             name = f"{piece.name}#{number}"
-        taken.add(name)
+        used.add(name)
         named.append(replace(piece, name=name))
     return named
 
@@ -154,11 +154,11 @@ def kilometre_spans(line_km: Floats, way_m: Floats, config: SurveyConfig) -> tup
 def measures_at(line_km: Floats, measure_m: Floats, km: float, config: SurveyConfig) -> list[float]:
     """All measures at which an element has a line kilometre; a kilometre within a jump is nowhere."""
     known, _, jumps = kilometre_spans(line_km, measure_m, config)
-    found = []
+    measures = []
     for low, high in zip(known[:-1][~jumps].tolist(), known[1:][~jumps].tolist(), strict=True):
         a = line_km[low]
         b = line_km[high]
         if min(a, b) <= km <= max(a, b) and a != b:
-            found.append(float(measure_m[low] + (km - a) / (b - a) * (measure_m[high] - measure_m[low])))
+            measures.append(float(measure_m[low] + (km - a) / (b - a) * (measure_m[high] - measure_m[low])))
     # A kilometre at a point ends one span and begins the next.
-    return [one for row, one in enumerate(found) if row == 0 or one - found[row - 1] > 1e-6]
+    return [measure for row, measure in enumerate(measures) if row == 0 or measure - measures[row - 1] > 1e-6]

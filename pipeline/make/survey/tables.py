@@ -87,12 +87,12 @@ def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None, config: SiteC
 def _renamed(place: str, frame: pl.DataFrame) -> pl.DataFrame:
     by_name = {alias: name for name, aliases in _NAMES.items() for alias in aliases}
     plain = {name: re.sub(r"\[.*?\]|\(.*?\)|[^a-z]", "", name.lower()) for name in frame.columns}
-    found = {name: by_name[word] for name, word in plain.items() if word in by_name}
-    twice = sorted({name for name in found.values() if list(found.values()).count(name) > 1})
+    meanings = {name: by_name[word] for name, word in plain.items() if word in by_name}
+    twice = sorted({name for name in meanings.values() if list(meanings.values()).count(name) > 1})
     if twice:
-        same = [name for name, meaning in found.items() if meaning in twice]
+        same = [name for name, meaning in meanings.items() if meaning in twice]
         raise SiteError("columns mean the same", place=place, found=", ".join(same), remedy="Keep one of them.")
-    return frame.rename(found)
+    return frame.rename(meanings)
 
 
 def _numbers(place: str, column: pl.Series) -> pl.Series:

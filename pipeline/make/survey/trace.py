@@ -20,24 +20,24 @@ _BLOCK = 2000
 
 def clean_traces(survey: Survey, config: SurveyConfig) -> Survey:
     """Recorded pieces cleaned, in order; each pass adds only track that none before it has. Others stay as they are."""
-    given = [piece for piece in survey.pieces if not piece.recorded]
-    cleaned = replace(survey, pieces=list(given))
+    surveyed = [piece for piece in survey.pieces if not piece.recorded]
+    cleaned = replace(survey, pieces=list(surveyed))
     for piece in survey.pieces:
         if piece.recorded:
             moving = piece.take(_moving(piece, config))
             for number, part in enumerate(_gapless(moving, cleaned, config), start=1):
                 name = f"{piece.name}/{number}" if number > 1 else piece.name
                 cleaned.pieces += _new_track(part, name, cleaned, config)
-    cleaned.pieces = _all_thinned(cleaned.pieces, len(given), config.shape_m)
+    cleaned.pieces = _all_thinned(cleaned.pieces, len(surveyed), config.shape_m)
     return cleaned
 
 
-def _all_thinned(pieces: list[LinePiece], given: int, shape_m: float) -> list[LinePiece]:
+def _all_thinned(pieces: list[LinePiece], surveyed: int, shape_m: float) -> list[LinePiece]:
     """All but the first `given` thinned; where a branch leaves another piece, both keep the point."""
     counts = Counter(place for piece in pieces for place in _places(piece))
     shared = [np.array([counts[place] > 1 for place in _places(piece)], dtype=np.bool_) for piece in pieces]
-    thinned = [_thinned(piece, held, shape_m) for piece, held in zip(pieces[given:], shared[given:], strict=True)]
-    return [*pieces[:given], *thinned]
+    thinned = [_thinned(piece, held, shape_m) for piece, held in zip(pieces[surveyed:], shared[surveyed:], strict=True)]
+    return [*pieces[:surveyed], *thinned]
 
 
 def _places(piece: LinePiece) -> list[tuple[float, float]]:
@@ -134,12 +134,12 @@ def _toe(lap: LinePiece, row: int, step: int, known: list[LinePiece], toe_m: flo
             nearest = np.linalg.norm(line - places[row], axis=1).argmin() == end
             if nearest and np.linalg.norm(ahead) < toe_m and ahead @ (line[end] - line[before]) > 0:
                 return piece.take([end])
-    other = row
-    while 0 <= other + step < len(lap) and np.linalg.norm(places[other] - places[row]) < toe_m:
-        other += step
+    beyond = row
+    while 0 <= beyond + step < len(lap) and np.linalg.norm(places[beyond] - places[row]) < toe_m:
+        beyond += step
     best: tuple[float, LinePiece | None] = (toe_m, None)
     for piece in known:
-        way = np.linalg.norm(piece.surface - places[other], axis=1)
+        way = np.linalg.norm(piece.surface - places[beyond], axis=1)
         if len(way) and way.min() < best[0]:
             best = float(way.min()), piece.take([int(np.argmin(way))])
     return best[1]

@@ -59,19 +59,19 @@ def _stream(
 def _supplemented(frame: pl.DataFrame, part: DecodedRows, supplements: Sequence[DecodedRows]) -> pl.DataFrame:
     """With the columns that other messages of the same receiver hold for the same epochs."""
     key = list(part.source.recipe.key)
-    for other in supplements:
-        if other.source.recipe.key != part.source.recipe.key or not _same_receiver(part, other):
+    for supplement in supplements:
+        if supplement.source.recipe.key != part.source.recipe.key or not _same_receiver(part, supplement):
             continue
-        columns = [expression.alias(name) for name, expression in other.source.columns.items()]
-        extra = other.frame.select(*key, *columns).unique(subset=key, keep="first", maintain_order=True)
+        columns = [expression.alias(name) for name, expression in supplement.source.columns.items()]
+        extra = supplement.frame.select(*key, *columns).unique(subset=key, keep="first", maintain_order=True)
         keys = part.frame.select(key)
         frame = frame.hstack(keys).join(extra, on=key, how="left", maintain_order="left").drop(key)
     return frame
 
 
-def _same_receiver(part: DecodedRows, other: DecodedRows) -> bool:
+def _same_receiver(part: DecodedRows, supplement: DecodedRows) -> bool:
     """Drivers publish the messages of one receiver side by side."""
-    return part.source.channel.topic.rpartition("/")[0] == other.source.channel.topic.rpartition("/")[0]
+    return part.source.channel.topic.rpartition("/")[0] == supplement.source.channel.topic.rpartition("/")[0]
 
 
 def _rows(part: DecodedRows, supplements: Sequence[DecodedRows], few: float, remarks: list[str]) -> pl.DataFrame:

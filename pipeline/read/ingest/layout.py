@@ -139,10 +139,10 @@ def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) ->
     """From one message; `static` masks the bits that shape the layout."""
     mask = np.frombuffer(static, dtype=np.uint8)
     content = np.frombuffer(payload, dtype=np.uint8)
-    taken = mask != 0
+    used = mask != 0
     for field in fields.values():
-        taken[field.start : field.end] = True
-    places = np.flatnonzero(taken)
+        used[field.start : field.end] = True
+    places = np.flatnonzero(used)
     stretches = []
     for part in np.split(places, np.flatnonzero(np.diff(places) > _NEAR) + 1):
         start, end = (int(part[0]), int(part[-1]) + 1) if len(part) else (0, 0)

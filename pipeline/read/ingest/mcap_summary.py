@@ -77,9 +77,9 @@ class Summary:
             # Some writers take a first time of 0 for none yet, and state the earliest after it.
             start_ns = stated.message_start_time if met.span_ns[0] else 0
             pairs.append(("times", (start_ns, stated.message_end_time), met.span_ns))
-        for name, given, counted in pairs:
-            if given != counted:
-                raise DamageError(position, f"the statistics record gives {given} {name}, the file holds {counted}")
+        for name, recorded, counted in pairs:
+            if recorded != counted:
+                raise DamageError(position, f"the statistics record gives {recorded} {name}, the file holds {counted}")
 
     def finish(self, footer: bytes, position: int) -> None:
         """The footer. A chunk index lists every chunk once, or there is none."""

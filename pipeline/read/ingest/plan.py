@@ -213,9 +213,9 @@ def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> li
 
 def _preferred(sources: Sequence[Source]) -> list[Source]:
     """This project's own schema alone where it is present; a supplement only with what it adds to."""
-    own = [source for source in sources if source.recipe.own]
-    if own:
-        return own
+    of_project = [source for source in sources if source.recipe.own]
+    if of_project:
+        return of_project
     whole = [source for source in sources if not source.recipe.supplement]
     return list(sources) if whole else []
 

@@ -42,7 +42,7 @@ def window_findings(site: Site, config: LdsConfig = DEFAULTS, limits: SiteConfig
     if site.balises is None:
         return []
     network = network_of(track_of(site.track), site.links)
-    found: dict[tuple[str, str], Finding] = {}
+    findings: dict[tuple[str, str], Finding] = {}
     for (_,), balises in site.balises.filter("linked").group_by("kind", maintain_order=True):
         points = _points(balises, network)
         for oriented, on_it in sorted(points.items()):
@@ -50,8 +50,8 @@ def window_findings(site: Site, config: LdsConfig = DEFAULTS, limits: SiteConfig
                 for near, far in _ahead(network, points, oriented, index, limits.announced_m):
                     if finding := _judge(reference, near, far, config):
                         first, second = sorted((near[0].balise_id, far[0].balise_id))
-                        found.setdefault((first, second), finding)
-    return [found[pair] for pair in sorted(found)]
+                        findings.setdefault((first, second), finding)
+    return [findings[pair] for pair in sorted(findings)]
 
 
 def _points(balises: pl.DataFrame, network: Network) -> dict[int, list[_Point]]:
@@ -156,14 +156,14 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelSt
     odds = np.log(config.ambiguity_probability / (1.0 - config.ambiguity_probability))
     limit_m = np.sqrt(2.0 * odds * (config.cross_bias_sigma_m**2 + survey_m**2))
     points = points_of(along.latitude_deg, along.longitude_deg)
-    found = candidates_of(points, network, segments_of(track), float(limit_m.max()))
-    own = element[found.step]
+    near_track = candidates_of(points, network, segments_of(track), float(limit_m.max()))
+    of_sample = element[near_track.step]
     # Two surveys never end at the same place.
-    near = (found.beyond_m <= config.survey_sigma_default_m) & (own < found.element)
-    near &= found.distance_m < limit_m[own]
-    pairs = own[near] * network.count + found.element[near]
-    row = found.step[near]
-    apart_m = found.distance_m[near]
+    near = (near_track.beyond_m <= config.survey_sigma_default_m) & (of_sample < near_track.element)
+    near &= near_track.distance_m < limit_m[of_sample]
+    pairs = of_sample[near] * network.count + near_track.element[near]
+    row = near_track.step[near]
+    apart_m = near_track.distance_m[near]
     order = np.lexsort((row, pairs))
     pairs = pairs[order]
     row = row[order]
@@ -171,17 +171,18 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelSt
     cuts = np.flatnonzero((np.diff(pairs) != 0) | (np.diff(row) > 1)) + 1
     for part in np.split(np.arange(len(row)), cuts):
         if len(part):
-            one, other = divmod(int(pairs[part[0]]), network.count)
+            element_a, element_b = divmod(int(pairs[part[0]]), network.count)
             at_m = measure_m[row[part]]
-            yield _ParallelStretch(one, other, float(at_m[0]), float(at_m[-1]), float(np.median(apart_m[part])))
+            median_m = float(np.median(apart_m[part]))
+            yield _ParallelStretch(element_a, element_b, float(at_m[0]), float(at_m[-1]), median_m)
 
 
 def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: MatchingConfig) -> Finding:
     name = network.track.ids[stretch.element]
-    other = network.track.ids[stretch.other]
+    parallel = network.track.ids[stretch.other]
     claim = most_claimed(stretch.apart_m, float(_survey_m(network.track, config)[stretch.element]), config)
     text = (
-        f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {other} lies {stretch.apart_m:.1f} m beside it; positions "
+        f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {parallel} lies {stretch.apart_m:.1f} m beside it; positions "
         f"alone give one of them a probability of {claim:.2f} at most, so that virtual balises there are ambiguous"
     )
     return Finding("warning", f"element {name}", text, _remedy(site, network, stretch))
@@ -196,7 +197,7 @@ def _remedy(site: Site, network: Network, stretch: _ParallelStretch) -> str:
     if reads:
         ways.append(f"a read of {', '.join(reads[:3])}")
     oriented = [2 * element + sense for element in (stretch.element, stretch.other) for sense in (0, 1)]
-    if any(len(network.successors[one]) > 1 for one in oriented):
+    if any(len(network.successors[side]) > 1 for side in oriented):
         ways.append("a switch taken at its end")
     return f"To tell the two apart: {', '.join(ways)}."
 

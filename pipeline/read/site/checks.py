@@ -48,15 +48,15 @@ def remarks(
     track = track_of(frame)
     known, findings = relations_to_nowhere(track, links)
     passable, turning = _relations_that_turn_back(track, known)
-    found = Remarks(passable, config, [*findings, *_relations_that_differ(known), *turning])
-    _check_elements(track, declared_length_m, found)
-    _check_gaps(track, found)
-    found.findings += _near_misses(track, known, config)
+    collected = Remarks(passable, config, [*findings, *_relations_that_differ(known), *turning])
+    _check_elements(track, declared_length_m, collected)
+    _check_gaps(track, collected)
+    collected.findings += _near_misses(track, known, config)
     if balises is not None:
-        _check_balises(track, balises, found)
+        _check_balises(track, balises, collected)
     if route is not None:
-        found.breaches += route_breaches(track, route, config)
-    return found
+        collected.breaches += route_breaches(track, route, config)
+    return collected
 
 
 def drop_repeated_points(file: str, frame: pl.DataFrame, breaches: list[str]) -> tuple[pl.DataFrame, list[Finding]]:
@@ -120,9 +120,9 @@ def _relations_that_turn_back(track: SurveyedTrack, links: pl.DataFrame) -> tupl
     """No train gets round a corner of less than a right angle: such a relation, as between the two branches of a
     switch, is not navigable, whatever it says.
     """
-    one, other = _related_ends(track, links)
+    side_a, side_b = _related_ends(track, links)
     directions = outward(track).reshape(-1, 3)
-    acute = pl.Series(np.einsum("ij,ij->i", directions[one], directions[other]) > 0.0, dtype=pl.Boolean)
+    acute = pl.Series(np.einsum("ij,ij->i", directions[side_a], directions[side_b]) > 0.0, dtype=pl.Boolean)
     back = acute & (links["navigability"] != Navigability.NONE.value)
     findings = [
         Finding(
@@ -159,33 +159,33 @@ def outward(track: SurveyedTrack) -> np.ndarray:
     return directions
 
 
-def _check_elements(track: SurveyedTrack, declared_length_m: dict[str, float], found: Remarks) -> None:
+def _check_elements(track: SurveyedTrack, declared_length_m: dict[str, float], collected: Remarks) -> None:
     """Length, declared length, height and vertex spacing of each element."""
     geometric = geometric_m(track)
     length_m = geometric[track.first[1:] - 1]
     stated_m = np.array([declared_length_m.get(name, np.nan) for name in track.ids])
-    tolerance_m = np.maximum(MEASURE_TOLERANCE_M, found.config.length_share * length_m)
+    tolerance_m = np.maximum(MEASURE_TOLERANCE_M, collected.config.length_share * length_m)
     wrong = [np.abs(declared - length_m) > tolerance_m for declared in (track.length_m, stated_m)]
     chord_m = np.maximum.reduceat(chord_errors_m(track), track.first[:-1])
-    remarkable = (length_m < GAP_COUNTS_M) | wrong[0] | wrong[1] | (chord_m > found.config.chord_m)
+    remarkable = (length_m < GAP_COUNTS_M) | wrong[0] | wrong[1] | (chord_m > collected.config.chord_m)
     for element in np.flatnonzero(remarkable).tolist():
         place = f"track: element {track.ids[element]}"
         length = float(length_m[element])
         if length < GAP_COUNTS_M:
-            found.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
+            collected.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
         for declared, off in zip((track.length_m, stated_m), wrong, strict=True):
             if off[element]:
                 text = f"the declared length is {declared[element]:.1f} m, the geometry is {length:.1f} m long"
-                found.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
-        if chord_m[element] > found.config.chord_m:
+                collected.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
+        if chord_m[element] > collected.config.chord_m:
             spacing = float(np.diff(geometric[track.vertices(element)]).max())
             text = f"points up to {spacing:.0f} m apart: straight lines between them leave the curve by "
             text += f"{chord_m[element]:.2f} m"
-            found.findings.append(Finding("note", place, text, "Survey curves with closer points."))
-    _check_heights(track, found)
+            collected.findings.append(Finding("note", place, text, "Survey curves with closer points."))
+    _check_heights(track, collected)
 
 
-def _check_heights(track: SurveyedTrack, found: Remarks) -> None:
+def _check_heights(track: SurveyedTrack, collected: Remarks) -> None:
     # An element has all heights or none.
     flat = [track.ids[element] for element in np.flatnonzero(np.isnan(track.height_m[track.first[:-1]])).tolist()]
     if flat and len(flat) < len(track.ids):
@@ -193,7 +193,7 @@ def _check_heights(track: SurveyedTrack, found: Remarks) -> None:
             f"{len(flat)} of {len(track.ids)} elements lack heights and are taken as 2-D ({', '.join(flat[:3])}, ...)"
         )
         remedy = "Give heights for all elements, or for none."
-        found.findings.append(Finding("warning", "track: column height_m", text, remedy))
+        collected.findings.append(Finding("warning", "track: column height_m", text, remedy))
 
 
 def chord_errors_m(track: SurveyedTrack) -> Floats:
@@ -218,25 +218,25 @@ def chord_errors_m(track: SurveyedTrack) -> Floats:
     return np.asarray(errors)
 
 
-def _check_gaps(track: SurveyedTrack, found: Remarks) -> None:
+def _check_gaps(track: SurveyedTrack, collected: Remarks) -> None:
     """Ends that a relation joins must meet, in place and, where both have one, in height."""
-    one, other = _related_ends(track, found.links)
+    end_a, end_b = _related_ends(track, collected.links)
     places = end_places(track).reshape(-1, 3)
-    gaps = np.linalg.norm(places[one] - places[other], axis=1)
+    gaps = np.linalg.norm(places[end_a] - places[end_b], axis=1)
     heights = track.height_m[np.column_stack([track.first[:-1], track.first[1:] - 1]).ravel()]
-    steps = np.abs(heights[one] - heights[other])
+    steps = np.abs(heights[end_a] - heights[end_b])
     for row in np.flatnonzero((gaps > GAP_COUNTS_M) | (steps > GAP_COUNTS_M)).tolist():
-        a, position_a, b, position_b, navigability = found.links.row(row)
+        a, position_a, b, position_b, navigability = collected.links.row(row)
         ends = f"end {position_a} of {a} and end {position_b} of {b}"
         text = f"{ends} are linked but {gaps[row]:.1f} m apart"
-        if gaps[row] > found.config.joined_m and navigability != Navigability.NONE.value:
-            found.breaches.append(f"links: {text}; expected at most {found.config.joined_m:g} m")
+        if gaps[row] > collected.config.joined_m and navigability != Navigability.NONE.value:
+            collected.breaches.append(f"links: {text}; expected at most {collected.config.joined_m:g} m")
         elif gaps[row] > GAP_COUNTS_M:
             remedy = "The straight line between them counts as track; survey the missing piece."
-            found.findings.append(Finding("warning", "links", text, remedy))
+            collected.findings.append(Finding("warning", "links", text, remedy))
         if steps[row] > GAP_COUNTS_M:
             text = f"{ends} differ by {steps[row]:.1f} m in height"
-            found.findings.append(Finding("warning", "links", text, "Correct the heights."))
+            collected.findings.append(Finding("warning", "links", text, "Correct the heights."))
 
 
 def _near_misses(track: SurveyedTrack, links: pl.DataFrame, config: SiteConfig) -> Iterator[Finding]:
@@ -247,9 +247,9 @@ def _near_misses(track: SurveyedTrack, links: pl.DataFrame, config: SiteConfig) 
     places = end_places(track).reshape(-1, 3)
     inward = outward(track).reshape(-1, 3)
     inward /= np.maximum(np.linalg.norm(inward, axis=1), 1e-9)[:, None]
-    for one, other, gap in _nearly_met(places, inward, free, config):
-        (a, position_a) = ends[one]
-        (b, position_b) = ends[other]
+    for end_a, end_b, gap in _nearly_met(places, inward, free, config):
+        (a, position_a) = ends[end_a]
+        (b, position_b) = ends[end_b]
         if a != b:
             text = f"end {position_a} of {a} and end {position_b} of {b} are {gap:.2f} m apart and not linked"
             remedy = "Survey the missing piece, or add the relation, if trains run there."
@@ -267,9 +267,9 @@ def _pairs_within(places: Floats, reach_m: float) -> npt.NDArray[np.int64]:
     number = number[order]
     pairs = []
     for step in _HALF_OF_THE_NEIGHBOURS:
-        other = number + (step[0] * across + step[1]) * above + step[2]
-        low = np.searchsorted(number, other, side="left") if any(step) else np.arange(len(number)) + 1
-        counts = np.maximum(np.searchsorted(number, other, side="right") - low, 0)
+        neighbour = number + (step[0] * across + step[1]) * above + step[2]
+        low = np.searchsorted(number, neighbour, side="left") if any(step) else np.arange(len(number)) + 1
+        counts = np.maximum(np.searchsorted(number, neighbour, side="right") - low, 0)
         first = np.repeat(np.arange(len(number)), counts)
         second = np.repeat(low, counts) + np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
         pairs.append(order[np.column_stack([first, second])])
@@ -299,21 +299,21 @@ def _nearly_met(places: Floats, inward: Floats, free: np.ndarray, config: SiteCo
             nearest.setdefault(end, row)
     both = [far[row] for row in set(nearest.values()) if all(nearest[end] == row for end in far[row].tolist())]
     pairs = sorted({(int(min(pair)), int(max(pair))) for pair in [*near, *both]})
-    return [(one, other, float(np.linalg.norm(places[one] - places[other]))) for one, other in pairs]
+    return [(first, second, float(np.linalg.norm(places[first] - places[second]))) for first, second in pairs]
 
 
-def _check_balises(track: SurveyedTrack, balises: pl.DataFrame, found: Remarks) -> None:
+def _check_balises(track: SurveyedTrack, balises: pl.DataFrame, collected: Remarks) -> None:
     repeated = balises.filter(pl.col("balise_id").is_duplicated())["balise_id"].unique().sort().to_list()
     if repeated:
-        found.breaches.append(f"balises: column balise_id: {', '.join(repeated[:3])} occur more than once")
+        collected.breaches.append(f"balises: column balise_id: {', '.join(repeated[:3])} occur more than once")
     off = [
         Finding("error", f"{BALISE_PLACE}{name}", *what)
         for name, element, measure in balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
         if (what := _off_the_track(track, element, measure)) is not None
     ]
-    found.findings += off
+    collected.findings += off
     if off and len(off) == balises.height:
-        found.breaches.append(f"balises: none lies on a net element of the track; {off[0].place} {off[0].message}")
+        collected.breaches.append(f"balises: none lies on a net element of the track; {off[0].place} {off[0].message}")
 
 
 def _off_the_track(track: SurveyedTrack, element: str, measure_m: float) -> tuple[str, str] | None:

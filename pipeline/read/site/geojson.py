@@ -102,10 +102,11 @@ def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> 
 
 def parts_of(feature: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """Properties and geometry of a feature, empty where it has none. Raises `ValueError`."""
-    found = [(feature.get(name) or {}) if isinstance(feature, Mapping) else None for name in ("properties", "geometry")]
-    if not all(isinstance(part, Mapping) for part in found):
+    names = ("properties", "geometry")
+    members = [(feature.get(name) or {}) if isinstance(feature, Mapping) else None for name in names]
+    if not all(isinstance(part, Mapping) for part in members):
         raise ValueError("a feature is no object with properties and a geometry")
-    return found[0], found[1]  # type: ignore[return-value]
+    return members[0], members[1]  # type: ignore[return-value]
 
 
 def triple(point: Any) -> tuple[float, float, float | None]:
@@ -171,14 +172,14 @@ def _relation(keys: Mapping[str, Any]) -> tuple[Any, ...]:
     ends = [_referred(_first(keys, names)) for names in (_A_KEYS, _B_KEYS)]
     positions = [_position(keys, names, origin) for names, origin in (_POSITIONS_A, _POSITIONS_B)]
     # Vocabularies give the word as the last part of an address.
-    said = keys.get("navigability")
-    word = "" if said is None else re.split("[/#]", str(said).strip().lower())[-1]
+    written = keys.get("navigability")
+    word = "" if written is None else re.split("[/#]", str(written).strip().lower())[-1]
     known = {member.value.lower(): member.value for member in Navigability}
     if word not in known:
-        raise ValueError(f"navigability {word or said!r}; expected one of {', '.join(Navigability)}")
+        raise ValueError(f"navigability {word or written!r}; expected one of {', '.join(Navigability)}")
     if None in positions:
-        found = [_first(keys, names) for names, _ in (_POSITIONS_A, _POSITIONS_B)]
-        raise ValueError(f"positionOnA {found[0]!r}, positionOnB {found[1]!r}; expected 0 or 1 (start or end)")
+        on_a, on_b = (_first(keys, names) for names, _ in (_POSITIONS_A, _POSITIONS_B))
+        raise ValueError(f"positionOnA {on_a!r}, positionOnB {on_b!r}; expected 0 or 1 (start or end)")
     if None in ends:
         raise ValueError(f"netelementA {ends[0]!r}, netelementB {ends[1]!r}; a relation joins two elements")
     return str(ends[0]), positions[0], str(ends[1]), positions[1], known[word]
@@ -186,11 +187,11 @@ def _relation(keys: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def _position(keys: Mapping[str, Any], names: tuple[str, ...], origin: str) -> int | None:
     """End 0 or 1 of an element, or whether it is its origin (ERA vocabulary); none where neither is said."""
-    said = _first(keys, names)
+    written = _first(keys, names)
     at_origin = keys.get(origin)
-    if said is None and isinstance(at_origin, bool):
+    if written is None and isinstance(at_origin, bool):
         return 0 if at_origin else 1
-    word = str(said).strip().lower()
+    word = str(written).strip().lower()
     return 0 if word in _START else 1 if word in _END else None
 
 

@@ -62,13 +62,13 @@ def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:
 def typed_table(raw: RawTable, table: str, breaches: list[str]) -> pl.DataFrame | None:
     """The contract's columns with the contract's types (words as text), or breaches and none."""
     columns = SITE_SCHEMAS[table].columns() | _RECORDED.get(table, {})
-    found: list[InputError] = []
-    read = {name: _read(raw, name, column, found) for name, column in columns.items() if name in raw.frame.columns}
+    errors: list[InputError] = []
+    read = {name: _read(raw, name, column, errors) for name, column in columns.items() if name in raw.frame.columns}
     known = {name: column for name, column in columns.items() if name not in read or read[name] is not None}
     recorded = raw.frame.with_columns(series for series in read.values() if series is not None)
-    frame = conform_to(known, recorded, raw.file, found, _DEFAULTS)
-    breaches += [line_of(breach) for breach in found]
-    return None if found else frame.with_columns(pl.col(pl.Enum).cast(pl.String))
+    frame = conform_to(known, recorded, raw.file, errors, _DEFAULTS)
+    breaches += [line_of(breach) for breach in errors]
+    return None if errors else frame.with_columns(pl.col(pl.Enum).cast(pl.String))
 
 
 def _with_epsg(file: str, frame: pl.DataFrame, named: str | None) -> RawTable:
@@ -88,21 +88,21 @@ def _with_epsg(file: str, frame: pl.DataFrame, named: str | None) -> RawTable:
 
 def _read(raw: RawTable, name: str, column: dy.Column, breaches: list[InputError]) -> pl.Series | None:
     """What stands as text in the type that it spells, identities that are numbers as text; none with a breach."""
-    found = raw.frame[name]
-    if isinstance(column, dy.String) and found.dtype.is_integer():
-        return found.cast(pl.String)
-    if found.dtype != pl.String or isinstance(column, dy.String | dy.Enum):
-        return found
-    texts = found.str.strip_chars()
+    recorded = raw.frame[name]
+    if isinstance(column, dy.String) and recorded.dtype.is_integer():
+        return recorded.cast(pl.String)
+    if recorded.dtype != pl.String or isinstance(column, dy.String | dy.Enum):
+        return recorded
+    texts = recorded.str.strip_chars()
     if isinstance(column, dy.Bool):
         series = texts.str.to_lowercase().replace_strict(_TRUTH, default=None, return_dtype=pl.Boolean)
     else:
         series = texts.cast(column.dtype, strict=False)
-    unreadable = series.is_null() & found.is_not_null()
+    unreadable = series.is_null() & recorded.is_not_null()
     if not unreadable.any():
         return series
     place = f"{raw.file}: column {name}"
-    value = found.filter(unreadable)[0]
+    value = recorded.filter(unreadable)[0]
     where = f"{value!r} in {rows_text(unreadable)}"
     breaches.append(InputError("cannot be read", place=place, found=where, expected=type_name(column)))
     return None

@@ -83,11 +83,11 @@ def _matched(a: pl.DataFrame, b: pl.DataFrame) -> dict[int, int]:
         and (apart_ns := 0 if t_a == t_b else window_ns + 1 if None in (t_a, t_b) else abs(t_a - t_b)) <= window_ns
     )
     pairs: dict[int, int] = {}
-    taken: set[int] = set()
+    matched_b: set[int] = set()
     for _, row_a, row_b in near:
-        if row_a not in pairs and row_b not in taken:
+        if row_a not in pairs and row_b not in matched_b:
             pairs[row_a] = row_b
-            taken.add(row_b)
+            matched_b.add(row_b)
     return dict(sorted(pairs.items()))
 
 

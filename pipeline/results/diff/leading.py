@@ -18,19 +18,19 @@ BALISE_COUNTS = {
 def verdict_changes(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
     """Solutions whose verdict is another one, from two `runs` tables of one run."""
     return tuple(
-        f"{_of(solution, a, b)}{one or 'failed'} became {other or 'failed'}"
-        for solution, one, other in _both(a, b, "verdict")
-        if one != other
+        f"{_of(solution, a, b)}{before or 'failed'} became {after or 'failed'}"
+        for solution, before, after in _both(a, b, "verdict")
+        if before != after
     )
 
 
 def balise_counts(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
     """`accepted 15 became 3`: counts of virtual balises that changed, from two `runs` tables of one run."""
     return tuple(
-        f"{_of(solution, a, b)}{words} {_or_unknown(one)} became {_or_unknown(other)}"
+        f"{_of(solution, a, b)}{words} {_or_unknown(before)} became {_or_unknown(after)}"
         for column, words in BALISE_COUNTS.items()
-        for solution, one, other in _both(a, b, column)
-        if one != other
+        for solution, before, after in _both(a, b, column)
+        if before != after
     )
 
 
@@ -40,13 +40,13 @@ def passage_changes(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
     before = _statuses(a)
     after = _statuses(b)
     for key in dict.fromkeys([*before, *after]):
-        one = before.get(key, "no passage")
-        other = after.get(key, "no passage")
-        if one != other:
-            moved.setdefault((key[0], one, other), []).append(key[1])
+        was = before.get(key, "no passage")
+        became = after.get(key, "no passage")
+        if was != became:
+            moved.setdefault((key[0], was, became), []).append(key[1])
     return tuple(
-        f"{_of(solution, a, b)}{' '.join(balises)}: {one} became {other}"
-        for (solution, one, other), balises in moved.items()
+        f"{_of(solution, a, b)}{' '.join(balises)}: {was} became {became}"
+        for (solution, was, became), balises in moved.items()
     )
 
 

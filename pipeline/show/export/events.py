@@ -36,8 +36,8 @@ def hazard_text(row: Row) -> str:
     size = "of unknown size" if row["size_m"] is None else f"of {row['size_m']:.1f} m"
     hit = ", ".join(row["balise_ids"]) or "no VB"
     accepted = f", accepted despite the fault: {', '.join(row['accepted_ids'])}" if row["accepted_ids"] else ""
-    found = "detected" if row["detected"] else "not detected"
-    return f"{row['hazard']} {size}, {row['failure_mode']}, {found}, hits {hit}{accepted}, suspect: {row['suspect']}"
+    detected = "detected" if row["detected"] else "not detected"
+    return f"{row['hazard']} {size}, {row['failure_mode']}, {detected}, hits {hit}{accepted}, suspect: {row['suspect']}"
 
 
 def alarm_entries(alarms: pl.DataFrame) -> list[Entry]:

@@ -52,10 +52,10 @@ def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) 
     check_site(site, known, tables.run_id)
     digest = site.digest if site is not None else known
     if log is not None and log.input_digest and digest:
-        found = input_digest(log, digest)
+        recorded = input_digest(log, digest)
         expected = str(tables.runs["input_digest"].first())
-        if found != expected:
-            raise UsageError("was replayed from another log", place=tables.run_id, found=found, expected=expected)
+        if recorded != expected:
+            raise UsageError("was replayed from another log", place=tables.run_id, found=recorded, expected=expected)
     if tables.epochs.is_empty():
         raise UsageError("has no epoch to export", place=tables.run_id, found=str(tables.runs["error"].first()))
 

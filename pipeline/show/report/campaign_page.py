@@ -173,10 +173,10 @@ def _whys(campaign: Campaign) -> dict[tuple[str, str], str]:
 
 
 def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
-    found, levels, balises = (_only(campaign.derived[table], name) for table in ("figures", "detection", "balises"))
-    said = "".join(f"<p>{escape(text)}</p>" for text in (*plain_statements(found), *level_statements(levels)))
+    rates, levels, balises = (_only(campaign.derived[table], name) for table in ("figures", "detection", "balises"))
+    statements = "".join(f"<p>{escape(text)}</p>" for text in (*plain_statements(rates), *level_statements(levels)))
     note = "<p>Rates count all that this campaign holds, injected faults included. Bounds: exact, 95 %, two-sided.</p>"
-    rows = found.drop("solution").iter_rows(named=True)
+    rows = rates.drop("solution").iter_rows(named=True)
     caption = "All figures of the campaign"
     return section(
         key,
@@ -184,7 +184,7 @@ def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
         balise_table(f"table-balises-{key}", "Balises over all runs, the worst first", lost_shares(balises)),
         _hazards_table(key, _only(campaign.hazards, name), campaign),
         *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in plots_of("campaign")),
-        said,
+        statements,
         frame_table(f"table-levels-{key}", ALLOWED, levels, _LEVEL_COLUMNS, CampaignDetection),
         note,
         *(figures(f"table-figures-{key}", caption, row, CampaignFigures) for row in rows),

@@ -70,22 +70,22 @@ def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.Da
     head = head_of(run_verdicts(runs).values())
     total = sum(head.counts().values())
     counts = ", ".join(f"{count} {name}" for name, count in head.counts().items() if count)
-    said = f"{plural(total, 'run')}: {counts}."
+    summary = f"{plural(total, 'run')}: {counts}."
     if head.verdict is None:
-        return Headline(head.word, "no run could be replayed", said), None
+        return Headline(head.word, "no run could be replayed", summary), None
     beside = beside_words(figures_beside(runs))
     if head.verdict == RunVerdict.SAFE:
         met = withstood(hazards)
-        return Headline(head.word, _ALL_SAFE + (f": {met}" if met else ""), said, beside), None
+        return Headline(head.word, _ALL_SAFE + (f": {met}" if met else ""), summary, beside), None
     rows = runs.filter(pl.col("verdict") == head.verdict.value)
     order = ("unsafe_accepted", "hazardous_max_s", "unproven_accepted", "share_unknown")
     worst = rows.sort(*order, "run_id", descending=[True] * len(order) + [False], nulls_last=True).head(1)
     if worst.is_empty():
-        return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", said, beside), None
+        return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", summary, beside), None
     row = worst.row(0, named=True)
     of_run = pl.col("run_id") == row["run_id"]
     reason = _worst(row, hazards.filter(of_run), passages.filter(of_run))
-    return Headline(head.word, f"{reason} (run {row['run_id']})", said, beside), row["run_id"]
+    return Headline(head.word, f"{reason} (run {row['run_id']})", summary, beside), row["run_id"]
 
 
 _TRAINS = {

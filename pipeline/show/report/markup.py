@@ -173,7 +173,7 @@ def _sheets(head: str, foot: str) -> str:
 
 def _css_text(text: str) -> str:
     """A string of CSS in which no character of the text can end anything."""
-    return '"' + re.sub(r"[^A-Za-z0-9 .,:]", lambda found: f"\\{ord(found[0]):x} ", text) + '"'
+    return '"' + re.sub(r"[^A-Za-z0-9 .,:]", lambda match: f"\\{ord(match[0]):x} ", text) + '"'
 
 
 def _numbered(body: str) -> str:

@@ -69,14 +69,14 @@ def route_section(identity: str, run_id: str, epochs: pl.DataFrame, sure: float)
     if route is None:
         return section(identity, "Route found", f"<p>{_TURNED}</p>")
     doubtful = route.filter("doubtful")["netelement_id"].to_list()
-    said = f"In doubt: {some_of(doubtful)}." if doubtful else "No stretch is in doubt."
+    doubt = f"In doubt: {some_of(doubtful)}." if doubtful else "No stretch is in doubt."
     href = f"data:text/csv;base64,{base64.b64encode(route.write_csv().encode()).decode()}"
     download = link(href, "route as csv", download=f"{file_name(run_id)}.csv")
     shown = route.select("doubtful", pl.exclude("doubtful"))
     return section(
         identity,
         "Route found",
-        f'<p class="notice {"partial" if doubtful else "ok"}">{escape(said)} {download}</p>',
+        f'<p class="notice {"partial" if doubtful else "ok"}">{escape(doubt)} {download}</p>',
         f"<p>{_NOTE}</p>",
         frame_table(f"table-{identity}", "Route found, in the order of the path", shown),
     )

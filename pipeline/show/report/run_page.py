@@ -116,9 +116,9 @@ def run_page(
 def _ways(neighbours: Neighbours) -> str:
     """To the campaign, and to the runs beside this one."""
     ways = [link("../index.html", "Campaign", data_go="campaign")]
-    for go, words, other in (("previous", "← run", neighbours.before), ("next", "run →", neighbours.after)):
-        if other is not None:
-            ways.append(link(other[1], f"{words} {other[0]}", data_go=go))
+    for go, words, neighbour in (("previous", "← run", neighbours.before), ("next", "run →", neighbours.after)):
+        if neighbour is not None:
+            ways.append(link(neighbour[1], f"{words} {neighbour[0]}", data_go=go))
     return f'<p class="ways">{" · ".join(ways)}</p>'
 
 

@@ -16,9 +16,9 @@ def plots_of(page: str) -> list[tuple[str, str, str]]:
     return [(name, plot["title"], plot["text"]) for name, plot in words.WORDS["plots"][page].items()]
 
 
-def plural(count: int, one: str) -> str:
+def plural(count: int, singular: str) -> str:
     """`1 balise`, `3 balises`."""
-    return f"{count} {one if count == 1 else one + 's'}"
+    return f"{count} {singular if count == 1 else singular + 's'}"
 
 
 def some_of(names: Sequence[str], most: int = 8) -> str:

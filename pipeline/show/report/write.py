@@ -92,9 +92,10 @@ def write_report(
             storage.remove(folder / name)
     hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
     storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, rows), made).encode())
-    contents = {name: storage.content_of(out / "report" / name) for name in storage.files_below(out / "report")}
+    written = [index, *(page.path for page in pages)]
+    contents = {page.relative_to(out / "report").as_posix(): storage.content_of(page) for page in written}
     note_pages(out, {name: content for name, content in contents.items() if content is not None})
-    return [index, *(page.path for page in pages)]
+    return written
 
 
 def page_name(run_id: str) -> str:

@@ -57,10 +57,10 @@ def _confidence(lds: LdsConfig) -> pl.Expr:
 
 
 def unrolled(epochs: pl.DataFrame, near: Bools) -> Floats:
-    """Path position with the way taken out that a curve adds to a position beside the track [m]; NaN elsewhere.
+    """Path position less what a curve adds to the way of a position beside the track [m]; NaN off the track.
 
-    A point y left of a track that turns left by its curvature k moves dx / (1 - k y) along it while the train moves
-    dx, whether y is an error of the position or of the survey. Both are known, so this is no noise of the monitor.
+    A point y to the left of a track with left curvature k moves dx / (1 - k y) along it while the train moves dx. Both
+    are known, so this is corrected and not counted as noise.
     """
     along = np.full(near.size, np.nan)
     rows = np.flatnonzero(near)
@@ -92,6 +92,7 @@ def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometry: Odometry) -> 
 def _columns(
     t_ns: Ints, jitter_s: float, odometry: Odometry, in_use: Estimates, config: Configuration
 ) -> list[pl.Series]:
+    """The odometer's columns of `schemas.stages.Aligned`, each read at the epoch less the latency in use there."""
     at = odometry.seconds(t_ns) - in_use.latency_s
     known = odometry.known_at_s(at)
     rows = np.flatnonzero(known)
@@ -164,11 +165,10 @@ def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float) -> Floats:
     valid = np.flatnonzero(np.isfinite(path_m))
     if valid.size < 2:
         return speed
-    t = t_s[valid]
-    x = path_m[valid]
-    before = np.searchsorted(t, t - window_s, side="right") - 1
-    before = np.maximum(before, 0)
-    span = t - t[before]
+    at_s = t_s[valid]
+    at_m = path_m[valid]
+    before = np.maximum(np.searchsorted(at_s, at_s - window_s, side="right") - 1, 0)
+    span_s = at_s - at_s[before]
     with np.errstate(invalid="ignore", divide="ignore"):
-        speed[valid] = np.where(span > 0, (x - x[before]) / span, np.nan)
+        speed[valid] = np.where(span_s > 0, (at_m - at_m[before]) / span_s, np.nan)
     return speed

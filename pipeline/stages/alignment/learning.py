@@ -51,9 +51,9 @@ def learn(
 class _Learner:
     """Runs the filter along the run, once the noise is known, and freezes it under alarm of the along-track monitors.
 
-    From the first failing epoch on the estimates stand still until the rule of recovery holds (`RecoveryRule`), so that
-    a fault that persists is never learned as scale; nor is an offset that a position brings back from a break or an
-    alarm, or its decay (`ScaleLatencyFilter.resume`).
+    From the first failing epoch on the estimates stand still until the rule of recovery holds (`RecoveryRule`): a
+    lasting fault must not be learned as scale. Nor must an offset with which the position comes back from a break or an
+    alarm, or the decay of that offset (`ScaleLatencyFilter.resume`).
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class _Learner:
         self._factor = config.monitors.threshold_factor
         self._limit_m = config.hazards.failure_limit_m
         self._rule = RecoveryRule(config)
-        # Latencies of five sigmas have to find a known distance too.
+        # The filter reads the odometer up to a latency of five sigmas earlier.
         margin_ns = round(5e9 * config.align.latency_prior_sigma_s)
         t_ns = times_ns(positions)
         self._rows = np.flatnonzero(usable & odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns))
@@ -102,6 +102,7 @@ class _Learner:
             self._meter = NoiseMeter(series, moving, config.monitors.noise_along_m, config)
 
     def run(self, prior: Estimates) -> None:
+        """Learn until an alarm, hold, learn on; fills `learned`."""
         position = self._meter.known_from() if self._rows.size else 0
         if position >= self._rows.size:
             return
@@ -147,14 +148,17 @@ class _Learner:
                 alarm = position + int(failing[0])
                 held = joints[_in_use(use_from, alarm)]
                 self._put(np.array([alarm]), held[None])
-                # Of what the block's last state has still to settle the alarm knows nothing: it may lie behind it.
+                # The block's last state may lie behind the alarm: what it has to settle is not carried over.
                 return FilterState(held, self._times[alarm], state.origin_m), alarm
             position = end
             block = min(2 * block, BLOCK)
         return state, position
 
     def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Ints, Floats]:
-        """The filter's last state in these positions; from where each of its states may be used; the joint states."""
+        """The filter over positions [begin, end): its last state, and its joint states with the first use of each.
+
+        The first use comes before the joint states in the result.
+        """
         due = self._due(state.t_s, begin, end)
         before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
         broken = (self._segment[before] != self._segment[due]) | (self._breaks[before] != self._breaks[due])
@@ -168,12 +172,15 @@ class _Learner:
             observed = self._t_s[part], self._path_m[part], self._sigma_m[part]
             joints[first:last] = self._filter.run(state, *observed, self._jitter_s)
             state = self._filter.after(state, joints[last - 1], float(self._t_s[part[-1]]))
-        # An update reads the odometer so long after its epoch, so its result may be used only after that.
+        # An update reads the odometer up to `latency_span_s` after its epoch: causal is its use from then on.
         use_from = np.searchsorted(self._t_s, self._t_s[due] + self._config.align.latency_span_s)
         return state, np.maximum(use_from, due + 1), joints
 
     def _beyond_break(self, state: FilterState, before: int, position: int) -> FilterState:
-        """The state at the first position after a break; where the odometer lost its way, nothing tells of a move."""
+        """The state at the first position after a break.
+
+        Where the odometer lost its distance the offset begins anew: no comparison shows whether the position moved.
+        """
         if self._segment[before] == self._segment[position]:
             observed = *self._observation(position), float(self._sigma_m[position]), self._jitter_s
             return self._filter.resume(state, *observed, self._limit_m)
@@ -228,9 +235,10 @@ class _Learner:
         return np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config))
 
     def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:
-        """Position from which learning goes on after the alarm at `alarm`, and what it has still to settle [m2].
+        """Position from which learning goes on after the alarm (the number of positions if never), and what may settle.
 
-        The number of positions if it never goes on. What may settle is how far the position is from its place then.
+        Learning goes on where GNSS minus odometer is back within the recovery bound, `recovery_s` after the last
+        failure. The offset left then, squared, and its variance [m^2] have still to settle.
         """
         begin = position = alarm - 1  # the first position of all cannot fail
         bank: AxisState | None = None
@@ -269,7 +277,7 @@ class _Learner:
 
 
 def _gaps_before(at_s: Floats, t_s: Floats, gap_s: float) -> Ints:
-    """How many gaps of a series of times end up to each of these times."""
+    """At each of `at_s`, how many gaps in the times `t_s` have ended: equal numbers mean no gap in between."""
     ends = t_s[1:][np.diff(t_s) > gap_s]
     return np.searchsorted(ends, at_s, side="right")
 

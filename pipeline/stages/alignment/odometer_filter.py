@@ -133,7 +133,7 @@ class ScaleLatencyFilter:
             row.dot(seen[:-1]).item() + self.config.white_share * sigma_m**2 + self._scatter_m2(jitter_s, speed_mps)
         )
         probability = self.config.break_moved_probability * -math.expm1((state.t_s - t_s) / self.config.break_moving_s)
-        # More than the offset's own prior would say no more, and leave no digits for the position's noise.
+        # Beyond the prior of the offset nothing changes, but the digits of the position's noise would be lost.
         brought_m2 = min(moved_m2(seen.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
         joint[_OFFSET, _OFFSET] += brought_m2
         return FilterState(joint, t_s, state.origin_m, left_m2 + brought_m2)
@@ -153,32 +153,33 @@ class ScaleLatencyFilter:
         white_m2 = (self.config.white_share * sigma_m**2).tolist()
         before = state.joint
         epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, steps_ns, settled_m2, strict=True)
-        for joint, row, now_s, place_m, own_m2, step_ns, walked_m2 in epochs:
+        for joint, row, now_s, place_m, noise_m2, step_ns, walked_m2 in epochs:
             self._predict(before, step_ns, walked_m2, joint)
             seen, speed_mps = self._seen(joint, row, now_s, place_m, state.origin_m)
             spread = seen[:-1]
-            variance_m2 = row.dot(spread).item() + own_m2 + self._scatter_m2(jitter_s, speed_mps)
+            # Kalman update of covariance and mean at once: minus gain times (H P, predicted minus observed).
+            variance_m2 = row.dot(spread).item() + noise_m2 + self._scatter_m2(jitter_s, speed_mps)
             joint -= (spread / variance_m2)[:, None] * seen
             before = joint
         return joints
 
     def _rows(self, sigma_m: Floats) -> Floats:
-        """By how much each state moves the position; what follows from the odometer comes in epoch by epoch."""
+        """Observation matrix, a row per epoch: d(position) / d(state); scale and latency are filled in by `_seen`."""
         rows: Floats = sigma_m[:, None] * np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
         rows[:, _OFFSET] = 1.0
         return rows
 
     def _predict(self, before: Floats, step_ns: int, settled_m2: float, joint: Floats) -> None:
-        """Write to `joint` what a joint state becomes over a step in which so much of the offset settles."""
+        """Predict `joint` from the state before: decay, noise, and the offset that settles over the step."""
         decay, noise = self._transition(step_ns)
         np.multiply(before, decay, out=joint)
         joint += noise
         joint[_OFFSET, _OFFSET] += settled_m2
 
     def _seen(self, joint: Floats, row: Floats, now_s: float, place_m: float, origin_m: float) -> tuple[Floats, float]:
-        """Covariance of the states with what is observed and, as its last, how far the states miss it; the speed.
+        """H P and, as its last element, predicted minus observed position; and the speed. Completes `row` (H).
 
-        Completes `row`. The distance was read at the mean of the latency, so its part of the miss is added.
+        H is linear in the latency, but the distance is already read at the mean latency, whose part is taken out again.
         """
         scale = 1.0 + joint.item(_SCALE, -1)
         latency_s = joint.item(_LATENCY, -1)
@@ -222,9 +223,9 @@ class ScaleLatencyFilter:
 
 
 def moved_m2(beside_m: float, variance_m2: float, limit_m: float, probability: float) -> float:
-    """Mean square of what a position moved by over a break, given how far it was seen beside its place.
+    """Mean square of a position's move over a break, given that it appears `beside_m` from its predicted place (Bayes).
 
-    Before it was seen it had moved with this probability, and then by a normal deviation of `limit_m` (Bayes).
+    Prior: moved with `probability`, then normally distributed with a sigma of `limit_m`.
     """
     gain = limit_m**2 / (limit_m**2 + variance_m2)
     evidence = math.exp(min(0.5 * gain * beside_m**2 / variance_m2, _CERTAIN))

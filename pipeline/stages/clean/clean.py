@@ -174,7 +174,7 @@ def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame
 
 
 def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
-    """Also with the rows that were left out of streams other than GNSS, whose runs say it for each solution."""
+    """Adds how many rows each stream lost; for GNSS the `runs` row of each solution has that count."""
     left_out = [
         f"{name}: {count.far_off} rows left out: their time is more than a day from the others or the positions"
         for name, count in counts.items()
@@ -184,7 +184,7 @@ def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNote
 
 
 def _strays(frame: pl.DataFrame, few: float) -> Bools:
-    """Rows before 1970, and those that more than a day parts from most of their solution, where they are `few`."""
+    """Rows before 1970, and rows more than a day away from most of their solution, if at most the share `few`."""
     t_ns = frame["t"].cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy()
     stray: Bools = t_ns < 0
     if not t_ns.size or int(t_ns.max()) - int(t_ns.min()) <= _DAY_NS:
@@ -218,7 +218,7 @@ def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
 
 
 def require_one_journey(fixes: pl.DataFrame, place: str) -> None:
-    """Refuse a cleaned solution that a gap of more than a day parts: no train is on the way for so long unseen."""
+    """Refuse a cleaned solution with a gap of more than a day: that is not one journey."""
     gaps = np.diff(fixes["t"].to_physical().to_numpy()) > _DAY_NS
     if gaps.any():
         row = int(gaps.argmax())
@@ -232,11 +232,11 @@ def require_one_journey(fixes: pl.DataFrame, place: str) -> None:
 
 
 def _of_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
+    """Counts of one solution; contradicting are duplicates at another place than the first row of their time."""
     counts = _in_order(part, ["t"])[1]
     contradicting = 0
     if counts.duplicates:
-        first = [pl.col(name).first().over("t") for name in _PLACE]
-        elsewhere = [(pl.col(name) != kept).fill_null(False) for name, kept in zip(_PLACE, first, strict=True)]
+        elsewhere = [(pl.col(name) != pl.col(name).first().over("t")).fill_null(False) for name in _PLACE]
         contradicting = int(part.select(pl.any_horizontal(elsewhere).sum()).item())
     far_off = far.filter(pl.col("solution") == part["solution"][0]).height
     return replace(counts, contradicting=contradicting, far_off=far_off)
@@ -248,10 +248,11 @@ def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
 
 
 def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
+    """The rows in order of time, the first of each `keys`; how many were duplicates, how many recorded too late."""
     frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
     if (np.diff(frame["t"].to_physical().to_numpy()) > 0).all():
         return frame, StreamCounts()
-    latest = pl.col("t").cum_max()  # of those recorded so far
+    latest = pl.col("t").cum_max()  # of the rows recorded so far
     keys = [key for key in keys if key in frame.columns]
     sources = [key for key in keys if key in _SOURCES]
     late = frame.select((pl.col("t") < (latest.over(sources) if sources else latest)).sum()).item()

@@ -40,7 +40,10 @@ def without_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps:
 
 
 def _far(t_ns: Ints, places: Floats, config: IngestConfig, fastest_mps: float) -> Bools:
-    """Placeholders among valid positions: pieces of the run between leaps that no train can make."""
+    """Placeholders among valid positions: far pieces of the run, between leaps that no train can make.
+
+    A far piece counts if it is one place repeated exactly, or the brief begin of the run (search for a first fix).
+    """
     step_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
     step_s = np.diff(t_ns) / NS_PER_S
     leap = step_m > config.placeholder_far_m + fastest_mps * step_s

@@ -60,7 +60,7 @@ def unambiguous(config: Configuration) -> pl.Expr:
 
 
 def least_belief() -> pl.Expr:
-    """How sure the track is: what was believed at the time or what is in hindsight, whichever is less.
+    """Probability of the track, at the time or in hindsight, whichever is less.
 
     The track is doubtful where this is below `matching.ambiguity_probability`.
     """
@@ -101,10 +101,7 @@ def position_ns(epochs: pl.DataFrame) -> Ints:
 
 
 def crossing_gap_ns(t_ns: Ints, lds: LdsConfig) -> int:
-    """Longest time between epochs over which a movement is interpolated [ns] (DOMAIN section 4).
-
-    For so long at most a position stands for what comes before it.
-    """
+    """Longest time between epochs over which a movement is interpolated [ns] (DOMAIN section 4)."""
     return round(max(GAP_PERIODS * (nominal_period_s(t_ns) or 0.0), lds.crossing_gap_s) * NS_PER_S)
 
 

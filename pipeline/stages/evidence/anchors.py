@@ -18,9 +18,9 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import BaliseKind, Evidence
 
-# A lag shows where the speed changes: ways of so long are compared [s].
+# Numerics: a lag shows where the speed changes, so ways over this time are compared [s].
 _LAG_WINDOW_S = 10.0
-# A train's speed is even over so long before and after [s]: what differs from it is a step.
+# Numerics: the speed is compared with its median over this time before and after [s].
 _EVEN_S = 2.0
 
 
@@ -55,10 +55,10 @@ class KnownStretch:
 
     def anchor(self, sample: int) -> TrueAnchor:
         """The places of one sample; what a step left open widens it like the clock."""
-        open_m = max(float((one.high_m - one.low_m)[sample]) for one in self.paths)
+        open_m = max(float((known.high_m - known.low_m)[sample]) for known in self.paths)
         return TrueAnchor(
             t_ns=int(self.t_ns[sample]),
-            places=tuple(dict.fromkeys(one.place(sample) for one in self.paths)),
+            places=tuple(dict.fromkeys(known.place(sample) for known in self.paths)),
             sigma_m=float(self.sigma_m[sample]),
             kind=Evidence.REFERENCE,
             clock_m=float(self.clock_m[sample]) + open_m,
@@ -116,23 +116,23 @@ def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> RecorderLa
     """The reference's clock against the odometer's, by its ways of ten seconds."""
     if not sides:
         return RecorderLag()
-    begins, ends, ways = (np.concatenate(column) for column in zip(*(_ways(one) for one in sides), strict=True))
+    begins, ends, ways = (np.concatenate(column) for column in zip(*(_ways(side) for side in sides), strict=True))
     return lag_of(begins, ends, ways, counter)
 
 
-def _ways(one: Sided) -> tuple[Ints, Ints, Floats]:
+def _ways(side: Sided) -> tuple[Ints, Ints, Floats]:
     """Begins, ends and lengths of the ways of ten seconds, as the odometer counts up."""
-    path = one.stretch.paths[0]
-    t_ns = one.stretch.t_ns
+    path = side.stretch.paths[0]
+    t_ns = side.stretch.t_ns
     rows = _every(t_ns, _LAG_WINDOW_S)
     whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
     begin = rows[:-1][whole]
     end = rows[1:][whole]
-    return t_ns[begin], t_ns[end], one.sense * (path.at_m[end] - path.at_m[begin])
+    return t_ns[begin], t_ns[end], side.sense * (path.at_m[end] - path.at_m[begin])
 
 
 def known_stretch(
-    one: Sided,
+    side: Sided,
     clock: RecorderClock,
     counters: Sequence[Counter],
     reads: Sequence[TrueAnchor],
@@ -140,16 +140,16 @@ def known_stretch(
     config: Configuration,
 ) -> KnownStretch:
     """The stretch as evidence; `reads` close a step of the reference where they confirm it."""
-    stretch = one.stretch
+    stretch = side.stretch
     t_ns = stretch.t_ns - round(clock.shift_s * NS_PER_S)
     paths: list[KnownPath] = []
     speed_mps = np.zeros(t_ns.size)
     for path in stretch.paths:
-        at_m = path.at_m - one.sense * ahead_m
-        own_mps = _speed_mps(t_ns, at_m, path.leg)
-        speed_mps = np.maximum(speed_mps, own_mps)
-        known = KnownPath(path, one.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
-        reads_ns = _confirming_ns(known, t_ns, stretch.sigma_m, own_mps * clock.delta_s, reads, config.hazards)
+        at_m = path.at_m - side.sense * ahead_m
+        path_mps = _speed_mps(t_ns, at_m, path.leg)
+        speed_mps = np.maximum(speed_mps, path_mps)
+        known = KnownPath(path, side.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
+        reads_ns = _confirming_ns(known, t_ns, stretch.sigma_m, path_mps * clock.delta_s, reads, config.hazards)
         low_m, high_m, step_m = _left_open(known, t_ns, stretch.sigma_m, counters, reads_ns, config)
         paths.append(replace(known, low_m=at_m + low_m, high_m=at_m + high_m, step_m=step_m))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
@@ -176,7 +176,7 @@ def _confirming_ns(
     reads: Sequence[TrueAnchor],
     config: HazardConfig,
 ) -> Ints:
-    """Reads of balises that lie where the reference was, within k roots and both clocks."""
+    """Times of reads at balises where the reference was too, within k sigmas of both and both clocks."""
     confirming: list[int] = []
     since_ns = (t_ns - t_ns[0]).astype(np.float64)
     for read in reads:
@@ -197,10 +197,10 @@ def _confirming_ns(
 def _left_open(
     known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter], reads_ns: Ints, config: Configuration
 ) -> tuple[Floats, Floats, Floats]:
-    """How far behind and ahead of each sample the train may be because the reference stepped aside, and the steps [m].
+    """How far behind and ahead of each sample the train may be after a step of the reference, and the steps [m].
 
-    A step that every odometer contradicts by more than k_T roots leaves both sides possible, until the step back or
-    the next read that confirms the reference (DOMAIN section 5.1).
+    After a step that every odometer contradicts by more than k_T sigmas, the reference may be wrong before or after
+    it: both sides stay possible, until the step back or the next read that confirms the reference (DOMAIN section 5.1).
     """
     low_m, high_m, open_step_m = np.zeros((3, t_ns.size))
     if t_ns.size < 2:
@@ -211,11 +211,12 @@ def _left_open(
     open_step_m[stepped] = np.abs(step_m[stepped])
     events = [(int(t_ns[row + 1]), float(step_m[row]), float(limit_m[row])) for row in stepped.tolist()]
     open_m: list[float] = []
-    for at_ns, own_m, noise_m in sorted(events + [(read_ns, 0.0, np.inf) for read_ns in reads_ns.tolist()]):
-        # How far the sides that earlier steps left are behind this one, the latest last.
-        sides_m = np.cumsum([own_m, *open_m[::-1]])[:0:-1]
+    # A read that confirms is a step of 0 m with any noise: it closes every step before it.
+    for at_ns, jump_m, noise_m in sorted(events + [(read_ns, 0.0, np.inf) for read_ns in reads_ns.tolist()]):
+        # From where each open step began to here, the oldest first: near 0 where this step leads back.
+        sides_m = np.cumsum([jump_m, *open_m[::-1]])[:0:-1]
         back = np.flatnonzero(np.abs(sides_m) <= np.sqrt(2.0) * noise_m)
-        open_m = open_m[: int(back[0])] if back.size else [*open_m, own_m]
+        open_m = open_m[: int(back[0])] if back.size else [*open_m, jump_m]
         behind_m = np.cumsum([0.0, *open_m[::-1]])
         rows = slice(int(np.searchsorted(t_ns, at_ns)), None)
         low_m[rows] = -behind_m.max()
@@ -224,7 +225,7 @@ def _left_open(
 
 
 def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
-    """Steps that the reference's speed about then does not explain: a failing odometer makes none."""
+    """Steps that the speed around them does not explain: these are of the reference, not of a failing odometer."""
     dt_s = np.diff(t_ns) / NS_PER_S
     speed_mps = np.diff(at_m) / dt_s
     beside = max(1, round(_EVEN_S / float(np.median(dt_s))))
@@ -234,17 +235,17 @@ def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
 
 
 def _contradicted(known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter]) -> tuple[Floats, Floats]:
-    """Per step to the next sample: its difference from the nearest odometer, and the root of both variances [m]."""
+    """Per step to the next sample: its difference from the odometer that agrees best, and the sigma of that [m]."""
     whole = np.diff(known.path.leg) == 0
     least = np.full(t_ns.size - 1, np.inf)
     root = np.ones(t_ns.size - 1)
     for counter in counters:
         way = counter.between(t_ns[:-1], t_ns[1:])
-        own_m = np.sqrt(sigma_m[1:] ** 2 + sigma_m[:-1] ** 2 + way.variance_m2)
+        step_sigma_m = np.sqrt(sigma_m[1:] ** 2 + sigma_m[:-1] ** 2 + way.variance_m2)
         off_m = np.diff(known.at_m) - known.sense * way.distance_m
-        nearer = np.isfinite(off_m) & (np.abs(off_m) / own_m < np.abs(least) / root)
+        nearer = np.isfinite(off_m) & (np.abs(off_m) / step_sigma_m < np.abs(least) / root)
         least = np.where(nearer, off_m, least)
-        root = np.where(nearer, own_m, root)
+        root = np.where(nearer, step_sigma_m, root)
     return np.where(whole & np.isfinite(least), least, 0.0), root
 
 
@@ -270,13 +271,13 @@ def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Count
     clock_m = clock.delta_s * np.abs(counter.best_speed_mps(t_ns))
     shift_ns = round(clock.shift_s * NS_PER_S)
     rows = zip(anchors, clock_m.tolist(), strict=True)
-    return [replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=own_m) for anchor, own_m in rows]
+    return [replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=added_m) for anchor, added_m in rows]
 
 
 def outside(anchors: Sequence[TrueAnchor], stretches: Sequence[KnownStretch]) -> list[TrueAnchor]:
     """Anchors at times that no stretch covers."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
     inside: Bools = np.zeros(t_ns.size, dtype=np.bool_)
-    for one in stretches:
-        inside |= (t_ns >= one.t_ns[0]) & (t_ns <= one.t_ns[-1])
+    for stretch in stretches:
+        inside |= (t_ns >= stretch.t_ns[0]) & (t_ns <= stretch.t_ns[-1])
     return [anchor for anchor, within in zip(anchors, inside.tolist(), strict=True) if not within]

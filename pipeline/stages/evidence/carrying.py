@@ -78,6 +78,7 @@ class Counter:
 
 
 def _stands_ns(odometer: Odometry) -> Ints:
+    """The middle of each stand, looked at second by second."""
     t_ns = np.arange(odometer.begin_ns, odometer.end_ns, NS_PER_S, dtype=np.int64)
     first, last = runs_of(~odometer.moved(t_ns))
     return np.array((t_ns[first] + t_ns[np.minimum(last + 1, t_ns.size - 1)]) // 2, dtype=np.int64)
@@ -106,8 +107,8 @@ def between_anchors(
 ) -> Interval:
     """Least and largest coordinate between two anchors at these coordinates (DOMAIN section 5.1, carrying).
 
-    Where the way closes by a vehicle file, the inverse-variance mean of both +- (k roots + closing error): the loss may
-    lie at one place. Else the hull of both.
+    Where the odometer of a vehicle file closes, the inverse-variance mean of both +- (k sigmas + closing error), as the
+    whole closing error may have arisen at one place. Else the hull of both.
     """
     factor = config.hazards.evidence_factor
     clock_m = [anchor.clock_m for anchor in anchors]
@@ -118,11 +119,11 @@ def between_anchors(
         weights = [1.0 / variance for variance in variances]
         share = weights[0] / (weights[0] + weights[1])
         centre = share * places[0] + (1.0 - share) * places[1]
-        # The distance of both is the closing error, at every instant.
+        # The two places differ by the closing error at every instant.
         half = factor / np.sqrt(weights[0] + weights[1]) + np.abs(places[0] - places[1])
         half += share * clock_m[0] + (1.0 - share) * clock_m[1]
         return centre - half, centre + half
-    halves = [factor * np.sqrt(variance) + own_m for variance, own_m in zip(variances, clock_m, strict=True)]
+    halves = [factor * np.sqrt(variance) + added_m for variance, added_m in zip(variances, clock_m, strict=True)]
     low = np.minimum(places[0] - halves[0], places[1] - halves[1])
     return low, np.maximum(places[0] + halves[0], places[1] + halves[1])
 
@@ -148,10 +149,10 @@ def carried_forward(
     stood: Sequence[tuple[int, int]],
     config: Configuration,
 ) -> Interval:
-    """Least and largest path position of the train [m] by the way since the last accepted balise, 5 m + 5 % of it.
+    """Least and largest path position of the train [m]: last accepted balise, plus the distance since, +- (5 m + 5 %).
 
-    NaN where none reaches. `accepted_ns` in order, at `path_m` of the solution's own path, with which the odometer
-    grows. A balise accepted beyond the limit by the one before is no anchor.
+    NaN before the first balise, over a break and over a stand in `stood`. `accepted_ns` in order, at `path_m` of the
+    solution's own path, with which the odometer grows.
     """
     counter = Counter.of(odometer)
     used = _consistent(accepted_ns, path_m, counter, config)
@@ -159,27 +160,28 @@ def carried_forward(
     if used.size:
         last = np.searchsorted(accepted_ns[used], t_ns, side="right") - 1
         rows = np.flatnonzero(last >= 0)
-        own = used[last[rows]]
-        interval = _since_accepted(counter, accepted_ns[own], path_m[own], t_ns[rows], config)
+        since_vb = used[last[rows]]
+        interval = _since_accepted(counter, accepted_ns[since_vb], path_m[since_vb], t_ns[rows], config)
         void = np.zeros(rows.size, dtype=np.bool_)
         for begin_ns, end_ns in stood:
-            void |= (t_ns[rows] >= begin_ns) & (accepted_ns[own] <= end_ns)
+            void |= (t_ns[rows] >= begin_ns) & (accepted_ns[since_vb] <= end_ns)
         low[rows], high[rows] = (np.where(void, np.nan, values) for values in interval)
     return low, high
 
 
 def _since_accepted(counter: Counter, since_ns: Ints, at_m: Floats, t_ns: Ints, config: Configuration) -> Interval:
+    """Each balise plus the distance since it, +- (5 m + 5 %) (SUBSET-041 5.3.1.1)."""
     centre = at_m + counter.between(since_ns, t_ns).distance_m
     half = beside_m(counter.driven_m(since_ns, t_ns), 0.0, config)
     return centre - half, centre + half
 
 
 def _consistent(accepted_ns: Ints, path_m: Floats, counter: Counter, config: Configuration) -> Ints:
-    """Accepted balises without those that the odometer since the one before puts beyond the limit."""
+    """Accepted balises that agree, within the failure limit, with the odometer since the last one that did."""
     used: list[int] = []
     limit_m = config.hazards.failure_limit_m
     for number in range(path_m.size):
-        here = slice(number, number + 1)
+        here = slice(number, number + 1)  # arrays of one, as `_since_accepted` takes them
         if used:
             before = np.array(used[-1:])
             low, high = _since_accepted(counter, accepted_ns[before], path_m[before], accepted_ns[here], config)

@@ -10,15 +10,15 @@ from pipeline.stages.evidence.carrying import Counter
 from schemas.arrays import NS_PER_S, Floats, Ints
 from schemas.config import HazardConfig
 
-# Numerics: lags are sought so far, in such steps; the rest is regressed, in so many rounds.
+# Numerics: range and step of the search for a coarse lag [s]; rounds of the regression after it.
 _FARTHEST_S = 30.0
 _STEP_S = 0.5
 _ROUNDS = 4
-# So many ways at least tell a lag, and so many say whether it is one of seconds.
+# Least number of ways for a lag, and for a coarse lag of seconds.
 _FEWEST, _FEWEST_FAR = 6, 12
 # A lag of seconds leaves less than this share of what the ways differ by as recorded.
 _EXPLAINS = 0.5
-# What lies farther from the others than so many of their deviations is a slip, or a step of the reference.
+# Outliers, in robust standard deviations: slip, or a step of the reference.
 _USUAL = 4.0
 
 
@@ -56,10 +56,10 @@ def clock_of(lag: RecorderLag, vehicle_file: bool, config: HazardConfig) -> Reco
 
 
 def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None) -> RecorderLag:
-    """The lag of a recorder that saw the train go these ways from some stamps to others, as the odometer counts up.
+    """The lag of a recorder by the ways `way_m` that it saw between its stamps, positive as the odometer counts up.
 
     way = scale * counted - lag * change of speed, by least squares without outliers; sigma is that of the fit, or half
-    of what both halves of the run differ by.
+    the difference between the two halves of the run if that is larger.
     """
     if counter is None or begin_ns.size < _FEWEST:
         return RecorderLag()
@@ -74,9 +74,9 @@ def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None)
     half = begin_ns.size // 2
     parts = (slice(None, half), slice(half, None))
     halves = [_rest_of_lag(begin_ns[part], end_ns[part], way_m[part], counter, lag_s) for part in parts]
-    apart_s = [rest_s for rest_s, own_s in halves if own_s < 3.0 * sigma_s]
-    if len(apart_s) == 2:
-        sigma_s = max(sigma_s, 0.5 * abs(apart_s[0] - apart_s[1]))
+    comparable_s = [rest_s for rest_s, half_sigma_s in halves if half_sigma_s < 3.0 * sigma_s]
+    if len(comparable_s) == 2:
+        sigma_s = max(sigma_s, 0.5 * abs(comparable_s[0] - comparable_s[1]))
     return RecorderLag(float(lag_s), float(sigma_s))
 
 
@@ -85,7 +85,7 @@ def _shifted(t_ns: Ints, lag_s: float) -> Ints:
 
 
 def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter) -> float:
-    """The lag of seconds that makes the ways agree; 0 where none does much better than none."""
+    """The lag with the least median difference of the ways; 0 where it does not halve that without a lag."""
     lags_s = np.arange(-_FARTHEST_S, _FARTHEST_S + _STEP_S, _STEP_S)
     spreads = []
     for lag_s in lags_s.tolist():
@@ -99,27 +99,28 @@ def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter)
 
 
 def _rest_of_lag(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter, lag_s: float) -> tuple[float, float]:
-    """What is left of the lag once `lag_s` is taken off, and its sigma [s]; infinite where nothing tells it."""
+    """The remaining lag once `lag_s` is taken off, and its sigma [s], infinite where the ways cannot show it."""
     begin_ns = _shifted(begin_ns, lag_s)
     end_ns = _shifted(end_ns, lag_s)
     counted = counter.between(begin_ns, end_ns).distance_m
     change = counter.speed_mps(end_ns) - counter.speed_mps(begin_ns)
-    # Noise of the odometer is no change of speed, and would look like a lag; nor is where its recording begins or ends.
+    # Noise of the odometer would look like a lag. Where its recording begins or ends the speed is NaN, not a change.
     change = np.where(np.abs(change) <= counter.odometer.deadband_mps, 0.0, change)
-    kept = np.isfinite(counted) & np.isfinite(change)
-    if kept.sum() < _FEWEST:
+    used = np.isfinite(counted) & np.isfinite(change)
+    if used.sum() < _FEWEST:
         return 0.0, np.inf
     estimate = np.array([1.0, 0.0])
     sigma = np.inf
     for _ in range(_ROUNDS):
-        design = np.column_stack([counted, -change])[kept]
+        design = np.column_stack([counted, -change])[used]
         normal = design.T @ design
-        if kept.sum() < _FEWEST or np.linalg.det(normal) <= 1e-9 * max(float(np.prod(np.diag(normal))), 1e-9):
+        if used.sum() < _FEWEST or np.linalg.det(normal) <= 1e-9 * max(float(np.prod(np.diag(normal))), 1e-9):
             return 0.0, np.inf
-        estimate = np.linalg.solve(normal, design.T @ way_m[kept])
-        left = way_m - np.column_stack([counted, -change]) @ estimate
-        spread = float(np.std(left[kept]) * np.sqrt(kept.sum() / (kept.sum() - 2.0)))
+        estimate = np.linalg.solve(normal, design.T @ way_m[used])
+        residual = way_m - np.column_stack([counted, -change]) @ estimate
+        spread = float(np.std(residual[used]) * np.sqrt(used.sum() / (used.sum() - 2.0)))
         sigma = spread * float(np.sqrt(np.linalg.inv(normal)[1, 1]))
-        usual = 1.4826 * float(np.median(np.abs(left[np.isfinite(left)])))
-        kept = np.isfinite(left) & (np.abs(left) <= _USUAL * usual + 1e-6)
+        # 1.4826 MAD is the sigma of normal residuals, whatever a few outliers do.
+        robust = 1.4826 * float(np.median(np.abs(residual[np.isfinite(residual)])))
+        used = np.isfinite(residual) & (np.abs(residual) <= _USUAL * robust + 1e-6)
     return float(estimate[1]), float(sigma)

@@ -97,25 +97,26 @@ class TrainEvidence:
 
     @property
     def contradicted(self) -> int:
-        """Gaps between anchors that the odometer of a vehicle file closes by no way."""
-        by_file = [one.gaps for one in self.carried[:1] if one.counter.by_file]
+        """Gaps between anchors whose length by the odometer, scaled by the vehicle file, fits no way on the track."""
+        by_file = [carried.gaps for carried in self.carried[:1] if carried.counter.by_file]
         return sum(bool(gap.ways) and len(gap.anchors) == 2 and not gap.closed for gaps in by_file for gap in gaps)
 
     @property
     def unreachable(self) -> int:
         """Pairs of anchors that no train can have passed one after the other."""
-        return sum(len(unreachable(one.gaps)) for one in self.carried[:1])
+        return sum(len(unreachable(carried.gaps)) for carried in self.carried[:1])
 
     @property
     def disputed(self) -> int:
-        """Reads that exclude the reference beyond k_T roots: at k = 3 noise alone does so in a long run."""
+        """Reads that exclude the reference at k_T sigmas: at k = 3 noise alone would do so in a long run."""
         t_ns = self.reads_ns
         kind = np.full(self.reads_ns.size, NOTHING)
         factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
         by_reference = self._covered(t_ns, kind == NOTHING, kind)
         by_reads = self._carried(self.by_reads, t_ns, kind != NOTHING, kind)
-        wide, other = ([one.widened(factor) for one in alternatives] for alternatives in (by_reference, by_reads))
-        return int(common(wide, other, t_ns.size)[1].size)
+        wide_reference = [alternative.widened(factor) for alternative in by_reference]
+        wide_reads = [alternative.widened(factor) for alternative in by_reads]
+        return int(common(wide_reference, wide_reads, t_ns.size)[1].size)
 
     @property
     def clock_assumed(self) -> bool:
@@ -125,8 +126,8 @@ class TrainEvidence:
     @property
     def anchored_ns(self) -> Span | None:
         """First and last anchor; None without anchors."""
-        times = [anchor.t_ns for one in self.carried[:1] for gap in one.gaps for anchor in gap.anchors]
-        times += [int(t_ns) for one in self.stretches for t_ns in one.t_ns[[0, -1]]]
+        times = [anchor.t_ns for carried in self.carried[:1] for gap in carried.gaps for anchor in gap.anchors]
+        times += [int(t_ns) for carried in self.stretches for t_ns in carried.t_ns[[0, -1]]]
         return (min(times), max(times)) if times else None
 
     def at(self, t_ns: Ints) -> EvidenceSet:
@@ -146,16 +147,16 @@ class TrainEvidence:
         """By the reference: straight lines between samples, each +- (k sigma + speed times clock)."""
         factor = self.config.hazards.evidence_factor
         alternatives: list[Alternative] = []
-        for one in self.stretches:
-            rows = np.flatnonzero((t_ns >= one.t_ns[0]) & (t_ns <= one.t_ns[-1]) & heard)
-            after = np.searchsorted(one.t_ns, t_ns[rows], side="left")
-            before = np.where(one.t_ns[after] == t_ns[rows], after, np.maximum(after - 1, 0))
-            half = factor * one.sigma_m + one.clock_m
+        for stretch in self.stretches:
+            rows = np.flatnonzero((t_ns >= stretch.t_ns[0]) & (t_ns <= stretch.t_ns[-1]) & heard)
+            after = np.searchsorted(stretch.t_ns, t_ns[rows], side="left")
+            before = np.where(stretch.t_ns[after] == t_ns[rows], after, np.maximum(after - 1, 0))
+            half = factor * stretch.sigma_m + stretch.clock_m
             half = np.maximum(half[before], half[after])
-            since = (t_ns[rows] - one.t_ns[0]).astype(np.float64)
-            for path in one.paths:
+            since = (t_ns[rows] - stretch.t_ns[0]).astype(np.float64)
+            for path in stretch.paths:
                 leg = path.path.leg
-                stamps = one.t_ns - one.t_ns[0]
+                stamps = stretch.t_ns - stretch.t_ns[0]
                 centre = np.interp(since, stamps, path.at_m)
                 low = np.minimum((path.low_m - path.at_m)[before], (path.low_m - path.at_m)[after])
                 high = np.maximum((path.high_m - path.at_m)[before], (path.high_m - path.at_m)[after])
@@ -200,34 +201,35 @@ class TrainEvidence:
         return carried(counter, anchor, at_m, t_ns, self.config)
 
 
-def common(one: Sequence[Alternative], other: Sequence[Alternative], size: int) -> tuple[list[Alternative], Ints]:
-    """The net elements common to both and the narrower interval; instants at which the two exclude each other.
+def common(first: Sequence[Alternative], second: Sequence[Alternative], size: int) -> tuple[list[Alternative], Ints]:
+    """Two sources of evidence together, and the instants at which they exclude each other.
 
-    There all that either says stays possible.
+    Where they agree: the net elements common to both, with the narrower interval. Where only one speaks, or they
+    exclude each other, every alternative of either stays possible.
     """
     spoken = np.zeros((2, size), dtype=np.bool_)
-    for number, alternatives in enumerate((one, other)):
+    for source, alternatives in enumerate((first, second)):
         for alternative in alternatives:
-            spoken[number, alternative.rows] = True
-    narrowed = [_narrowed(a, b) for a in one for b in other]
+            spoken[source, alternative.rows] = True
+    narrowed = [_narrowed(left, right) for left in first for right in second]
     agreed = np.zeros(size, dtype=np.bool_)
     for alternative in narrowed:
         agreed[alternative.rows] = True
-    alone = [alternative.where(~agreed[alternative.rows]) for alternative in (*one, *other)]
+    alone = [alternative.where(~agreed[alternative.rows]) for alternative in (*first, *second)]
     return narrowed + alone, np.flatnonzero(spoken.all(axis=0) & ~agreed)
 
 
-def _narrowed(one: Alternative, other: Alternative) -> Alternative:
-    """The part of the first that the second leaves too, at the instants of both; on the first's route."""
-    _, here, there = np.intersect1d(one.rows, other.rows, assume_unique=True, return_indices=True)
-    one = Alternative(one.rows[here], one.route, one.low_m[here], one.high_m[here])
-    other = Alternative(other.rows[there], other.route, other.low_m[there], other.high_m[there])
-    element, measure_m, sense = one.route.locate(one.middle_m)
-    at_m, along = other.route.coordinate(element, measure_m, other.middle_m)
-    ends_m = [one.middle_m + sense * along * (end_m - at_m) for end_m in (other.low_m, other.high_m)]
-    low_m = np.maximum(one.low_m, np.minimum(*ends_m))
-    high_m = np.minimum(one.high_m, np.maximum(*ends_m))
-    return Alternative(one.rows, one.route, low_m, high_m).where(low_m <= high_m)
+def _narrowed(first: Alternative, second: Alternative) -> Alternative:
+    """Where the intervals of both overlap, at the instants of both; in coordinates of the first's route."""
+    _, in_first, in_second = np.intersect1d(first.rows, second.rows, assume_unique=True, return_indices=True)
+    first = Alternative(first.rows[in_first], first.route, first.low_m[in_first], first.high_m[in_first])
+    second = Alternative(second.rows[in_second], second.route, second.low_m[in_second], second.high_m[in_second])
+    element, measure_m, sense = first.route.locate(first.middle_m)
+    at_m, along = second.route.coordinate(element, measure_m, second.middle_m)
+    ends_m = [first.middle_m + sense * along * (end_m - at_m) for end_m in (second.low_m, second.high_m)]
+    low_m = np.maximum(first.low_m, np.minimum(*ends_m))
+    high_m = np.minimum(first.high_m, np.maximum(*ends_m))
+    return Alternative(first.rows, first.route, low_m, high_m).where(low_m <= high_m)
 
 
 def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
@@ -269,24 +271,25 @@ def evidence_of(
     sides = [sided(stretch, main, config.matching.orientation_distance_m) for stretch in reference[0]]
     carrier = _Carrier.of(sides, network, config)
     of_reference = clock_of(reference_lag(sides, main), by_file, hazards)
-    reads_found = read_anchors(reads, balises, network.track, hazards)
-    lag_of_reads = RecorderLag() if main is None else _lag_of_reads(carrier.by(main, _points(reads_found)))
+    recorded_reads = read_anchors(reads, balises, network.track, hazards)
+    lag_of_reads = RecorderLag() if main is None else _lag_of_reads(carrier.by(main, _points(recorded_reads)))
     of_reads = clock_of(lag_of_reads, by_file, hazards)
-    read = [] if main is None else on_clock(reads_found, of_reads, main)
-    reads_ns = np.array([one.t_ns for one in read], dtype=np.int64)
+    clocked_reads = [] if main is None else on_clock(recorded_reads, of_reads, main)
+    reads_ns = np.array([stretch.t_ns for stretch in clocked_reads], dtype=np.int64)
     ahead_m = vehicle.gnss_antenna_ahead_m
-    stretches = tuple(known_stretch(one, of_reference, counters, read, ahead_m, config) for one in sides)
-    apart = outside(read, stretches)
+    stretches = tuple(known_stretch(side, of_reference, counters, clocked_reads, ahead_m, config) for side in sides)
+    reads_apart = outside(clocked_reads, stretches)
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return TrainEvidence(
         stretches=stretches,
         silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]),
         carried=tuple(
-            carrier.by(counter, [*(one.ends(counter) for one in stretches), *_points(apart)]) for counter in counters
+            carrier.by(counter, [*(stretch.ends(counter) for stretch in stretches), *_points(reads_apart)])
+            for counter in counters
         ),
-        by_reads=tuple(carrier.by(counter, _points(read)) for counter in counters) if stretches else (),
+        by_reads=tuple(carrier.by(counter, _points(clocked_reads)) for counter in counters) if stretches else (),
         reads_ns=reads_ns,
-        clocks=(of_reference,) * bool(stretches) + (of_reads,) * bool(apart),
+        clocks=(of_reference,) * bool(stretches) + (of_reads,) * bool(reads_apart),
         network=network,
         config=config,
     )
@@ -311,8 +314,8 @@ class _Carrier:
     @classmethod
     def of(cls, sides: Sequence[Sided], network: Network, config: Configuration) -> _Carrier:
         least_m = config.matching.orientation_distance_m
-        facing = frozenset(one.facing for one in sides if abs(one.with_m - one.against_m) >= least_m)
-        return cls(network, config, facing, any(min(one.with_m, one.against_m) >= least_m for one in sides))
+        facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
+        return cls(network, config, facing, any(min(side.with_m, side.against_m) >= least_m for side in sides))
 
     def by(self, counter: Counter, borders: list[tuple[TrueAnchor, TrueAnchor]]) -> Carried:
         """The gaps between what is known; an odometer that counts up in both directions carries over no stand."""

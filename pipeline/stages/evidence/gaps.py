@@ -71,8 +71,8 @@ def gaps_of(
     first = borders[0][0]
     last = borders[-1][1]
     gaps = [Gap(min(counter.odometer.begin_ns, first.t_ns), first.t_ns, None, first, [])]
-    for (_, a), (b, _) in pairwise(borders):
-        gaps += _between(a, b, counter, network, config)
+    for (_, begin), (end, _) in pairwise(borders):
+        gaps += _between(begin, end, counter, network, config)
     gaps.append(Gap(last.t_ns, max(counter.odometer.end_ns, last.t_ns), last, None, []))
     gaps = _without_contradicted(gaps)
     sheets = _sheets(gaps, facing, network) or {True, False}
@@ -84,25 +84,30 @@ def without_sign(gaps: Sequence[Gap], facing: Set[int], network: Network) -> boo
     return not _sheets(gaps, facing, network)
 
 
-def _between(a: TrueAnchor, b: TrueAnchor, counter: Counter, network: Network, config: Configuration) -> list[Gap]:
-    """Where the odometer lost distance in a gap, it is two halves that know nothing of each other."""
-    if b.t_ns < a.t_ns:
+def _between(
+    begin: TrueAnchor, end: TrueAnchor, counter: Counter, network: Network, config: Configuration
+) -> list[Gap]:
+    """The gap between two anchors; where the odometer lost distance in it, two halves, each with one anchor.
+
+    Ways within the odometer's error come first; only where there is none, those within slip too.
+    """
+    if end.t_ns < begin.t_ns:
         return []
-    end_ns = np.array([b.t_ns])
-    length_m = float(counter.between(a.t_ns, end_ns).distance_m[0])
+    end_ns = np.array([end.t_ns])
+    length_m = float(counter.between(begin.t_ns, end_ns).distance_m[0])
     if np.isnan(length_m):
-        return [Gap(a.t_ns, b.t_ns, a, None, []), Gap(a.t_ns, b.t_ns, None, b, [])]
-    way_m = float(counter.driven_m(a.t_ns, end_ns)[0])
+        return [Gap(begin.t_ns, end.t_ns, begin, None, []), Gap(begin.t_ns, end.t_ns, None, end, [])]
+    way_m = float(counter.driven_m(begin.t_ns, end_ns)[0])
     hazards = config.hazards
-    noise_m = hazards.evidence_factor * (a.sigma_m + b.sigma_m) + a.clock_m + b.clock_m
+    noise_m = hazards.evidence_factor * (begin.sigma_m + end.sigma_m) + begin.clock_m + end.clock_m
     slack_m = float(beside_m(np.array(way_m), 0.0, config)) + noise_m
-    ways = _ways_of_length(a, b, length_m, slack_m, network, hazards.routes_limit)
+    ways = _ways_of_length(begin, end, length_m, slack_m, network, hazards.routes_limit)
     if ways == []:
         slack_m = hazards.slip_m + hazards.slip_share * way_m
-        ways = _ways_of_length(a, b, length_m, slack_m, network, hazards.routes_limit)
+        ways = _ways_of_length(begin, end, length_m, slack_m, network, hazards.routes_limit)
     if ways is not None:
-        ways = [replace(way, closed=closes(counter, (a, b), way.at_m[1] - way.at_m[0], config)) for way in ways]
-    return [Gap(a.t_ns, b.t_ns, a, b, ways)]
+        ways = [replace(way, closed=closes(counter, (begin, end), way.at_m[1] - way.at_m[0], config)) for way in ways]
+    return [Gap(begin.t_ns, end.t_ns, begin, end, ways)]
 
 
 def unreachable(gaps: Sequence[Gap]) -> list[Gap]:
@@ -111,65 +116,70 @@ def unreachable(gaps: Sequence[Gap]) -> list[Gap]:
 
 
 def _without_contradicted(gaps: list[Gap]) -> list[Gap]:
-    """Nothing is carried outward from an anchor none of whose ways closes, nor beside an unreachable gap.
+    """Nothing is carried outward from an anchor none of whose ways closes, nor from the anchors of an unreachable gap.
 
-    Which of the two anchors of an unreachable gap is wrong nobody knows.
+    One of these two is wrong, and nothing tells which.
     """
     weighed = [gap for gap in gaps if len(gap.anchors) == 2 and gap.ways is not None]
     joined = {id(anchor) for gap in weighed for anchor in gap.anchors}
     closed = {id(anchor) for gap in weighed if gap.closed for anchor in gap.anchors}
-    wrong = {id(anchor) for gap in unreachable(gaps) for anchor in gap.anchors}
+    impossible = unreachable(gaps)
+    wrong = {id(anchor) for gap in impossible for anchor in gap.anchors}
 
     def doubtful(gap: Gap) -> bool:
         anchors = {id(anchor) for anchor in gap.anchors}
         return bool(anchors & wrong) or (len(anchors) == 1 and bool(anchors & (joined - closed)))
 
-    apart = unreachable(gaps)
-    return [replace(gap, ways=None) if gap not in apart and doubtful(gap) else gap for gap in gaps]
+    return [replace(gap, ways=None) if gap not in impossible and doubtful(gap) else gap for gap in gaps]
 
 
 def _ways_of_length(
-    a: TrueAnchor, b: TrueAnchor, length_m: float, slack_m: float, network: Network, most: int
+    first: TrueAnchor, second: TrueAnchor, length_m: float, slack_m: float, network: Network, most: int
 ) -> list[GapChain] | None:
-    """Chains from anchor to anchor of the odometer's length +- the slack, either way round."""
+    """Ways from anchor to anchor of the odometer's length +- the slack, either way round; None if they are too many."""
     ways: list[GapChain] = []
-    for begins, goals, way_m, back in ((a.places, b.places, length_m, False), (b.places, a.places, -length_m, True)):
+    for starts, goals, way_m, back in (
+        (first.places, second.places, length_m, False),
+        (second.places, first.places, -length_m, True),
+    ):
         lengths = (max(way_m - slack_m, 0.0), way_m + slack_m)
-        for begin, side, goal in product(begins, (0, 1), goals):
-            chains = chains_between(network, 2 * begin.element + side, begin, goal, lengths, back, most)
+        for start_place, side, goal_place in product(starts, (0, 1), goals):
+            chains = chains_between(
+                network, 2 * start_place.element + side, start_place, goal_place, lengths, back, most
+            )
             if chains is None:
                 return None
             for chain in chains:
-                end_m = chain.entry_m[-1] + network.track.along_m(chain.oriented[-1], goal.measure_m)
+                end_m = chain.entry_m[-1] + network.track.along_m(chain.oriented[-1], goal_place.measure_m)
                 ways.append(GapChain(chain, (end_m, 0.0) if back else (0.0, end_m)))
     return _distinct(ways)
 
 
 def _distinct(ways: list[GapChain]) -> list[GapChain]:
     """Each chain once: a gap of hardly any length is found from both sides."""
-    kept: dict[tuple[object, ...], GapChain] = {}
+    distinct: dict[tuple[object, ...], GapChain] = {}
     for way in ways:
         apart_m = way.at_m[-1] - way.at_m[0]
-        kept.setdefault((way.chain.oriented, round(apart_m, 2)), way)
-    return list(kept.values())
+        distinct.setdefault((way.chain.oriented, round(apart_m, 2)), way)
+    return list(distinct.values())
 
 
 def _sheets(gaps: Sequence[Gap], facing: Set[int], network: Network) -> set[bool]:
-    """Which orientation of the network the train keeps over the whole run; both where nothing says it.
+    """In which orientation of the network (`Network.usable`) the odometer counts up, over the whole run.
 
-    Where a loop turns trains round, or parts of the network are not connected, nothing does. None where the gaps
-    contradict each other: the odometer counts up both ways.
+    Both where nothing decides: a loop turns trains round, or parts of the network are not connected. Empty where the
+    gaps contradict each other: the odometer counts up both ways.
     """
     both = {True, False}
     if not network.orientable or not _connected(
         {place.element for gap in gaps for anchor in gap.anchors for place in anchor.places}, network
     ):
         return both
-    kept = [
+    decided = [
         {network.usable[way.chain.oriented[0]] for way in gap.ways or [] if way.closed} for gap in gaps if gap.closed
     ]
-    kept += [{network.usable[oriented]} for oriented in facing]
-    return set.intersection(both, *kept)
+    decided += [{network.usable[oriented]} for oriented in facing]
+    return set.intersection(both, *decided)
 
 
 def _connected(elements: set[int], network: Network) -> bool:
@@ -184,7 +194,7 @@ def _connected(elements: set[int], network: Network) -> bool:
 
 
 def _reaching(gap: Gap, sheets: set[bool], counter: Counter, network: Network, config: Configuration) -> Gap:
-    """The gap with the chains of the kept orientation, over every branch as far as the odometer says."""
+    """The gap with its chains in the possible orientations, over every branch as far as the odometer counts."""
     if gap.ways is None:
         return gap
     turned = _turned(gap, counter, config)
@@ -201,35 +211,38 @@ def _reaching(gap: Gap, sheets: set[bool], counter: Counter, network: Network, c
 
 
 def _turned(gap: Gap, counter: Counter, config: Configuration) -> bool:
-    """The train went to and fro in the gap by more than the odometer's own error."""
+    """The train went back in the gap by more than the fixed error of the odometer."""
     t_ns = _looks(gap, counter)
     for anchor in gap.anchors[:1]:
-        way = counter.between(anchor.t_ns, t_ns).distance_m
-        known = way[np.isfinite(way)]
-        if known.size:
-            back = min(float((np.maximum.accumulate(sign * known) - sign * known).max()) for sign in (1.0, -1.0))
-            return back > config.lds.odometer_fixed_m
+        distance_m = counter.between(anchor.t_ns, t_ns).distance_m
+        distance_m = distance_m[np.isfinite(distance_m)]
+        if distance_m.size:
+            # The largest fall behind the farthest place so far; a run without a turn has none in one of the two senses.
+            ways_m = (distance_m, -distance_m)
+            back_m = min(float((np.maximum.accumulate(way_m) - way_m).max()) for way_m in ways_m)
+            return back_m > config.lds.odometer_fixed_m
     return False
 
 
 def _branches(chain: Chain, network: Network) -> bool:
     """A switch on the chain: a train that turned beyond it may have come back on another track."""
-    return any(len(network.successors[side]) > 1 for one in chain.oriented for side in (one, one ^ 1))
+    return any(len(network.successors[side]) > 1 for oriented in chain.oriented for side in (oriented, oriented ^ 1))
 
 
 def _looks(gap: Gap, counter: Counter) -> Ints:
-    """Instants at which to look how far the train went before it turned; a speed is a mean over such a time."""
+    """Instants over the gap, one speed window apart, at which the train's farthest places are looked for."""
     count = int((gap.end_ns - gap.begin_ns) / (counter.odometer.config.speed_window_s * NS_PER_S)) + 2
     return np.linspace(gap.begin_ns, gap.end_ns, count).astype(np.int64)
 
 
 def _from_one_anchor(gap: Gap, network: Network) -> list[GapChain]:
-    """Both ways round."""
+    """The element of each place of the anchor, run either way round."""
     (anchor,) = gap.anchors
     return [
-        GapChain(Chain((one,), (-network.track.along_m(one, place.measure_m),)), (0.0,))
+        # The coordinate is 0 at the anchor, so the element is entered at minus the way to it.
+        GapChain(Chain((oriented,), (-network.track.along_m(oriented, place.measure_m),)), (0.0,))
         for place in anchor.places
-        for one in (2 * place.element, 2 * place.element + 1)
+        for oriented in (2 * place.element, 2 * place.element + 1)
     ]
 
 

@@ -14,7 +14,7 @@ def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> pl.DataFrame:
 
     Null where nothing is known; the measures also where there are several net elements.
     """
-    parts = [_touched(one) for one in evidence.alternatives]
+    parts = [_touched(alternative) for alternative in evidence.alternatives]
     touched = pl.concat([pl.DataFrame(schema=_TOUCHED), *parts])
     places = touched.group_by("row").agg(
         pl.col("element").unique().sort(), low=pl.col("low").min(), high=pl.col("high").max()
@@ -36,25 +36,25 @@ def _numbers(names: pl.Series) -> pl.Series:
     return pl.Series(range(len(names)), dtype=pl.Int64)
 
 
-def _touched(one: Alternative) -> pl.DataFrame:
+def _touched(alternative: Alternative) -> pl.DataFrame:
     """Every net element that the interval touches, with the measures on it: one row per instant and visit."""
-    route = one.route
-    first = np.searchsorted(route.entry_m, one.low_m, side="right") - 1
-    last = np.searchsorted(route.entry_m, one.high_m, side="right") - 1
+    route = alternative.route
+    first = np.searchsorted(route.entry_m, alternative.low_m, side="right") - 1
+    last = np.searchsorted(route.entry_m, alternative.high_m, side="right") - 1
     first = np.maximum(first, 0)
     last = np.maximum(last, 0)
     count = last - first + 1
-    numbers = np.repeat(np.arange(one.rows.size), count)
+    numbers = np.repeat(np.arange(alternative.rows.size), count)
     visit = np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
     entry = route.entry_m[visit]
     low = route.low_m[visit]
     high = route.high_m[visit]
-    begin = np.clip(one.low_m[numbers] - entry, 0.0, high - low)
-    end = np.clip(one.high_m[numbers] - entry, 0.0, high - low)
+    begin = np.clip(alternative.low_m[numbers] - entry, 0.0, high - low)
+    end = np.clip(alternative.high_m[numbers] - entry, 0.0, high - low)
     forward = route.forward[visit]
     return pl.DataFrame(
         {
-            "row": one.rows[numbers],
+            "row": alternative.rows[numbers],
             "element": route.element[visit],
             "low": np.where(forward, low + begin, high - end),
             "high": np.where(forward, low + end, high - begin),

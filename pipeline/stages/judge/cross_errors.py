@@ -13,8 +13,8 @@ from schemas.arrays import NS_PER_S, Floats, floats, times_ns
 def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
     """`error_cross_m`, `error_up_m`: position minus reference, left of growing path and upwards.
 
-    Null where the reference is silent, and where the position is farther ahead or behind than the failure limit: a
-    curve goes aside by metres over such a way, and a slope up.
+    Null where the reference is silent, and where the position is farther ahead or behind than the failure limit: over
+    such a distance a curve alone is metres aside, and a slope metres up.
     """
     fixes = case.solution.fixes
     reference = case.reference
@@ -37,6 +37,7 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
         east = np.einsum("ij,ij->i", away, points.east)
         north = np.einsum("ij,ij->i", away, points.north)
         heading = np.radians(heading_deg[rows])
+        # The vector from reference to position, turned from east and north to along and left of the heading.
         along_m = east * np.sin(heading) + north * np.cos(heading)
         left_m = north * np.sin(heading) - east * np.cos(heading)
         near = np.abs(along_m) <= case.config.hazards.failure_limit_m

@@ -72,7 +72,7 @@ def find_episodes(
 
 
 def _offered_wrong(course: Course) -> Bools:
-    """Positions that complete an offer judged wrong; what a jump offers on its way is the jump's."""
+    """Positions that complete an offer judged wrong; balises that a jump passes on its way belong to the jump."""
     marked = np.zeros(course.size, dtype=np.bool_)
     marked[course.offers.number[course.offers.offered & course.offers.judged.is_wrong]] = True
     for jump in course.jumps:
@@ -125,7 +125,7 @@ def _end(course: Course, mark: int, step: Jump | None, config: HazardConfig) -> 
 
 
 def _is_back(judged: Judgements, jump: Jump, config: HazardConfig) -> bool:
-    """Against the error before it, and no longer beyond the limit after it."""
+    """The jump goes against the error before it, and the error after it is within the limit."""
     ends = judged.take(np.array([jump.first - 1, jump.last]))
     back = float(ends.middle_m[0]) * jump.step_m < 0.0
     return back and float(ends.least_m[1]) <= config.failure_limit_m and ends.code[1] != WRONG
@@ -177,7 +177,7 @@ def _detection(log: FailureLog, onset_ns: int, end_ns: int) -> Detection:
 
 
 def _failed(course: Course, onset: int, end: int, step: Jump | None, config: HazardConfig) -> int | None:
-    """First position of a second of `wrong`; a step counts at once; else the first wrong one of the episode."""
+    """First position that stays wrong for `failure_hold_s`, a step at once; else the first wrong one of the episode."""
     spans = [(onset + first, onset + last) for first, last in spans_of(course.judged.is_wrong[onset:end])]
     hold_ns = round(config.failure_hold_s * NS_PER_S)
     for first, last in spans:
@@ -188,9 +188,9 @@ def _failed(course: Course, onset: int, end: int, step: Jump | None, config: Haz
 
 
 def _failed_may_ns(course: Course, failed: int, config: HazardConfig) -> int | None:
-    """First of the unbroken run of unknown or wrong positions before a failure whose interval reaches beyond the limit.
+    """When the failure may have begun: the first position not proved right whose interval reaches beyond the limit.
 
-    None where the evidence is silent in that run: the failure may have begun at any time of it.
+    Looked for since the last right position. None where the evidence is silent for some of that time.
     """
     right = np.flatnonzero(course.judged.is_right[:failed])
     run = np.arange(int(right[-1]) + 1 if right.size else 0, failed + 1)

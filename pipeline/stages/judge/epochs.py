@@ -53,9 +53,9 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
 
 
 def _direction(case: Case, positions: MatchedPositions, at_ns: Ints, along: Judgements) -> pl.Series:
-    given = ints(case.solution.epochs["direction"], 1)
+    as_driven = ints(case.solution.epochs["direction"], 1)
     hazards = case.config.hazards
-    direction = travel_direction(given, along, at_ns, positions.path_m, case.odometry is not None, hazards)
+    direction = travel_direction(as_driven, along, at_ns, positions.path_m, case.odometry is not None, hazards)
     return pl.Series("direction", direction, dtype=pl.Int8)
 
 

@@ -81,12 +81,14 @@ def course_of(positions: pl.DataFrame, offers: pl.DataFrame, jumps: Sequence[Jum
 
 
 def _calm_from(t_ns: Ints, judged: Judgements, config: HazardConfig) -> Ints:
+    """`Course.calm_from`: from each position on, the first that begins `episode_end_s` within half the limit."""
     calm = (judged.largest_m <= 0.5 * config.failure_limit_m) & ~judged.is_wrong
     hold_ns = round(config.episode_end_s * NS_PER_S)
     begins: Ints = np.full(t_ns.size + 1, t_ns.size, dtype=np.int64)
     for first, last in spans_of(calm):
-        latest = int(np.searchsorted(t_ns, t_ns[last] - hold_ns, side="right"))
-        begins[first:latest] = np.arange(first, max(first, latest))
+        # The positions of a calm span up to here have `hold_ns` of it ahead of them.
+        after_last = int(np.searchsorted(t_ns, t_ns[last] - hold_ns, side="right"))
+        begins[first:after_last] = np.arange(first, max(first, after_last))
     calm_from: Ints = np.minimum.accumulate(begins[::-1])[::-1][: t_ns.size]
     return calm_from
 
@@ -115,7 +117,10 @@ class Failure:
 
 
 def find_failures(course: Course, config: Configuration) -> list[Failure]:
-    """Wrong positions in use, as one while less than `recovery_s` lies between, or nothing calm: in order of time."""
+    """Wrong positions in use, in order of time.
+
+    Two belong to one failure where less than `recovery_s` lies between them, or no calm position does.
+    """
     wrong = np.flatnonzero(course.wrong_s > 0.0)
     if wrong.size == 0:
         return []

@@ -26,11 +26,12 @@ def reaction_s(position_ns: Ints, config: Configuration) -> float:
 
 
 def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.DataFrame:
-    """Per epoch `in_use`, and the time that it stands for [s]: `used_s`, `wrong_s`, `counted_s` (DOMAIN section 5.3).
+    """Per epoch `in_use`, and the time before it that it accounts for [s] (DOMAIN section 5.3).
 
-    A fault may be as old as the position before. `wrong_s`: whole since then where that was wrong in use too, else one
-    nominal period at most. `used_s`: the same of wrong or unknown, and of any other position in use. `counted_s`: for
-    shares of time, `wrong_s` where there is any. Epochs without a position stand for time in a gap only.
+    `wrong_s`: of a position wrong in use, all time since the position before where that was wrong in use too, else one
+    nominal period at most. `used_s`: the same for wrong or unknown; for right positions, the time since the position
+    before, of a gap one period. `counted_s`: for shares of time, `wrong_s` where there is any. An epoch without a
+    position accounts for time only in a gap.
     """
     known = met(epochs, pl.col("path_m").is_not_null())
     steps = _StepTimes.of(epochs, known, config)
@@ -50,9 +51,10 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
 
 @dataclass(frozen=True)
 class _StepTimes:
-    """From the position before to each: `step_s`; `near_s` with one period for a gap; `alone_s` one period at most.
+    """The time from the position before to each, ending at `end_s`.
 
-    `blocked_s`: time negated up to `edge_s`, linear between.
+    `step_s`: whole; `near_s`: one period where it is a gap; `alone_s`: one period at most. `blocked_s`: total time
+    negated up to each of `edge_s`, the begins and ends of the negations; linear between them.
     """
 
     end_s: Floats
@@ -79,7 +81,7 @@ class _StepTimes:
         return cls(all_s[known], step_s, near_s, alone_s, period_s, gap_s, negated.ravel(), blocked_s)
 
     def left_s(self, length_s: Floats) -> Floats:
-        """So much time before each position, less what is negated."""
+        """This much time before each position, less the negated part of it."""
         if self.edge_s.size == 0:
             return length_s
         until_s, since_s = (np.interp(t_s, self.edge_s, self.blocked_s) for t_s in (self.end_s, self.end_s - length_s))
@@ -88,12 +90,12 @@ class _StepTimes:
 
     def lasting_s(self, member: Bools) -> Floats:
         """Time of the members: whole since the position before where that is a member too."""
-        lasted = np.concatenate([[False], member[:-1]])[: member.size]
-        return np.where(member, self.left_s(np.where(lasted, self.step_s, self.alone_s)), 0.0)
+        member_before = np.concatenate([[False], member[:-1]])[: member.size]
+        return np.where(member, self.left_s(np.where(member_before, self.step_s, self.alone_s)), 0.0)
 
 
 def negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) -> Floats:
-    """Begin and end of each negation [s]: after the reaction, at once where nothing was in use, until the return."""
+    """Begin and end of each negation [s]: from `delay_s` after it, or at once where already withheld, to the return."""
     firsts, lasts = runs_of(negated)
     until_s = np.append(t_s, t_s[-1:])[lasts + 1]
     from_s = t_s[firsts] + np.where(withheld[firsts], 0.0, delay_s)
@@ -101,7 +103,10 @@ def negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) 
 
 
 def _counted_s(t_ns: Ints, known: Bools, steps: _StepTimes) -> Floats:
-    """Time since the epoch before [s], one period of a gap; nothing between near positions, where the later has all."""
+    """Time since the epoch before [s], of a gap one period.
+
+    Of epochs between two near positions the later position accounts for all, the others for none.
+    """
     since_s = np.diff(t_ns, prepend=t_ns[:1] - round(steps.period_s * NS_PER_S)) / NS_PER_S
     since_s = np.where(since_s <= max(steps.gap_s, steps.period_s), since_s, steps.period_s)
     rows = np.flatnonzero(known)

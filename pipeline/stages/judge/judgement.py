@@ -137,23 +137,24 @@ def margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
 
 
 def judgements_of(case: Case, positions: MatchedPositions, at_ns: Ints, evidence: EvidenceSet) -> Judgements:
-    """Positions at instants against the evidence, else against the odometer's way since an accepted VB."""
+    """Positions against the evidence; where there is none, against the odometer since the last accepted VB."""
     judged = judge_positions(positions, evidence, case.legs(), case.config.hazards)
     if case.odometry is None:
         return judged
     accepted = case.solution.accepted
-    since_ns = case.instants(times_ns(accepted))
+    accepted_ns = case.instants(times_ns(accepted))
     stood = case.evidence.stood
-    train_m = carried_forward(since_ns, floats(accepted, "path_m"), at_ns, case.odometry, stood, case.config)
+    train_m = carried_forward(accepted_ns, floats(accepted, "path_m"), at_ns, case.odometry, stood, case.config)
     return with_own_anchors(judged, positions, train_m, case.config.hazards)
 
 
 def judge_positions(
     positions: MatchedPositions, evidence: EvidenceSet, legs: Sequence[RoutePath], config: HazardConfig
 ) -> Judgements:
-    """Wrong, or right, where it is so wherever the train may have been; `legs`: of the path, coordinate `path_m`.
+    """Wrong where it is too far ahead, or too far behind, for every alternative; right where it is right for all.
 
-    The interval spans the tracks on which the place along the track can be compared.
+    `legs`: of the path, coordinate `path_m`. The interval of the error spans the alternatives whose track joins the
+    position's, as only there a distance along the track exists.
     """
     size = positions.element.size
     limit_m = config.failure_limit_m
@@ -166,6 +167,7 @@ def judge_positions(
         there = alternative.where(positions.known[alternative.rows])
         rows = there.rows
         least_m, most_m, off_track = _relative(positions, sense, there, legs)
+        # On another track a position is wrong only if the match was sure of its own track.
         excluded = off_track & positions.unambiguous[rows]
         with np.errstate(invalid="ignore"):
             ahead[rows] &= excluded | (least_m > limit_m)

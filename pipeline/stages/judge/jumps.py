@@ -66,7 +66,10 @@ def find_jumps(steps: PositionChanges, direction: Ints, config: HazardConfig) ->
 
 
 def _largest_step(steps: PositionChanges, config: HazardConfig) -> Floats:
-    """The largest signed change up to each position within the window; that since the one before always counts."""
+    """The largest signed change up to each position, from those in the window before it, always from the last before.
+
+    Lag by lag: as soon as no pair of positions so far apart is in the window, no longer lag has one.
+    """
     excess_m = steps.excess_m
     size = steps.t_ns.size
     largest_m = np.zeros(size)
@@ -87,7 +90,10 @@ def _largest_step(steps: PositionChanges, config: HazardConfig) -> Floats:
 
 
 def _extent(steps: PositionChanges, begin: int, end: int, sign: float, config: HazardConfig) -> tuple[int, int]:
-    """First and last position of the increments that make the jump seen at positions `begin..end`."""
+    """First and last position of the increments that make up the jump over the limit at positions `begin..end`.
+
+    Those of at least `jump_share` of the largest count, from one window before `begin` on.
+    """
     window_ns = round(config.jump_window_s * NS_PER_S)
     earliest = int(np.searchsorted(steps.t_ns, steps.t_ns[begin] - window_ns, side="left"))
     start = max(min(earliest + 1, begin), 1)

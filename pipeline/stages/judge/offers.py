@@ -16,7 +16,7 @@ from schemas.enums import Judgement
 def judged_offers(case: Case, epochs: pl.DataFrame) -> pl.DataFrame:
     """The offers of the LDS as `schemas.stages.JudgedOffers`; `epochs`: judged.
 
-    The place judged is that of the balise; of a virtual one at the instant at which a position of that stamp was true.
+    Judged is the place of the balise: at the time of the telegram, or of the crossing less the GNSS latency.
     """
     offers = case.solution.offers
     limits = case.config.hazards

@@ -47,9 +47,9 @@ def passages_table(
 
 
 def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[HazardRow]) -> pl.DataFrame:
-    """Judgement, error, hazard and insertion of the offer that each passage rests on; of a telegram its error alone.
+    """Judgement, error, hazard and insertion from the offer of each passage; from a telegram its error alone.
 
-    Inserted is one by a jump, on another track, or early and wrong.
+    Inserted: by a jump, on another track, or early and wrong.
     """
     judged = Judgements.of(offers)
     hazard = np.full(offers.height, NOTHING)
@@ -146,7 +146,7 @@ def _word(frame: pl.DataFrame, column: str, *rows: tuple[pl.Expr, FailureMode | 
 def _with_unoffered(
     passages: pl.DataFrame, case: Case, crossings: Crossings, stamps: Ints, gap_ns: int
 ) -> pl.DataFrame:
-    """One more passage for each crossing of a virtual balise that the LDS knows nothing of, as it follows the position.
+    """Adds a passage for each true crossing of a virtual balise without one: the LDS, misled by the position, has none.
 
     `crossings`: those that belong to no passage; `stamps`: of valid positions.
     """
@@ -168,6 +168,7 @@ def _with_unoffered(
 
 
 def _unoffered(balise: dict[str, Any], crossing: TrueCrossing, case: Case, positioned: bool) -> dict[str, Any]:
+    """The row of such a passage; `sense` of crossing and balise are along the measure, `direction` along the path."""
     names = ("balise_id", "kind", "netelement_id", "measure_m", "path_m", "location_accuracy_m")
     growing = crossing.sense * balise["sense"] > 0
     return {name: balise[name] for name in names} | {

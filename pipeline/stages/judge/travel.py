@@ -17,9 +17,9 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class OdometerSteps:
-    """From each epoch to the next: the odometer `counts` throughout, and `moves`.
+    """From each epoch to the next: `counts`, the odometer has no gap there; `moves`, it shows movement.
 
-    `stood`: times [ns] in which it stands while positions leave their place by more than the failure limit.
+    `stood`: times [ns] in which it shows none while positions leave their place by more than the failure limit.
     """
 
     moves: Bools
@@ -28,6 +28,7 @@ class OdometerSteps:
 
 
 def odometer_steps(case: Case) -> OdometerSteps:
+    """What the odometer says of the steps between the epochs; without one, nothing."""
     at_ns = case.instants_of_epochs()
     odometry = case.odometry
     if odometry is None:
@@ -49,10 +50,10 @@ def odometer_steps(case: Case) -> OdometerSteps:
 def travel_direction(
     direction: Ints, along: Judgements, at_ns: Ints, path_m: Floats, has_odometer: bool, config: HazardConfig
 ) -> Ints:
-    """Direction of travel along growing path, 1 or -1, per epoch; `direction`: as the train took it.
+    """Direction of travel along growing path, 1 or -1, per epoch; `direction`: as the LDS knew it.
 
-    Without an odometer it is that of the train's place by the evidence: a position that jumps back does not turn the
-    train. With one it is the odometer's, unless the reference shows that it counts up in reverse.
+    Without an odometer the evidence decides, as a position that jumps back does not turn the train. With one the
+    odometer does, unless the reference shows that it counts up in reverse.
     """
     train_m = path_m - along.known_m(config.known_error_m)
     moved_m, noise_m, _ = _moved_m(at_ns, train_m, along.half_m, config.turn_s)
@@ -61,8 +62,8 @@ def travel_direction(
     by_reference = along.kind == REFERENCE
     if has_odometer:
         # Not over a turn: the odometer knows best when that was.
-        turned, _, _ = _moved_m(at_ns, direction.astype(np.float64), along.half_m, config.turn_s)
-        sure &= by_reference & (turned == 0.0)
+        turned_by, _, _ = _moved_m(at_ns, direction.astype(np.float64), along.half_m, config.turn_s)
+        sure &= by_reference & (turned_by == 0.0)
     rows = np.flatnonzero(sure)
     if rows.size == 0:
         return direction
@@ -70,7 +71,7 @@ def travel_direction(
     sense = np.sign(moved_m[last]).astype(np.int64)
     if not has_odometer:
         return sense
-    # An odometer that agreed with the reference then goes on to agree, and one that did not does not.
+    # Until the reference says otherwise, the odometer agrees with it, or contradicts it, as at the last sure epoch.
     return direction * np.where(by_reference, sense * direction[last], 1)
 
 
@@ -91,13 +92,13 @@ def moving(
 
 
 def _moved_m(at_ns: Ints, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
-    """Way from each epoch to the one `window_s` later [m], what both places may be off by [m], and the time [s]."""
+    """From each epoch to the one `window_s` later: the way [m], the half intervals of both places [m], the time [s]."""
     ahead = np.searchsorted(at_ns, at_ns + round(window_s * NS_PER_S)).clip(0, at_ns.size - 1)
     return place_m[ahead] - place_m, half_m + half_m[ahead], (at_ns[ahead] - at_ns) / NS_PER_S
 
 
 def _to_the_next(steps: Bools, size: int) -> Bools:
-    """What holds from each epoch to the next; the last one stays as it was before."""
+    """Steps as a column of epochs: each epoch has that of the step after it, the last epoch that of the step before."""
     last = steps[-1:] if steps.size else np.zeros(1, dtype=np.bool_)
     return np.concatenate([steps, last])[:size]
 
@@ -115,7 +116,8 @@ def beyond_confidence(
 ) -> Bools:
     """The distance counted since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1).
 
-    `train_m` +- `half_m`: path position of the train, NaN where not known; the whole interval has to be beyond.
+    `train_m` +- `half_m`: path position of the train, NaN where not known; the error counts where it exceeds the
+    allowance and the half intervals of both places.
     """
     beyond = np.zeros(t_ns.size, dtype=np.bool_)
     rows = np.flatnonzero(np.isfinite(odometer_m) & np.isfinite(train_m))

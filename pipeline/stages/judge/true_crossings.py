@@ -13,7 +13,7 @@ from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration
 
-# So many instants before and after a track are looked at, for where the train came from and went on to.
+# Numerics: so many instants before and after a track show where the train came from and went on to.
 _BESIDE = 100
 
 
@@ -38,7 +38,10 @@ def crossings_of(case: Case) -> dict[str, list[TrueCrossing]]:
     crossings = true_crossings(at_ns, case.evidence.at(at_ns), places, case.config)
     # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both ways.
     valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).iter_rows())
-    return {name: [one for one in crossed if valid[name] in (0, one.sense)] for name, crossed in crossings.items()}
+    return {
+        name: [crossing for crossing in crossed if valid[name] in (0, crossing.sense)]
+        for name, crossed in crossings.items()
+    }
 
 
 def between_far_epochs(at_ns: Ints, step_s: float) -> Ints:
@@ -53,10 +56,10 @@ def between_far_epochs(at_ns: Ints, step_s: float) -> Ints:
 def true_crossings(
     t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], config: Configuration
 ) -> dict[str, list[TrueCrossing]]:
-    """Crossings of each balise in order of time, where the evidence leaves one track; `t_ns`: its instants.
+    """Crossings of each balise in order of time, where the evidence leaves one track; `t_ns`: of the evidence.
 
-    Where it gives the place to `known_error_m` the middle of the interval crosses; else the whole interval has to pass
-    from one side to the other.
+    Where the half interval is at most `known_error_m`, its middle counts; else the whole interval has to pass from one
+    side of the balise to the other.
     """
     alone = _alone(evidence, t_ns.size)
     tracks = [track.where(alone[track.rows]) for track in evidence.alternatives]
@@ -77,9 +80,11 @@ def true_crossings(
         most_m = at_m.max()
         for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
             if least_m <= visit_m <= most_m:
-                found = _crossed(train, rows, on_track, at_m - visit_m, config)
-                crossings[names[balise]] += [one._replace(sense=int(one.sense * sense)) for one in found]
-    return {name: sorted(found) for name, found in crossings.items()}
+                crossed = _crossed(train, rows, on_track, at_m - visit_m, config)
+                crossings[names[balise]] += [
+                    crossing._replace(sense=int(crossing.sense * sense)) for crossing in crossed
+                ]
+    return {name: sorted(crossed) for name, crossed in crossings.items()}
 
 
 class _Train(NamedTuple):
@@ -101,7 +106,7 @@ def _alone(evidence: EvidenceSet, size: int) -> Bools:
 
 
 def _with_beside(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
-    """Rows and coordinates on a track, with the rows beside it at which the train's place lies on it too."""
+    """Rows and coordinates on a track, also of the rows just before and after, where the train's place lies on it."""
     rows = track.rows
     around = np.arange(max(rows[0] - _BESIDE, 0), min(rows[-1] + _BESIDE + 1, train.t_ns.size))
     beside = np.setdiff1d(around, rows)
@@ -128,8 +133,8 @@ def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config:
     armed_from = 0
     passed = False
     for change, later in zip(changes.tolist(), [*changes[1:].tolist(), away_m.size], strict=False):
-        armed = bool(beyond[armed_from:change].any())
-        clear = armed and bool(beyond[change:later].any())
+        armed = bool((beyond & (ahead != ahead[change]))[armed_from:change].any())
+        clear = armed and bool((beyond & (ahead == ahead[change]))[change:later].any())
         if not clear and not (close[change - 1 : change + 1].all() and (armed or not passed)):
             continue
         armed_from = change

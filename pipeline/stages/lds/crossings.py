@@ -131,8 +131,9 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing
         passed_after = np.searchsorted(at_m, journey.path_m[after], side="right")
         passing = np.flatnonzero(passed_before != passed_after)
         for step in passing.tolist():
-            i, k, first, last = (int(rows[step]) for rows in (before, after, passed_before, passed_after))
-            crossings += [_crossing(journey, balise, i, k, sense) for balise, sense in _in_order(on_leg, first, last)]
+            begin, end = int(before[step]), int(after[step])
+            passed = _in_order(on_leg, int(passed_before[step]), int(passed_after[step]))
+            crossings += [_crossing(journey, balise, begin, end, sense) for balise, sense in passed]
     return [crossing for crossing in crossings if _is_valid(crossing, journey)]
 
 
@@ -146,33 +147,35 @@ def _is_valid(crossing: Crossing, journey: Journey) -> bool:
 
 
 def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tuple[Balise, int]]:
+    """The balises passed by a step, with its sense; `before`, `after`: how many balises lie behind it at its ends."""
     if after > before:
         yield from ((balise, 1) for balise in balises[before:after])
     else:
         yield from ((balise, -1) for balise in reversed(balises[after:before]))
 
 
-def _crossing(journey: Journey, balise: Balise, before: int, k: int, sense: int) -> Crossing:
-    near = bool(journey.t_ns[k] - journey.t_ns[before] <= journey.gap_ns)
+def _crossing(journey: Journey, balise: Balise, before: int, epoch: int, sense: int) -> Crossing:
+    """The step from `before` to `epoch` passes a balise: interpolated, in a gap as at `epoch`."""
+    near = bool(journey.t_ns[epoch] - journey.t_ns[before] <= journey.gap_ns)
     share = 1.0
     t_ns = journey.t_ns
     path_m = journey.path_m
     odometer_m = journey.odometer_m
     if near:
-        share = float((balise.path_m - path_m[before]) / (path_m[k] - path_m[before]))
-    direction = int(journey.direction[k])
-    back_m = 0.0 if share == 1.0 else (1.0 - share) * float(odometer_m[k] - odometer_m[before])
+        share = float((balise.path_m - path_m[before]) / (path_m[epoch] - path_m[before]))
+    direction = int(journey.direction[epoch])
+    back_m = 0.0 if share == 1.0 else (1.0 - share) * float(odometer_m[epoch] - odometer_m[before])
     return Crossing(
         balise=balise,
         before=before,
-        epoch=k,
-        t_ns=int(t_ns[before]) + round(share * int(t_ns[k] - t_ns[before])),
+        epoch=epoch,
+        t_ns=int(t_ns[before]) + round(share * int(t_ns[epoch] - t_ns[before])),
         sense=sense,
         direction=direction,
-        odometer_m=_known(float(odometer_m[k]) - back_m),
-        travelled_m=float(journey.travelled_m[k]) - back_m * direction,
-        confidence_m=_known(float(journey.confidence_m[k])),
-        absence=None if near else journey.absence(slice(before + 1, k)),
+        odometer_m=_known(float(odometer_m[epoch]) - back_m),
+        travelled_m=float(journey.travelled_m[epoch]) - back_m * direction,
+        confidence_m=_known(float(journey.confidence_m[epoch])),
+        absence=None if near else journey.absence(slice(before + 1, epoch)),
     )
 
 
@@ -232,7 +235,7 @@ def _read(
     epoch = min(int(np.searchsorted(journey.t_ns, t_ns)), journey.t_ns.size - 1)
     before = max(int(np.searchsorted(journey.t_ns, t_ns, side="right")) - 1, 0)
     here_m = float(np.nan_to_num(journey.path_m[epoch]))
-    # Where the train is, the telegram before and the odometer tell; the position only where these do not tell it.
+    # The place of the last telegram plus the odometer since then; the matched position only where there is none.
     before_m = None if last is None or journey.segment[last.before] != journey.segment[before] else last.odometer_m
     if last is not None and before_m is not None and odometer_m is not None:
         here_m = last.balise.path_m + odometer_m - before_m

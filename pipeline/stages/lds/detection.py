@@ -50,23 +50,23 @@ class BaliseDetection:
         """A balise was detected so near that noise could detect it again."""
         return bool(self._disarmed)
 
-    def turn(self, k: int) -> None:
+    def turn(self, epoch: int) -> None:
         """Both chains learn that the train goes another way from this epoch on."""
-        for chain in (self.virtual, self.physical) if k in self._turns else ():
-            chain.turn(self._journey, k)
+        for chain in (self.virtual, self.physical) if epoch in self._turns else ():
+            chain.turn(self._journey, epoch)
 
-    def read(self, k: int) -> list[Crossing]:
+    def read(self, epoch: int) -> list[Crossing]:
         """Telegrams accepted by the rules of linking; only windows can reject them, no monitor."""
-        reads = self._at[BaliseKind.PHYSICAL].get(k, ())
+        reads = self._at[BaliseKind.PHYSICAL].get(epoch, ())
         return [read for read in reads if not self._disarmed.holds(read.balise) and self._offer(read, None)]
 
-    def pass_virtual(self, k: int, distrusted: bool, entering: bool) -> tuple[list[Crossing], bool]:
+    def pass_virtual(self, epoch: int, distrusted: bool, entering: bool) -> tuple[list[Crossing], bool]:
         """Offer what the position crossed in this step: what was accepted, and is the order of identities broken?
 
         `distrusted`: negated, withheld, or a monitor fails; `entering`: no chain has begun.
         """
         offered: list[Crossing] = []
-        for crossing in self._at[BaliseKind.VIRTUAL].get(k, ()):
+        for crossing in self._at[BaliseKind.VIRTUAL].get(epoch, ()):
             if self._disarmed.holds(crossing.balise):
                 self.virtual.cross_again(crossing)
             elif crossing.absence is None:
@@ -79,20 +79,20 @@ class BaliseDetection:
         overdue = sum(self.virtual.is_overdue(crossing.balise) for crossing in offered)
         refusals = [(crossing, self._refusal_of(crossing, distrusted, entering)) for crossing in offered]
         accepted = [crossing for crossing, refusal in refusals if self._offer(crossing, refusal)]
-        return accepted, self._order_fails(k, offered, overdue)
+        return accepted, self._order_fails(epoch, offered, overdue)
 
-    def rearm(self, k: int) -> None:
+    def rearm(self, epoch: int) -> None:
         """Balises that the train has left behind can be detected again."""
         if self._disarmed:
-            self._disarmed.rearm(k)
+            self._disarmed.rearm(epoch)
 
-    def close_windows(self, k: int, t_ns: int) -> None:
+    def close_windows(self, epoch: int, t_ns: int) -> None:
         """Windows that the train has left are closed."""
-        along_m = self._along_m[k]
+        along_m = self._along_m[epoch]
         if along_m > self.virtual.closing_m:
-            self.virtual.advance(float(self._journey.odometer_m[k]), t_ns, self._absence(k))
+            self.virtual.advance(float(self._journey.odometer_m[epoch]), t_ns, self._absence(epoch))
         if along_m > self.physical.closing_m:
-            self.physical.advance(float(self._journey.odometer_m[k]), t_ns, PassageStatus.MISSED)
+            self.physical.advance(float(self._journey.odometer_m[epoch]), t_ns, PassageStatus.MISSED)
 
     def finish(self, t_ns: int) -> None:
         """Balises that the train has passed by its odometer when the run ends without a position."""
@@ -122,15 +122,15 @@ class BaliseDetection:
             return PassageStatus.REJECTED_MONITOR
         return refusal
 
-    def _absence(self, k: int) -> PassageStatus:
-        """What to say of a balise that the train has passed and the position has not."""
-        return self._journey.absence(slice(k, k + 1)) if self._journey.blind[k] else PassageStatus.MISSED
+    def _absence(self, epoch: int) -> PassageStatus:
+        """The status of a balise passed by the train, but not by the position."""
+        return self._journey.absence(slice(epoch, epoch + 1)) if self._journey.blind[epoch] else PassageStatus.MISSED
 
-    def _order_fails(self, k: int, offered: list[Crossing], overdue: int) -> bool:
-        if not self.order.is_evaluated(k):
+    def _order_fails(self, epoch: int, offered: list[Crossing], overdue: int) -> bool:
+        if not self.order.is_evaluated(epoch):
             return False
         out_of_order = disorder(offered, overdue, self._journey, self._config)
-        self.order.note(k, out_of_order)
+        self.order.note(epoch, out_of_order)
         return out_of_order > 0
 
 
@@ -156,17 +156,17 @@ class Disarmed:
         odometer_m = float("nan") if crossing.odometer_m is None else crossing.odometer_m
         self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
 
-    def rearm(self, k: int) -> None:
-        """Re-arm what the train has left behind at epoch `k`."""
-        away_m = max(self._config.rearm_m, self._config.rearm_sigmas * float(self._journey.sigma_m[k]))
+    def rearm(self, epoch: int) -> None:
+        """Re-arm what the train has left behind at `epoch`."""
+        away_m = max(self._config.rearm_m, self._config.rearm_sigmas * float(self._journey.sigma_m[epoch]))
         for name, (balise, at_m) in list(self._at.items()):
-            if abs(self._moved_m(k, balise, at_m)) >= away_m:
+            if abs(self._moved_m(epoch, balise, at_m)) >= away_m:
                 del self._at[name]
 
-    def _moved_m(self, k: int, balise: Balise, at_m: float) -> float:
+    def _moved_m(self, epoch: int, balise: Balise, at_m: float) -> float:
         if not self._journey.has_odometer:
-            return float(self._journey.path_m[k]) - balise.path_m
-        odometer_m = float(self._journey.odometer_m[k])
+            return float(self._journey.path_m[epoch]) - balise.path_m
+        odometer_m = float(self._journey.odometer_m[epoch])
         if isnan(at_m):
             self._at[balise.balise_id] = (balise, odometer_m)
         return odometer_m - at_m

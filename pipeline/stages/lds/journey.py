@@ -65,7 +65,7 @@ class Journey:
         return self.on_odometer.size > 0
 
     def absence(self, epochs: slice) -> PassageStatus:
-        """What to say of a balise passed while no position was on the path: off all track, or none."""
+        """The status of a balise passed without a position on the path: fixes off all track, or no fix."""
         unplaced = self.placed_nowhere[epochs].any()
         return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
 
@@ -106,6 +106,7 @@ def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configur
 
 
 def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
+    """Epochs more than `gap_ns` after the last position, and all before the first one."""
     last_ns = np.maximum.accumulate(np.where(positioned, t_ns, np.iinfo(np.int64).min))
     first = np.argmax(positioned) if positioned.any() else t_ns.size
     blind: Bools = t_ns - np.maximum(last_ns, t_ns[0] - gap_ns) > gap_ns

@@ -39,13 +39,13 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Co
     Two or more at once, or one against the direction of travel, are out of order where the
     odometer's step does not explain the position's; `overdue` ones, whose window has closed, always.
     """
-    i = offered[0].before
-    j = offered[0].epoch
-    odometer_step_m = journey.odometer_m[j] - journey.odometer_m[i]
-    excess_m = abs(journey.path_m[j] - journey.path_m[i] - odometer_step_m)
-    noise_m = config.monitors.threshold_factor * sqrt(journey.sigma_m[i] ** 2 + journey.sigma_m[j] ** 2)
+    before = offered[0].before
+    after = offered[0].epoch
+    odometer_step_m = journey.odometer_m[after] - journey.odometer_m[before]
+    excess_m = abs(journey.path_m[after] - journey.path_m[before] - odometer_step_m)
+    noise_m = config.monitors.threshold_factor * sqrt(journey.sigma_m[before] ** 2 + journey.sigma_m[after] ** 2)
     unexplained = excess_m > noise_m + config.lds.odometer_share * abs(odometer_step_m)
-    backwards = offered[0].sense != journey.direction[j]
+    backwards = offered[0].sense != journey.direction[after]
     return len(offered) if unexplained and (len(offered) > 1 or backwards) else overdue
 
 
@@ -57,11 +57,11 @@ class LinkOrder:
         self._evaluated: Bools = self._reason.is_null().to_numpy()
         self._value = np.zeros(journey.t_ns.size)
 
-    def is_evaluated(self, k: int) -> bool:
-        return bool(self._evaluated[k])
+    def is_evaluated(self, epoch: int) -> bool:
+        return bool(self._evaluated[epoch])
 
-    def note(self, k: int, out_of_order: int) -> None:
-        self._value[k] = out_of_order
+    def note(self, epoch: int, out_of_order: int) -> None:
+        self._value[epoch] = out_of_order
 
     def columns(self) -> list[pl.Series]:
         """`link_order_*` as in the contract of epochs."""
@@ -92,47 +92,47 @@ class LinkDistance:
         self._done = 0
         self._since_return = np.full((2, journey.t_ns.size), np.nan)  # moved since the re-link anchor, its bound
 
-    def measure_from(self, anchor: Anchor | None, k: int) -> None:
-        """From epoch `k` on the distance counts from this anchor."""
+    def measure_from(self, anchor: Anchor | None, epoch: int) -> None:
+        """From `epoch` on the distance counts from this anchor."""
         self._anchor = anchor
-        self._done = k
+        self._done = epoch
 
-    def hold_to(self, k: int, moved_m: Floats, bound_m: Floats) -> None:
-        """From epoch `k` on the position is held to the re-link anchor, for as long as these are; then measure anew."""
-        self._since_return[:, k:] = np.nan
-        self._since_return[:, k : k + moved_m.size] = moved_m, bound_m
-        self._done = k
+    def hold_to(self, epoch: int, moved_m: Floats, bound_m: Floats) -> None:
+        """From `epoch` on the position is held to the re-link anchor, for as long as these are; then measure anew."""
+        self._since_return[:, epoch:] = np.nan
+        self._since_return[:, epoch : epoch + moved_m.size] = moved_m, bound_m
+        self._done = epoch
 
-    def is_possible(self, k: int) -> bool:
+    def is_possible(self, epoch: int) -> bool:
         """There is a position and an odometer to compare at this epoch."""
-        return bool(self._possible[k])
+        return bool(self._possible[epoch])
 
-    def can_measure(self, k: int) -> bool:
+    def can_measure(self, epoch: int) -> bool:
         """What the distance counts from is in the same continuity segment of the odometer as this epoch."""
         segment = self._journey.segment
-        return self._anchor is not None and bool(segment[self._anchor.epoch] == segment[k])
+        return self._anchor is not None and bool(segment[self._anchor.epoch] == segment[epoch])
 
-    def fails(self, k: int) -> bool:
+    def fails(self, epoch: int) -> bool:
         if self._anchor is None:
             return False
-        if k >= self._done:
-            self._evaluate(self._anchor, k)
-        return bool(self._fails[k])
+        if epoch >= self._done:
+            self._evaluate(self._anchor, epoch)
+        return bool(self._fails[epoch])
 
-    def quiet_until(self, k: int, end: int) -> int:
-        """The first epoch from `k` on that fails or is not evaluated yet; at most `end`."""
+    def quiet_until(self, epoch: int, end: int) -> int:
+        """The first epoch from `epoch` on that fails or is not evaluated yet; at most `end`."""
         if self._anchor is None:
             return end
-        if k >= self._done:
-            self._evaluate(self._anchor, k)
-        ahead = self._fails[k : min(self._done, end)]
+        if epoch >= self._done:
+            self._evaluate(self._anchor, epoch)
+        ahead = self._fails[epoch : min(self._done, end)]
         first = int(ahead.argmax())
-        return k + (first if ahead[first] else ahead.size)
+        return epoch + (first if ahead[first] else ahead.size)
 
-    def _evaluate(self, anchor: Anchor, k: int) -> None:
+    def _evaluate(self, anchor: Anchor, epoch: int) -> None:
         """A block ahead at once: elementwise, so every epoch still knows only its own past."""
-        self._done = min(k + _BLOCK, self._fails.size)
-        ahead = slice(k, self._done)
+        self._done = min(epoch + _BLOCK, self._fails.size)
+        ahead = slice(epoch, self._done)
         way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
         noise_m = self._factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
         threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
@@ -147,21 +147,21 @@ class LinkDistance:
         self._threshold[ahead] = np.where(known, np.where(held, bound_m, threshold_m), np.nan)
         self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
 
-    def hold_against(self, comparison: Comparison, k: int) -> None:
-        """The verdict on a position after an outage joins that of the bounds at epoch `k`, whose fail remains."""
-        if self.fails(k):
+    def hold_against(self, comparison: Comparison, epoch: int) -> None:
+        """The verdict on a position after an outage joins that of the bounds at `epoch`, whose fail remains."""
+        if self.fails(epoch):
             return
-        self._value[k] = comparison.moved_m
-        self._threshold[k] = comparison.bound_m
-        self._fails[k] = comparison.reason is None and not comparison.holds
-        self._reason[k] = comparison.reason
+        self._value[epoch] = comparison.moved_m
+        self._threshold[epoch] = comparison.bound_m
+        self._fails[epoch] = comparison.reason is None and not comparison.holds
+        self._reason[epoch] = comparison.reason
 
-    def forget(self, k: int) -> None:
-        """From epoch `k` on there is nothing to measure from."""
-        self.measure_from(None, k)
-        self._since_return[:, k:] = np.nan
-        self._value[k:] = self._threshold[k:] = np.nan
-        self._reason[k:][self._possible[k:]] = None
+    def forget(self, epoch: int) -> None:
+        """From `epoch` on there is nothing to measure from."""
+        self.measure_from(None, epoch)
+        self._since_return[:, epoch:] = np.nan
+        self._value[epoch:] = self._threshold[epoch:] = np.nan
+        self._reason[epoch:][self._possible[epoch:]] = None
 
     def columns(self) -> list[pl.Series]:
         """`link_distance_*` as in the contract of epochs."""

@@ -101,28 +101,31 @@ class LinkingChain:
         """A new initialisation: no reference, no linking."""
         self.reference = None
         self._expect(_Announced([], 1), 0)
-        for kept in (self._own, self._set_aside, self._unoffered):
-            kept.clear()
+        for passages in (self._own, self._set_aside, self._unoffered):
+            passages.clear()
 
     def is_overdue(self, balise: Balise) -> bool:
         """Its window has closed without any offer."""
         return balise.balise_id in self._unoffered
 
     def advance(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
-        """The train has come to this odometer reading; `absence`: status of what it did not find."""
+        """The train has come to this odometer reading; `absence`: status of balises not found in their window."""
         if self.linking:
             self._close_windows(self._distance_m(odometer_m), t_ns, absence)
 
-    def turn(self, journey: Journey, k: int) -> None:
-        """The train goes the other way from this epoch on, or on another leg: expect what lies on its new way."""
+    def turn(self, journey: Journey, epoch: int) -> None:
+        """From `epoch` on the train goes the other way, or on another leg: expect the balises on its new way.
+
+        Balises whose window covers the place of the turn may have been passed or not: they are optional.
+        """
         if self.reference is None or not self.linking:
             return
-        self._direction = int(journey.direction[k])
-        self._leg = int(journey.leg[k])
-        travelled_m = float(journey.travelled_m[k]) - self.reference.travelled_m
-        self._turn = _Turn(self._distance_m(float(journey.odometer_m[k])), travelled_m)
-        for kept in (self._own, self._set_aside, self._unoffered):
-            kept.clear()
+        self._direction = int(journey.direction[epoch])
+        self._leg = int(journey.leg[epoch])
+        travelled_m = float(journey.travelled_m[epoch]) - self.reference.travelled_m
+        self._turn = _Turn(self._distance_m(float(journey.odometer_m[epoch])), travelled_m)
+        for passages in (self._own, self._set_aside, self._unoffered):
+            passages.clear()
         windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel().balises]
         here_m = self._turn.distance_m
         self._optional = {balise.balise_id for balise, window in windows if window.holds(here_m)}
@@ -130,7 +133,7 @@ class LinkingChain:
         self._expect(_Announced(ahead, self._direction), 0)
 
     def offer(self, crossing: Crossing, refusal: PassageStatus | None) -> bool:
-        """Judge an offered balise; its passage is written whatever comes of it. True where it is accepted.
+        """Judge an offered balise and write its passage; true where it is accepted.
 
         `refusal`: why it does not count as a detection, None where it does.
         """
@@ -159,7 +162,7 @@ class LinkingChain:
         return accepted
 
     def pass_unoffered(self, crossing: Crossing, status: PassageStatus) -> None:
-        """The position was on one side before a gap and on the other after it."""
+        """The position passed the balise in a gap; `status`: why it was not offered."""
         crossing.status = status
         name = crossing.balise.balise_id
         if crossing.sense != crossing.direction:
@@ -174,13 +177,13 @@ class LinkingChain:
     def cross_again(self, crossing: Crossing) -> None:
         """Crossed once more before it was re-armed: not offered, but the position changed sides."""
         forward = crossing.sense == crossing.direction
-        taken, kept = (self._set_aside, self._own) if forward else (self._own, self._set_aside)
-        passage = taken.pop(crossing.balise.balise_id, None)
+        source, destination = (self._set_aside, self._own) if forward else (self._own, self._set_aside)
+        passage = source.pop(crossing.balise.balise_id, None)
         if passage is not None:
-            kept[crossing.balise.balise_id] = passage
+            destination[crossing.balise.balise_id] = passage
 
     def finish(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
-        """The run ends without a position: `absence` is the status of what was passed by reckoning."""
+        """The run ends without a position: balises passed by the odometer get the status `absence`."""
         if not self.linking:
             return
         distance_m = self._distance_m(odometer_m)
@@ -227,15 +230,16 @@ class LinkingChain:
             passage.record(LinkingError.EARLY, balise.reaction)
 
     def _expected_at(self, balise: Balise) -> Balise | None:
-        """The expected balise that this offer stands against, `None` where it is not ahead.
+        """The balise expected when this one is offered; `None` where the offered one is not ahead.
 
-        Balises near which the train turned may or may not be passed: they stand in nobody's way.
+        That is the first ahead that is not optional; optional balises may be skipped.
         """
         place = self._ahead.place_of(balise.balise_id, self._next)
         if place is None:
             return None
-        before = (self._ahead.balises[i] for i in range(self._next, place))
-        return next((other for other in before if other.balise_id not in self._optional), self._ahead.balises[place])
+        before = self._ahead.balises[self._next : place]
+        required = (expected for expected in before if expected.balise_id not in self._optional)
+        return next(required, self._ahead.balises[place])
 
     def _close_windows(self, distance_m: float, t_ns: int, absence: PassageStatus) -> None:
         balises = self._ahead.balises

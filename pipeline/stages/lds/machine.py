@@ -10,8 +10,6 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from enum import Enum, auto
 
-import numpy as np
-
 from pipeline.stages.lds.crossings import Balise, Crossing
 from pipeline.stages.lds.detection import BaliseDetection
 from pipeline.stages.lds.journey import Journey, mission_epochs, odometer_epochs
@@ -22,8 +20,6 @@ from pipeline.stages.monitors.bank import MonitorBank
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, LostTo
-
-_NOTHING = np.zeros((2, 0))
 
 
 class Use(Enum):
@@ -135,11 +131,12 @@ class LocationSystem:
     def _step(self, k: int) -> None:
         if k in self._missions:
             self._relink.begin_mission(k)
+            self._hold_to_ns = None
             self._initialise_anew(k)
         self.balises.turn(k)
         for read in self.balises.read(k):
             self._relink.note_read(read)
-            self.distance.hold_to(k, *_NOTHING)
+            self._hold(k)
         bank_failed = self._bank.failed(k)
         self._watch(k)
         self.withheld_for[k] = self._withheld_for(k)
@@ -190,7 +187,9 @@ class LocationSystem:
         return self.distance.is_possible(k) and bool(self._journey.usable[k])
 
     def _relink_after_slip(self, k: int) -> None:
-        if self._can_return(k) and self._relink.compare(k, self._relink.anchor_before_slip(self._since)).holds:
+        # Several slips would each let a held position go on by as much as one may.
+        anchor = self._relink.anchor_at(k) if self._is_held(k) else self._relink.anchor_before_slip(self._since)
+        if self._can_return(k) and self._relink.compare(k, anchor).holds:
             self._use = Use.IN_USE
             self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
 
@@ -258,9 +257,19 @@ class LocationSystem:
         # The bank begins anew: for the memory of its slowest average nothing else would see a slow drift go on.
         if self._hold_to_ns is None:
             self._hold_to_ns = self._t_ns[k] + self._memory_ns
+        self._hold(k)
+        self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+
+    def _is_held(self, k: int) -> bool:
+        return self._hold_to_ns is not None and self._t_ns[k] <= self._hold_to_ns
+
+    def _hold(self, k: int) -> None:
+        """From here on to the anchor of the re-link, or to the telegram that renewed it."""
+        anchor = self._relink.anchor_at(k)
+        if self._hold_to_ns is None or anchor is None:
+            return
         end = max(bisect_right(self._t_ns, self._hold_to_ns), k)
         self.distance.hold_to(k, *self._relink.moved_m(anchor, k, end))
-        self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
 
     def _initialise_anew(self, k: int) -> None:
         """No reference and no linking: a start of mission, or a fault before anything was validated."""

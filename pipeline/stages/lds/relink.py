@@ -2,7 +2,8 @@
 
 After an alarm the anchor is a TVB well before it, for a slow drift has moved the last one already; alarms that follow
 may be about the same fault, so that a return does not move it. Only a telegram does: it says where the train is. After
-slip that the odometer reports, no fault is suspected, so the anchor is the last TVB before the slip. A wheel that slips
+slip that the odometer reports, no fault is suspected, so the anchor is the last TVB before the slip, but the first one
+while a position is held to it after a return. A wheel that slips
 is counted wrongly: that widens the bound, up to half the failure limit; if the count may be off by more, only a
 telegram re-links.
 """
@@ -39,9 +40,11 @@ class Anchor:
     is_read: bool = False
 
     @classmethod
-    def at_epoch(cls, journey: Journey, k: int) -> Anchor:
-        offset_m = float(journey.path_m[k] - journey.odometer_m[k])
-        return cls(k, int(journey.t_ns[k]), offset_m, float(journey.sigma_m[k]), float(journey.travelled_m[k]))
+    def at_epoch(cls, journey: Journey, epoch: int) -> Anchor:
+        offset_m = float(journey.path_m[epoch] - journey.odometer_m[epoch])
+        return cls(
+            epoch, int(journey.t_ns[epoch]), offset_m, float(journey.sigma_m[epoch]), float(journey.travelled_m[epoch])
+        )
 
     @classmethod
     def at_crossing(cls, journey: Journey, crossing: Crossing, sigma_m: float) -> Anchor | None:
@@ -90,69 +93,70 @@ class Relink:
         self._mission_from = 0
         self.held: list[Held] = []
 
-    def begin_mission(self, k: int) -> None:
-        """What was before epoch `k` does not count."""
+    def begin_mission(self, epoch: int) -> None:
+        """Whatever was before `epoch` no longer counts."""
         self._fixed = None
         self._alarmed = False
-        self._mission_from = k
+        self._mission_from = epoch
 
     def note_read(self, read: Crossing) -> None:
         """A telegram says where the train is."""
         self._fixed = Anchor.at_crossing(self._journey, read, self._config.hazards.balise_read_sigma_m) or self._fixed
 
-    def note_alarm(self, k: int, memory_s: float = 0.0) -> None:
+    def note_alarm(self, epoch: int, memory_s: float = 0.0) -> None:
         """The first alarm with an anchor before it fixes that; only a telegram moves it from there.
 
         `memory_s`: of the slowest average that fails: the drift may have gone on for so long.
         """
-        self._fixed = self.anchor_at(k, memory_s)
+        self._fixed = self.anchor_at(epoch, memory_s)
         self._alarmed = self._fixed is not None
 
-    def anchor_at(self, k: int, least_s: float = 0.0) -> Anchor | None:
-        """Before the first alarm: the last TVB `anchor_lag_s` before epoch `k`, else the first TVB, or a later read."""
+    def anchor_at(self, epoch: int, least_s: float = 0.0) -> Anchor | None:
+        """Before the first alarm: the last TVB `anchor_lag_s` before `epoch`, else the first TVB, or a later read."""
         lag_s = max(self._config.lds.anchor_lag_s, least_s)
-        return self._fixed if self._alarmed else self._last_validated(k, lag_s)
+        return self._fixed if self._alarmed else self._last_validated(epoch, lag_s)
 
-    def anchor_before_slip(self, k: int) -> Anchor | None:
-        """The last TVB before slip that began at epoch `k`, or a later telegram."""
-        return self._last_validated(k, 0.0)
+    def anchor_before_slip(self, epoch: int) -> Anchor | None:
+        """The last TVB before slip that began at `epoch`, or a later telegram."""
+        return self._last_validated(epoch, 0.0)
 
-    def _last_validated(self, k: int, lag_s: float) -> Anchor | None:
-        tvbs = self._mission_from + np.flatnonzero(self._tvb[self._mission_from : k])
+    def _last_validated(self, epoch: int, lag_s: float) -> Anchor | None:
+        """The last TVB at least `lag_s` before `epoch`, else the first of the mission; or a later telegram."""
+        tvbs = self._mission_from + np.flatnonzero(self._tvb[self._mission_from : epoch])
         if not tvbs.size:
             return self._fixed
-        old_ns = int(self._journey.t_ns[k]) - round(lag_s * NS_PER_S)
+        old_ns = int(self._journey.t_ns[epoch]) - round(lag_s * NS_PER_S)
         last_old = int(np.searchsorted(self._journey.t_ns[tvbs], old_ns, side="right")) - 1
         tvb = Anchor.at_epoch(self._journey, int(tvbs[max(last_old, 0)]))
         return tvb if self._fixed is None or tvb.t_ns > self._fixed.t_ns else self._fixed
 
-    def compare(self, k: int, anchor: Anchor | None) -> Comparison:
-        """Hold the position at epoch `k` against an anchor."""
+    def compare(self, epoch: int, anchor: Anchor | None) -> Comparison:
+        """Hold the position at `epoch` against an anchor."""
         if not self._config.lds.relink:
             return Comparison(reason=NotEvaluated.RELINK_OFF)
         if anchor is None:
             return Comparison(reason=NotEvaluated.RELINK_NO_ANCHOR)
-        if self._journey.counter[anchor.epoch] != self._journey.counter[k]:
+        if self._journey.counter[anchor.epoch] != self._journey.counter[epoch]:
             return Comparison(reason=NotEvaluated.RELINK_DISTANCE_LOST)
-        if self._journey.scale_sigma is None and not (anchor.is_read and anchor.epoch == k):
+        if self._journey.scale_sigma is None and not (anchor.is_read and anchor.epoch == epoch):
             return Comparison(reason=NotEvaluated.RELINK_NO_VEHICLE)
-        doubt_m = float(self._journey.slip_doubt_m[k] - self._journey.slip_doubt_m[anchor.epoch])
+        doubt_m = float(self._journey.slip_doubt_m[epoch] - self._journey.slip_doubt_m[anchor.epoch])
         if doubt_m > 0.5 * self._config.hazards.failure_limit_m:
             # Slip at each start counts too much each time, and would soon explain any fault.
             return Comparison(reason=NotEvaluated.RELINK_SLIPPED)
-        moved_m, bound_m = (float(values[0]) for values in self.moved_m(anchor, k, k + 1))
+        moved_m, bound_m = (float(values[0]) for values in self.moved_m(anchor, epoch, epoch + 1))
         comparison = Comparison(moved_m, bound_m)
         if comparison.holds:
-            self.held.append(Held(k, None if anchor.is_read else anchor.epoch, moved_m, bound_m + doubt_m))
+            self.held.append(Held(epoch, None if anchor.is_read else anchor.epoch, moved_m, bound_m + doubt_m))
         return comparison
 
-    def moved_m(self, anchor: Anchor, k: int, end: int) -> tuple[Floats, Floats]:
+    def moved_m(self, anchor: Anchor, epoch: int, end: int) -> tuple[Floats, Floats]:
         """How far GNSS minus odometer moved since the anchor at these epochs, and how far it may have [m].
 
         NaN where the odometer lost its distance, or may have miscounted too much through slip.
         """
         journey = self._journey
-        at = slice(k, end)
+        at = slice(epoch, end)
         moved_m = journey.path_m[at] - journey.odometer_m[at] - anchor.offset_m
         waited_s = (journey.t_ns[at] - anchor.t_ns) / NS_PER_S
         way_m = journey.travelled_m[at] - anchor.travelled_m
@@ -165,30 +169,31 @@ class Relink:
 
 
 class Recovery:
-    """Since when nothing has failed fast while the position is negated."""
+    """While the position is negated: for how long no fast monitor has failed."""
 
     def __init__(self, journey: Journey, bank: MonitorBank, config: Configuration) -> None:
         self._journey = journey
         self._bank = bank
         self._rule = RecoveryRule(config)
-        self._failed_at_ns = self._seen_at_ns = 0
+        self._failed_at_ns = self._observed_at_ns = 0
 
-    def begin(self, k: int) -> None:
-        """The position is negated at epoch `k`."""
-        self._failed_at_ns = self._seen_at_ns = int(self._journey.t_ns[k])
+    def begin(self, epoch: int) -> None:
+        """The position is negated at `epoch`."""
+        self._failed_at_ns = self._observed_at_ns = int(self._journey.t_ns[epoch])
 
-    def is_over(self, k: int, evaluated: bool, failing: bool) -> bool:
-        """`recovery_s` without a failure of the raw and fastest monitors, all of it seen, and a usable position now.
+    def is_over(self, epoch: int, evaluated: bool, failing: bool) -> bool:
+        """`recovery_s` without a failure of the raw and fastest monitors, observed without a gap, and usable now.
 
-        Without an odometer there is no along bank to look on; the position itself has to do.
+        Observed is an epoch with a verdict of `along_raw` (`evaluated`); without an odometer, with a usable position.
         """
-        t_ns = int(self._journey.t_ns[k])
-        seen = evaluated if self._journey.has_odometer else bool(self._journey.usable[k])
-        if seen:
-            if t_ns - self._seen_at_ns > self._journey.gap_ns:
+        t_ns = int(self._journey.t_ns[epoch])
+        usable = bool(self._journey.usable[epoch])
+        observed = evaluated if self._journey.has_odometer else usable
+        if observed:
+            if t_ns - self._observed_at_ns > self._journey.gap_ns:
                 self._failed_at_ns = t_ns
-            self._seen_at_ns = t_ns
-        if failing or self._bank.fast_failed(k):
+            self._observed_at_ns = t_ns
+        if failing or self._bank.fast_failed(epoch):
             self._failed_at_ns = t_ns
         quiet = bool(self._rule.is_quiet((t_ns - self._failed_at_ns) / NS_PER_S))
-        return seen and bool(self._journey.usable[k]) and quiet
+        return observed and usable and quiet

@@ -117,6 +117,7 @@ def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools)
 
 
 def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld: Bools) -> pl.Series:
+    """`lds_mode` of each epoch; `index`: the change of LRVB in force there."""
     linked = np.array(
         [
             (change.lrvb is not None and change.lrvb.odometer_m is not None)
@@ -178,9 +179,9 @@ def passage_rows(
     ids = {id(crossing): number for number, crossing in enumerate(crossings)}
     rows = [_row(passage, ids, journey, solution) for passage in passages]
     when = [row["t_offered"] or row["t_reckoned"] or passage.t_ns for row, passage in zip(rows, passages, strict=True)]
-    order = sorted(range(len(rows)), key=lambda i: (when[i], passages[i].balise.balise_id))
+    order = sorted(range(len(rows)), key=lambda number: (when[number], passages[number].balise.balise_id))
     schema = dtypes(Passages) | {"t_reckoned": pl.Datetime("ns", "UTC")}
-    return pl.DataFrame([rows[i] for i in order], schema=schema)
+    return pl.DataFrame([rows[number] for number in order], schema=schema)
 
 
 def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:
@@ -226,11 +227,11 @@ def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
         beyond = journey.odometer_m[rows] >= passage.announced_odometer_m
         steps = np.flatnonzero(beyond[1:] != beyond[:-1])
         if steps.size:
-            i = rows[steps[-1]]
-            j = rows[steps[-1] + 1]
-            part_m = passage.announced_odometer_m - journey.odometer_m[i]
-            share = float(part_m / (journey.odometer_m[j] - journey.odometer_m[i]))
-            return int(journey.t_ns[i]) + round(share * int(journey.t_ns[j] - journey.t_ns[i]))
+            before = rows[steps[-1]]
+            after = rows[steps[-1] + 1]
+            part_m = passage.announced_odometer_m - journey.odometer_m[before]
+            share = float(part_m / (journey.odometer_m[after] - journey.odometer_m[before]))
+            return int(journey.t_ns[before]) + round(share * int(journey.t_ns[after] - journey.t_ns[before]))
         end = end - rows.size + 1
         size = 2 * size
     return None

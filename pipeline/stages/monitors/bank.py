@@ -203,7 +203,7 @@ class MonitorBank:
         return bool(self._fast[epoch])
 
     def failing_memory_s(self, epoch: int) -> float:
-        """Memory of the slowest average that fails here [s], over which its fault may have gone on; 0 without one."""
+        """Memory of the slowest failing average [s]: its fault may be that old; 0 where none fails."""
         self._look(epoch)
         failing = np.any([axis.state[epoch] == FAIL for axis in self._axes], axis=0)
         return float(np.max(self._memories_s * failing))

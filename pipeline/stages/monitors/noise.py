@@ -17,8 +17,8 @@ from pipeline.stages.monitors.axis import AxisSeries, error_model
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, MonitorConfig
 
-# Second differences of a random walk have four times the variance of what it does to an average of that memory; of
-# white noise six times: it is taken for 1.5 times as much (DOMAIN section 3).
+# M = (second difference)^2 / 4 is exact for a random walk; for white noise it is 6 / 4 of it, so on the safe side
+# (DOMAIN section 3).
 _OF_WALK = 4.0
 
 
@@ -43,13 +43,13 @@ class NoiseMeter:
         self._entering = [np.arange(samples.row.size) for samples in self._samples]
 
     def freeze(self, row: int) -> None:
-        """From this row on nothing enters."""
+        """Samples of this row and later ones are no longer counted."""
         for index, samples in enumerate(self._samples):
             entering = self._entering[index]
             self._entering[index] = entering[: np.searchsorted(samples.row[entering], row)]
 
     def restart(self, row: int) -> None:
-        """From this row on samples enter again; none reaches back over it."""
+        """Samples count again whose three rows all lie at this row or after it."""
         self.freeze(row)
         for index, samples in enumerate(self._samples):
             later = np.arange(np.searchsorted(samples.oldest, row), samples.row.size)
@@ -71,18 +71,18 @@ class NoiseMeter:
         if not self._samples or begin == end:
             return np.full((end - begin, self._memories_s.size), np.nan)
         renewals = np.arange(self._renewal[begin], self._renewal[end - 1] + 1)
-        # After a pause an increment has the noise of that time, which is no less than that of the next longer lag.
-        asked_s = np.maximum(self._memories_s, self._series.dt_s[begin:end, None])
-        columns = np.searchsorted(1.5 * np.array(self._lags_s[:-1]), asked_s)
+        # A monitor takes the noise of the lag nearest to its memory; after a pause, that of a lag as long as the pause.
+        needed_s = np.maximum(self._memories_s, self._series.dt_s[begin:end, None])
+        columns = np.searchsorted(1.5 * np.array(self._lags_s[:-1]), needed_s)
         by_lag = self._by_lag(renewals)
         return np.asarray(np.take_along_axis(by_lag[self._renewal[begin:end] - renewals[0]], columns, axis=1))
 
     def _by_lag(self, renewals: Ints) -> Floats:
-        """M of every lag at these renewals: measured, or expected by the shorter ones until it is.
+        """M of every lag (columns) at these renewals (rows): measured, or expected from the shorter lags until it is.
 
-        Noise that grows from lag to lag goes on to grow with the model, as smooth errors of a larger sigma do; white
-        noise does not grow. (The shortest lag has none before it: all its noise is taken for smooth.) The growth may
-        decline from lag to lag, as beyond the memory of an error, and never rises.
+        Expected: M(lag) = M(shorter) + growth x (model(lag) - model(shorter)). The growth is that of the lag before,
+        so 0 for white noise and more for smooth errors of a larger sigma than stated; at the shortest lag all noise is
+        taken for smooth. Where it declined from lag to lag it declines on in the same ratio; it never rises.
         """
         row = np.searchsorted(self._renewal, renewals)
         model_m2 = np.column_stack([_model_at_m2(self._series, row, lag_s, self._config) for lag_s in self._lags_s])
@@ -104,11 +104,11 @@ class NoiseMeter:
         return noise_m2
 
     def _measured(self, index: int, renewals: Ints, row: Ints) -> tuple[Floats, Bools]:
-        """M of one lag from the samples before each renewal, which begins at `row`; and whether they are enough."""
+        """M of one lag by the samples before each renewal (first row `row`), and whether there were enough of them."""
         samples = self._samples[index]
         entering = self._entering[index]
         before = np.searchsorted(samples.renewal[entering], renewals)
-        # The onset of a drift touches samples over 2 L: they wait so long again, and it meets the thresholds before it.
+        # The latest samples wait: a drift, whose onset shows in samples for 2 L, must not raise its own thresholds.
         waiting = round(self._config.noise_wait_spans * samples.span)
         end = np.maximum(before - waiting, np.minimum(before, samples.ready))
         ready = end >= samples.ready
@@ -117,12 +117,12 @@ class NoiseMeter:
         ends, window = np.unique(end, return_inverse=True)
         shown_m2, error, stated_m2 = samples.looked_back(entering, ends)
         doubted = 1.0 + self._config.noise_doubt * error[window]
-        # What is not white grows with the errors that the receiver states: by the time it shows it would be too late.
+        # The noise grows with the sigma that the receiver states now: measured anew, it would come too late.
         larger = np.maximum(1.0, _ratio(_stated_m2(self._series, row, self._config), stated_m2[window]))
         return self._capped(shown_m2[window], shown_m2[window] * doubted * larger), ready
 
     def _capped(self, known_m2: Floats, more_m2: Floats) -> Floats:
-        """With what is expected, or in doubt: that alone does not make an axis blind."""
+        """`more_m2`, the noise with its doubt, up to the limit: doubt alone does not make an axis blind."""
         return np.minimum(more_m2, np.maximum(known_m2, self._limit_m2))
 
 
@@ -146,12 +146,16 @@ class _SecondDifferences:
     span: float
 
     def looked_back(self, entering: Ints, ends: Ints) -> tuple[Floats, Floats, Floats]:
-        """M in the windows of entering samples that end there, its standard error in parts of it, the stated mean."""
+        """Of the window of counted samples before each of `ends`: M, its relative standard error, the stated variance.
+
+        M is the largest over the quantiles; a window still short at the begin is filled with -inf, which sorts first.
+        """
         begins = np.maximum(ends - self.window, 0)
         count = np.maximum(ends - begins, 1)
         nothing = np.full((len(self.quantiles), self.window), -np.inf)
         windows = sliding_window_view(np.hstack([nothing, self.noise_m2[:, entering]]), self.window, axis=1)
         ordered = np.sort(windows[:, ends])
+        # Windows are `window` wide, so the sample of a quantile stands behind the filling.
         rank = self.window - count + np.ceil(np.array(self.quantiles)[:, None] * count).astype(np.int64) - 1
         shown_m2 = np.take_along_axis(ordered, rank[..., None], axis=2).max(axis=(0, 2))
         total_m2 = np.concatenate([[0.0], np.cumsum(self.stated_m2[entering])])
@@ -181,19 +185,20 @@ class _Sampler:
         self._config = config
         self._t_s = np.cumsum(series.dt_s) - series.dt_s[:1]
         self.renewal: Ints = (self._t_s // config.noise_renewal_s).astype(np.int64)
-        # Of the time in which the noise is not known anyway: no lag hangs on what comes later.
+        # Only of the time before the noise is first known: later rows must not change the lags (causal).
         steps_s = series.dt_s[1:][self._t_s[1:] <= config.noise_first_s]
         self.period_s = (
             round(float(np.median(steps_s if steps_s.size else series.dt_s)), 6) if series.dt_s.size else 0.0
         )
         unknown = ~np.isfinite(series.rate_mps + series.sigma_m.sum(axis=1))
         self._countable = moving & ~unknown
-        self._piece = np.cumsum(series.fresh | unknown)  # one number for rows that increments lead through
+        self._piece = np.cumsum(series.fresh | unknown)  # the same number for rows joined by increments
         self._offset_m = np.cumsum(np.where(series.border | unknown, 0.0, series.rate_mps) * series.dt_s)
         self._white_m2 = np.cumsum(series.white_m2)
         self._lasting_m = [np.cumsum(rate_mps * series.dt_s) for rate_mps in series.lasting_mps.T if rate_mps.any()]
 
     def over(self, lag_s: float) -> _SecondDifferences:
+        """Those of one lag: M = (second difference^2 / quantile of chi^2 - model) / 4 (DOMAIN section 3)."""
         config = self._config
         spacing_s = max(self.period_s, 0.1 * lag_s, config.noise_spacing_s)
         rows = self._triples(lag_s, spacing_s)
@@ -211,12 +216,13 @@ class _Sampler:
             noise_m2=(shown_m2 / gaussian_m2 - self._model_m2(lag_s, rows)) / _OF_WALK,
             stated_m2=_stated_m2(self._series, rows.last, config),
             window=round(max(config.noise_window_s, config.noise_window_lags * lag_s) / spacing_s),
-            ready=max(round(ready_s / spacing_s), 1),
+            # No sample begins where the run does: rounded up, logs faster than 2 Hz waited for a renewal more.
+            ready=max(int(ready_s / spacing_s + 1e-6), 1),
             span=max(2.0 * lag_s / spacing_s, 1.0),
         )
 
     def _triples(self, lag_s: float, spacing_s: float) -> _Triples:
-        """Rows t, one such in every `spacing_s`, and the rows nearest to t - L and t - 2 L, where near enough."""
+        """The first row t in every `spacing_s`, and the rows nearest to t - L and t - 2 L, if near enough."""
         t_s = self._t_s
         reach_s = max(0.1 * lag_s, 0.5 * self.period_s)
         cell = np.floor(t_s / spacing_s + 1e-6)

@@ -107,7 +107,7 @@ def variance_of_ewma(
 def noise_of_ewma(
     keep: Floats, gain: Floats, noise_m2: Floats, state: AxisState
 ) -> tuple[Floats, tuple[Floats, Floats]]:
-    """Variance of the EWMAs of a rate by noise without memory [m^2/s^2], another for each; all shapes (n, alphas).
+    """Variance of the EWMAs of a rate by memoryless noise [m^2/s^2], of its own size for each; all shapes (n, alphas).
 
     The recursion of DOMAIN section 3 with phi = 0 and R = `noise_m2`; its limit at a constant step is
     M 2 alpha^2 g^2 / (2 - alpha). Returns what is carried on too: the recursion's own last
@@ -123,7 +123,7 @@ def noise_of_ewma(
 
 
 def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> tuple[Floats, Floats, Floats]:
-    """By which factor the errors' covariances go on, what is new in them, and their share in the increment."""
+    """Of the recursion (`variance_of_ewma`): phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n, sources)."""
     if np.array_equal(sigma_m, sigma_before_m):
         return 1.0 - decorrelation, sigma_m * (decorrelation * sigma_m), -decorrelation
     ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
@@ -133,20 +133,19 @@ def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> t
 
 
 def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Floats:
-    """The sigma before each row that the recursion counts with, per source; shapes (n, sources).
+    """Per source the sigma s_p at the row before, for the recursion; shapes (n, sources).
 
-    Until a source's sigma first changes by more than `factor` (a step), R_j of the row stands for both ends of the
-    increment, as printed; from then on the row before has its own. Sources without memory (phi = 0) know no step.
+    Before the first step of a source (a change of its sigma by more than `factor`) that is the row's own sigma, as in
+    the printed recursion; from the step on it is that of the row before. Sources without memory (phi = 0) have no step.
     """
     before = sigma_m
-    for source, (now, lost) in enumerate(zip(sigma_m.T, decorrelation.T, strict=True)):
-        earlier = np.concatenate([now[:1], now[:-1]])
-        low = np.minimum(now, earlier)
-        high = np.maximum(now, earlier)
-        steps = (high > factor * low) & (lost < 1.0)
-        if steps.any():
+    for source, (sigma, lost) in enumerate(zip(sigma_m.T, decorrelation.T, strict=True)):
+        earlier = np.concatenate([sigma[:1], sigma[:-1]])
+        is_step = np.maximum(sigma, earlier) > factor * np.minimum(sigma, earlier)
+        is_step &= lost < 1.0
+        if is_step.any():
             before = before.copy(order="F") if before is sigma_m else before
-            before[:, source] = np.where(np.logical_or.accumulate(steps), earlier, now)
+            before[:, source] = np.where(np.logical_or.accumulate(is_step), earlier, sigma)
     return before
 
 

@@ -59,17 +59,17 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame
 
 
 def channel_monitor(
-    epochs: pl.DataFrame, other: pl.DataFrame | None, config: Configuration, absent: str = NO_OTHER_SOLUTION
+    epochs: pl.DataFrame, channel: pl.DataFrame | None, config: Configuration, absent: str = NO_OTHER_SOLUTION
 ) -> pl.DataFrame:
     """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
 
-    `other`: `t, path_m, sigma_along_m, fix_valid, on_track` of the other solution, on the same path; at an epoch its
-    last position since the epoch before counts, against this solution's at that time (`paired`). Errors that both share
-    (troposphere) make the threshold larger than it need be. `absent`: the reason where there is none.
+    `channel`: `t, path_m, sigma_along_m, fix_valid, on_track` of the other solution, on the same path; at an epoch its
+    last position since the epoch before counts, against this solution's at that time (`paired`). Errors common to both
+    (troposphere) make the threshold larger than needed. `absent`: the reason where there is no other solution.
     """
-    if other is None:
+    if channel is None:
         return no_verdicts(epochs.height, absent)
-    usable = other.filter("fix_valid", "on_track")
+    usable = channel.filter("fix_valid", "on_track")
     own_m = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
     pairs = paired(epochs.select("t", path_m=own_m), usable, config.lds)
     met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
@@ -105,8 +105,8 @@ def _way(t_s: Floats, velocity: Floats) -> Floats:
 _PLACE = ("netelement_id", "measure_m", "path_m")
 
 
-def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
-    """The rows of `other` with `path_m` as it counts on the path of `epochs`; null where nothing joins the paths.
+def on_path_of(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
+    """The rows of `channel` with `path_m` as it counts on the path of `epochs`; null where nothing joins the paths.
 
     Each solution has its own matched path. Where one of them began later, on another net element or in the other
     direction, their path positions count from different places.
@@ -115,7 +115,7 @@ def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.
     the beginning: as they will).
     """
     mine = _with_sense(epochs)
-    theirs = _with_sense(other).with_row_index("row")
+    theirs = _with_sense(channel).with_row_index("row")
     pairs = theirs.join_asof(
         mine, on="t_ns", strategy="nearest", tolerance=crossing_gap_ns(times_ns(epochs), lds), suffix="_mine"
     )
@@ -131,17 +131,17 @@ def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.
         .with_columns(pl.col("turned", "start_m").forward_fill().backward_fill())
         .select("row", path_m=pl.col("start_m") + pl.col("turned") * pl.col("path_m"))
     )
-    return other.with_columns(placed.sort("row")["path_m"])
+    return channel.with_columns(placed.sort("row")["path_m"])
 
 
-def paired(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
-    """For each epoch: `row_other`, the last of `other` since the epoch before, and `path_m`, where the train was then.
+def paired(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
+    """For each epoch: `row_other`, the last row of `channel` since the epoch before, and this solution's `path_m` then.
 
     Two receivers need not measure at the same times. Where they do, `path_m` is the epoch's own; else it lies between
     the positions of this epoch and the one before, if both have one and are no more than `crossing_gap_s` apart.
-    Null where there is nothing to compare. `epochs` with `t, path_m` (null where not usable), `other` with `t`.
+    Null where there is nothing to compare. `epochs` with `t, path_m` (null where not usable), `channel` with `t`.
     """
-    stamps = other.select(t_other=_stamp()).with_row_index("row_other")
+    stamps = channel.select(t_other=_stamp()).with_row_index("row_other")
     mine = epochs.select("path_m", t_ns=_stamp())
     since = pl.col("t_ns") - pl.col("t_ns").shift(1)
     early = pl.col("t_ns") - pl.col("t_other")

@@ -13,34 +13,34 @@ from schemas.config import AlignConfig
 
 
 def hysteresis_m(sigma_m: Floats, config: AlignConfig) -> Floats:
-    """By how much the distance may leave what is held of it before it has moved [m]."""
+    """How far the distance may leave the held distance before that follows [m]."""
     return config.sure_sigmas * sigma_m
 
 
 def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
     """The distance with a hysteresis to both sides [m], causal; NaN where it is not known.
 
-    Behind a movement it stays `width_m` back, and turns once the distance came back by twice that.
+    The result stays `width_m` behind a movement, and turns once the distance came back by twice that.
     """
-    held = np.full(distance_m.size, np.nan)
+    held_m = np.full(distance_m.size, np.nan)
     rows = np.flatnonzero(np.isfinite(distance_m))
     if rows.size == 0:
-        return held
-    at = float(distance_m[rows[0]])
-    low = (distance_m - width_m)[rows].tolist()
-    high = (distance_m + width_m)[rows].tolist()
+        return held_m
+    at_m = float(distance_m[rows[0]])
+    least_m = (distance_m - width_m)[rows].tolist()
+    most_m = (distance_m + width_m)[rows].tolist()
     values = []
-    for least, most in zip(low, high, strict=True):
-        at = min(max(at, least), most)
-        values.append(at)
-    held[rows] = values
-    return held
+    for low_m, high_m in zip(least_m, most_m, strict=True):
+        at_m = min(max(at_m, low_m), high_m)
+        values.append(at_m)
+    held_m[rows] = values
+    return held_m
 
 
 def turns_of(distance_m: Floats, back_m: float) -> list[tuple[int, int, int]]:
-    """Where the train turned, where that showed by its coming back so far, and the sense from then on (+1 or -1).
+    """Turns: row of the farthest place, row at which it had come back by `back_m`, sense from then on (+1 or -1).
 
-    The distance is taken to grow at first.
+    The distance is assumed to grow at first.
     """
     turns: list[tuple[int, int, int]] = []
     start, sense = 0, 1
@@ -61,7 +61,7 @@ def driven_m(distance_m: Floats, width_m: Floats) -> Floats:
     steps = np.diff(with_hysteresis(distance_m, width_m))
     moves = np.flatnonzero(steps)
     turns = moves[1:][np.sign(steps[moves[1:]]) != np.sign(steps[moves[:-1]])]
-    # A turn shows once the distance came back by the whole width.
+    # At a turn the held distance lags by twice the width (`with_hysteresis`), which was driven all the same.
     ways = np.abs(steps)
     ways[turns] += 2.0 * width_m[turns + 1]
     return np.concatenate([[0.0], np.cumsum(ways)])
@@ -83,44 +83,45 @@ def moving_steps(t_s: Floats, distance_m: Floats, deadband_mps: float, window_s:
 
 
 def driven_or_left_m(distance_m: Floats, moving: Bools) -> Floats:
-    """Way driven up to each sample [m]; of a stand only how far its place was left, for its noise would add up."""
-    way = np.abs(np.diff(distance_m))
+    """Way driven up to each sample [m]; of a stand only the farthest it was from its place, as noise would add up."""
+    way_m = np.abs(np.diff(distance_m))
     first = np.flatnonzero(np.diff(moving, prepend=~moving[:1]))
-    steps = np.diff(first, append=moving.size)
-    stand = np.repeat(np.arange(first.size), steps)
-    away = np.abs(distance_m[1:] - np.repeat(distance_m[first], steps))
-    # The farthest so far within each stand: offsets that grow from one to the next keep them apart.
-    apart = (away.max() + 1.0) * stand
-    left = np.maximum.accumulate(away + apart) - apart
-    fresh = np.zeros(moving.size, dtype=np.bool_)
-    fresh[first] = True
-    since = np.where(fresh, left, np.diff(left, prepend=0.0))
-    return np.concatenate([[0.0], np.cumsum(np.where(moving, way, since))])
+    lengths = np.diff(first, append=moving.size)
+    span = np.repeat(np.arange(first.size), lengths)  # of steps that all move, or all stand
+    away_m = np.abs(distance_m[1:] - np.repeat(distance_m[first], lengths))
+    # Running maximum within each span: an offset that grows from span to span keeps one from reaching into the next.
+    offset_m = (away_m.max() + 1.0) * span
+    farthest_m = np.maximum.accumulate(away_m + offset_m) - offset_m
+    begins = np.zeros(moving.size, dtype=np.bool_)
+    begins[first] = True
+    left_m = np.where(begins, farthest_m, np.diff(farthest_m, prepend=0.0))
+    return np.concatenate([[0.0], np.cumsum(np.where(moving, way_m, left_m))])
 
 
 def evenly_driven(
     t_s: Floats, distance_m: Floats, sigma_m: Floats, least_mps: float, config: AlignConfig
 ) -> tuple[Floats, Floats]:
-    """Times and distances [m] between which the train drove evenly, after the fact; slower than `least_mps` it stood.
+    """Support points (times, distances [m]) of a distance without quantisation noise, linear between; not causal.
 
-    From one row that moves the held distance to the next; out of a stand, from the last row near where it stood.
+    These are the rows that move the held distance. Where the way to the next is slower than `least_mps` the train
+    stood: the last row near the place of the stand is one more point, from which it departs.
     """
     width_m = hysteresis_m(sigma_m, config)
     held = with_hysteresis(distance_m, width_m)
     steps = np.diff(held, prepend=np.nan)
-    # A width that falls with the speed moves what is held too, but not the train.
+    # A hysteresis that narrows with the speed moves the held distance too: only rows that move themselves count.
     moves = np.flatnonzero((steps != 0) & (np.diff(distance_m, prepend=np.nan) != 0))
     at_s = t_s[moves].tolist()
     at_m = distance_m[moves].tolist()
     gaps = np.diff(t_s[moves])
     ways = np.abs(np.diff(distance_m[moves]))
-    # A turn, and the first way, show after the hysteresis alone.
+    # A turn, and the first movement, are held back by twice the width.
     turned = steps[moves[1:]] * np.nan_to_num(steps[moves[:-1]]) <= 0
     stood = ways - np.where(turned, 2.0 * width_m[moves[1:]], 0.0) <= least_mps * gaps
     for gap in np.flatnonzero(stood & (gaps > 0))[::-1].tolist():
         between = slice(int(moves[gap]), int(moves[gap + 1]))
         stood_m = float(np.median(distance_m[between]))
-        # So many of its deviations are the edges of a count from its middle.
+        # A uniform error of sigma s has its edges at sqrt(3) s.
         near = np.abs(distance_m[between] - stood_m) <= np.sqrt(3.0) * sigma_m[between]
         last = between.start + int(np.flatnonzero(near)[-1]) if near.any() else between.start
         at_s.insert(gap + 1, float(t_s[last]))

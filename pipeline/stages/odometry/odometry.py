@@ -109,7 +109,7 @@ class Odometry:
         return np.where(self.known_at_s(t_s), self.distance_at_s(t_s), np.nan)
 
     def travelled_at(self, t_ns: Ints) -> Floats:
-        """Way driven since the first row [m], turns included, noise of rows and stands not; a guess where not known."""
+        """Way driven since the first row [m], to and fro, without noise of rows and stands; interpolated over gaps."""
         return np.interp(self.seconds(t_ns), self.t_s, self._travelled_m)
 
     def moving_s_at(self, t_ns: Ints) -> Floats:
@@ -143,11 +143,12 @@ class Odometry:
         return Increments(distance, scale * (self.speed_at_s(now) - self.speed_at_s(before)))
 
     def driven(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Floats:
-        """The same of the way driven, turns included [m]."""
+        """Way driven between consecutive instants, to and fro [m], as `increments`."""
         begin_m, end_m = (np.interp(at_s, self.t_s, self._travelled_m) for at_s in self._steps_s(t_ns, latency_s))
         return np.asarray(scale * (end_m - begin_m))
 
     def _steps_s(self, t_ns: Ints, latency_s: Floats) -> tuple[Floats, Floats]:
+        """Begin and end of the step to each instant [s], less the latency in use at its end; none at the first."""
         t_s = self.seconds(t_ns)
         now = t_s - latency_s
         return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
@@ -165,7 +166,7 @@ class Odometry:
         return segment
 
     def distance_at_s(self, t_s: Floats) -> Floats:
-        """Distance [m]; a guess where it is not known, the end value outside the recording."""
+        """Distance [m]; interpolated where it is not known, the end value outside the recording."""
         return np.interp(t_s, self.t_s, self.distance_m)
 
     def speed_at_s(self, t_s: Floats) -> Floats:
@@ -181,7 +182,7 @@ class Odometry:
         return np.maximum(t_s - about_s, self.t_s[0]), np.minimum(t_s + about_s, self.t_s[-1])
 
     def reading_at_s(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Distance [m] and speed [m/s], centred: one over the second before would bias a latency by the same noise."""
+        """Distance [m] and speed [m/s] centred on each instant: a speed of the second before would bias a latency."""
         begin_s, end_s = self.span_s(t_s)
         speed_mps = (self.distance_at_s(end_s) - self.distance_at_s(begin_s)) / (end_s - begin_s)
         return self.distance_at_s(t_s), speed_mps
@@ -275,6 +276,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 
 
 def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: Configuration) -> Noise:
+    """The noise with what quantisation adds; `whole`: steps that the counter recorded without a gap."""
     counter_m = count_step_m(distance_m, whole, config.align)
     deadband_mps = config.matching.deadband_mps
     scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, deadband_mps, config.align)
@@ -288,9 +290,9 @@ def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
 
 
 def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
-    """By how much the count of each way that begins or ends in slip may be off [m].
+    """By how much the count of each step that begins or ends in slip may be off [m].
 
-    A share of the way, or the odometer's own sigma: an error that lasts while it slips grows with time, not its root.
+    A share of the step, or its reported sigma times dt: the error lasts while it slips, so it grows with the time.
     """
     sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
     doubt_m = np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s)

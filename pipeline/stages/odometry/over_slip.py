@@ -13,32 +13,32 @@ from schemas.config import AlignConfig
 
 
 def counted_over_slip(odometry: Odometry, others: Sequence[Odometry], config: AlignConfig) -> Odometry:
-    """The odometer, with its way over slip from the first of the others that knew it throughout.
+    """The odometer, with its distance over each slip taken from the first other odometer that counted throughout.
 
-    Slip stays reported, but the re-link after it compares with a way in doubt by only `other_way_share` of it.
+    Slip stays reported, but the re-link after it compares with a distance in doubt by only `other_way_share` of it.
     """
     if not others or not odometry.slip.any():
         return odometry
     t_ns: Ints = odometry.epoch_ns + np.round(odometry.t_s * 1e9).astype(np.int64)
     step_m = np.diff(odometry.distance_m)
     doubt_m = np.diff(odometry.slip_doubt_m)
-    senses = [_sense(odometry, other, t_ns) for other in others]
+    senses = [_sense(odometry, odometer, t_ns) for odometer in others]
     for first, last in spans_of(odometry.slip):
         part = slice(max(first - 1, 0), min(last + 1, t_ns.size - 1))
         at_ns = t_ns[part.start : part.stop + 1]
-        for other, sense in zip(others, senses, strict=True):
-            if other.known_at(at_ns).all() and np.ptp(other.segment_at(at_ns)) == 0:
-                step_m[part] = sense * np.diff(other.distance_at(at_ns)) / (odometry.scale or 1.0)
+        for odometer, sense in zip(others, senses, strict=True):
+            if odometer.known_at(at_ns).all() and np.ptp(odometer.segment_at(at_ns)) == 0:
+                step_m[part] = sense * np.diff(odometer.distance_at(at_ns)) / (odometry.scale or 1.0)
                 doubt_m[part] = config.other_way_share * np.abs(step_m[part])
                 break
     distance_m = odometry.distance_m[0] + _sums(step_m)
     return replace(odometry, distance_m=distance_m, slip_doubt_m=_sums(doubt_m))
 
 
-def _sense(odometry: Odometry, other: Odometry, t_ns: Ints) -> float:
-    """+1 where both count up alike, -1 where one of the two runs backwards."""
-    both = np.diff(odometry.distance_m) * np.diff(other.distance_at_s(other.seconds(t_ns)))
-    return -1.0 if both.sum() < 0.0 else 1.0
+def _sense(odometry: Odometry, witness: Odometry, t_ns: Ints) -> float:
+    """+1 where both count up alike, -1 where one of the two counts backwards: the sign of the steps' correlation."""
+    products = np.diff(odometry.distance_m) * np.diff(witness.distance_at_s(witness.seconds(t_ns)))
+    return -1.0 if products.sum() < 0.0 else 1.0
 
 
 def _sums(steps: Floats) -> Floats:

@@ -11,7 +11,7 @@ from schemas.arrays import Floats, Ints
 def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) -> int:
     """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement.
 
-    Starts every metre have a vote each, so that a leap of the position does not turn the odometer round. A run that
+    Starts a metre apart have a vote each, so that a leap of the position does not turn the odometer round. A run that
     never moves so far is judged by its largest movement.
     """
     recorded_m = odometry.distance_at(t_ns)
@@ -22,7 +22,7 @@ def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) 
     path = path_m[usable]
     way = np.maximum.accumulate(np.abs(odometer - odometer[0]))
     window = int(np.searchsorted(way, 4.0 * distance_m)) + 1
-    # Starts a metre apart: a long stand before the departure has one vote, not thousands.
+    # By metres, not by rows: a long stand before the departure has one vote, not thousands.
     starts = np.unique(np.searchsorted(way, np.arange(0.0, 2.0 * distance_m)))
     starts = starts[starts < min(window, way.size)]
     votes = [_side(odometer[start:window], path[start:window], distance_m) for start in starts]

@@ -24,8 +24,8 @@ class Ways(NamedTuple):
 def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: float, config: AlignConfig) -> Ways:
     """Ways between rows at these times [s]; `distance_m` and `speed_mps` as recorded, NaN where not.
 
-    A leap of the distance is no way: there the speeds tell it where they agree with the distance elsewhere. Where rows
-    are by turns, nothing is carried over more than `limit_s`.
+    Over a leap of the distance the speeds count, if they agree with the distance elsewhere. Where rows hold distance
+    and speed by turns, nothing is interpolated over more than `limit_s`.
     """
     distance_m = _without_spikes(t_s, distance_m, config)
     leap = leaps(t_s, distance_m, config)
@@ -44,21 +44,22 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
 
 
 def leaps(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
-    """Per step: longer than any train can drive, or back as none can: the counter was reset, ran over or lied."""
+    """Steps longer than any train can drive, or back as none can: the counter was reset, overflowed or is wrong."""
     leap: Bools = _too_far(np.diff(distance_m), np.diff(t_s), config) | _resets(t_s, distance_m, config)
     return leap
 
 
 def _too_far(way_m: Floats, dt_s: Floats, config: AlignConfig) -> Bools:
+    """Faster than any train; stamps that came in a bunch are allowed `bunched_stamps_m`."""
     far: Bools = np.abs(way_m) > config.fastest_mps * dt_s + config.bunched_stamps_m
     return far
 
 
 def _resets(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
-    """Steps back between moves the other way before and after, as no train can brake, turn, brake and turn again.
+    """Steps back between two moves forward, longer than a train can brake, turn, brake and turn again.
 
-    Within dt a train that begins and ends at rest gets braking dt^2 / 4 far. A row that is off by itself is no reset:
-    it makes the way before or after as much longer.
+    Within dt a train from rest to rest gets braking dt^2 / 4 far. A single wrong row is no reset: it makes the move
+    before or after it longer by the same amount, so these two differ.
     """
     resets = np.zeros(t_s.size - 1, dtype=np.bool_)
     rows = np.flatnonzero(np.isfinite(distance_m))
@@ -90,10 +91,7 @@ def _without_spikes(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Flo
 
 
 def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignConfig) -> Floats:
-    """Ways by the speeds; none over leaps where they do not agree with what the counter tells elsewhere.
-
-    A unit, a sign or the sensor may be wrong.
-    """
+    """Ways by the speeds; none over leaps if speeds and counter disagree elsewhere (a wrong unit, sign or sensor)."""
     both = np.isfinite(recorded_m) & np.isfinite(driven_m)
     if not leap.any() or not both.any():
         return driven_m
@@ -105,12 +103,13 @@ def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignCon
 
 
 def _driven(t_s: Floats, speed_mps: Floats) -> Floats:
+    """The way of each step by its two speeds (trapezoids) [m]."""
     steps: Floats = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(t_s)
     return steps
 
 
 def _carried(t_s: Floats, values: Floats, limit_s: float) -> Floats:
-    """Values between known rows no further apart than the limit by straight lines; NaN elsewhere."""
+    """Values interpolated between known rows no farther apart than the limit; NaN elsewhere."""
     known = np.flatnonzero(np.isfinite(values))
     if known.size < 2:
         return values
@@ -127,8 +126,8 @@ def filled_in(
 ) -> tuple[Floats, Floats, Ints]:
     """Samples with finer ones between the given rows and the next, on cubic curves: times, distances, row of each.
 
-    Slopes at the rows are the speeds where these make about the way between (a unit, a sign or a sensor may be wrong),
-    else those of a curve that keeps its direction (PCHIP), and never so steep that the train would turn back.
+    Slopes at the rows are the speeds where these agree with the way between, else those of a monotone curve (PCHIP),
+    and at most three times the mean slope, so that the cubic does not turn back (Fritsch and Carlson).
     """
     from scipy.interpolate import PchipInterpolator  # hardly a log needs it, and it takes long to load
 
@@ -136,16 +135,17 @@ def filled_in(
     slopes = np.where(np.isfinite(speed_mps), speed_mps, smooth)
     span = t_s[rows + 1] - t_s[rows]
     way = distance_m[rows + 1] - distance_m[rows]
-    # Whatever a train does that gathers speed or brakes no harder, the mean of two speeds is no farther from its way.
+    # With acceleration and braking up to b, mean speed x dt differs from the way by at most b dt^2 / 4.
     true = np.abs(0.5 * (slopes[rows] + slopes[rows + 1]) * span - way) <= 0.25 * config.braking_mps2 * span**2
     low = np.minimum(0.0, 3.0 * way)
     high = np.maximum(0.0, 3.0 * way)
     start, end = (np.clip(np.where(true, slopes[at], smooth[at]) * span, low, high) for at in (rows, rows + 1))
-    # A third of the span in which a straight line is near enough: within a ninth of that.
+    # Three points in each `straight_s`: the error of a straight line falls with the square of its length, to a ninth.
     fine = np.ceil(3.0 * span / config.straight_s).astype(np.int64)
     which = np.repeat(np.arange(rows.size), fine - 1)
     part = np.concatenate([np.arange(1, count) / count for count in fine.tolist()])
     rest = 1.0 - part
+    # Cubic Hermite polynomial.
     curve = part**2 * (3.0 - 2.0 * part) * way[which] + part * rest * (rest * start[which] - part * end[which])
     at_s = np.concatenate([t_s, t_s[rows][which] + part * span[which]])
     order = np.argsort(at_s, kind="stable")

@@ -41,55 +41,58 @@ class Near:
 
     def of(self, element: int, begin: int, end: int) -> slice:
         """The pairs of an element with samples from `begin` to `end`."""
-        own = slice(int(self.first[element]), int(self.first[element + 1]))
-        low, high = np.searchsorted(self.sample[own], [begin, end + 1]).tolist()
-        return slice(own.start + low, own.start + high)
+        of_element = slice(int(self.first[element]), int(self.first[element + 1]))
+        low, high = np.searchsorted(self.sample[of_element], [begin, end + 1]).tolist()
+        return slice(of_element.start + low, of_element.start + high)
 
     def feet(self, samples: Ints) -> list[list[Foot]]:
         """All feet of some samples, in their order."""
         position = np.full(self.any_near.size, -1)
         position[samples] = np.arange(samples.size)
-        found: list[list[Foot]] = [[] for _ in range(samples.size)]
+        feet: list[list[Foot]] = [[] for _ in range(samples.size)]
         for pair in np.flatnonzero(position[self.sample] >= 0).tolist():
             element = int(self.element[pair])
             measure_m = float(self.measure_m[pair])
             ends = (abs(measure_m - self.track.begin_m[element]), abs(measure_m - self.track.end_m[element]))
             end = int(np.argmin(ends)) if min(ends) < AT_END_M else None
             foot = Foot(element, float(self.distance_m[pair]), measure_m, end)
-            found[position[self.sample[pair]]].append(foot)
-        return found
+            feet[position[self.sample[pair]]].append(foot)
+        return feet
 
 
 def near_elements(points: Points, sigma_m: Floats, network: Network, factor: float, unstated_m: float) -> Near:
-    """Net elements within `factor` roots of samples' and survey's sigma; `unstated_m`: that of a silent survey."""
+    """Each net element with each sample nearer than `factor` x sqrt(sample sigma^2 + survey sigma^2).
+
+    `unstated_m`: the survey's sigma where it states none.
+    """
     track = network.track
-    owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
+    element_of = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
     surface = points_of(track.latitude_deg, track.longitude_deg).surface
-    begin = np.flatnonzero(owner[1:] == owner[:-1])
-    line = Polyline(surface[begin], surface[begin + 1])
-    segment_sigma_m = network.survey_sigmas_m(unstated_m)[begin]
+    starts = np.flatnonzero(element_of[1:] == element_of[:-1])
+    line = Polyline(surface[starts], surface[starts + 1])
+    segment_sigma_m = network.survey_sigmas_m(unstated_m)[starts]
     sample, segment = _candidates(points, line, factor * np.hypot(sigma_m, segment_sigma_m.max(initial=0.0)))
     feet = on_segments(points.take(sample), line, segment)
-    part = np.clip(feet.fraction, 0.0, 1.0)
-    low_m = track.measure_m[begin[segment]]
-    high_m = track.measure_m[begin[segment] + 1]
+    fraction = np.clip(feet.fraction, 0.0, 1.0)
+    low_m = track.measure_m[starts[segment]]
+    high_m = track.measure_m[starts[segment] + 1]
     within = feet.distance_m <= factor * np.hypot(sigma_m[sample], segment_sigma_m[segment])
-    element = owner[begin[segment]]
+    element = element_of[starts[segment]]
     order = np.lexsort((feet.distance_m, sample, element))
     order = order[within[order]]
-    # Of each pair of element and sample the nearest segment.
+    # Several segments of an element lie near a sample; in this order the first of each pair is the nearest.
     nearest = np.ones(order.size, dtype=np.bool_)
     nearest[1:] = (np.diff(element[order]) != 0) | (np.diff(sample[order]) != 0)
-    kept = order[nearest]
+    pairs = order[nearest]
     any_near = np.zeros(len(points), dtype=np.bool_)
-    any_near[sample[kept]] = True
+    any_near[sample[pairs]] = True
     return Near(
-        sample=sample[kept],
-        element=element[kept],
-        distance_m=feet.distance_m[kept],
-        measure_m=(low_m + part * (high_m - low_m))[kept],
-        survey_sigma_m=segment_sigma_m[segment][kept],
-        first=np.searchsorted(element[kept], np.arange(len(track.ids) + 1)),
+        sample=sample[pairs],
+        element=element[pairs],
+        distance_m=feet.distance_m[pairs],
+        measure_m=(low_m + fraction * (high_m - low_m))[pairs],
+        survey_sigma_m=segment_sigma_m[segment][pairs],
+        first=np.searchsorted(element[pairs], np.arange(len(track.ids) + 1)),
         any_near=any_near,
         track=track,
     )
@@ -100,8 +103,8 @@ def _candidates(points: Points, line: Polyline, reach_m: Floats) -> tuple[Ints, 
     if len(points) == 0 or len(line) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     tree, segment_of = line.samples
-    found = tree.query_ball_point(points.surface, reach_m + 0.5 * SAMPLE_SPACING_M)
-    sample = np.repeat(np.arange(len(points)), [len(one) for one in found])
-    segment = segment_of[np.concatenate([np.asarray(one, dtype=np.int64) for one in found])]
+    hits = tree.query_ball_point(points.surface, reach_m + 0.5 * SAMPLE_SPACING_M)
+    sample = np.repeat(np.arange(len(points)), [len(hit) for hit in hits])
+    segment = segment_of[np.concatenate([np.asarray(hit, dtype=np.int64) for hit in hits])]
     pairs = np.unique(sample * len(line) + segment)
     return pairs // len(line), pairs % len(line)

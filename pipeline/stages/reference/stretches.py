@@ -74,15 +74,15 @@ def reference_stretches(
     # A sample beyond k_T roots of every track is no sample of the track.
     factor = config.align.sure_sigmas
     near = near_elements(samples.points, samples.sigma_m, network, factor, config.hazards.survey_sigma_m)
-    off = off_the_survey(samples.points, samples.sigma_m, near, network, config.hazards)
-    placed = np.flatnonzero(near.any_near & ~off)
-    found: list[ReferenceStretch] = []
-    used = np.zeros(samples.t_ns.size, dtype=np.bool_)
+    off_survey = off_the_survey(samples.points, samples.sigma_m, near, network, config.hazards)
+    placed = np.flatnonzero(near.any_near & ~off_survey)
+    stretches: list[ReferenceStretch] = []
+    covered = np.zeros(samples.t_ns.size, dtype=np.bool_)
     for rows in _between_gaps(samples.t_ns, placed, config.hazards.reference_gap_s):
         for stretch in _placed(samples, near, rows, network, numbers, config):
-            found.append(stretch)
-            used[np.searchsorted(samples.t_ns, stretch.t_ns)] = True
-    return found, _silent_spans(samples.t_ns, used, config.hazards.reference_gap_s)
+            stretches.append(stretch)
+            covered[np.searchsorted(samples.t_ns, stretch.t_ns)] = True
+    return stretches, _silent_spans(samples.t_ns, covered, config.hazards.reference_gap_s)
 
 
 def _between_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
@@ -93,12 +93,12 @@ def _between_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
     return np.split(rows, np.flatnonzero(broken) + 1)
 
 
-def _silent_spans(t_ns: Ints, used: Bools, gap_s: float) -> list[tuple[int, int]]:
+def _silent_spans(t_ns: Ints, covered: Bools, gap_s: float) -> list[tuple[int, int]]:
     """Times beside samples that lie nowhere, up to the next one that does: nobody knows where the train was."""
     gap_ns = round(gap_s * NS_PER_S)
-    known_ns = t_ns[used]
+    known_ns = t_ns[covered]
     spans: list[tuple[int, int]] = []
-    for at_ns in t_ns[~used].tolist():
+    for at_ns in t_ns[~covered].tolist():
         after = int(np.searchsorted(known_ns, at_ns))
         before_ns = int(known_ns[after - 1]) if after else at_ns - gap_ns
         after_ns = int(known_ns[after]) if after < known_ns.size else at_ns + gap_ns
@@ -114,20 +114,20 @@ def _placed(
     samples: ReferenceSamples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
 ) -> list[ReferenceStretch]:
     """The ways of samples without a gap among them: nothing where no way passes, or more do than can be weighed."""
-    own = samples.take(rows)
-    all_steps = _steps(own)
-    found: list[ReferenceStretch] = []
-    for part in _connected(list(_parts(own, near.feet(rows[all_steps]), all_steps, network))):
+    part_samples = samples.take(rows)
+    all_steps = _steps(part_samples)
+    stretches: list[ReferenceStretch] = []
+    for part in _connected(list(_parts(part_samples, near.feet(rows[all_steps]), all_steps, network))):
         steps = all_steps[part.first : part.last + 1]
         last = len(part.layers)
         nodes = nodes_of(part.starts, part.layers)
-        failed = _failed(nodes, near, rows, own.sigma_m, steps, config)
+        failed = _failed(nodes, near, rows, part_samples.sigma_m, steps, config)
         ways = ways_over(nodes, last, failed, config.hazards.routes_limit)
         if ways:
             paths = tuple(_path(way.stays(last), near, rows, steps, network, numbers) for way in ways)
             inside = slice(int(steps[0]), int(steps[-1]) + 1)
-            found.append(ReferenceStretch(own.t_ns[inside], own.sigma_m[inside], paths))
-    return found
+            stretches.append(ReferenceStretch(part_samples.t_ns[inside], part_samples.sigma_m[inside], paths))
+    return stretches
 
 
 def _steps(samples: ReferenceSamples) -> Ints:
@@ -178,15 +178,15 @@ def _parts(
     noise_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m[steps])
     places = [_inside(one, network) for one in feet]
 
-    def limit_m(step: int, other: int) -> float:
-        return min(float(_CURVED * np.linalg.norm(at_m[other] - at_m[step]) + noise_m[other]), _FARTHEST_M)
+    def limit_m(step: int, next_step: int) -> float:
+        return min(float(_CURVED * np.linalg.norm(at_m[next_step] - at_m[step]) + noise_m[next_step]), _FARTHEST_M)
 
     network_moves = _Onward(network)
 
-    def onward(step: int, other: int) -> bool:
-        both = [2 * element + side for element in places[step] for side in (0, 1)]
-        limit = limit_m(step, other)
-        return any(any(network_moves.moves(one, places[step], places[other], limit)) for one in both)
+    def onward(step: int, next_step: int) -> bool:
+        ways_round = [2 * element + side for element in places[step] for side in (0, 1)]
+        limit = limit_m(step, next_step)
+        return any(any(network_moves.moves(one, places[step], places[next_step], limit)) for one in ways_round)
 
     first = 0
     layers = list[list[Transition]]()
@@ -250,24 +250,24 @@ class _Onward:
             left_m = self.network.length_m(start) - along_m(start ^ back, here[element])
             for to, gap_m, between in self._from(start ^ back, limit_m - left_m) if left_m <= limit_m else ():
                 if to // 2 in there and left_m + gap_m + along_m(to, there[to // 2]) <= limit_m:
-                    yield Transition(start, to ^ back, tuple(one ^ back for one in between), bool(back))
+                    yield Transition(start, to ^ back, tuple(oriented ^ back for oriented in between), bool(back))
 
     def _from(self, side: int, limit_m: float) -> list[tuple[int, float, tuple[int, ...]]]:
         """What can be entered beyond the end of an oriented element, how far beyond, and over which elements."""
-        searched_m, found = self.known.get(side, (-1.0, []))
+        searched_m, entered = self.known.get(side, (-1.0, []))
         if searched_m < limit_m:
             searched_m = max(limit_m, MIN_REACH_M)
-            found = []
-            growing = [(side, 0.0, tuple[int, ...]())]
-            while growing:
-                last, gone_m, between = growing.pop()
+            entered = []
+            open_ways = [(side, 0.0, tuple[int, ...]())]
+            while open_ways:
+                last, gone_m, between = open_ways.pop()
                 for edge in self.network.successors[last]:
                     if edge.forward and gone_m + edge.gap_m <= searched_m:
-                        found.append((edge.to, gone_m + edge.gap_m, between))
+                        entered.append((edge.to, gone_m + edge.gap_m, between))
                         length_m = self.network.length_m(edge.to)
-                        growing.append((edge.to, gone_m + edge.gap_m + length_m, (*between, edge.to)))
-            self.known[side] = searched_m, found
-        return found
+                        open_ways.append((edge.to, gone_m + edge.gap_m + length_m, (*between, edge.to)))
+            self.known[side] = searched_m, entered
+        return entered
 
 
 def _failed(
@@ -280,8 +280,8 @@ def _failed(
     survey_m = np.zeros(rows.size)
     for node in nodes:
         pairs = near.of(node.oriented // 2, int(rows[steps[node.first]]), int(rows[steps[node.last]]))
-        own = near.sample[pairs] - rows[0]
-        survey_m[own] = np.maximum(survey_m[own], near.survey_sigma_m[pairs])
+        row = near.sample[pairs] - rows[0]
+        survey_m[row] = np.maximum(survey_m[row], near.survey_sigma_m[pairs])
     root_m = config.hazards.evidence_factor * np.hypot(sigma_m, survey_m)
     failed: set[Node] = set()
     for piece in pieces_of(nodes):
@@ -293,8 +293,8 @@ def _failed(
         distance_m = np.full(end - begin + 1, np.inf)
         for element in {node.oriented // 2 for node in piece}:
             pairs = near.of(element, int(rows[begin]), int(rows[end]))
-            own = near.sample[pairs] - rows[begin]
-            distance_m[own] = np.minimum(distance_m[own], near.distance_m[pairs])
+            row = near.sample[pairs] - rows[begin]
+            distance_m[row] = np.minimum(distance_m[row], near.distance_m[pairs])
         if np.median(distance_m / root_m[begin : end + 1]) > 1.0:
             failed |= set(piece)
     return failed
@@ -314,22 +314,22 @@ def _path(
         low = max(stay.first - 1, 0)
         high = min(stay.last + 1, steps.size - 1)
         pairs = near.of(stay.oriented // 2, int(rows[steps[low]]), int(rows[steps[high]]))
-        own = near.sample[pairs] - rows[begin]
-        nearer = near.distance_m[pairs] < nearest_m[own]
-        own = own[nearer]
+        sample = near.sample[pairs] - rows[begin]
+        nearer = near.distance_m[pairs] < nearest_m[sample]
+        sample = sample[nearer]
         pair = np.arange(pairs.start, pairs.stop)[nearer]
         measure_m = near.measure_m[pair]
         element = stay.oriented // 2
         along_m = measure_m - network.track.begin_m[element]
         against_m = network.track.end_m[element] - measure_m
-        nearest_m[own] = near.distance_m[pair]
-        leg[own] = number
-        at_m[own] = entry_m + (against_m if stay.oriented % 2 else along_m)
-    known = np.flatnonzero(leg >= 0)
-    every = np.arange(count)
-    leg = leg[known[np.maximum(np.searchsorted(known, every, side="right") - 1, 0)]]
+        nearest_m[sample] = near.distance_m[pair]
+        leg[sample] = number
+        at_m[sample] = entry_m + (against_m if stay.oriented % 2 else along_m)
+    on_way = np.flatnonzero(leg >= 0)
+    samples = np.arange(count)
+    leg = leg[on_way[np.maximum(np.searchsorted(on_way, samples, side="right") - 1, 0)]]
     routes = tuple(chain.route(network, numbers) for chain in legs)
-    return ReferencePath(leg, np.interp(every, known, at_m[known]), routes)
+    return ReferencePath(leg, np.interp(samples, on_way, at_m[on_way]), routes)
 
 
 def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:

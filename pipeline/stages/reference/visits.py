@@ -101,8 +101,8 @@ def nodes_of(starts: set[int], layers: Sequence[Sequence[Transition]]) -> list[N
 
 
 def _linked(move: Transition, start: Node, to: Node, step: int) -> list[Node]:
-    """Two visits linked over those between, which are returned."""
-    between = [Node(one, step, step, False) for one in move.between]
+    """Link two visits over the elements between them; returns the new visits there, on which no sample lies."""
+    between = [Node(oriented, step, step, False) for oriented in move.between]
     for here, there in pairwise([start, *between, to]):
         link = Link(here, there, step, move.back)
         here.after.append(link)
@@ -145,7 +145,8 @@ def ways_over(nodes: Sequence[Node], last: int, failed: set[Node], most: int) ->
     alive = leading_on & _closure(begins, failed, forward=True)
     ways = [WayThrough(node, ()) for node in nodes if node in begins & ends & alive]
     covered: set[Link] = set()
-    for link in [one for node in nodes if node in alive for one in node.after if one.there in alive]:
+    alive_links = [link for node in nodes if node in alive for link in node.after if link.there in alive]
+    for link in alive_links:
         way = None if link in covered else _way_over(link, begins, ends, alive, covered)
         if way is not None:
             ways.append(way)
@@ -156,37 +157,38 @@ def ways_over(nodes: Sequence[Node], last: int, failed: set[Node], most: int) ->
 
 
 def _closure(start: set[Node], failed: set[Node], forward: bool) -> set[Node]:
+    """All visits reachable from `start` over visits that did not fail, forward or backward in time."""
     seen: set[Node] = set()
-    growing = list(start)
-    while growing:
-        node = growing.pop()
+    to_visit = list(start)
+    while to_visit:
+        node = to_visit.pop()
         if node not in seen:
             seen.add(node)
             onward = [link.there for link in node.after] if forward else [link.here for link in node.before]
-            growing += [one for one in onward if one not in failed]
+            to_visit += [neighbour for neighbour in onward if neighbour not in failed]
     return seen
 
 
 def _way_over(
     link: Link, begins: set[Node], ends: set[Node], alive: set[Node], covered: set[Link]
 ) -> WayThrough | None:
-    """A whole way over a link, preferably over links that no way has taken yet."""
+    """A whole way over a link, grown at both ends; each next link is the nearest in time, then one not yet covered."""
 
     def nearest(links: list[Link]) -> Link | None:
-        return min(links, key=lambda one: (abs(one.at - link.at), one in covered), default=None)
+        return min(links, key=lambda option: (abs(option.at - link.at), option in covered), default=None)
 
     links = [link]
     while links[-1].there not in ends:
         here = links[-1].there
         at = links[-1].at
-        onward = nearest([one for one in here.after if one.there in alive and one.at >= at])
+        onward = nearest([link for link in here.after if link.there in alive and link.at >= at])
         if onward is None:
             return None
         links.append(onward)
     while links[0].here not in begins:
         there = links[0].here
         at = links[0].at
-        before = nearest([one for one in there.before if one.here in alive and one.at <= at])
+        before = nearest([link for link in there.before if link.here in alive and link.at <= at])
         if before is None:
             return None
         links.insert(0, before)

@@ -123,8 +123,8 @@ def _monitored(
     stated = _with_monitors(config, {**_AS_STATED, **dict.fromkeys(_NO_NOISE), "noise_doubt": 0.0})
     aligned = align(match.epochs, odometry, vehicle, stated)
     noise_m = MonitorBank(aligned, {}, stated).median_noise_m()
-    given = _with_monitors(stated, noise_m)
-    bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, given)}, given)
+    as_stated = _with_monitors(stated, noise_m)
+    bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, as_stated)}, as_stated)
     return noise_m, pl.concat([aligned, pl.DataFrame(bank.columns())], how="horizontal").select(COMPARED)
 
 

@@ -70,7 +70,7 @@ def estimate_run(
     if not blocks:
         return None
     factors = [_factor(_covariance(block, odometry, shares, taus_s, config)) for block in blocks]
-    by_chance = sum(_chance_information(block, one, odometry) for block, one in zip(blocks, factors, strict=True))
+    by_chance = sum(_chance_information(block, factor, odometry) for block, factor in zip(blocks, factors, strict=True))
     scale = scale_sigma = latency_sigma_s = misfit = 0.0
     for _ in range(_ITERATIONS):
         normal, right, left_over, freedom = _accumulate(blocks, factors, odometry, latency_s)

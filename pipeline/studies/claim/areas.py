@@ -55,24 +55,24 @@ def read_areas(path: Path | str, site: Site) -> pl.DataFrame | None:
 def _breaches(file: str, areas: pl.DataFrame, site: Site) -> list[str]:
     known = set(site.track["netelement_id"])
     ordered = areas.sort("netelement_id", "from_m", maintain_order=True)
-    found = [
+    breaches = [
         f"{file}: no net element of the track is called {name}"
         for name in ordered["netelement_id"].unique(maintain_order=True)
         if name not in known
     ]
-    found += [
+    breaches += [
         f"{file}: {row['netelement_id']}: the area from {row['from_m']:g} m ends at {row['to_m']:g} m; "
         "expected an end behind the begin, in growing measure"
         for row in ordered.filter(~(pl.col("to_m") > pl.col("from_m"))).iter_rows(named=True)
     ]
     before = pl.col("to_m").cum_max().shift().over("netelement_id")
     overlaps = ordered.with_columns(before=before).filter(pl.col("from_m") < pl.col("before"))
-    found += [
+    breaches += [
         f"{file}: {row['netelement_id']}: the area from {row['from_m']:g} m begins before another ends, at "
         f"{row['before']:g} m; expected one area at each place"
         for row in overlaps.iter_rows(named=True)
     ]
-    return found
+    return breaches
 
 
 def placed(areas: pl.DataFrame | None, netelement_id: pl.Series, measure_m: pl.Series) -> AreaPlaces:
@@ -82,7 +82,7 @@ def placed(areas: pl.DataFrame | None, netelement_id: pl.Series, measure_m: pl.S
         return AreaPlaces(np.full(size, NO_AREA), np.full(size, np.nan))
     places = pl.DataFrame({"netelement_id": netelement_id, "at_m": measure_m}).with_row_index("row")
     there = areas.with_columns(at_m=pl.col("from_m"), area_type=pl.col("area_type").cast(pl.String))
-    found = (
+    in_area = (
         places.drop_nulls()
         .sort("at_m")
         .join_asof(there.sort("at_m"), on="at_m", by="netelement_id", check_sortedness=False)
@@ -90,8 +90,8 @@ def placed(areas: pl.DataFrame | None, netelement_id: pl.Series, measure_m: pl.S
     )
     area = np.full(size, NO_AREA)
     speed = np.full(size, np.nan)
-    rows = found["row"].to_numpy()
+    rows = in_area["row"].to_numpy()
     numbers = {kind.value: number for number, kind in enumerate(AREA_TYPES)}
-    area[rows] = found["area_type"].replace_strict(numbers, return_dtype=pl.Int64).to_numpy()
-    speed[rows] = found["track_speed_kmh"].to_numpy() / 3.6
+    area[rows] = in_area["area_type"].replace_strict(numbers, return_dtype=pl.Int64).to_numpy()
+    speed[rows] = in_area["track_speed_kmh"].to_numpy() / 3.6
     return AreaPlaces(area, speed)

@@ -52,21 +52,21 @@ def claim(
     runs = store.read_table(out, "runs").collect()
     done = runs.filter((pl.col("status").cast(pl.String) != RunStatus.FAILED.value) & pl.col("run_id").is_in(run_ids))
     done, twice = distinct(done)
-    found: dict[str, Tallies] = defaultdict(dict)
+    by_solution: dict[str, Tallies] = defaultdict(dict)
     days: set[tuple[object, ...]] = set()
     # Which run of a day is its trial is drawn before an error is looked at, and apart from its instant.
     for run in sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}")):
         of_run = _tallies_of(out, run, config, profile, areas, ahead_m)
         if profile.method.independent == "day" and run["t_start"] is not None:
             of_run = _once_a_day(of_run, (run["solution"], run["t_start"].date()), days)
-        _add(found[run["solution"]], of_run)
-    outside_h = sum(counts["no_area", ALL].held_s for counts in found.values()) / S_PER_H
+        _add(by_solution[run["solution"]], of_run)
+    outside_h = sum(counts["no_area", ALL].held_s for counts in by_solution.values()) / S_PER_H
     notes = [*twice, *_notes(runs, outside_h, areas, ahead_m)]
     if profile.method.independent == "run":
         notes.append(
             'Runs of one day count as independent; `method.independent = "day"` of a profile counts one a day.'
         )
-    return Claim(profile, claim_table(found, profile), notes)
+    return Claim(profile, claim_table(by_solution, profile), notes)
 
 
 def _once_a_day(of_run: Tallies, day: tuple[object, ...], days: set[tuple[object, ...]]) -> Tallies:
@@ -103,24 +103,24 @@ def _add(sums: Tallies, more: Tallies) -> None:
         sums[key] = sums.get(key, Tally()) + counts
 
 
-def claim_table(found: dict[str, Tallies], profile: RequirementProfile) -> pl.DataFrame:
+def claim_table(by_solution: dict[str, Tallies], profile: RequirementProfile) -> pl.DataFrame:
     """One row per solution and requirement, those of the profile that nothing was recorded for included."""
     rows = [
-        _row(solution, one, counts.get(one.key, Tally()))
-        for solution, counts in sorted(found.items())
-        for one in requirements(profile)
+        _row(solution, requirement, counts.get(requirement.key, Tally()))
+        for solution, counts in sorted(by_solution.items())
+        for requirement in requirements(profile)
     ]
     return pl.DataFrame(rows, schema=SCHEMA, orient="row")
 
 
-def _row(solution: str, one: Requirement, counts: Tally) -> dict[str, Any]:
-    shown = one.demand.shown(counts)
+def _row(solution: str, requirement: Requirement, counts: Tally) -> dict[str, Any]:
+    shown = requirement.demand.shown(counts)
     return {
         "solution": solution,
-        "requirement": one.name,
-        "applies_to": one.applies_to,
-        "limit": one.limit,
-        "demanded": one.demand.words,
+        "requirement": requirement.name,
+        "applies_to": requirement.applies_to,
+        "limit": requirement.limit,
+        "demanded": requirement.demand.words,
         "finding": shown.finding.value,
         "events": counts.events,
         "possible_events": counts.possible,
@@ -134,8 +134,8 @@ def _row(solution: str, one: Requirement, counts: Tally) -> dict[str, Any]:
         "hours": counts.held_s / S_PER_H,
         "hours_known": counts.known_s / S_PER_H,
         "hours_needed": shown.needed_h,
-        "clause": one.clause,
-        "reason": _reason(one, shown.finding, counts),
+        "clause": requirement.clause,
+        "reason": _reason(requirement, shown.finding, counts),
     }
 
 
@@ -151,19 +151,19 @@ _NEVER = {
 }
 
 
-def _reason(one: Requirement, finding: Compliance, counts: Tally) -> str | None:
+def _reason(requirement: Requirement, finding: Compliance, counts: Tally) -> str | None:
     """Why a requirement is not shown, in words."""
     if finding is not Compliance.NOT_SHOWN:
         return None
-    if one.key in _NEVER:
-        return _NEVER[one.key]
-    if one.name == "way_without_balise":
+    if requirement.key in _NEVER:
+        return _NEVER[requirement.key]
+    if requirement.name == "way_without_balise":
         return "no run is long enough" if not counts.trials else "no event on ways long enough; that is no proof"
     if not counts.held_s and not counts.trials:
         return "nothing recorded to which it applies"
     if not counts.known_s:
         return "the evidence says nothing of it: too wide, missing, or the position in doubt"
-    if one.demand.kind is Kind.ALWAYS:
+    if requirement.demand.kind is Kind.ALWAYS:
         return "no exceedance was seen, and no number of hours proves a maximum that is demanded without a probability"
     if counts.events == 0 and counts.known_s < counts.held_s:
         return "too few runs or hours; part of the time the evidence does not say"
@@ -172,35 +172,39 @@ def _reason(one: Requirement, finding: Compliance, counts: Tally) -> str | None:
 
 def _notes(runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahead_m: float) -> list[str]:
     """What the reader must know before the rows."""
-    said = failed_runs(runs)
+    notes = failed_runs(runs)
     if areas is None:
-        said.append("Without areas (`--site` with areas.csv or areas.parquet) nothing is said of limits by area type.")
-    said += runs_without_truth(runs, "they can show no error small.")
+        notes.append("Without areas (`--site` with areas.csv or areas.parquet) nothing is said of limits by area type.")
+    notes += runs_without_truth(runs, "they can show no error small.")
     settings = several_settings(
         runs,
         ": trains may differ. Errors do not depend on where the front end is, but areas are looked up with one "
         "distance for all.",
     )
-    said += settings
+    notes += settings
     if not settings and not ahead_m:
-        said.append("Areas are looked up at the balise antenna; `--front-ahead` puts the front end ahead of it.")
+        notes.append("Areas are looked up at the balise antenna; `--front-ahead` puts the front end ahead of it.")
     if outside_h and areas is not None:
-        said.append(f"{outside_h:.3g} h lie outside all areas: no limit by area type applied there.")
+        notes.append(f"{outside_h:.3g} h lie outside all areas: no limit by area type applied there.")
     late = runs["latency_sigma_s"].null_count()
     if late:
-        said.append(f"{late} of {runs.height} runs have no figure of latency: safe front ends are not widened for it.")
-    said.append(
+        notes.append(f"{late} of {runs.height} runs have no figure of latency: safe front ends are not widened for it.")
+    notes.append(
         "No recording can show maxima demanded without a probability (MAPO, MAPU, MASO, MASU, below 30 km/h, way "
         "without balise), accuracy of speed, start of mission, cold movement and availability: they can "
         "only be found broken. `--csv` has the reasons."
     )
-    said.append("Nothing is said of the rear end: the length of the train is not recorded.")
-    return said
+    notes.append("Nothing is said of the rear end: the length of the train is not recorded.")
+    return notes
 
 
 def for_reading(claim: Claim) -> pl.DataFrame:
     """The rows as they fit a screen: what was found of each requirement, and what it rests on."""
-    by_runs = {one.key for one in requirements(claim.profile) if one.demand.kind in (Kind.SHARE, Kind.AVAILABILITY)}
+    by_runs = {
+        requirement.key
+        for requirement in requirements(claim.profile)
+        if requirement.demand.kind in (Kind.SHARE, Kind.AVAILABILITY)
+    }
     keys = claim.table.select("requirement", "applies_to").iter_rows()
     shares = pl.Series([key in by_runs for key in keys], dtype=pl.Boolean)
     solution = ["solution"] if claim.table["solution"].n_unique() > 1 else []

@@ -233,12 +233,12 @@ def _windows(front: Front, window_ns: int) -> list[tuple[int, int]]:
     sense = front.direction
     usable = np.isfinite(front.speed_mps) & np.isfinite(sense) & (sense != 0)
     joined = usable[:-1] & usable[1:] & (held[:-1] > 0) & (sense[:-1] == sense[1:])
-    found: list[tuple[int, int]] = []
+    windows: list[tuple[int, int]] = []
     begin = 0
     for row, together in enumerate(joined, start=1):
         if not together:
             begin = row
         elif t_ns[row] - t_ns[begin] >= window_ns:
-            found.append((begin, row))
+            windows.append((begin, row))
             begin = row
-    return found
+    return windows

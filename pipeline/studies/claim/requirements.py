@@ -117,17 +117,17 @@ class Requirement:
 
 def tallies(ride: ClaimRide) -> Tallies:
     """Every requirement on one ride."""
-    return {one.key: one.count(ride) for one in requirements(ride.profile)}
+    return {requirement.key: requirement.count(ride) for requirement in requirements(ride.profile)}
 
 
 def requirements(profile: RequirementProfile) -> list[Requirement]:
     """The requirements of a profile in their order."""
     rate = profile.failure_rate
     return [
-        *(one for kind, area in profile.areas.items() for one in _of_area(kind, area, profile)),
+        *(requirement for kind, area in profile.areas.items() for requirement in _of_area(kind, area, profile)),
         Requirement("safe_front_end", ALL, "own CI", Demand(Kind.RATE, rate.aim_per_h), rate.clause, _safe),
         Requirement("safe_front_end_bound", ALL, "own CI", Demand(Kind.RATE, rate.bound_per_h), rate.clause, _safe),
-        *(one for kind in profile.slow.area_types for one in _slow(kind, profile)),
+        *(requirement for kind in profile.slow.area_types for requirement in _slow(kind, profile)),
         *_after_balise(profile),
         *_speed(profile),
         *_start(profile),
@@ -187,7 +187,7 @@ def _slow(kind: AreaType, profile: RequirementProfile) -> list[Requirement]:
 
     limit = f"{slow.limit_m:g} m"
     close = f"{slow.accuracy_m:g} m"
-    safe, accurate = (partial(known, limit_m=one) for one in (slow.limit_m, slow.accuracy_m))
+    safe, accurate = (partial(known, limit_m=limit_m) for limit_m in (slow.limit_m, slow.accuracy_m))
     return [
         Requirement("slow_claimed", of, limit, ALWAYS, slow.clause, claimed),
         Requirement("slow_front_end", of, limit, ALWAYS, slow.clause, safe),
@@ -264,13 +264,13 @@ def _speed(profile: RequirementProfile) -> list[Requirement]:
 
 def _of_windows(ride: ClaimRide, code: Ints, where: Bools) -> Tally:
     """Of windows of speed, and of the gaps of the log between them, in order of time."""
-    found = ride.speeds
+    speeds = ride.speeds
     gaps = np.flatnonzero(ride.front.silent_s > 0)
     gap_s = ride.front.silent_s[gaps]
     nothing = np.zeros(gaps.size)
-    t_ns = np.concatenate((found.t_ns, ride.front.clock.t_ns[gaps]))
-    held_s = np.concatenate((found.length_s, nothing))
-    silent_s = np.concatenate((np.zeros(found.t_ns.size), gap_s))
+    t_ns = np.concatenate((speeds.t_ns, ride.front.clock.t_ns[gaps]))
+    held_s = np.concatenate((speeds.length_s, nothing))
+    silent_s = np.concatenate((np.zeros(speeds.t_ns.size), gap_s))
     codes = np.concatenate((code, np.full(gaps.size, NOT_KNOWN)))
     order = np.argsort(t_ns, kind="stable")
     rows = order[np.concatenate((where, gap_s > 0))[order]]

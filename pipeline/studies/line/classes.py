@@ -87,7 +87,7 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
             days=pl.col("t").filter(right | lost | wrong).dt.date().n_unique(),
             few_satellites=(pl.col("few") & lost).sum(),
             monitors=pl.col("monitor").drop_nulls(),
-            **{f"lost_{one.value}": (cause == one.value).sum() for one in LOSSES},
+            **{f"lost_{loss.value}": (cause == loss.value).sum() for loss in LOSSES},
         )
         .with_columns(pl.col("monitors").map_elements(_by_frequency, return_dtype=pl.String))
         .join(hours, on=KEYS, how="left")
@@ -95,7 +95,7 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
 
 
 def _by_frequency(names: pl.Series) -> str:
-    return " ".join(name for name, _ in sorted(Counter(names).items(), key=lambda one: (-one[1], one[0])))
+    return " ".join(name for name, _ in sorted(Counter(names).items(), key=lambda item: (-item[1], item[0])))
 
 
 def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
@@ -126,8 +126,8 @@ def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
 
 def _cause(unsuitable: pl.Expr, shown: pl.Expr, hours: pl.Expr) -> pl.Expr:
     """What speaks most against a piece, the first that applies."""
-    lost = pl.concat_list(f"lost_{one.value}" for one in LOSSES).list.arg_max()
-    named = lost.replace_strict(dict(enumerate(one.value for one in LOSSES)), return_dtype=pl.String)
+    lost = pl.concat_list(f"lost_{loss.value}" for loss in LOSSES).list.arg_max()
+    named = lost.replace_strict(dict(enumerate(loss.value for loss in LOSSES)), return_dtype=pl.String)
     few = named.is_in(SHORT_OF_SATELLITES) & (2 * pl.col("few_satellites") > pl.col("lost"))
     most_lost = pl.when(few).then(pl.lit(LineCause.FEW_SATELLITES.value)).otherwise(named)
     some = {

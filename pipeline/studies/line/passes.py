@@ -58,8 +58,8 @@ class PieceIndex:
         place = plane_of(self.site, ground_of(self.site.track, rows["netelement_id"], floats(rows, "measure_m")))
         place = place[np.isfinite(place).all(axis=1)]
         half_m = 0.5 * float((self.pieces.to_m - self.pieces.from_m).max())
-        found = self.tree.query_ball_point(place, float(np.hypot(reach_m, half_m)))
-        return np.unique(np.array([number for near in found for number in near], dtype=np.int64))
+        hits = self.tree.query_ball_point(place, float(np.hypot(reach_m, half_m)))
+        return np.unique(np.array([number for hit in hits for number in hit], dtype=np.int64))
 
 
 def passes_of(
@@ -94,7 +94,7 @@ def laid_on(spans: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataF
     A span counts on the net elements of the train only, not on a track that runs beside them on the path. An outage,
     and what is unknown, count on all of them: nobody saw which of them it led over.
     """
-    found: list[pl.DataFrame] = []
+    laid: list[pl.DataFrame] = []
     for name, sign, offset_m in legs.select("netelement_id", "sign", "offset_m").iter_rows():
         element = pieces.track.index.get(name)
         if element is None:
@@ -103,8 +103,8 @@ def laid_on(spans: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataF
         rows = pieces.track.vertices(element)
         first_m = pieces.track.measure_m[rows][0]
         last_m = pieces.track.measure_m[rows][-1]
-        own = pl.col("state").is_in(_ANYWHERE) | pl.col("elements").list.contains(name)
-        kept = at.filter((pl.col("high") >= first_m) & (pl.col("low") <= last_m) & own.fill_null(value=False))
+        on_element = pl.col("state").is_in(_ANYWHERE) | pl.col("elements").list.contains(name)
+        kept = at.filter((pl.col("high") >= first_m) & (pl.col("low") <= last_m) & on_element.fill_null(value=False))
         begin = pieces.at(element, floats(kept, "low"))
         end = pieces.at(element, floats(kept, "high"))
         index = np.repeat(np.arange(kept.height), end - begin + 1)
@@ -113,9 +113,9 @@ def laid_on(spans: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataF
         hit = kept[index].with_columns(piece=pl.Series(piece, dtype=pl.Int64))
         begin_m = np.maximum(floats(hit, "begin"), pieces.from_m[piece])
         end_m = np.minimum(floats(hit, "end"), pieces.to_m[piece])
-        found.append(hit.with_columns(begin_m=begin_m, end_m=end_m))
+        laid.append(hit.with_columns(begin_m=begin_m, end_m=end_m))
     empty = _measures(spans.clear(), 1, 0.0).with_columns(piece=pl.lit(0), begin_m=pl.lit(0.0), end_m=pl.lit(0.0))
-    return pl.concat(found) if found else empty
+    return pl.concat(laid) if laid else empty
 
 
 def _measures(spans: pl.DataFrame, sign: int, offset_m: float) -> pl.DataFrame:
@@ -141,9 +141,9 @@ def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.Dat
 
 def _rows(frame: pl.DataFrame, cause: LineCause | None = None) -> pl.DataFrame:
     """Rows of `_OUTCOMES` with the cause that the state has, or another."""
-    names = {int(state): found.value for state, found in CAUSES.items()}
-    own = pl.col("state").replace_strict(names, default=LineCause.NONE.value, return_dtype=pl.String)
-    code = own if cause is None else pl.lit(cause.value)
+    names = {int(state): code_of.value for state, code_of in CAUSES.items()}
+    cause_of_state = pl.col("state").replace_strict(names, default=LineCause.NONE.value, return_dtype=pl.String)
+    code = cause_of_state if cause is None else pl.lit(cause.value)
     claimed = cause is LineCause.CLAIMED_WRONGLY
     return frame.with_columns(cause=code, claimed=pl.lit(claimed)).select(
         pl.col(name).cast(dtype) for name, dtype in _OUTCOMES.items()
@@ -191,27 +191,29 @@ def _named(rows: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFra
     signs: dict[str, set[int]] = {}
     for name, sign in legs.select("netelement_id", "sign").iter_rows():
         signs.setdefault(name, set()).add(sign)
-    found: dict[tuple[int, bool], object] = {}
+    first_times: dict[tuple[int, bool], object] = {}
     for name, at, ahead, t in rows.select("netelement_id", "measure_m", "ahead", "t").iter_rows():
         if (element := pieces.track.index.get(name)) is None or at is None:
             continue
         ways = {sign * ahead > 0 for sign in signs.get(name, ())} if ahead in (1, -1) else set()
         for growing in ways or {True, False}:
-            found.setdefault((int(pieces.at(element, np.array([at]))[0]), growing), t)
+            first_times.setdefault((int(pieces.at(element, np.array([at]))[0]), growing), t)
     schema = {name: _OUTCOMES[name] for name in ("piece", "growing", "state", "t")}
-    table = [(piece, growing, int(SpanState.WRONG_IN_USE), t) for (piece, growing), t in found.items()]
+    table = [(piece, growing, int(SpanState.WRONG_IN_USE), t) for (piece, growing), t in first_times.items()]
     return pl.DataFrame(table, schema=schema, orient="row")
 
 
 def _merged(rows: pl.DataFrame) -> pl.DataFrame:
     """One row per piece and direction: the worst state with its cause; a mere claim stands beside that."""
     claims = rows.filter("claimed").select("piece", "growing").unique().with_columns(has_claim=pl.lit(value=True))
-    own = rows.filter(~pl.col("claimed"))
+    unclaimed = rows.filter(~pl.col("claimed"))
     worst = (
-        own.sort("state", "cause", descending=[True, False]).group_by("piece", "growing", maintain_order=True).first()
+        unclaimed.sort("state", "cause", descending=[True, False])
+        .group_by("piece", "growing", maintain_order=True)
+        .first()
     )
     both = worst.join(claims, on=["piece", "growing"], how="left")
-    lone = rows.filter("claimed").join(own, on=["piece", "growing"], how="anti").unique(["piece", "growing"])
+    lone = rows.filter("claimed").join(unclaimed, on=["piece", "growing"], how="anti").unique(["piece", "growing"])
     kept = both.with_columns(claimed=pl.col("has_claim").fill_null(value=False)).drop("has_claim")
     return pl.concat([kept, lone.with_columns(state=pl.lit(int(SpanState.UNSEEN)).cast(pl.Int64))])
 

@@ -27,8 +27,8 @@ class Pieces:
         """The piece that holds each measure; beyond an end the last one there."""
         last = int(self.first[element + 1]) - 1
         begin = int(self.first[element])
-        found = begin + np.searchsorted(self.from_m[begin : last + 1], measure_m, side="right") - 1
-        return np.clip(found, begin, last).astype(np.int64)
+        piece = begin + np.searchsorted(self.from_m[begin : last + 1], measure_m, side="right") - 1
+        return np.clip(piece, begin, last).astype(np.int64)
 
     @property
     def names(self) -> list[str]:

@@ -76,7 +76,9 @@ def proposals(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
             continue
         for spacing_m in line.criteria.spacings_m:
             name = f"{mode}-{spacing_m:g}m"
-            placed = _disjoint(line, [one for way in ways for one in _walk(line, way, allowed, sides, spacing_m)])
+            placed = _disjoint(
+                line, [placement for way in ways for placement in _walk(line, way, allowed, sides, spacing_m)]
+            )
             balises.append(_balises(line, name, placed))
             rows.append(_figures(line, name, spacing_m, mode, placed, growing))
     empty = {name: pl.Series([], dtype=column.dtype) for name, column in LineBalises.columns().items()}
@@ -128,7 +130,9 @@ def _ways(line: LineEvidence) -> list[list[_PieceOnWay]]:
     wanted = {int(element) for element in np.unique(line.pieces.element[seen])}
     ways = []
     while wanted:
-        start = min((2 * one + side for one in wanted for side in (0, 1)), key=lambda way: _rank(network, way, wanted))
+        start = min(
+            (2 * piece + side for piece in wanted for side in (0, 1)), key=lambda way: _rank(network, way, wanted)
+        )
         ways.append(list(_chain(network, line.pieces, start, wanted)))
     return ways
 
@@ -210,21 +214,21 @@ def _best(
 
 def _near(line: LineEvidence) -> dict[int, tuple[str, float]]:
     """Pieces near stations and signals of the same net element: name and distance [m]."""
-    found: dict[int, tuple[str, float]] = {}
+    nearest: dict[int, tuple[str, float]] = {}
     middle_m = 0.5 * (line.pieces.from_m + line.pieces.to_m)
     for name, element_name, measure_m in line.points.select("name", "netelement_id", "measure_m").iter_rows():
         element = line.pieces.track.index[element_name]
         for piece in range(int(line.pieces.first[element]), int(line.pieces.first[element + 1])):
             away_m = abs(float(middle_m[piece]) - measure_m)
-            if away_m <= line.criteria.near_m and (piece not in found or away_m < found[piece][1]):
-                found[piece] = (name, away_m)
-    return found
+            if away_m <= line.criteria.near_m and (piece not in nearest or away_m < nearest[piece][1]):
+                nearest[piece] = (name, away_m)
+    return nearest
 
 
 def _disjoint(line: LineEvidence, placed: list[_Proposed]) -> list[_Proposed]:
     """Without balises whose windows linking cannot tell apart, as where ways meet; the later one goes."""
     while True:
-        named = {f"B{one.piece}": one for one in placed}
+        named = {f"B{placement.piece}": placement for placement in placed}
         balises = _named(line, placed).with_columns(balise_id=pl.Series(list(named), dtype=pl.String))
         # Announced in one list, whatever their kind.
         table = site_balises(balises, line.criteria).with_columns(kind=pl.lit(BaliseKind.VIRTUAL.value))
@@ -232,20 +236,20 @@ def _disjoint(line: LineEvidence, placed: list[_Proposed]) -> list[_Proposed]:
         if not clashes:
             return placed
         gone = {max(clash.place.removeprefix("balises ").split(", "), key=list(named).index) for clash in clashes[:1]}
-        placed = [one for name, one in named.items() if name not in gone]
+        placed = [placement for name, placement in named.items() if name not in gone]
 
 
 def _named(line: LineEvidence, placed: Sequence[_Proposed]) -> pl.DataFrame:
     """Place, kind and direction of each balise."""
-    piece = [one.piece for one in placed]
+    piece = [placement.piece for placement in placed]
     middle_m = 0.5 * (line.pieces.from_m + line.pieces.to_m)[piece]
     names = line.pieces.names
-    kind = [(BaliseKind.VIRTUAL if one.virtual else BaliseKind.PHYSICAL).value for one in placed]
+    kind = [(BaliseKind.VIRTUAL if placement.virtual else BaliseKind.PHYSICAL).value for placement in placed]
     columns = {
         "netelement_id": [names[number] for number in piece],
         "measure_m": np.round(middle_m, 3),
         "kind": kind,
-        "direction": [one.direction.value for one in placed],
+        "direction": [placement.direction.value for placement in placed],
     }
     return pl.DataFrame(columns, schema={name: LineBalises.columns()[name].dtype for name in columns})
 
@@ -255,37 +259,41 @@ def _balises(line: LineEvidence, name: str, placed: Sequence[_Proposed]) -> pl.D
     worst = dict(line.table.group_by("piece").agg(why).iter_rows())
     proved = _allowed(line, MODES["both"], np.ones(len(line.pieces.element), dtype=np.bool_))
     errors = dict(line.table.group_by("piece").agg(pl.col("largest_undetected_m").max()).iter_rows())
-    distance = pl.Series([one.distance_m for one in placed], dtype=pl.Float64)
+    distance = pl.Series([placement.distance_m for placement in placed], dtype=pl.Float64)
     numbers = {True: 0, False: 0}
     ids = []
-    for one in placed:
-        numbers[one.virtual] += 1
-        ids.append(f"{'VB' if one.virtual else 'PB'}{numbers[one.virtual]:03d}")
+    for placement in placed:
+        numbers[placement.virtual] += 1
+        ids.append(f"{'VB' if placement.virtual else 'PB'}{numbers[placement.virtual]:03d}")
     return (
         _named(line, placed)
         .with_columns(
             proposal=pl.lit(name),
             balise_id=pl.Series(ids, dtype=pl.String),
-            why=pl.Series(["" if one.virtual else worst[one.piece] for one in placed], dtype=pl.String),
-            near=pl.Series([one.near for one in placed], dtype=pl.String),
+            why=pl.Series(
+                ["" if placement.virtual else worst[placement.piece] for placement in placed], dtype=pl.String
+            ),
+            near=pl.Series([placement.near for placement in placed], dtype=pl.String),
             distance_m=distance,
             odometer_confidence_m=line.lds.odometer_fixed_m + line.lds.odometer_share * distance,
-            largest_undetected_m=pl.Series([_largest(errors, one) for one in placed], dtype=pl.Float64),
-            proved=pl.Series([bool(proved[one.piece]) and one.virtual for one in placed], dtype=pl.Boolean),
+            largest_undetected_m=pl.Series([_largest(errors, placement) for placement in placed], dtype=pl.Float64),
+            proved=pl.Series(
+                [bool(proved[placement.piece]) and placement.virtual for placement in placed], dtype=pl.Boolean
+            ),
         )
         .select(*LineBalises.columns())
     )
 
 
-def _largest(errors: dict[int, float | None], one: _Proposed) -> float | None:
-    known = (errors.get(piece) for piece in one.since)
+def _largest(errors: dict[int, float | None], placement: _Proposed) -> float | None:
+    known = (errors.get(piece) for piece in placement.since)
     return max((error for error in known if error is not None), default=None)
 
 
 def _figures(
     line: LineEvidence, name: str, spacing_m: float, mode: str, placed: Sequence[_Proposed], growing: Bools
 ) -> dict[str, object]:
-    virtual = [one.piece for one in placed if one.virtual]
+    virtual = [placement.piece for placement in placed if placement.virtual]
     sides = [(piece, bool(growing[piece]) == ahead, ahead) for piece in virtual for ahead in MODES[mode]]
     schema = {"piece": pl.Int64, "growing": pl.Boolean, "ahead": pl.Boolean}
     wanted = pl.DataFrame(sides, schema=schema, orient="row")
@@ -296,9 +304,9 @@ def _figures(
     # What the evidence should have judged and did not may have been wrong.
     maybe = pl.col("state").is_in([int(SpanState.UNKNOWN), int(SpanState.WRONG_IN_USE)])
     journeys = judged.group_by("run_id").agg(wrong=maybe.any())
-    distances: Floats = np.array([one.distance_m for one in placed if one.distance_m is not None])
+    distances: Floats = np.array([placement.distance_m for placement in placed if placement.distance_m is not None])
     longest_m = float(distances.max()) if len(distances) else None
-    served = {one.near for one in placed if one.near and one.virtual}
+    served = {placement.near for placement in placed if placement.near and placement.virtual}
     return {
         "proposal": name,
         "spacing_m": spacing_m,

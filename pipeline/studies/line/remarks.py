@@ -49,8 +49,8 @@ def _sides(table: pl.DataFrame) -> Iterator[str]:
     """Net elements that runs passed in one direction only; a wrong track condemns both, whichever was run."""
     run = table.filter(pl.col("passes") > pl.col("lost_wrong_track"))
     sides = run.group_by("netelement_id", maintain_order=True).agg(pl.col("direction").unique())
-    for side, other in (tuple(LineDirection), tuple(reversed(LineDirection))):
-        lone = sides.filter(pl.col("direction") == [other.value])["netelement_id"].to_list()
+    for side, opposite in (tuple(LineDirection), tuple(reversed(LineDirection))):
+        lone = sides.filter(pl.col("direction") == [opposite.value])["netelement_id"].to_list()
         if lone:
             yield (
                 f"No run in the direction of {side.value} measure on {', '.join(lone[:_NAMED])}"

@@ -53,7 +53,9 @@ def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configurati
         (~in_use, SpanState.AFTER_ALARM),
         (_is(epochs, "right"), SpanState.RIGHT),
     ]
-    states = np.select([one for one, _ in conditions], [int(state) for _, state in conditions], int(SpanState.UNKNOWN))
+    states = np.select(
+        [condition for condition, _ in conditions], [int(state) for _, state in conditions], int(SpanState.UNKNOWN)
+    )
     return states.astype(np.int64)
 
 
@@ -124,5 +126,7 @@ def _between(ends: int, inner: Ints, possible: list[list[str] | None], way: set[
 def _elements(possible: list[list[str] | None], here: Ints, there: Ints) -> pl.Series:
     """Net elements on which the train may have been from one epoch to the other."""
     pairs = zip(here.tolist(), there.tolist(), strict=True)
-    found = [sorted({name for names in possible[begin : end + 1] for name in names or ()}) for begin, end in pairs]
-    return pl.Series(found, dtype=pl.List(pl.String))
+    names_of_spans = [
+        sorted({name for names in possible[begin : end + 1] for name in names or ()}) for begin, end in pairs
+    ]
+    return pl.Series(names_of_spans, dtype=pl.List(pl.String))

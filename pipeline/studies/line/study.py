@@ -100,14 +100,14 @@ def passes_of_runs(
     parts = []
     errors = []
     for run, solution, evidence in runs.select("run_id", "solution", "evidence").iter_rows():
-        own = pl.col("solution") == solution
-        epochs = read_table(out, "epochs", run).select(EPOCH_COLUMNS).filter(own).collect()
-        passages, alarms = (read_table(out, name, run).filter(own).collect() for name in ("passages", "alarms"))
-        found = passes_of(epochs, passages, alarms, ground, criteria, config)
+        of_solution = pl.col("solution") == solution
+        epochs = read_table(out, "epochs", run).select(EPOCH_COLUMNS).filter(of_solution).collect()
+        passages, alarms = (read_table(out, name, run).filter(of_solution).collect() for name in ("passages", "alarms"))
+        passes = passes_of(epochs, passages, alarms, ground, criteria, config)
         if evidence != Evidence.REFERENCE.value:
             # Reads and odometers tell by where they are, not by how good positions are: what they miss hides nothing.
-            found = found.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.UNSEEN)))
-        parts.append(found.with_columns(run_id=pl.lit(run)))
+            passes = passes.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.UNSEEN)))
+        parts.append(passes.with_columns(run_id=pl.lit(run)))
         errors.append(_undetected(passages, ground.pieces))
     return pl.concat(parts), pl.concat(errors).group_by("piece").agg(pl.col("largest_undetected_m").max())
 

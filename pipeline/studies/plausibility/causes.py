@@ -51,7 +51,7 @@ def explain_factor(factor: float, speed: bool) -> Explained | None:
 def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> Explained | None:
     """What makes two clocks differ by `lag_s`, known to within `precision_s`, at an instant; the simplest cause."""
     size_s = abs(lag_s)
-    near = (one for one in _lags(size_s, t_ns) if abs(size_s - one.exact) <= max(precision_s, _CLOCK_NEAR_S))
+    near = (cause for cause in _lags(size_s, t_ns) if abs(size_s - cause.exact) <= max(precision_s, _CLOCK_NEAR_S))
     explained = next(near, None)
     return explained and Explained(explained.causes, float(np.copysign(explained.exact, lag_s)))
 

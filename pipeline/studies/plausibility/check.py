@@ -79,7 +79,7 @@ class Check:
 
 def misfit(
     what: str,
-    found: str,
+    finding: str,
     *codes: MisfitCause,
     lines: str = "",
     into: str = CONFIGURATION,
@@ -88,7 +88,7 @@ def misfit(
 ) -> Check:
     """A misfit of causes that need no figure."""
     causes = tuple(map(KnownCause, codes))
-    return Check(what, FitState.MISFIT, found, causes, lines, into, advice, of_evidence)
+    return Check(what, FitState.MISFIT, finding, causes, lines, into, advice, of_evidence)
 
 
 def not_checked(what: str, why: str) -> Check:
@@ -96,8 +96,8 @@ def not_checked(what: str, why: str) -> Check:
     return Check(what, FitState.NOT_CHECKED, why)
 
 
-def fits(what: str, found: str) -> Check:
-    return Check(what, FitState.FITS, found)
+def fits(what: str, finding: str) -> Check:
+    return Check(what, FitState.FITS, finding)
 
 
 def correction(

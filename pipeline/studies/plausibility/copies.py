@@ -59,38 +59,38 @@ def copy_check(of: Recording) -> Check | None:
     reference = of.run.reference
     if reference is None or of.reference is None:
         return None
-    own = _track(fixes, of.seconds(fixes))
-    other = _track(reference, of.seconds(reference))
-    other = other.take(of.reference.moves(other.t_s))
-    other = other.take(np.arange(other.t_s.size) % max(1, other.t_s.size // _ROWS) == 0)
-    if min(own.t_s.size, other.t_s.size) < _FEWEST:
+    positions = _track(fixes, of.seconds(fixes))
+    references = _track(reference, of.seconds(reference))
+    references = references.take(of.reference.moves(references.t_s))
+    references = references.take(np.arange(references.t_s.size) % max(1, references.t_s.size // _ROWS) == 0)
+    if min(positions.t_s.size, references.t_s.size) < _FEWEST:
         return None
-    digit_deg = max(_digit_deg(own.degrees), _digit_deg(other.degrees), _LEAST_DEG)
-    to_m = np.radians(1.0) * SEMI_MAJOR_AXIS_M * np.array([1.0, np.cos(np.radians(own.degrees[0, 0]))])
+    digit_deg = max(_digit_deg(positions.degrees), _digit_deg(references.degrees), _LEAST_DEG)
+    to_m = np.radians(1.0) * SEMI_MAJOR_AXIS_M * np.array([1.0, np.cos(np.radians(positions.degrees[0, 0]))])
     digit_m = digit_deg * to_m
     sigma_m = _sigma_m(fixes)
     # Of a normal error, so much lies within a digit on either side.
     chance = float(np.prod(np.minimum(1.0, 2.0 * digit_m / (np.sqrt(2.0 * np.pi) * sigma_m))))
-    lag_s = _lag_s(own, other, 2.0 * float(digit_m[0])) if chance <= config.copy_chance else None
+    lag_s = _lag_s(positions, references, 2.0 * float(digit_m[0])) if chance <= config.copy_chance else None
     if lag_s is None:
         return None
-    row = np.clip(np.searchsorted(own.t_s, other.t_s - lag_s), 1, own.t_s.size - 1)
-    row -= other.t_s - lag_s - own.t_s[row - 1] < own.t_s[row] - (other.t_s - lag_s)
-    common = np.abs(own.t_s[row] - (other.t_s - lag_s)) <= _SAME_STAMP_S
-    equal = np.all(np.abs(own.degrees[row] - other.degrees) <= 1.001 * digit_deg, axis=1)[common]
+    row = np.clip(np.searchsorted(positions.t_s, references.t_s - lag_s), 1, positions.t_s.size - 1)
+    row -= references.t_s - lag_s - positions.t_s[row - 1] < positions.t_s[row] - (references.t_s - lag_s)
+    common = np.abs(positions.t_s[row] - (references.t_s - lag_s)) <= _SAME_STAMP_S
+    equal = np.all(np.abs(positions.degrees[row] - references.degrees) <= 1.001 * digit_deg, axis=1)[common]
     if equal.size < _FEWEST or equal.mean() < config.copy_share:
         return None
     exact_m = _WITHOUT_ERROR * float(sigma_m.min())
     if of.line is not None and fit_survey(of.gnss, of.line, of.config.shift_told_m).aside_m < exact_m:
         return None
     stamps = f", at stamps {lag_s:+.2f} s from them" if abs(lag_s) > _SAME_STAMP_S else ""
-    found = (
+    finding = (
         f"{equal.sum()} of {equal.size} places are those of the positions to the last digit ({digit_m[0]:.1g} m)"
         f"{stamps}; an independent one would be so near in {chance:.1g} of all cases, for the positions have sigma "
         f"{sigma_m.max():.2g} m"
     )
     advice = "Leave the reference out of the run, or record one with another, better instrument."
-    return Check(_WHAT, FitState.IMPOSSIBLE, found, (KnownCause(MisfitCause.COPY),), advice=advice, of_evidence=True)
+    return Check(_WHAT, FitState.IMPOSSIBLE, finding, (KnownCause(MisfitCause.COPY),), advice=advice, of_evidence=True)
 
 
 def _track(frame: pl.DataFrame, t_s: Floats) -> _StampedTrack:
@@ -98,16 +98,16 @@ def _track(frame: pl.DataFrame, t_s: Floats) -> _StampedTrack:
     return _StampedTrack(t_s, degrees).take(np.all(np.isfinite(degrees), axis=1))
 
 
-def _lag_s(own: _StampedTrack, other: _StampedTrack, reach_m: float) -> float | None:
+def _lag_s(positions: _StampedTrack, references: _StampedTrack, reach_m: float) -> float | None:
     """The difference of stamps that most places of the other record have which are in the own one too."""
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(points_of(*own.degrees.T).surface)
-    away_m, row = tree.query(points_of(*other.degrees.T).surface, distance_upper_bound=reach_m)
+    tree = cKDTree(points_of(*positions.degrees.T).surface)
+    away_m, row = tree.query(points_of(*references.degrees.T).surface, distance_upper_bound=reach_m)
     near = np.isfinite(away_m)
     if near.sum() < _FEWEST:
         return None
-    lags_s = np.sort(other.t_s[near] - own.t_s[row[near]])
+    lags_s = np.sort(references.t_s[near] - positions.t_s[row[near]])
     alike = np.searchsorted(lags_s, lags_s + _SAME_STAMP_S, "right") - np.arange(lags_s.size)
     first = int(alike.argmax())
     return float(np.median(lags_s[first : first + alike[first]]))
@@ -124,6 +124,6 @@ def _sigma_m(fixes: pl.DataFrame) -> Floats:
     usual_m = pl.col("fix").cast(pl.String).replace_strict({kind.value: FixSigma().horizontal_m(kind) for kind in Fix})
     stated = (pl.when(pl.col(name) > 0.0).then(pl.col(name).sqrt()) for name in ("cov_nn_m2", "cov_ee_m2"))
     sigma_m = fixes.select(
-        pl.coalesce(own, usual_m).median().alias(name) for own, name in zip(stated, "ne", strict=True)
+        pl.coalesce(stated_m, usual_m).median().alias(name) for stated_m, name in zip(stated, "ne", strict=True)
     )
     return np.array(sigma_m.row(0), dtype=np.float64)

@@ -87,21 +87,21 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
 
 def refuse_impossible(fit: Fit, place: str, config: IngestConfig) -> None:
     """One error for a run that cannot be as recorded, unless the configuration lets it pass."""
-    found = fit.impossible
-    if not found or config.plausibility == "warn":
+    impossible = fit.impossible
+    if not impossible or config.plausibility == "warn":
         return
     raise InputError(
-        "does not fit: " + "; ".join(check.sentence for check in found),
+        "does not fit: " + "; ".join(check.sentence for check in impossible),
         place=place,
         expected="streams of one journey, in the units and times of the contract",
-        remedy='To replay it all the same: [ingest] plausibility = "warn". ' + remedy_of(found),
+        remedy='To replay it all the same: [ingest] plausibility = "warn". ' + remedy_of(impossible),
     )
 
 
 def lines_of(checks: Sequence[Check]) -> dict[str, str]:
     """The lines that mend these, by what to do with them."""
     files = dict.fromkeys(check.into for check in checks if check.lines)
-    return {into: "\n".join(dict.fromkeys(one.lines for one in checks if one.into == into)) for into in files}
+    return {into: "\n".join(dict.fromkeys(check.lines for check in checks if check.into == into)) for into in files}
 
 
 def remedy_of(checks: Sequence[Check]) -> str:

@@ -70,15 +70,15 @@ def odometer_checks(of: Recording, reference: StreamLag | None) -> tuple[list[Ch
     latency = _latency_check(pair, reference, of)
     if scale is not None and scale.state in (FitState.MISFIT, FitState.IMPOSSIBLE):
         # Where there is a reference it has to contradict the file too: else it is the positions that drift.
-        other = by_reference()
-        beside = None if other is None else _scale_check(other, of, _unit(pair, config))
+        referenced = by_reference()
+        beside = None if referenced is None else _scale_check(referenced, of, _unit(pair, config))
         scale = fits(scale.what, scale.found) if beside is not None and beside.state is FitState.FITS else scale
     checks += [check for check in (scale, latency) if check is not None]
     if latency is not None and latency.state is FitState.MISFIT:
         return checks, [StreamLag("odometer", reason="the latency of the vehicle file does not fit")]
     lag = _lag(pair, of)
-    other = by_reference() if lag.sure and abs(lag.lag_s) <= config.lag_limit_s else None
-    if other is not None and other.lag_known and not other.other_lag(0.0, config.lag_told_s):
+    referenced = by_reference() if lag.sure and abs(lag.lag_s) <= config.lag_limit_s else None
+    if referenced is not None and referenced.lag_known and not referenced.other_lag(0.0, config.lag_told_s):
         return checks, [StreamLag("odometer", reason=f"{lag.lag_s:+.2f} s, but none against the reference")]
     return checks, [lag]
 
@@ -132,8 +132,8 @@ def _factor_check(name: str, pairs: dict[str, PairFit], config: PlausibilityConf
     if pair.constant < _UNIT_WINDOWS or not pair.other_factor(1.0, config.scale_limit):
         return misfit(what, f"no constant factor ({words} usually)")
     # What the other column shows too, if it is near 1, is of the wheel or of drifting positions.
-    others = [abs(fit.factor) for other, fit in pairs.items() if other != name and fit.known]
-    base = next((other for other in others if abs(other - 1.0) <= 2.0 * config.scale_limit), 1.0)
+    factors = [abs(fit.factor) for pair_name, fit in pairs.items() if pair_name != name and fit.known]
+    base = next((pair_name for pair_name in factors if abs(pair_name - 1.0) <= 2.0 * config.scale_limit), 1.0)
     if (explained := explain_factor(factor / base, name == "speed")) is not None:
         lines = correction("odometer", {column: 1.0 / explained.exact})
         return Check(what, FitState.IMPOSSIBLE, words, explained.causes, lines)
@@ -202,8 +202,8 @@ def sign_check(counters: dict[str, Record]) -> list[Check]:
     """Speed and distance of one odometer; none where it has not both."""
     if len(counters) < 2:
         return []
-    begin_s = max(one.t_s[0] for one in counters.values())
-    end_s = min(one.t_s[-1] for one in counters.values())
+    begin_s = max(counter.t_s[0] for counter in counters.values())
+    end_s = min(counter.t_s[-1] for counter in counters.values())
     starts = np.linspace(begin_s, max(end_s - 10.0, begin_s), 300)
     gained = np.array([counters[name].gained(starts, starts + 10.0) for name in ("distance", "speed")])
     # By the median of what moves: a counter that is reset seems to run far, once.
@@ -218,8 +218,10 @@ def sign_check(counters: dict[str, Record]) -> list[Check]:
         # A train that runs backwards all the way is rarer than a counter of the wrong sign.
         name, does = ("distance", "falls") if falls.mean() > 0.5 else ("speed", "grows")
         lines = correction("odometer", {"distance_m" if name == "distance" else "speed_mps": -1.0})
-        found = f"the distance {does} at the opposite speed"
-        return [Check(_SIGNS, FitState.IMPOSSIBLE, found, (KnownCause(MisfitCause.COUNTS_BACKWARDS, (name,)),), lines)]
+        finding = f"the distance {does} at the opposite speed"
+        return [
+            Check(_SIGNS, FitState.IMPOSSIBLE, finding, (KnownCause(MisfitCause.COUNTS_BACKWARDS, (name,)),), lines)
+        ]
     if against > 0.1 and not back.any() and not falls.all():
         return [misfit(_SIGNS, "the speed has no sign", MisfitCause.SPEED_WITHOUT_SIGN)]
     return [fits(_SIGNS, "the same")]

@@ -244,8 +244,8 @@ def _correlations(first: Floats, second: Floats) -> Floats:
     left = spectra(first)
     right = spectra(second[::-1])
 
-    def sums(one: int, other: int) -> Floats:
-        return np.asarray(np.fft.irfft(left[one] * right[other], size)[: first.size + second.size - 1])
+    def sums(of_left: int, of_right: int) -> Floats:
+        return np.asarray(np.fft.irfft(left[of_left] * right[of_right], size)[: first.size + second.size - 1])
 
     least = max(_COMMON_S, _COMMON_SHARE * min(np.isfinite(values).sum() for values in (first, second)))
     spread = sums(2, 0) * sums(0, 2)

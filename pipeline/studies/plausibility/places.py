@@ -38,23 +38,23 @@ def reference_checks(of: Recording) -> tuple[StreamLag, list[Check], bool]:
         return StreamLag("reference", reason="hardly any place"), [], False
     if copied := copy_check(of):
         return StreamLag("reference", reason="a copy of the positions"), [copied], False
-    found = fit_places(of.gnss, of.reference, config)
-    if found.reason:
-        return StreamLag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False
-    significant = abs(found.lag_s) > max(config.lag_told_s, SIGNIFICANT_SIGMAS * found.lag_sigma_s)
-    agrees = explains(found.agreeing, 0.0)
-    small = abs(found.lag_s) <= config.lag_limit_s and agrees
-    sure = significant and found.lag_is_steady and (small or explains(found.agreeing, found.as_recorded))
-    lag = StreamLag("reference", found.lag_s, found.lag_sigma_s, sure=sure)
+    shift = fit_places(of.gnss, of.reference, config)
+    if shift.reason:
+        return StreamLag("reference", reason=shift.reason), [not_checked(_REFERENCE, shift.reason)], False
+    significant = abs(shift.lag_s) > max(config.lag_told_s, SIGNIFICANT_SIGMAS * shift.lag_sigma_s)
+    agrees = explains(shift.agreeing, 0.0)
+    small = abs(shift.lag_s) <= config.lag_limit_s and agrees
+    sure = significant and shift.lag_is_steady and (small or explains(shift.agreeing, shift.as_recorded))
+    lag = StreamLag("reference", shift.lag_s, shift.lag_sigma_s, sure=sure)
     if not agrees:
         words = "no one lag or shift explains them; the positions may be wrong"
         return lag, [not_checked(_REFERENCE, words)], False
-    near = found.shift_m <= config.shift_told_m
-    words = f"{found.towards} of them"
+    near = shift.shift_m <= config.shift_told_m
+    words = f"{shift.towards} of them"
     # No lines: the judge believes the reference, and nobody should shift it to where the positions want it.
     beside = misfit(_REFERENCE, words, MisfitCause.OFFSET_OF_REFERENCE, advice="Find out which of the two is off.")
-    beside = fits(_REFERENCE, words) if near or not found.shift_is_steady else beside
-    return lag, [beside, *_reference_heights(of, found.lag_s)], near
+    beside = fits(_REFERENCE, words) if near or not shift.shift_is_steady else beside
+    return lag, [beside, *_reference_heights(of, shift.lag_s)], near
 
 
 def _reference_heights(of: Recording, lag_s: float) -> Iterator[Check]:
@@ -154,22 +154,22 @@ def _beside(fit: SurveyFit, datum: Datum | None, of: Recording, streams: tuple[s
     return misfit(_SURVEY, words, code, lines=lines, advice=advice)
 
 
-def _heights(other: str, up_m: Floats, height_m: Floats, of: Recording) -> Iterator[Check]:
+def _heights(base: str, up_m: Floats, height_m: Floats, of: Recording) -> Iterator[Check]:
     """Heights of the survey or reference, which lie `up_m` above those of the positions."""
-    what = f"heights against the {other}"
+    what = f"heights against the {base}"
     apart_m, is_steady = steady_median(up_m)
     if not np.isfinite(apart_m):
         return
-    words = f"the {other} lies {apart_m:.0f} m above them"
+    words = f"the {base} lies {apart_m:.0f} m above them"
     if abs(apart_m) <= 1.5 * of.config.shift_told_m or not is_steady:
         yield fits(what, words)
         return
     ratio, _ = steady_median(height_m / (height_m + up_m))
-    for stream, factor in (("gnss", ratio), (other, 1.0 / ratio)):
+    for stream, factor in (("gnss", ratio), (base, 1.0 / ratio)):
         unit = explain_factor(factor, False)
         name = "" if unit is None else unit.causes[0].figures[0]
         if unit is not None and name in _HEIGHT_UNITS:
-            causes = (KnownCause(MisfitCause.HEIGHT_UNIT, ("positions" if stream == "gnss" else other, name)),)
+            causes = (KnownCause(MisfitCause.HEIGHT_UNIT, ("positions" if stream == "gnss" else base, name)),)
             lines = "" if stream == "survey" else correction(stream, {"height_m": 1.0 / unit.exact})
             advice = "Write the survey's heights in metres." if stream == "survey" else ""
             yield Check(what, FitState.MISFIT, words, causes, lines, advice=advice)
@@ -178,5 +178,5 @@ def _heights(other: str, up_m: Floats, height_m: Floats, of: Recording) -> Itera
         yield misfit(what, words, MisfitCause.HEIGHT_UNKNOWN)
         return
     # The judge believes the reference: where it has the other zero, somebody has to say which is right.
-    lines = correction("gnss", shift_m={"up": round(apart_m, 1)}) if other == "survey" else ""
+    lines = correction("gnss", shift_m={"up": round(apart_m, 1)}) if base == "survey" else ""
     yield misfit(what, words, MisfitCause.HEIGHT_ZERO, lines=lines)

@@ -49,19 +49,19 @@ def fit_report(
         problems = (str(error),)
         if cleaned.gnss.height < 2:
             return FitReport({}, problems)
-    found = {
+    fits = {
         name: fit_run(cleaned, name, vehicle or Vehicle(), config.plausibility, site) for name in cleaned.solutions()
     }
-    tables = {"Fit": _checks(found, counts)}
+    tables = {"Fit": _checks(fits, counts)}
     mending: dict[str, str] = {}
-    for fit in found.values():
+    for fit in fits.values():
         for into, lines in lines_of(fit.misfits).items():
             known = mending.setdefault(into, lines)
             mending[into] = known if lines in known else known + "\n" + lines
     text = "\n".join(f"# {into}\n{lines}" for into, lines in mending.items())
     if text:
         tables["Lines that mend it"] = pl.DataFrame({"toml": text.splitlines()})
-    failing = found.values() if config.ingest.plausibility == "fail" and not problems else ()
+    failing = fits.values() if config.ingest.plausibility == "fail" and not problems else ()
     impossible = dict.fromkeys(check.sentence for fit in failing for check in fit.impossible)
     return FitReport(tables, problems + tuple(impossible))
 
@@ -71,16 +71,22 @@ def _in_order(run: RunLog) -> RunLog:
     return run.with_streams(**{name: frame.sort("t") for name in streams if (frame := run.stream(name)) is not None})
 
 
-def _checks(found: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
+def _checks(fits: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
     columns = ("solution", "check", "state", "found", "cause")
     rows = [
         (name, check.what, check.state.value, check.found, check.cause)
-        for name, fit in found.items()
+        for name, fit in fits.items()
         for check in fit.checks
     ]
     rows += [
-        (name, "placeholders", FitState.MISFIT.value, f"{one.placeholders} taken as no fix", "0/0 or a default place")
-        for name, one in counts.solutions.items()
-        if one.placeholders
+        (
+            name,
+            "placeholders",
+            FitState.MISFIT.value,
+            f"{counted.placeholders} taken as no fix",
+            "0/0 or a default place",
+        )
+        for name, counted in counts.solutions.items()
+        if counted.placeholders
     ]
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row")

@@ -92,9 +92,9 @@ def fit_velocity(fixes: pl.DataFrame, gnss: Places, epoch_ns: int) -> VelocityFi
     ratio = float(np.median(np.linalg.norm(flat, axis=1) / size))
     left = [np.linalg.norm(way.turned(flat) / max(ratio, 1e-9) - moved, axis=1) / size for way in ARRANGEMENTS]
     misfits = np.median(left, axis=1)
-    other = int(np.argmin(misfits))
-    far_better = misfits[0] > _TURNED and misfits[other] <= min(_EXPLAINED * misfits[0], VELOCITY_SHARE)
-    return VelocityFit(ratio, misfits, other if far_better else 0, begin_s[fast], recorded)
+    best = int(np.argmin(misfits))
+    far_better = misfits[0] > _TURNED and misfits[best] <= min(_EXPLAINED * misfits[0], VELOCITY_SHARE)
+    return VelocityFit(ratio, misfits, best if far_better else 0, begin_s[fast], recorded)
 
 
 def velocity_checks(fit: VelocityFit | None, gnss: Places, config: PlausibilityConfig) -> list[Check]:

@@ -79,9 +79,9 @@ def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool
         sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
         return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
     later = "later" if lag.lag_s > 0 else "earlier"
-    found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {name} are {later}"
+    finding = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {name} are {later}"
     if size_s <= config.lag_limit_s:
-        return _small(what, found, lag)
+        return _small(what, finding, lag)
     clock = of_gnss or lag
     explained = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0))
     exact_s = round(clock.lag_s if explained is None else explained.exact, 2)
@@ -91,11 +91,11 @@ def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool
     pair = ("GNSS", name) if at_gnss else (name, "GNSS")
     whose = Whose(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
     if not at_gnss:
-        return Check(what, FitState.IMPOSSIBLE, found, causes, correction(lag.stream, shift_s=-exact_s), whose=whose)
+        return Check(what, FitState.IMPOSSIBLE, finding, causes, correction(lag.stream, shift_s=-exact_s), whose=whose)
     streams = ("gnss",) if of.run.satellites is None else ("gnss", "satellites")
     only = of.solution if len(of.run.solutions()) > 1 else None
     lines = "".join(correction(stream, shift_s=exact_s, solution=only) for stream in streams)
-    return Check(what, FitState.IMPOSSIBLE, found, causes, lines, whose=whose)
+    return Check(what, FitState.IMPOSSIBLE, finding, causes, lines, whose=whose)
 
 
 def _rather_gnss(lag_s: float, rolled_over: bool, t_ns: int) -> bool:
@@ -108,14 +108,14 @@ def _rather_gnss(lag_s: float, rolled_over: bool, t_ns: int) -> bool:
     return rolled_over and lag_s > 0
 
 
-def _small(what: str, found: str, lag: StreamLag) -> Check:
+def _small(what: str, finding: str, lag: StreamLag) -> Check:
     """A lag that a train can have, and that costs availability all the same."""
     latency_s = round(-lag.lag_s, 2)
     if lag.stream == "odometer" and latency_s > 0 and not lag.latency_known:
         lines = f"gnss_latency_s = {latency_s}\ngnss_latency_sigma_s = {max(round(lag.sigma_s, 3), 0.02)}\n"
-        return misfit(what, found, MisfitCause.LATENCY, lines=lines, into=VEHICLE_FILE)
+        return misfit(what, finding, MisfitCause.LATENCY, lines=lines, into=VEHICLE_FILE)
     code = MisfitCause.STAMPED_LATE if latency_s < 0 else MisfitCause.STAMPED_EARLY
     if lag.stream == "reference":
         # The judge believes the reference: nobody should shift it to where the positions want it.
-        return misfit(what, found, code, advice="Find out which clock is wrong before one is corrected.")
-    return misfit(what, found, code, lines=correction(lag.stream, shift_s=latency_s))
+        return misfit(what, finding, code, advice="Find out which clock is wrong before one is corrected.")
+    return misfit(what, finding, code, lines=correction(lag.stream, shift_s=latency_s))

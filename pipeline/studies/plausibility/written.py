@@ -48,10 +48,10 @@ def _without_survey(of: Recording, recorded: dict[str, bool]) -> list[Check]:
     words = "no other stream fits them"
     for mistake in COORDINATE_MISTAKES:
         mended = _mended(of, mistake)
-        found = {} if mended is None else _witnesses(mended)
-        if not all(found.values()) or sum(found.values()) <= sum(recorded.values()):
+        after = {} if mended is None else _witnesses(mended)
+        if not all(after.values()) or sum(after.values()) <= sum(recorded.values()):
             continue
-        if "odometer" in found and not recorded.get("odometer", False):
+        if "odometer" in after and not recorded.get("odometer", False):
             return [_mistaken(mistake, words)]
         # Signs leave the ways as they are: the velocity alone says that they differ.
         causes = (KnownCause(mistake.code),)
@@ -73,16 +73,16 @@ def _lines(stream: str, mistake: CoordinateMistake) -> str:
 
 def _witnesses(of: Recording) -> dict[str, bool]:
     """What of the run's other streams fits its positions, by name; without those that show nothing."""
-    found: dict[str, bool] = {}
+    agreeing: dict[str, bool] = {}
     limit = of.config.scale_limit
     if known := [pair for pair in of.pairs.values() if pair.known]:
-        found["odometer"] = any(pair.constant > 0.5 and abs(abs(pair.factor) - 1.0) <= limit for pair in known)
+        agreeing["odometer"] = any(pair.constant > 0.5 and abs(abs(pair.factor) - 1.0) <= limit for pair in known)
     if of.velocity is not None:
-        found["velocity"] = of.velocity.best == 0 and abs(of.velocity.ratio - 1.0) <= limit
+        agreeing["velocity"] = of.velocity.best == 0 and abs(of.velocity.ratio - 1.0) <= limit
     if of.reference is not None:
         far_m = _apart_m(of.gnss, of.reference.latitude_deg, of.reference.longitude_deg)
-        found["reference"] = far_m < of.config.same_line_m
-    return found
+        agreeing["reference"] = far_m < of.config.same_line_m
+    return agreeing
 
 
 def _mended(of: Recording, mistake: CoordinateMistake) -> Recording | None:

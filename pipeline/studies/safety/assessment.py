@@ -64,14 +64,14 @@ def assess(out: Address, config: Configuration | None = None, replay: Replay | N
         "alarms": alarm_causes(alarms, settings.hazards.map_reach_m),
         "map": derived["map"],
     }
-    said = [
+    statements = [
         verdict_statement(runs),
         *reservations(runs, alarms),
         *slow_receivers(derived["levels"]),
         *plain_statements(derived["figures"]),
         *level_statements(derived["detection"]),
     ]
-    return Assessment(said, tables)
+    return Assessment(statements, tables)
 
 
 def compare_architectures(
@@ -80,18 +80,19 @@ def compare_architectures(
     """`side_by_side` of every run that holds several solutions; one run's epochs in memory at a time."""
     done = runs.filter(pl.col("status") != RunStatus.FAILED)
     several = done.group_by("run_id").len().filter(pl.col("len") > 1)["run_id"].sort()
-    found = {}
+    compared = {}
     for run_id in several.to_list():
         epochs = store.read_table(out, "epochs", run_id).select(EPOCH_COLUMNS).collect()
         of_hazards, of_alarms, of_runs = (frame.filter(pl.col("run_id") == run_id) for frame in (hazards, alarms, done))
-        found[run_id] = side_by_side(epochs, of_hazards, of_alarms, of_runs, config)
-    return found
+        compared[run_id] = side_by_side(epochs, of_hazards, of_alarms, of_runs, config)
+    return compared
 
 
-def by_run(found: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+def by_run(counts_of_runs: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
     """The architectures of each run, one run below the other."""
     parts = [
-        architecture_figures(counts).insert_column(0, pl.lit(run).alias("run_id")) for run, counts in found.items()
+        architecture_figures(counts).insert_column(0, pl.lit(run).alias("run_id"))
+        for run, counts in counts_of_runs.items()
     ]
     return pl.concat(parts) if parts else pl.DataFrame()
 

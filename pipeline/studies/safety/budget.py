@@ -87,8 +87,8 @@ def allowed_table(config: SafetyConfig, period_s: float = 0.1, negation_s: float
         (level, service.integrity_risk, service.exposure_s, config.allowed_time_to_detect_s(level))
         for level, service in config.service_levels.items()
     ]
-    own = pl.DataFrame(rows, schema=["service_level", "integrity_risk", "exposure_s", "allowed_s"], orient="row")
-    return own.join(levels_table(config), on="service_level", maintain_order="left").select(
+    allowed = pl.DataFrame(rows, schema=["service_level", "integrity_risk", "exposure_s", "allowed_s"], orient="row")
+    return allowed.join(levels_table(config), on="service_level", maintain_order="left").select(
         *("service_level", "integrity_risk", "exposure_s"),
         hazard_rate_per_h="rate",
         allowed_published_s="detect_s",

@@ -18,12 +18,12 @@ from schemas.enums import Verdict
 _OPEN_END_NS = 2**63 - 1
 
 
-def faults_of_pair(one: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
+def faults_of_pair(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
     """Faults of either solution, as from `independent_episodes`; those that overlap are one fault of the pair.
 
     `common`: a failure of each solution at the same time.
     """
-    both = pl.concat([_beside(one, other), _beside(other, one)]).sort("begin")
+    both = pl.concat([_beside(first, second), _beside(second, first)]).sort("begin")
     end_ns = pl.col("t_end").to_physical().fill_null(_OPEN_END_NS)
     begin_ns = pl.col("begin").to_physical()
     apart = begin_ns > end_ns.cum_max().shift(1)
@@ -56,11 +56,11 @@ def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
     last = int(fails.t_ns[-1])
     kind = faults.schema["begin"]
     ends = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(last)).rows()
-    found = [_detected_ns(fails, *span) for span in ends]
+    detected_ns = [_detected_ns(fails, *span) for span in ends]
     failed = pl.col("failed")
     missed = pl.col("missed")
     judged = pl.col("with_truth")
-    seen = faults.with_columns(t_detected=pl.Series(found, dtype=pl.Int64).cast(kind))
+    seen = faults.with_columns(t_detected=pl.Series(detected_ns, dtype=pl.Int64).cast(kind))
     seen = seen.with_columns(missed=missed_detection())
     counts = {
         "hazards": pl.len(),
@@ -71,7 +71,9 @@ def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
     }
     if "common" in faults.columns:
         counts |= {"common_failures": pl.col("common").sum(), "common_missed": (pl.col("common") & missed).sum()}
-    delays = [(moment - begin) / 1e9 for moment, (begin, _) in zip(found, ends, strict=True) if moment is not None]
+    delays = [
+        (moment - begin) / 1e9 for moment, (begin, _) in zip(detected_ns, ends, strict=True) if moment is not None
+    ]
     return seen.select(**counts).row(0, named=True) | {"delays_s": delays}
 
 
@@ -98,8 +100,8 @@ def verdict_of_both(alarm: AlarmEpisode, sides: tuple[SolutionTables, SolutionTa
 
     The rule of the `alarms` table (DOMAIN section 5.3), asked of both solutions.
     """
-    found = {_of_side(alarm, side, config) for side in sides}
-    return next(verdict for verdict in (Verdict.TRUE, Verdict.UNKNOWN, Verdict.FALSE) if verdict in found)
+    verdicts = {_of_side(alarm, side, config) for side in sides}
+    return next(verdict for verdict in (Verdict.TRUE, Verdict.UNKNOWN, Verdict.FALSE) if verdict in verdicts)
 
 
 def _of_side(alarm: AlarmEpisode, side: SolutionTables, config: HazardConfig) -> Verdict:

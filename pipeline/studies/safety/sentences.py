@@ -24,39 +24,39 @@ def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     """What keeps the figures from being those of traffic, and what they leave out."""
     injected = runs.filter(pl.col("faults_injected").fill_null(value=False))["run_id"].n_unique()
     number = runs["run_id"].n_unique()
-    said = failed_runs(runs)
+    sentences = failed_runs(runs)
     if injected:
-        said.insert(
+        sentences.insert(
             0,
             f"Faults were injected into {injected} of {number} runs: rates of hazards, misses and outages per hour are "
             "those of the trial, not of traffic.",
         )
     partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
     if partial:
-        said.append(f"{partial} of {number} runs are partial: only what was read of them counts.")
+        sentences.append(f"{partial} of {number} runs are partial: only what was read of them counts.")
     limits = ": each verdict is by its own limits; those shown are the last ones."
-    return [*said, *several_settings(runs, limits), *_unjudged(runs, alarms)]
+    return [*sentences, *several_settings(runs, limits), *_unjudged(runs, alarms)]
 
 
 def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     """Per solution: the time and the alarms that nothing could judge."""
-    said = []
+    sentences = []
     done = runs.filter(pl.col("status") != RunStatus.FAILED).sort("solution")
     for (solution,), rows in done.group_by("solution", maintain_order=True):
         held_s, seen_s = (float(rows[name].sum()) for name in ("held_s", "evidence_s"))
         if held_s - seen_s >= 1.0:  # less is not worth saying
             without = rows["evidence"].null_count()
-            said.append(
+            sentences.append(
                 f"{solution}: in {(held_s - seen_s) / 3600.0:.3g} of {held_s / 3600.0:.3g} h the position could not be"
                 f" checked ({without} of {rows.height} runs have no evidence at all). No rate counts this time."
             )
         open_cases = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
         if open_cases.height:
-            said.append(
+            sentences.append(
                 f"{solution}: {open_cases.height} alarms in {open_cases['run_id'].n_unique()} runs could not be"
                 " checked. The rate of false alarms leaves these runs out."
             )
-    return said
+    return sentences
 
 
 def slow_receivers(levels: pl.DataFrame) -> list[str]:
@@ -75,11 +75,11 @@ def slow_receivers(levels: pl.DataFrame) -> list[str]:
 
 def level_statements(detection: pl.DataFrame) -> list[str]:
     """Per solution: how many failures were in use no longer than each service level allows."""
-    said = []
+    sentences = []
     for (solution,), rows in detection.filter(pl.col("failures") > 0).group_by("solution", maintain_order=True):
         levels = [_level(row) for row in rows.iter_rows(named=True)]
-        said.append(f"{solution}: of {rows['failures'][0]} position failures in use " + ", ".join(levels) + ".")
-    return said
+        sentences.append(f"{solution}: of {rows['failures'][0]} position failures in use " + ", ".join(levels) + ".")
+    return sentences
 
 
 def _level(row: dict[str, Any]) -> str:
@@ -130,19 +130,19 @@ def _failures(row: dict[str, Any]) -> str:
 def _missed(row: dict[str, Any]) -> str:
     known = row["missed_known"]
     missed = row["missed_judged"]
-    said = f"No monitor found {missed} of {known} faults with a failure that a truth judged"
+    sentence = f"No monitor found {missed} of {known} faults with a failure that a truth judged"
     if row["missed"] > missed:
-        said += f"; {row['missed'] - missed} more are known by the odometer alone, and shares leave them out"
-    return f"{said}."
+        sentence += f"; {row['missed'] - missed} more are known by the odometer alone, and shares leave them out"
+    return f"{sentence}."
 
 
 def _acceptances(row: dict[str, Any]) -> str:
     judged = row["accepted_judged"]
     unsafe = row["unsafe_judged"]
     seen = row["unsafe_accepted"]
-    said = f"Of {judged} accepted virtual balises judged by a truth {unsafe} were accepted despite a wrong position"
+    sentence = f"Of {judged} accepted virtual balises judged by a truth {unsafe} were accepted despite a wrong position"
     if seen > unsafe:
-        said += f", and {seen - unsafe} more by the odometer alone"
+        sentence += f", and {seen - unsafe} more by the odometer alone"
     if row["unproven_accepted"]:
-        said += f"; {row['unproven_accepted']} accepted ones could not be checked"
-    return f"{said}."
+        sentence += f"; {row['unproven_accepted']} accepted ones could not be checked"
+    return f"{sentence}."

@@ -89,19 +89,19 @@ def _moving_s(epochs: pl.DataFrame) -> float | None:
 def _solution(
     name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame
 ) -> SolutionTables:
-    own = pl.col("solution") == name
-    evidence = runs.filter(own)["evidence"].cast(pl.String).to_list()
+    of_solution = pl.col("solution") == name
+    evidence = runs.filter(of_solution)["evidence"].cast(pl.String).to_list()
     return SolutionTables(
-        epochs=epochs.filter(own).sort("t"),
-        faults=independent_episodes(hazards.filter(own)),
-        alarms=alarms.filter(own),
+        epochs=epochs.filter(of_solution).sort("t"),
+        faults=independent_episodes(hazards.filter(of_solution)),
+        alarms=alarms.filter(of_solution),
         with_truth=len(evidence) == 1 and evidence[0] in TRUTH,
     )
 
 
-def _reactive(one: SolutionTables, config: Configuration) -> _Diagnosed:
+def _reactive(solution: SolutionTables, config: Configuration) -> _Diagnosed:
     judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
-    epochs = one.epochs.drop("moving", "path_m").hstack(_states(one, trusted(config)).drop("t"))
+    epochs = solution.epochs.drop("moving", "path_m").hstack(_states(solution, trusted(config)).drop("t"))
     return _channel(epochs, _DIAGNOSIS, judged, config)
 
 
@@ -111,33 +111,33 @@ def _evaluated(monitor: str) -> pl.Expr:
 
 def _composite(first: SolutionTables, second: SolutionTables, config: Configuration) -> Row:
     """Compared at the epochs of the solution that measures less often."""
-    one, other = (first, second) if _period_s(first) >= _period_s(second) else (second, first)
-    placed = on_path_of(one.epochs, other.epochs, config.lds).with_columns(fix_valid=pl.col("path_m").is_not_null())
-    positioned = one.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
+    slower, faster = (first, second) if _period_s(first) >= _period_s(second) else (second, first)
+    placed = on_path_of(slower.epochs, faster.epochs, config.lds).with_columns(fix_valid=pl.col("path_m").is_not_null())
+    positioned = slower.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
     compared = channel_monitor(positioned, placed, config).select(
         pl.col("value", "threshold", "state").name.prefix(f"{COMPARISON}_")
     )
-    row_other = paired(one.epochs, other.epochs, config.lds)["row_other"]
-    theirs = _states(other, trusted(config)).select(_STATES.gather(row_other).fill_null(value=False))
-    own = _states(one, trusted(config))
-    wrong = own["wrong"] | theirs["wrong"]
-    both = own.with_columns(
-        trusted=own["trusted"] & theirs["trusted"], known=(own["known"] & theirs["known"]) | wrong, wrong=wrong
+    row_other = paired(slower.epochs, faster.epochs, config.lds)["row_other"]
+    theirs = _states(faster, trusted(config)).select(_STATES.gather(row_other).fill_null(value=False))
+    ours = _states(slower, trusted(config))
+    wrong = ours["wrong"] | theirs["wrong"]
+    both = ours.with_columns(
+        trusted=ours["trusted"] & theirs["trusted"], known=(ours["known"] & theirs["known"]) | wrong, wrong=wrong
     )
     channel = _channel(both.hstack(compared), (COMPARISON,), _evaluated(COMPARISON), config)
-    verdicts = [verdict_of_both(alarm, (one, other), config.hazards) for alarm in channel.fails.alarms]
-    faults = fault_counts(faults_of_pair(one.faults, other.faults), channel.fails)
+    verdicts = [verdict_of_both(alarm, (slower, faster), config.hazards) for alarm in channel.fails.alarms]
+    faults = fault_counts(faults_of_pair(slower.faults, faster.faults), channel.fails)
     return faults | _alarms(channel, verdicts) | _working(channel)
 
 
-def _period_s(one: SolutionTables) -> float:
-    return nominal_period_s(position_ns(one.epochs)) or 0.0
+def _period_s(solution: SolutionTables) -> float:
+    return nominal_period_s(position_ns(solution.epochs)) or 0.0
 
 
-def _states(one: SolutionTables, position: pl.Expr) -> pl.DataFrame:
+def _states(solution: SolutionTables, position: pl.Expr) -> pl.DataFrame:
     """`position` may be relied on, a truth judged it, and judged it wrong."""
-    known = judged_epoch() & pl.lit(one.with_truth)
-    return one.epochs.select(
+    known = judged_epoch() & pl.lit(solution.with_truth)
+    return solution.epochs.select(
         "t",
         "moving",
         "path_m",
@@ -188,15 +188,15 @@ def _working(channel: _Diagnosed) -> Row:
     }
 
 
-def _redundant(one: _Diagnosed, other: _Diagnosed) -> Row:
+def _redundant(first: _Diagnosed, second: _Diagnosed) -> Row:
     """Time in which at least one of two reactive channels works; an epoch counts at its own time (LOC eq. 11)."""
     parts = [
         pl.DataFrame({"t_ns": channel.clock.t_ns, "working": channel.working, "moving": channel.moving})
-        for channel in (one, other)
+        for channel in (first, second)
     ]
     merged = pl.concat(parts).group_by("t_ns").agg(pl.col("working", "moving").any()).sort("t_ns")
     t_ns, working, moving = (merged[name].to_numpy() for name in ("t_ns", "working", "moving"))
-    limit_s = max(one.clock.limit_s, other.clock.limit_s)
+    limit_s = max(first.clock.limit_s, second.clock.limit_s)
     up = uptime(t_ns, working, limit_s)
     # Held from one working epoch to the next: between them may lie epochs of the channel that does not work.
     working_s = float(held_s(t_ns[working], limit_s)[moving[working]].sum())

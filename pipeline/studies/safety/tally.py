@@ -38,8 +38,8 @@ not, for `up_s`; time judged by a truth, and of this in work and judged wrong, w
 def added(parts: Iterable[pl.DataFrame]) -> pl.DataFrame:
     """Counts over several runs; `runs`: how many hold the solutions concerned."""
     sums = [pl.when(pl.col(name).count() > 0).then(pl.col(name).sum()) for name in (*_WHOLE, *_TIMES)]
-    found = pl.concat([pl.DataFrame(schema=COUNTS), *parts]).group_by(_KEYS, maintain_order=True)
-    return found.agg(pl.len().cast(pl.Int64).alias("runs"), *sums, pl.col("delays_s").explode().drop_nulls())
+    groups = pl.concat([pl.DataFrame(schema=COUNTS), *parts]).group_by(_KEYS, maintain_order=True)
+    return groups.agg(pl.len().cast(pl.Int64).alias("runs"), *sums, pl.col("delays_s").explode().drop_nulls())
 
 
 def architecture_figures(counts: pl.DataFrame) -> pl.DataFrame:

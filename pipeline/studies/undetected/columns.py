@@ -122,7 +122,7 @@ def _both(rows: Watched, parts: list[FaultWindow], config: UndetectedConfig) -> 
     outright = np.zeros(rows.rows, dtype=np.bool_)
     for window in parts:
         seen = rows.since(window.start, window.end, window.since_s)
-        ahead, behind = (largest_errors(one, config) for one in (seen, seen.mirrored()))
+        ahead, behind = (largest_errors(travel, config) for travel in (seen, seen.mirrored()))
         part = slice(window.start + 1, window.end + 1)
         worse = ahead.most_m >= behind.most_m
         error[:, part] = (ahead.most_m, behind.most_m)
@@ -194,7 +194,7 @@ def _at_passages(
     holding = [
         _holding(errors, row, names, least) if yes else None for row, yes in zip(at.tolist(), known, strict=True)
     ]
-    return pl.DataFrame([pl.Series(name, one, nan_to_null=True) for name, one in values.items()]).with_columns(
+    return pl.DataFrame([pl.Series(name, column, nan_to_null=True) for name, column in values.items()]).with_columns(
         undetected_since=pl.Series(since, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
         undetected_monitors=pl.Series(holding, dtype=pl.List(pl.String)),
     )

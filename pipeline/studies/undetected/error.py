@@ -48,11 +48,11 @@ def largest_errors(
             most[begin] = min(_across(window, begin, most), after_level[begin])
             outright[begin] = after_level[begin] == most[begin]
         if begin + 1 < beyond:
-            found = grow(stretch_after(window, begin, beyond - 1, known=begin == 0))
+            growth = grow(stretch_after(window, begin, beyond - 1, known=begin == 0))
             part = slice(begin + 1, beyond)
             learned = np.cumsum(window.learned_m[part]) + window.learned_late_m[part]
-            grown = most[begin] + (window.learned_late_m[begin] if begin else 0.0) + found.most_m + learned
-            paid[part] = found.paid_m
+            grown = most[begin] + (window.learned_late_m[begin] if begin else 0.0) + growth.most_m + learned
+            paid[part] = growth.paid_m
             outright[part] = after_level[part] < grown
             most[part] = np.minimum(grown, after_level[part])
     return Errors(most[1:], paid[1:], outright[1:])

@@ -48,7 +48,7 @@ def largest_profile(window: Watched, margin: float = 0.0) -> Optimum:
     program = _program(window, margin)
     goal = np.zeros(program.low.size)
     goal[program.fault[-1]] = -1.0
-    found = linprog(
+    solution = linprog(
         goal,
         A_eq=program.equations,
         b_eq=program.right,
@@ -58,10 +58,10 @@ def largest_profile(window: Watched, margin: float = 0.0) -> Optimum:
         method="highs-ds",
         options={"primal_feasibility_tolerance": _TOLERANCE, "dual_feasibility_tolerance": _TOLERANCE},
     )
-    if found.status != 0:
-        raise BaliseError("the linear program of the largest error has no solution", found=str(found.message))
-    fault = np.concatenate([[0.0], found.x[program.fault]])
-    return Optimum(float(fault[-1]), fault, _binding(window, program, found.x))
+    if solution.status != 0:
+        raise BaliseError("the linear program of the largest error has no solution", found=str(solution.message))
+    fault = np.concatenate([[0.0], solution.x[program.fault]])
+    return Optimum(float(fault[-1]), fault, _binding(window, program, solution.x))
 
 
 class _Program(NamedTuple):
@@ -86,7 +86,7 @@ def _program(window: Watched, margin: float) -> _Program:
     count = window.rows - 1
     averages = window.weight.shape[1]
     seen = ~window.fresh[1:]
-    one = sparse.identity(count)
+    unit = sparse.identity(count)
     scale = np.maximum(np.maximum(np.abs(window.most_mps), np.abs(window.least_mps)), 1e-9)[1:]
     limits = np.where(np.isfinite(window.threshold_mps), window.threshold_mps, 1e6) * (1.0 - margin)
     # Blocks of the matrix: an equation each, over y, each average, the fault and the unseen growth.
@@ -99,14 +99,14 @@ def _program(window: Watched, margin: float) -> _Program:
         carried = sparse.diags(keep[1:] * limit[1:-1] / limit[2:], -1, shape=(count, count))
         row: list[sparse.spmatrix | None] = [None] * (averages + 3)
         row[0] = sparse.diags(-weight * scale / limit[1:])
-        row[1 + average] = one - carried
+        row[1 + average] = unit - carried
         blocks.append(row)
         begin = np.zeros(count)
         begin[0] = keep[0] * window.average_mps[0, average] / limit[1]
         right.append(begin)
     way_s = np.where(seen, -window.way_s[1:], 0.0)
-    grown = one - sparse.diags(np.ones(count - 1), -1, shape=(count, count))
-    blocks.append([sparse.diags(way_s * scale), *[None] * averages, grown, -one])
+    grown = unit - sparse.diags(np.ones(count - 1), -1, shape=(count, count))
+    blocks.append([sparse.diags(way_s * scale), *[None] * averages, grown, -unit])
     right.append(way_s * window.rate_mps[1:])
     order = np.arange((averages + 3) * count).reshape(-1, count).T.ravel()
     relinks, relink_bounds = _relinks(window, averages + 1)
@@ -115,7 +115,7 @@ def _program(window: Watched, margin: float) -> _Program:
     ones = [np.ones(count)] * averages
     low, high = (
         np.array(
-            [np.where(seen, inside * raw_mps[1:] / scale, 0.0), *(side * one for one in ones), fault_m[1:], grown_m]
+            [np.where(seen, inside * raw_mps[1:] / scale, 0.0), *(side * unit for unit in ones), fault_m[1:], grown_m]
         )
         for side, raw_mps, fault_m, grown_m in (
             (-1.0, window.least_mps, window.low_m, -most),

@@ -41,7 +41,10 @@ def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle,
     rows = rows_of(diagnosis, vehicle, config)
     t_ns = times_ns(diagnosis.epochs)
     row = int(np.searchsorted(rows.epoch, epoch))
-    window = next((one for one in windows(rows, t_ns, diagnosis.fixes_ns) if one.start < row <= one.end), None)
+    window = next(
+        (candidate for candidate in windows(rows, t_ns, diagnosis.fixes_ns) if candidate.start < row <= candidate.end),
+        None,
+    )
     if window is None or row >= rows.rows or rows.epoch[row] != epoch:
         raise UsageError(
             "has no fault to look for",
@@ -51,18 +54,18 @@ def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle,
     against = behind != bool(ints(diagnosis.epochs["direction"], unknown=1)[epoch] < 0)
     part = rows.since(window.start, row, window.since_s)
     seen = part.mirrored() if against else part
-    found = largest_profile(seen, MARGIN)
+    optimum = largest_profile(seen, MARGIN)
     names = [name for name, on in zip(SCALES, diagnosis.bank.enabled, strict=True) if on or name == "raw"]
     return FaultProfile(
         fault=pl.DataFrame(
-            {"t_s": [window.since_s, *part.t_s[1:]], "size_m": -found.fault_m if against else found.fault_m}
+            {"t_s": [window.since_s, *part.t_s[1:]], "size_m": -optimum.fault_m if against else optimum.fault_m}
         ),
         t=pl.Series("t", [window.since_ns, int(t_ns[epoch])]).cast(pl.Datetime("ns", "UTC")),
-        error_m=found.error_m,
+        error_m=optimum.error_m,
         bound_m=float(largest_errors(seen, config.undetected).most_m[-1]),
         step_m=largest_of_shape(seen, "step"),
         ramp_m=largest_of_shape(seen, "ramp"),
-        monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in found.binding),
+        monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in optimum.binding),
     )
 
 
@@ -84,8 +87,8 @@ def epoch_of(
         row = int(np.searchsorted(stamps, latest, side="right")) - 1
         return int(rows.epoch[row]) if row >= 0 else 0
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
-    own = (passages["balise_id"] == balise).to_numpy() & (at >= 0)
-    if not own.any():
+    of_balise = (passages["balise_id"] == balise).to_numpy() & (at >= 0)
+    if not of_balise.any():
         known = ", ".join(passages["balise_id"].unique(maintain_order=True).to_list())
         raise UsageError("is no balise that a watched position passed", place=balise, expected=known)
-    return int(rows.epoch[at[own][0]])
+    return int(rows.epoch[at[of_balise][0]])

@@ -33,37 +33,37 @@ def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tupl
     errors = partial(largest_errors, config=config.undetected, grow=grow, after=splits_after(rows, config.undetected))
     search = partial(_first_beyond, both, errors=errors, limit_m=config.hazards.failure_limit_m, ahead_s=step_s)
     starts = np.unique(np.searchsorted(rows.t_s, np.arange(rows.t_s[0], rows.t_s[-1], step_s))).tolist()
-    found = {start: search(start) for start in starts if start + 1 < rows.rows}
+    first_beyond = {start: search(start) for start in starts if start + 1 < rows.rows}
     close = 1.0 - config.undetected.spacing_close_share
-    ways, times = (_shortest(found, place, close, search) for place in (way_m, rows.t_s))
-    reached = sum(row < rows.rows for row in found.values())
-    return Spacing(ways, times, len(found), reached), _before(found, way_m)
+    ways, times = (_shortest(first_beyond, place, close, search) for place in (way_m, rows.t_s))
+    reached = sum(row < rows.rows for row in first_beyond.values())
+    return Spacing(ways, times, len(first_beyond), reached), _before(first_beyond, way_m)
 
 
-def _shortest(found: dict[int, int], place: Floats, close: float, search: Callable[[int], int]) -> float | None:
+def _shortest(first_beyond: dict[int, int], place: Floats, close: float, search: Callable[[int], int]) -> float | None:
     """The shortest way (or time) from any row to the last one within the limit; `found`: first row beyond, by start.
 
     From between two starts it is no shorter than from the second one to where the first reaches the limit. More starts
     are tried until the two agree to the share `close`.
     """
     while True:
-        starts = sorted(found)
-        if any(row < place.size and place[row - 1] <= place[start] for start, row in found.items()):
+        starts = sorted(first_beyond)
+        if any(row < place.size and place[row - 1] <= place[start] for start, row in first_beyond.items()):
             return 0.0
         pairs = zip(starts, [*starts[1:], place.size - 1], strict=True)
-        sure = [(float(place[found[one] - 1] - place[after]), one, after) for one, after in pairs]
-        least, one, after = min((item for item in sure if found[item[1]] < place.size), default=(None, 0, 0))
+        sure = [(float(place[first_beyond[before] - 1] - place[after]), before, after) for before, after in pairs]
+        least, before, after = min((item for item in sure if first_beyond[item[1]] < place.size), default=(None, 0, 0))
         if least is None:
             return None
-        if after <= one + 1 or least >= close * (place[found[one] - 1] - place[one]):
+        if after <= before + 1 or least >= close * (place[first_beyond[before] - 1] - place[before]):
             return max(least, 0.0)
-        found[(one + after) // 2] = search((one + after) // 2)
+        first_beyond[(before + after) // 2] = search((before + after) // 2)
 
 
-def _before(found: dict[int, int], way_m: Floats) -> Floats:
+def _before(first_beyond: dict[int, int], way_m: Floats) -> Floats:
     """How far before each row a balise keeps it within the limit: the first start that does, NaN where all do."""
-    starts = np.array(sorted(found))
-    beyond = np.maximum.accumulate([found[start] for start in starts])
+    starts = np.array(sorted(first_beyond))
+    beyond = np.maximum.accumulate([first_beyond[start] for start in starts])
     rows = np.arange(way_m.size)
     first = np.searchsorted(beyond, rows, side="right")
     at = np.minimum(starts[np.minimum(first, starts.size - 1)], rows)
@@ -81,7 +81,7 @@ def _first_beyond(
     while True:
         end = min(int(np.searchsorted(rows.t_s, rows.t_s[start] + ahead_s)), rows.rows - 1)
         end = max(end, start + 1)
-        most = np.maximum(*(errors(one.since(start, end)).most_m for one in both))
+        most = np.maximum(*(errors(travel.since(start, end)).most_m for travel in both))
         beyond = np.flatnonzero(most > limit_m)
         if beyond.size:
             return start + 1 + int(beyond[0])

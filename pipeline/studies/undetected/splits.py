@@ -44,10 +44,10 @@ class _Blocks(NamedTuple):
         block = self.of_row[row]
         each = np.arange(row.size)
         along = (row - self.first[block]) / np.maximum(self.last[block] - self.first[block], 1)
-        found = np.zeros((row.size, 2 * self.first.size))
-        found[each, 2 * block] = 1.0 - along
-        found[each, 2 * block + 1] = along
-        return found
+        weights = np.zeros((row.size, 2 * self.first.size))
+        weights[each, 2 * block] = 1.0 - along
+        weights[each, 2 * block + 1] = along
+        return weights
 
 
 def best_shares(stretch: GrowthStretch) -> Floats:
@@ -58,7 +58,7 @@ def best_shares(stretch: GrowthStretch) -> Floats:
     blocks = _Blocks.over(stretch.rows)
     monitors = 1 + stretch.seen.weight.shape[1]
     ends = 2 * blocks.first.size
-    parts = [_raw(stretch, blocks), *(_average(stretch, blocks, one) for one in range(monitors - 1))]
+    parts = [_raw(stretch, blocks), *(_average(stretch, blocks, average) for average in range(monitors - 1))]
     costs = np.concatenate([part.cost for part in parts])
     linear = np.concatenate([part.linear for part in parts])
     gauge = max(float(costs.max()), 1e-12)
@@ -66,14 +66,14 @@ def best_shares(stretch: GrowthStretch) -> Floats:
     # Each term is what it has above zero less what it has below; shares add up to one at both ends of each block.
     whole = np.tile(np.eye(ends), monitors)
     nothing = np.zeros((ends, 2 * costs.size))
-    found = linprog(
+    optimum = linprog(
         np.concatenate([linear, costs, costs]) / gauge,
         A_eq=np.block([[block_diag(*(part.terms for part in parts)), -each, each], [whole, nothing]]),
         b_eq=np.concatenate([np.zeros(costs.size), np.ones(ends)]),
         bounds=np.array([(-np.inf, np.inf)] * (monitors * ends) + [(0.0, np.inf)] * (2 * costs.size)),
         method="highs-ds",
     )
-    knots = found.x[: monitors * ends].reshape(monitors, ends) if found.status == 0 else np.zeros((monitors, ends))
+    knots = optimum.x[: monitors * ends].reshape(monitors, ends) if optimum.status == 0 else np.zeros((monitors, ends))
     shares: Floats = blocks.lines(np.arange(stretch.rows)) @ knots.T
     # They add up to one, to the last digit.
     shares[:, 0] += 1.0 - shares.sum(axis=1)
@@ -152,7 +152,7 @@ def growth_with(stretch: GrowthStretch, splits: Iterable[Floats]) -> Growth:
     monitors = 1 + stretch.seen.weight.shape[1]
     paid = np.zeros((stretch.rows, monitors))
     # All to one monitor, and the splits.
-    for shares in (*(np.tile(one, (stretch.rows, 1)) for one in np.eye(monitors)), *splits):
+    for shares in (*(np.tile(alone, (stretch.rows, 1)) for alone in np.eye(monitors)), *splits):
         part = stretch.first(len(shares))
         bills = paid_m(part, shares[: part.rows])
         total = bills.sum(axis=1)
@@ -173,7 +173,7 @@ def horizons(rows: int) -> list[int]:
 
     The best split up to one row is good up to the rows around it too.
     """
-    found = [2]
-    while found[-1] < rows:
-        found.append(min(max(found[-1] + 1, int((1.0 + GROWTH) * found[-1])), rows))
-    return found if rows > 1 else []
+    lengths = [2]
+    while lengths[-1] < rows:
+        lengths.append(min(max(lengths[-1] + 1, int((1.0 + GROWTH) * lengths[-1])), rows))
+    return lengths if rows > 1 else []

@@ -197,17 +197,17 @@ def _with_relinks(rows: Watched, held: tuple[Held, ...]) -> Watched:
     held_low = rows.held_low_m.copy()
     held_high = rows.held_high_m.copy()
     free = rows.free.copy()
-    for one in held:
-        row = int(np.searchsorted(rows.epoch, one.epoch))
-        if row >= rows.rows or rows.epoch[row] != one.epoch:
+    for relink in held:
+        row = int(np.searchsorted(rows.epoch, relink.epoch))
+        if row >= rows.rows or rows.epoch[row] != relink.epoch:
             continue
         late_m = rows.learned_late_m[row]
-        bounds = -one.bound_m - one.moved_m - late_m, one.bound_m - one.moved_m + late_m
-        if one.anchor_epoch is None:
+        bounds = -relink.bound_m - relink.moved_m - late_m, relink.bound_m - relink.moved_m + late_m
+        if relink.anchor_epoch is None:
             low[row] = max(low[row], bounds[0])
             high[row] = min(high[row], bounds[1])
         else:
-            anchor[row] = int(np.searchsorted(rows.epoch, one.anchor_epoch))
+            anchor[row] = int(np.searchsorted(rows.epoch, relink.anchor_epoch))
             late_m = rows.learned_late_m[anchor[row]]
             held_low[row] = bounds[0] - late_m
             held_high[row] = bounds[1] + late_m
@@ -221,12 +221,12 @@ def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...
     Physical balises read on the path, the reference by configuration, and configured starts of mission. The run's
     first row is a start of mission in any case.
     """
-    found: list[Ints] = [np.array([round(t.timestamp() * 1e9) for t in missions], dtype=np.int64)]
+    times: list[Ints] = [np.array([round(t.timestamp() * 1e9) for t in missions], dtype=np.int64)]
     if "read" in config.fixes:
-        found.append(times_ns(crossings.filter(kind=BaliseKind.PHYSICAL.value)))
+        times.append(times_ns(crossings.filter(kind=BaliseKind.PHYSICAL.value)))
     if "reference" in config.fixes and run.reference is not None:
-        found.append(times_ns(run.reference))
-    return np.unique(np.concatenate(found))
+        times.append(times_ns(run.reference))
+    return np.unique(np.concatenate(times))
 
 
 class FaultWindow(NamedTuple):

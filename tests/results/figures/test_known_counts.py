@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.campaign.outcome import outcome_of
-from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.known_counts import known_counts
 from pipeline.results.store import write_run
 from pipeline.show.inspection import inspect_result
-from schemas.config import Configuration, Vehicle
 from schemas.run import RunTables
 from schemas.tables import TABLES, Hazards, Passages, Runs
 from tests.tables import table
@@ -37,11 +35,10 @@ def test_without_evidence_the_judged_counts_are_not_known_and_of_a_failed_run_no
 
 
 def test_outcome_of_a_run() -> None:
-    job = RunJob("r", "r", "site", "", Configuration(), Vehicle(), "out", "")
     told = [
         (found.hazards, found.missed_detections)
         for found in (
-            outcome_of(job, rows, Hazards.create_empty(), Passages.create_empty())
+            outcome_of("r", "r", 0.0, rows, Hazards.create_empty(), Passages.create_empty())
             for rows in (ROWS, ROWS[1:2], ROWS[2:])
         )
     ]

@@ -186,6 +186,19 @@ def test_a_balise_is_passed_where_the_whole_interval_passes_it(half_m: float, la
     assert found == {"V": [TrueCrossing(round(9.5 * NS), 1, half_m > 5.0)] * crossings}
 
 
+@pytest.mark.parametrize(("turn_m", "passed_s"), [(110.0, []), (150.0, [9.5, 19.5])])
+def test_a_train_that_turns_at_a_balise_has_not_surely_passed_it(turn_m: float, passed_s: list[float]) -> None:
+    """From 5 m on at 10 m/s to a turn beyond a balise at 100 m, and back to 5 m, known to 40 m."""
+    there_m = np.arange(5.0, turn_m, 10.0)
+    at_m = np.concatenate([there_m, there_m[::-1]])
+    rows = np.arange(at_m.size)
+    route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
+    evidence = EvidenceSet(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - 40.0, at_m + 40.0),))
+    found = true_crossings(rows * NS, evidence, {"V": Place(0, 100.0)}, Configuration())
+    assert [crossing.t_ns / NS for crossing in found["V"]] == passed_s
+    assert [crossing.sense for crossing in found["V"]] == [1, -1][: len(passed_s)]
+
+
 @pytest.mark.parametrize(("alarm_s", "onset_s", "standing"), [(3, 3, True), (12, 10, False), (None, 10, False)])
 def test_an_alarm_shortly_before_a_drift_is_its_onset_and_was_there_before_it(
     alarm_s: int | None, onset_s: int, standing: bool

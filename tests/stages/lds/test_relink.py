@@ -221,13 +221,14 @@ def test_a_drift_that_goes_on_after_a_return_is_negated_again(drift_mps: float, 
     assert result.epochs["alarm"][again or 80] is (again is not None)
 
 
-def test_a_telegram_ends_the_hold_after_a_return() -> None:
-    """P1 at 1410 m is read where the position is 6 m ahead: from then on that is the anchor, and no hold."""
+@pytest.mark.parametrize(("ahead_m", "again"), [(0.0, 78), (6.0, 109)])
+def test_a_telegram_renews_what_a_position_is_held_to_after_a_return(ahead_m: float, again: int) -> None:
+    """The telegram at 70.5 s lies where the train is, or where the position is, 6 m ahead; bounds are 7.5 and 7.7 m."""
     odometer_m = steps(0.0, 20.0, 120)
     path_m = [x + 0.2 * max(k - 40, 0) for k, x in enumerate(odometer_m)]
-    balises = balises_at(V1_P1, kind=KINDS)
+    balises = balises_at({"V1": 110.0, "P1": 1410.0 + ahead_m}, kind=KINDS)
     result = run(epochs_of(path_m, odometer_m), balises, ScriptedBank([20]), reads_at([(70.5, "P1")]))
-    assert negations(result) == [(20, 50)]
+    assert negations(result) == [(20, 50), (again, None)]
 
 
 # After an outage

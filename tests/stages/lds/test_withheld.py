@@ -5,6 +5,7 @@ One epoch a second at 20 m/s; V1 is crossed at 5.5 s, the first TVB is at 7 s.
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import Any
 
 import pytest
@@ -108,22 +109,24 @@ def test_where_slip_may_hide_a_failure_nothing_links_again() -> None:
     assert result.held[-1].bound_m == pytest.approx(19.9)
 
 
-def test_slip_late_in_a_run_is_held_against_the_last_tvb_before_it() -> None:
-    """Three times 6 m are miscounted and one alarm lies before: each slip explains its own 6 m, not all 18 m."""
-    slips = [k % 60 in range(40, 50) for k in range(200)]
-    counted_m = [6.0 * sum(k >= 60 * leg + 50 for leg in range(3)) for k in range(200)]
-    odometer_m = [None if slips[k] else x + counted_m[k] for k, x in enumerate(steps(0.0, 20.0, 200))]
+@pytest.mark.parametrize(("later_s", "withheld"), [(0, [None, "relink", "relink"]), (1020, [None] * 3)])
+def test_slips_add_up_while_a_position_is_held_after_a_return(later_s: int, withheld: list[str | None]) -> None:
+    """An alarm at 8 s, held from 38 s for 1000 s: in it 12 m are too much, later each slip explains its own 6 m."""
+    count = later_s + 200
+    slips = [k >= later_s and (k - later_s) % 60 in range(40, 50) for k in range(count)]
+    counted_m = [6.0 * sum(k >= later_s + 60 * leg + 50 for leg in range(3)) for k in range(count)]
+    odometer_m = [None if slips[k] else x + counted_m[k] for k, x in enumerate(steps(0.0, 20.0, count))]
     epochs = epochs_of(
-        steps(0.0, 20.0, 200),
+        steps(0.0, 20.0, count),
         odometer_m,
         odometer_slips=slips,
-        odometer_segment=[sum(slips[: k + 1]) for k in range(200)],
-        odometer_counter=[0] * 200,
+        odometer_segment=list(accumulate(map(int, slips))),
+        odometer_counter=[0] * count,
         slip_doubt_m=counted_m,
     )
     result = run(epochs, balises_at(V), ScriptedBank([8]), anchor_lag_s=0.0)
     assert negations(result) == [(8, 38)]
-    assert [result.epochs["withheld_for"][k] for k in (51, 111, 171)] == [None] * 3
+    assert [result.epochs["withheld_for"][later_s + k] for k in (51, 111, 171)] == withheld
 
 
 def test_a_position_that_comes_back_after_slip_links_again() -> None:

@@ -56,6 +56,13 @@ def test_by_hand_an_offset_that_alternates() -> None:
     assert fast == raw
 
 
+@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.2, 0.25, 0.5, 1.0])
+def test_the_noise_is_known_after_30_s_at_every_rate(period_s: float) -> None:
+    """`noise_first_s`: with a sample every second the first is at 1 s, and the 29th, of 29.6 s asked for, at 29 s."""
+    known_from = meter_of(series_of(np.zeros(round(100.0 / period_s)), period_s)).known_from()
+    assert known_from * period_s == pytest.approx(30.0, abs=1.01 * period_s)
+
+
 def test_a_drift_is_no_noise() -> None:
     assert noise_m(0.5 * np.arange(1000.0), 999) == [0.0] * 4
 
