@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
 from random import Random
@@ -130,7 +130,8 @@ class Bench:
         left_out = [word for name in self.failing_anyway(folders, speed) for word in left_out_by(name)]
         place = self.copy / mutant.path.relative_to(ROOT)
         original = place.read_text(encoding="utf-8")
-        place.write_text(mutant.source(), encoding="utf-8")
+        # Made of the copy: the project may be worked on meanwhile.
+        place.write_text(replace(mutant, path=place).source(), encoding="utf-8")
         begin = time.monotonic()
         try:
             done = run_tests(self.copy, folders, ["-m", speed, "-x", *left_out], self.limit_s)

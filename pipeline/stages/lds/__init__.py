@@ -29,6 +29,7 @@ Touches no file, knows of no truth, and asks the monitors only through `MonitorB
   first usable position has to re-link, for the window is too wide to see what came of it: where it has moved, the
   linking distance monitor fails; where that cannot be said, the position is negated without an alarm until a telegram.
 - After slip that the odometer reports no alarm stands, so the last TVB before it, or a later telegram, is the anchor.
+  While a position is held to an anchor after a return, it is that one.
 - A start of mission (`lds.starts_of_mission`) forgets LRVB, linking and anchor.
 - Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
 """

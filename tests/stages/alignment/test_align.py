@@ -10,6 +10,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from pipeline.stages.alignment.align import BEYOND_SPAN, align, odometer_at, speed_of_positions
+from pipeline.stages.alignment.odometer_filter import stamp_jitter_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.odometry.odometry import Noise
@@ -266,3 +267,26 @@ def test_learning_begins_with_the_first_epoch():
 
 def test_a_leap_to_the_second_epoch_stops_the_learning():
     np.testing.assert_array_equal(ten_epochs(50.0), 0.01)
+
+
+def test_slip_is_that_of_the_rows_about_an_epoch_inside_the_odometer():
+    """Rows at 0, 1, ... 6 s, of which those at 2 s and at 6 s slip; epochs half a second later, two of them beyond."""
+    odometer = odometer_of(np.arange(7.0), distance_m=10.0 * np.arange(7.0), slip=[k in (2, 6) for k in range(7)])
+    epochs = epochs_of(0.5 + np.arange(-1.0, 8.0), 5.0 + 10.0 * np.arange(-1.0, 8.0))
+    vehicle = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4, gnss_latency_s=0.0, gnss_latency_sigma_s=0.01)
+    found = align_run(epochs, odometer, vehicle, CONFIG)["odometer_slips"].to_list()
+    assert found == [False, False, True, True, False, False, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("t_s", "clock_periods", "jitter_s"),
+    [
+        ([0.0, 1.0, 2.0, 3.0, 4.0], 3.0, 0.0),
+        ([0.0, 1.02, 2.0, 3.02, 4.0, 5.0], 3.0, np.sqrt(4 * 0.02**2 / 5 / 2)),  # five steps, four of them 20 ms off
+        ([0.0, 1.0, 2.0, 3.0, 5.1], 3.0, np.sqrt(0.1**2 / 4 / 2)),  # of two periods, 0.1 s late
+        ([0.0, 1.0, 2.0, 3.0, 8.1], 3.0, 0.0),  # of five: the clock may have started anew
+        ([0.0, 1.0, 101.0], 1.0, 0.0),  # no step is of one period: nothing shows how the stamps scatter
+    ],
+)
+def test_stamps_scatter_by_how_far_their_steps_are_off_whole_periods(t_s, clock_periods, jitter_s):
+    assert stamp_jitter_s(np.array(t_s), clock_periods) == pytest.approx(jitter_s, abs=1e-12)

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
-from pipeline.stages.judge.alarms import healthy_across, verdict_of, verdict_within
+from pipeline.stages.judge.alarms import _belongs, healthy_across, verdict_of, verdict_within
 from pipeline.stages.judge.attribution import suspect_of
 from pipeline.stages.judge.case import Case, Solution
 from pipeline.stages.judge.cross_errors import cross_errors
@@ -712,3 +712,48 @@ def test_whether_an_alarm_was_due(error_m: float, half_m: float, evidence: str, 
     # What comes after the alarm says nothing of it.
     early = AlarmEpisode(2, 2, 2 * NS, 2 * NS, (monitor,), 2.0)
     assert verdict_of(early, epochs, healthy_across(epochs, config), config) is not Verdict.TRUE
+
+
+@pytest.mark.parametrize(
+    ("onset_s", "end_s", "detected_s", "belongs"),
+    [
+        (3, 6, None, True),  # the fault lasted into the alarm
+        (6, 7, None, True),
+        (7, 12, None, True),
+        (1, 4, None, False),
+        (9, 12, None, False),
+        (1, 4, 5, True),  # over before the alarm that showed it
+        (1, 4, 8, True),
+        (1, 4, 4, False),
+        (1, 4, 9, False),  # shown by a later alarm
+    ],
+)
+def test_an_alarm_belongs_to_the_fault_that_lasted_or_that_it_showed(
+    onset_s: int, end_s: int, detected_s: int | None, belongs: bool
+) -> None:
+    """An alarm from 5 s to 8 s."""
+    alarm = AlarmEpisode(5, 8, 5 * NS, 8 * NS, ("along_raw",), 2.0)
+    episode = replace(EPISODE, onset_ns=onset_s * NS, end_ns=end_s * NS, detection=Detection(ns(detected_s)))
+    assert _belongs(alarm, episode) is belongs
+
+
+def test_what_was_offered_and_of_it_what_the_lds_accepted() -> None:
+    """Two crossings came to no passage: one before the balise was armed again, one that is no offer at all."""
+    rows = [
+        # balise, kind, status, offered, t
+        ("V3", "virtual", "accepted", True, 30),
+        ("V1", "virtual", "accepted", True, 10),
+        ("V2", "virtual", "rejected_window", True, 20),
+        ("P1", "physical", "accepted", True, 11),
+        ("V1", "virtual", None, False, 12),
+        ("V4", "virtual", "missed", False, 40),
+        ("V5", None, "accepted", True, 50),
+    ]
+    crossings = pl.DataFrame(rows, schema=["balise_id", "kind", "status", "offered", "t"], orient="row")
+    absent: Any = None
+    solution = Solution("primary", absent, absent, crossings, absent, absent, absent)
+    assert solution.offers.select("balise_id", "virtual", "accepted").rows() == [
+        ("V3", True, True), ("V1", True, True), ("V2", True, False), ("P1", False, False), ("V1", True, False),
+        ("V5", None, False),
+    ]  # fmt: skip
+    assert solution.accepted["balise_id"].to_list() == ["V1", "V3"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import polars as pl
 import pytest
 
 from benchmarks.noise import Receiver, epochs_of, first_alarm
-from pipeline.stages.monitors.axis import AxisSeries, errors_of
+from pipeline.stages.monitors.axis import AxisSeries, Source, errors_of
 from pipeline.stages.monitors.bank import NOISE_TOO_LARGE, NOISE_UNKNOWN, MonitorBank
 from pipeline.stages.monitors.noise import NoiseMeter
 from schemas.arrays import Floats
@@ -19,8 +20,10 @@ from schemas.enums import MonitorState
 CONFIG = Configuration()
 
 
-def series_of(offset_m: Floats, period_s: float = 1.0, sigma_m: float = 0.0) -> AxisSeries:
-    """An axis whose offset is this, epoch by epoch, with smooth errors of this sigma stated."""
+def series_of(
+    offset_m: Floats, period_s: float = 1.0, sigma_m: float = 0.0, beside: Sequence[Source] = ()
+) -> AxisSeries:
+    """An axis whose offset is this, epoch by epoch, with smooth errors of this sigma stated, and other errors."""
     count = offset_m.size
     dt_s = np.full(count, period_s)
     nothing, never = np.zeros(count), np.zeros(count, dtype=np.bool_)
@@ -30,7 +33,7 @@ def series_of(offset_m: Floats, period_s: float = 1.0, sigma_m: float = 0.0) -> 
         border=never,
         dt_s=dt_s,
         rate_mps=np.diff(offset_m, prepend=offset_m[:1]) / dt_s,
-        **errors_of(np.full(count, sigma_m), dt_s, [], CONFIG.monitors),
+        **errors_of(np.full(count, sigma_m), dt_s, beside, CONFIG.monitors),
         white_m2=nothing,
         border_m2=nothing,
         lasting_mps=np.zeros((count, 0)),
@@ -54,6 +57,21 @@ def test_by_hand_an_offset_that_alternates() -> None:
     raw, fast, *_ = noise_m(0.01 * (-1.0) ** np.arange(200), 199)
     assert raw == pytest.approx(0.0297, rel=0.045)
     assert fast == raw
+
+
+@pytest.mark.parametrize(("kept", "times"), [(0.0, 6.0), (0.5, 2.5), (0.9, 0.42), (1.0, 0.0)])
+def test_an_error_that_the_model_knows_is_taken_off_by_its_second_differences(kept: float, times: float) -> None:
+    """Of an error that keeps this part from epoch to epoch: (1 + 4 + 1) - (4 + 4) kept + 2 kept^2 times its variance.
+
+    Digits keep nothing, and an offset of the survey all; four variances of a second difference are one of noise.
+    """
+    config = Configuration.model_validate({"monitors": {"noise_doubt": 0.0}})
+    offset_m = 0.01 * (-1.0) ** np.arange(200)
+    known = np.full(200, 0.01), np.full(200, 1.0 - kept)
+    without, beside = (
+        meter_of(series_of(offset_m, beside=errors), config).variance_m2(199, 200)[0, 0] for errors in ([], [known])
+    )
+    assert without - beside == pytest.approx(0.25 * times * 0.01**2, rel=1e-6, abs=1e-12)
 
 
 @pytest.mark.parametrize("period_s", [0.05, 0.1, 0.2, 0.25, 0.5, 1.0])

@@ -1,0 +1,109 @@
+"""What single samples of a reference are as evidence, on ways along one element worked out by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.stages.evidence.anchors import Sided, known_stretch, reference_lag, sided
+from pipeline.stages.evidence.carrying import Counter, TrueAnchor
+from pipeline.stages.evidence.clock import RecorderClock, RecorderLag
+from pipeline.stages.odometry import odometry_of
+from pipeline.stages.reference import ReferencePath, ReferenceStretch
+from pipeline.stages.track.path import Place, RoutePath
+from schemas.arrays import NS_PER_S, Floats, Ints
+from schemas.config import Configuration, Vehicle
+from schemas.enums import Evidence
+from tests.stages.matching.builders import odometer
+
+CONFIG = Configuration()
+SURE = RecorderClock(RecorderLag(0.0, 0.0), 0.0, 0.0, assumed=False)
+
+
+def ns(t_s: Floats) -> Ints:
+    return np.round(t_s * NS_PER_S).astype(np.int64)
+
+
+def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch:
+    """Samples to 0.1 m along element 4, which is 10 km long and entered at 0 m."""
+    route = RoutePath(np.array([4]), np.array([forward]), np.zeros(1), np.zeros(1), np.array([10_000.0]))
+    path = ReferencePath(np.zeros(t_s.size, dtype=np.int64), at_m, (route,))
+    return ReferenceStretch(ns(t_s), np.full(t_s.size, 0.1), (path,))
+
+
+def counter(at_m: Floats, rate_hz: float) -> Counter:
+    found = odometry_of(odometer(at_m, rate_hz), Vehicle(), CONFIG)
+    assert found is not None
+    return Counter.of(found)
+
+
+@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize("away", [True, False])
+def test_a_stretch_faces_along_its_element_as_the_odometer_counts_up(forward: bool, away: bool) -> None:
+    """Oriented elements are twice their number in the sense of the measure, and one more against it."""
+    t_s = np.arange(0.0, 61.0)
+    at_m = 10.0 * t_s if away else 600.0 - 10.0 * t_s
+    side = sided(stretch(t_s, at_m, forward), counter(10.0 * t_s, 1.0), 50.0)
+    assert side.sense == (1 if away else -1)
+    assert side.facing == (8 if forward is away else 9)
+    assert (side.with_m, side.against_m) == pytest.approx((600.0, 0.0))
+
+
+def test_a_shunt_before_the_journey_does_not_turn_the_sense() -> None:
+    """An odometer without a sign: 20 m back, less than the 50 m that tell the sense, then 300 m ahead."""
+    t_s = np.arange(0.0, 40.0)
+    at_m = np.interp(t_s, [0, 4, 9, 39], [100, 80, 80, 380])
+    counted_m = np.interp(t_s, [0, 4, 9, 39], [0, 20, 20, 320])
+    side = sided(stretch(t_s, at_m), counter(counted_m, 1.0), 50.0)
+    assert (side.sense, side.with_m, side.against_m) == (1, pytest.approx(300.0), pytest.approx(20.0))
+
+
+def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
+    """Seven ways of ten seconds, and six are enough; the odometer stamps 0.4 s earlier."""
+    fine_s = np.arange(0.0, 73.0, 0.01)
+    way_m = np.cumsum(np.interp(fine_s, [0, 12, 24, 36, 48, 60, 72], [4, 28, 6, 30, 8, 26, 4])) * 0.01
+    t_s = np.arange(0.0, 71.0, 0.1)
+    late = stretch(t_s + 0.4, np.interp(t_s, fine_s, way_m))
+    counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, way_m), 10.0)
+    found = reference_lag([Sided(late, 1, 1.0, 0.0)], counted)
+    assert found.lag_s == pytest.approx(0.4, abs=0.03)
+    assert found.sigma_s < 0.05
+    cut = late.t_ns <= 60 * NS_PER_S
+    path = replace(late.paths[0], leg=late.paths[0].leg[cut], at_m=late.paths[0].at_m[cut])
+    few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (path,))
+    assert reference_lag([Sided(few, 1, 1.0, 0.0)], counted) == RecorderLag()
+
+
+def test_a_clock_counts_by_the_greatest_speed_that_it_leaves_possible() -> None:
+    """t^2 metres: 2 t m/s at each sample over a second about it, 2 (t + 0.5) half a second later."""
+    t_s = np.arange(0.0, 10.25, 0.25)
+    clock = replace(SURE, shift_s=3.0, delta_s=0.5)
+    found = known_stretch(Sided(stretch(t_s + 3.0, t_s**2), 1, 1.0, 0.0), clock, [], [], 0.0, CONFIG)
+    assert found.t_ns.tolist() == ns(t_s).tolist()
+    assert found.clock_m[4:36] == pytest.approx(0.5 * 2.0 * (t_s[4:36] + 0.5))
+    assert found.clock_m[0] == pytest.approx(0.5 * 1.0)  # at 0.5 s; before the first sample nothing moved faster
+
+
+@pytest.mark.parametrize(
+    ("read_s", "read_m", "closed"),
+    [(12.0, 120.0, True), (12.0, 124.0, False), (4.0, 40.0, False), (19.5, 195.0, True), (25.0, 250.0, False)],
+)
+def test_a_step_is_open_until_a_read_confirms_where_the_reference_is(
+    read_s: float, read_m: float, closed: bool
+) -> None:
+    """10 m/s; at 9 s the reference steps 30 m ahead of the odometer. Reads are true to 3 sqrt(1^2 + 0.1^2) = 3.01 m."""
+    t_s = np.arange(0.0, 20.5, 0.5)
+    counted = counter(10.0 * t_s, 2.0)
+    step_m = np.where(t_s >= 9.0, 30.0, 0.0)
+    ahead = step_m[-1] if read_s > 9.0 else 0.0
+    read = TrueAnchor(round(read_s * NS_PER_S), (Place(4, read_m + ahead),), 1.0, Evidence.BALISE)
+    found = known_stretch(Sided(stretch(t_s, 10.0 * t_s + step_m), 1, 1.0, 0.0), SURE, [counted], [read], 0.0, CONFIG)
+    (path,) = found.paths
+    assert np.flatnonzero(path.step_m).tolist() == [17]
+    open_m = path.at_m - path.low_m
+    assert open_m[:18].tolist() == [0.0] * 18
+    assert open_m[18:23] == pytest.approx(30.0)
+    assert open_m[-1] == pytest.approx(0.0 if closed else 30.0)
+    assert path.high_m == pytest.approx(path.at_m)
