@@ -217,9 +217,10 @@ def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs
 
 
 def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence[RoutePath]) -> _Relative:
-    """Where the train's place lies on the path of the solution too.
+    """The error along the solution's own path, for positions off the train's track, where that path leads to the train.
 
-    If the track of the evidence covers the place so far ahead or behind, the position is on another track.
+    Counted that far along the train's track, the position's place may lie on that track: then the two tracks are
+    parallel, and the position is on another track, at no distance along.
     """
     rows = there.rows
     middle_m = there.middle_m
@@ -232,6 +233,7 @@ def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence
         train_m[part], along[part] = leg.coordinate(element[part], measure_m[part], path_m[part])
     against = along * sense < 0
     ahead_m = path_m - train_m
+    # `against`: the train's route counts against the path of the solution.
     onward_m = middle_m + np.where(against, -ahead_m, ahead_m)
     off_track = ~np.isfinite(train_m) | there.route.covers(np.nan_to_num(onward_m, nan=-np.inf))
     low_m = ahead_m - np.where(against, middle_m - there.low_m, there.high_m - middle_m)

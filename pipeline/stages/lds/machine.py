@@ -93,203 +93,208 @@ class LocationSystem:
 
     def run(self) -> None:
         """Walk along all epochs."""
-        k = 0
-        while k < len(self._t_ns):
-            end = self._uneventful_until(k)
-            if end > k:
-                self._pass_uneventful(k, end)
+        epoch = 0
+        while epoch < len(self._t_ns):
+            end = self._uneventful_until(epoch)
+            if end > epoch:
+                self._pass_uneventful(epoch, end)
             else:
-                self._step(k)
-            k = max(end, k + 1)
-        if k:
+                self._step(epoch)
+            epoch = max(end, epoch + 1)
+        if epoch:
             self.balises.finish(self._t_ns[-1])
 
-    def _uneventful_until(self, k: int) -> int:
-        """The first epoch from `k` on that has to be stepped through; those before it can only be TVBs.
+    def _uneventful_until(self, epoch: int) -> int:
+        """The first epoch from here on for `_step`; those before it are TVBs where evaluated and usable.
 
-        So it is on linked way where no balise, read, turn, outage, loss of distance, alarm or end of a window is near.
+        Uneventful is a position in use, in a begun chain, up to the next event (balise, read, turn, outage, loss of
+        distance), alarm or end of a window.
         """
-        if self._use is not Use.IN_USE or self._withheld_for(k) is not None:
-            return k
-        if self.balises.disarmed or self._chain_from is None or k <= self._chain_from:
-            return k
-        if self._journey.has_odometer and not self.distance.can_measure(k):
-            return k
-        near = bisect_left(self._events, k)
+        if self._use is not Use.IN_USE or self._withheld_for(epoch) is not None:
+            return epoch
+        if self.balises.disarmed or self._chain_from is None or epoch <= self._chain_from:
+            return epoch
+        if self._journey.has_odometer and not self.distance.can_measure(epoch):
+            return epoch
+        near = bisect_left(self._events, epoch)
         end = self._events[near] if near < len(self._events) else len(self._t_ns)
         for monitors in (self._bank, self.distance):
-            end = monitors.quiet_until(k, end) if end > k else k
-        closing = self._way_m[k:end] > self.balises.closing_m
-        return k + int(closing.argmax()) if closing.any() else end
+            end = monitors.quiet_until(epoch, end) if end > epoch else epoch
+        closing = self._way_m[epoch:end] > self.balises.closing_m
+        return epoch + int(closing.argmax()) if closing.any() else end
 
-    def _pass_uneventful(self, k: int, end: int) -> None:
-        evaluated = self._bank.along_evaluated_between(k, end)
-        self.evaluated[k:end] = evaluated.tolist()
-        self.tvb[k:end] = (evaluated & self._journey.usable[k:end]).tolist()
+    def _pass_uneventful(self, epoch: int, end: int) -> None:
+        evaluated = self._bank.along_evaluated_between(epoch, end)
+        self.evaluated[epoch:end] = evaluated.tolist()
+        self.tvb[epoch:end] = (evaluated & self._journey.usable[epoch:end]).tolist()
         self._validated = True
 
-    def _step(self, k: int) -> None:
-        if k in self._missions:
-            self._relink.begin_mission(k)
+    def _step(self, epoch: int) -> None:
+        if epoch in self._missions:
+            self._relink.begin_mission(epoch)
             self._hold_to_ns = None
-            self._initialise_anew(k)
-        self.balises.turn(k)
-        for read in self.balises.read(k):
+            self._initialise_anew(epoch)
+        self.balises.turn(epoch)
+        for read in self.balises.read(epoch):
             self._relink.note_read(read)
-            self._hold(k)
-        bank_failed = self._bank.failed(k)
-        self._watch(k)
-        self.withheld_for[k] = self._withheld_for(k)
-        withheld = self.withheld_for[k] is not None
-        distrusted = bank_failed or self.distance.fails(k) or self._use is Use.NEGATED or withheld
-        accepted, disordered = self.balises.pass_virtual(k, distrusted, self._chain_from is None)
+            self._hold(epoch)
+        bank_failed = self._bank.failed(epoch)
+        self._watch(epoch)
+        self.withheld_for[epoch] = self._withheld_for(epoch)
+        withheld = self.withheld_for[epoch] is not None
+        distrusted = bank_failed or self.distance.fails(epoch) or self._use is Use.NEGATED or withheld
+        accepted, disordered = self.balises.pass_virtual(epoch, distrusted, self._chain_from is None)
         for crossing in accepted:
-            self._accept(crossing, k)
-        self.balises.rearm(k)
-        self.balises.close_windows(k, self._t_ns[k])
-        self.evaluated[k] = self._bank.along_evaluated(k)
-        self.alarm[k] = bank_failed or disordered or self.distance.fails(k)
+            self._accept(crossing, epoch)
+        self.balises.rearm(epoch)
+        self.balises.close_windows(epoch, self._t_ns[epoch])
+        self.evaluated[epoch] = self._bank.along_evaluated(epoch)
+        self.alarm[epoch] = bank_failed or disordered or self.distance.fails(epoch)
         if self._use is Use.NEGATED:
-            self._seek_return(k, disordered)
-        elif self.alarm[k]:
-            self._negate(k)
-        elif self.evaluated[k] and self._journey.usable[k] and not withheld:
-            self._validate(k)
+            self._seek_return(epoch, disordered)
+        elif self.alarm[epoch]:
+            self._negate(epoch)
+        elif self.evaluated[epoch] and self._journey.usable[epoch] and not withheld:
+            self._validate(epoch)
 
-    def _withheld_for(self, k: int) -> LostTo | None:
-        """Why the diagnosis cannot stand behind a position here, as it says itself (DOMAIN section 5.2)."""
-        if not self._bank.noise_known_at(k):
+    def _withheld_for(self, epoch: int) -> LostTo | None:
+        """Why the diagnosis withholds the position here, None where it does not (DOMAIN section 5.2)."""
+        if not self._bank.noise_known_at(epoch):
             return LostTo.NOISE
-        if self._journey.slips[k]:
+        if self._journey.slips[epoch]:
             return LostTo.SLIP
-        return LostTo.RELINK if self._use is Use.SLIPPED or self._bank.begins_at(k) else None
+        return LostTo.RELINK if self._use is Use.SLIPPED or self._bank.begins_at(epoch) else None
 
-    def _watch(self, k: int) -> None:
-        """Whether anybody looks on at the position, or has looked on until now."""
-        if self._journey.slips[k]:
+    def _watch(self, epoch: int) -> None:
+        """Leave or re-enter use: slip and its end, noise that hides the position, outages, the return from them."""
+        if self._journey.slips[epoch]:
             self._consistent_since_ns = None
             if self._use in (Use.IN_USE, Use.UNSEEN) and self._validated:
                 self._use = Use.SLIPPED
-                self._since = k
+                self._since = epoch
         elif self._use is Use.SLIPPED:
-            self._relink_after_slip(k)
-        if self._use is Use.IN_USE and not self._bank.noise_known_at(k):
+            self._relink_after_slip(epoch)
+        if self._use is Use.IN_USE and not self._bank.noise_known_at(epoch):
             self._use = Use.UNSEEN
-            self._since = k
-        if self._use in (Use.IN_USE, Use.UNSEEN) and k in self._after_outages:
-            # The last epoch that lies farther back than the bank bridges: there is one before an outage.
+            self._since = epoch
+        if self._use in (Use.IN_USE, Use.UNSEEN) and epoch in self._after_outages:
+            # The last epoch before the time that the bank bridges; an outage is longer, so there is one.
             self._use = Use.UNSEEN
-            self._since = bisect_left(self._t_ns, self._t_ns[k] - self._bridged_ns) - 1
-        if self._use is Use.UNSEEN and self._bank.noise_known_at(k) and self._can_return(k):
-            self._relink_unseen(k)
+            self._since = bisect_left(self._t_ns, self._t_ns[epoch] - self._bridged_ns) - 1
+        if self._use is Use.UNSEEN and self._bank.noise_known_at(epoch) and self._can_return(epoch):
+            self._relink_unseen(epoch)
 
-    def _can_return(self, k: int) -> bool:
-        return self.distance.is_possible(k) and bool(self._journey.usable[k])
+    def _can_return(self, epoch: int) -> bool:
+        return self.distance.is_possible(epoch) and bool(self._journey.usable[epoch])
 
-    def _relink_after_slip(self, k: int) -> None:
+    def _relink_after_slip(self, epoch: int) -> None:
         # Several slips would each let a held position go on by as much as one may.
-        anchor = self._relink.anchor_at(k) if self._is_held(k) else self._relink.anchor_before_slip(self._since)
-        if self._can_return(k) and self._relink.compare(k, anchor).holds:
+        anchor = self._relink.anchor_at(epoch) if self._is_held(epoch) else self._relink.anchor_before_slip(self._since)
+        if self._can_return(epoch) and self._relink.compare(epoch, anchor).holds:
             self._use = Use.IN_USE
-            self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+            self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
 
-    def _relink_unseen(self, k: int) -> None:
-        """The first usable position after an outage or the noise: where it moved meanwhile, that is an alarm."""
+    def _relink_unseen(self, epoch: int) -> None:
+        """The first usable position after an outage or the noise: it re-links, or is negated."""
         self._use = Use.IN_USE
-        if self._validated and self._t_ns[k] - self._t_ns[self._since] > self._bridged_ns:
-            comparison = self._relink.compare(k, self._relink.anchor_at(k))
-            self.distance.hold_against(comparison, k)
+        if self._validated and self._t_ns[epoch] - self._t_ns[self._since] > self._bridged_ns:
+            comparison = self._relink.compare(epoch, self._relink.anchor_at(epoch))
+            self.distance.hold_against(comparison, epoch)
             if comparison.reason is not None:
-                self._negate(k)
+                self._negate(epoch)
 
-    def _accept(self, crossing: Crossing, k: int) -> None:
-        self.accepted_at_ns[k] = crossing.t_ns
+    def _accept(self, crossing: Crossing, epoch: int) -> None:
+        """An accepted virtual balise is the LRVB and begins the chain of TVBs; the linking distance counts from it."""
+        self.accepted_at_ns[epoch] = crossing.t_ns
         crossing.initialising = not self._validated
         self._validated = True
-        self._chain_from = k if self._chain_from is None else self._chain_from
-        anchor = Anchor.at_crossing(self._journey, crossing, float(self._journey.sigma_m[k]))
+        self._chain_from = epoch if self._chain_from is None else self._chain_from
+        anchor = Anchor.at_crossing(self._journey, crossing, float(self._journey.sigma_m[epoch]))
         if anchor is not None:
-            self.distance.measure_from(anchor, k)
-        self._note_lrvb(k)
+            self.distance.measure_from(anchor, epoch)
+        self._note_lrvb(epoch)
 
-    def _validate(self, k: int) -> None:
-        """A usable position that the diagnosis stands behind is a TVB once the chain has begun."""
-        if self._has_initialised(k) if self._chain_from is None else k > self._chain_from:
-            self.tvb[k] = self._validated = True
-            if not self.distance.can_measure(k):
-                self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+    def _validate(self, epoch: int) -> None:
+        """A usable position not withheld is a TVB, once the chain has begun; else it may begin it."""
+        if self._has_initialised(epoch) if self._chain_from is None else epoch > self._chain_from:
+            self.tvb[epoch] = self._validated = True
+            if not self.distance.can_measure(epoch):
+                self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
 
-    def _has_initialised(self, k: int) -> bool:
+    def _has_initialised(self, epoch: int) -> bool:
         """Consistent for `init_s` without a break: a TVB may arise between two VBs (SR)."""
-        t_ns = self._t_ns[k]
+        t_ns = self._t_ns[epoch]
         if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns:
             self._consistent_since_ns = t_ns
         self._consistent_at_ns = t_ns
         if t_ns - self._consistent_since_ns < self._config.lds.init_s * NS_PER_S:
             return False
-        self._chain_from = k
-        self._note_lrvb(k)
+        self._chain_from = epoch
+        self._note_lrvb(epoch)
         return True
 
-    def _negate(self, k: int) -> None:
-        # A jump fails the slow averages too: how old a drift may be is said by them where they fail alone.
-        self._relink.note_alarm(k, 0.0 if self._bank.fast_failed(k) else self._bank.failing_memory_s(k))
-        if self._bank.failed(k):
+    def _negate(self, epoch: int) -> None:
+        """An alarm: fix the re-link anchor, freeze the noise, wait for recovery."""
+        # Slow averages that fail alone show a drift as old as their memory; after a jump they fail too, but it is new.
+        self._relink.note_alarm(epoch, 0.0 if self._bank.fast_failed(epoch) else self._bank.failing_memory_s(epoch))
+        if self._bank.failed(epoch):
             self._hold_to_ns = None
-        self._bank.freeze(k)
+        self._bank.freeze(epoch)
         self._use = Use.NEGATED
-        self._recovery.begin(k)
-        self.negated[k] = True
+        self._recovery.begin(epoch)
+        self.negated[epoch] = True
         self._consistent_since_ns = None
 
-    def _seek_return(self, k: int, disordered: bool) -> None:
-        self.negated[k] = True
-        if not self._recovery.is_over(k, self.evaluated[k], disordered):
+    def _seek_return(self, epoch: int, disordered: bool) -> None:
+        """Negated: return after recovery if the position re-links, or anew where nothing was validated before."""
+        self.negated[epoch] = True
+        if not self._recovery.is_over(epoch, self.evaluated[epoch], disordered):
             return
         if not self._validated:
-            self._initialise_anew(k)
+            self._initialise_anew(epoch)
             return
-        anchor = self._relink.anchor_at(k)
-        if anchor is None or not self._relink.compare(k, anchor).holds:
-            self.withheld_for[k] = LostTo.RELINK
+        anchor = self._relink.anchor_at(epoch)
+        if anchor is None or not self._relink.compare(epoch, anchor).holds:
+            self.withheld_for[epoch] = LostTo.RELINK
             return
-        self._return(k)
-        # The bank begins anew: for the memory of its slowest average nothing else would see a slow drift go on.
+        self._return(epoch)
+        # The restarted bank cannot see a slow drift go on until its slowest average is full: the anchor stays for it.
         if self._hold_to_ns is None:
-            self._hold_to_ns = self._t_ns[k] + self._memory_ns
-        self._hold(k)
-        self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+            self._hold_to_ns = self._t_ns[epoch] + self._memory_ns
+        self._hold(epoch)
+        self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
 
-    def _is_held(self, k: int) -> bool:
-        return self._hold_to_ns is not None and self._t_ns[k] <= self._hold_to_ns
+    def _is_held(self, epoch: int) -> bool:
+        return self._hold_to_ns is not None and self._t_ns[epoch] <= self._hold_to_ns
 
-    def _hold(self, k: int) -> None:
+    def _hold(self, epoch: int) -> None:
         """From here on to the anchor of the re-link, or to the telegram that renewed it."""
-        anchor = self._relink.anchor_at(k)
+        anchor = self._relink.anchor_at(epoch)
         if self._hold_to_ns is None or anchor is None:
             return
-        end = max(bisect_right(self._t_ns, self._hold_to_ns), k)
-        self.distance.hold_to(k, *self._relink.moved_m(anchor, k, end))
+        end = max(bisect_right(self._t_ns, self._hold_to_ns), epoch)
+        self.distance.hold_to(epoch, *self._relink.moved_m(anchor, epoch, end))
 
-    def _initialise_anew(self, k: int) -> None:
+    def _initialise_anew(self, epoch: int) -> None:
         """No reference and no linking: a start of mission, or a fault before anything was validated."""
         self.balises.virtual.forget()
-        self.distance.forget(k)
+        self.distance.forget(epoch)
         self._chain_from = self._consistent_since_ns = None
         self._validated = False
         if self._use is Use.NEGATED:
-            self._return(k)
+            self._return(epoch)
         self._use = Use.IN_USE
-        self._note_lrvb(k)
+        self._note_lrvb(epoch)
 
-    def _return(self, k: int) -> None:
+    def _return(self, epoch: int) -> None:
+        """The position is in use again, but withheld at this epoch, from which the bank restarts."""
         self._use = Use.IN_USE
-        self.negated[k] = False
-        self._bank.restart(k)
-        self.withheld_for[k] = LostTo.RELINK
-        # What still rang at this epoch belonged to the fault that is over.
-        self.evaluated[k] = self._bank.along_evaluated(k)
-        self.alarm[k] = self._bank.failed(k)
+        self.negated[epoch] = False
+        self._bank.restart(epoch)
+        self.withheld_for[epoch] = LostTo.RELINK
+        # Verdicts before the restart were of the fault that is over.
+        self.evaluated[epoch] = self._bank.along_evaluated(epoch)
+        self.alarm[epoch] = self._bank.failed(epoch)
 
-    def _note_lrvb(self, k: int) -> None:
-        self.lrvb_changes.append(LrvbChange(k, self.balises.virtual.reference, self._chain_from is not None))
+    def _note_lrvb(self, epoch: int) -> None:
+        self.lrvb_changes.append(LrvbChange(epoch, self.balises.virtual.reference, self._chain_from is not None))

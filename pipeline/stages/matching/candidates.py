@@ -120,53 +120,53 @@ def candidates_of(points: Points, network: Network, segments: Segments, reach_m:
     return _candidates(len(points), network, segments, step[fresh][near], feet.take(near))
 
 
-def overtaken(found: Candidates, network: Network) -> Bools:
-    """Candidates about an end where the track goes on, whose place is on what it goes on to.
+def overtaken(candidates: Candidates, network: Network) -> Bools:
+    """Candidates near an end of their element whose position belongs to the next element beyond that end.
 
-    So every position has one place on a line, however many elements it is cut into. Of the two elements at a joint it
-    is on the one that it lies farther inside of: at a bend it may lie past both their ends, or inside both.
+    So a position has one place on a line, however many elements this is cut into: on the element that it lies farther
+    inside of, as at a bend it may lie past the ends of both, or inside both.
     """
-    past_m = _past_ends_m(found)
-    one, end = np.nonzero(np.isfinite(past_m))
+    past_m = _past_ends_m(candidates)
+    row, end = np.nonzero(np.isfinite(past_m))
     edge_first, edge_to = network.edges
-    leaving = 2 * found.element[one] + 1 - end
+    leaving = 2 * candidates.element[row] + 1 - end
     number = np.diff(edge_first)[leaving]
     edge = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number - edge_first[leaving], number)
-    one = np.repeat(one, number)
+    row = np.repeat(row, number)
     end = np.repeat(end, number)
     entered = edge_to[edge]
-    keys = found.step * network.count + found.element
-    wanted = found.step[one] * network.count + entered // 2
-    other = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    own_m = past_m[one, end]
-    other_m = past_m[other, entered % 2]
-    rival = (keys[other] == wanted) & (other != one)
-    beyond = rival & (own_m > 0.0) & np.isinf(other_m)
-    nearer = rival & ((other_m < own_m) | ((other_m == own_m) & (other < one)))
+    keys = candidates.step * network.count + candidates.element
+    beside_key = candidates.step[row] * network.count + entered // 2
+    beside = np.minimum(np.searchsorted(keys, beside_key), len(keys) - 1)
+    row_m = past_m[row, end]
+    beside_m = past_m[beside, entered % 2]
+    rival = (keys[beside] == beside_key) & (beside != row)
+    beyond = rival & (row_m > 0.0) & np.isinf(beside_m)
+    nearer = rival & ((beside_m < row_m) | ((beside_m == row_m) & (beside < row)))
     out = np.zeros(len(keys), dtype=bool)
     while True:
-        # At the joint itself only by one that is not beaten there: at a switch another branch may hold the place.
+        # Only by a candidate that is not overtaken itself, as at a switch another branch may hold it: so in rounds.
         now = np.zeros(len(keys), dtype=bool)
-        now[one[beyond | (nearer & ~out[other])]] = True
+        now[row[beyond | (nearer & ~out[beside])]] = True
         if (now == out).all():
             return out
         out = now
 
 
-def _past_ends_m(found: Candidates) -> Floats:
-    """Per candidate how far it lies past its element's start and end [m], infinite where it is not about them."""
+def _past_ends_m(candidates: Candidates) -> Floats:
+    """Per candidate how far it lies past its element's start and end [m], negative inside, infinite if not near."""
     columns = []
-    for past, inside_m in ((-1, found.along_m), (1, found.left_m)):
-        inside = np.where((found.past == 0) & (inside_m < BEND_M), -inside_m, np.inf)
-        columns.append(np.where(found.past == past, found.beyond_m, inside))
+    for past, inside_m in ((-1, candidates.along_m), (1, candidates.left_m)):
+        inside = np.where((candidates.past == 0) & (inside_m < BEND_M), -inside_m, np.inf)
+        columns.append(np.where(candidates.past == past, candidates.beyond_m, inside))
     return np.column_stack(columns)
 
 
-def merged(some: Candidates, others: Candidates, step_of_others: Ints) -> Candidates:
+def merged(some: Candidates, added: Candidates, step_of_added: Ints) -> Candidates:
     """Candidates of two searches together; the steps of the second are numbered anew."""
     steps = len(some.first) - 1
-    others = replace(others, step=step_of_others[others.step])
-    columns = {name: np.concatenate([getattr(some, name), getattr(others, name)]) for name in _COLUMNS}
+    added = replace(added, step=step_of_added[added.step])
+    columns = {name: np.concatenate([getattr(some, name), getattr(added, name)]) for name in _COLUMNS}
     order = np.lexsort((columns["element"], columns["step"]))
     columns = {name: values[order] for name, values in columns.items()}
     return Candidates(first=np.searchsorted(columns["step"], np.arange(steps + 1)), **columns)

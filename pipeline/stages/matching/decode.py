@@ -31,7 +31,7 @@ class LegElements:
 
     def turned(self) -> LegElements:
         """The same leg run the other way round."""
-        around = tuple(one ^ 1 for one in reversed(self.oriented))
+        around = tuple(oriented ^ 1 for oriented in reversed(self.oriented))
         return LegElements(around, -self.high, None if self.shared is None else -self.shared)
 
 
@@ -46,7 +46,7 @@ class Decoded:
 
     def turned(self, network: Network, legs: range) -> Decoded:
         """Some legs run the other way round."""
-        chains = tuple(one.turned() if i in legs else one for i, one in enumerate(self.chains))
+        chains = tuple(chain.turned() if index in legs else chain for index, chain in enumerate(self.chains))
         inside = (self.leg >= legs.start) & (self.leg < legs.stop)
         length = np.array(
             [
@@ -84,7 +84,7 @@ def legs_of(trellis: Trellis, decoded: Decoded) -> list[Leg]:
     """Legs with one path position: equal on what two legs share, carried on by distance over a break."""
     legs: list[Leg] = []
     for index, chain in enumerate(decoded.chains):
-        visits = [Visit(one // 2, one % 2 == 0) for one in chain.oriented]
+        visits = [Visit(oriented // 2, oriented % 2 == 0) for oriented in chain.oriented]
         leg = leg_of(trellis.network.track, visits)
         if legs and chain.shared is not None:
             before = decoded.chains[index - 1]
@@ -120,13 +120,13 @@ def aligned(trellis: Trellis, decoded: Decoded) -> Decoded:
     return decoded
 
 
-def _follow(chains: list[LegElements], at: int, move: Move | None, other: int) -> int:
+def _follow(chains: list[LegElements], at: int, move: Move | None, to: int) -> int:
     """Extend the legs by one move; where the last leg does not lead there, begin a new one."""
     if move is None:
         number = chains[-1].high + 1
-        chains.append(LegElements((other,), number))
+        chains.append(LegElements((to,), number))
         return number
-    for oriented in (*move.between, other) if move.sense else ():
+    for oriented in (*move.between, to) if move.sense else ():
         chain = chains[-1]
         number = at + move.sense
         if not chain.low <= number <= chain.high:
@@ -153,7 +153,7 @@ def _branched(chain: LegElements, at: int, oriented: int, sense: int) -> LegElem
 
 def _next_break(decoded: Decoded, index: int) -> int:
     later = range(index + 1, len(decoded.chains))
-    return next((i for i in later if decoded.chains[i].shared is None), len(decoded.chains))
+    return next((number for number in later if decoded.chains[number].shared is None), len(decoded.chains))
 
 
 def _border(decoded: Decoded, index: int) -> int:

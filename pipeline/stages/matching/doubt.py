@@ -44,13 +44,13 @@ def doubt_of(trellis: Trellis, beliefs: Beliefs, legs: Sequence[Leg], leg: Ints,
     """Probability of all states that are on the path where the path is; `leg`, `at_m`: where that is at each step."""
     count = np.diff(trellis.first)
     step = np.repeat(np.arange(len(count)), count)
-    own = _on_path(trellis, legs, leg, at_m, step)
-    other = np.where(own, -1.0, beliefs.forward + beliefs.posterior)
-    worst = np.lexsort((other, step))[trellis.first[1:] - 1]
+    on_path = _on_path(trellis, legs, leg, at_m, step)
+    rival = np.where(on_path, -1.0, beliefs.forward + beliefs.posterior)
+    worst = np.lexsort((rival, step))[trellis.first[1:] - 1]
     return Doubt(
-        posterior=_share(beliefs.posterior * own, trellis.first),
-        gate=_share(beliefs.forward * own, trellis.first),
-        other=np.where(other[worst] >= 0, trellis.oriented[worst] // 2, -1),
+        posterior=_share(beliefs.posterior * on_path, trellis.first),
+        gate=_share(beliefs.forward * on_path, trellis.first),
+        other=np.where(rival[worst] >= 0, trellis.oriented[worst] // 2, -1),
     )
 
 
@@ -70,10 +70,10 @@ def stretches(
     for begin, last in spans_of(probability < config.ambiguity_probability):
         end = last + 1
         worst = begin + int(np.argmin(probability[begin:end]))
-        other = int(doubt.other[worst])
+        rival = int(doubt.other[worst])
         until = int(epoch[end]) - 1 if end < len(trellis) else len(fixes) - 1
         here = ids[int(trellis.oriented[beliefs.best[worst]]) // 2]
-        there = ids[other] if other >= 0 else None
+        there = ids[rival] if rival >= 0 else None
         span = int(fixes.t_ns[epoch[begin]]), int(fixes.t_ns[until])
         least = float(doubt.gate[begin:end].min()), float(doubt.posterior[begin:end].min())
         rows.append((*span, here, there, *least, _resolved_by(trellis, beliefs, pinned, begin, end)))
@@ -88,14 +88,14 @@ def _resolved_by(trellis: Trellis, beliefs: Beliefs, pinned: Ints, begin: int, e
     if (pinned[int(epoch[end - 1]) + 1 : int(epoch[end]) + 1] >= 0).any():
         return "read"
     way = trellis.oriented[beliefs.best[max(begin - 1, 0) : end + 1]]
-    passed = [(one, other) for one, other in itertools.pairwise(way.tolist()) if one != other]
-    return "switch" if any(_over_switch(trellis.network, one, other) for one, other in passed) else "positions"
+    passed = [(here, there) for here, there in itertools.pairwise(way.tolist()) if here != there]
+    return "switch" if any(_over_switch(trellis.network, here, there) for here, there in passed) else "positions"
 
 
-def _over_switch(network: Network, one: int, other: int) -> bool:
+def _over_switch(network: Network, here: int, there: int) -> bool:
     """Whether more than one way leads on from one oriented element towards another, or from there back."""
-    forward = any(edge.to == other for edge in network.successors[one])
-    ends = (one, other ^ 1) if forward else (one ^ 1, other)
+    forward = any(edge.to == there for edge in network.successors[here])
+    ends = (here, there ^ 1) if forward else (here ^ 1, there)
     return any(len(network.successors[end]) > 1 for end in ends)
 
 
@@ -109,7 +109,7 @@ def _on_path(trellis: Trellis, legs: Sequence[Leg], leg: Ints, at_m: Floats, ste
     measure_m = np.where(
         backward == 1, track.end_m[element] - trellis.place_m, track.begin_m[element] + trellis.place_m
     )
-    own = np.zeros(len(step), dtype=bool)
+    on_path = np.zeros(len(step), dtype=bool)
     border = np.flatnonzero(np.diff(leg))
     for number, route in enumerate(routes_of(track, legs)):
         on_leg = leg == number
@@ -117,8 +117,8 @@ def _on_path(trellis: Trellis, legs: Sequence[Leg], leg: Ints, at_m: Floats, ste
         on_leg[border + 1] |= leg[border] == number
         rows = np.flatnonzero(on_leg[step])
         coordinate, _ = route.coordinate(element[rows], measure_m[rows], at_m[step[rows]])
-        own[rows] |= np.abs(coordinate - at_m[step[rows]]) <= trellis.config.reach_m
-    return own
+        on_path[rows] |= np.abs(coordinate - at_m[step[rows]]) <= trellis.config.reach_m
+    return on_path
 
 
 def _share(values: Floats, first: Ints) -> Floats:
@@ -152,7 +152,7 @@ def rivals_of(
     posterior: Posterior, epochs: pl.DataFrame, path: TravelledPath, index: dict[str, int], limit: float
 ) -> tuple[Ints, Ints]:
     """Pairs of epoch and net element (numbers by `index`): of at least `limit` at the steps about it, and its own."""
-    own = epochs["netelement_id"].replace_strict(index, default=None, return_dtype=pl.Int64)
+    path_element = epochs["netelement_id"].replace_strict(index, default=None, return_dtype=pl.Int64)
     number = np.array([index[name] for name in path.track.ids], dtype=np.int64)
     likely = np.flatnonzero(posterior.probability >= limit)
     step = np.searchsorted(posterior.first, likely, side="right") - 1
@@ -162,6 +162,6 @@ def rivals_of(
     after = np.searchsorted(posterior.epoch, row, side="left")
     about = [np.maximum(before, 0), np.minimum(after, len(posterior.epoch) - 1)]
     pairs = [pl.DataFrame({"row": row, "step": side}).join(elements, on="step").drop("step") for side in about]
-    pairs.append(pl.DataFrame({"row": row, "element": own}).drop_nulls())
-    found = pl.concat(pairs).unique().sort("row", "element")
-    return ints(found["row"]), ints(found["element"])
+    pairs.append(pl.DataFrame({"row": row, "element": path_element}).drop_nulls())
+    rivals = pl.concat(pairs).unique().sort("row", "element")
+    return ints(rivals["row"]), ints(rivals["element"])

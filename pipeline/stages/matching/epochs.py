@@ -50,7 +50,7 @@ def epoch_frame(
     fixes: Fixes,
     solution: pl.Series,
     path: TravelledPath,
-    found: Assignment,
+    assignment: Assignment,
     vehicle: Vehicle,
     config: MatchingConfig,
 ) -> pl.DataFrame:
@@ -59,19 +59,19 @@ def epoch_frame(
     `path_m` is the raw position projected, never smoothed: a jump of the GNSS stays a jump. It is given off
     track too (`on_track` false), and goes on straight beyond the ends of the path.
     """
-    feet = path.feet(fixes.points, found.leg, fixes.valid, found.near_path_m)
-    antenna_m, vertical_m = path.places(found.leg, feet, fixes.height_m)
+    feet = path.feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
+    antenna_m, vertical_m = path.places(assignment.leg, feet, fixes.height_m)
     path_m = antenna_m - vehicle.gnss_antenna_ahead_m
-    element, measure_m = path.locate_index(found.leg, path_m)
+    element, measure_m = path.locate_index(assignment.leg, path_m)
     # The track's direction counts where the GNSS antenna is, not the balise antenna.
-    shape = shape_at(path, found.leg, antenna_m)
+    shape = shape_at(path, assignment.leg, antenna_m)
     sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape)
     allowed_m = on_track_limit_m(sigma_cross_m, shape.survey_sigma_m, config)
     distance_m = np.nan_to_num(feet.distance_m, nan=np.inf)
     on_track = fixes.valid & (distance_m <= np.nan_to_num(allowed_m))
     source = np.where(fixes.valid, np.where(fixes.from_receiver, 0, 1), -1)
     columns: dict[str, npt.NDArray[Any] | pl.Series] = {
-        "leg": pl.Series(found.leg, dtype=pl.Int32),
+        "leg": pl.Series(assignment.leg, dtype=pl.Int32),
         "netelement_id": _words(path.track.ids, element, pl.String()),
         "measure_m": measure_m,
         "path_m": path_m,
@@ -79,8 +79,8 @@ def epoch_frame(
         "vertical_m": vertical_m,
         "on_track": on_track,
         "near_track": fixes.valid & (distance_m <= config.reach_m),
-        "path_probability": np.where(on_track, found.path_probability, np.nan),
-        "gate_probability": np.where(on_track, found.gate_probability, np.nan),
+        "path_probability": np.where(on_track, assignment.path_probability, np.nan),
+        "gate_probability": np.where(on_track, assignment.gate_probability, np.nan),
         "heading_deg": shape.heading_deg,
         "slope": shape.slope,
         "curvature_per_m": shape.curvature_per_m,
@@ -100,22 +100,22 @@ def epoch_frame(
 def shape_at(path: TravelledPath, leg: Ints, path_m: Floats) -> Shape:
     """Direction, slope, curvature and survey quality of the track at places of the path."""
     shape = Shape(*(np.full(len(path_m), np.nan) for _ in range(5)))
-    for index, one in enumerate(path.legs):
+    for index, line in enumerate(path.legs):
         rows = np.flatnonzero((leg == index) & np.isfinite(path_m))
-        segment, fraction = segments_at(one, path_m[rows])
+        segment, fraction = segments_at(line, path_m[rows])
         held = np.clip(fraction, 0.0, 1.0)
-        length = one.path_end_m - one.path_start_m
+        length = line.path_end_m - line.path_start_m
         before = np.concatenate([length[:1], length[:-1]])
         after = np.concatenate([length[1:], length[-1:]])
-        curve_start = 2.0 * one.turn_start_rad / (before + length)
-        curve_end = 2.0 * one.turn_end_rad / (length + after)
-        bend = 0.5 * (np.abs(one.turn_start_rad) + np.abs(one.turn_end_rad))
-        shape.heading_deg[rows] = one.heading_deg[segment]
-        shape.slope[rows] = _slope(one.height_end_m - one.height_start_m, length)[segment]
+        curve_start = 2.0 * line.turn_start_rad / (before + length)
+        curve_end = 2.0 * line.turn_end_rad / (length + after)
+        bend = 0.5 * (np.abs(line.turn_start_rad) + np.abs(line.turn_end_rad))
+        shape.heading_deg[rows] = line.heading_deg[segment]
+        shape.slope[rows] = _slope(line.height_end_m - line.height_start_m, length)[segment]
         shape.curvature_per_m[rows] = (curve_start[segment] * (1 - held)) + curve_end[segment] * held
         # Sagitta of an arc: length times the angle it turns over 8.
         shape.interpolation_error_m[rows] = (length * bend / 8.0)[segment]
-        shape.survey_sigma_m[rows] = one.sigma_m[segment]
+        shape.survey_sigma_m[rows] = line.sigma_m[segment]
     return shape
 
 

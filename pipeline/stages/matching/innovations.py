@@ -47,11 +47,11 @@ def innovations_of(
 
 
 def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats, before: Ints, keep: Floats) -> Floats:
-    """What of the movements that differ from the shared one has been taken for an error of the survey [m].
+    """Per state the part of its movement, beyond the shared one, that counts as an error of the survey [m].
 
-    What is common to all errors nobody can tell from an error of the position: only differences count. So each step all
-    are shifted to their median, by no more than it takes: a track that leads aside on its own moves no other. By the
-    smallest error a crossover became the measure of both tracks, and lifted them by as much as it led aside.
+    What is common to all errors cannot be told from an error of the position: only differences count. So at each step
+    all errors are shifted by their median: a single track that leads aside does not move the others. (By the smallest
+    error, a crossover would become the measure of both tracks and shift them as it leads aside.)
     """
     parted = parted_m.tolist()
     limit = tolerance_m.tolist()
@@ -59,25 +59,25 @@ def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats,
     origin = before.tolist()
     errors = [0.0] * len(parted)
     begins = first.tolist()
-    kept = keep.tolist()
-    for step in range(1, len(kept) if parted_m.any() else 0):
+    lasting = keep.tolist()
+    for step in range(1, len(lasting) if parted_m.any() else 0):
         rows = [row for row in range(begins[step], begins[step + 1]) if origin[row] >= 0]
         grown = [side[row] * errors[origin[row]] + parted[row] for row in rows]
         if any(grown):
-            taken = [min(max(error, -limit[row]), limit[row]) for row, error in zip(rows, grown, strict=True)]
+            clipped = [min(max(error, -limit[row]), limit[row]) for row, error in zip(rows, grown, strict=True)]
             # As far as no other leaves its tolerance: that would be a parting that counts nowhere.
-            lowest = max(error - limit[row] for row, error in zip(rows, taken, strict=True))
-            highest = min(error + limit[row] for row, error in zip(rows, taken, strict=True))
-            shift = min(max(_common_m(taken, limit[rows[0]]), lowest), highest)
-            for row, error in zip(rows, taken, strict=True):
-                errors[row] = kept[step] * side[row] * (error - shift)
+            lowest = max(error - limit[row] for row, error in zip(rows, clipped, strict=True))
+            highest = min(error + limit[row] for row, error in zip(rows, clipped, strict=True))
+            shift = min(max(_common_m(clipped, limit[rows[0]]), lowest), highest)
+            for row, error in zip(rows, clipped, strict=True):
+                errors[row] = lasting[step] * side[row] * (error - shift)
     return np.array(errors)
 
 
 def _common_m(errors_m: list[float], limit_m: float) -> float:
-    """What of these errors counts as common: their median, as near to nothing as it may be.
+    """The common part of these errors: their median, of two middle values the nearest to 0 between them.
 
-    Off every track (no limit) errors are as large as the yard is wide, and its middle measures nothing: the smallest.
+    Off every track (no limit) errors are as large as the yard is wide, and its middle says nothing: then the smallest.
     """
     if np.isinf(limit_m):
         return min(errors_m, key=abs)
@@ -87,9 +87,13 @@ def _common_m(errors_m: list[float], limit_m: float) -> float:
     return min(max(0.0, lower), upper)
 
 
-def movements_m(innovations: Innovations, offset_m: Floats, tolerance_m: Floats, one: Ints, other: Ints) -> Floats:
-    """Movement from states to others [m]: the shared one, and what no error of the survey explains."""
-    shared_m = innovations.shared_m[other]
-    error_m = innovations.survey_m[one] + offset_m[other] - offset_m[one] - shared_m
-    limit_m = tolerance_m[other]
+def movements_m(innovations: Innovations, offset_m: Floats, tolerance_m: Floats, before: Ints, after: Ints) -> Floats:
+    """Movement across the track between pairs of states [m]: the shared one, plus what the survey cannot explain.
+
+    The change of a track's distance, together with the error so far, counts as an error of the survey within
+    `tolerance_m`; only the excess over that is movement.
+    """
+    shared_m = innovations.shared_m[after]
+    error_m = innovations.survey_m[before] + offset_m[after] - offset_m[before] - shared_m
+    limit_m = tolerance_m[after]
     return np.asarray(shared_m + error_m - np.clip(error_m, -limit_m, limit_m))

@@ -61,14 +61,14 @@ def match(
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
     network = network_in_pieces(site)
     pinned = pins_of(arrays, site, network.track, balise_reads)
-    path, found, ambiguous, posterior = find_path(arrays, odometry, network, pinned, config)
-    epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
+    path, assignment, ambiguous, posterior = find_path(arrays, odometry, network, pinned, config)
+    epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
     if sign < 0 and vehicle.gnss_antenna_ahead_m:
         # The odometer falls when reversing (CONTRACT section 1): the leading end faces against growing path, and the
         # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
-        epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
+        epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)
     epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg"), config.digits_least_m))
     return Match(epochs, path, ambiguous, posterior, sign)
 

@@ -50,19 +50,19 @@ class Move(NamedTuple):
 
 
 def move_scores(
-    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, way: MoveDistances, config: MatchingConfig
+    network: Network, start: Ints, start_m: Floats, end: Ints, end_m: Floats, way: MoveDistances, config: MatchingConfig
 ) -> Floats:
     """Log-probability of each move between pairs of places, -inf where there is none: `[sense, pair]`.
 
     Rows: on the element, ahead, behind. Places are oriented elements and metres from their entries.
     """
-    ahead_m, ahead_barred, behind_m, behind_barred = _network_distances(network, one, other, way.limit_m)
+    ahead_m, ahead_barred, behind_m, behind_barred = _network_distances(network, start, end, way.limit_m)
     length = network.track.length_m
-    left_m = length[one // 2] - one_m
-    other_left_m = length[other // 2] - other_m
-    stay = np.where(one == other, distance_scores(other_m - one_m, way, config), -np.inf)
-    ahead = distance_scores(left_m + ahead_m + other_m, way, config) - config.barred_cost * ahead_barred
-    behind = distance_scores(-(one_m + behind_m + other_left_m), way, config) - config.barred_cost * behind_barred
+    start_left_m = length[start // 2] - start_m
+    end_left_m = length[end // 2] - end_m
+    stay = np.where(start == end, distance_scores(end_m - start_m, way, config), -np.inf)
+    ahead = distance_scores(start_left_m + ahead_m + end_m, way, config) - config.barred_cost * ahead_barred
+    behind = distance_scores(-(start_m + behind_m + end_left_m), way, config) - config.barred_cost * behind_barred
     ahead[~np.isfinite(ahead_m)] = behind[~np.isfinite(behind_m)] = -np.inf
     return np.stack([stay, ahead, behind])
 
@@ -76,27 +76,27 @@ def distance_scores(displacement_m: Floats, way: MoveDistances, config: Matching
 
 
 def best_moves(
-    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, way: MoveDistances, config: MatchingConfig
+    network: Network, start: Ints, start_m: Floats, end: Ints, end_m: Floats, way: MoveDistances, config: MatchingConfig
 ) -> list[Move | None]:
     """The most plausible move of each pair of places, none where the network has none."""
-    scores = move_scores(network, one, one_m, other, other_m, way, config)
+    scores = move_scores(network, start, start_m, end, end_m, way, config)
     chosen = np.where(np.isfinite(scores.max(axis=0)), scores.argmax(axis=0), -1)
-    rows = zip(chosen.tolist(), one.tolist(), other.tolist(), way.limit_m.tolist(), strict=True)
+    rows = zip(chosen.tolist(), start.tolist(), end.tolist(), way.limit_m.tolist(), strict=True)
     return [_move(network, *row) for row in rows]
 
 
-def _move(network: Network, chosen: int, one: int, other: int, limit_m: float) -> Move | None:
+def _move(network: Network, chosen: int, start: int, end: int, limit_m: float) -> Move | None:
     """The move of a row of `move_scores`, -1 for none."""
     if chosen <= 0:
         return None if chosen else Move((), 0)
     if chosen == 1:
-        return Move(network.reach(one, limit_m)[other].between, 1)
-    return Move(network.reach(other, limit_m)[one].between[::-1], -1)
+        return Move(network.reach(start, limit_m)[end].between, 1)
+    return Move(network.reach(end, limit_m)[start].between[::-1], -1)
 
 
-def _network_distances(network: Network, one: Ints, other: Ints, limit_m: Floats) -> tuple[Floats, ...]:
+def _network_distances(network: Network, start: Ints, end: Ints, limit_m: Floats) -> tuple[Floats, ...]:
     """From exit to entry, ahead and behind, with the relations not navigable that way; inf where none leads."""
-    pairs, inverse = np.unique(one * len(network.successors) + other, return_inverse=True)
+    pairs, inverse = np.unique(start * len(network.successors) + end, return_inverse=True)
     limit = np.zeros(len(pairs))
     np.maximum.at(limit, inverse, limit_m)
     table = np.full((4, len(pairs)), np.inf)

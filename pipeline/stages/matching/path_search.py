@@ -89,35 +89,39 @@ def _trellis(
 def _candidates(fixes: Fixes, rows: Ints, network: Network, segments: Segments, config: MatchingConfig) -> Candidates:
     """Places within reach; within far reach where no track is near."""
     points = fixes.points.take(rows)
-    found = candidates_of(points, network, segments, (1.0 + _NEAR) * config.reach_m)
+    candidates = candidates_of(points, network, segments, (1.0 + _NEAR) * config.reach_m)
     nearest_m = np.full(len(rows), np.inf)
-    np.minimum.at(nearest_m, found.step, found.distance_m)
+    np.minimum.at(nearest_m, candidates.step, candidates.distance_m)
     far = np.flatnonzero(nearest_m > _NEAR * config.reach_m)
     if len(far):
         wide = candidates_of(points.take(far), network, segments, config.far_reach_factor * config.reach_m)
-        near = found.take(np.flatnonzero(nearest_m[found.step] <= _NEAR * config.reach_m), len(rows))
-        found = merged(near, wide, far)
-    return found.take(np.flatnonzero(~overtaken(found, network)), len(rows))
+        near = candidates.take(np.flatnonzero(nearest_m[candidates.step] <= _NEAR * config.reach_m), len(rows))
+        candidates = merged(near, wide, far)
+    return candidates.take(np.flatnonzero(~overtaken(candidates, network)), len(rows))
 
 
 def _pins(steps: Steps, pinned: Ints, candidates: Candidates) -> Bools:
-    """Candidates that a balise read rules out."""
+    """Candidates on another element than that of a balise read at their step."""
+    # A read counts at the first step not before it, at the last step if there is none.
     index = np.searchsorted(steps.epoch, np.flatnonzero(pinned >= 0))
-    wanted = np.full(len(steps), -1, dtype=np.int64)
-    wanted[np.minimum(index, len(steps) - 1)] = pinned[pinned >= 0]
-    proved = wanted[candidates.step]
+    proved_at = np.full(len(steps), -1, dtype=np.int64)
+    proved_at[np.minimum(index, len(steps) - 1)] = pinned[pinned >= 0]
+    proved = proved_at[candidates.step]
     return np.asarray((proved >= 0) & (candidates.element != proved))
 
 
 def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: Doubt) -> Assignment:
-    """Every epoch takes over from the step before it; a new leg begins right after the step before it."""
+    """Every epoch by the step before it: its probabilities, and its place moved on towards the next step.
+
+    Between the steps of two legs an epoch belongs to the later one.
+    """
     last = np.searchsorted(steps.epoch, np.arange(len(fixes)), side="right") - 1
     following = np.clip(last + 1, 0, len(steps) - 1)
     exact = np.zeros(len(fixes), dtype=bool)
     exact[steps.epoch] = True
     last = np.maximum(last, 0)
     leg = np.where(exact, decoded.leg[last], decoded.leg[following])
-    # Until positions are believed again after a jump, steps are hundreds of metres apart: both tell passages apart.
+    # During a jump that is not believed, steps are hundreds of metres apart: interpolated to tell passages apart.
     begin_s = fixes.t_s[steps.epoch[last]]
     end_s = fixes.t_s[steps.epoch[following]]
     elapsed = np.clip(fixes.t_s - begin_s, 0.0, np.maximum(end_s - begin_s, 0.0))
@@ -127,7 +131,7 @@ def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: D
 
 
 def with_tracks_aside(
-    found: Candidates,
+    candidates: Candidates,
     fixes: Fixes,
     believed: Ints,
     steps: Steps,
@@ -144,14 +148,14 @@ def with_tracks_aside(
     aside_m = _aside_m(fixes, believed, steps, config)
     wider = np.flatnonzero(aside_m > 0)
     if len(wider) == 0:
-        return found
+        return candidates
     far = candidates_of(fixes.points.take(steps.epoch[wider]), network, segments, float(aside_m.max()) + config.reach_m)
-    known = found.step * network.count + found.element
+    known = candidates.step * network.count + candidates.element
     step = wider[far.step]
-    kept = (far.distance_m <= aside_m[step] + config.reach_m) & np.isin(far.element, np.unique(found.element))
+    kept = (far.distance_m <= aside_m[step] + config.reach_m) & np.isin(far.element, np.unique(candidates.element))
     kept &= ~np.isin(step * network.count + far.element, known)
     kept &= (far.past == 0) | ~np.where(far.past < 0, far.linked_start, far.linked_end)
-    return merged(found, far.take(np.flatnonzero(kept), len(wider)), wider)
+    return merged(candidates, far.take(np.flatnonzero(kept), len(wider)), wider)
 
 
 def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig) -> Floats:
@@ -165,8 +169,8 @@ def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig)
     first = np.searchsorted(t_s, begin_s - config.jump_aside_s)
     last = np.searchsorted(t_s, end_s + config.jump_aside_s, side="right")
     aside_m = np.zeros(len(steps))
-    for one, (low, high) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
-        aside_m[low:high] = np.maximum(aside_m[low:high], min(float(size[one]), config.jump_aside_m))
+    for jump, (low, high) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+        aside_m[low:high] = np.maximum(aside_m[low:high], min(float(size[jump]), config.jump_aside_m))
     return aside_m
 
 

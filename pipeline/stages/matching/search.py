@@ -51,9 +51,9 @@ def search(trellis: Trellis) -> Beliefs:
 
 
 def _forward(trellis: Trellis, begins: Ints, ends: Ints) -> tuple[Floats, list[Floats]]:
-    """Log-weight of each state by the steps up to its own; per block but the first whence its states come.
+    """Log-weight of each state by the steps up to its own; and per block but the first, where its states come from.
 
-    That is `[before, after]`, each column adding up to one.
+    The latter as probabilities `[before, after]`, each column adding up to one.
     """
     weights = np.empty(len(trellis.oriented))
     state = trellis.initial[:, : int(trellis.first[1])] + trellis.like.prior()[:, None]
@@ -79,16 +79,16 @@ def _gained(trellis: Trellis, state: Terms, begin: int, end: int, weights: Float
 
 
 def _best_branch(entered: Terms, enters: Ints) -> Floats:
-    """Nothing for the best of the branches of a switch that lead to a state by one end, next to impossible for others.
+    """0 for the best of the branches that lead to a state over one end, next to impossible for the others.
 
-    A train that stands on a switch seems to go to and fro over it: each time its track would be as likely again by each
-    branch.
+    The position of a train standing on a switch goes to and fro over it. If each time all branches added up, its track
+    would become likelier for no reason.
     """
     total = _log_sum(log_mass(entered), axis=2)
     out = np.zeros_like(total)
     for end in (1, 2):
-        own = np.where(enters == end, total, -np.inf)
-        out[(enters == end) & (own < own.max(axis=0))] = _NONE
+        by_this_end = np.where(enters == end, total, -np.inf)
+        out[(enters == end) & (by_this_end < by_this_end.max(axis=0))] = _NONE
     return out
 
 

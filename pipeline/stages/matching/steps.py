@@ -42,10 +42,10 @@ class Travelled:
     distance_m: Floats
     segment: Ints
 
-    def between(self, rows: Ints, others: Ints) -> Floats:
+    def between(self, earlier: Ints, later: Ints) -> Floats:
         """Signed distance from some epochs to others, NaN where the odometer does not know it."""
-        same = self.segment[rows] == self.segment[others]
-        return np.where(same, self.distance_m[others] - self.distance_m[rows], np.nan)
+        same = self.segment[earlier] == self.segment[later]
+        return np.where(same, self.distance_m[later] - self.distance_m[earlier], np.nan)
 
 
 def travelled(fixes: Fixes, odometry: Odometry | None) -> Travelled:
@@ -75,6 +75,7 @@ def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConf
     since = _span_before(t_s, config.jump_speed_least_s)
 
     def reachable(before: Ints, after: Ints) -> Bools:
+        """Whether the train can have come from one usable epoch to another, or the first one holds no longer."""
         velocity = _velocity_mps(fixes, rows, since[before], before, config.jump_speed_most_s)
         return _reachable(fixes, rows[before], rows[after], velocity, way, config) | (
             t_s[after] - t_s[before] > config.jump_hold_s
@@ -87,10 +88,10 @@ def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConf
         last = int(doubtful[0])
         held = int(np.searchsorted(t_s, t_s[last] + config.jump_hold_s, side="right"))
         later = number[last + 1 : held + 1]
-        found = np.flatnonzero(reachable(np.full(len(later), last), later))
-        again = int(later[found[0]]) if len(found) else len(rows)
+        reached = np.flatnonzero(reachable(np.full(len(later), last), later))
+        again = int(later[reached[0]]) if len(reached) else len(rows)
         believed[last + 1 : again] = False
-        # What is not believed tells no speed of the epochs after it.
+        # Velocities of later epochs must not start at an epoch that is not believed.
         near = number[again : int(np.searchsorted(since, again))]
         since[near] = np.minimum(since[near], last)
         pairs = near[near < len(rows) - 1]
@@ -114,19 +115,19 @@ def _velocity_mps(fixes: Fixes, rows: Ints, since: Ints, until: Ints, most_s: fl
 
 
 def _reachable(
-    fixes: Fixes, rows: Ints, others: Ints, velocity_mps: Floats, way: Travelled, config: MatchingConfig
+    fixes: Fixes, earlier: Ints, later: Ints, velocity_mps: Floats, way: Travelled, config: MatchingConfig
 ) -> Bools:
     """Whether the train can have been at the positions of both epochs, by odometer or else by its velocity.
 
-    Without an odometer a position that falls back is as far from where the train was heading as one that runs ahead.
+    By the velocity a position is as suspect behind the place where the train was heading as ahead of it.
     """
-    moved = fixes.points.surface[others] - fixes.points.surface[rows]
-    elapsed = fixes.t_s[others] - fixes.t_s[rows]
+    moved = fixes.points.surface[later] - fixes.points.surface[earlier]
+    elapsed = fixes.t_s[later] - fixes.t_s[earlier]
     apart = np.linalg.norm(moved, axis=1)
     aside = np.linalg.norm(moved - velocity_mps * elapsed[:, None], axis=1)
-    by_odometer = np.abs(way.between(rows, others))
+    by_odometer = np.abs(way.between(earlier, later))
     variance = 0.5 * (fixes.cov_ee_m2 + fixes.cov_nn_m2)
-    margin = config.jump_margin_m + config.jump_sigmas * (np.sqrt(variance[rows]) + np.sqrt(variance[others]))
+    margin = config.jump_margin_m + config.jump_sigmas * (np.sqrt(variance[earlier]) + np.sqrt(variance[later]))
     turned = aside > config.jump_acceleration_mps2 * elapsed**2 + margin
     heading_there = (apart <= elapsed * config.jump_speed_mps + margin) & ~turned
     counted = apart <= by_odometer * (1 + config.jump_odometer_share) + margin

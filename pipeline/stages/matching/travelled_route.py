@@ -63,17 +63,17 @@ def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, 
     segment, _ = segments_at(leg, np.nan_to_num(path_m))
     known = match.epochs["path_probability"].is_not_null().to_numpy()
     inside = np.flatnonzero(on_leg & np.isin(leg.visit[segment], visits) & known)
-    own = match.epochs[inside]
-    least = own.select(least_belief().min()).item()
-    one = leg.visits[visits[0]]
+    epochs = match.epochs[inside]
+    least = epochs.select(least_belief().min()).item()
+    first_visit = leg.visits[visits[0]]
     times = match.epochs["t"]
     return (
-        match.path.track.ids[one.element],
-        "AB" if one.forward else "BA",
+        match.path.track.ids[first_visit.element],
+        "AB" if first_visit.forward else "BA",
         number,
         least is None or least < sure,
-        own["gate_probability"].min(),
-        own["path_probability"].min(),
+        epochs["gate_probability"].min(),
+        epochs["path_probability"].min(),
         _rivals(match, inside, 1.0 - sure),
         float(np.median(floats(match.epochs, "cross_track_m")[inside])) if len(inside) else None,
         times[int(inside[0])] if len(inside) else None,
@@ -87,9 +87,9 @@ def _rivals(match: Match, rows: Ints, least: float) -> str:
         return ""
     highest = _highest(match.posterior, int(rows[0]), int(rows[-1]))
     ids = match.path.track.ids
-    own = set(match.path.elements())
+    on_path = set(match.path.elements())
     order = sorted((-probability, ids[element]) for element, probability in highest.items())
-    return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in own)
+    return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in on_path)
 
 
 def _highest(posterior: Posterior, first: int, last: int) -> dict[int, float]:

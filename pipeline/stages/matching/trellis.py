@@ -34,8 +34,8 @@ class Pairs:
 
     steps: Ints
     first: Ints
-    one: Ints
-    other: Ints
+    before: Ints
+    after: Ints
     score: Floats
     enters: Ints
 
@@ -81,11 +81,11 @@ class Trellis:
     def moves(self, numbers: slice) -> list[tuple[Terms, Ints]]:
         """Of some steps of `pairs`: the terms `[coefficient, before, after, scale]`, and by which end moves enter."""
         part = slice(int(self.pairs.first[numbers.start]), int(self.pairs.first[numbers.stop]))
-        one = self.pairs.one[part]
-        other = self.pairs.other[part]
+        before = self.pairs.before[part]
+        after = self.pairs.after[part]
         score = self.pairs.score[part]
         known = np.isfinite(score)
-        terms = np.where(known[:, None], self._terms(one, other), self.initial[:, other])
+        terms = np.where(known[:, None], self._terms(before, after), self.initial[:, after])
         terms[0] += np.where(known, score, BREAK)[:, None]
         steps = self.pairs.steps[numbers]
         cuts = self.pairs.first[numbers.start + 1 : numbers.stop] - part.start
@@ -94,8 +94,8 @@ class Trellis:
         split = np.split(terms, cuts, axis=1)
         enters = np.split(self.pairs.enters[part], cuts)
         return [
-            (own.reshape(3, *shape, own.shape[2]), by.reshape(shape))
-            for own, by, shape in zip(split, enters, shapes, strict=True)
+            (values.reshape(3, *shape, values.shape[2]), by.reshape(shape))
+            for values, by, shape in zip(split, enters, shapes, strict=True)
         ]
 
     def batches(self) -> Iterator[slice]:
@@ -118,11 +118,11 @@ class Trellis:
         stay[0, rows] += moved[:, None]
         return stay
 
-    def _terms(self, one: Ints, other: Ints) -> Terms:
+    def _terms(self, before: Ints, after: Ints) -> Terms:
         offset_m = self.states.offset_m
-        level_m = offset_m[other] - self.innovations.survey_m[other]
-        moved_m = movements_m(self.innovations, offset_m, self.tolerance_m, one, other)
-        return step_terms(moved_m, level_m, self.states.candidate[other], self.like)
+        level_m = offset_m[after] - self.innovations.survey_m[after]
+        moved_m = movements_m(self.innovations, offset_m, self.tolerance_m, before, after)
+        return step_terms(moved_m, level_m, self.states.candidate[after], self.like)
 
 
 @dataclass(frozen=True)
@@ -199,48 +199,54 @@ def _stays(network: Network, steps: Steps, states: States, config: MatchingConfi
     for step in np.flatnonzero(stays).tolist():
         group = tuple(oriented[first[step] : first[step + 1]])
         if group not in apart:
-            apart[group] = not any(network.linked(one, other) for one in group for other in group)
+            apart[group] = not any(network.linked(here, there) for here in group for there in group)
         stays[step] = apart[group]
     return stays
 
 
 def _unchanged(states: States) -> Bools:
-    """Steps that have the same states as the one before."""
+    """Steps that have the same states as the one before: as many, and each on the same oriented element."""
     count, step = _counted(states.first)
     state = np.arange(len(states.oriented))
+    # With equal counts, the same place in the step before is `count` states back.
     equal = states.oriented == states.oriented[np.maximum(state - count[step], 0)]
-    return np.asarray((np.diff(count, prepend=0) == 0) & np.logical_and.reduceat(equal, states.first[:-1]))
+    all_equal = np.logical_and.reduceat(equal, states.first[:-1])
+    return np.asarray((np.diff(count, prepend=0) == 0) & all_equal)
 
 
 def _pairs(network: Network, states: States, steps: Ints, ways: StepDistances, config: MatchingConfig) -> Pairs:
+    """Every state of these steps with every state of the step before, and the most plausible move between them."""
     count = np.diff(states.first)
     sizes = count[steps - 1] * count[steps]
     begin = np.concatenate([[0], np.cumsum(sizes)])
     number = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes)
     width = np.repeat(count[steps], sizes)
-    one = np.repeat(states.first[steps - 1], sizes) + number // width
-    other = np.repeat(states.first[steps], sizes) + number % width
-    places = states.oriented[one], states.place_m[one], states.oriented[other], states.place_m[other]
+    before = np.repeat(states.first[steps - 1], sizes) + number // width
+    after = np.repeat(states.first[steps], sizes) + number % width
+    places = states.oriented[before], states.place_m[before], states.oriented[after], states.place_m[after]
     scores = move_scores(network, *places, ways.along(np.repeat(steps, sizes), places[0]), config)
-    return Pairs(steps, begin, one, other, scores.max(axis=0), scores.argmax(axis=0))
+    return Pairs(steps, begin, before, after, scores.max(axis=0), scores.argmax(axis=0))
 
 
 def _before(states: States, stays: Bools, pairs: Pairs) -> Ints:
-    """The state that each goes on from: its own, else of those followed longest the likeliest that led aside least.
+    """Per state the state of the step before that its survey error goes on from, -1 for none.
 
-    Where a branch joins a track, the track's own error of the survey goes on. That of the branch is by how much it has
-    come nearer since it was first in reach, which is no error.
+    Where steps stay, the same state. Else of the states that lead to it, those followed since the earliest step; of
+    these the one with the least movement aside and the likeliest move. So where a branch joins a track, the error of
+    the track goes on: that of the branch is its approach since it came within reach, which is no error of the survey.
     """
     count, step = _counted(states.first)
     before = np.where(stays[step], np.arange(len(step)) - count[step], -1).tolist()
     possible = np.flatnonzero(np.isfinite(pairs.score))
-    one = pairs.one[possible]
-    other = pairs.other[possible]
-    cost = np.abs(states.offset_m[other] - states.offset_m[one]) - pairs.score[possible]
-    order = np.lexsort((cost, other))
+    origins = pairs.before[possible]
+    states_after = pairs.after[possible]
+    cost = np.abs(states.offset_m[states_after] - states.offset_m[origins]) - pairs.score[possible]
+    order = np.lexsort((cost, states_after))
     leading: dict[int, list[tuple[int, float]]] = {}
-    for origin, state, own in zip(one[order].tolist(), other[order].tolist(), cost[order].tolist(), strict=True):
-        leading.setdefault(state, []).append((origin, own))
+    for origin, state, step_cost in zip(
+        origins[order].tolist(), states_after[order].tolist(), cost[order].tolist(), strict=True
+    ):
+        leading.setdefault(state, []).append((origin, step_cost))
     offset_m = states.offset_m.tolist()
     begun = step.tolist()
     aside_m = [0.0] * len(before)
@@ -264,16 +270,17 @@ def _ways(network: Network, steps: Steps, states: States, config: MatchingConfig
 
 
 def _polarity(network: Network, steps: Steps, states: States) -> Ints:
-    """Sign of the odometer against each oriented element: +1, -1, or 0 where it cannot be told.
+    """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown.
 
-    One for each connected part of the network, whose orientation is arbitrary, from the states that stay on one
-    element: the sign is a property of the installation, one for the whole run.
+    The sign belongs to the installation and holds for the whole run, but the orientation of a connected part of the
+    network is arbitrary: so one sign for each part, by the votes of all states that stay on one element for a step.
     """
     count = len(network.successors)
     if not network.orientable:
         return np.zeros(count, dtype=np.int64)
     part = network.parts
     _, step = _counted(states.first)
+    # Step and oriented element in one sorted number: the same element a step before is `count` less.
     keys = step * count + states.oriented
     before = np.minimum(np.searchsorted(keys, keys - count), len(keys) - 1)
     stayed = np.flatnonzero((keys[before] == keys - count) & np.isfinite(steps.odometer_m[step]))

@@ -109,8 +109,8 @@ def _ambiguous(match: Match) -> str:
 def _unlinked(lds: LdsResult) -> tuple[int, str] | None:
     """How many positions after outages could not be re-linked, and why not."""
     reasons = lds.epochs["link_distance_reason"].drop_nulls()
-    given = reasons.filter(reasons.is_in([reason.value for reason in NO_RELINK]))
-    return (given.len(), ", ".join(sorted(set(given)))) if given.len() else None
+    not_relinked = reasons.filter(reasons.is_in([reason.value for reason in NO_RELINK]))
+    return (not_relinked.len(), ", ".join(sorted(set(not_relinked)))) if not_relinked.len() else None
 
 
 def _scatter(aligned: pl.DataFrame, config: Configuration) -> dict[Note, object]:

@@ -22,9 +22,9 @@ class Chain:
         oriented = np.array(self.oriented, dtype=np.int64)
         element = oriented // 2
         track = network.track
-        own = element if numbers is None else np.array([numbers[track.ids[one]] for one in element.tolist()])
+        numbered = element if numbers is None else np.array([numbers[track.ids[number]] for number in element.tolist()])
         return RoutePath(
-            element=own,
+            element=numbered,
             forward=oriented % 2 == 0,
             entry_m=np.array(self.entry_m),
             low_m=track.begin_m[element],

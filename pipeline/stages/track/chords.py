@@ -31,7 +31,7 @@ def chord_sigmas_m(track: SurveyedTrack, successors: Sequence[Sequence[int]]) ->
     last = track.first[1:] - 2
     enter = np.column_stack([heading_rad[first, 0], heading_rad[last, 1] + np.pi]).ravel()
     leave = np.column_stack([heading_rad[last, 1], heading_rad[first, 0] + np.pi]).ravel()
-    onward = [_straightest(leave[one], enter, ways) for one, ways in enumerate(successors)]
+    onward = [_straightest(leave[oriented], enter, ways) for oriented, ways in enumerate(successors)]
     chains = _chains([to for to, _ in onward])
     # Points of all chains one after the other: a vertex each, and one at the end of each chain.
     vertex, against, ends = _points(track, chains)
@@ -69,15 +69,15 @@ def _straightest(leave_rad: float, enter_rad: Floats, ways: Sequence[int]) -> tu
 
 def _chains(onward: Sequence[int]) -> list[list[int]]:
     """Oriented elements of which each is the straightest way on from the one before, there and back."""
-    after = [to if to >= 0 and onward[to ^ 1] == one ^ 1 else -1 for one, to in enumerate(onward)]
+    after = [to if to >= 0 and onward[to ^ 1] == oriented ^ 1 else -1 for oriented, to in enumerate(onward)]
     chains: list[list[int]] = []
     left = dict.fromkeys(range(0, len(onward), 2))
     while left:
-        start = one = next(iter(left))
-        while after[one ^ 1] not in (-1, start ^ 1):
-            one = after[one ^ 1] ^ 1
-        chain = [one]
-        while after[chain[-1]] not in (-1, one):
+        start = oriented = next(iter(left))
+        while after[oriented ^ 1] not in (-1, start ^ 1):
+            oriented = after[oriented ^ 1] ^ 1
+        chain = [oriented]
+        while after[chain[-1]] not in (-1, oriented):
             chain.append(after[chain[-1]])
         for member in chain:
             del left[member & ~1]
@@ -92,10 +92,10 @@ def _points(track: SurveyedTrack, chains: Sequence[Sequence[int]]) -> tuple[Ints
     ends: list[int] = []
     count = 0
     for chain in chains:
-        for one in chain:
-            part = np.arange(track.first[one // 2], track.first[one // 2 + 1] - 1)
-            parts.append(part[::-1] if one % 2 else part)
-            senses.append(one % 2)
+        for oriented in chain:
+            part = np.arange(track.first[oriented // 2], track.first[oriented // 2 + 1] - 1)
+            parts.append(part[::-1] if oriented % 2 else part)
+            senses.append(oriented % 2)
             count += len(part)
         parts.append(parts[-1][-1:])
         senses.append(senses[-1])
@@ -108,8 +108,8 @@ def _points(track: SurveyedTrack, chains: Sequence[Sequence[int]]) -> tuple[Ints
 def _sigmas_m(way_m: Floats, turn_rad: Floats, ends: Ints) -> Floats:
     """Of the segment behind each point the largest sigma of all chords that it may be a part of.
 
-    What turns within a chord is no part of the turn at its ends, of which the geometric mean counts: a chord with a
-    straight at one end is straight. Where the survey ends, nothing is known of its turn, and it counts as none.
+    A chord spans 1, 2, ... `points` segments. Its turn is the geometric mean of the turns at its ends (0 with a
+    straight at one of them) less the turn within it. At the end of the survey the turn is unknown and counts as 0.
     """
     bend_rad = _turn_about(way_m, turn_rad)
     inside_rad = np.abs(turn_rad)

@@ -70,16 +70,16 @@ class Leg:
         return float(self.path_end_m[-1])
 
     def entry_m(self, number: int) -> float:
-        """Path position where an element of the leg is entered, a gap before it left behind."""
-        own = np.searchsorted(self.visit, number)
-        return float(self.path_start_m[own + (self.measure_start_m[own] == self.measure_end_m[own])])
+        """Path position where an element of the leg is entered, behind the gap before it."""
+        first = np.searchsorted(self.visit, number)
+        return float(self.path_start_m[first + (self.measure_start_m[first] == self.measure_end_m[first])])
 
 
 def leg_of(track: SurveyedTrack, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
     """A leg over oriented elements, `path_m` beginning at `start_m`.
 
-    Gaps that the site check let pass count as straight track, so that path and odometer agree; a survey that only
-    goes on beside where it ended has no way in between.
+    Gaps that the site check let pass count as straight track, so that path and odometer agree; an offset sideways
+    between two elements adds no length.
     """
     vertex = np.concatenate([_vertices(track, visit) for visit in visits])
     count = np.array([track.first[visit.element + 1] - track.first[visit.element] for visit in visits])
@@ -144,12 +144,12 @@ def segments_at(leg: Leg, path_m: Floats) -> tuple[Ints, Floats]:
 
 
 def _prefer_hint(point: Points, leg: Leg, hint_m: float, row: int, feet: Feet) -> None:
-    """Of the passages no farther from the hint than the nearest place, the closest to it that is as near the point.
+    """Replace the foot of `row` by another passage of the same place that is closer to the hint, if there is one.
 
-    A position that jumped may lie farther than the window from where it is expected, and on a crossing there.
+    Looked for as far from the hint as the nearest place is: a position that jumped may lie far from where expected.
     """
-    found_m = float(path_at(leg, feet.take(np.array([row])))[0])
-    reach_m = max(HINT_WINDOW_M, abs(found_m - hint_m))
+    nearest_m = float(path_at(leg, feet.take(np.array([row])))[0])
+    reach_m = max(HINT_WINDOW_M, abs(nearest_m - hint_m))
     inside = np.flatnonzero((leg.path_end_m >= hint_m - reach_m) & (leg.path_start_m <= hint_m + reach_m))
     trial = on_segments(point.take(np.zeros(len(inside), dtype=np.int64)), leg.line, inside)
     same = np.flatnonzero(trial.distance_m <= feet.distance_m[row] + SAME_PLACE_M)

@@ -62,7 +62,7 @@ class Network:
     _known: dict[int, tuple[float, dict[int, Reach]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.pairs = frozenset((one, edge.to) for one, edges in enumerate(self.successors) for edge in edges)
+        self.pairs = frozenset((oriented, edge.to) for oriented, edges in enumerate(self.successors) for edge in edges)
 
     @cached_property
     def edges(self) -> tuple[Ints, Ints]:
@@ -104,9 +104,9 @@ class Network:
             self._known[oriented] = known
         return known[1]
 
-    def linked(self, one: int, other: int) -> bool:
+    def linked(self, first: int, second: int) -> bool:
         """Whether one is a direct successor of the other, either way round."""
-        return (one, other) in self.pairs or (other, one) in self.pairs
+        return (first, second) in self.pairs or (second, first) in self.pairs
 
     def linked_ends(self) -> Bools:
         """Per element, whether a relation leads on from its start and from its end."""
@@ -119,22 +119,22 @@ class Network:
         queue: list[tuple[float, int, Reach]] = []
         self._push(queue, source, Reach(0.0, (), 0, 0))
         while queue:
-            _, oriented, found = heapq.heappop(queue)
-            if oriented in settled or found.distance_m > limit_m:
+            _, oriented, so_far = heapq.heappop(queue)
+            if oriented in settled or so_far.distance_m > limit_m:
                 continue
-            settled[oriented] = found
-            through = (*found.between, oriented)
-            onward = found._replace(distance_m=found.distance_m + self.length_m(oriented), between=through)
+            settled[oriented] = so_far
+            through = (*so_far.between, oriented)
+            onward = so_far._replace(distance_m=so_far.distance_m + self.length_m(oriented), between=through)
             self._push(queue, oriented, onward)
         return settled
 
-    def _push(self, queue: list[tuple[float, int, Reach]], oriented: int, found: Reach) -> None:
+    def _push(self, queue: list[tuple[float, int, Reach]], oriented: int, so_far: Reach) -> None:
         for edge in self.successors[oriented]:
             reach = Reach(
-                found.distance_m + edge.gap_m,
-                found.between,
-                found.barred_forward + (not edge.forward),
-                found.barred_backward + (not edge.backward),
+                so_far.distance_m + edge.gap_m,
+                so_far.between,
+                so_far.barred_forward + (not edge.forward),
+                so_far.barred_backward + (not edge.backward),
             )
             barred = min(reach.barred_forward, reach.barred_backward)
             heapq.heappush(queue, (reach.distance_m + barred * BARRED_DETOUR_M, edge.to, reach))
@@ -155,12 +155,12 @@ def network_of(track: SurveyedTrack, links: pl.DataFrame) -> Network:
             successors[2 * number - 2].append(Edge(2 * number, 0.0, True, True))
             successors[2 * number + 1].append(Edge(2 * number - 1, 0.0, True, True))
     usable_links = links.filter(pl.col("navigability") != Navigability.NONE.value)
-    one, position_a = _linked_ends(track, usable_links, "a")
-    other, position_b = _linked_ends(track, usable_links, "b")
+    element_a, position_a = _linked_ends(track, usable_links, "a")
+    element_b, position_b = _linked_ends(track, usable_links, "b")
     ends = end_places(track)
-    gap = gaps_m(ends[one, position_a], ends[other, position_b]).tolist()
-    leaving = (2 * one + 1 - position_a).tolist()
-    entering = (2 * other + position_b).tolist()
+    gap = gaps_m(ends[element_a, position_a], ends[element_b, position_b]).tolist()
+    leaving = (2 * element_a + 1 - position_a).tolist()
+    entering = (2 * element_b + position_b).tolist()
     for row, way in enumerate(usable_links["navigability"].cast(pl.String).to_list()):
         there = way in (Navigability.AB.value, Navigability.BOTH.value)
         back = way in (Navigability.BA.value, Navigability.BOTH.value)
@@ -188,7 +188,10 @@ def _add(edges: list[Edge], edge: Edge) -> None:
 
 
 def oriented_sheet(successors: list[list[Edge]]) -> tuple[list[bool], bool]:
-    """Of each connected part one orientation; both where a loop lets trains come back turned round."""
+    """Usable oriented elements: one orientation of each connected part, both where a loop turns trains round.
+
+    And whether no part has such a loop (`Network.orientable`).
+    """
     part = connected_parts(successors)
     turned = part.reshape(-1, 2)[:, ::-1].ravel()
     # Of a part and its mirror image the one that holds the first element in the sense of its measure.
@@ -243,9 +246,9 @@ def _joined(track: SurveyedTrack, visits: list[Visit]) -> list[list[Edge]]:
         )
         leaving = 2 * here.element + (not here.forward)
         entering = 2 * there.element + (not there.forward)
-        for one, other in ((leaving, entering), (entering ^ 1, leaving ^ 1)):
-            if all(edge.to != other for edge in successors[one]):
-                successors[one].append(Edge(other, gap, True, True))
+        for start, end in ((leaving, entering), (entering ^ 1, leaving ^ 1)):
+            if all(edge.to != end for edge in successors[start]):
+                successors[start].append(Edge(end, gap, True, True))
     return successors
 
 

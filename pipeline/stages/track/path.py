@@ -39,8 +39,8 @@ def valid_along_measure(balises: pl.DataFrame) -> pl.Series:
     0 both: a physical one, which every train reads, and one of a table that does not say (CONTRACT section 2).
     """
     both = pl.Series([BaliseDirection.BOTH.value]).new_from_index(0, balises.height)
-    said = balises.get_column("direction", default=both).cast(pl.String)
-    along = said.replace_strict(_ALONG_MEASURE, return_dtype=pl.Int64)
+    direction = balises.get_column("direction", default=both).cast(pl.String)
+    along = direction.replace_strict(_ALONG_MEASURE, return_dtype=pl.Int64)
     virtual = balises["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value
     return along * virtual.cast(pl.Int64)
 
@@ -83,7 +83,7 @@ class RoutePath:
 
         Of several visits the one nearest to `near_m` is meant: a lap more is no error of place.
         """
-        found = np.full(element.size, np.nan)
+        coordinate_m = np.full(element.size, np.nan)
         sense = np.zeros(element.size, dtype=np.int64)
         cost = np.full(element.size, np.inf)
         order = np.argsort(element, kind="stable")
@@ -96,13 +96,13 @@ class RoutePath:
             measure = measure_m[rows]
             at_m = self.entry_m[visit] + (measure - low if self.forward[visit] else high - measure)
             outside = np.maximum(np.maximum(low - measure, measure - high), 0.0)
-            own = outside * _OUTSIDE_COUNTS + np.abs(at_m - near_m[rows])
-            better = own < cost[rows]
+            visit_cost = outside * _OUTSIDE_COUNTS + np.abs(at_m - near_m[rows])
+            better = visit_cost < cost[rows]
             chosen = rows[better]
-            cost[chosen] = own[better]
-            found[chosen] = at_m[better]
+            cost[chosen] = visit_cost[better]
+            coordinate_m[chosen] = at_m[better]
             sense[chosen] = 1 if self.forward[visit] else -1
-        return found, sense
+        return coordinate_m, sense
 
     def locate(self, at_m: Floats) -> tuple[Ints, Floats, Ints]:
         """Element, measure [m] and its sense (+1: grows with the coordinate); beyond the ends the measure goes on."""
@@ -114,11 +114,11 @@ class RoutePath:
 
     def places(self, element: Ints, measure_m: Floats) -> tuple[Ints, Floats, Ints]:
         """All visits of some places, but for what lists round: which place, coordinate [m], sense of the measure."""
-        own = self.element[:, None] == element
-        own &= (self.low_m[:, None] - MEASURE_TOLERANCE_M <= measure_m) & (
+        holds = self.element[:, None] == element
+        holds &= (self.low_m[:, None] - MEASURE_TOLERANCE_M <= measure_m) & (
             measure_m <= self.high_m[:, None] + MEASURE_TOLERANCE_M
         )
-        visit, place = np.nonzero(own)
+        visit, place = np.nonzero(holds)
         measure = measure_m[place]
         since = np.where(self.forward[visit], measure - self.low_m[visit], self.high_m[visit] - measure)
         return place, self.entry_m[visit] + since, np.where(self.forward[visit], 1, -1)
@@ -133,14 +133,14 @@ def routes_of(track: SurveyedTrack, legs: Sequence[Leg]) -> list[RoutePath]:
     """Legs as routes whose coordinate is `path_m`; net elements by their numbers in the track."""
     routes = []
     for leg in legs:
-        own = np.array([visit.element for visit in leg.visits])
+        element = np.array([visit.element for visit in leg.visits])
         routes.append(
             RoutePath(
-                element=own,
+                element=element,
                 forward=np.array([visit.forward for visit in leg.visits]),
-                entry_m=np.array([leg.entry_m(number) for number in range(len(own))]),
-                low_m=track.begin_m[own],
-                high_m=track.end_m[own],
+                entry_m=np.array([leg.entry_m(number) for number in range(len(element))]),
+                low_m=track.begin_m[element],
+                high_m=track.end_m[element],
             )
         )
     return routes
@@ -177,12 +177,12 @@ class TravelledPath:
         """As `locate`, the net element as its number in the track (-1: not known)."""
         element = np.full(len(path_m), -1, dtype=np.int64)
         measure = np.full(len(path_m), np.nan)
-        for index, one in enumerate(self.legs):
+        for index, route_leg in enumerate(self.legs):
             rows = np.flatnonzero((leg == index) & np.isfinite(path_m))
-            segment, fraction = segments_at(one, path_m[rows])
-            span = one.measure_end_m[segment] - one.measure_start_m[segment]
-            element[rows] = np.array([visit.element for visit in one.visits])[one.visit[segment]]
-            measure[rows] = one.measure_start_m[segment] + fraction * span
+            segment, fraction = segments_at(route_leg, path_m[rows])
+            span = route_leg.measure_end_m[segment] - route_leg.measure_start_m[segment]
+            element[rows] = np.array([visit.element for visit in route_leg.visits])[route_leg.visit[segment]]
+            measure[rows] = route_leg.measure_start_m[segment] + fraction * span
         return element, measure
 
     def feet(self, points: Points, leg: Ints, known: Bools, near_path_m: Floats | None = None) -> Feet:
@@ -191,27 +191,27 @@ class TravelledPath:
         `near_path_m` tells passages of the same place apart; it never moves a point that has only one, so jumps stay.
         """
         feet = no_feet(len(points))
-        for index, one in enumerate(self.legs):
+        for index, route_leg in enumerate(self.legs):
             rows = np.flatnonzero((leg == index) & known)
             near = None if near_path_m is None else near_path_m[rows]
-            feet.put(rows, nearest_on_leg(points.take(rows), one, near))
+            feet.put(rows, nearest_on_leg(points.take(rows), route_leg, near))
         return feet
 
     def places(self, leg: Ints, feet: Feet, height_m: Floats) -> tuple[Floats, Floats]:
         """Feet on the legs as path positions, and heights over the track [m]; NaN where not known."""
         path_m, vertical_m = np.full((2, len(leg)), np.nan)
-        for index, one in enumerate(self.legs):
+        for index, route_leg in enumerate(self.legs):
             rows = np.flatnonzero((leg == index) & np.isfinite(feet.fraction))
             part = feet.take(rows)
-            rise = one.height_end_m[part.segment] - one.height_start_m[part.segment]
-            path_m[rows] = path_at(one, part)
-            vertical_m[rows] = height_m[rows] - one.height_start_m[part.segment] - part.fraction * rise
+            rise = route_leg.height_end_m[part.segment] - route_leg.height_start_m[part.segment]
+            path_m[rows] = path_at(route_leg, part)
+            vertical_m[rows] = height_m[rows] - route_leg.height_start_m[part.segment] - part.fraction * rise
         return path_m, vertical_m
 
     def routes(self, numbers: dict[str, int]) -> list[RoutePath]:
         """The legs as routes whose coordinate is `path_m`; `numbers`: net elements as the caller counts them."""
         number = np.array([numbers[name] for name in self.track.ids], dtype=np.int64)
-        return [replace(one, element=number[one.element]) for one in routes_of(self.track, self.legs)]
+        return [replace(route, element=number[route.element]) for route in routes_of(self.track, self.legs)]
 
     def balises(self, balises: pl.DataFrame | None) -> pl.DataFrame:
         """Balises on the path with path position and `sense` (of the measure along it), in order of leg and position.

@@ -60,12 +60,12 @@ class Feet:
         """Some of the feet."""
         return Feet(self.segment[rows], self.fraction[rows], self.offset_m[rows], self.distance_m[rows])
 
-    def put(self, rows: Ints, other: Feet) -> None:
+    def put(self, rows: Ints, replacement: Feet) -> None:
         """Replace some of the feet."""
-        self.segment[rows] = other.segment
-        self.fraction[rows] = other.fraction
-        self.offset_m[rows] = other.offset_m
-        self.distance_m[rows] = other.distance_m
+        self.segment[rows] = replacement.segment
+        self.fraction[rows] = replacement.fraction
+        self.offset_m[rows] = replacement.offset_m
+        self.distance_m[rows] = replacement.distance_m
 
 
 def no_feet(count: int) -> Feet:
@@ -92,15 +92,15 @@ def downhill(points: Points, line: Polyline, segment: Ints, line_of: Ints | None
     active = np.flatnonzero((feet.fraction < 0) | (feet.fraction > 1))
     while len(active):
         step = np.where(feet.fraction[active] < 0, -1, 1)
-        other = feet.segment[active] + step
-        inside = (other >= 0) & (other < len(line))
+        neighbour = feet.segment[active] + step
+        inside = (neighbour >= 0) & (neighbour < len(line))
         active = active[inside]
-        other = other[inside]
+        neighbour = neighbour[inside]
         if line_of is not None:
-            same = line_of[other] == line_of[feet.segment[active]]
+            same = line_of[neighbour] == line_of[feet.segment[active]]
             active = active[same]
-            other = other[same]
-        trial = on_segments(points.take(active), line, other)
+            neighbour = neighbour[same]
+        trial = on_segments(points.take(active), line, neighbour)
         better = np.flatnonzero(trial.distance_m < feet.distance_m[active] - 1e-9)
         active = active[better]
         feet.put(active, trial.take(better))

@@ -160,9 +160,9 @@ def end_places(track: SurveyedTrack) -> Floats:
     return places.surface.reshape(-1, 2, 3)
 
 
-def gaps_m(one: Floats, other: Floats) -> Floats:
+def gaps_m(left: Floats, entered: Floats) -> Floats:
     """Lengths of gaps between ends that count as track [m]: 0 where it is only survey noise."""
-    gap = np.linalg.norm(one - other, axis=-1)
+    gap = np.linalg.norm(left - entered, axis=-1)
     return np.where(gap > GAP_COUNTS_M, gap, 0.0)
 
 
@@ -190,9 +190,9 @@ def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
     """
     owner, vertex = _spaced_vertices(track)
     along = np.diff(points_of(track.latitude_deg[vertex], track.longitude_deg[vertex]).surface, axis=0)
-    own = owner[:-1] == owner[1:]
+    same_element = owner[:-1] == owner[1:]
     start = np.searchsorted(owner, np.arange(len(track.ids)))
-    turned = own & (np.einsum("ij,ij->i", along, along[np.minimum(start[owner[:-1]], len(along) - 1)]) < 0.0)
+    turned = same_element & (np.einsum("ij,ij->i", along, along[np.minimum(start[owner[:-1]], len(along) - 1)]) < 0.0)
     cuts: list[list[int]] = [[] for _ in track.ids]
     for element in np.unique(owner[:-1][turned]).tolist():
         since = int(start[element])
