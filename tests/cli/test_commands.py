@@ -66,7 +66,7 @@ def test_replay_one_run(balise: Balise, small_trial: SmallTrial, tmp_path: Path)
     assert "\x1b[" not in said.out + said.err
     assert "\u2502" not in said.out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        *(".catalogue", "alarms", "campaign", "config.toml", "epochs", "hazards", "manifest.json", "passages"),
+        *(".catalogue", ".held", "alarms", "campaign", "config.toml", "epochs", "hazards", "manifest.json", "passages"),
         *("replay.log", "runs"),
     ]
     quiet = balise("replay", small_trial.paths[0], "--site", small_trial.site, "--out", tmp_path / "out", "--quiet")

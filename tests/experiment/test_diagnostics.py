@@ -85,7 +85,7 @@ def test_first_passages_equal_those_of_naive_evaluation(probability: float) -> N
 def first_passages_from(plan: ExperimentPlan, basis: np.ndarray) -> np.ndarray:
     """The fast evaluation on a given path."""
     weights = NoisePaths(plan, 1, generator(0)).weights
-    watch = passage.Watch(plan, bank_forms(plan), failure_forms(plan), weights, basis.shape[2])
+    watch = passage.FirstAnswers(plan, bank_forms(plan), failure_forms(plan), weights, basis.shape[2])
     for begin, end in passage._blocks(plan.onset_s, plan.span_s, 4):
         watch.after_onset(basis[begin:end], begin)
     return watch.first[: len(plan.questions)]
@@ -95,7 +95,7 @@ def test_failure_is_the_first_epoch_beyond_the_limit() -> None:
     plan = small_plan(rates_mps=(1.0, 5.0))
     paths = NoisePaths(plan, 15, generator(6))
     basis = np.concatenate([paths.advance(50).copy() for _ in range(plan.span_s // 50)])
-    watch = passage.Watch(plan, bank_forms(plan), failure_forms(plan), paths.weights, 15)
+    watch = passage.FirstAnswers(plan, bank_forms(plan), failure_forms(plan), paths.weights, 15)
     for begin, end in passage._blocks(plan.onset_s, plan.span_s, 4):
         watch.after_onset(basis[begin:end], begin)
     east_north = basis[:, -2:]
@@ -166,7 +166,7 @@ def test_results_do_not_depend_on_the_number_of_jobs() -> None:
 
 def test_tables_of_hand_made_passages() -> None:
     plan = small_plan(rates_mps=(1.0,), headings_deg=(0.0,), readings=("increments",), sensors=("odometer",))
-    passages = passage.Passages(
+    passages = passage.FirstPassages(
         np.array([[[10, 20, 40, NEVER]]], dtype=np.int32),
         np.array([[[30, 30, 30, 30]]], dtype=np.int32),
         np.array([[False, True, False, False]]),

@@ -132,9 +132,12 @@ def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config:
     crossings: list[TrueCrossing] = []
     armed_from = 0
     passed = False
-    for change, later in zip(changes.tolist(), [*changes[1:].tolist(), away_m.size], strict=False):
+    far = np.flatnonzero(beyond)
+    for change in changes.tolist():
         armed = bool((beyond & (ahead != ahead[change]))[armed_from:change].any())
-        clear = armed and bool((beyond & (ahead == ahead[change]))[change:later].any())
+        # However often its middle wavers at the balise: on which side the train is next known to be beyond it.
+        next_far = int(np.searchsorted(far, change))
+        clear = armed and next_far < far.size and bool(ahead[far[next_far]] == ahead[change])
         if not clear and not (close[change - 1 : change + 1].all() and (armed or not passed)):
             continue
         armed_from = change

@@ -199,6 +199,18 @@ def test_a_train_that_turns_at_a_balise_has_not_surely_passed_it(turn_m: float, 
     assert [crossing.sense for crossing in found["V"]] == [1, -1][: len(passed_s)]
 
 
+@pytest.mark.parametrize("half_m", [1.0, 15.0])
+def test_a_train_that_stands_on_a_balise_and_goes_on_has_passed_it_once(half_m: float) -> None:
+    """From 5 m to a stand at 100 m, where the middle wavers by half a metre, and on to 195 m."""
+    wavering_m = 100.0 + 0.5 * np.where(np.arange(20) % 2 == 0, 1.0, -1.0)
+    at_m = np.concatenate([np.arange(5.0, 100.0, 10.0), wavering_m, np.arange(105.0, 196.0, 10.0)])
+    rows = np.arange(at_m.size)
+    route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
+    evidence = EvidenceSet(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - half_m, at_m + half_m),))
+    (found,) = true_crossings(rows * NS, evidence, {"V": Place(0, 100.0)}, Configuration())["V"]
+    assert (found.sense, found.clear) == (1, True)
+
+
 @pytest.mark.parametrize(("alarm_s", "onset_s", "standing"), [(3, 3, True), (12, 10, False), (None, 10, False)])
 def test_an_alarm_shortly_before_a_drift_is_its_onset_and_was_there_before_it(
     alarm_s: int | None, onset_s: int, standing: bool
