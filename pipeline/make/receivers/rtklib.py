@@ -149,7 +149,7 @@ def _times(words: Any, layout: _RtklibHeader, path: Path) -> pl.Series:
 
 
 def _numbers(words: Any, layout: _RtklibHeader, path: Path) -> dict[str, Floats]:
-    """The columns by name."""
+    """The columns after date and time, by the names of the header."""
     rest = words[:, 2:]
     try:
         values = numbers_of(rest.ravel()).reshape(rest.shape)

@@ -129,6 +129,7 @@ class _Walk:
             self.fields[path] = constant(field.default_value, self._types[path])
 
     def _null(self, tree: Mapping[Any, Any]) -> None:
+        """Every field below an absent message is null."""
         for step, node in tree.items():
             if step == "":
                 self.fields[node] = constant(None, self._types[node])

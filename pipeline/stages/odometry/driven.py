@@ -113,12 +113,13 @@ def evenly_driven(
     moves = np.flatnonzero((steps != 0) & (np.diff(distance_m, prepend=np.nan) != 0))
     at_s = t_s[moves].tolist()
     at_m = distance_m[moves].tolist()
-    gaps = np.diff(t_s[moves])
-    ways = np.abs(np.diff(distance_m[moves]))
-    # A turn, and the first movement, are held back by twice the width.
+    elapsed_s = np.diff(t_s[moves])
+    way_m = np.abs(np.diff(distance_m[moves]))
+    # At a turn, and at first, the hysteresis delays the row by twice the width: the way to it is longer by that.
     turned = steps[moves[1:]] * np.nan_to_num(steps[moves[:-1]]) <= 0
-    stood = ways - np.where(turned, 2.0 * width_m[moves[1:]], 0.0) <= least_mps * gaps
-    for gap in np.flatnonzero(stood & (gaps > 0))[::-1].tolist():
+    stood = way_m - np.where(turned, 2.0 * width_m[moves[1:]], 0.0) <= least_mps * elapsed_s
+    # From the last stand to the first, so that the places of those before stay where they are in the lists.
+    for gap in np.flatnonzero(stood & (elapsed_s > 0))[::-1].tolist():
         between = slice(int(moves[gap]), int(moves[gap + 1]))
         stood_m = float(np.median(distance_m[between]))
         # A uniform error of sigma s has its edges at sqrt(3) s.

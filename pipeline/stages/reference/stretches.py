@@ -113,7 +113,10 @@ def _silent_spans(t_ns: Ints, covered: Bools, gap_s: float) -> list[tuple[int, i
 def _placed(
     samples: ReferenceSamples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
 ) -> list[ReferenceStretch]:
-    """The ways of samples without a gap among them: nothing where no way passes, or more do than can be weighed."""
+    """The stretches of samples without a gap among them: each part with a way through, with all ways that do not fail.
+
+    A part without any such way, or with more than `routes_limit`, is left out.
+    """
     part_samples = samples.take(rows)
     all_steps = _steps(part_samples)
     stretches: list[ReferenceStretch] = []

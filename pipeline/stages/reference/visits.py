@@ -63,6 +63,7 @@ class WayThrough:
     def stays(self, last: int) -> list[ElementStay]:
         """The elements that it runs over, in order of time; `last`: the last step."""
         nodes = [self.start, *(link.there for link in self.links)]
+        # A link behind step `at` enters a sampled element at the next step, one passed between samples at the same.
         entered = [0, *(link.at + int(link.there.sampled) for link in self.links)]
         left = [*(link.at for link in self.links), last]
         backs = [False, *(link.back for link in self.links)]

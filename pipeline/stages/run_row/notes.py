@@ -130,7 +130,6 @@ def judged_notes(
     share_unknown: float | None,
     vehicle: VehicleFigures,
     odometer_contradicted: int,
-    config: Configuration,
 ) -> list[Remark]:
     """What stands behind the judgements of one solution (DOMAIN sections 5.1 and 5.4).
 

@@ -177,7 +177,7 @@ def _notes(
     noted = (
         *ingest_notes(results.ingest),
         *results.notes,
-        *judged_notes(results.judged.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
+        *judged_notes(results.judged.evidence, unknown, results.vehicle, results.odometer_contradicted),
         *undiagnosed_notes(results.epochs, results.judged.passages),
         *noise_notes(results.epochs, results.white_noise, config),
         *time_notes(results.epochs, clock, lost, config),

@@ -203,8 +203,10 @@ def _after_balise(profile: RequirementProfile) -> list[Requirement]:
     after = profile.after_balise
 
     def count(ride: ClaimRide, kind: BaliseKind) -> Tally:
+        """The balises of one kind on one ride, those passed faster than the requirement reaches left out."""
         front = ride.front
         limit = after.limit_m(ride.front.speed_mps)
+        # One more row: no epoch after the balise.
         code = np.append(_asked(front.within(limit, limit), limit), NOT_KNOWN)
         faster = np.append(np.abs(front.speed_mps) * KMH_PER_MPS > after.to_kmh, False)
         at_ns = _passed(ride.passages, kind)
