@@ -229,7 +229,7 @@ class _Learner:
         return along_series(epochs, odometer, self._config).between(begin - part.start, end - part.start)
 
     def _rows_m(self, at_s: Floats) -> Floats | None:
-        """Quantisation noise of the odometer's rows; none at a stand may be some under way."""
+        """Quantisation noise of the odometer's rows, by the speed: 0 at a stand may be more under way. None without."""
         if not self._odometry.noise.quantisation:
             return None
         return np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config))

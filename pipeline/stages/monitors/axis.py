@@ -191,8 +191,8 @@ def _rows_decorrelation(dt_s: Floats, period_s: Floats | float, config: MonitorC
 def most_scatter_m(config: Configuration) -> float:
     """The largest deviation of an odometer's row, or of digits, that the thresholds allow for [m].
 
-    With more, a position that leaves its place by the failure limit would be no more than rows of the odometer, or the
-    digits, make of it. Alarms of a record that scatters by more are its own, but no failure passes.
+    With more, the threshold k_T sqrt(2) sigma of two rows would exceed the failure limit and hide a failure. A record
+    that scatters by more raises false alarms instead.
     """
     factor = config.monitors.threshold_factor
     return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))

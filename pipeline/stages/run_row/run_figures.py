@@ -248,20 +248,19 @@ def exposure(epochs: pl.DataFrame) -> Row:
 
 
 def state_shares(epochs: pl.DataFrame) -> Row:
-    """Shares of the time, gaps apart, known to be spent in each state of the LDS (TVB section 4).
+    """Share of the time, without gaps, in which each state of the LDS is known to hold (TVB section 4).
 
-    `share_p1` of the time that shares count is the hazardous time of all failures.
-
-    Where the judgement is unknown for a while the four do not add up to one. Where no epoch is known to be P0, P0 is
-    not known, nor is P1 unless some epoch is in it.
+    The time in P1 is the hazardous time of all failures. While the state is unknown no share grows, so the four may add
+    up to less than one. If some state is unknown and no epoch is known to be P0, the share of P0 is null, not 0; so is
+    that of P1 unless some epoch is in it.
     """
     states = {f"share_{state.value.lower()}": pl.col("lds_state") == state for state in LdsState}
     inside = epochs.select(condition.fill_null(value=False).alias(name) for name, condition in states.items())
     counted_s = floats(epochs, "counted_s")
     row: Row = {flag.name: share_of_time(counted_s, flag.to_numpy()) for flag in inside}
     if epochs["lds_state"].null_count() and not inside["share_p0"].any():
-        unseen = ["share_p0"] if inside["share_p1"].any() else ["share_p0", "share_p1"]
-        row |= dict.fromkeys(unseen)
+        unknown = ["share_p0"] if inside["share_p1"].any() else ["share_p0", "share_p1"]
+        row |= dict.fromkeys(unknown)
     return row
 
 
