@@ -79,7 +79,7 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     body = [
         tiles((f"runs {name}", str(count), _TONES[name] if count else "") for name, count in counts.items()),
         pairs(_facts(campaign, solutions)),
-        section("runs", "Runs", _runs_table(campaign, made)),
+        section("runs", "Runs", _runs_table(campaign)),
         *(_solution(f"s{index}", name, campaign, len(solutions) > 1) for index, name in enumerate(solutions)),
         architectures_section("architectures", campaign.architectures),
         _map_in_doubt(campaign.derived["map"]),
@@ -126,7 +126,7 @@ def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
     return list(lines.items())
 
 
-def _runs_table(campaign: Campaign, made: Made) -> str:
+def _runs_table(campaign: Campaign) -> str:
     runs = (
         known_counts(campaign.runs)
         .with_columns(

@@ -3,9 +3,8 @@
 After an alarm the anchor is a TVB well before it, for a slow drift has moved the last one already; alarms that follow
 may be about the same fault, so that a return does not move it. Only a telegram does: it says where the train is. After
 slip that the odometer reports, no fault is suspected, so the anchor is the last TVB before the slip, but the first one
-while a position is held to it after a return. A wheel that slips
-is counted wrongly: that widens the bound, up to half the failure limit; if the count may be off by more, only a
-telegram re-links.
+while a position is held to it after a return. A wheel that slips is counted wrongly: that widens the bound, up to half
+the failure limit; if the count may be off by more, only a telegram re-links.
 """
 
 from __future__ import annotations
