@@ -160,8 +160,6 @@ class MisfitCause(StrEnum):
     COUNTS_BACKWARDS = "counts_backwards"
     SPEED_WITHOUT_SIGN = "speed_without_sign"
     COUNTER_WITHOUT_SIGN = "counter_without_sign"
-    SIGN_OF_SOMETHING_ELSE = "sign_of_something_else"
-    TWO_COUNTERS = "two_counters"
     OFFSET_OF_REFERENCE = "offset_of_reference"
     WHOLE_SECONDS = "whole_seconds"
     DATUM = "datum"
@@ -178,13 +176,9 @@ class MisfitCause(StrEnum):
     VELOCITY_FRAME = "velocity_frame"
     VELOCITY_DOWN = "velocity_down"
     GPS_AS_UTC = "gps_as_utc"
-    TAI_AS_GPS = "tai_as_gps"
-    TAI_AS_UTC = "tai_as_utc"
     TIME_ZONE = "time_zone"
     GPS_WEEK = "gps_week"
-    WRONG_WEEK = "wrong_week"
     WRONG_DAY = "wrong_day"
-    DAY_AND_MONTH = "day_and_month"
     CONSTANT_LAG = "constant_lag"
     LATENCY = "latency"
     STAMPED_LATE = "stamped_late"
@@ -204,7 +198,6 @@ class MisfitPlace(StrEnum):
     RATHER_IN_STREAM = "rather_in_stream"
     IN_SURVEY = "in_survey"
     IN_REFERENCE = "in_reference"
-    OR_VELOCITY = "or_velocity"
 
 
 class Note(StrEnum):
