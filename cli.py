@@ -59,7 +59,7 @@ def _here(value: Any) -> Any:
 
 _place, _file = partial(Argument, callback=_here), partial(Option, callback=_here)
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
-_LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; .gz, .zip of these."
+_LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; archives of these."
 
 _CALIBRATE = (
     "Vehicle and noise from these fault-free runs of the same vehicle (again for more), or `auto`: each run from the "
