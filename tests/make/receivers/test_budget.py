@@ -116,6 +116,7 @@ def tarred(*members: tuple[str, bytes | None]) -> bytes:
         ("a.zst", zstd(bestposa())[:-4], "cannot be unpacked"),
         ("a.tar", tarred(("log", b"x" * 2000))[:1000], "cannot be unpacked"),
     ],
+    ids=["link", "above", "absolute", "above in a zip", "short zstd", "short tar"],
 )
 def test_members_that_are_no_plain_files(
     tmp_path: Path, scratch: Path, name: str, content: bytes, message: str
