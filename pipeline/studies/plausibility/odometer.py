@@ -50,7 +50,7 @@ def odometer_checks(of: Recording) -> tuple[list[Check], list[StreamLag]]:
     if not pair.known:
         return checks, [StreamLag("odometer", reason=pair.reason)]
     checks.append(turn_check(of.gnss, of.counters[name], pair))
-    checks += _scale_checks(pair, of)
+    checks += _scale_checks(name, of)
     return checks, [_lag(pair, of)]
 
 
@@ -95,8 +95,9 @@ def _factor_check(name: str, of: Recording) -> Check:
     return misfit(what, words)
 
 
-def _scale_checks(pair: PairFit, of: Recording) -> list[Check]:
+def _scale_checks(name: str, of: Recording) -> list[Check]:
     """The scale that the run shows against that of the vehicle file, or 1; none of another unit than metres."""
+    pair = of.pairs[name]
     config = of.config
     file_scale = of.vehicle.odometer_scale
     what = "odometer scale" if file_scale is None else "odometer scale of the vehicle file"
@@ -113,7 +114,9 @@ def _scale_checks(pair: PairFit, of: Recording) -> list[Check]:
         return [misfit(what, words, MisfitCause.WHEEL, lines=_scale_lines(pair), into=VEHICLE_FILE)]
     words = f"{file_scale:.4f}, {words}"
     least = max(config.file_scale, config.file_sigmas * (of.vehicle.odometer_scale_sigma or 0.0))
-    if not pair.other_factor(1.0 / file_scale, least):
+    # Where a reference says that the file is right the positions drift.
+    against = (pair, of.by_reference(name)) if pair.other_factor(1.0 / file_scale, least) else (pair,)
+    if any(fit.known and not fit.other_factor(1.0 / file_scale, least) for fit in against):
         return [fits(what, words)]
     return [misfit(what, words, MisfitCause.SCALE_OF_FILE, lines=_scale_lines(pair), into=IN_VEHICLE_FILE)]
 
