@@ -152,7 +152,8 @@ class MonitorBank:
 
     Epochs are rows of the solution's epochs. The answers for an epoch may change with `freeze` or `restart` at that
     epoch or before it, never through later ones. `single`: monitors without memory beyond an epoch, evaluated
-    beforehand, `value, threshold, state, reason` by name. `watched`: epochs with a row along the track. A fail of any monitor at an epoch is an alarm.
+    beforehand, `value, threshold, state, reason` by name. `watched`: epochs with a row along the track. A fail of any
+    monitor at an epoch is an alarm.
     """
 
     def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration):
