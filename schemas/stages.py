@@ -73,7 +73,7 @@ class Aligned(Positions):
     odometer_counter = dy.Int64(
         min=0, description="the same number over slip and pauses between speeds: there the way is known roughly"
     )
-    slip_doubt_m = real("m", "by how much slip may have falsified the distance since the first epoch", min=0)
+    slip_doubt_m = real("m", "by how much slip and pauses may have falsified the distance since the first epoch", min=0)
     odometer_white_m2_per_s = real("m2/s", "variance that the odometer's distance gathers in a second", min=0)
     odometer_rows_m = real("m", "quantisation noise of the odometer's rows, as far as thresholds allow for it", min=0)
     odometer_period_s = real("s", "time between rows of the odometer", min=0)

@@ -45,8 +45,8 @@ class Odometry:
 
     Instants are int64 nanoseconds; `t_s` of the samples (rows, and what was filled in) and all `_s` arguments are
     seconds since `epoch_ns`. Distances are as recorded, but for `between` and `increments`, and grow with the path once
-    `oriented`. `segment`: how often the distance was lost before a sample; `counter`: the same, over slip and over
-    pauses between speeds, where the way is known roughly; `slip_doubt_m`: by how much that may be off so far. `pause[i]`:
+    `oriented`. `segment`: how often the distance was lost before a sample; `counter`: the same, over slip and pauses
+    between speeds, where the way is known roughly; `slip_doubt_m`: by how much that may be off so far. `pause[i]`:
     between samples i and i+1 nothing is interpolated. `scale`: true over recorded distance, None without its sigma.
     `leaps_ns`: rows to which the counter leaps (`rows.leaps`).
     """

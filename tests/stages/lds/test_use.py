@@ -28,7 +28,7 @@ def changes(result: LdsResult) -> list[tuple[int, str]]:
 def walk(
     bank: dict[str, Any], offset_m: float = 0.0, slip: range = range(0), silent: range = range(0), **lds: Any
 ) -> LdsResult:
-    """The position is off by `offset_m` from 25 s on; the odometer reports slip, or is silent and loses its distance."""
+    """The position is off by `offset_m` from 25 s on; the odometer slips, or is silent and loses its distance."""
     slips = [k in slip for k in range(COUNT)]
     true_m = steps(0.0, 20.0, COUNT)
     epochs = epochs_of(
