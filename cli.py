@@ -452,6 +452,9 @@ def experiment(
     seed: Annotated[int, Option(help="Seed of all random numbers.")] = 1,
     jobs: Jobs = 0,
     config: Annotated[Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue` only).")] = None,
+    noise_of: Annotated[
+        Path | None, _file(help="Result of fault-free runs whose noise replaces the published one (`rare` only).")
+    ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -467,7 +470,7 @@ def experiment(
 
     bank = None if config is None else _configuration(config)
     with watched(None if quiet else how_far("pieces of work")):
-        files = wanted(out, repetitions, seed, jobs, bank)
+        files = wanted(out, repetitions, seed, jobs, bank, noise_of)
     _tell(as_json, {"experiment": name, "out": out, "files": files}, {}, *map(str, files))
 
 
