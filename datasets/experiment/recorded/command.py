@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -27,7 +26,6 @@ from pipeline.read.ingest import read_run
 from pipeline.read.site.read import read_site
 from pipeline.results.software import software_digest
 from pipeline.results.workers import mapped
-from pipeline.show.terminal import show_table
 from pipeline.storage.parquet import parquet_bytes
 from schemas.arrays import flags
 from schemas.config import Configuration, Vehicle, digest_of, load_settings, to_toml
@@ -40,17 +38,15 @@ from schemas.version import SOFTWARE
 
 # Injections that one process takes on at once, and that are not made again when the command is repeated.
 _PIECE = 20
+PAGE = "index.html"
 _PIECES = "pieces"
 _SHOWN = (
-    "bank",
-    "cell",
-    "injections",
-    "passes",
-    "noticed",
-    "time_to_detect_median_s",
-    "failures",
-    "pmd_at_failure",
-    "pmd_at_failure_high",
+    *("bank", "cell", "injections", "passes", "noticed", "time_to_detect_median_s", "failures"),
+    *("pmd_at_failure", "pmd_at_failure_high"),
+)
+_SHOWN_OF_BANKS = (
+    *("bank", "hours", "alarms", "alarm_rate_per_h", "alarm_rate_high_per_h", "injections", "passes", "noticed"),
+    *("failures", "missed_at_failure", "pmd_at_failure", "pmd_at_failure_high", "in_use_max_m"),
 )
 _LOST_KEY = "balise.lost"
 _LOST = {"bank": pl.String, "cell": pl.String, "reason": pl.String}
@@ -76,6 +72,7 @@ class Made:
 
     tables: dict[str, pl.DataFrame]
     failed: dict[str, str]
+    page: Path
 
 
 @dataclass(frozen=True)
@@ -140,7 +137,7 @@ def recorded_experiment(
     tables = _tables(mapped(_made_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
     _write(out, tables, plan)
     _forget_others(pieces, out)
-    return Made(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None})
+    return Made(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, out / PAGE)
 
 
 def _inputs(
@@ -355,13 +352,7 @@ def _own_digest() -> str:
     return digest.hexdigest()
 
 
-def show(made: Made, out: Path, quiet: bool) -> None:
-    """The cells and banks on the screen, and what could not be used."""
-    for run_id, error in made.failed.items():
-        print(f"{run_id} is not used: {error}", file=sys.stderr)
-    if quiet:
-        return
-    shown = made.tables["cells"].select(_SHOWN).filter(pl.col("injections") > 0)
-    show_table(shown, "Cells")
-    show_table(made.tables["banks"].drop("slowest_cell"), "Banks")
-    print(f"Tables in {out}")
+def shown(made: Made) -> dict[str, pl.DataFrame]:
+    """What the screen shows: cells that were replayed, and banks."""
+    cells = made.tables["cells"].filter(pl.col("injections") > 0)
+    return {"Cells": cells.select(_SHOWN), "Banks": made.tables["banks"].select(_SHOWN_OF_BANKS)}
