@@ -17,6 +17,8 @@ from datasets.experiment.recorded.baseline import Baseline, baseline_of
 from datasets.experiment.recorded.draw import Onset, Room, numbered, onsets_of, room_of
 from datasets.experiment.recorded.injection import injected
 from datasets.experiment.recorded.outcome import outcome_row
+from datasets.experiment.recorded.page import recorded_page
+from datasets.experiment.recorded.pictures import pictures
 from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan, banks_of, load_plan
 from datasets.experiment.recorded.tables import Quiet, banks_table, cells_table, places_table, pmd_table
 from datasets.experiment.tables import Row
@@ -333,6 +335,10 @@ def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> No
         metadata = {"balise.table": f"experiment_{name}", "balise.software": SOFTWARE}
         storage.write_bytes(out / f"{name}.parquet", parquet_bytes(table, metadata, notes))
     storage.write_bytes(out / "plan.toml", to_toml(plan).encode())
+    drawn = pictures(tables)
+    for name, (_, drawing) in drawn.items():
+        storage.write_bytes(out / f"{name}.svg", drawing.encode())
+    storage.write_bytes(out / PAGE, recorded_page(tables, drawn, plan).encode())
 
 
 def _forget_others(pieces: Sequence[_Piece], out: Path) -> None:
