@@ -128,7 +128,8 @@ def overtaken(candidates: Candidates, network: Network) -> Bools:
     """
     past_m = _past_ends_m(candidates)
     row, end = np.nonzero(np.isfinite(past_m))
-    edge_first, edge_to = network.edges
+    edge_first = network.successors.first
+    edge_to = network.successors.to
     leaving = 2 * candidates.element[row] + 1 - end
     number = np.diff(edge_first)[leaving]
     edge = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number - edge_first[leaving], number)

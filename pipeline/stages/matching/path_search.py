@@ -176,7 +176,7 @@ def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig)
 
 def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) -> InputError:
     """The error for a run of which no epoch is within reach of any track."""
-    tree = cKDTree(points_of(track.latitude_deg, track.longitude_deg).surface)
+    tree = cKDTree(track.surface)
     rows = np.flatnonzero(fixes.valid)
     nearest_m, vertex = tree.query(fixes.points.surface[rows])
     row = int(np.argmin(nearest_m))

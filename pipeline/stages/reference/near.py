@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.stages.track.geodesy import Points, points_of
+from pipeline.stages.track.geodesy import Points
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.segments import SAMPLE_SPACING_M, Polyline, on_segments
 from pipeline.stages.track.survey import SurveyedTrack
@@ -67,7 +67,7 @@ def near_elements(points: Points, sigma_m: Floats, network: Network, factor: flo
     """
     track = network.track
     element_of = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
-    surface = points_of(track.latitude_deg, track.longitude_deg).surface
+    surface = track.surface
     starts = np.flatnonzero(element_of[1:] == element_of[:-1])
     line = Polyline(surface[starts], surface[starts + 1])
     segment_sigma_m = network.survey_sigmas_m(unstated_m)[starts]
