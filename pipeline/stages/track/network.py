@@ -10,17 +10,17 @@ from __future__ import annotations
 import copy
 import heapq
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Generic, NamedTuple, TypeVar
-from weakref import WeakKeyDictionary
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
 from pipeline.stages.track.chords import chord_sigmas_m
 from pipeline.stages.track.leg import Visit
+from pipeline.stages.track.once import Once
 from pipeline.stages.track.survey import (
     SurveyedTrack,
     end_places,
@@ -301,33 +301,13 @@ def _joined(track: SurveyedTrack, visits: Sequence[Visit]) -> Ways:
     return _ways(2 * len(track.ids), here, there, np.repeat(gap_m, 2), both, both)
 
 
-Made = TypeVar("Made")
-
-
-class OncePerSite(Generic[Made]):
-    """What is made of a site is made once and kept as long as the site, however many runs ask."""
-
-    def __init__(self, make: Callable[[Site], Made]) -> None:
-        self._make = make
-        self._made: WeakKeyDictionary[Site, Made] = WeakKeyDictionary()
-
-    def __call__(self, site: Site) -> Made:
-        if site not in self._made:
-            self.keep(site, self._make(site))
-        return self._made[site]
-
-    def keep(self, site: Site, made: Made) -> None:
-        """Whoever read the site may have made it already."""
-        self._made[site] = made
-
-
-@OncePerSite
+@Once
 def surveyed(site: Site) -> SurveyedTrack:
     """The track of a site as arrays."""
     return track_of(site.track)
 
 
-@OncePerSite
+@Once
 def network_in_pieces(site: Site) -> Network:
     """The network of a site, or of nothing but its route, with elements that turn round in pieces that do not."""
     track = surveyed(site)
@@ -337,7 +317,7 @@ def network_in_pieces(site: Site) -> Network:
     return site_network(site) if pieces is track else network_of(pieces, site.links)
 
 
-@OncePerSite
+@Once
 def site_network(site: Site) -> Network:
     """The network of a site; where it gives a route, the elements of the survey with its relations alone."""
     track = surveyed(site)

@@ -28,7 +28,7 @@ MEASURE_TOLERANCE_M = 0.5
 _DIRECTION_OVER_M = 10.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SurveyedTrack:
     """Net elements, each a run of vertices `first[e] : first[e + 1]`, in the order of the survey.
 
