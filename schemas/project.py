@@ -153,10 +153,12 @@ class Project(Settings):
         return self
 
 
+_OWN_KEYS = Project.model_fields.keys() - Configuration.model_fields.keys()
+
+
 def is_project(data: dict[str, object]) -> bool:
-    """Whether TOML is a project: a configuration of the same name has nothing but the configuration's own tables."""
-    of_configuration = all(name in Configuration.model_fields and isinstance(data[name], dict) for name in data)
-    return not data or not of_configuration
+    """Whether TOML is a project: it has keys that no configuration has (of tables of one name a project has none)."""
+    return isinstance(data.get("site"), str) or not data.keys().isdisjoint(_OWN_KEYS)
 
 
 def load_project(file: Path) -> Project:
@@ -166,7 +168,7 @@ def load_project(file: Path) -> Project:
 
 def load_configuration(file: Path | None) -> Configuration:
     """A configuration file, or the configuration that a project file stands for."""
-    if file is None or file.name != FILE_NAME or not is_project(data := read_toml(file)):
+    if file is None or not is_project(data := read_toml(file)):
         return load_settings(file, Configuration)
     project = settings_from(data, Project, str(file), _REMEDY)
     config = load_settings(None if project.config is None else file.parent / project.config, Configuration)
