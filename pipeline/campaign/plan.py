@@ -53,13 +53,17 @@ class RunJob:
 
 @dataclass(frozen=True)
 class Plan:
-    """All runs of one call, and where their results go; `given`: the settings files of the call."""
+    """All runs of one call, and where their results go; `given`: the settings files of the call.
+
+    `given_by_digest`: those of runs that have other ones, by the digest of their configuration.
+    """
 
     jobs: tuple[RunJob, ...]
     out: str
     config: Configuration
     vehicle: Vehicle
     given: SettingsFiles = field(default_factory=settings_files)
+    given_by_digest: Mapping[str, SettingsFiles] = field(default_factory=dict)
 
 
 def make_plan(

@@ -54,6 +54,10 @@ class Recording:
         """Each counter against the positions."""
         return {name: fit_pair(self.gnss, counter) for name, counter in self.counters.items()}
 
+    def by_reference(self, name: str) -> PairFit:
+        """A counter against the reference, which no drift of the GNSS is in."""
+        return fit_pair(self.reference, self.counters[name]) if self.reference else PairFit(reason="no reference")
+
     @cached_property
     def velocity(self) -> VelocityFit | None:
         return fit_velocity(self.fixes, self.gnss, self.epoch_ns)

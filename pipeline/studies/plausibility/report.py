@@ -21,6 +21,12 @@ class FitReport:
     tables: dict[str, pl.DataFrame]
     problems: tuple[str, ...]
 
+    def as_dict(self) -> dict[str, object]:
+        """For programs: what keeps the run from being replayed, every check, and the lines that mend it."""
+        mending = self.tables.get("Lines that mend it")
+        mends = [] if mending is None else mending["toml"].to_list()
+        return {"problems": list(self.problems), "fit": self.tables.get("Fit", []), "mends": mends}
+
     def lines(self) -> list[str]:
         """The same as plain lines, without what fits or could not be checked."""
         lines = [f"does not fit: {problem}" for problem in self.problems]
