@@ -78,7 +78,7 @@ def recorded_noises(result: Path) -> list[RecordedNoise]:
             "has no run whose noise along the track is known",
             place=str(result),
             expected="runs with an odometer, without injected faults, replayed to the end",
-            found=f"{runs.height} such runs, none with `white_noise_along_m`",
+            found=f"{runs.height} fault-free runs, none with `white_noise_along_m`" if runs.height else "no such run",
             remedy="Replay fault-free runs of some minutes, with their odometer.",
         )
     return [_noise_of(result, solution, part) for (solution,), part in known.group_by("solution", maintain_order=True)]

@@ -59,7 +59,8 @@ def tables_of_a_result(faults: bool = False, white_m: float | None = 0.05) -> di
         "white_noise_along_m": pl.Series([white_m, white_m], dtype=pl.Float64),
     })  # fmt: skip
     epochs = pl.DataFrame({
-        "run_id": ["a"] * 3 + ["b"] * 3, "solution": ["primary"] * 6, "t": [start + timedelta(seconds=k) for k in range(6)],
+        "run_id": ["a"] * 3 + ["b"] * 3, "solution": ["primary"] * 6,
+        "t": [start + timedelta(seconds=k) for k in range(6)],
         "sigma_along_m": [1.0, 9.0, 2.0, 1.0, 9.0, 2.0], "alarm": [False, True, False] * 2,
         **{f"along_{scale}_value": [0.3, 5.0, -0.3] * 2 for scale in rare_recorded.SCALES},
         **{f"along_{scale}_threshold": [1.0] * 6 for scale in rare_recorded.SCALES},
