@@ -74,7 +74,6 @@ def _place_solutions(prepared: PreparedRun) -> _Placed:
     errors: dict[str, InputError] = {}
     for name in prepared.run.solutions():
         try:
-            prepared.fixes(name)
             fits[name] = required_fit(prepared, name, prepared.vehicle)
             matches[name] = prepared.match(name)
         except InputError as error:

@@ -84,9 +84,10 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
 
 
 def required_fit(prepared: PreparedRun, solution: str, vehicle: Vehicle) -> Fit:
-    """The fit of a solution; raises `InputError` where no train can have driven it, unless the configuration lets it
-    pass.
+    """The fit of a solution; raises `InputError` where it has no journey, or no train can have driven it (unless the
+    configuration lets that pass).
     """
+    prepared.fixes(solution)
     config = prepared.config
     fit = fit_run(prepared.recorded, solution, vehicle, config.plausibility, prepared.site)
     impossible = fit.impossible
