@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import signal
@@ -16,12 +17,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from typer import Argument, Exit, Option, Typer
+from typer.core import TyperCommand
 from typer.main import get_command
 
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.campaign import Plan
+    from pipeline.campaign import CampaignSummary, Interrupted, Plan
     from schemas.config import Configuration, Vehicle
     from schemas.run import RunLog
     from schemas.run import Site as Ground
@@ -41,9 +43,29 @@ app = Typer(
 )
 
 
-def _command(*examples: str, name: str | None = None) -> Callable[[Command], Command]:
+class _OfProject(TyperCommand):
+    """Takes what is not given from the project (`--project`, or that of the working directory), and says so."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given, _, _ = self.make_parser(ctx).parse_args(list(args))
+        if not given.get("help") and (given.get("project") or Path("balise.toml").is_file()):
+            from pipeline.project.opened import taken_from_project
+
+            named = given.pop("project", None)
+            missing = [option.name for option in self.params if given.get(option.name or "") in (None, [], ())]
+            # A single word is the query, though the result comes first.
+            shifted = self.name == "sql" and "query" in missing and "out" not in missing
+            missing = ["out"] if shifted else missing
+            say = None if given.get("quiet") else _say
+            ctx.default_map = taken_from_project(named, self.name or "", missing, say)
+            args = [ctx.default_map["out"], *args] if shifted and ctx.default_map else args
+        return super().parse_args(ctx, args)
+
+
+def _command(*examples: str, name: str | None = None, of_project: bool = False) -> Callable[[Command], Command]:
     """A command with examples under its help; an empty line keeps each on a line of its own."""
-    return app.command(name, epilog="\n\n".join(["Examples:", *examples]))
+    epilog = "\n\n".join(["Examples:", *examples])
+    return app.command(name, epilog=epilog, cls=_OfProject if of_project else None)
 
 
 def _here(value: Any) -> Any:
@@ -60,7 +82,9 @@ def _here(value: Any) -> Any:
 
 _place, _file = partial(Argument, callback=_here), partial(Option, callback=_here)
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
-_LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; .gz, .zip of these."
+_LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; archives of these."
+
+_CSV = "Write CSV; `-` is standard output."
 
 _CALIBRATE = (
     "Vehicle and noise from these fault-free runs of the same vehicle (again for more), or `auto`: each run from the "
@@ -81,10 +105,13 @@ Solution = Annotated[str, Option(help="Solution of the runs.")]
 Jobs = Annotated[
     int, Option(min=0, callback=lambda jobs: jobs or os.cpu_count() or 1, help="So many at once; 0: one per core.")
 ]
-CsvFile = Annotated[Path | None, _file("--csv", metavar="FILE", help="Write CSV; `-` is standard output.")]
+ProjectFile = Annotated[Path | None, _file("--project", help="Project: its folder or file; default: balise.toml here.")]
+OfProject = Annotated[
+    Path | None, _file("--project", help="Take what is not given from this project; default: balise.toml here.")
+]
 Force = Annotated[bool, Option("--force", help="Replace what is there.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no tables; errors only.")]
-Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
+Json = Annotated[bool, Option("--json", help="Print the answer as JSON (docs/json.md), progress on standard error.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -102,6 +129,7 @@ def _about(
     "balise replay logs/*.mcap --site line9 --out week12 --vehicle train7.toml",
     "balise replay logs/*.mcap --site line9 --out week12 --calibrate auto",
     "balise replay s3://trial/logs --site line9 --out s3://trial/week12 --jobs 8",
+    of_project=True,
 )
 def replay(
     runs: Annotated[list[str], Argument(help="Runs: logs, run folders, folders of runs, glob patterns or addresses.")],
@@ -121,7 +149,8 @@ def replay(
         Literal["unsafe", "unproven"] | None, Option(help="Exit status 1 also for this verdict, and for worse ones.")
     ] = None,
     quiet: Quiet = False,
-    as_json: Annotated[bool, Option("--json", help="JSON: progress on standard error, then the result.")] = False,
+    as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
@@ -141,16 +170,27 @@ def replay(
             plan, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit, watches=shown
         )
     except Interrupted as interrupted:
-        # A terminal that was closed takes no more words.
-        with contextlib.suppress(OSError):
-            if interrupted.summary is not None:
-                show_summary(interrupted.summary, out, quiet, as_json, **places)
-            print("balise: interrupted; repeat the command to continue", file=sys.stderr)
-        raise Exit(128 + interrupted.signum) from None
+        raise _stopped(interrupted, out, quiet, as_json, places) from None
     show_summary(summary, out, quiet, as_json, **places)
+    raise Exit(_status_of(summary, fail_on))
+
+
+def _stopped(interrupted: Interrupted, out: str, quiet: bool, as_json: bool, places: Mapping[str, str]) -> Exit:
+    """Say what is done of an interrupted campaign."""
+    from pipeline.show.progress import show_summary
+
+    # A terminal that was closed takes no more words.
+    with contextlib.suppress(OSError):
+        if interrupted.summary is not None:
+            show_summary(interrupted.summary, out, quiet, as_json, **places)
+        print("balise: interrupted; repeat the command to continue", file=sys.stderr)
+    return Exit(128 + interrupted.signum)
+
+
+def _status_of(summary: CampaignSummary, fail_on: str | None) -> int:
     refused = {"unsafe": ["unsafe"], "unproven": ["unsafe", "unproven"]}.get(fail_on or "", [])
     acceptable = summary.all_ok and not any(summary.head.counts()[verdict] for verdict in refused)
-    raise Exit(DEFECT if summary.defects else OK if acceptable else RUNS_NOT_OK)
+    return DEFECT if summary.defects else OK if acceptable else RUNS_NOT_OK
 
 
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
@@ -160,6 +200,54 @@ def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
 
     with watched(None if quiet else how_far("runs looked at to calibrate")):
         return calibrated(plan, runs, jobs)
+
+
+@_command("balise run", "balise run --project week12 --jobs 4")
+def run(
+    project: ProjectFile = None,
+    jobs: Annotated[int | None, Option(min=0, help="So many at once; default: as the project says.")] = None,
+    force: Annotated[bool, Option("--force", help="Make everything again, whatever is there.")] = False,
+    prune: Annotated[bool, Option("--prune", help="Remove results of runs that the project does not name.")] = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Bring a project up to date: convert, site, calibrate, replay, report; only what changed is done again."""
+    from datasets.recordings import recordings
+    from pipeline.campaign import Interrupted
+    from pipeline.project.opened import open_project
+    from pipeline.project.run import Call, run_project
+    from pipeline.show.progress import show_summary, summary_answer, watches
+    from pipeline.show.terminal import how_far
+
+    opened = open_project(project)
+    options = opened.project.replay
+    out = opened.place(opened.project.out)
+    files = (("vehicle", opened.vehicle_file), ("config", opened.config_file))
+    named = "".join(f" --{name} {file}" for name, file in files if file)
+    places = {"site": opened.place(opened.project.site), "options": named}
+    pages = None if quiet or as_json else how_far("pages")
+    at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
+    call = Call(_steps(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)
+    try:
+        ended = run_project(opened, recordings(), call)
+    except Interrupted as interrupted:
+        raise _stopped(interrupted, out, quiet, as_json, places) from None
+    if as_json:
+        _print_json({**summary_answer(ended.summary, out), "page": ended.page, "changed": ended.changed})
+    else:
+        show_summary(ended.summary, out, quiet, False, **places)
+    if not (quiet or as_json):
+        print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
+    raise Exit(_status_of(ended.summary, options.fail_on))
+
+
+def _steps(quiet: bool, as_json: bool) -> Callable[[str, str], None]:
+    """Says what a project's steps do, one line each, on standard error."""
+    if quiet:
+        return lambda step, text: None
+    if as_json:
+        return lambda step, text: _say(json.dumps({"event": "step", "step": step, "text": text}))
+    return lambda step, text: _say(f"{step:<10}{text}")
 
 
 @_command("balise dictionary --table hazards", "balise dictionary --markdown > dictionary.md")
@@ -190,12 +278,15 @@ def demo(
     out: OutFolder = Path("demo-out"),
     seed: Annotated[int | None, Option(help="Seed of the trial; another seed gives other noise.")] = None,
     quiet: Quiet = False,
+    as_json: Json = False,
 ) -> None:
     """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
     from datasets.demo import demo as run_demo
 
     result = run_demo(out, seed, None if quiet else _say)
-    if not quiet:
+    if as_json:
+        _print_json({"out": out, **result.as_dict()})
+    elif not quiet:
         if not result.agrees:
             _show(result.differing, "What was found differs from what was expected")
         print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {result.page}\n")
@@ -205,17 +296,25 @@ def demo(
 
 
 @_command("balise synth scenario.toml --out trial")
-def synth(scenario: Annotated[Path, _place(help="Scenario (TOML).")], out: OutFolder, quiet: Quiet = False) -> None:
+def synth(
+    scenario: Annotated[Path, _place(help="Scenario (TOML).")],
+    out: OutFolder,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
     """Write a synthetic trial: site, runs and the faults injected into them."""
     from datasets.scenario import load_scenario
     from datasets.trial import write_trial
 
     paths = write_trial(load_scenario(scenario), out, None if quiet else _say)
-    if not quiet:
-        print(f"{len(paths)} runs in {out / 'runs'}, site in {out / 'site'}")
+    if as_json or not quiet:
+        made = {"out": out, "site": out / "site", "runs": paths}
+        _tell(as_json, made, {}, f"{len(paths)} runs in {out / 'runs'}, site in {out / 'site'}")
 
 
-@_command("balise safety", "balise safety week12", "balise safety week12 --config other_level.toml --json")
+@_command(
+    "balise safety", "balise safety week12", "balise safety week12 --config other_level.toml --json", of_project=True
+)
 def safety(
     out: Annotated[str | None, Argument(help="Result of `balise replay`; without it: the budget only.")] = None,
     config: ConfigFile = None,
@@ -224,6 +323,7 @@ def safety(
     vehicle: VehicleFile = None,
     jobs: Jobs = 0,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Print the safety budget and its errata; for a result also its sources and each measured figure with bounds.
 
@@ -246,14 +346,19 @@ def safety(
     _print_json(tables) if as_json else show_tables(tables)
 
 
-@_command("balise claim week12 --site line9", "balise claim week12 --site line9 --profile newer.toml --csv claim.csv")
+@_command(
+    "balise claim week12 --site line9",
+    "balise claim week12 --site line9 --profile newer.toml --csv claim.csv",
+    of_project=True,
+)
 def claim(
     out: Result,
     profile: Annotated[str, Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
     site: Annotated[str | None, Option(help="Site with areas.csv or areas.parquet.")] = None,
     front_ahead: Annotated[float, Option(metavar="METRES", help="Front end ahead of the balise antenna.")] = 0.0,
-    csv: CsvFile = None,
+    csv: Annotated[Path | None, _file("--csv", "--out", metavar="FILE", help=_CSV)] = None,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Compare a result with published requirements for train localisation: met, not met or not shown."""
     from pipeline.results.answer_files import write_csv
@@ -272,7 +377,7 @@ def claim(
         _tell(as_json, answer, {title: for_reading(found)}, "", *found.notes)
 
 
-@_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12")
+@_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12", of_project=True)
 def inspect(
     path: Annotated[str, Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
     result: Annotated[str | None, Option(help="Result of runs on this site, to check its survey.")] = None,
@@ -280,6 +385,7 @@ def inspect(
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Describe a log, a site or a result, and list what needs attention."""
     from pipeline.show.inspection import inspect_path, show
@@ -290,21 +396,25 @@ def inspect(
     raise Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
-@_command("balise inject monday.mcap --fault ramp.toml --out monday_ramp.mcap")
+@_command("balise inject monday.mcap ramp.toml --out monday_ramp.mcap")
 def inject(
     run: Run,
-    fault: Annotated[Path, _file(help="Fault file (TOML).")],
     out: Annotated[Path, _file(help=_NEW_RUN)],
+    fault: Annotated[Path | None, _place(help="Fault file (TOML).")] = None,
+    fault_option: Annotated[Path | None, _file("--fault", help="The fault file, if it is not the second word.")] = None,
     site: Annotated[str | None, Option(help="Site, for faults along its track.")] = None,
     config: ConfigFile = None,
+    as_json: Json = False,
 ) -> None:
     """Add a known fault to a recorded run, to measure detection on real noise."""
     from datasets.inject import inject_into, load_faults
 
-    faults = load_faults(fault)
+    file = _one_of(fault, fault_option, "FAULT", "--fault")
+    faults = load_faults(file)
     settings = _configuration(config)
     inject_into(run, settings, faults, _ground(site, settings) if site else None, out)
-    print(f"{len(faults)} faults injected into {run}: {out}")
+    injected = {"run": run, "fault": file, "out": out, "faults": len(faults)}
+    _tell(as_json, injected, {}, f"{len(faults)} faults injected into {run}: {out}")
 
 
 @_command("balise undetected monday.mcap --site line9 --out worst --balise VB07")
@@ -318,38 +428,41 @@ def undetected(
     balise: Annotated[str | None, Option(help="Place: where the run passes this balise; default: its end.")] = None,
     at_s: Annotated[float | None, Option(help="Place: this many seconds after the first epoch.")] = None,
     behind: Annotated[bool, Option("--behind", help="An error behind the train instead of ahead.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
-    from datasets.undetected import largest_fault, sentence_of, write_fault
+    from datasets.undetected import figures_of, largest_fault, sentence_of, write_fault
 
     settings, train = _configuration(config), _vehicle(vehicle)
     found = largest_fault(_log(run, settings), _ground(site, settings), train, settings, solution, balise, at_s, behind)
     file = write_fault(found, solution if settings.undetected.solutions_at_fault == "one" else None, out)
-    print(sentence_of(found))
-    print(f"To check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
+    check = f"To check it: balise inject {run} {file} --site {site} --out RUN2, and replay RUN2."
+    _tell(as_json, {"fault": file, **figures_of(found)}, {}, sentence_of(found), check)
 
 
 @_command(
-    "balise convert receiver.ubx --to monday",
-    "balise convert rover.pos --to monday --stream reference",
-    "balise convert second.sbf.gz --to monday --solution second",
-    "balise convert positions.csv --config columns.toml --to monday.mcap",
+    "balise convert receiver.ubx --out monday",
+    "balise convert rover.pos --out monday --stream reference",
+    "balise convert second.sbf.gz --out monday --solution second",
+    "balise convert positions.csv --config columns.toml --out monday.mcap",
 )
 def convert(
     logs: Annotated[list[Path], _place(help=_LOGS)],
-    to: Annotated[Path, _file(help=_NEW_RUN + " To one that exists, streams are added.")],
+    out: Annotated[Path, _file("--out", "--to", help=_NEW_RUN + " To one that exists, streams are added.")],
     config: ConfigFile = None,
     solution: Annotated[str | None, Option(help="Name of the receiver in the run, where it has several.")] = None,
     stream: Annotated[Literal["gnss", "reference"], Option(help="What the positions are for.")] = "gnss",
     date: Annotated[datetime | None, Option(formats=["%Y-%m-%d"], help="Day (UTC) of an NMEA log without one.")] = None,
     force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Convert receiver logs to a run, or add streams to a run."""
     from datasets.recordings import convert_logs
     from pipeline.make.receivers import Purpose
 
     given, day = None if config is None else _configuration(config), None if date is None else date.date()
-    print("\n".join(convert_logs(logs, to, given, Purpose(solution, stream), day, force)))
+    done = convert_logs(logs, out, given, Purpose(solution, stream), day, force)
+    _tell(as_json, done.as_dict(), {}, *done.lines())
 
 
 @_command(
@@ -388,7 +501,7 @@ def make_a_site(
     site = make_site(wish, _vehicle(vehicle), _configuration(config))
     write_made(site, site_page(out.resolve().name, site), out, force)
     elements, findings = elements_table(site), findings_table(site.findings)
-    made = {"elements": elements, "findings": findings, "balises": site.balises}
+    made = {"out": out, "page": out / "site.html", "elements": elements, "findings": findings, "balises": site.balises}
     count = 0 if site.balises is None else site.balises.height
     size = f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}."
     look = f"Look at {out / 'site.html'} before you replay on it."
@@ -415,7 +528,8 @@ def calibrate(
     logs = [_log(address, settings) for address in find_runs(runs).values()]
     found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
-    measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors, "alarms": found.alarms}
+    vehicle_found = found.vehicle.model_dump()
+    measured = {"out": out, "vehicle": vehicle_found, "monitors": found.monitors, "alarms": found.alarms}
     tables = {"Scale and latency": found.runs, "Sigma of the monitors": found.sigmas}
     none = "\nNo latency in the vehicle file: only changes of speed show it, and these runs have too few."
     words = [none] if found.vehicle.gnss_latency_s is None else []
@@ -427,36 +541,67 @@ def calibrate(
     _tell(as_json, {**measured, "runs": found.runs, "sigmas": found.sigmas}, tables, *words)
 
 
-@_command("balise experiment list", "balise experiment diagnostics --repetitions 50")
+@_command(
+    "balise experiment list",
+    "balise experiment diagnostics --repetitions 50",
+    "balise experiment recorded good/*.mcap --site line9 --vehicle train7.toml --plan plan.toml --out pmd",
+)
 def experiment(
     name: Annotated[str, Argument(help="Name of the experiment; `list` prints all names.")],
+    runs: Annotated[list[str] | None, Argument(help="Fault-free recorded runs (`recorded` only).")] = None,
+    site: Annotated[str | None, Option(help="Site of these runs.")] = None,
+    vehicle: VehicleFile = None,
+    plan: Annotated[Path | None, _file(help="Faults, counts and banks (TOML, `recorded` only).")] = None,
+    solution: Solution = "primary",
     out: OutFolder = Path("experiment-out"),
-    repetitions: Annotated[int | None, Option(min=1, help="Number of repetitions; default: as published.")] = None,
-    seed: Annotated[int, Option(help="Seed of all random numbers.")] = 1,
+    repetitions: Annotated[
+        int | None, Option(min=1, help="Number of repetitions, of `recorded` per cell; default: as published.")
+    ] = None,
+    seed: Annotated[int | None, Option(min=0, help="Seed of all random numbers; default: 1, or the plan's.")] = None,
     jobs: Jobs = 0,
-    config: Annotated[Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue` only).")] = None,
+    config: Annotated[
+        Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue`, `recorded` only).")
+    ] = None,
     quiet: Quiet = False,
+    as_json: Json = False,
 ) -> None:
-    """Repeat a published experiment, by default with its own number of runs."""
-    from datasets.experiment import EXPERIMENTS, experiment_of
+    """Repeat a published experiment, by default with its own number of runs, or on recorded runs (`recorded`)."""
+    from datasets.experiment import EXPERIMENTS, RECORDED, experiment_of
 
     if name == "list":
-        print("\n".join(EXPERIMENTS))
+        names = [*EXPERIMENTS, RECORDED]
+        _tell(as_json, {"experiments": names}, {}, *names)
         return
-    wanted = experiment_of(name)
     from pipeline.results.workers import watched
     from pipeline.show.terminal import how_far
 
-    bank = None if config is None else _configuration(config)
     with watched(None if quiet else how_far("pieces of work")):
-        print(*wanted(out, repetitions, seed, jobs, bank), sep="\n")
+        if name == RECORDED:
+            from datasets.experiment.recorded.command import recorded_experiment, shown
+
+            settings = _configuration(config)
+            made = recorded_experiment(
+                runs or [], site, out, plan, vehicle, settings, seed, repetitions, solution, jobs
+            )
+        else:
+            wanted = experiment_of(name, on_recordings=bool(runs or site or vehicle or plan))
+            bank = None if config is None else _configuration(config)
+            files = wanted(out, repetitions, 1 if seed is None else seed, jobs, bank)
+    if name != RECORDED:
+        _tell(as_json, {"experiment": name, "out": out, "files": files}, {}, *map(str, files))
+        return
+    for run_id, error in made.failed.items():
+        _say(f"{run_id} is not used: {error}")
+    _tell(as_json, {"experiment": name, "out": out, **made.tables}, shown(made), f"\nBegin with {made.page}")
+    raise Exit(RUNS_NOT_OK if made.failed else OK)
 
 
 @_command(
     'balise sql week12 "SHOW TABLES"',
-    'balise sql week12 "SELECT run_id, verdict FROM runs" --csv runs.csv',
+    'balise sql week12 "SELECT run_id, verdict FROM runs" --out runs.csv',
     'balise sql week12 "SELECT r.run_id, r.verdict, o.verdict FROM runs r JOIN old_runs o USING (run_id)"'
     " --with old=week11",
+    of_project=True,
 )
 def sql(
     out: Result,
@@ -465,29 +610,36 @@ def sql(
         list[str] | None,
         Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
     ] = None,
-    csv: CsvFile = None,
+    csv: Annotated[Path | None, _file("--csv", metavar="FILE", help=_CSV)] = None,
     parquet: Annotated[Path | None, _file(metavar="FILE", help="Write Parquet.")] = None,
     xlsx: Annotated[Path | None, _file(metavar="FILE", help="Write an Excel workbook (extra `excel`).")] = None,
     as_json: Json = False,
+    file: Annotated[
+        Path | None, _file("--out", metavar="FILE", help="Write CSV, Parquet or Excel, as the suffix says.")
+    ] = None,
     allow_files: Annotated[bool, Option("--allow-files", help="Let the query read other files (`read_csv`).")] = False,
+    project: OfProject = None,
 ) -> None:
     """Ask the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
     from pipeline.results.answer_files import write_answer
     from pipeline.results.query import named_results, run_sql
 
     answer = run_sql(out, query, allow_files, named_results(beside or []))
-    for file in (written := write_answer(answer, csv, parquet, xlsx)):
-        _say(f"{answer.height} rows in {file}")
+    written = write_answer(answer, csv, parquet, xlsx, file)
+    for name in written:
+        _say(f"{answer.height} rows in {name}")
     if as_json or not (written or csv):
         _tell(as_json, answer, {"": answer})
 
 
-@_command("balise report week12 --site line9")
+@_command("balise report week12 --site line9", of_project=True)
 def report(
     out: ResultFolder,
     site: Annotated[str | None, Option(help="Site, for plans of the track.")] = None,
     jobs: Annotated[int, Option(min=0, help="Pages at the same time; 0: one per core if there are many.")] = 0,
     quiet: Quiet = False,
+    as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Write HTML pages for the campaign and each run. They open offline.
 
@@ -497,13 +649,14 @@ def report(
     from pipeline.show.terminal import how_far
 
     pages = write_report(out, _ground(site, _used(out)) if site else None, jobs, None if quiet else how_far("pages"))
-    if not quiet:
-        print(f"{len(pages)} files; begin with {pages[0]}")
+    if as_json or not quiet:
+        _tell(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
 
 
 @_command(
     "balise line week12 --site line9",
     "balise line week12 --site line9 --criteria ours.toml --points signals.csv --out placing",
+    of_project=True,
 )
 def line(
     out: ResultFolder,
@@ -513,6 +666,7 @@ def line(
     solution: Annotated[str | None, Option(help="Solution of the runs; `primary` where there are several.")] = None,
     to: Annotated[Path | None, _file("--out", help="Folder to write; by default OUT/line.")] = None,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Say of each piece of track whether virtual balises may be placed there, and propose some."""
     from pipeline.show.line import write_line
@@ -524,22 +678,25 @@ def line(
     decided = settings_from({} if criteria is None else read_toml(criteria), LineCriteria, str(criteria), keys)
     result = study_line(out, _ground(site, _used(out)), decided, solution, given)
     files = write_line(result, to or out / "line")
-    shown = {"pieces": result.pieces, "proposals": result.proposals, "remarks": list(result.remarks)}
-    tables = {"Pieces of track": result.summary, "Proposals": result.proposals}
-    _tell(as_json, shown, tables, "\n".join(result.remarks), f"{len(files)} files; begin with {files[0]}")
+    tables = {"pieces": result.pieces, "proposals": result.proposals}
+    answer = {"page": files[0], "files": files, **tables, "remarks": list(result.remarks)}
+    shown = {"Pieces of track": result.summary, "Proposals": result.proposals}
+    _tell(as_json, answer, shown, "\n".join(result.remarks), f"{len(files)} files; begin with {files[0]}")
 
 
 @_command(
-    "balise export week12 monday --to monday.mcap --site line9", "balise export week12 monday --to monday.geojson"
+    "balise export week12 monday --out monday.mcap --site line9",
+    "balise export week12 monday --out monday.geojson --site line9",
 )
 def export(
     out: ResultFolder,
     run: Annotated[str, Argument(help="Id of the run.")],
-    to: Annotated[Path, _file(help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")],
+    to: Annotated[Path, _file("--out", "--to", help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")],
     site: Annotated[str | None, Option(help="Site, for positions on the ground.")] = None,
     log: Annotated[str | None, Option(help="The recorded run, for its raw positions.")] = None,
     ros: Annotated[bool, Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
+    as_json: Json = False,
 ) -> None:
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
     from pipeline.show.export import export_run
@@ -547,10 +704,13 @@ def export(
     recorded = _log(log, _configuration(config), True) if log else None
     ground = _ground(site, _used(out)) if site else None
     files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
-    print("\n".join(["Wrote " + " and ".join(map(str, files)), *(f"Without {text}" for text in missing)]))
+    words = ["Wrote " + " and ".join(map(str, files)), *(f"Without {text}" for text in missing)]
+    _tell(as_json, {"files": files, "missing": missing}, {}, *words)
 
 
-@_command("balise verify week12", "balise verify week12 --logs logs --site line9 --vehicle train7.toml")
+@_command(
+    "balise verify week12", "balise verify week12 --logs logs --site line9 --vehicle train7.toml", of_project=True
+)
 def verify(
     out: Result,
     logs: LogsAgain = None,
@@ -561,6 +721,7 @@ def verify(
     jobs: Jobs = 0,
     quiet: Quiet = False,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
     from pipeline.campaign.verify import recompute
@@ -572,7 +733,8 @@ def verify(
         settings = _configuration(config) if config else None
         found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs))
     if as_json:
-        _print_json([{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found])
+        compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
+        _print_json({"agrees": not any(one.problems for one in found), "comparisons": compared})
     for one in found if not as_json else []:
         if one.problems or not quiet:
             _tell(False, None, {"": one.table} if one.problems else {}, one.sentence)
@@ -664,15 +826,25 @@ def _complain(text: str, debug: bool) -> None:
 
 
 def _configuration(file: Path | None) -> Configuration:
-    from schemas.config import Configuration, load_settings
+    from schemas.project import load_configuration
 
-    return load_settings(file, Configuration)
+    return load_configuration(file)
 
 
 def _vehicle(file: Path | None) -> Vehicle:
     from schemas.config import Vehicle, load_settings
 
     return load_settings(file, Vehicle)
+
+
+def _one_of(positional: Path | None, option: Path | None, name: str, flag: str) -> Path:
+    """An input that may stand among the arguments or behind its option, once."""
+    from schemas.errors import UsageError
+
+    if (positional is None) == (option is None):
+        found = "neither" if option is None else "both"
+        raise UsageError("is wanted once", place=name, found=found, expected=f"{name}, or {flag} {name}")
+    return positional or option  # type: ignore[return-value]
 
 
 def _log(address: str, settings: Configuration, with_digest: bool = False) -> RunLog:

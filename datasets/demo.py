@@ -61,6 +61,11 @@ class DemoResult:
         names = ("run_id", "injected", "verdict", "hazards", "checks")
         return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")
 
+    def as_dict(self) -> dict[str, object]:
+        """For programs; `checks` holds what was expected and found in full."""
+        verdicts = {"verdict": self.head.word, "verdicts": self.head.counts()}
+        return {**verdicts, "page": self.page, "agrees": self.agrees, "checks": self.checks}
+
     @property
     def sentence(self) -> str:
         """`all 87 checks agree`, or how many do not."""

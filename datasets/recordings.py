@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
@@ -9,16 +11,36 @@ from datasets import infrabel
 from datasets.comma2k19 import comma2k19_run
 from datasets.trial import write_run_as
 from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather
+from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
-from pipeline.studies.plausibility.report import fit_report
+from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import visible
 
 
+@dataclass(frozen=True)
+class Conversion:
+    """What was written, how often which kind of record was not used, and what does not fit."""
+
+    run: Path
+    epochs: int
+    not_used: Mapping[str, int]
+    fit: FitReport
+
+    def lines(self) -> list[str]:
+        """For people."""
+        unused = [f"not used: {count} x {visible(reason)}" for reason, count in self.not_used.items()]
+        return [f"{self.epochs} epochs in {self.run}", *unused, *self.fit.lines()]
+
+    def as_dict(self) -> dict[str, object]:
+        """For programs."""
+        return {"run": self.run, "epochs": self.epochs, "not_used": self.not_used, **self.fit.as_dict()}
+
+
 def convert_logs(
     logs: list[Path], to: Path, given: Configuration | None, purpose: Purpose, day: date | None, force: bool
-) -> list[str]:
-    """Write logs as a run, or add their streams to one; returns what was done and what does not fit, in lines.
+) -> Conversion:
+    """Write logs as a run, or add their streams to one.
 
     With a configuration no log is taken for a public recording.
     """
@@ -31,9 +53,7 @@ def convert_logs(
     else:
         converted = as_run(found, to.name.removesuffix(".mcap"), purpose, settings.fix_sigma)
     write_run_as(converted.run, to)
-    unused = [f"not used: {count} x {visible(reason)}" for reason, count in converted.dropped.items()]
-    fit = fit_report(converted.run, settings).lines()
-    return [f"{converted.run.gnss.height} epochs in {to}", *unused, *fit]
+    return Conversion(to, converted.run.gnss.height, converted.dropped, fit_report(converted.run, settings))
 
 
 def known_recording(path: Path) -> Converted | None:
@@ -45,3 +65,8 @@ def known_recording(path: Path) -> Converted | None:
     with path.open("rb") as stream:
         head = stream.readline()
     return infrabel.infrabel_recording(path) if all(name.encode() in head for name in infrabel.COLUMNS) else None
+
+
+def recordings() -> Recordings:
+    """What a project needs to know of recordings."""
+    return Recordings(known_recording, write_run_as)

@@ -44,6 +44,13 @@ def sentence_of(found: FaultProfile) -> str:
     )
 
 
+def figures_of(found: FaultProfile) -> dict[str, object]:
+    """The fault for programs: when it begins and reaches its size, its sizes [m], the monitors at their thresholds."""
+    t_start, t_reached = found.t
+    sizes = {"error_m": found.error_m, "bound_m": found.bound_m, "ramp_m": found.ramp_m, "step_m": found.step_m}
+    return {"t_start": t_start, "t_reached": t_reached, **sizes, "monitors": list(found.monitors)}
+
+
 def write_fault(profile: FaultProfile, solution: str | None, out: Path) -> Path:
     """`fault.toml` and its `profile.csv` in a folder; `solution`: the only one that is hit, None for all."""
     fault = {"kind": "profile", "target": "along", "profile": PROFILE}

@@ -218,11 +218,11 @@ def _pages(out: Address) -> dict[str, str]:
 
 
 def _other_files(out: Address, runs: set[str], known: set[str]) -> Iterator[str]:
-    """Files that are neither known nor of a run; pages and catalogue are looked at elsewhere."""
+    """Files that are neither known, nor of a run, nor of `balise line`; pages and catalogue are looked at elsewhere."""
     of_runs = {f"{table}/{store.folder_name(run)}/{table}.parquet" for table in TABLES for run in runs}
     expected = of_runs | known | {name for pack in packs.listed(out) for name in packs.file_digests(pack)}
     for name in storage.files_below(out):
-        if name not in expected and not name.startswith((f"{catalogue.FOLDER}/", "report/")):
+        if name not in expected and not name.startswith((f"{catalogue.FOLDER}/", "report/", "line/")):
             yield name
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import polars as pl
@@ -16,14 +17,27 @@ from schemas.errors import UsageError
 _MOST_ROWS = 1_048_575
 _TIMES = "yyyy-mm-dd hh:mm:ss.000"
 
+Writer = Callable[[pl.DataFrame, Path], None]
 
-def write_answer(answer: pl.DataFrame, csv: Path | None, parquet: Path | None, xlsx: Path | None) -> list[Path]:
+
+def write_answer(
+    answer: pl.DataFrame, csv: Path | None, parquet: Path | None, xlsx: Path | None, by_suffix: Path | None = None
+) -> list[Path]:
     """Write the formats that are asked for; returns the files, without standard output."""
-    formats = {csv: write_csv, parquet: write_parquet, xlsx: write_xlsx}
+    formats: dict[Path | None, Writer] = {csv: write_csv, parquet: write_parquet, xlsx: write_xlsx}
+    if by_suffix is not None:
+        formats[by_suffix] = _writer_for(by_suffix)
     for file, write in formats.items():
         if file is not None:
             write(answer, file)
     return [file for file in formats if file is not None and str(file) != "-"]
+
+
+def _writer_for(file: Path) -> Writer:
+    writers: dict[str, Writer] = {".csv": write_csv, ".parquet": write_parquet, ".xlsx": write_xlsx}
+    if file.suffix.lower() not in writers:
+        raise UsageError("has an unknown suffix", place=str(file), expected=" or ".join(writers))
+    return writers[file.suffix.lower()]
 
 
 def write_csv(answer: pl.DataFrame, file: Path) -> None:

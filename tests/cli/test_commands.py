@@ -137,6 +137,9 @@ USAGE_ERRORS: list[tuple[Sequence[str], str]] = [
     (("convert", "s3://bucket/run.ubx", "--to", "{tmp}/out"), "s3://bucket/run.ubx: is an address"),
     (("report", "s3://bucket/out"), "s3://bucket/out: is an address"),
     (("inject", "{run}", "--fault", "{tmp}/bad.toml", "--out", "{tmp}/out"), "docs/scenarios.md lists every key"),
+    (("inject", "{run}", "--out", "{tmp}/out"), "is wanted once; found neither; expected FAULT, or --fault FAULT"),
+    (("inject", "{run}", "{tmp}/file", "--fault", "{tmp}/file", "--out", "{tmp}/out"), "found both"),
+    (("sql", "{result}", "select 1", "--out", "{tmp}/out.txt"), "expected .csv or .parquet or .xlsx"),
     (("export", "{result}", "none", "--to", "{tmp}/x.mcap"), "has no run 'none'; found run0"),
     (("dictionary", "--table", "nonsense"), "is not a table"),
     (("nonsense",), "No such command"),
@@ -263,6 +266,8 @@ def test_sql_writes_files(balise: Balise, result: Path, tmp_path: Path) -> None:
     assert pl.read_parquet(files["parquet"])["service_levels"].to_list()[0][0] == "npa"
     assert zipfile.ZipFile(files["xlsx"]).testzip() is None
     assert balise("sql", result, query, "--csv", "-").out.splitlines() == lines
+    assert balise("sql", result, query, "--out", tmp_path / "by_suffix.csv").status == 0
+    assert (tmp_path / "by_suffix.csv").read_text().splitlines() == lines
 
 
 def test_sql_over_two_results(balise: Balise, result: Path) -> None:
@@ -295,9 +300,7 @@ def test_inject(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None
     said = balise("inject", small_trial.paths[0], "--fault", tmp_path / "fault.toml", "--out", tmp_path / "faulty")
     assert said.status == 0
     assert pl.read_parquet(tmp_path / "faulty/faults.parquet")["kind"].cast(pl.String).to_list() == ["outage"]
-    onto_itself = balise(
-        "inject", tmp_path / "faulty", "--fault", tmp_path / "fault.toml", "--out", tmp_path / "faulty"
-    )
+    onto_itself = balise("inject", tmp_path / "faulty", tmp_path / "fault.toml", "--out", tmp_path / "faulty")
     assert (onto_itself.status, "is the recording itself" in onto_itself.err) == (2, True)
     a_file = tmp_path / "fault.toml"
     nowhere = balise("inject", small_trial.paths[0], "--fault", a_file, "--out", a_file / "run")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,9 +14,10 @@ from datasets.comparison import checks_table, compare, describe_faults
 from datasets.demo import DemoResult, demo, demo_scenario
 from datasets.trial import build_run
 from pipeline.campaign.verify import recompute, verify
-from pipeline.show.terminal import table_lines
+from pipeline.show.terminal import table_lines, to_json
 from schemas.config import Vehicle, load_settings
 from schemas.run import RunTables
+from tests.docs.json_page import fields, places
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +40,11 @@ def test_the_replay_finds_what_was_injected(result: DemoResult) -> None:
     differs = result.checks.filter(~pl.col("agrees"))
     assert differs.rows() == []
     assert result.agrees
+
+
+def test_its_answer_in_json_has_the_fields_of_the_page(result: DemoResult) -> None:
+    answer = json.loads(to_json({"out": "demo", **result.as_dict()}))
+    assert set(places(answer, fields("demo"))) == set(fields("demo"))
 
 
 def test_another_seed_shows_the_same(tmp_path: Path) -> None:

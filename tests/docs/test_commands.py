@@ -31,7 +31,8 @@ def lines(page: Path) -> list[tuple[list[str], int]]:
 
 
 FIELD = ROOT / "docs" / "field-engineer.md"
-WITH_COMMANDS = [page for page in PAGES if lines(page) and page != FIELD]
+# The answers of `json.md` are held by a test of their own.
+WITH_COMMANDS = [page for page in PAGES if lines(page) and page.name not in (FIELD.name, "json.md")]
 
 
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.name)

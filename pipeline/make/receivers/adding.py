@@ -127,5 +127,5 @@ def _refuse_what_is_lost(run: RunLog, place: Path) -> None:
             place=str(place),
             found=", ".join(lost[:5]),
             expected="a run that `balise convert` wrote",
-            remedy="Convert it into a new run together with the logs: balise convert LOG.mcap OTHER --to RUN.",
+            remedy="Convert it into a new run together with the logs: balise convert LOG.mcap OTHER --out RUN.",
         )
