@@ -562,6 +562,9 @@ def experiment(
     config: Annotated[
         Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue`, `recorded` only).")
     ] = None,
+    noise_of: Annotated[
+        Path | None, _file(help="Result of fault-free runs whose noise replaces the published one (`rare` only).")
+    ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -586,7 +589,7 @@ def experiment(
         else:
             wanted = experiment_of(name, on_recordings=bool(runs or site or vehicle or plan))
             bank = None if config is None else _configuration(config)
-            files = wanted(out, repetitions, 1 if seed is None else seed, jobs, bank)
+            files = wanted(out, repetitions, 1 if seed is None else seed, jobs, bank, noise_of)
     if name != RECORDED:
         _tell(as_json, {"experiment": name, "out": out, "files": files}, {}, *map(str, files))
         return
