@@ -63,8 +63,11 @@ def show_tables(tables: Mapping[str, pl.DataFrame]) -> None:
 
 
 def show_text(text: str) -> None:
-    """Print a sentence in lines that fit the terminal."""
-    print(textwrap.fill(text, screen_width() or len(text) + 1, break_long_words=False, break_on_hyphens=False))
+    """Print a sentence: on a terminal in lines that fit, in a pipe in one."""
+    if sys.stdout.isatty():
+        width = shutil.get_terminal_size().columns
+        text = textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)
+    print(text)
 
 
 def table_lines(frame: pl.DataFrame, width: int | None = None) -> list[str]:
