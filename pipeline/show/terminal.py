@@ -28,17 +28,9 @@ _COLOURS = {"unsafe": "\x1b[1;31m", "failed": "\x1b[31m", "unproven": "\x1b[90m"
 _VERDICT_WORD = re.compile(r"(?<![\w-])(?:unsafe|failed|unproven|safe)(?![\w-])")
 # Where not all columns fit, these stay, the first of them first.
 _MATTERS = (
-    *(
-        "verdict",
-        "run_id",
-        "unsafe_accepted",
-        "failures",
-        "failures_beyond_budget",
-        "hazards",
-        "hazards_1a",
-        "hazards_1b",
-    ),
-    *("hazards_shift", "hazards_wrong_track", "missed_detections", "why", "faults", "reasons", "error", "availability"),
+    *("verdict", "run_id", "key", "value", "unsafe_accepted", "failures", "failures_beyond_budget", "hazards"),
+    *("hazards_1a", "hazards_1b", "hazards_shift", "hazards_wrong_track", "missed_detections"),
+    *("why", "faults", "reasons", "error", "availability"),
 )
 # Control characters that JSON itself lets stand.
 _STEERING = re.compile("[\x7f-\x9f]")
