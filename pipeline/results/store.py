@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from urllib.parse import quote, unquote
 
@@ -17,7 +16,7 @@ from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join, redacted, shown
 from pipeline.storage.files import exists, read_bytes
 from schemas.config import Configuration, Settings, Vehicle, settings_from, to_toml, toml_of
-from schemas.conform import conform, dtypes
+from schemas.conform import conform, dtypes, meanings
 from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES
@@ -72,16 +71,7 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
 def table_bytes(frame: pl.DataFrame, table: str, metadata: Mapping[str, str]) -> bytes:
     """A table as Parquet, held to its contract, with unit and meaning in the field of each column."""
     checked = conform(frame, TABLES[table])
-    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata}, _fields(table))
-
-
-@cache
-def _fields(table: str) -> dict[str, dict[str, str]]:
-    """Unit and meaning of each column, as CONTRACT section 3 wants them in every file."""
-    return {
-        name: {"unit": str((column.metadata or {}).get("unit", "")), "meaning": column.description or ""}
-        for name, column in TABLES[table].columns().items()
-    }
+    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata}, meanings(TABLES[table]))
 
 
 def parquet_bytes(
