@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import signal
@@ -15,12 +16,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from typer import Argument, Exit, Option, Typer
+from typer.core import TyperCommand
 from typer.main import get_command
 
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.campaign import Plan
+    from pipeline.campaign import CampaignSummary, Interrupted, Plan
     from schemas.config import Configuration, Vehicle
     from schemas.run import RunLog
     from schemas.run import Site as Ground
@@ -40,9 +42,29 @@ app = Typer(
 )
 
 
-def _command(*examples: str, name: str | None = None) -> Callable[[Command], Command]:
+class _OfProject(TyperCommand):
+    """Takes what is not given from the project (`--project`, or that of the working directory), and says so."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given, _, _ = self.make_parser(ctx).parse_args(list(args))
+        if not given.get("help") and (given.get("project") or Path("balise.toml").is_file()):
+            from pipeline.project.opened import taken_from_project
+
+            named = given.pop("project", None)
+            missing = [option.name for option in self.params if given.get(option.name or "") in (None, [], ())]
+            # A single word is the query, though the result comes first.
+            shifted = self.name == "sql" and "query" in missing and "out" not in missing
+            missing = ["out"] if shifted else missing
+            say = None if given.get("quiet") else _say
+            ctx.default_map = taken_from_project(named, self.name or "", missing, say)
+            args = [ctx.default_map["out"], *args] if shifted and ctx.default_map else args
+        return super().parse_args(ctx, args)
+
+
+def _command(*examples: str, name: str | None = None, of_project: bool = False) -> Callable[[Command], Command]:
     """A command with examples under its help; an empty line keeps each on a line of its own."""
-    return app.command(name, epilog="\n\n".join(["Examples:", *examples]))
+    epilog = "\n\n".join(["Examples:", *examples])
+    return app.command(name, epilog=epilog, cls=_OfProject if of_project else None)
 
 
 def _here(value: Any) -> Any:
@@ -59,7 +81,7 @@ def _here(value: Any) -> Any:
 
 _place, _file = partial(Argument, callback=_here), partial(Option, callback=_here)
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
-_LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; .gz, .zip of these."
+_LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; archives of these."
 
 _CSV = "Write CSV; `-` is standard output."
 
@@ -82,6 +104,10 @@ Solution = Annotated[str, Option(help="Solution of the runs.")]
 Jobs = Annotated[
     int, Option(min=0, callback=lambda jobs: jobs or os.cpu_count() or 1, help="So many at once; 0: one per core.")
 ]
+ProjectFile = Annotated[Path | None, _file("--project", help="Project: its folder or file; default: balise.toml here.")]
+OfProject = Annotated[
+    Path | None, _file("--project", help="Take what is not given from this project; default: balise.toml here.")
+]
 Force = Annotated[bool, Option("--force", help="Replace what is there.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no tables; errors only.")]
 Json = Annotated[bool, Option("--json", help="Print the answer as JSON (docs/json.md), progress on standard error.")]
@@ -102,6 +128,7 @@ def _about(
     "balise replay logs/*.mcap --site line9 --out week12 --vehicle train7.toml",
     "balise replay logs/*.mcap --site line9 --out week12 --calibrate auto",
     "balise replay s3://trial/logs --site line9 --out s3://trial/week12 --jobs 8",
+    of_project=True,
 )
 def replay(
     runs: Annotated[list[str], Argument(help="Runs: logs, run folders, folders of runs, glob patterns or addresses.")],
@@ -122,6 +149,7 @@ def replay(
     ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
@@ -141,16 +169,27 @@ def replay(
             plan, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit, watches=shown
         )
     except Interrupted as interrupted:
-        # A terminal that was closed takes no more words.
-        with contextlib.suppress(OSError):
-            if interrupted.summary is not None:
-                show_summary(interrupted.summary, out, quiet, as_json, **places)
-            print("balise: interrupted; repeat the command to continue", file=sys.stderr)
-        raise Exit(128 + interrupted.signum) from None
+        raise _stopped(interrupted, out, quiet, as_json, places) from None
     show_summary(summary, out, quiet, as_json, **places)
+    raise Exit(_status_of(summary, fail_on))
+
+
+def _stopped(interrupted: Interrupted, out: str, quiet: bool, as_json: bool, places: Mapping[str, str]) -> Exit:
+    """Say what is done of an interrupted campaign."""
+    from pipeline.show.progress import show_summary
+
+    # A terminal that was closed takes no more words.
+    with contextlib.suppress(OSError):
+        if interrupted.summary is not None:
+            show_summary(interrupted.summary, out, quiet, as_json, **places)
+        print("balise: interrupted; repeat the command to continue", file=sys.stderr)
+    return Exit(128 + interrupted.signum)
+
+
+def _status_of(summary: CampaignSummary, fail_on: str | None) -> int:
     refused = {"unsafe": ["unsafe"], "unproven": ["unsafe", "unproven"]}.get(fail_on or "", [])
     acceptable = summary.all_ok and not any(summary.head.counts()[verdict] for verdict in refused)
-    raise Exit(DEFECT if summary.defects else OK if acceptable else RUNS_NOT_OK)
+    return DEFECT if summary.defects else OK if acceptable else RUNS_NOT_OK
 
 
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
@@ -160,6 +199,54 @@ def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
 
     with watched(None if quiet else how_far("runs looked at to calibrate")):
         return calibrated(plan, runs, jobs)
+
+
+@_command("balise run", "balise run --project week12 --jobs 4")
+def run(
+    project: ProjectFile = None,
+    jobs: Annotated[int | None, Option(min=0, help="So many at once; default: as the project says.")] = None,
+    force: Annotated[bool, Option("--force", help="Make everything again, whatever is there.")] = False,
+    prune: Annotated[bool, Option("--prune", help="Remove results of runs that the project does not name.")] = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Bring a project up to date: convert, site, calibrate, replay, report; only what changed is done again."""
+    from datasets.recordings import recordings
+    from pipeline.campaign import Interrupted
+    from pipeline.project.opened import open_project
+    from pipeline.project.run import Call, run_project
+    from pipeline.show.progress import show_summary, summary_answer, watches
+    from pipeline.show.terminal import how_far
+
+    opened = open_project(project)
+    options = opened.project.replay
+    out = opened.place(opened.project.out)
+    files = (("vehicle", opened.vehicle_file), ("config", opened.config_file))
+    named = "".join(f" --{name} {file}" for name, file in files if file)
+    places = {"site": opened.place(opened.project.site), "options": named}
+    pages = None if quiet or as_json else how_far("pages")
+    at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
+    call = Call(_steps(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)
+    try:
+        ended = run_project(opened, recordings(), call)
+    except Interrupted as interrupted:
+        raise _stopped(interrupted, out, quiet, as_json, places) from None
+    if as_json:
+        _print_json({**summary_answer(ended.summary, out), "page": ended.page, "changed": ended.changed})
+    else:
+        show_summary(ended.summary, out, quiet, False, **places)
+    if not (quiet or as_json):
+        print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
+    raise Exit(_status_of(ended.summary, options.fail_on))
+
+
+def _steps(quiet: bool, as_json: bool) -> Callable[[str, str], None]:
+    """Says what a project's steps do, one line each, on standard error."""
+    if quiet:
+        return lambda step, text: None
+    if as_json:
+        return lambda step, text: _say(json.dumps({"event": "step", "step": step, "text": text}))
+    return lambda step, text: _say(f"{step:<10}{text}")
 
 
 @_command("balise dictionary --table hazards", "balise dictionary --markdown > dictionary.md")
@@ -224,7 +311,9 @@ def synth(
         _tell(as_json, made, {}, f"{len(paths)} runs in {out / 'runs'}, site in {out / 'site'}")
 
 
-@_command("balise safety", "balise safety week12", "balise safety week12 --config other_level.toml --json")
+@_command(
+    "balise safety", "balise safety week12", "balise safety week12 --config other_level.toml --json", of_project=True
+)
 def safety(
     out: Annotated[str | None, Argument(help="Result of `balise replay`; without it: the budget only.")] = None,
     config: ConfigFile = None,
@@ -233,6 +322,7 @@ def safety(
     vehicle: VehicleFile = None,
     jobs: Jobs = 0,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Print the safety budget and its errata; for a result also its sources and each measured figure with bounds.
 
@@ -255,7 +345,11 @@ def safety(
     _print_json(tables) if as_json else show_tables(tables)
 
 
-@_command("balise claim week12 --site line9", "balise claim week12 --site line9 --profile newer.toml --csv claim.csv")
+@_command(
+    "balise claim week12 --site line9",
+    "balise claim week12 --site line9 --profile newer.toml --csv claim.csv",
+    of_project=True,
+)
 def claim(
     out: Result,
     profile: Annotated[str, Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
@@ -263,6 +357,7 @@ def claim(
     front_ahead: Annotated[float, Option(metavar="METRES", help="Front end ahead of the balise antenna.")] = 0.0,
     csv: Annotated[Path | None, _file("--csv", "--out", metavar="FILE", help=_CSV)] = None,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Compare a result with published requirements for train localisation: met, not met or not shown."""
     from pipeline.results.answer_files import write_csv
@@ -286,6 +381,7 @@ def claim(
     "balise inspect line9",
     "balise inspect line9 --result week12",
     "balise inspect week12/runs/run_id=monday/runs.parquet",
+    of_project=True,
 )
 def inspect(
     path: Annotated[str, Argument(help="A log, a CSV or Parquet file, a site, or a result of `balise replay`.")],
@@ -294,6 +390,7 @@ def inspect(
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Describe a log, a site or a result, and list what needs attention."""
     from pipeline.show.inspection import inspect_path, show
@@ -481,6 +578,7 @@ def experiment(
     'balise sql week12 "SELECT run_id, verdict FROM runs" --out runs.csv',
     'balise sql week12 "SELECT r.run_id, r.verdict, o.verdict FROM runs r JOIN old_runs o USING (run_id)"'
     " --with old=week11",
+    of_project=True,
 )
 def sql(
     out: Result,
@@ -497,6 +595,7 @@ def sql(
         Path | None, _file("--out", metavar="FILE", help="Write CSV, Parquet or Excel, as the suffix says.")
     ] = None,
     allow_files: Annotated[bool, Option("--allow-files", help="Let the query read other files (`read_csv`).")] = False,
+    project: OfProject = None,
 ) -> None:
     """Ask the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
     from pipeline.results.answer_files import write_answer
@@ -510,13 +609,14 @@ def sql(
         _tell(as_json, answer, {"": answer})
 
 
-@_command("balise report week12 --site line9")
+@_command("balise report week12 --site line9", of_project=True)
 def report(
     out: ResultFolder,
     site: Annotated[str | None, Option(help="Site, for plans of the track.")] = None,
     jobs: Annotated[int, Option(min=0, help="Pages at the same time; 0: one per core if there are many.")] = 0,
     quiet: Quiet = False,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Write HTML pages for the campaign and each run. They open offline.
 
@@ -533,6 +633,7 @@ def report(
 @_command(
     "balise line week12 --site line9",
     "balise line week12 --site line9 --criteria ours.toml --points signals.csv --out placing",
+    of_project=True,
 )
 def line(
     out: ResultFolder,
@@ -542,6 +643,7 @@ def line(
     solution: Annotated[str | None, Option(help="Solution of the runs; `primary` where there are several.")] = None,
     to: Annotated[Path | None, _file("--out", help="Folder to write; by default OUT/line.")] = None,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Say of each piece of track whether virtual balises may be placed there, and propose some."""
     from pipeline.show.line import write_line
@@ -583,7 +685,9 @@ def export(
     _tell(as_json, {"files": files, "missing": missing}, {}, *words)
 
 
-@_command("balise verify week12", "balise verify week12 --logs logs --site line9 --vehicle train7.toml")
+@_command(
+    "balise verify week12", "balise verify week12 --logs logs --site line9 --vehicle train7.toml", of_project=True
+)
 def verify(
     out: Result,
     logs: LogsAgain = None,
@@ -594,6 +698,7 @@ def verify(
     jobs: Jobs = 0,
     quiet: Quiet = False,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
     from pipeline.campaign.verify import recompute
@@ -677,9 +782,9 @@ def _complain(text: str, debug: bool) -> None:
 
 
 def _configuration(file: Path | None) -> Configuration:
-    from schemas.config import Configuration, load_settings
+    from schemas.project import load_configuration
 
-    return load_settings(file, Configuration)
+    return load_configuration(file)
 
 
 def _vehicle(file: Path | None) -> Vehicle:

@@ -11,6 +11,7 @@ from datasets import infrabel
 from datasets.comma2k19 import comma2k19_run
 from datasets.trial import write_run_as
 from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather
+from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, IngestConfig
@@ -64,3 +65,8 @@ def known_recording(path: Path) -> Converted | None:
     with path.open("rb") as stream:
         head = stream.readline()
     return infrabel.infrabel_recording(path) if all(name.encode() in head for name in infrabel.COLUMNS) else None
+
+
+def recordings() -> Recordings:
+    """What a project needs to know of recordings."""
+    return Recordings(known_recording, write_run_as)

@@ -84,6 +84,16 @@ class IngestConfig(Settings):
     balise_reads: tuple[StreamMapping, ...] = ()
     # A damaged length must not fill the memory; recorders write chunks of a few MiB.
     chunk_limit_mib: Positive = 128.0
+    # What one archive may unpack to, archives in it included: a day's logs, not a disk.
+    unpacked_limit_mib: Positive = 4096.0
+    unpacked_files_limit: Annotated[int, Field(strict=True, gt=0)] = 10_000
+    # Text logs pack to a tenth, a train that stands all night to a hundredth; what packs better was made to.
+    unpacked_ratio_limit: Annotated[Number, Field(ge=1)] = 300.0
+    unpacked_limit_s: Positive = 900.0
+    # Rows are held in memory: five receivers at 10 Hz for four days. A file can declare any number of them.
+    rows_limit: Annotated[int, Field(strict=True, gt=0)] = 20_000_000
+    # No train is under way for a week; memory follows the time, so that a wrong date must not make a journey.
+    longest_journey_h: Annotated[Number, Field(gt=0, le=8_784)] = 168.0
     # A receiver before its first fix, or a week rollover, affects few rows; more is another recording. Ours.
     wrong_dates_share: Annotated[Number, Field(ge=0, lt=1)] = 0.1
     correct: tuple[StreamCorrection, ...] = ()
@@ -251,6 +261,9 @@ class AlignConfig(Settings):
     fastest_mps: Positive = 200.0
     bunched_stamps_m: NonNegative = 20.0
     reset_back_m: NonNegative = 5.0
+    # Over a reset between two rows the speed about it counts where no braking changes the way by more than this, as at
+    # 1 Hz: a tenth of the odometer's fixed error.
+    reset_doubt_m: NonNegative = 0.5
     # Speeds give the distance over such a jump if, over the whole run, they differ from it by a smaller share:
     # another unit or sign differs by more than a half, slip and scale by some percent.
     speed_agreement: Probability = 0.2

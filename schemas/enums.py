@@ -204,7 +204,6 @@ class MisfitPlace(StrEnum):
     RATHER_IN_STREAM = "rather_in_stream"
     IN_SURVEY = "in_survey"
     IN_REFERENCE = "in_reference"
-    OR_VELOCITY = "or_velocity"
 
 
 class Note(StrEnum):

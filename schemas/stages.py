@@ -70,8 +70,10 @@ class Aligned(Positions):
     odometer_reason = text("why there is no odometer", nullable=True)
     odometer_segment = dy.Int64(min=0, description="continuity segment: distances compare where it is the same")
     odometer_slips = flag("the odometer says itself that it slips here")
-    odometer_counter = dy.Int64(min=0, description="the same number over slip: there the wheel was counted, if wrongly")
-    slip_doubt_m = real("m", "by how much slip may have falsified the distance since the first epoch", min=0)
+    odometer_counter = dy.Int64(
+        min=0, description="the same number over slip and pauses between speeds: there the way is known roughly"
+    )
+    slip_doubt_m = real("m", "by how much slip and pauses may have falsified the distance since the first epoch", min=0)
     odometer_white_m2_per_s = real("m2/s", "variance that the odometer's distance gathers in a second", min=0)
     odometer_rows_m = real("m", "quantisation noise of the odometer's rows, as far as thresholds allow for it", min=0)
     odometer_period_s = real("s", "time between rows of the odometer", min=0)

@@ -120,6 +120,11 @@ def beside_words(run: Mapping[str, Any]) -> str:
     return ", ".join([accepted, available, *([] if margin_m is None else [say("verdicts", "margin", margin_m)])])
 
 
+def unnoticed_words(largest_m: float | None) -> str:
+    """How large an error may stay unnoticed; `largest_m`: the largest while in use, where it was computed."""
+    return say("verdicts", "unnoticed_not_known") if largest_m is None else say("verdicts", "unnoticed", largest_m)
+
+
 def noise_words(widened: Mapping[str, tuple[float, float]]) -> str:
     """What measured noise does to the thresholds: by axis, raw threshold over the model's, and the white noise [m]."""
     return ", ".join(

@@ -66,6 +66,7 @@ _SLOW = (
     "stages/odometry/test_quantisation.py",
     "studies/plausibility",
     "stages/monitors/test_pseudorange.py",
+    "project/test_run.py",
     "replay/test_channels.py",
     "replay/test_evidence.py",
     "replay/test_moving.py",

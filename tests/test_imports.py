@@ -19,6 +19,7 @@ DOORS = {
     "studies": {"one_run", "read", "results", "stages", "storage"},
     "make": {"read", "stages", "storage"},
     "show": {"read", "results", "stages", "storage", "studies"},
+    "project": {"campaign", "make", "read", "results", "show", "stages", "storage", "studies"},
 }
 """What each door of `pipeline/` may import of the others."""
 DRAWERS = {"utils", "util", "tools", "common", "helpers", "helper", "misc"}

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pipeline import storage
+from pipeline.campaign.ground import hold
 from pipeline.read.site.read import read_site, refuse_unrelated
 from pipeline.results import store
 from pipeline.results.manifest import SettingsFiles, listing, settings_files, unaltered
@@ -52,13 +53,17 @@ class RunJob:
 
 @dataclass(frozen=True)
 class Plan:
-    """All runs of one call, and where their results go; `given`: the settings files of the call."""
+    """All runs of one call, and where their results go; `given`: the settings files of the call.
+
+    `given_by_digest`: those of runs that have other ones, by the digest of their configuration.
+    """
 
     jobs: tuple[RunJob, ...]
     out: str
     config: Configuration
     vehicle: Vehicle
     given: SettingsFiles = field(default_factory=settings_files)
+    given_by_digest: Mapping[str, SettingsFiles] = field(default_factory=dict)
 
 
 def make_plan(
@@ -84,6 +89,7 @@ def make_plan(
         raise UsageError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
     ground = read_site(site, config.site)
     refuse_unrelated(ground, site)
+    hold(ground, config.site)
     base = RunJob(
         run_id="",
         address="",

@@ -47,7 +47,7 @@ def run_campaign(
         store.write_config(plan.out, plan.config)
         store.write_vehicle(plan.out, plan.vehicle)
         for digest in sorted({job.config_digest for job in plan.jobs}):
-            note_settings(plan.out, digest, plan.given)
+            note_settings(plan.out, digest, plan.given_by_digest.get(digest, plan.given))
         engine = _engine_for(jobs, len(left.jobs), scheduler, time_limit_s)
         held = [replace(job, campaign=campaign) for job in left.jobs]
         loop = CampaignLoop(held, engine, time_limit_s, watches, known)

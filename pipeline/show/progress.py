@@ -221,10 +221,7 @@ def progress_watch() -> CampaignWatch:
 def show_summary(summary: CampaignSummary, out: str, quiet: bool, as_json: bool, **places: str) -> None:
     """How it ended: as JSON, as messages of what failed alone, or for people; `places`: as in `remedy_lines`."""
     if as_json:
-        head = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.beside()}
-        figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
-        seconds = round(summary.seconds, 3)
-        print(to_json({**head, **figures, "seconds": seconds, "out": out, "runs": outcome_rows(summary)}))
+        print(to_json(summary_answer(summary, out)))
     elif quiet:
         for outcome in summary.outcomes:
             if outcome.status is not RunStatus.OK:
@@ -233,6 +230,13 @@ def show_summary(summary: CampaignSummary, out: str, quiet: bool, as_json: bool,
         _show_ending(summary, out)
         for line in remedy_lines(summary, out=out, **places):
             print(f"To mend {line}")
+
+
+def summary_answer(summary: CampaignSummary, out: str) -> dict[str, object]:
+    """The same for programs."""
+    head = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.beside()}
+    figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
+    return {**head, **figures, "seconds": round(summary.seconds, 3), "out": out, "runs": outcome_rows(summary)}
 
 
 def _show_ending(summary: CampaignSummary, out: str, most: int = 25) -> None:

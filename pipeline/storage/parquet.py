@@ -128,6 +128,14 @@ def metadata_of(content: bytes) -> dict[str, str]:
         return {name.decode(errors="replace"): value.decode(errors="replace") for name, value in metadata.items()}
 
 
+def rows_of(content: bytes) -> int:
+    """How many rows the file declares: its size says nothing of that. Raises `ParquetError`."""
+    with _reading():
+        metadata = pq.read_metadata(pa.BufferReader(content))
+        groups = (metadata.row_group(number).num_rows for number in range(metadata.num_row_groups))
+        return int(max(metadata.num_rows, sum(groups)))
+
+
 def without_checksums(content: bytes) -> bool:
     """Whether some column has no checksum, so that damage to it may stay unseen. Raises `ParquetError`."""
     with reading():

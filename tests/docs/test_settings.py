@@ -30,11 +30,23 @@ from datasets.scenario import (
 )
 from schemas.config import StreamCorrection, StreamMapping
 from schemas.dictionary import settings_frame
-from tests.docs.blocks import ROOT
+from schemas.project import (
+    CalibrateEntry,
+    ClaimEntry,
+    ConvertEntry,
+    LineEntry,
+    LogEntry,
+    Project,
+    ReplayEntry,
+    TrackEntry,
+    load_project,
+)
+from tests.docs.blocks import ROOT, blocks
 
 Rows = dict[str, str]
 CONFIGURATION = ROOT / "docs" / "configuration.md"
 SCENARIOS = ROOT / "docs" / "scenarios.md"
+PROJECT = ROOT / "docs" / "project.md"
 DEFAULTS_IN_WORDS = {"start": "2025-03-03T06:00:00Z", "solutions": "primary: gps", "target": "by kind"}
 # Keys that nothing reads yet.
 IDLE: tuple[str, ...] = ()
@@ -149,3 +161,17 @@ def test_a_key_that_is_described_is_read(key: str, sources: str) -> None:
 def sources() -> str:
     files = [*(ROOT / "pipeline").rglob("*.py"), ROOT / "schemas" / "config.py"]
     return "\n".join(path.read_text(encoding="utf-8") for path in sorted(files))
+
+
+def test_project_keys_and_defaults() -> None:
+    models = (Project, TrackEntry, ConvertEntry, LogEntry, CalibrateEntry, ReplayEntry, ClaimEntry, LineEntry)
+    assert tables(PROJECT) == [defaults(model) for model in models]
+
+
+def test_example_of_a_project_is_one(tmp_path: Path) -> None:
+    examples = [block.text for block in blocks(PROJECT) if block.language == "toml"]
+    assert examples
+    for number, text in enumerate(examples):
+        file = tmp_path / f"{number}.toml"
+        file.write_text(text)
+        load_project(file)

@@ -9,7 +9,9 @@ from typing import Any
 
 import polars as pl
 
+from pipeline.make.receivers.bag_budget import Unpack, budget_of_bag, unpacker_of
 from pipeline.read.ingest.run import read_run
+from pipeline.storage.budget import Budget
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
 from schemas.run import STREAMS, RunLog, Stream
@@ -29,7 +31,7 @@ def read_bag(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
         return _streams(read_run(path, config, with_digest=False), {})
     with TemporaryDirectory() as folder:
         log = Path(folder) / "bag.mcap"
-        left = _transcribe(path, log)
+        left = _transcribe(path, log, config)
         try:
             return _streams(read_run(log, config, with_digest=False), left)
         except BaliseError as error:
@@ -45,8 +47,9 @@ def _streams(run: RunLog, left: dict[str, int]) -> tuple[dict[Stream, pl.DataFra
     return streams, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
 
 
-def _transcribe(path: Path, to: Path) -> dict[str, int]:
+def _transcribe(path: Path, to: Path, config: IngestConfig) -> dict[str, int]:
     """Write the messages with their definitions; those of a topic whose definition is not known are counted."""
+    budget = budget_of_bag(path, config)
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -58,7 +61,7 @@ def _transcribe(path: Path, to: Path) -> dict[str, int]:
         # Bags of ROS 1 always hold their definitions, older ones of ROS 2 never do.
         known = None if path.suffix.lower() == ".bag" else get_typestore(Stores.LATEST)
         with AnyReader([path], default_typestore=known) as bag:
-            return _write(bag, to)
+            return _write(bag, to, unpacker_of(bag, str(path), config), budget)
     except BaliseError:
         raise
     except Exception as error:  # the reader's own errors share no base class
@@ -70,7 +73,7 @@ def _transcribe(path: Path, to: Path) -> dict[str, int]:
         ) from None
 
 
-def _write(bag: Any, to: Path) -> dict[str, int]:
+def _write(bag: Any, to: Path, unpack: Unpack, budget: Budget) -> dict[str, int]:
     from mcap.writer import CompressionType, Writer
 
     left: dict[str, int] = {}
@@ -89,7 +92,9 @@ def _write(bag: Any, to: Path) -> dict[str, int]:
             schema = writer.register_schema(connection.msgtype, "ros2msg", definition.encode())
             channels[connection.id, connection.owner] = writer.register_channel(connection.topic, "cdr", schema)
         for connection, t_ns, raw in bag.messages([c for c in bag.connections if (c.id, c.owner) in channels]):
-            data = bytes(raw) if bag.is2 else bytes(types.ros1_to_cdr(raw, connection.msgtype))
+            message = unpack(raw)
+            budget.take(len(message))
+            data = message if bag.is2 else bytes(types.ros1_to_cdr(message, connection.msgtype))
             writer.add_message(channels[connection.id, connection.owner], t_ns, data, t_ns)
         writer.finish()  # type: ignore[no-untyped-call]
     return left

@@ -87,7 +87,7 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
     strangers: list[UnknownError] = []
     for log in logs:
         files.require_regular(log)
-        with unpacked(log) as inner:
+        with unpacked(log, config or IngestConfig()) as inner:
             for plain in inner:
                 try:
                     streams, counts = _convert_one(plain, config or IngestConfig(), date)

@@ -1,75 +1,145 @@
-"""Logs out of `.gz` and `.zip`."""
+"""Logs out of archives: `.zip`, `.tar`, `.gz`, `.bz2`, `.xz`, `.zst`, and archives in them."""
 
 from __future__ import annotations
 
+import bz2
 import gzip
-import shutil
+import lzma
+import re
+import tarfile
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import IO, Any
 
+import pyarrow as pa
+
+from pipeline.storage.budget import Budget
+from schemas.config import IngestConfig
 from schemas.errors import InputError
 
 BAG_FOLDER = "metadata.yaml"
-_PACKED = (".gz", ".zip")
 _DEEPEST = 3  # archives in archives; one that holds itself has no end
+# What the readers raise for damage, a password, a method that they do not know, a disk that is full.
+_ERRORS = (
+    *(OSError, EOFError, RuntimeError, NotImplementedError, ValueError, MemoryError),
+    *(zlib.error, lzma.LZMAError, zipfile.BadZipFile, tarfile.TarError, pa.ArrowException),
+)
 
 
 @contextmanager
-def unpacked(log: Path) -> Iterator[list[Path]]:
+def unpacked(log: Path, config: IngestConfig) -> Iterator[list[Path]]:
     """The logs that a file holds: itself, or what it is the archive of; gone after the block.
 
     A folder is one log (a bag of ROS 2), in an archive as well. Errors name the archive, not where it was unpacked.
     """
-    if log.suffix.lower() not in _PACKED:
+    if not _is_packed(log):
         yield [log]
         return
     with TemporaryDirectory() as folder:
-        place = Path(folder)
         try:
-            _unpack(log, place)
-            yield [inner for entry in sorted(place.iterdir()) for inner in _logs(entry, _DEEPEST)]
-        except (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
-            raise InputError(
-                f"cannot be unpacked: {error}",
-                place=str(log),
-                expected="a whole .gz or .zip without a password",
-                remedy="Copy the file again, or unpack it by hand.",
-            ) from None
+            yield _all_logs(log, Path(folder), Budget(str(log), log.stat().st_size, config))
         except InputError as error:
             error.place = str(error.place).replace(folder, str(log))
             raise
 
 
-def _unpack(log: Path, place: Path) -> None:
-    if log.suffix.lower() == ".zip":
-        with zipfile.ZipFile(log) as archive:
-            names = archive.namelist()
-            if len(set(names)) < len(names):
-                raise OSError("two of its files have the same name")
-            archive.extractall(place)
-        return
-    with gzip.open(log) as packed, (place / log.stem).open("wb") as plain:
-        shutil.copyfileobj(packed, plain)
+def _all_logs(log: Path, place: Path, budget: Budget) -> list[Path]:
+    try:
+        _unpack(log, place, budget)
+        return [inner for entry in sorted(place.iterdir()) for inner in _logs(entry, _DEEPEST, budget)]
+    except _ERRORS as error:
+        raise InputError(
+            f"cannot be unpacked: {error}",
+            place=str(log),
+            expected=f"a whole archive ({', '.join(_UNPACKERS)}) without a password",
+            remedy="Copy the file again, or unpack it by hand.",
+        ) from None
 
 
-def _logs(path: Path, deeper: int) -> Iterator[Path]:
+def _is_packed(path: Path) -> bool:
+    return path.suffix.lower() in _UNPACKERS
+
+
+def _unpack(archive: Path, place: Path, budget: Budget) -> None:
+    _UNPACKERS[archive.suffix.lower()](archive, place, budget)
+
+
+def _unpack_zip(archive: Path, place: Path, budget: Budget) -> None:
+    with zipfile.ZipFile(archive) as opened:
+        for entry in opened.infolist():
+            if not entry.is_dir():
+                with opened.open(entry) as packed:
+                    _write(packed, entry.filename, place, budget)
+
+
+def _unpack_tar(archive: Path, place: Path, budget: Budget) -> None:
+    with tarfile.open(archive, "r:") as opened:
+        for entry in opened:
+            packed = opened.extractfile(entry) if entry.isreg() else None
+            if packed is not None:
+                _write(packed, entry.name, place, budget)
+            elif not entry.isdir():
+                raise OSError(f"{entry.name} is no regular file")
+
+
+def _unpack_one(opener: Callable[[Path], Any]) -> Callable[[Path, Path, Budget], None]:
+    """Of a format that packs a single file, which is called as the archive without its last suffix."""
+
+    def unpack(archive: Path, place: Path, budget: Budget) -> None:
+        name = archive.stem + (".tar" if archive.suffix.lower() == ".tgz" else "")
+        with opener(archive) as packed:
+            _write(packed, name, place, budget)
+
+    return unpack
+
+
+def _opened_zst(archive: Path) -> Any:
+    return pa.CompressedInputStream(pa.OSFile(str(archive)), "zstd")
+
+
+def _write(packed: IO[bytes], name: str, place: Path, budget: Budget) -> None:
+    """Unpack one file to where its name says, which must lie within the archive and be no other's."""
+    parts = re.split(r"[/\\]", name.removeprefix("./"))
+    if {"", ".", ".."} & set(parts) or ":" in name:
+        raise OSError(f"{name!r} is no path within the archive")
+    target = place.joinpath(*parts)
+    if target.exists():
+        raise OSError(f"two of its files have the same name {name!r}")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with target.open("wb") as plain:
+        budget.copy(packed, plain)
+
+
+_UNPACKERS: dict[str, Callable[[Path, Path, Budget], None]] = {
+    ".zip": _unpack_zip,
+    ".tar": _unpack_tar,
+    ".gz": _unpack_one(gzip.open),
+    ".tgz": _unpack_one(gzip.open),
+    ".bz2": _unpack_one(bz2.open),
+    ".xz": _unpack_one(lzma.open),
+    ".zst": _unpack_one(_opened_zst),
+}
+
+
+def _logs(path: Path, deeper: int, budget: Budget) -> Iterator[Path]:
     """The logs at a place of an archive; what the makers of archives leave in them is none."""
     if path.name.startswith((".", "__MACOSX")):
         return
-    if path.suffix.lower() in _PACKED and path.is_file():
+    if _is_packed(path) and path.is_file():
         if not deeper:
             raise OSError(f"{path.name} is packed too often")
         inner = path.with_name(path.name + ".unpacked")
         inner.mkdir()
-        _unpack(path, inner)
+        _unpack(path, inner, budget)
+        path.unlink()  # or archives in archives would take their room twice
         path = inner
         deeper -= 1
     if path.is_dir() and not (path / BAG_FOLDER).exists():
         for inner in sorted(path.iterdir()):
-            yield from _logs(inner, deeper)
+            yield from _logs(inner, deeper, budget)
         return
     yield path

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +34,25 @@ def read_map(path: Path, data: bytes) -> Survey:
     if not data.startswith(_BEGINNINGS[path.suffix.lower()]):
         raise SiteError(f"is no {path.suffix} file", place=str(path), found=repr(data[:16]))
     try:
-        features = [feature for layer, _ in pyogrio.list_layers(path) for feature in _features(path, str(layer))]
-    except (ValueError, RuntimeError, OSError, struct.error) as error:
+        layers = [str(layer) for layer, _ in pyogrio.list_layers(path)]
+        _refuse_computed(path, layers)
+        # Room is made for as many as the file declares; each takes some bytes of it.
+        if sum(abs(pyogrio.read_info(path, layer=layer)["features"]) for layer in layers) > len(data):
+            raise ValueError("it declares more features than it has bytes")
+        features = [feature for layer in layers for feature in _features(path, layer)]
+    except (ValueError, RuntimeError, OSError, struct.error, sqlite3.Error) as error:
         raise SiteError(f"cannot be read ({str(error).splitlines()[0]})", place=str(path)) from None
     return survey_of_features(str(path), path.stem, features)
+
+
+def _refuse_computed(path: Path, layers: list[str]) -> None:
+    """A layer of a GeoPackage may be a query over nothing that never ends; a survey is a table."""
+    if path.suffix.lower() != ".gpkg":
+        return
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+        views = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'view'")}
+    for layer in sorted(views & set(layers)):
+        raise ValueError(f"its layer {layer} is a view; expected a table: export it as a file of its own")
 
 
 def _features(path: Path, layer: str) -> Iterator[Feature]:
@@ -47,7 +64,7 @@ def _features(path: Path, layer: str) -> Iterator[Feature]:
     for row, shape in enumerate(() if shapes is None else shapes):
         if shape is not None:
             tags = {name: _plain(column[row]) for name, column in zip(names, values, strict=True)}
-            lines = [_in_degrees(line, meta["crs"]).tolist() for line in lines_of_wkb(shape)]
+            lines = [_in_degrees(line, meta["crs"]).tolist() for line in lines_of_wkb(memoryview(shape))]
             point = len(lines) == 1 and len(lines[0]) == 1
             kind, coordinates = ("Point", lines[0][0]) if point else ("MultiLineString", lines)
             yield tags, {"type": kind, "coordinates": coordinates}
@@ -68,7 +85,7 @@ def _in_degrees(line: npt.NDArray[np.float64], crs: str | None) -> npt.NDArray[n
     return np.column_stack([longitude, latitude, line[:, 2:3]])
 
 
-def lines_of_wkb(shape: bytes) -> list[npt.NDArray[np.float64]]:
+def lines_of_wkb(shape: bytes | memoryview) -> list[npt.NDArray[np.float64]]:
     """The lines of a well-known binary geometry (OGC 06-103r4, 8.2): a Point is a line of one, areas have none."""
     order = "<" if shape[0] == 1 else ">"
     (code,) = struct.unpack_from(f"{order}I", shape, 1)

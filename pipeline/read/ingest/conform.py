@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import dataframely as dy
 import polars as pl
 
+from schemas.config import IngestConfig
 from schemas.errors import InputError, listed
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import Stream
@@ -42,6 +43,18 @@ def conform(frame: pl.DataFrame, stream: Stream, place: str, breaches: list[Inpu
                 )
             )
     return result
+
+
+def refuse_too_many(rows: int, place: str, config: IngestConfig) -> None:
+    """Refuse a stream that takes more memory than any journey needs."""
+    if rows > config.rows_limit:
+        raise InputError(
+            "has too many rows",
+            place=place,
+            found=str(rows),
+            expected=f"at most {config.rows_limit}",
+            remedy="If so many were recorded, write a larger `rows_limit` under [ingest] in the configuration file.",
+        )
 
 
 def conform_to(

@@ -20,6 +20,7 @@ from pipeline.read.ingest.plan import Sample, is_candidate, settle, solution_of,
 from pipeline.read.ingest.reader import SourceReader
 from pipeline.storage import files
 from pipeline.storage.address import Address, stem_of
+from pipeline.storage.budget import most_unpacked
 from schemas.arrays import times_ns
 from schemas.config import IngestConfig
 from schemas.errors import InputError
@@ -123,7 +124,8 @@ def walk_log(
     try:
         with files.open_binary(path) as raw, io.BufferedReader(raw, _MIB) as stream:  # type: ignore[type-var]
             size = stream.seek(0, io.SEEK_END)
-            walk = McapWalk(stream, size, str(path), int(config.chunk_limit_mib * _MIB))
+            chunk_limit = int(config.chunk_limit_mib * _MIB)
+            walk = McapWalk(stream, size, str(path), chunk_limit, most_unpacked(size, config))
             for block in walk.blocks():
                 streams.add(block, walk.channels)
             stream.seek(0)

@@ -45,7 +45,7 @@ _SLACK = 1024 * 1024  # what does not compress grows a little
 class McapWalk:
     """Walks a log once; `blocks` yields its messages, the attributes hold what was met so far."""
 
-    def __init__(self, stream: IO[bytes], size: int, file: str, chunk_limit: int) -> None:
+    def __init__(self, stream: IO[bytes], size: int, file: str, chunk_limit: int, most_unpacked: int) -> None:
         self.channels: dict[int, Channel] = {}
         self.met = WalkCounts()
         self.cut_at: int | None = None
@@ -55,6 +55,7 @@ class McapWalk:
         self._size = size
         self._file = file
         self._limit = chunk_limit
+        self._left_to_unpack = most_unpacked
         self._schemas: dict[int, Schema] = {}
         self._known: set[bytes] = set()
         self._pieces: list[Piece] = []
@@ -201,6 +202,11 @@ class McapWalk:
         if not chunk.uncompressed_crc and size:  # that of nothing is 0
             self._bare_chunks.extend((end - len(chunk.data), end))
             self.without_crc += 1
+        self._left_to_unpack -= size
+        if self._left_to_unpack < 0:
+            raise DamageError(
+                position, "the chunks unpack to too many times the size of the file ([ingest] unpacked_ratio_limit)"
+            )
         self.met.add_chunk(chunk, position, HEAD_SIZE + len(body))
         content = unpacked(chunk, position)
         indexes, end = self._indexes(end, position, size)

@@ -7,16 +7,17 @@ from collections.abc import Iterable
 
 import polars as pl
 
-from pipeline.read.ingest.conform import conform, refuse
+from pipeline.read.ingest.conform import conform, refuse, refuse_too_many
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
-from pipeline.storage.parquet import ColumnTypes, ParquetError, read_parquet, without_checksums
+from pipeline.storage.parquet import ColumnTypes, ParquetError, read_parquet, rows_of, without_checksums
+from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 
-def read_folder(path: Address, with_digest: bool = True) -> RunLog:
+def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
     """A folder `RUN/` of `gnss.parquet`, `odometer.parquet`, ...; every breach of every file in one error."""
     present = set(files.list_dir(path))
     breaches: list[InputError] = []
@@ -34,7 +35,7 @@ def read_folder(path: Address, with_digest: bool = True) -> RunLog:
         if with_digest:
             digest.update(f"{stream}:{len(content)}:".encode())
             digest.update(content)
-        recorded = _read(content, stream, str(file), breaches)
+        recorded = _read(content, stream, str(file), config, breaches)
         if recorded is not None:
             frames[stream] = conform(recorded, stream, str(file), breaches)
             unproved += [f"{stream}.parquet"] if without_checksums(content) else []
@@ -59,7 +60,9 @@ def _no_gnss(path: Address, present: set[str]) -> InputError:
     )
 
 
-def _read(content: bytes, stream: Stream, place: str, breaches: list[InputError]) -> pl.DataFrame | None:
+def _read(
+    content: bytes, stream: Stream, place: str, config: IngestConfig, breaches: list[InputError]
+) -> pl.DataFrame | None:
     if not content:
         breaches.append(InputError("is empty", place=place, found="0 bytes", expected="a Parquet file"))
         return None
@@ -71,6 +74,7 @@ def _read(content: bytes, stream: Stream, place: str, breaches: list[InputError]
         return [name for name in types if name in contract]
 
     try:
+        refuse_too_many(rows_of(content), place, config)
         frame = read_parquet(content, known)
     except ParquetError as error:
         breaches.append(

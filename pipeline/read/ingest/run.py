@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipeline.read.ingest.conform import refuse_too_many
 from pipeline.read.ingest.correct import corrected
 from pipeline.read.ingest.mcap_run import MOST_TOPICS, read_mcap
 from pipeline.read.ingest.parquet import read_folder
@@ -9,7 +10,7 @@ from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, shown
 from schemas.config import IngestConfig
 from schemas.errors import InputError
-from schemas.run import RunLog
+from schemas.run import STREAMS, RunLog
 
 _DEFAULTS = IngestConfig()
 
@@ -24,6 +25,9 @@ def read_run(path: Address, config: IngestConfig = _DEFAULTS, with_digest: bool 
     damage and says so in `notes`. What the configuration corrects in the streams is corrected (`[[ingest.correct]]`).
     """
     run = _recorded(path, config, with_digest)
+    for stream in STREAMS:
+        if (frame := run.stream(stream)) is not None:
+            refuse_too_many(frame.height, f"{shown(path)}: {stream}", config)
     if (count := run.gnss["solution"].n_unique()) > MOST_TOPICS:
         raise InputError(
             "holds more solutions of the position than any train has receivers",
@@ -38,7 +42,7 @@ def _recorded(path: Address, config: IngestConfig, with_digest: bool) -> RunLog:
     if name_of(path).endswith(".mcap"):
         return read_mcap(path, config, with_digest)
     if files.is_dir(path):
-        return read_folder(path, with_digest)
+        return read_folder(path, config, with_digest)
     if not files.exists(path):
         raise InputError("does not exist", place=shown(path), expected="RUN.mcap or a folder RUN/")
     raise InputError(

@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.read.ingest.conform import Defaults, conform_to, line_of, rows_text, type_name
 from pipeline.read.ingest.csv_text import comments_of, epsg_in, read_table
-from pipeline.storage.parquet import metadata_of, read_parquet
+from pipeline.storage.parquet import metadata_of, read_parquet, rows_of
 from schemas.enums import BaliseDirection, Reaction
 from schemas.errors import InputError
 from schemas.inputs import SITE_SCHEMAS
@@ -52,6 +52,8 @@ def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:
         if not file.endswith(".parquet"):
             return _with_epsg(file, read_table(data, infer=False), epsg_in(comments_of(data)))
         named = {name.lower(): value for name, value in metadata_of(data).items()}.get("epsg")
+        if (rows := rows_of(data)) > len(data):  # each has numbers of its own
+            raise ValueError(f"{rows} rows in {len(data)} bytes")
         return _with_epsg(file, read_parquet(data), named)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         kind = "Parquet" if file.endswith(".parquet") else "CSV"

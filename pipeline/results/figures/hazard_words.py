@@ -28,14 +28,23 @@ def hazard_words(hazards: pl.DataFrame, passages: pl.DataFrame) -> list[str]:
 
 
 def withstood(hazards: pl.DataFrame) -> str:
-    """`2 jumps negated within 0.2 s, 1 shift seen by no monitor and not in use`: what a safe run came through."""
+    """What a safe run came through: `2 jumps of up to 300 m negated within 0.2 s, 1 shift that no monitor saw`."""
     faults = hazards.filter(pl.col("caused_by").is_null())
     kinds = pl.col("hazard").cast(pl.String).replace_strict({kind.value: _say(kind.value) for kind in Hazard})
     parts = []
     for (kind,), rows in faults.group_by(kinds, maintain_order=True):
         for (detected,), part in rows.group_by("detected", maintain_order=True):
-            parts.append(f"{part.height} {kind}{'s' * (part.height > 1)} {_met(part, detected=bool(detected))}")
+            met = _met(part, detected=bool(detected))
+            parts.append(f"{part.height} {kind}{'s' * (part.height > 1)}{_sizes(part['size_m'])} {met}")
     return ", ".join(parts)
+
+
+def _sizes(size_m: pl.Series) -> str:
+    """How large they became, as far as that is known."""
+    largest_m = size_m.abs().max()
+    if largest_m is None:
+        return ""
+    return _say("of_size" if len(size_m) == 1 else "of_sizes", largest_m)
 
 
 def _met(rows: pl.DataFrame, *, detected: bool) -> str:

@@ -17,6 +17,7 @@ from pipeline.show.report.columns import Row, figures, frame_table
 from pipeline.show.report.ground import availability_map
 from pipeline.show.report.headline import campaign_headline, run_headline
 from pipeline.show.report.markup import (
+    UNKNOWN,
     Cell,
     Json,
     badge,
@@ -36,6 +37,7 @@ from pipeline.studies.safety.sentences import level_statements, plain_statements
 from schemas.campaign import CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
 from schemas.enums import TRUTH, Hazard, RunVerdict
 from schemas.tables import Hazards
+from schemas.words import notes_apart
 
 
 @dataclass(frozen=True)
@@ -53,16 +55,18 @@ class Campaign:
     architectures: pl.DataFrame
 
 
+# The first ten are shown, the others behind a switch.
 RUN_COLUMNS = (
-    *("verdict", "run_id", "balises_accepted", "balises_on_path", "availability", "proof_margin_m", "why", "remedies"),
-    *("unsafe_accepted", "failures_beyond_budget", "missed_detections", "unproven_accepted", "share_unknown"),
-    *("part_verdict", "part_share", "location_error_max_m", "hazards", "hazardous_max_s", "time_to_detect_max_s"),
-    *("alarms", "false_alarms", "lost_to", "lost_to_share", "lost_to_monitor", "outages"),
-    *("evidence", "solution", "t_start", "duration_s", "distance_m", "status", "notes", "input_digest"),
+    *("verdict", "run_id", "why", "unsafe_accepted", "failures_beyond_budget", "missed_detections"),
+    *("balises_accepted", "availability", "proof_margin_m", "remedies"),
+    *("balises_on_path", "unproven_accepted", "share_unknown", "part_verdict", "part_share"),
+    *("location_error_max_m", "hazards", "hazardous_max_s", "time_to_detect_max_s", "alarms", "false_alarms"),
+    *("lost_to", "lost_to_share", "lost_to_monitor", "outages", "evidence", "solution"),
+    *("t_start", "duration_s", "distance_m", "status", "notes", "input_digest"),
 )
 _HAZARD_COLUMNS = (
-    *("run_id", "hazard", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "time_since_failure_s"),
-    *("hazardous_s", "hazardous_may_s", "size_m", "balise_ids", "failure_mode", "t_onset", "suspect"),
+    *("run_id", "hazard", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "hazardous_s", "size_m"),
+    *("balise_ids", "t_onset", "time_since_failure_s", "hazardous_may_s", "failure_mode", "suspect"),
 )
 _LEVEL_COLUMNS = ("service_level", "allowed_s", "failures", "within", "exceeded", "failures_judged", "within_share")
 _TONES = {"unsafe": "bad", "failed": "bad", "unproven": "doubt", "safe": "good"}
@@ -121,7 +125,7 @@ def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
         "Line": f"{plural(elements, 'net element')}, {plural(campaign.passages['balise_id'].n_unique(), 'balise')} met",
         "Trains (vehicle file)": ", ".join(f"{name} {count}" for name, count in trains.iter_rows()),
         "Receivers": f"{', '.join(solutions)} at {', '.join(number(rate) for rate in rates)} Hz",
-        "Files": "each run's digest of log and site is in the last column of Table 1",
+        "Files": "the last of all columns of Table 1 has each run's digest of log and site",
     }
     return list(lines.items())
 
@@ -151,12 +155,28 @@ def _runs_table(campaign: Campaign) -> str:
         "run_id": lambda row: Cell(
             row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"], data_run="")
         ),
+        "balises_accepted": _accepted,
+        "notes": _notes,
         "why": lambda row: Cell(text := why[row["run_id"], row["solution"]], text),
         "status": lambda row: Cell(row["status"], row["status"], badge(f"reading {row['status']}", row["status"])),
         "input_digest": digest,
     }
     caption = "Runs, the worst first"
     return frame_table("table-runs", caption, runs, RUN_COLUMNS, CampaignRuns, special)
+
+
+def _accepted(row: Row) -> Cell:
+    """Of the balises on the path."""
+    accepted = row["balises_accepted"]
+    return Cell(UNKNOWN) if accepted is None else Cell(f"{accepted} of {row['balises_on_path']}", float(accepted))
+
+
+def _notes(row: Row) -> Cell:
+    """Folded: some are longer than all that stands beside them."""
+    notes = notes_apart(row["notes"])
+    items = "".join(f"<p>{escape(note)}</p>" for note in notes)
+    summary = plural(len(notes), "note")
+    return Cell(summary, float(len(notes)), f"<details><summary>{summary}</summary>{items}</details>" if notes else "")
 
 
 def _whys(campaign: Campaign) -> dict[tuple[str, str], str]:

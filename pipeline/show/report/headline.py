@@ -15,7 +15,7 @@ from pipeline.show.report.markup import Cell, cell, number, table
 from pipeline.show.report.words import WORDS, plural, some_of
 from schemas.enums import Reason, RunVerdict
 from schemas.run import RunTables
-from schemas.words import beside_words, part_words, reason_words
+from schemas.words import beside_words, part_words, reason_words, say, unnoticed_words
 
 _ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
 
@@ -38,12 +38,26 @@ def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, passages: pl.DataFr
     if verdict is None:
         return Headline(word_of(verdict), heading["error"] or "the run failed", "")
     worst = _worst(heading, hazards, passages)
-    beside = ". ".join(filter(None, (beside_words(heading), part_words(heading))))
+    proved = _withstands(heading) if verdict == RunVerdict.SAFE else ""
+    beside = _sentences(beside_words(heading), part_words(heading), proved)
     if len(listed) > 1:
         reasons = " ".join(_of_solution(row) for row in listed)
         return Headline(word_of(verdict), f"{heading['solution']}: {worst}", reasons, beside)
     reasons = f"{reason_words(heading)}." if verdict == RunVerdict.UNSAFE else ""
     return Headline(word_of(verdict), worst, reasons, beside)
+
+
+def _sentences(*texts: str) -> str:
+    """One sentence after the other; the page ends the last."""
+    return ". ".join(text[0].upper() + text[1:] for text in texts if text)
+
+
+def _withstands(run: Row) -> str:
+    """What a safe verdict rests on: the evidence, and how large an error would have been noticed."""
+    used_s, judged_s = run["in_use_s"], run["in_use_judged_s"]
+    judge = JUDGES.get(run["evidence"])
+    judged = say("verdicts", "judged", judge, judged_s / used_s) if judge and used_s and judged_s is not None else ""
+    return _sentences(judged, unnoticed_words(run["undetected_max_m"]))
 
 
 def _of_solution(row: Row) -> str:
@@ -57,8 +71,9 @@ def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame) -> str:
     Of a safe run with faults: what it withstood.
     """
     of_solution = pl.col("solution") == run["solution"]
-    if run["verdict"] == RunVerdict.SAFE and (met := withstood(hazards.filter(of_solution))):
-        return met
+    if run["verdict"] == RunVerdict.SAFE:
+        met = withstood(hazards.filter(of_solution))
+        return met or f"{reason_words(run)}; {say('verdicts', 'no_fault')}"
     accepted = pl.col("accepted_ids").list.len() > 0
     late = pl.col("within_budget").eq(other=False)
     guilty = hazards.filter(of_solution, accepted | late)
@@ -75,8 +90,10 @@ def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.Da
         return Headline(head.word, "no run could be replayed", summary), None
     beside = beside_words(figures_beside(runs))
     if head.verdict == RunVerdict.SAFE:
-        met = withstood(hazards)
-        return Headline(head.word, _ALL_SAFE + (f": {met}" if met else ""), summary, beside), None
+        met = withstood(hazards) or say("verdicts", "no_fault")
+        largest_m = None if runs["undetected_max_m"].has_nulls() else float(runs["undetected_max_m"].max())  # type: ignore[arg-type]
+        proved = _sentences(beside, unnoticed_words(largest_m))
+        return Headline(head.word, f"{_ALL_SAFE}; {met}", summary, proved), None
     rows = runs.filter(pl.col("verdict") == head.verdict.value)
     order = ("unsafe_accepted", "hazardous_max_s", "unproven_accepted", "share_unknown")
     worst = rows.sort(*order, "run_id", descending=[True] * len(order) + [False], nulls_last=True).head(1)

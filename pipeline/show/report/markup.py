@@ -21,7 +21,9 @@ import numpy.typing as npt
 Json = Any
 
 UNKNOWN = "–"
-_LONG = 32
+_LONG = 40
+# A table shows so many columns, which fit a screen and a sheet of paper; a switch shows the rest.
+_SHOWN_COLUMNS = 10
 # What a page takes along: it is one file.
 _SHARED_SCRIPTS = ("tables.js", "scales.js", "plots.js")
 
@@ -79,16 +81,21 @@ def link(href: str, text: str, **attributes: str) -> str:
 
 
 def table(identity: str, caption: str, heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Cell]]) -> str:
-    """A table whose columns have a title and a meaning; the script sorts it, and searches a long one."""
+    """A table whose columns have a title and a meaning; the script sorts it, and searches a long one.
+
+    The first columns matter most: those beyond ten stand behind a switch that needs no script.
+    """
     if not rows:
         return f'<p class="none">{escape(caption)}: none.</p>'
     numeric = [any(isinstance(item.order, float) for item in column) for column in zip(*rows, strict=True)]
-    body = "\n".join(f"<tr>{''.join(map(_td, row, numeric))}</tr>" for row in rows)
-    titles = "".join(map(_th, heads, numeric))
+    beyond = [number >= _SHOWN_COLUMNS for number in range(len(heads))]
+    body = "\n".join(f"<tr>{''.join(map(_td, row, numeric, beyond))}</tr>" for row in rows)
+    titles = "".join(map(_th, heads, numeric, beyond))
+    switch = f'<label class="all"><input type="checkbox"> all {len(heads)} columns</label>' if any(beyond) else ""
     return (
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">'
+        f'<div class="columns">{switch}<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">'
         f'<table class="data" id="{identity}"><caption>{escape(caption)}</caption>'
-        f"<thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div>"
+        f"<thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div></div>"
     )
 
 
@@ -184,20 +191,24 @@ def _numbered(body: str) -> str:
     return body
 
 
-def _th(head: tuple[str, str], numeric: bool) -> str:
+def _th(head: tuple[str, str], numeric: bool, beyond: bool) -> str:
     title, meaning = head
-    kind = ' class="number"' if numeric else ""
+    kind = _classes("number" * numeric, "more" * beyond)
     hint = f' title="{escape(meaning)}"' if meaning else ""
     return f'<th scope="col"{kind}{hint}>{escape(title)}</th>'
 
 
-def _td(item: Cell, numeric: bool) -> str:
+def _td(item: Cell, numeric: bool, beyond: bool) -> str:
     order = item.order
     key = "" if order is None else f' data-order="{escape(repr(order) if isinstance(order, float) else order)}"'
     shape = "number" if numeric else "long" if len(item.text) > _LONG else ""
-    kinds = [name for name in (shape, item.tone) if name]
-    classes = f' class="{" ".join(kinds)}"' if kinds else ""
+    classes = _classes(shape, item.tone, "more" * beyond)
     return f"<td{key}{classes}>{item.html if item.html is not None else escape(item.text)}</td>"
+
+
+def _classes(*names: str) -> str:
+    given = " ".join(name for name in names if name)
+    return f' class="{given}"' if given else ""
 
 
 def packed(values: npt.ArrayLike, kind: str) -> dict[str, str]:

@@ -153,6 +153,7 @@ const Plots = (() => {
   function draw(id, spec) {
     const place = document.getElementById(id);
     drawn.set(id, spec);
+    place.closest("figure").classList.remove("nothing");
     const width = place.clientWidth;
     if (!width) return;
     const left = spec.x.kind === "time" ? EDGE.time : spec.y.kind === "names" ? EDGE.names : EDGE.left;
@@ -267,6 +268,7 @@ const Plots = (() => {
     return { listen };
   })();
 
+  // One line with the reason stands for a drawing of nothing.
   function empty(id, text) {
     const place = document.getElementById(id);
     const note = document.createElement("p");
@@ -274,6 +276,7 @@ const Plots = (() => {
     note.textContent = text;
     drawn.delete(id);
     place.replaceChildren(note);
+    place.closest("figure").classList.add("nothing");
   }
 
   // With another width all is drawn again; paper scales what is there.

@@ -103,10 +103,10 @@
     return [layers, rules];
   }
 
-  function timePlot(now, name, unit, layers, height, { levels = [], y = null, least = 0 } = {}) {
+  function timePlot(now, name, unit, layers, height, { levels = [], y = null, least = 0, none = "There was no epoch." } = {}) {
     const id = `plot-s${state.index}-${name}`;
     const known = layers.filter(Boolean);
-    if (!known.length) { empty(id, "Nothing is known to draw here."); return; }
+    if (!known.length) { empty(id, none); return; }
     const upright = y ?? { ...range([...known.flatMap((layer) => layer.y), ...levels], least), title: unit, unit };
     const [shades, rules] = hazardMarks(now, upright);
     draw(id, { height, layers: [...shades, ...known], rules: [...rules, ...levels.map((level) => ({ y: level }))],
@@ -175,7 +175,7 @@
     timePlot(now, "linking", "m", [
       line(now, "distance_from_lrvb_m", "distance since the LRVB", "a"), offered.length ? windows : null,
       ...marksOf(offered, (one) => one.t_ms, (one) => one.odometer_m, (one) => `${one.id} ${one.status}, ${number(one.odometer_m)} m`),
-    ], 250);
+    ], 250, { none: "No balise was offered, and nothing was known to measure a distance from." });
   }
 
   // What became of each balise, in the order of the line: readable with hundreds of them.
@@ -201,16 +201,17 @@
   const LOOKS = ["a", "b", "c", "d", "e"];
 
   // A monitor far beyond its threshold must not flatten those that are near theirs.
-  function ratioPlot(now, name, layers) {
+  function ratioPlot(now, name, layers, none) {
     const sizes = layers.filter(Boolean).map((layer) => layer.y.reduce((most, y) => Math.max(most, Math.abs(y ?? 0)), 0));
     const reach = Math.min(RATIO_REACH, Math.max(1.3, 1.1 * Math.max(0, ...sizes)));
-    timePlot(now, name, "", layers, 210, { levels: [-1, 1], y: { lo: -reach, hi: reach, title: "value / threshold" } });
+    timePlot(now, name, "", layers, 210, { none, levels: [-1, 1], y: { lo: -reach, hi: reach, title: "value / threshold" } });
   }
 
   function monitorPlots(now) {
     for (const [drawing, monitors] of Object.entries(data.monitors)) {
       const lines = monitors.map(([name, label], i) => line(now, `ratio_${name}`, label, LOOKS[i % LOOKS.length]));
-      ratioPlot(now, `monitors-${drawing}`, lines);
+      const reason = now.raw.time.silent[drawing];
+      ratioPlot(now, `monitors-${drawing}`, lines, `Never evaluated${reason ? `: ${reason}` : ""}.`);
     }
   }
 
@@ -230,15 +231,15 @@
   function timePlots(now) {
     const limit = data.limits.failure_limit_m;
     bandPlot(now, "bands", "lds");
-    timePlot(now, "speed", "km/h", [line(now, "speed_mps", "speed", "a", KMH)], 180, { least: 5 });
+    timePlot(now, "speed", "km/h", [line(now, "speed_mps", "speed", "a", KMH)], 180, { least: 5, none: "No speed is known." });
     const along = line(now, "error_along_m", "error", "a") ?? line(now, "residual_m", "GNSS minus odometer", "a");
-    timePlot(now, "along", "m", [...confidence(now), ...unnoticed(now), along], 250, { levels: along ? [-limit, limit] : [] });
+    timePlot(now, "along", "m", [...confidence(now), ...unnoticed(now), along], 250, { levels: along ? [-limit, limit] : [], none: "No truth and no odometer to hold positions against." });
     timePlot(now, "across", "m", [
       line(now, "error_cross_m", "across", "a") ?? line(now, "cross_track_m", "across, residual", "a"),
       line(now, "error_up_m", "height", "b") ?? line(now, "vertical_m", "height, residual", "b"),
-    ], 220, { least: 1 });
+    ], 220, { least: 1, none: "No position was matched to the track." });
     linkingPlot(now);
-    timePlot(now, "exposure", "s", [line(now, "exposure_s", "exposure", "a")], 180, { least: 1 });
+    timePlot(now, "exposure", "s", [line(now, "exposure_s", "exposure", "a")], 180, { least: 1, none: "No balise was accepted and no position validated." });
     monitorPlots(now);
     bandPlot(now, "states", "monitors");
   }

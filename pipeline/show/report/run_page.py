@@ -39,15 +39,16 @@ from schemas.run import RunTables, Site
 from schemas.tables import Alarms, Hazards, Passages, Runs
 from schemas.words import notes_apart
 
+# The first ten are shown, the others behind a switch.
 _HAZARDS = (
-    *("hazard_id", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "time_since_failure_s"),
-    *("hazardous_s", "hazardous_may_s", "budget_s", "size_m", "timing", "balise_ids", "failure_mode", "rate_mps"),
-    *("t_onset", "t_failure", "t_detected", "suspect", "evidence", "speed_mps", "caused_by"),
+    *("hazard_id", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "hazardous_s", "size_m", "timing"),
+    *("balise_ids", "t_onset", "t_failure", "t_detected", "time_since_failure_s", "hazardous_may_s", "budget_s"),
+    *("failure_mode", "rate_mps", "suspect", "evidence", "speed_mps", "caused_by"),
 )
 _PASSAGES = (
-    *("balise_id", "judgement", "status", "location_error_m", "t_offered", "t_true", "kind", "direction"),
-    *("location_accuracy_m", "speed_mps", "window_open_m", "odometer_distance_m", "window_close_m", "confidence_m"),
-    *("linking_error", "reaction", "failure_mode", "cause", "suspect_after_the_fact", "hazard_id"),
+    *("balise_id", "judgement", "status", "location_error_m", "confidence_m", "t_offered", "kind", "linking_error"),
+    *("cause", "hazard_id", "t_true", "direction", "location_accuracy_m", "speed_mps"),
+    *("window_open_m", "odometer_distance_m", "window_close_m", "reaction", "failure_mode", "suspect_after_the_fact"),
 )
 _ALARMS = (
     *("t_start", "t_end", "verdict", "monitors", "peak_ratio", "suspect", "hazard_id", "netelement_id", "measure_m"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import polars as pl
@@ -38,7 +38,7 @@ MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end
 def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Json:
     """Series and bands over time; times are milliseconds from `t0_ms`. Across a gap lines are broken."""
     if epochs.is_empty():
-        return {"t0_ms": 0, "t1_ms": 0, "t": None, "series": {}, "bands": []}
+        return {"t0_ms": 0, "t1_ms": 0, "t": None, "series": {}, "bands": [], "silent": {}}
     t_ns = epochs["t"].to_physical().to_numpy()
     t0_ms = int(t_ns[0] // 1_000_000)
     t_ms = t_ns // 1_000_000 - t0_ms
@@ -56,7 +56,21 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
         "t": packed(shown_ms, "u4") if len(shown_ms) <= WHOLE_SERIES else None,
         "series": {name: _series(shown_ms, np.insert(values, gaps, np.nan), whole) for name, values in known.items()},
         "bands": [_band(*row, t_ms, hold_ms) for row in _states(epochs)],
+        "silent": _silent(epochs, known),
     }
+
+
+def _silent(epochs: pl.DataFrame, known: Collection[str]) -> dict[str, str]:
+    """Per drawing of monitors none of which was ever evaluated: the most frequent reason."""
+    silent = {}
+    for drawing, lines in monitor_lines().items():
+        reasons = [epochs[f"{name}_reason"].cast(pl.String).alias("reason") for name, _ in lines]
+        counts = (
+            pl.concat(reasons).drop_nulls().value_counts(sort=True).sort("count", "reason", descending=[True, False])
+        )
+        if counts.height and not any(f"ratio_{name}" in known for name, _ in lines):
+            silent[drawing] = counts["reason"][0]
+    return silent
 
 
 def moments_of(*frames: pl.DataFrame) -> Ints:

@@ -25,9 +25,10 @@ Touches no file, knows of no truth, and asks the monitors only through `MonitorB
   consistent epochs).
 - The linking distance monitor allows the odometer's 5 m + 5 % and the noise of both positions at k_T: 5 m alone would
   alarm on sound receivers.
-- After an outage that the bank does not bridge (`align.gap_reset_s`), or noise that hid the position for as long, the
-  first usable position has to re-link, for the window is too wide to see what came of it: where it has moved, the
-  linking distance monitor fails; where that cannot be said, the position is negated without an alarm until a telegram.
+- After an outage that the bank does not bridge (`align.gap_reset_s`, or shorter where the odometer lost its
+  distance), or noise that hid the position for as long, the first usable position has to re-link, for the window is
+  too wide to see what came of it: where it has moved, the linking distance monitor fails; where that cannot be said,
+  the position is negated without an alarm until a telegram.
 - After slip that the odometer reports no alarm stands, so the last TVB before it, or a later telegram, is the anchor.
   While a position is held to an anchor after a return, it is that one.
 - A start of mission (`lds.starts_of_mission`) forgets LRVB, linking and anchor.

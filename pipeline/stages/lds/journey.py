@@ -160,3 +160,13 @@ def mission_epochs(journey: Journey, config: LdsConfig) -> frozenset[int]:
     starts_ns = np.array([round(start.timestamp() * NS_PER_S) for start in config.starts_of_mission], dtype=np.int64)
     inside = starts_ns[(starts_ns > journey.t_ns[:1].sum()) & (starts_ns <= journey.t_ns[-1:].sum())]
     return frozenset(np.searchsorted(journey.t_ns, inside).tolist())
+
+
+def unwatched_epochs(journey: Journey, watched: Ints, gap_reset_s: float) -> frozenset[int]:
+    """The first watched epochs after time over which no monitor can say what became of the position.
+
+    Longer than the bank bridges; or longer than a crossing is interpolated over, and the odometer lost its distance.
+    """
+    waited_ns = np.diff(journey.t_ns[watched])
+    lost = (np.diff(journey.counter[watched]) != 0) & (waited_ns > journey.gap_ns)
+    return frozenset(watched[1:][lost | (waited_ns > gap_reset_s * NS_PER_S)].tolist())

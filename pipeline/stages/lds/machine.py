@@ -12,7 +12,7 @@ from enum import Enum, auto
 
 from pipeline.stages.lds.crossings import Balise, Crossing
 from pipeline.stages.lds.detection import BaliseDetection
-from pipeline.stages.lds.journey import Journey, mission_epochs, odometer_epochs
+from pipeline.stages.lds.journey import Journey, mission_epochs, odometer_epochs, unwatched_epochs
 from pipeline.stages.lds.link_monitors import LinkDistance
 from pipeline.stages.lds.linking import LrvbChange
 from pipeline.stages.lds.relink import Anchor, Held, Recovery, Relink
@@ -28,7 +28,7 @@ class Use(Enum):
     | from | when | to |
     |---|---|---|
     | in use | the odometer reports slip, and something was validated | slipped |
-    | in use | an outage, or the noise hides what the position does | unseen |
+    | in use | nothing watched it (`unwatched_epochs`), or the noise hides what it does | unseen |
     | unseen | a usable position, watched again within `gap_reset_s`, or it re-links | in use |
     | unseen | it has moved (an alarm), or nothing can be said of that | negated |
     | slipped | it re-links | in use |
@@ -71,14 +71,15 @@ class LocationSystem:
         # The walk reads single elements: lists are several times faster at that than arrays.
         self._t_ns: list[int] = journey.t_ns.tolist()
         self._way_m = journey.odometer_m * journey.direction
-        self._after_outages = frozenset(bank.after_outages.tolist())
+        self._unwatched = unwatched_epochs(journey, bank.watched, config.align.gap_reset_s)
         self._bridged_ns = round(config.align.gap_reset_s * NS_PER_S)
         self._memory_ns = round(NS_PER_S / min(config.monitors.ewma_alphas))
         self._missions = mission_epochs(journey, config.lds)
-        self._events = sorted({*self.balises.events, *self._after_outages, *self._missions, *odometer_epochs(journey)})
+        self._events = sorted({*self.balises.events, *self._unwatched, *self._missions, *odometer_epochs(journey)})
         self._relink = Relink(journey, self.tvb, config)
         self._use = Use.IN_USE
-        self._since = 0  # the epoch from which the position is slipped or unseen
+        self._slipped_at = 0  # the epoch at which slip began
+        self._unseen_ns = 0  # since when the position is unseen
         self._recovery = Recovery(journey, bank, config)
         self._hold_to_ns: int | None = None  # since the first return after an alarm of the bank
         self._validated = False  # a VB or a TVB
@@ -171,16 +172,15 @@ class LocationSystem:
             self._consistent_since_ns = None
             if self._use in (Use.IN_USE, Use.UNSEEN) and self._validated:
                 self._use = Use.SLIPPED
-                self._since = epoch
+                self._slipped_at = epoch
         elif self._use is Use.SLIPPED:
             self._relink_after_slip(epoch)
         if self._use is Use.IN_USE and not self._bank.noise_known_at(epoch):
             self._use = Use.UNSEEN
-            self._since = epoch
-        if self._use in (Use.IN_USE, Use.UNSEEN) and epoch in self._after_outages:
-            # The last epoch before the time that the bank bridges; an outage is longer, so there is one.
+            self._unseen_ns = self._t_ns[epoch]
+        if self._use in (Use.IN_USE, Use.UNSEEN) and epoch in self._unwatched:
             self._use = Use.UNSEEN
-            self._since = bisect_left(self._t_ns, self._t_ns[epoch] - self._bridged_ns) - 1
+            self._unseen_ns = self._t_ns[epoch] - self._bridged_ns - 1
         if self._use is Use.UNSEEN and self._bank.noise_known_at(epoch) and self._can_return(epoch):
             self._relink_unseen(epoch)
 
@@ -189,7 +189,9 @@ class LocationSystem:
 
     def _relink_after_slip(self, epoch: int) -> None:
         # Several slips would each let a held position go on by as much as one may.
-        anchor = self._relink.anchor_at(epoch) if self._is_held(epoch) else self._relink.anchor_before_slip(self._since)
+        anchor = (
+            self._relink.anchor_at(epoch) if self._is_held(epoch) else self._relink.anchor_before_slip(self._slipped_at)
+        )
         if self._can_return(epoch) and self._relink.compare(epoch, anchor).holds:
             self._use = Use.IN_USE
             self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
@@ -197,7 +199,7 @@ class LocationSystem:
     def _relink_unseen(self, epoch: int) -> None:
         """The first usable position after an outage or the noise: it re-links, or is negated."""
         self._use = Use.IN_USE
-        if self._validated and self._t_ns[epoch] - self._t_ns[self._since] > self._bridged_ns:
+        if self._validated and self._t_ns[epoch] - self._unseen_ns > self._bridged_ns:
             comparison = self._relink.compare(epoch, self._relink.anchor_at(epoch))
             self.distance.hold_against(comparison, epoch)
             if comparison.reason is not None:

@@ -152,7 +152,8 @@ class MonitorBank:
 
     Epochs are rows of the solution's epochs. The answers for an epoch may change with `freeze` or `restart` at that
     epoch or before it, never through later ones. `single`: monitors without memory beyond an epoch, evaluated
-    beforehand, `value, threshold, state, reason` by name. A fail of any monitor at an epoch is an alarm.
+    beforehand, `value, threshold, state, reason` by name. `watched`: epochs with a row along the track. A fail of any
+    monitor at an epoch is an alarm.
     """
 
     def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration):
@@ -164,7 +165,7 @@ class MonitorBank:
         # In a run without an odometer the axis across the track has to say where the bank begins.
         self._begins = (along if along.series.epoch.size else across).begins
         self._noise_known = along.noise_known
-        self.after_outages: Ints = along.series.epoch[along.series.dt_s > config.align.gap_reset_s]
+        self.watched: Ints = along.series.epoch
         self._single = {
             name: no_verdicts(self._count, DISABLED) if name in disabled else frame for name, frame in single.items()
         }

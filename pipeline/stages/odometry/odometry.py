@@ -45,8 +45,8 @@ class Odometry:
 
     Instants are int64 nanoseconds; `t_s` of the samples (rows, and what was filled in) and all `_s` arguments are
     seconds since `epoch_ns`. Distances are as recorded, but for `between` and `increments`, and grow with the path once
-    `oriented`. `segment`: how often the distance was lost before a sample; `counter`: the same, over slip, where the
-    wheel was counted all the same; `slip_doubt_m`: by how much the count may be off through slip so far. `pause[i]`:
+    `oriented`. `segment`: how often the distance was lost before a sample; `counter`: the same, over slip and pauses
+    between speeds, where the way is known roughly; `slip_doubt_m`: by how much that may be off so far. `pause[i]`:
     between samples i and i+1 nothing is interpolated. `scale`: true over recorded distance, None without its sigma.
     `leaps_ns`: rows to which the counter leaps (`rows.leaps`).
     """
@@ -242,8 +242,12 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     lost = silent | slip[1:]
     distance_m = _sums(np.where(unknown, 0.0, way_m))
     segment = _sums(lost.astype(np.float64)).astype(np.int64)
-    counter = _sums(silent.astype(np.float64)).astype(np.int64)
-    doubt_m = _sums(_slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align))
+    counter = _sums((silent & unknown).astype(np.float64)).astype(np.int64)
+    doubt_m = _sums(
+        _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
+        # Mean speed x dt over a pause, with acceleration and braking up to b.
+        + np.where(silent & ~unknown, 0.25 * align.braking_mps2 * dt_s**2, 0.0)
+    )
     white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
     noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, config) if counted.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])

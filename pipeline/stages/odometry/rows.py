@@ -41,7 +41,26 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
     recorded = np.where(unknown & ~leap, np.diff(carried_m), recorded)
     driven = _trusted(_driven(t_s, _carried(t_s, speed_mps, limit_s)), recorded, leap, config)
     counted = ~np.isnan(recorded)
-    return Ways(np.where(counted, recorded, driven), counted)
+    return Ways(_over_resets(t_s, np.where(counted, recorded, driven), leap, config), counted)
+
+
+def _over_resets(t_s: Floats, way_m: Floats, leap: Bools, config: AlignConfig) -> Floats:
+    """The ways, at leaps of the counter between rows close together by the mean speed about them.
+
+    With acceleration and braking up to b that is off by at most b dt^2 / 4. Where this is more than `reset_doubt_m`,
+    the distance is lost.
+    """
+    dt_s = np.diff(t_s)
+    lost = np.flatnonzero(leap & np.isnan(way_m) & (0.25 * config.braking_mps2 * dt_s**2 <= config.reset_doubt_m))
+    filled_m = way_m.copy()
+    for step in lost.tolist():
+        about_s = config.speed_window_s + 0.5 * dt_s[step]  # so that rounded stamps take in the row at its edge
+        begin, end = np.searchsorted(t_s, (t_s[step] - about_s, t_s[step + 1] + about_s)).tolist()
+        about = slice(begin, end - 1)
+        known = np.isfinite(way_m[about])
+        if known[: step - about.start].any() and known[step + 1 - about.start :].any():
+            filled_m[step] = way_m[about][known].sum() / dt_s[about][known].sum() * dt_s[step]
+    return filled_m
 
 
 def leaps(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:

@@ -1,11 +1,10 @@
-"""Known causes of a factor, a lag or a shift between two recorders; `causes.toml` has units, datums and mistakes."""
+"""Known causes of a factor, a lag or a shift between two recorders; their figures are in `causes.toml`."""
 
 from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from importlib.resources import files
 from typing import Any
 
@@ -24,11 +23,6 @@ _CLOCK_NEAR_S = 2.2
 # A survey is in a national datum if its shift is so near to the datum's: transformations differ by some metres.
 _DATUM_NEAR_M = 12.0
 _DATUM_NEAR_SHARE = 0.12
-_TAI_OVER_GPS_S = 19
-_HOUR_S = 3_600
-_DAY_S = 86_400
-_WEEK_S = 604_800
-_ROLL_OVER_WEEKS = 1024
 
 
 @dataclass(frozen=True)
@@ -51,48 +45,23 @@ def explain_factor(factor: float, speed: bool) -> Explained | None:
 def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> Explained | None:
     """What makes two clocks differ by `lag_s`, known to within `precision_s`, at an instant; the simplest cause."""
     size_s = abs(lag_s)
-    near = (cause for cause in _lags(size_s, t_ns) if abs(size_s - cause.exact) <= max(precision_s, _CLOCK_NEAR_S))
-    explained = next(near, None)
+    near_s = max(precision_s, _CLOCK_NEAR_S)
+    explained = next((cause for cause in _lags(size_s, t_ns) if abs(size_s - cause.exact) <= near_s), None)
     return explained and Explained(explained.causes, float(np.copysign(explained.exact, lag_s)))
 
 
 def _lags(size_s: float, t_ns: int) -> Iterator[Explained]:
-    """Candidates near a lag, the simplest first."""
+    """Candidates near a lag, the simplest first: leap seconds, then steps of the clock without and with them."""
     leap_s = leap_seconds(t_ns)
     gps = KnownCause(MisfitCause.GPS_AS_UTC)
     yield Explained((gps,), leap_s)
-    yield Explained((KnownCause(MisfitCause.TAI_AS_GPS),), _TAI_OVER_GPS_S)
-    yield Explained((KnownCause(MisfitCause.TAI_AS_UTC),), _TAI_OVER_GPS_S + leap_s)
     for extra_s in (0, leap_s, -leap_s):
-        for calendar in _calendar(size_s - extra_s, t_ns):
-            yield Explained((*calendar.causes, gps) if extra_s else calendar.causes, calendar.exact + extra_s)
-
-
-def _calendar(rest_s: float, t_ns: int) -> Iterator[Explained]:
-    """Whole hours, weeks and days near a lag."""
-    for zone_s in (_HOUR_S, _HOUR_S // 2):
-        count = round(rest_s / zone_s)
-        # Clocks on Earth are at most 14 h from each other.
-        if count >= 1 and rest_s < 14.5 * _HOUR_S:
-            yield _amount(MisfitCause.TIME_ZONE, f"{count * zone_s / _HOUR_S:g} h", count * zone_s)
-    if (roll_overs := round(rest_s / (_ROLL_OVER_WEEKS * _WEEK_S))) >= 1:
-        weeks = _ROLL_OVER_WEEKS * roll_overs
-        yield _amount(MisfitCause.GPS_WEEK, f"{weeks} weeks", weeks * _WEEK_S)
-    date = datetime.fromtimestamp(t_ns // 1_000_000_000, UTC)
-    if date.day <= 12 and date.day != date.month:
-        swapped = date.replace(month=date.day, day=date.month) - date
-        yield Explained((KnownCause(MisfitCause.DAY_AND_MONTH),), abs(swapped.total_seconds()))
-    for code, unit, unit_s in (MisfitCause.WRONG_WEEK, "weeks", _WEEK_S), (MisfitCause.WRONG_DAY, "days", _DAY_S):
-        if (count := round(rest_s / unit_s)) >= 1:
-            whole = _amount(code, f"{count} {unit}", count * unit_s)
-            yield whole
-            if odd := round((rest_s - whole.exact) / _HOUR_S):
-                zone = KnownCause(MisfitCause.TIME_ZONE, (f"{odd:+d} h",))
-                yield Explained((*whole.causes, zone), whole.exact + odd * _HOUR_S)
-
-
-def _amount(code: MisfitCause, amount: str, exact_s: float) -> Explained:
-    return Explained((KnownCause(code, (amount,)),), exact_s)
+        for step in _KNOWN["clock_steps"]:
+            count = round((size_s - extra_s) / step["step_s"])
+            if 1 <= count <= step["most"]:
+                amount = f"{count * step['step_s'] / step['unit_s']:g} {step['unit']}"
+                cause = KnownCause(MisfitCause(step["code"]), (amount,))
+                yield Explained((cause, gps) if extra_s else (cause,), count * step["step_s"] + extra_s)
 
 
 def leap_seconds(t_ns: int) -> int:
@@ -138,12 +107,10 @@ class Datum(Shift):
 
     def explains(self, shift: Shift, one_heading: bool) -> bool:
         """Whether it is this shift; of a single heading only the part across it is known."""
-        east_m = shift.east_m
-        north_m = shift.north_m
-        size_m = shift.shift_m
-        across_m = abs((self.east_m - east_m) * east_m + (self.north_m - north_m) * north_m) / size_m
-        off_m = across_m if one_heading else self.off_m(shift)
-        return off_m < max(_DATUM_NEAR_M, _DATUM_NEAR_SHARE * size_m)
+        apart_m = np.array([self.east_m - shift.east_m, self.north_m - shift.north_m])
+        across = np.array([shift.east_m, shift.north_m]) / shift.shift_m
+        off_m = abs(float(apart_m @ across)) if one_heading else self.off_m(shift)
+        return off_m < max(_DATUM_NEAR_M, _DATUM_NEAR_SHARE * shift.shift_m)
 
 
 def datums_at(latitude_deg: float, longitude_deg: float) -> Iterator[Datum]:

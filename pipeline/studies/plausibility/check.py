@@ -11,6 +11,7 @@ from schemas.words import CAUSES, MISFIT_PLACES
 
 CONFIGURATION = "append to the configuration file"
 VEHICLE_FILE = "append to the vehicle file"
+IN_VEHICLE_FILE = "write instead in the vehicle file"
 
 
 class FitState(StrEnum):
@@ -66,7 +67,6 @@ class Check:
 
     @property
     def sentence(self) -> str:
-        """What does not fit, in one sentence."""
         return f"{self.what}: {self.found}" + (f" ({self.cause})" if self.causes else "")
 
     @property
@@ -92,7 +92,6 @@ def misfit(
 
 
 def not_checked(what: str, why: str) -> Check:
-    """A check that the data do not allow."""
     return Check(what, FitState.NOT_CHECKED, why)
 
 

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.studies.plausibility.check import Check, FitState, not_checked
+from pipeline.studies.plausibility.clocks import clock_checks
 from pipeline.studies.plausibility.odometer import odometer_checks
 from pipeline.studies.plausibility.places import read_stamp_checks, reads_lag, reference_checks, survey_checks
 from pipeline.studies.plausibility.recording import recording_of
 from pipeline.studies.plausibility.velocity import velocity_checks
-from pipeline.studies.plausibility.witnesses import StreamLag, clock_checks
 from pipeline.studies.plausibility.written import reference_elsewhere, written_checks
 from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
 from schemas.enums import MisfitCause, Note
@@ -66,14 +66,12 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
     if written := written_checks(of):
         return Fit(tuple(written))
     checks = reference_elsewhere(of)
-    lags: list[StreamLag] = []
+    of_odometer, lags = odometer_checks(of)
     beside_reference = False
     if not checks and run.reference is not None and run.reference.height:
         of_reference, checks, beside_reference = reference_checks(of)
         lags.append(of_reference)
-    of_odometer, odometer_lags = odometer_checks(of, lags[0] if lags else None)
     checks = [*of_odometer, *checks]
-    lags = [*odometer_lags, *lags]
     if run.balise_reads is not None and run.balise_reads.height and site is not None:
         lags.append(reads_lag(of, run.balise_reads, site))
         checks += read_stamp_checks(of, run.balise_reads)
@@ -81,8 +79,7 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
         checks = [*survey_checks(of, of.line, beside_reference), *checks]
     if of.fixes["vel_e_mps"].null_count() < of.fixes.height:
         checks += velocity_checks(of.velocity, of.gnss, config)
-    doubted = any(cause.code is MisfitCause.LATENCY_OF_FILE for check in checks for cause in check.causes)
-    return Fit((*checks, *clock_checks(of, lags, 0.0 if doubted else vehicle.gnss_latency_s or 0.0)))
+    return Fit((*checks, *clock_checks(of, lags)))
 
 
 def refuse_impossible(fit: Fit, place: str, config: IngestConfig) -> None:

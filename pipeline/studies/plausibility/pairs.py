@@ -6,7 +6,6 @@ of the lag, by the ways of windows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,10 +42,11 @@ _ALIKE_SHARE = 0.07
 _ALIKE_USUAL = 0.04
 # Speeds are means over 4 s, and show a lag to half of that.
 _SPEED_LAG_S = SPEED_S / 2.0
-# Lags that are worth a closer look: so many, so far from each other [s], improved in these steps.
+# Lags that are worth a closer look: so many, so far from each other [s], and those beside them: a stuck counter moves
+# a correlation by seconds.
 _CANDIDATES = 4
 _APART_S = 15.0
-_CLIMB_S = (8.0, 4.0, 2.0, 1.0)
+_BESIDE_S = np.arange(-8.0, 9.0)
 # All shifts of two records are tried on their longest parts without a longer pause, of so many rows at least per time.
 _PAUSE_S = 3_600.0
 _SPARSE_S = 100.0
@@ -82,12 +82,14 @@ class PairFit:
     def lag_known(self) -> bool:
         return self.known and self.lag_sigma_s < _LAG_SIGMA_S
 
-    def scale(self, unit: float = 1.0) -> float:
-        """True distance over what is counted, in a unit of which `unit` make a metre."""
-        return unit / abs(self.factor)
+    @property
+    def scale(self) -> float:
+        """True distance over what is counted."""
+        return 1.0 / abs(self.factor)
 
-    def scale_sigma(self, unit: float = 1.0) -> float:
-        return unit * self.factor_sigma / self.factor**2
+    @property
+    def scale_sigma(self) -> float:
+        return self.factor_sigma / self.factor**2
 
     def other_lag(self, lag_s: float, least_s: float) -> bool:
         """Whether the lag differs from `lag_s` by more than `least_s` and than its noise, in both halves of the run."""
@@ -101,7 +103,7 @@ class PairFit:
 
 
 def _beyond(apart: Floats, least: float) -> bool:
-    """Whole run first, then its halves; a drift or slip in one half is none."""
+    """Whole run first, then its halves."""
     return abs(apart[0]) > least and steady(*apart[:, None])
 
 
@@ -111,9 +113,7 @@ def fit_pair(gnss: Places, counter: Record) -> PairFit:
     fit = _fitted(gnss, counter, coarse_s)
     if fit.lag_known and abs(fit.lag_s - coarse_s) <= 2.0 * _SPEED_LAG_S:
         fit = _fitted(gnss, counter, fit.lag_s)
-    # Regressed, a lag is twice as near where both halves agree on it, or faults of the counter have bent it.
-    agreed = fit.lag_known and all(abs(half_s - fit.lag_s) < _SPEED_LAG_S / 2.0 for _, half_s in fit.halves)
-    if coarse_s and abs(fit.lag_s - coarse_s) > (2.0 if agreed else 1.0) * _SPEED_LAG_S:
+    if coarse_s and abs(fit.lag_s - coarse_s) > _SPEED_LAG_S:
         fit = replace(fit, lag_s=coarse_s, lag_sigma_s=_SPEED_LAG_S / 2.0)
     return replace(fit, shifted=coarse_s != 0.0, clock_reason=clock_reason)
 
@@ -124,7 +124,7 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     GNSS way = a counted + b change, for the counter is the less noisy one; a lag of the counter's stamps by `d` beyond
     the assumed one is b = a d.
     """
-    begin_s, end_s = common(gnss, counter, lag_s)
+    begin_s, end_s = _common(gnss, counter, lag_s)
     if end_s - begin_s < 3.0 * _WINDOW_LEAST_S:
         return PairFit(reason="nothing in common")
     (way, counted, change), counts = _windows(gnss, counter, begin_s, end_s, lag_s)
@@ -186,47 +186,46 @@ def clock_lag(gnss: Places, counter: Record) -> tuple[float, str]:
     possible_s, reason = _possible_lags(gnss, counter)
     if reason:
         return 0.0, reason
-    rated = _rated(gnss, counter, possible_s)
+    rated = sorted((_best_beside(gnss, counter, lag_s) for lag_s in possible_s), reverse=True)
+    rated = [lag for lag in rated if abs(lag[1]) > _SPEED_LAG_S]
     if not rated or not explains(rated[0][0], as_recorded):
         return 0.0, "" if explains(as_recorded, 0.0) else "no shift of the clocks makes the speeds agree"
-    if len(rated) > 1 and rated[0][0] - rated[1][0] < _LAG_RIVAL:
+    agreement, lag_s = rated[0]
+    if any(agreement - other < _LAG_RIVAL for other, other_s in rated if abs(other_s - lag_s) > _APART_S):
         return 0.0, "several shifts of the clocks make the speeds agree"
-    return rated[0][1], ""
+    return lag_s, ""
+
+
+def _best_beside(gnss: Places, counter: Record, lag_s: float) -> tuple[float, float]:
+    """Best agreement of the speeds near a lag, and the lag."""
+    return max((_agreement(gnss, counter, near_s, _COMMON_SHARE), near_s) for near_s in (lag_s + _BESIDE_S).tolist())
 
 
 def _possible_lags(gnss: Places, counter: Record) -> tuple[list[float], str]:
     """Lags at which both speeds look alike, to a second, best correlated first; and why there are none."""
-    spans = [_longest_part(record.t_s) for record in (gnss, counter)]
-    if any(end - begin > _SPARSE_S * rows for begin, end, rows in spans):
-        return [], "the rows are too far apart"
-    times = [np.arange(begin, end + 0.5, 1.0) for begin, end, _ in spans]
-    speeds = [np.abs(record.speed(t_s)) for record, t_s in zip((gnss, counter), times, strict=True)]
-    # Without speeds that only a jump of the position has.
-    speeds = [np.where(speed > 1.5 * usual(speed, 0.95) + 1e-9, np.nan, speed) for speed in speeds]
-    if any(np.isfinite(speed).sum() < _COMMON_S for speed in speeds):
-        return [], f"less than {_COMMON_S:.0f} s of movement are known"
-    if any(np.nanstd(speed) < _SPEED_CHANGE * max(float(np.nanmean(speed)), 1e-9) for speed in speeds):
-        return [], "the speed hardly changes"
+    speeds: list[Floats] = []
+    begins_s: list[float] = []
+    for record in (gnss, counter):
+        parts = np.split(record.t_s, np.flatnonzero(np.diff(record.t_s) > _PAUSE_S) + 1)
+        part = max(parts, key=np.ptp)
+        if np.ptp(part) > _SPARSE_S * part.size:
+            return [], "the rows are too far apart"
+        speed = np.abs(record.speed(np.arange(part[0], part[-1] + 0.5, 1.0)))
+        # Without speeds that only a jump of the position has.
+        speed[speed > 1.5 * usual(speed, 0.95) + 1e-9] = np.nan
+        if np.isfinite(speed).sum() < _COMMON_S:
+            return [], f"less than {_COMMON_S:.0f} s of movement are known"
+        if np.nanstd(speed) < _SPEED_CHANGE * max(float(np.nanmean(speed)), 1e-9):
+            return [], "the speed hardly changes"
+        speeds.append(speed)
+        begins_s.append(float(part[0]))
     rho = _correlations(*speeds)
-    lags_s = times[1][0] - times[0][0] + times[1].size - 1.0 - np.arange(rho.size)
-    return list(_peaks(lags_s, rho)), ""
-
-
-def _longest_part(t_s: Floats) -> tuple[float, float, int]:
-    """Begin and end [s] and rows of the longest part of a record without a long pause."""
-    parts = np.split(t_s, np.flatnonzero(np.diff(t_s) > _PAUSE_S) + 1)
-    longest = max(parts, key=lambda part: float(part[-1] - part[0]))
-    return float(longest[0]), float(longest[-1]), longest.size
-
-
-def _peaks(lags_s: Floats, rho: Floats) -> Iterator[float]:
-    """Lags of the highest correlations that are not beside a higher one."""
-    left = rho.copy()
-    for _ in range(_CANDIDATES):
-        best = int(np.argmax(left))
-        if left[best] > 0.0:
-            yield float(lags_s[best])
-        left[np.abs(lags_s - lags_s[best]) < _APART_S] = 0.0
+    lags_s = begins_s[1] - begins_s[0] + speeds[1].size - 1.0 - np.arange(rho.size)
+    peaks: list[float] = []
+    while len(peaks) < _CANDIDATES and rho.max() > 0.0:
+        peaks.append(float(lags_s[rho.argmax()]))
+        rho[np.abs(lags_s - peaks[-1]) < _APART_S] = 0.0
+    return peaks, ""
 
 
 def _correlations(first: Floats, second: Floats) -> Floats:
@@ -234,43 +233,21 @@ def _correlations(first: Floats, second: Floats) -> Floats:
 
     Element k pairs `first[i]` with `second[i - k + n - 1]`, n the length of `second` (Padfield 2012, masked FFT).
     """
-    size = 1 << (first.size + second.size - 2).bit_length()
+    count = first.size + second.size - 1
+    size = 1 << count.bit_length()
 
-    def spectra(values: Floats) -> list[np.ndarray]:
-        """Of what is known, of how it differs from the mean, and of the square of that."""
-        apart = np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0)
-        return [np.fft.rfft(part, size) for part in (np.isfinite(values).astype(np.float64), apart, apart**2)]
+    def sums(left: Floats, right: Floats) -> Floats:
+        return np.asarray(np.fft.irfft(np.fft.rfft(left, size) * np.fft.rfft(right[::-1], size), size)[:count])
 
-    left = spectra(first)
-    right = spectra(second[::-1])
-
-    def sums(of_left: int, of_right: int) -> Floats:
-        return np.asarray(np.fft.irfft(left[of_left] * right[of_right], size)[: first.size + second.size - 1])
-
-    least = max(_COMMON_S, _COMMON_SHARE * min(np.isfinite(values).sum() for values in (first, second)))
-    spread = sums(2, 0) * sums(0, 2)
-    enough = (np.round(sums(0, 0)) >= least) & (spread > _SPEED_CHANGE**4)
-    return np.where(enough, sums(1, 1) / np.sqrt(np.where(enough, spread, 1.0)), 0.0)
+    known = [np.isfinite(values).astype(np.float64) for values in (first, second)]
+    apart = [np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0) for values in (first, second)]
+    spread = sums(apart[0] ** 2, known[1]) * sums(known[0], apart[1] ** 2)
+    least = max(_COMMON_S, _COMMON_SHARE * min(known[0].sum(), known[1].sum()))
+    enough = (np.round(sums(*known)) >= least) & (spread > _SPEED_CHANGE**4)
+    return np.where(enough, sums(*apart) / np.sqrt(np.where(enough, spread, 1.0)), 0.0)
 
 
-def _rated(gnss: Places, counter: Record, possible_s: list[float]) -> list[tuple[float, float]]:
-    """Agreement and lag of the best shifts away from 0, best first; a stuck counter moves a correlation by seconds."""
-
-    def rated(lag_s: float) -> tuple[float, float]:
-        return _agreement(gnss, counter, lag_s, _COMMON_SHARE), lag_s
-
-    climbed: list[tuple[float, float]] = []
-    for lag_s in possible_s:
-        best = rated(lag_s)
-        for step_s in _CLIMB_S:
-            best = max(best, rated(best[1] - step_s), rated(best[1] + step_s))
-        climbed.append(best)
-    climbed.sort(reverse=True)
-    apart = climbed[:1] + [lag for lag in climbed[1:] if abs(lag[1] - climbed[0][1]) > _APART_S]
-    return [lag for lag in apart if abs(lag[1]) > _SPEED_LAG_S]
-
-
-def common(gnss: Places, counter: Record, lag_s: float) -> tuple[float, float]:
+def _common(gnss: Places, counter: Record, lag_s: float) -> tuple[float, float]:
     """Begin and end of what both records have in common at this lag, by the stamps of the GNSS [s]."""
     return max(gnss.t_s[0], counter.t_s[0] - lag_s), min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
 
@@ -279,7 +256,7 @@ def _agreement(gnss: Places, counter: Record, lag_s: float, least_overlap: float
     """Share of the moving time in which both speeds agree at this lag, times what of the shorter record they have in
     common then: a shift that cuts a fault off explains nothing. 0 where that is too little.
     """
-    begin_s, end_s = common(gnss, counter, lag_s)
+    begin_s, end_s = _common(gnss, counter, lag_s)
     shorter_s = min(np.ptp(gnss.t_s), np.ptp(counter.t_s))
     if end_s - begin_s < max(least_overlap * shorter_s, 20.0):
         return 0.0

@@ -8,14 +8,14 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import points_of
-from pipeline.stages.track.survey import track_of
+from pipeline.stages.track.network import surveyed
 from pipeline.studies.plausibility.causes import Datum, datums_at, explain_factor
 from pipeline.studies.plausibility.check import Check, FitState, KnownCause, correction, fits, misfit, not_checked
+from pipeline.studies.plausibility.clocks import StreamLag
 from pipeline.studies.plausibility.copies import copy_check
 from pipeline.studies.plausibility.recording import Recording
-from pipeline.studies.plausibility.robust import SIGNIFICANT_SIGMAS, explains, steady_median
+from pipeline.studies.plausibility.robust import SIGNIFICANT_SIGMAS, explains, steady, usual
 from pipeline.studies.plausibility.shifts import SurveyFit, SurveyLine, common_lag, fit_places, fit_survey, passes
-from pipeline.studies.plausibility.witnesses import StreamLag
 from schemas.arrays import NS_PER_S, Floats, times_ns
 from schemas.enums import MisfitCause
 from schemas.run import Site
@@ -28,7 +28,6 @@ _GEOID_M = 107.0
 # and position together.
 _FEWEST_READS = 3
 _READ_M = 60.0
-_HEIGHT_UNITS = ("feet", "cm", "mm")
 
 
 def reference_checks(of: Recording) -> tuple[StreamLag, list[Check], bool]:
@@ -57,15 +56,14 @@ def reference_checks(of: Recording) -> tuple[StreamLag, list[Check], bool]:
     return lag, [beside, *_reference_heights(of, shift.lag_s)], near
 
 
-def _reference_heights(of: Recording, lag_s: float) -> Iterator[Check]:
-    gnss = of.gnss
+def _reference_heights(of: Recording, lag_s: float) -> list[Check]:
     record = of.reference
     known = np.zeros(0) if record is None else np.isfinite(record.height_m)
-    if record is None or known.sum() < 2 or not np.isfinite(gnss.height_m).any():
-        return
-    t_s = gnss.t_s + lag_s
+    if record is None or known.sum() < 2:
+        return []
+    t_s = of.gnss.t_s + lag_s
     height_m = np.where(record.known(t_s), np.interp(t_s, record.t_s[known], record.height_m[known]), np.nan)
-    yield from _heights("reference", height_m - gnss.height_m, gnss.height_m, of)
+    return _heights("reference", height_m - of.gnss.height_m, of.gnss.height_m, of)
 
 
 def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> StreamLag:
@@ -99,7 +97,7 @@ def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
 
 def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:
     """Latitude and longitude of the balises on their net elements [deg]."""
-    track = track_of(site.track)
+    track = surveyed(site)
     places = {}
     rows = () if site.balises is None else site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
     for name, element, measure_m in rows:
@@ -154,29 +152,25 @@ def _beside(fit: SurveyFit, datum: Datum | None, of: Recording, streams: tuple[s
     return misfit(_SURVEY, words, code, lines=lines, advice=advice)
 
 
-def _heights(base: str, up_m: Floats, height_m: Floats, of: Recording) -> Iterator[Check]:
-    """Heights of the survey or reference, which lie `up_m` above those of the positions."""
+def _heights(base: str, up_m: Floats, height_m: Floats, of: Recording) -> list[Check]:
+    """Heights of the survey or reference, which lie `up_m` above those of the positions, `height_m`."""
     what = f"heights against the {base}"
-    apart_m, is_steady = steady_median(up_m)
+    half = len(up_m) // 2
+    apart_m = usual(up_m)
     if not np.isfinite(apart_m):
-        return
+        return []
     words = f"the {base} lies {apart_m:.0f} m above them"
+    is_steady = steady(*(np.array([usual(part)]) for part in (up_m, up_m[:half], up_m[half:])))
     if abs(apart_m) <= 1.5 * of.config.shift_told_m or not is_steady:
-        yield fits(what, words)
-        return
-    ratio, _ = steady_median(height_m / (height_m + up_m))
-    for stream, factor in (("gnss", ratio), (base, 1.0 / ratio)):
+        return [fits(what, words)]
+    ratio = usual(height_m / (height_m + up_m))
+    for stream, factor in (("positions", ratio), (base, 1.0 / ratio)):
         unit = explain_factor(factor, False)
-        name = "" if unit is None else unit.causes[0].figures[0]
-        if unit is not None and name in _HEIGHT_UNITS:
-            causes = (KnownCause(MisfitCause.HEIGHT_UNIT, ("positions" if stream == "gnss" else base, name)),)
-            lines = "" if stream == "survey" else correction(stream, {"height_m": 1.0 / unit.exact})
-            advice = "Write the survey's heights in metres." if stream == "survey" else ""
-            yield Check(what, FitState.MISFIT, words, causes, lines, advice=advice)
-            return
+        if unit is not None and unit.causes[0].figures == ("feet",):
+            cause = KnownCause(MisfitCause.HEIGHT_UNIT, (stream, "feet"))
+            return [Check(what, FitState.MISFIT, words, (cause,), advice=f"Write heights of the {stream} in metres.")]
     if abs(apart_m) > _GEOID_M:
-        yield misfit(what, words, MisfitCause.HEIGHT_UNKNOWN)
-        return
+        return [misfit(what, words, MisfitCause.HEIGHT_UNKNOWN)]
     # The judge believes the reference: where it has the other zero, somebody has to say which is right.
     lines = correction("gnss", shift_m={"up": round(apart_m, 1)}) if base == "survey" else ""
-    yield misfit(what, words, MisfitCause.HEIGHT_ZERO, lines=lines)
+    return [misfit(what, words, MisfitCause.HEIGHT_ZERO, lines=lines)]

@@ -36,7 +36,7 @@ class Recording:
 
     @cached_property
     def line(self) -> SurveyLine | None:
-        return None if self.site is None else line_of(self.site.track)
+        return None if self.site is None else line_of(self.site)
 
     @cached_property
     def reference(self) -> Places | None:
@@ -53,6 +53,10 @@ class Recording:
     def pairs(self) -> dict[str, PairFit]:
         """Each counter against the positions."""
         return {name: fit_pair(self.gnss, counter) for name, counter in self.counters.items()}
+
+    def by_reference(self, name: str) -> PairFit:
+        """A counter against the reference, which no drift of the GNSS is in."""
+        return fit_pair(self.reference, self.counters[name]) if self.reference else PairFit(reason="no reference")
 
     @cached_property
     def velocity(self) -> VelocityFit | None:

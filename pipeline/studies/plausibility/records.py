@@ -120,27 +120,24 @@ def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
     rows = _thinned(t_s, np.flatnonzero(valid))
     if rows.size < _LEAST_ROWS:
         return None
-    t_s = t_s[rows]
     latitude = latitude[rows]
     longitude = longitude[rows]
     height = floats(frame, "height_m")[rows] if "height_m" in frame.columns else np.full(rows.size, np.nan)
     level_m = float(np.nanmedian(height)) if np.isfinite(height).any() else 0.0
     flat = np.full(rows.size, level_m if abs(level_m) < 9000.0 else 0.0)
-    return Places(t_s, earth_centred_m(latitude, longitude, flat), latitude, longitude, height)
+    return Places(t_s[rows], earth_centred_m(latitude, longitude, flat), latitude, longitude, height)
 
 
 def counters_of(odometer: pl.DataFrame, epoch_ns: int) -> dict[str, Record]:
     """`distance`, and `speed` summed up, of an odometer, each where enough rows have it."""
     counters: dict[str, Record] = {}
     for name, column in ("distance", "distance_m"), ("speed", "speed_mps"):
-        t_s = seconds_since(epoch_ns, odometer)
-        values = floats(odometer, column)
-        rows = np.flatnonzero(np.isfinite(values))
-        t_s = t_s[rows]
-        way = values[rows]
-        if name == "speed" and rows.size:
+        known = odometer.filter(pl.col(column).is_finite())
+        t_s = seconds_since(epoch_ns, known)
+        way = floats(known, column)
+        if name == "speed" and way.size:
             way = np.concatenate([[0.0], np.cumsum(0.5 * (way[1:] + way[:-1]) * np.diff(t_s))])
-        kept = _thinned(t_s, np.arange(rows.size))
+        kept = _thinned(t_s, np.arange(way.size))
         if kept.size >= _LEAST_ROWS:
             counters[name] = Record(t_s[kept], way[kept])
     return counters

@@ -53,13 +53,9 @@ class Regression:
     whole: bool
     halves: tuple[Floats, ...] = ()
 
-    def steady(self, first: int, last: int, zero: float = 0.0) -> bool:
-        """Whether both halves show what this part of the estimate is off `zero`: a drift or fault in one is no lag."""
-        return steady(self.estimate[first:last] - zero, *(half[first:last] - zero for half in self.halves))
-
 
 def steady(whole: Floats, *halves: Floats) -> bool:
-    """Whether every half points the same way as the whole, and by more than half of it."""
+    """Whether every half points the same way as the whole, and by more than half of it: a drift in one does not."""
     return all(float(half @ whole) > 0.5 * float(whole @ whole) for half in halves)
 
 
@@ -69,7 +65,6 @@ def regressed(
     floor: float,
     least_known: float = 1e-12,
     start: tuple[float, ...] | None = None,
-    halves: bool = True,
 ) -> Regression:
     """Robust regression; `design` (n, m, k), `target` (n, m): the m parts of one observation share a weight.
 
@@ -77,7 +72,7 @@ def regressed(
     best known one stay zero. `start`: an estimate to begin with, else that of least absolute deviations.
     """
     half = len(target) // 2
-    parts = [(design[:half], target[:half]), (design[half:], target[half:])] if halves else []
+    parts = [(design[:half], target[:half]), (design[half:], target[half:])]
     alone = tuple(_solved(*part, floor, least_known, start).estimate for part in parts if len(part[1]) >= LEAST)
     return replace(_solved(design, target, floor, least_known, start), halves=alone)
 
@@ -85,6 +80,7 @@ def regressed(
 def _solved(
     design: Floats, target: Floats, floor: float, least_known: float, start: tuple[float, ...] | None
 ) -> Regression:
+    """Iteratively reweighted least squares: the weight of an observation falls with what the last round left of it."""
     count, each = target.shape
     equations = design.reshape(count * each, -1)
     goal = target.ravel()
@@ -124,10 +120,3 @@ def usual(values: Floats, share: float = 0.5) -> float:
     """Quantile of what is known; NaN where nothing is."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")
-
-
-def steady_median(values: Floats) -> tuple[float, bool]:
-    """Usual value, NaN where none is known, and whether both halves show it."""
-    half = len(values) // 2
-    whole, *halves = (np.array([usual(part)]) for part in (values, values[:half], values[half:]))
-    return float(whole[0]), steady(whole, *halves)

@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import polars as pl
 
 from pipeline.stages.track.geodesy import Points, points_of
+from pipeline.stages.track.network import surveyed
+from pipeline.stages.track.once import Once
 from pipeline.stages.track.segments import Polyline, on_segments
-from pipeline.stages.track.survey import track_of
 from pipeline.studies.plausibility.records import MOVING_MPS, Places
-from pipeline.studies.plausibility.robust import LEAST, Shift, explains, regressed, sampled
+from pipeline.studies.plausibility.robust import LEAST, Shift, explains, regressed, sampled, steady
 from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
+from schemas.run import Site
 
 # Two records are of one place within so much: the worst known datum is 700 m off, most 100 to 200.
 _SAME_PLACE_M = 400.0
@@ -57,9 +58,9 @@ def fit_places(gnss: Places, record: Places, config: PlausibilityConfig) -> Plac
     if lag_s is None or abs(lag_s) <= _PASSING_S:
         return as_recorded
     shifted = _refined(gnss, record, lag_s, config)
-    if shifted.reason or not explains(shifted.agreeing, 0.0 if as_recorded.reason else as_recorded.agreeing):
+    if shifted.reason or not explains(shifted.agreeing, as_recorded.agreeing):
         return as_recorded
-    return replace(shifted, as_recorded=0.0 if as_recorded.reason else as_recorded.as_recorded)
+    return replace(shifted, as_recorded=as_recorded.as_recorded)
 
 
 def passes(track: Places, places: Points, within_m: float) -> tuple[Ints, Floats]:
@@ -90,16 +91,12 @@ def passes(track: Places, places: Points, within_m: float) -> tuple[Ints, Floats
 
 def common_lag(lags_s: Floats, count: int) -> tuple[float | None, float]:
     """What most of so many passages agree on, with its sigma [s]; None where they do not."""
-    if lags_s.size < 3:
-        return None, np.inf
     ordered = np.sort(lags_s)
-    counts = np.searchsorted(ordered, lags_s + _PASSING_S, "right") - np.searchsorted(
-        ordered, lags_s - _PASSING_S, "left"
-    )
-    best = int(counts.argmax())
-    if counts[best] < max(_PASSING_SHARE * count, 3):
+    before = np.searchsorted(ordered, lags_s - _PASSING_S, "left")
+    counts = np.searchsorted(ordered, lags_s + _PASSING_S, "right") - before
+    if counts.max(initial=0) < max(_PASSING_SHARE * count, 3):
         return None, np.inf
-    agreeing = lags_s[np.abs(lags_s - lags_s[best]) <= _PASSING_S]
+    agreeing = lags_s[np.abs(lags_s - lags_s[counts.argmax()]) <= _PASSING_S]
     return float(np.median(agreeing)), float(np.std(agreeing) / np.sqrt(agreeing.size))
 
 
@@ -117,18 +114,24 @@ def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityCon
         return PlaceFit(reason="hardly any movement in common")
     velocity = velocity[moves]
     apart = apart[moves]
+    # Apart = lag * velocity + shift. Along one heading at constant speed the two look alike: it is taken for a lag.
     design = np.concatenate([velocity[:, :, None], np.broadcast_to(np.eye(2), (len(apart), 2, 2))], axis=2)
-    # Along one heading at constant speed a lag and a shift look alike: it is taken for a lag.
     fit = regressed(design, apart, floor=0.2, least_known=1e-4)
     # What is reported besides is no disagreement, nor what positions scatter beyond it.
     bound = 1.5 * config.shift_told_m + config.lag_told_s * np.linalg.norm(velocity, axis=1)
-    agreeing = float(np.mean(np.linalg.norm(apart - design @ fit.estimate, axis=1) < bound))
-    before = float(np.mean(np.linalg.norm(apart, axis=1) < bound))
-    # The record is ahead by so much way at its stamp: it stamps a place so much too early.
     rest_s, east_m, north_m = fit.estimate.tolist()
-    sigma_s = 3.0 * float(fit.sigma[0]) if fit.whole else fit.spread / float(np.linalg.norm(velocity))
-    steady = fit.steady(0, 1, lag_s), fit.steady(1, 3)
-    return PlaceFit(east_m, north_m, lag_s - rest_s, sigma_s, agreeing, before, *steady)
+    # The record is ahead by so much way at its stamp: it stamps a place so much too early.
+    of_parts = (fit.estimate, *fit.halves)
+    return PlaceFit(
+        east_m=east_m,
+        north_m=north_m,
+        lag_s=lag_s - rest_s,
+        lag_sigma_s=3.0 * float(fit.sigma[0]) if fit.whole else fit.spread / float(np.linalg.norm(velocity)),
+        agreeing=float(np.mean(np.linalg.norm(apart - design @ fit.estimate, axis=1) < bound)),
+        as_recorded=float(np.mean(np.linalg.norm(apart, axis=1) < bound)),
+        lag_is_steady=steady(*(part[:1] - lag_s for part in of_parts)),
+        shift_is_steady=steady(*(part[1:] for part in of_parts)),
+    )
 
 
 @dataclass(frozen=True)
@@ -143,7 +146,7 @@ class SurveyLine(Polyline):
         if np.any(np.abs(latitude_deg) > 90.0):
             return float("inf")
         rows = slice(None, None, max(1, len(latitude_deg) // 100))
-        return float(np.median(self.samples[0].query(points_of(latitude_deg[rows], longitude_deg[rows]).surface)[0]))
+        return float(np.median(self.nearest_sample(points_of(latitude_deg[rows], longitude_deg[rows]).surface)[0]))
 
 
 @dataclass(frozen=True)
@@ -162,10 +165,11 @@ class SurveyFit(Shift):
     up_m: Floats
 
 
-def line_of(frame: pl.DataFrame) -> SurveyLine:
+@Once
+def line_of(site: Site) -> SurveyLine:
     """The segments of a site's track."""
-    track = track_of(frame)
-    surface = points_of(track.latitude_deg, track.longitude_deg).surface
+    track = surveyed(site)
+    surface = track.surface
     within = np.setdiff1d(np.arange(len(surface) - 1), track.first[1:-1] - 1)
     rows = within[np.any(surface[within] != surface[within + 1], axis=1)]
     return SurveyLine(surface[rows], surface[rows + 1], track.height_m[rows], track.height_m[rows + 1])
@@ -183,8 +187,7 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float, start_m: tuple[flo
 
     def beside(shift_m: Floats) -> tuple[Floats, Floats, Floats]:
         """Direction across the track at the nearest segment of each moved position, how far it is, and its height."""
-        tree, segment = line.samples
-        nearest = segment[tree.query(points.surface + np.einsum("ijk,j->ik", axes, shift_m))[1]]
+        _, nearest = line.nearest_sample(points.surface + np.einsum("ijk,j->ik", axes, shift_m))
         along = np.einsum("ijk,ik->ij", axes, line.end[nearest] - line.start[nearest])
         across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
         feet = on_segments(points, line, nearest)
@@ -196,21 +199,20 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float, start_m: tuple[flo
     shift = np.array(start_m)
     for _ in range(_ROUNDS):
         across, apart, height_m = beside(shift)
-        fit = regressed(across[:, None, :], apart[:, None], floor=1.0, least_known=_ONE_HEADING, halves=False)
+        fit = regressed(across[:, None, :], apart[:, None], floor=1.0, least_known=_ONE_HEADING)
         shift = fit.estimate
     left = np.abs(apart - across @ shift)
-    left_m = float(np.median(left))
     half = len(apart) // 2
     toward = (across @ shift) * apart
     whole = (across @ shift) ** 2
-    steady = all(toward[part].sum() > 0.5 * whole[part].sum() for part in (slice(half), slice(half, None)))
+    is_steady = all(toward[part].sum() > 0.5 * whole[part].sum() for part in (slice(half), slice(half, None)))
     # By metres, not by what is left elsewhere: a shift brings no run onto a network that it left.
     near = float(np.mean(left < near_m)) > _SHIFT_POSITIONS
     return SurveyFit(
         east_m=float(shift[0]),
         north_m=float(shift[1]),
         aside_m=aside_m,
-        constant=left_m < _SHIFT_LEAVES * aside_m and near and steady,
+        constant=float(np.median(left)) < _SHIFT_LEAVES * aside_m and near and is_steady,
         one_heading=not fit.whole,
         height_m=gnss.height_m[rows],
         up_m=height_m - gnss.height_m[rows],

@@ -114,5 +114,8 @@ def _markov_row(level: str, model: LdsModel, t_h: float, thr_per_h: float) -> di
         "approximation_error": approximation_error(model, t_h),
         "p1_numeric": solved.p1,
         "numeric_difference": difference,
-        "p3_alone_beyond_thr": state.p3 > thr_per_h * t_h,
+        # P3 has no way back in this model, so its mean rate stays: at 1e-9 /h it uses up THR_VB alone (DOMAIN 6).
+        "p3_rate_per_h": state.p3 / t_h,
+        "thr_vb_per_h": thr_per_h,
+        "p3_rate_beyond_thr": state.p3 > thr_per_h * t_h,
     }

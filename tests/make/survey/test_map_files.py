@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +27,10 @@ def line_wkb(points: np.ndarray) -> bytes:
     return struct.pack("<BII", 1, 2, len(points)) + np.asarray(points, dtype="<f8").tobytes()
 
 
-def write(path: Path, shapes: list[bytes]) -> Path:
+def write(path: Path, shapes: list[bytes], **options: str) -> Path:
     names = np.array([f"way{number}" for number in range(len(shapes))], dtype=object)
     kinds = np.array(["rail", "abandoned", "rail"][: len(shapes)], dtype=object)
-    fields = {"field_data": [names, kinds], "fields": ["name", "railway"]}
+    fields = {"field_data": [names, kinds], "fields": ["name", "railway"], **options}
     pyogrio.raw.write(path, np.array(shapes, dtype=object), **fields, geometry_type="LineString", crs="EPSG:31370")
     return path
 
@@ -96,3 +98,19 @@ def test_heights_and_many_lines_of_well_known_binary() -> None:
 def test_a_replay_loads_no_map_library() -> None:
     code = "import sys, pipeline.one_run, pipeline.read.site.read, cli; assert 'pyogrio' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_layers_that_a_map_only_declares_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "line.gpkg", [line_wkb(belgian())])
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("ALTER TABLE line RENAME TO kept")
+        database.execute("CREATE VIEW line AS SELECT kept.* FROM kept, kept AS again")
+        database.commit()
+    with pytest.raises(SiteError, match="its layer line is a view; expected a table"):
+        read_surveys([path], None, Vehicle(), Configuration())
+    flat = write(tmp_path / "line.fgb", [line_wkb(belgian())], SPATIAL_INDEX="NO")
+    content = bytearray(flat.read_bytes())
+    content[72:80] = (0x7000_0000).to_bytes(8, "little")  # the header's count of features, 1 before
+    flat.write_bytes(content)
+    with pytest.raises(SiteError, match="it declares more features than it has bytes"):
+        read_surveys([flat], None, Vehicle(), Configuration())

@@ -126,6 +126,30 @@ def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
         mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent)
 
 
+def test_chunks_unpack_to_so_many_times_the_size_of_their_log(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    other = struct.pack("<BQ", 0x90, 1_000_000) + bytes(1_000_000)
+    path.write_bytes(whole(definitions(), *[packed(other * 30)] * 3, some_messages()))
+    with pytest.raises(InputError, match=r"unpack to too many times.*unpacked_ratio_limit"):
+        read_run(path, with_digest=False)
+    assert read_run(path, IngestConfig(unpacked_ratio_limit=1e6), with_digest=False).gnss.height == 3
+
+
+def test_more_rows_than_the_limit_are_not_read(tmp_path: Path) -> None:
+    gnss = pl.DataFrame({"t": pl.Series([0], dtype=pl.Datetime("ns", "UTC")), "latitude_deg": [1.0]})
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "gnss.parquet").write_bytes(parquet_bytes(pl.concat([gnss] * 1000)))
+    with pytest.raises(
+        InputError, match=r"gnss\.parquet: has too many rows; found 1000; expected at most 999.*rows_limit"
+    ):
+        read_run(folder, IngestConfig(rows_limit=999))
+    log = tmp_path / "run.mcap"
+    log.write_bytes(whole(definitions(), some_messages()))
+    with pytest.raises(InputError, match=r"gnss: has too many rows; found 3; expected at most 2"):
+        read_run(log, IngestConfig(rows_limit=2))
+
+
 def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
     """An index is only believed where all records from its first message to the end are as it tells."""
     records = definitions() + some_messages(3)

@@ -150,6 +150,9 @@ def column(browser: Chrome, index: int) -> list[str]:
 def test_runs_are_sorted_and_searched(browser: Chrome, out: Path) -> None:
     visit(browser, out, "index.html")
     heads = browser.find_elements("css selector", "#table-runs th")
+    assert sum(head.is_displayed() for head in heads) == 10
+    browser.find_element("css selector", "#runs .all input").click()
+    assert all(head.is_displayed() for head in heads)
     names = [head.text.replace("\n", " ").split(" ↕")[0] for head in heads]
     ids, whys = (column(browser, names.index(name)) for name in ("run", "why"))
     assert ids[:2] == ["jump_one_no_odometer", FAILED]

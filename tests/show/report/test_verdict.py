@@ -4,13 +4,16 @@ import re
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 import pytest
 
 from pipeline.results.store import write_run
-from pipeline.show.report import write_report
+from pipeline.show.report import markup, write_report
+from pipeline.show.report.balises import balise_table
 from pipeline.show.report.markup import cell
 from pipeline.stages.provenance import Provenance
 from pipeline.stages.run_row.summary import failed_row
+from schemas.campaign import CampaignBalises
 from schemas.run import RunTables
 from schemas.tables import TABLES, Runs
 from tests.tables import NS, alarms, epochs, hazards, passages, table
@@ -80,7 +83,11 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("page", "word", "reason"),
     [
         ("index.html", "unsafe", "VB_JUMP_1B: VB2 accepted 500.0 m early; no monitor saw it (run bad)."),
-        ("runs/good.html", "safe", "every acceptance right, every position failure within the time allowed."),
+        (
+            "runs/good.html",
+            "safe",
+            "every acceptance right, every position failure within the time allowed; no fault was met.",
+        ),
         ("runs/bad.html", "unsafe", "VB_JUMP_1B: VB2 accepted 500.0 m early; no monitor saw it."),
         ("runs/lost.html", "failed", "gnss.parquet: column t: not in order."),
     ],
@@ -88,6 +95,40 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_verdict_is_the_first_word(report: Path, page: str, word: str, reason: str) -> None:
     body = (report / page).read_text().partition("<header>")[2]
     assert body.startswith(f'<p class="verdict {word}"><strong>{word}</strong>: {reason}')
+
+
+def test_a_safe_run_says_what_it_rests_on(tmp_path: Path) -> None:
+    """40 of 50 s in use judged; the largest unnoticed error is said where it was computed, else that it was not."""
+    used = SAFE | {"in_use_s": 50.0, "in_use_judged_s": 40.0}
+    for run_id, largest in (("known", {"undetected_max_m": 14.26}), ("silent", {})):
+        write_run(run_of(run_id, used | largest, []), tmp_path, {})
+    write_report(tmp_path)
+    banner = {
+        name: (tmp_path / "report" / page).read_text().partition("<header>")[2].partition("</p>")[0]
+        for name, page in (("known", "runs/known.html"), ("silent", "runs/silent.html"), ("all", "index.html"))
+    }
+    assert "Judged by balise reads for 80% of the time in use." in banner["known"]
+    assert "The largest error that no monitor would have noticed was 14.3 m (not proved on curves)." in banner["known"]
+    for name in ("silent", "all"):
+        assert "no monitor would have noticed was not computed (`balise replay --undetected`)" in banner[name]
+
+
+def test_physical_balises_are_not_the_worst_for_want_of_a_judge() -> None:
+    """P1 was read twice, which nobody checks; VB1 was accepted once without a check."""
+    counts = {"runs": 2, "passages": 2, "unsafe_accepted": 0, "lost": 0, "lost_share": 0.0}
+    rows = table(
+        CampaignBalises, 2, balise_id=["P1", "VB1"], kind=["physical", "virtual"], unproven_accepted=[2, 1]
+    ).with_columns(**{name: pl.lit(value) for name, value in counts.items()})  # fmt: skip
+    text = balise_table("t", "Balises", rows)
+    assert text.index(">VB1<") < text.index(">P1<")
+
+
+def test_ten_columns_are_shown_and_the_rest_behind_a_switch() -> None:
+    heads = [(f"c{number}", "") for number in range(12)]
+    text = markup.table("t", "Many", heads, [[cell(number) for number in range(12)]])
+    assert re.findall(r'<th[^>]*class="number more"[^>]*>(\w+)<', text) == ["c10", "c11"]
+    assert "all 12 columns" in text
+    assert "columns</label>" not in markup.table("t", "Few", heads[:10], [[cell(number) for number in range(10)]])
 
 
 def test_all_reasons_stand_behind_it(report: Path) -> None:

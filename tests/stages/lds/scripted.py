@@ -40,15 +40,13 @@ class ScriptedBank:
         self.frozen: list[int] = []
         self.unknown, self.memory_s = set(unknown), memory_s
         self.restarted: list[int] = []
-        self.after_outages = np.zeros(0, dtype=np.int64)
+        self.watched = np.zeros(0, dtype=np.int64)
 
     def watch(self, epochs: pl.DataFrame) -> ScriptedBank:
-        """As a real bank: it begins anew after 60 s without a position or the odometer."""
-        known = np.flatnonzero(
+        """As a real bank: rows where position and odometer are known."""
+        self.watched = np.flatnonzero(
             epochs.select(pl.all_horizontal(pl.col("path_m", "odometer_m").is_not_null())).to_series()
         )
-        t_ns = epochs["t"].to_physical().to_numpy()
-        self.after_outages = known[1:][np.diff(t_ns[known]) > 60 * 10**9]
         return self
 
     def failed(self, epoch: int) -> bool:

@@ -25,16 +25,18 @@ def changes(result: LdsResult) -> list[tuple[int, str]]:
     return [(k + 1, after) for k, (before, after) in enumerate(pairwise(use)) if after != before]
 
 
-def walk(bank: dict[str, Any], offset_m: float = 0.0, slip: range = range(0), **lds: Any) -> LdsResult:
-    """The position is off by `offset_m` from 25 s on; the odometer reports slip over `slip`."""
+def walk(
+    bank: dict[str, Any], offset_m: float = 0.0, slip: range = range(0), silent: range = range(0), **lds: Any
+) -> LdsResult:
+    """The position is off by `offset_m` from 25 s on; the odometer slips, or is silent and loses its distance."""
     slips = [k in slip for k in range(COUNT)]
     true_m = steps(0.0, 20.0, COUNT)
     epochs = epochs_of(
         [x + (offset_m if k >= 25 else 0.0) for k, x in enumerate(true_m)],
-        [None if slips[k] else x for k, x in enumerate(true_m)],
+        [None if slips[k] or k in silent else x for k, x in enumerate(true_m)],
         odometer_slips=slips,
-        odometer_segment=[sum(slips[: k + 1]) for k in range(COUNT)],
-        odometer_counter=[0] * COUNT,
+        odometer_segment=[sum(slips[: k + 1]) + (bool(silent) and k >= silent.stop) for k in range(COUNT)],
+        odometer_counter=[int(bool(silent) and k >= silent.stop) for k in range(COUNT)],
     )
     return run(epochs, balises_at({"V1": 110.0}), ScriptedBank(**bank), **lds)
 
@@ -53,6 +55,9 @@ def walk(bank: dict[str, Any], offset_m: float = 0.0, slip: range = range(0), **
         ({"bank": {"unknown": range(20, 90)}}, [(20, "noise"), (90, IN_USE)]),
         ({"bank": {"unknown": range(20, 90)}, "offset_m": 30.0}, [(20, "noise"), (90, NEGATED)]),
         ({"bank": {"unknown": range(20, 90)}, "scale_sigma": None}, [(20, "noise"), (90, NEGATED)]),
+        # Distance lost while nothing watched: no fault can be ruled out, with or without one.
+        ({"bank": {"begins": [30]}, "silent": range(28, 30)}, [(30, NEGATED)]),
+        ({"bank": {"begins": [30]}, "silent": range(28, 30), "offset_m": 30.0}, [(30, NEGATED)]),
         # Slip: withheld until it re-links, without an alarm; an alarm in it is one.
         ({"bank": {"begins": [30]}, "slip": range(20, 30)}, [(20, "slip"), (30, "relink"), (31, IN_USE)]),
         ({"bank": {"begins": [30]}, "slip": range(20, 30), "offset_m": 30.0}, [(20, "slip"), (30, "relink")]),

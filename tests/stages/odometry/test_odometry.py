@@ -138,13 +138,18 @@ def test_a_counter_that_is_reset_or_runs_over_drives_nowhere(reads, leap, speed)
     speeds = None if speed is None else [forth * speed] * 6
     odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=speeds))
     known = odometry.known_at_s(t[:-1] + 0.25)
-    if speed is None:
-        assert odometry.segment.tolist() == [0] * leap + [1] * (6 - leap)
-        assert known.tolist() == [index != leap - 1 for index in range(5)]
-    else:
-        np.testing.assert_allclose(odometry.distance_m, forth * 5.0 * np.arange(6.0))
-        assert (odometry.segment == 0).all()
-        assert known.all()
+    np.testing.assert_allclose(odometry.distance_m, forth * 5.0 * np.arange(6.0))
+    assert (odometry.segment == 0).all()
+    assert known.all()
+    assert odometry.leaps_ns == (int(1e9 * t[leap]),)
+
+
+def test_a_reset_at_the_end_or_between_rows_far_apart_loses_the_way():
+    """No step after it, or 2 s between rows, in which braking at 1.8 m/s^2 changes the way by 1.8 m."""
+    at_the_end = odometry_from(odometer_of(0.5 * np.arange(4.0), distance_m=[1000.0, 1005.0, 1010.0, 0.0]))
+    far_apart = odometry_from(odometer_of(2.0 * np.arange(5.0), distance_m=[1000.0, 1020.0, 1040.0, 0.0, 20.0]))
+    assert at_the_end.segment.tolist() == [0, 0, 0, 1]
+    assert far_apart.segment_at_s(2.0 * np.arange(5.0)).tolist() == [0, 0, 0, 1, 1]
 
 
 @pytest.mark.parametrize(("reset_m", "step_s"), [(138.0, 1.0), (39.0, 1.0), (30.0, 0.1), (9.0, 0.1)])
@@ -154,8 +159,8 @@ def test_a_counter_that_is_reset_by_little_turns_no_train_round(reset_m, step_s,
     t = step_s * np.arange(60.0)
     reads = reset_m + 20.0 * t - np.where(np.arange(60) >= 30, reset_m, 0.0)
     odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=None if speed is None else np.full(60, speed)))
-    assert odometry.speed_at_s(t[1:]).min() >= 0.0
-    assert odometry.segment[-1] == (1 if speed is None else 0)
+    np.testing.assert_allclose(odometry.distance_m, 20.0 * t, atol=1e-9)
+    assert odometry.segment[-1] == 0
     assert len(odometry.leaps_ns) == 1
 
 
@@ -247,11 +252,17 @@ def test_speeds_that_contradict_the_way_fill_in_nothing(period_s, wrong):
 
 @pytest.mark.parametrize("factor", [3.6, 0.0, -1.0])
 def test_a_speed_of_another_unit_or_sign_tells_no_way_over_a_leap(factor):
-    t = 0.5 * np.arange(40.0)
-    reads = np.where(t < 10.0, 1000.0 + 10.0 * t, 10.0 * (t - 10.0))
-    for noisy, lost in ((1.1, 0), (factor, 1)):
-        odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=[10.0 * noisy] * 40))
-        assert odometry.segment[-1] == lost
+    """Rows 0.5 s apart: the counter's own steps do, 5 m in place of 5.5. Rows 2 s apart: nothing does."""
+    for period_s, counted_m in ((0.5, 5.0), (2.0, None)):
+        t = period_s * np.arange(40.0)
+        reads = np.where(np.arange(40) < 20, 1000.0 + 10.0 * t, 10.0 * (t - t[20]))
+        for noisy in (1.1, factor):
+            odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=[10.0 * noisy] * 40))
+            lost = noisy == factor and counted_m is None
+            assert odometry.segment[-1] == lost
+            if not lost:
+                expected_m = counted_m if noisy == factor else 11.0 * period_s
+                assert np.diff(odometry.distance_at_s(t[19:21])) == pytest.approx(expected_m)
 
 
 def test_a_standstill_between_rows_far_apart_stays_one():

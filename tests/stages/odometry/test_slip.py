@@ -31,11 +31,19 @@ def test_a_sigma_beyond_the_limit_is_slip_and_counts_where_it_is_more(sigma_mps:
     assert odometry.slip_doubt_m[-1] == pytest.approx(doubt_m or 0.0)
 
 
-def test_a_pause_of_speeds_ends_the_counter_and_slip_does_not() -> None:
+def test_a_pause_of_speeds_puts_the_way_in_doubt() -> None:
+    """5 s at 10 m/s are 50 m, to 1.8 m/s^2 x (5 s)^2 / 4; slip before it by a tenth of the way: 5 m twice."""
     t_s = [0.0, 0.5, 1.0, 6.0, 6.5]
     odometry = odometry_from(odometer_of(t_s, speed_mps=[10.0] * 5, slip=[False, True, False, False, False]))
-    assert odometry.counter.tolist() == [0, 0, 0, 1, 1]
+    assert odometry.counter.tolist() == [0] * 5
     assert odometry.segment.tolist() == [0, 1, 1, 2, 2]
+    assert odometry.distance_m == pytest.approx([0.0, 5.0, 10.0, 60.0, 65.0])
+    assert odometry.slip_doubt_m == pytest.approx([0.0, 0.5, 1.0, 12.25, 12.25])
+
+
+def test_a_pause_of_a_counter_that_is_reset_loses_the_count() -> None:
+    odometry = odometry_from(odometer_of([0.0, 0.5, 1.0, 6.0, 6.5], distance_m=[900.0, 905.0, 910.0, 0.0, 5.0]))
+    assert odometry.counter.tolist() == [0, 0, 0, 1, 1]
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])

@@ -32,10 +32,6 @@ def _truncated(frame: pl.DataFrame) -> pl.DataFrame:
     return frame.with_columns((pl.col("latitude_deg", "longitude_deg") * 1e7).floor() / 1e7)
 
 
-def _later(seconds: float) -> Changed:
-    return lambda frame: frame.with_columns(pl.col("t") + pl.duration(microseconds=round(seconds * 1e6)))
-
-
 def _gnss(run: RunLog, sigma_m: float = 1.0) -> pl.DataFrame:
     """Positions with a sigma stated, of which a part has no fix."""
     fixed = pl.col("fix").cast(pl.String) != "none"
@@ -76,12 +72,9 @@ def run() -> RunLog:
         (_rounded(5, per_degree=60), "0.02 m"),
         (_truncated, "0.01 m"),
         (lambda frame: frame.gather_every(3, offset=1), "places are those"),
-        (_later(0.25), "+0.25 s"),
-        (_later(-3.0), "-3.00 s"),
-        (lambda frame: _later(0.7)(_rounded(7)(frame.gather_every(2))), "+0.70 s"),
         (lambda frame: frame.slice(frame.height // 3), "places are those"),
     ],
-    ids=["exact", "7 decimals", "6 decimals", "minutes", "truncated", "thinned", "later", "earlier", "all", "part"],
+    ids=["exact", "7 decimals", "6 decimals", "minutes", "truncated", "thinned", "part"],
 )
 def test_a_copy_is_told(run: RunLog, change: Changed, said: str) -> None:
     gnss = _gnss(run)

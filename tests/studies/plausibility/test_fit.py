@@ -6,13 +6,12 @@ import re
 import tomllib
 from dataclasses import replace
 
-import numpy as np
 import polars as pl
 import pytest
 
 from benchmarks.plausibility import applies, fit_of, told
 from benchmarks.plausibility_trips import Trip, trip
-from benchmarks.plausibility_wrongs import WRONGS, Wrong, exchanged, moved_site, scaled, shifted
+from benchmarks.plausibility_wrongs import WRONGS, Wrong, moved_site, scaled, shifted
 from datasets.random_trials import random_trial
 from pipeline.one_run import replay as replayed
 from pipeline.read.ingest.correct import corrected
@@ -95,14 +94,12 @@ def test_a_run_at_constant_speed_tells_no_clock() -> None:
     [
         (18.4, [("gps_as_utc",)]),
         (-16.6, [("gps_as_utc",)]),
-        (37.0, [("tai_as_utc",)]),
         (-7200.9, [("time_zone", "2 h")]),
         (12_600.0, [("time_zone", "3.5 h")]),
         (3618.0, [("time_zone", "1 h"), ("gps_as_utc",)]),
         (172_800.0, [("wrong_day", "2 days")]),
-        (5_097_600.0, [("day_and_month",)]),  # 5 March to 3 May: 59 days
+        (5_097_600.0, [("wrong_day", "59 days")]),
         (619_315_200.0, [("gps_week", "1024 weeks")]),
-        (90_000.0, [("wrong_day", "1 days"), ("time_zone", "+1 h")]),
     ],
 )
 def test_causes_of_lags(lag_s: float, causes: list[tuple[str, ...]]) -> None:
@@ -198,17 +195,6 @@ def _fit(run: RunLog, site: Site | None = None, vehicle: Vehicle | None = None) 
     return fit_run(run, "primary", vehicle or Vehicle(), PlausibilityConfig(), site)
 
 
-def test_positions_written_wrongly_are_told_without_a_site(trips: list[Trip]) -> None:
-    run = trips[0].run
-    for change in (exchanged("gnss", *_AXES), scaled("gnss", latitude_deg=np.pi / 180, longitude_deg=np.pi / 180)):
-        found = _fit(change(run))
-        assert [check.what for check in found.misfits] == ["positions as written"]
-        assert _fit(_fixed(change(run), found)).misfits == ()
-    mirrored = _fit(scaled("gnss", longitude_deg=-1.0)(run))
-    assert mirrored.impossible[0].whose == Whose(MisfitPlace.OR_VELOCITY)
-    assert lines_of(mirrored.misfits) == {}, "nobody can tell which of both it is"
-
-
 def test_a_survey_with_exchanged_axes_is_not_taken_for_the_positions_fault(trips: list[Trip]) -> None:
     track = trips[0].site.track
     turned = track.with_columns(pl.col(one).alias(other) for one, other in (_AXES, _AXES[::-1]))
@@ -264,12 +250,3 @@ def test_recorders_of_different_hours_are_told_with_lines(trips: list[Trip]) -> 
     assert "shift_s = -7200.0" in report.lines()
     (inline,) = re.findall(r"ingest\.correct = .*\]", report.problems[0])
     assert tomllib.loads(inline)["ingest"]["correct"] == [{"stream": "odometer", "shift_s": -7200.0}]
-
-
-def test_two_counters_under_one_name_are_reported(trips: list[Trip]) -> None:
-    run = trips[0].run
-    assert run.odometer is not None
-    second = pl.when(pl.int_range(pl.len()) % 2 == 1).then(pl.col("distance_m") + 500.0).otherwise("distance_m")
-    found = _fit(run.with_streams(odometer=run.odometer.with_columns(distance_m=second)), trips[0].site)
-    (check,) = [check for check in found.misfits if KnownCause(MisfitCause.TWO_COUNTERS) in check.causes]
-    assert "leap to and fro by about 5" in check.found

@@ -67,9 +67,12 @@ def test_diagnosis_at_sil_4_alone_exceeds_the_thr() -> None:
     """No HR_Diag is published; at 1e-9/h P3 after an hour is beyond THR_VB."""
     assert exact(LPV200, 1.0).p3 == pytest.approx(1e-9, rel=1e-5)
     assert exact(LPV200, 1.0).p3 > 0.67e-9
-    assert safety_tables(SafetyConfig())["markov"]["p3_alone_beyond_thr"].all()
+    assert safety_tables(SafetyConfig())["markov"]["p3_rate_beyond_thr"].all()
+    table = safety_tables(SafetyConfig())["markov"]
+    assert table["p3_rate_per_h"].to_numpy() == pytest.approx(1e-9, rel=1e-4)
+    assert table["thr_vb_per_h"].to_list() == [0.67e-9] * table.height
     better = SafetyConfig(diagnosis_hazard_rate_per_h=1e-10)
-    assert not safety_tables(better)["markov"]["p3_alone_beyond_thr"].any()
+    assert not safety_tables(better)["markov"]["p3_rate_beyond_thr"].any()
 
 
 def test_table_holds_its_own_check() -> None:

@@ -192,6 +192,12 @@ class TestContinuity:
         assert redundant < REQUIRED_MTBF_ONBOARD_H == 3e5
         assert not TABLES["continuity"]["fulfilled"].any()
 
+    def test_continuity_of_two_channels_is_that_of_the_same_15_s(self) -> None:
+        risks = dict(TABLES["continuity"].select("architecture", "continuity_risk_15s").iter_rows())
+        assert risks["1oo1, reactive"] == pytest.approx(8e-6, rel=1e-5)
+        assert risks["1oo2, reactive"] == pytest.approx(6.4e-11, rel=1e-4)
+        assert risks["2oo2, composite"] == pytest.approx(16e-6, rel=1e-5)
+
 
 def test_hours_for_the_thr_of_a_virtual_balise() -> None:
     """DOMAIN section 6: 4.47e9 fault-free hours."""

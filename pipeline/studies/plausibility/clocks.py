@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from pipeline.studies.plausibility.causes import explain_lag, leap_seconds
 from pipeline.studies.plausibility.check import (
+    IN_VEHICLE_FILE,
     VEHICLE_FILE,
     Check,
     FitState,
@@ -22,15 +23,13 @@ from schemas.enums import MisfitCause, MisfitPlace
 
 # Two lags so near to each other are of one clock.
 _SAME_CLOCK_S = 1.5
-NAMES = {"odometer": "odometer", "reference": "reference", "balise_reads": "balise reads"}
 
 
 @dataclass(frozen=True)
 class StreamLag:
     """Of one stream against the GNSS [s]: its stamp of a moment minus the GNSS's; `reason`: why it is not known.
 
-    `sure`: its noise is far below it, and no part of the run contradicts it. `latency_known`: the vehicle file says
-    how late the GNSS is.
+    `sure`: its noise is far below it, and no part of the run contradicts it.
     """
 
     stream: str
@@ -38,28 +37,20 @@ class StreamLag:
     sigma_s: float = float("inf")
     sure: bool = False
     reason: str = ""
-    latency_known: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.stream.replace("_", " ")
 
 
-def clock_checks(of: Recording, lags: list[StreamLag], latency_s: float) -> list[Check]:
-    """One check per stream. What two recorders say against the GNSS is the GNSS's own.
-
-    `latency_s`: how late the GNSS is by the vehicle file; only what is beyond is reported.
+def clock_checks(of: Recording, lags: list[StreamLag]) -> list[Check]:
+    """One check per stream, of what is beyond the GNSS latency of the vehicle file. What two recorders say against the
+    GNSS is the GNSS's own.
     """
-    config = of.config
+    latency_s = of.vehicle.gnss_latency_s or 0.0
     lags = [replace(lag, lag_s=lag.lag_s + latency_s) for lag in lags]
-    sure_s = [lag.lag_s for lag in lags if lag.sure]
-
-    def large(lag: StreamLag) -> bool:
-        return abs(lag.lag_s) > config.lag_limit_s
-
-    def seconded(lag: StreamLag) -> bool:
-        """Two recorders that show the same lag are surer than each."""
-        return lag.sure or (large(lag) and any(abs(lag.lag_s - other_s) < _SAME_CLOCK_S for other_s in sure_s))
-
-    lags = [lag if lag.reason else replace(lag, sure=seconded(lag)) for lag in lags]
-    wrong = [lag for lag in lags if lag.sure and large(lag)]
-    others = [lag for lag in lags if not lag.reason and not large(lag)]
+    wrong = [lag for lag in lags if lag.sure and abs(lag.lag_s) > of.config.lag_limit_s]
+    others = [lag for lag in lags if not lag.reason and abs(lag.lag_s) <= of.config.lag_limit_s]
     alike = all(abs(lag.lag_s - wrong[0].lag_s) < _SAME_CLOCK_S for lag in wrong)
     # One clock has one lag, and one line that mends it.
     of_gnss = min(wrong, key=lambda lag: lag.sigma_s) if len(wrong) >= 2 and alike and not others else None
@@ -67,9 +58,8 @@ def clock_checks(of: Recording, lags: list[StreamLag], latency_s: float) -> list
 
 
 def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
-    name = NAMES[lag.stream]
     config = of.config
-    what = f"clock of the {name} against the GNSS"
+    what = f"clock of the {lag.name} against the GNSS"
     size_s = abs(lag.lag_s)
     if lag.reason:
         return not_checked(what, lag.reason)
@@ -79,16 +69,22 @@ def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool
         sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
         return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
     later = "later" if lag.lag_s > 0 else "earlier"
-    finding = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {name} are {later}"
+    finding = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {lag.name} are {later}"
     if size_s <= config.lag_limit_s:
-        return _small(what, finding, lag)
+        return _small(what, finding, lag, of.vehicle.gnss_latency_s)
+    return _large(what, finding, of, lag, of_gnss, known)
+
+
+def _large(what: str, finding: str, of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
+    """A lag that no train can have; `known`: other recorders tell whose it is."""
     clock = of_gnss or lag
     explained = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0))
     exact_s = round(clock.lag_s if explained is None else explained.exact, 2)
     causes = (KnownCause(MisfitCause.CONSTANT_LAG),) if explained is None else explained.causes
-    rolled_over = any(cause.code is MisfitCause.GPS_WEEK for cause in causes)
-    at_gnss = of_gnss is not None or (not known and _rather_gnss(lag.lag_s, rolled_over, of.epoch_ns))
-    pair = ("GNSS", name) if at_gnss else (name, "GNSS")
+    # GPS time is ahead of UTC, so where nobody else knows the stream with the later stamps holds it.
+    leaps = abs(abs(lag.lag_s) - leap_seconds(of.epoch_ns)) < _SAME_CLOCK_S
+    at_gnss = of_gnss is not None or (not known and leaps and lag.lag_s < 0)
+    pair = ("GNSS", lag.name) if at_gnss else (lag.name, "GNSS")
     whose = Whose(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
     if not at_gnss:
         return Check(what, FitState.IMPOSSIBLE, finding, causes, correction(lag.stream, shift_s=-exact_s), whose=whose)
@@ -98,24 +94,16 @@ def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool
     return Check(what, FitState.IMPOSSIBLE, finding, causes, lines, whose=whose)
 
 
-def _rather_gnss(lag_s: float, rolled_over: bool, t_ns: int) -> bool:
-    """Which of two clocks it is, where nobody else knows.
-
-    GPS time is ahead of UTC, so the stream with the later stamps holds it; a week rolls over in GNSS receivers.
-    """
-    if abs(abs(lag_s) - leap_seconds(t_ns)) < _SAME_CLOCK_S:
-        return lag_s < 0
-    return rolled_over and lag_s > 0
-
-
-def _small(what: str, finding: str, lag: StreamLag) -> Check:
-    """A lag that a train can have, and that costs availability all the same."""
-    latency_s = round(-lag.lag_s, 2)
-    if lag.stream == "odometer" and latency_s > 0 and not lag.latency_known:
+def _small(what: str, finding: str, lag: StreamLag, file_s: float | None) -> Check:
+    """A lag that a train can have, and that costs availability all the same; `file_s`: latency of the vehicle file."""
+    latency_s = round((file_s or 0.0) - lag.lag_s, 2)
+    if lag.stream == "odometer" and latency_s >= 0.0:
+        code = MisfitCause.LATENCY if file_s is None else MisfitCause.LATENCY_OF_FILE
+        into = VEHICLE_FILE if file_s is None else IN_VEHICLE_FILE
         lines = f"gnss_latency_s = {latency_s}\ngnss_latency_sigma_s = {max(round(lag.sigma_s, 3), 0.02)}\n"
-        return misfit(what, finding, MisfitCause.LATENCY, lines=lines, into=VEHICLE_FILE)
-    code = MisfitCause.STAMPED_LATE if latency_s < 0 else MisfitCause.STAMPED_EARLY
+        return misfit(what, finding, code, lines=lines, into=into)
+    code = MisfitCause.STAMPED_LATE if lag.lag_s > 0 else MisfitCause.STAMPED_EARLY
     if lag.stream == "reference":
         # The judge believes the reference: nobody should shift it to where the positions want it.
         return misfit(what, finding, code, advice="Find out which clock is wrong before one is corrected.")
-    return misfit(what, finding, code, lines=correction(lag.stream, shift_s=latency_s))
+    return misfit(what, finding, code, lines=correction(lag.stream, shift_s=-round(lag.lag_s, 2)))

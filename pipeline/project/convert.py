@@ -1,0 +1,104 @@
+"""One run of a project from its logs, as `balise convert` makes it in one or several calls."""
+
+from __future__ import annotations
+
+import glob
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import date
+from itertools import groupby
+from pathlib import Path
+
+from pipeline.make.receivers import Converted, Gatherings, Purpose, as_run, extended, gather
+from pipeline.project.opened import Opened
+from pipeline.read.ingest.correct import corrected
+from schemas.config import Configuration, IngestConfig
+from schemas.errors import UsageError
+from schemas.project import ConvertEntry, LogEntry
+from schemas.run import RunLog
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """What public recordings need no mapping for, and how a run is written; both are known to `datasets` alone."""
+
+    known: Callable[[Path], Converted | None]
+    write: Callable[[RunLog, Path], None]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Logs that are read in one call, what their positions are for, and what they hold."""
+
+    purpose: Purpose
+    found: Gatherings
+
+
+def logs_of(opened: Opened, entry: ConvertEntry) -> list[Path]:
+    """Every log of a run. Raises `UsageError` for one that is not there."""
+    return [path for log in entry.logs for path in _paths(opened, log, entry)]
+
+
+def run_of_logs(opened: Opened, entry: ConvertEntry, config: Configuration, recordings: Recordings) -> Converted:
+    """The run, corrected as the project says; raises `InputError` for logs that cannot be read."""
+    parts = _parts(opened, entry, config.ingest, recordings)
+    parts.sort(key=lambda part: part.purpose.stream != "gnss" or "gnss" not in part.found.streams)
+    first = parts[0]
+    made = as_run(first.found, entry.run_id, first.purpose, config.fix_sigma)
+    dropped = Counter(made.dropped)
+    for part in parts[1:]:
+        made = extended(made.run, Path(entry.to), part.found, part.purpose, config.fix_sigma, False)
+        dropped.update(made.dropped)
+    return Converted(corrected(made.run, entry.correct), dict(dropped))
+
+
+def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: Recordings) -> list[_Part]:
+    """Logs of the same purpose are read together, so that two of the same time are refused."""
+    ingest = _with_mappings(base, entry.logs)
+    parts = []
+    for (purpose, day), logs in groupby(sorted(entry.logs, key=_call_key), key=_call_of):
+        paths = []
+        for log in logs:
+            for path in _paths(opened, log, entry):
+                known = None if log.mappings() or day else recordings.known(path)
+                if known is None:
+                    paths.append(path)
+                else:
+                    parts.append(_Part(purpose, known.gathered()))
+        if paths:
+            parts.append(_Part(purpose, gather(paths, ingest, day)))
+    return parts
+
+
+def _call_of(log: LogEntry) -> tuple[Purpose, date | None]:
+    return Purpose(log.solution, log.stream), log.date
+
+
+def _call_key(log: LogEntry) -> tuple[str, str, str]:
+    return log.stream, log.solution or "", str(log.date or "")
+
+
+def _with_mappings(base: IngestConfig, logs: tuple[LogEntry, ...]) -> IngestConfig:
+    """The mappings of all logs before those of the configuration; its corrections are made by the replay."""
+    own: list[Mapping[str, object]] = [log.mappings() for log in logs]
+    names = dict.fromkeys(name for mappings in own for name in mappings)
+    joined = {name: sum((tuple(of[name]) for of in own if name in of), ()) + getattr(base, name) for name in names}  # type: ignore[arg-type]
+    return base.model_copy(update={"correct": (), **joined})
+
+
+def _paths(opened: Opened, log: LogEntry, entry: ConvertEntry) -> list[Path]:
+    """The files of a log, patterns resolved."""
+    found: list[Path] = []
+    for named in log.files:
+        place = opened.place(named)
+        matches = [place] if Path(place).exists() else sorted(glob.glob(place, recursive=True))
+        if not matches:
+            raise UsageError(
+                "does not exist",
+                place=place,
+                expected=f"a log of run {entry.run_id}, as {opened.file} names it",
+                remedy="Put it back, or correct `files` under [[convert]]; paths are relative to balise.toml.",
+            )
+        found += map(Path, matches)
+    return found

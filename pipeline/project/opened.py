@@ -1,0 +1,179 @@
+"""A project where it stands: its paths, its settings, and what other commands take from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path, PurePath
+from typing import Any
+
+from pipeline.storage.address import is_url
+from schemas.config import Configuration, Vehicle, load_settings, read_toml
+from schemas.errors import UsageError
+from schemas.project import FILE_NAME, NO_VEHICLE, Project, is_project, load_configuration, load_project
+
+MEASURED_VEHICLE = "vehicle_measured.toml"
+MEASURED_CONFIG = "config_measured.toml"
+RECORD = ".balise"
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A project and its file; places that it names are told as seen from the working directory."""
+
+    file: Path
+    project: Project
+
+    @property
+    def folder(self) -> Path:
+        return self.file.parent
+
+    def place(self, named: str) -> str:
+        """A path of the file, or an address."""
+        return named if is_url(named) else str(self.folder / Path(named).expanduser())
+
+    def path(self, named: str | None) -> Path | None:
+        return None if named is None else Path(self.place(named))
+
+    @property
+    def config_file(self) -> Path | None:
+        """What stands for `--config`: the project itself where it changes the configuration."""
+        if self.project.calibrate is not None and self.project.calibrate.monitors:
+            return self.folder / RECORD / MEASURED_CONFIG
+        return self.file if self.project.service_level else self.path(self.project.config)
+
+    @property
+    def vehicle_file(self) -> Path | None:
+        """The vehicle file of runs that name no other; measured ones are made by `run`."""
+        if self.project.calibrate is not None:
+            return self.folder / RECORD / MEASURED_VEHICLE
+        return self.path(self.project.vehicle)
+
+    def vehicle_of(self, run_id: str) -> Path | None:
+        """The vehicle file of one run: the first pattern of `[vehicles]` that fits, else that of all."""
+        named = next((file for pattern, file in self.project.vehicles.items() if fnmatchcase(run_id, pattern)), None)
+        if named == NO_VEHICLE:
+            return None
+        return self.vehicle_file if named is None else self.path(named)
+
+    def given_config(self) -> Configuration:
+        """The configuration as written, before anything is measured."""
+        return load_configuration(self.file)
+
+    def given_vehicle(self) -> Vehicle:
+        return load_settings(self.path(self.project.vehicle), Vehicle)
+
+    def runs(self) -> list[str]:
+        """Paths of all runs: the converted ones, and patterns of those that need no conversion."""
+        return [
+            *map(self.place, (entry.to for entry in self.project.convert)),
+            *map(self.place, self.project.replay.runs),
+        ]
+
+
+def open_project(named: Path | None) -> Opened:
+    """The project of a folder or file. Raises `UsageError` where there is none, `ConfigError` for a wrong key."""
+    file = named or Path()
+    file = file / FILE_NAME if file.is_dir() else file
+    if not file.is_file():
+        remedy = "`balise trial RAW... --track LINE --balises B --to FOLDER` or `balise init FOLDER` writes one."
+        raise UsageError("there is no project", place=str(file), expected=f"a file {FILE_NAME}", remedy=remedy)
+    return Opened(file, load_project(file))
+
+
+def project_here(named: Path | None) -> Opened | None:
+    """The project that was named, or that of the working directory, if any."""
+    file = Path(FILE_NAME)
+    if named is not None or (file.is_file() and is_project(read_toml(file))):
+        return open_project(named)
+    return None
+
+
+def values_for(command: str, opened: Opened) -> dict[str, Any]:
+    """What a command takes where its own options are not given, by the names of its parameters."""
+    project = opened.project
+    out = opened.place(project.out)
+    site = opened.place(project.site)
+    settings = {"vehicle": opened.vehicle_file, "config": opened.config_file}
+    route = opened.path(project.replay.route)
+    values: dict[str, dict[str, Any]] = {
+        "inspect": {"path": out if Path(out).exists() else site, "site": site, **settings},
+        "replay": {"runs": opened.runs(), "site": site, "out": out, **settings, **_replay_values(opened)},
+        "report": {"out": out, "site": site},
+        "sql": {"out": out},
+        "verify": {"out": out, "site": site, "route": route, **settings},
+        "safety": {"out": out, "site": site, "vehicle": opened.vehicle_file},
+        "line": {"out": out, "site": site, **_line_values(opened)},
+        "claim": {"out": out, "site": site, **_claim_values(opened)},
+    }
+    return {name: value for name, value in values.get(command, {}).items() if value not in (None, [], False)}
+
+
+def taken_from_project(
+    named: str | None, command: str, missing: Sequence[str | None], say: Callable[[str], None] | None
+) -> dict[str, Any]:
+    """What a command takes from the project for parameters that are missing, said in one line."""
+    opened = project_here(None if named is None else Path(named))
+    if opened is None:
+        return {}
+    values = values_for(command, opened)
+    _require_measured(opened, values)
+    taken = {name: value for name, value in values.items() if name in missing}
+    if taken and say is not None:
+        told = ", ".join(f"{name} {_shown(value)}" for name, value in taken.items())
+        say(f"balise: from {opened.file}: {told}")
+    return values
+
+
+def _require_measured(opened: Opened, values: dict[str, Any]) -> None:
+    """What a calibration has not measured yet cannot be used."""
+    measured = opened.folder / RECORD
+    absent = [value for value in values.values() if isinstance(value, Path) and value.parent == measured]
+    if any(not value.exists() for value in absent):
+        raise UsageError("is not calibrated yet", place=str(opened.file), remedy="`balise run` does it.")
+
+
+def _shown(value: object) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _replay_values(opened: Opened) -> dict[str, Any]:
+    options = opened.project.replay
+    calibrate = [one if one == "auto" else opened.place(one) for one in options.calibrate]
+    return {
+        "route": opened.path(options.route),
+        "write_route": opened.path(options.write_route),
+        "undetected": options.undetected,
+        "calibrate": calibrate,
+        "jobs": options.jobs or None,
+        "scheduler": options.scheduler,
+        "time_limit": options.time_limit_s if "time_limit_s" in options.model_fields_set else None,
+        "fail_on": options.fail_on,
+    }
+
+
+def _line_values(opened: Opened) -> dict[str, Any]:
+    options = opened.project.line
+    files = {"criteria": options.criteria, "points": options.points, "to": options.out}
+    return {"solution": options.solution, **{name: opened.path(named) for name, named in files.items()}}
+
+
+def _claim_values(opened: Opened) -> dict[str, Any]:
+    options = opened.project.claim
+    is_file = (options.profile or "").endswith(".toml")
+    profile = opened.place(options.profile) if options.profile and is_file else options.profile
+    return {"profile": profile, "front_ahead": options.front_ahead_m}
+
+
+def named_from(path: PurePath, folder: PurePath) -> str:
+    """A path as a project in this folder names it, both absolute.
+
+    Relative for what lies beside or below the folder, so that both can be moved together; else absolute. Slashes go
+    forward, so that the file is read on any system.
+    """
+    if path.is_relative_to(folder):
+        return path.relative_to(folder).as_posix()
+    if path.is_relative_to(folder.parent) and folder.parent != folder.parent.parent:
+        return f"../{path.relative_to(folder.parent).as_posix()}"
+    return path.as_posix()

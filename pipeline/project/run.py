@@ -1,0 +1,293 @@
+"""Everything of a project brought up to date: convert, site, calibrate, replay, report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+from pipeline import storage
+from pipeline.campaign import CampaignSummary, Plan, find_runs, make_plan, run_campaign
+from pipeline.campaign.watch import Follower
+from pipeline.make.survey.make import Wish, make_site, wish_of, write_made
+from pipeline.project.convert import Recordings, logs_of, run_of_logs
+from pipeline.project.made import Product, Record, digest_over
+from pipeline.project.opened import MEASURED_CONFIG, MEASURED_VEHICLE, RECORD, Opened
+from pipeline.read.ingest import read_run
+from pipeline.read.site.read import read_site
+from pipeline.results import store
+from pipeline.results.manifest import settings_files
+from pipeline.show.report import write_report
+from pipeline.show.report.site_page import site_page
+from pipeline.storage.address import is_url
+from schemas.config import Configuration, Vehicle, digest_of, load_settings, to_toml
+from schemas.errors import InputError, UsageError
+from schemas.project import CalibrateEntry, ConvertEntry, TrackEntry, load_configuration
+from schemas.tables import TABLES
+
+Said = Callable[[str, str], None]
+"""Receives a step and what there is to say of it."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """What one call of `balise run` adds: none of it decides a result. `prune`: results of other runs are removed."""
+
+    said: Said
+    watches: Sequence[Follower] = ()
+    pages: Callable[[int, int], None] | None = None
+    jobs: int = 1
+    force: bool = False
+    prune: bool = False
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How the replay ended, and the first page of the report; `changed`: whether anything had to be done."""
+
+    summary: CampaignSummary
+    page: Path | None
+    changed: bool
+
+
+@dataclass
+class _Steps:
+    """A project on its way: which steps had something to do."""
+
+    opened: Opened
+    recordings: Recordings
+    call: Call
+    record: Record
+    changed: list[str] = field(default_factory=list)
+
+    def bring(self, product: Product, make: Callable[[], Sequence[Path]]) -> bool:
+        made = self.record.bring(product, make)
+        if made:
+            self.changed.append(product.name)
+        return made
+
+
+def run_project(opened: Opened, recordings: Recordings, call: Call) -> Ended:
+    """Do what is left to do. Raises `InputError` where logs cannot be converted: then nothing is replayed.
+
+    Raises `Interrupted` when asked to stop; the same call then does the rest.
+    """
+    steps = _Steps(opened, recordings, call, Record(opened.folder, call.force))
+    _convert(steps)
+    _make_site(steps)
+    _calibrate(steps)
+    plan = plan_of(opened)
+    _only_these(plan, call)
+    options = opened.project.replay
+    call.said("replay", f"{len(plan.jobs)} runs")
+    summary = run_campaign(
+        _calibrated(steps, plan),
+        jobs=call.jobs,
+        scheduler=options.scheduler,
+        force=call.force,
+        time_limit_s=options.time_limit_s,
+        watches=call.watches,
+    )
+    changed = bool(steps.changed) or not all(outcome.skipped for outcome in summary.outcomes)
+    return Ended(summary, _report(steps, plan), changed)
+
+
+def plan_of(opened: Opened) -> Plan:
+    """The replay of all runs, each with its own vehicle file."""
+    project = opened.project
+    config = load_configuration(opened.config_file)
+    vehicle = load_settings(opened.vehicle_file, Vehicle)
+    given = settings_files(opened.config_file, opened.vehicle_file)
+    if not opened.runs():
+        raise UsageError(
+            "names no run",
+            place=str(opened.file),
+            expected="logs under [[convert]], or `runs` under [replay]",
+            remedy="`balise trial` writes them for your logs; docs/project.md has an example.",
+        )
+    route, to = opened.path(project.replay.route), opened.path(project.replay.write_route)
+    site = opened.place(project.site)
+    plan = make_plan(opened.runs(), site, opened.place(project.out), config, vehicle, route, to, given)
+    return _with_vehicles(plan, opened) if project.vehicles else plan
+
+
+def _with_vehicles(plan: Plan, opened: Opened) -> Plan:
+    """Each run with the vehicle file that the project names for it."""
+    files = {job.run_id: opened.vehicle_of(job.run_id) for job in plan.jobs}
+    vehicles = {file: load_settings(file, Vehicle) for file in set(files.values())}
+    digests = {file: digest_of(plan.config, vehicle) for file, vehicle in vehicles.items()}
+    jobs = tuple(
+        replace(job, vehicle=vehicles[files[job.run_id]], config_digest=digests[files[job.run_id]]) for job in plan.jobs
+    )
+    given = {digest: settings_files(opened.config_file, file) for file, digest in digests.items()}
+    return replace(plan, jobs=jobs, given_by_digest=given)
+
+
+def _convert(steps: _Steps) -> None:
+    """Every run of logs; all that fail are told at once."""
+    entries = steps.opened.project.convert
+    config = steps.opened.given_config()
+    failures: list[InputError] = []
+    made = 0
+    for entry in entries:
+        try:
+            product = _run_product(steps, entry, config)
+            made += steps.bring(product, partial(_write_run, steps, entry, config))
+        except InputError as error:
+            failures.append(error)
+    if failures:
+        raise _unconverted(failures, len(entries), steps.opened)
+    if entries:
+        steps.call.said("convert", f"{made} converted, {len(entries) - made} up to date")
+
+
+def _run_product(steps: _Steps, entry: ConvertEntry, config: Configuration) -> Product:
+    settings = [part.model_dump(mode="json") for part in (entry, config.ingest, config.fix_sigma)]
+    made_of = digest_over(settings, logs_of(steps.opened, entry))
+    return Product(f"run {entry.to}", Path(steps.opened.place(entry.to)), made_of)
+
+
+def _write_run(steps: _Steps, entry: ConvertEntry, config: Configuration) -> list[Path]:
+    logs = sum(len(log.files) for log in entry.logs)
+    steps.call.said("convert", f"{entry.run_id}: {logs} {'log' if logs == 1 else 'logs'}")
+    converted = run_of_logs(steps.opened, entry, config, steps.recordings)
+    for reason, count in sorted(converted.dropped.items()):
+        steps.call.said("convert", f"{entry.run_id}: not used: {count} x {reason}")
+    place = Path(steps.opened.place(entry.to))
+    steps.recordings.write(converted.run, place)
+    return [place] if place.is_file() else sorted(place.glob("*.parquet"))
+
+
+def _unconverted(failures: Sequence[InputError], of: int, opened: Opened) -> InputError:
+    if of == 1:
+        return failures[0]
+    return InputError(
+        f"{len(failures)} of {of} runs cannot be converted, and nothing was replayed\n  "
+        + "\n  ".join(map(str, failures))
+        + "\n",
+        place=str(opened.file),
+        remedy="Mend these logs, or take their [[convert]] tables out of the project.",
+    )
+
+
+def _make_site(steps: _Steps) -> None:
+    entry = steps.opened.project.track
+    if entry is None:
+        return
+    config = steps.opened.given_config()
+    vehicle = steps.opened.given_vehicle()
+    wish = wish_for(steps.opened, entry)
+    site = Path(steps.opened.place(steps.opened.project.site))
+
+    def write() -> list[Path]:
+        steps.call.said("site", f"made of {', '.join(path.name for path in wish.surveys)}")
+        made = make_site(wish, vehicle, config)
+        write_made(made, site_page(site.resolve().name, made), site, True)
+        count = len(made.findings)
+        steps.call.said("site", f"{count} findings in {site / 'findings.csv'}; look at {site / 'site.html'}")
+        names = ("track.parquet", "links.parquet", "balises.parquet", "findings.csv", "site.html")
+        return [site / name for name in names if (site / name).exists()]
+
+    settings = [part.model_dump(mode="json") for part in (entry, vehicle, config.survey, config.site, config.ingest)]
+    sources = [*wish.surveys, *([wish.balise_list] if wish.balise_list else [])]
+    for source in sources:
+        if not source.exists():
+            remedy = "Put it back, or correct [track]; paths are relative to balise.toml."
+            raise UsageError(
+                "does not exist", place=str(source), expected=f"as {steps.opened.file} names it", remedy=remedy
+            )
+    if not steps.bring(Product(f"site {steps.opened.project.site}", site, digest_over(settings, sources)), write):
+        steps.call.said("site", "up to date")
+
+
+def wish_for(opened: Opened, entry: TrackEntry) -> Wish:
+    """The site that is asked for, with places as seen from here."""
+    balises = entry.balises
+    if balises is not None and not balises.startswith("every"):
+        balises = opened.place(balises)
+    surveys = [Path(opened.place(named)) for named in entry.survey]
+    return wish_of(surveys, balises, entry.epsg, entry.join_m, entry.flat, entry.direction)
+
+
+def _calibrate(steps: _Steps) -> None:
+    entry = steps.opened.project.calibrate
+    if entry is None:
+        return
+    config = steps.opened.given_config()
+    vehicle = steps.opened.given_vehicle()
+    runs = find_runs(map(steps.opened.place, entry.runs))
+    site = Path(steps.opened.place(steps.opened.project.site))
+    settings = [part.model_dump(mode="json") for part in (entry, vehicle, config)]
+    product = Product(
+        "calibration",
+        steps.opened.folder / RECORD / MEASURED_VEHICLE,
+        digest_over(settings, [*map(Path, runs.values()), site]),
+    )
+    measured = steps.bring(product, lambda: _measure(steps, entry, runs, config, vehicle))
+    if not measured:
+        steps.call.said("calibrate", "up to date")
+
+
+def _measure(
+    steps: _Steps, entry: CalibrateEntry, runs: dict[str, str], config: Configuration, vehicle: Vehicle
+) -> list[Path]:
+    from pipeline.studies.calibration.calibrate import calibrate  # replays, which most projects do not ask for
+
+    steps.call.said("calibrate", f"on {len(runs)} runs")
+    logs = [read_run(address, config.ingest) for address in runs.values()]
+    site = read_site(steps.opened.place(steps.opened.project.site), config.site)
+    found = calibrate(logs, site, vehicle, config, entry.solution)
+    for run_id, monitors in found.alarms.items():
+        alarmed = f"{', '.join(monitors)} failed beyond its noise. Leave it out unless nothing was wrong"
+        steps.call.said("calibrate", f"{run_id}: {alarmed}")
+    files = [steps.opened.folder / RECORD / MEASURED_VEHICLE, steps.opened.folder / RECORD / MEASURED_CONFIG]
+    mended = config.model_copy(update={"monitors": config.monitors.model_copy(update=found.monitors)})
+    for file, settings in zip(files, (found.vehicle, mended), strict=True):
+        storage.write_bytes(file, to_toml(settings).encode())
+    return files
+
+
+def _calibrated(steps: _Steps, plan: Plan) -> Plan:
+    """Vehicle and noise of each run from others, where `[replay]` asks for it."""
+    asked = steps.opened.project.replay.calibrate
+    if not asked:
+        return plan
+    from pipeline.campaign.calibrated import AUTO, calibrated
+
+    steps.call.said("calibrate", "each run from others")
+    return calibrated(plan, [one if one == AUTO else steps.opened.place(one) for one in asked], steps.call.jobs)
+
+
+def _only_these(plan: Plan, call: Call) -> None:
+    """Refuse, or remove, results of runs that the project does not name: they would count in its figures."""
+    named = {job.run_id for job in plan.jobs}
+    others = _others(plan.out, named)
+    if others and call.prune:
+        for run_id in others:
+            for table in reversed(TABLES):
+                storage.remove_folder(Path(store.table_address(plan.out, table, run_id)).parent)
+        call.said("replay", f"removed the results of {', '.join(others)}")
+        others = _others(plan.out, named)
+    if others:
+        raise UsageError(
+            "holds results of runs that the project does not name, and they would count in its figures",
+            place=plan.out,
+            found=", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else ""),
+            remedy="Add these runs to balise.toml, remove their results with `balise run --prune`, or change `out`.",
+        )
+
+
+def _others(out: str, named: set[str]) -> list[str]:
+    return sorted(set(store.run_ids(out)) - named)
+
+
+def _report(steps: _Steps, plan: Plan) -> Path | None:
+    if is_url(plan.out):
+        steps.call.said("report", "none: pages are written for results on this machine")
+        return None
+    out = Path(steps.opened.place(steps.opened.project.out))
+    site = read_site(steps.opened.place(steps.opened.project.site), plan.config.site)
+    page = write_report(out, site, 0, steps.call.pages)[0]
+    steps.call.said("report", str(page))
+    return page

@@ -1,0 +1,184 @@
+"""The project file `balise.toml`: what a trial recorded, on which line, with which settings.
+
+Tables are named after the command whose options they hold. Paths are relative to the file.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import date as day
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from schemas.config import (
+    Configuration,
+    NonNegative,
+    Settings,
+    StreamCorrection,
+    StreamMapping,
+    load_settings,
+    read_toml,
+    settings_from,
+)
+from schemas.enums import TravelAlong
+from schemas.errors import ConfigError
+
+FILE_NAME = "balise.toml"
+NO_VEHICLE = "none"
+_REMEDY = "docs/project.md explains every key."
+
+
+class LogMapping(StreamMapping):
+    """As in `[ingest]`, but of the log that it stands under: `topic` is needed for bags alone."""
+
+    topic: str = ""
+
+
+class LogEntry(Settings):
+    """Logs of one recorder: `files` follow each other in time. `stream`: what their positions are for."""
+
+    files: Annotated[tuple[str, ...], Field(min_length=1)]
+    stream: Literal["gnss", "reference"] = "gnss"
+    solution: str | None = None
+    date: day | None = None
+    gnss: tuple[LogMapping, ...] = ()
+    odometer: tuple[LogMapping, ...] = ()
+    satellites: tuple[LogMapping, ...] = ()
+    reference: tuple[LogMapping, ...] = ()
+    balise_reads: tuple[LogMapping, ...] = ()
+
+    def mappings(self) -> dict[str, tuple[StreamMapping, ...]]:
+        """By stream, each with the topic that it is for: of tables the name of the file."""
+        names = [Path(file).name for file in self.files]
+        return {
+            stream: tuple(
+                StreamMapping(**{**given.model_dump(), "topic": topic})
+                for given in getattr(self, stream)
+                for topic in ([given.topic] if given.topic else names)
+            )
+            for stream in ("gnss", "odometer", "satellites", "reference", "balise_reads")
+            if getattr(self, stream)
+        }
+
+
+class ConvertEntry(Settings):
+    """One run of receivers' logs (`balise convert`); `correct` as `[[ingest.correct]]`, of this run alone."""
+
+    to: Annotated[str, Field(min_length=1)]
+    logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)]
+    correct: tuple[StreamCorrection, ...] = ()
+
+    @property
+    def run_id(self) -> str:
+        return Path(self.to).name.removesuffix(".mcap")
+
+
+class TrackEntry(Settings):
+    """A site made of surveys (`balise site`)."""
+
+    survey: Annotated[tuple[str, ...], Field(min_length=1)]
+    balises: str | None = None
+    direction: TravelAlong = TravelAlong.BOTH
+    epsg: int | None = None
+    join_m: NonNegative | None = None
+    flat: bool = False
+
+
+class CalibrateEntry(Settings):
+    """A vehicle file measured on runs without fault (`balise calibrate`); it is used in place of `vehicle`.
+
+    `monitors`: also the monitors' noise and sigmas, in place of those of the configuration.
+    """
+
+    runs: Annotated[tuple[str, ...], Field(min_length=1)]
+    solution: str = "primary"
+    monitors: bool = False
+
+
+class ReplayEntry(Settings):
+    """Options of `balise replay`; `runs`: those that need no conversion, beside the converted ones."""
+
+    runs: tuple[str, ...] = ()
+    route: str | None = None
+    write_route: str | None = None
+    undetected: bool = False
+    calibrate: tuple[str, ...] = ()
+    jobs: Annotated[int, Field(ge=0)] = 0
+    scheduler: str | None = None
+    time_limit_s: Annotated[float, Field(ge=0.1)] = 3600.0
+    fail_on: Literal["unsafe", "unproven"] | None = None
+
+
+class ClaimEntry(Settings):
+    """Options of `balise claim`."""
+
+    profile: str | None = None
+    front_ahead_m: float | None = None
+
+
+class LineEntry(Settings):
+    """Options of `balise line`."""
+
+    criteria: str | None = None
+    points: str | None = None
+    solution: str | None = None
+    out: str | None = None
+
+
+class Project(Settings):
+    """The whole of a project file."""
+
+    site: str = "site"
+    out: str = "result"
+    vehicle: str | None = None
+    vehicles: dict[str, str] = Field(default={})
+    config: str | None = None
+    service_level: str | None = None
+    track: TrackEntry | None = None
+    convert: tuple[ConvertEntry, ...] = ()
+    calibrate: CalibrateEntry | None = None
+    replay: ReplayEntry = ReplayEntry()
+    claim: ClaimEntry = ClaimEntry()
+    line: LineEntry = LineEntry()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        twice = [run for run, count in Counter(entry.run_id for entry in self.convert).items() if count > 1]
+        if twice:
+            raise ValueError(f"convert: {', '.join(twice)} stands there twice; results are stored by run id")
+        if self.vehicles and (self.calibrate or self.replay.calibrate):
+            raise ValueError("vehicles: runs of several vehicles cannot be calibrated together; make a project of each")
+        return self
+
+
+_OWN_KEYS = Project.model_fields.keys() - Configuration.model_fields.keys()
+
+
+def is_project(data: dict[str, object]) -> bool:
+    """Whether TOML is a project: it has keys that no configuration has (of tables of one name a project has none)."""
+    return isinstance(data.get("site"), str) or not data.keys().isdisjoint(_OWN_KEYS)
+
+
+def load_project(file: Path) -> Project:
+    """Raises `ConfigError` with every breach; an unknown key is told with the nearest known one."""
+    return settings_from(read_toml(file), Project, str(file), _REMEDY)
+
+
+def load_configuration(file: Path | None) -> Configuration:
+    """A configuration file, or the configuration that a project file stands for."""
+    if file is None or not is_project(data := read_toml(file)):
+        return load_settings(file, Configuration)
+    project = settings_from(data, Project, str(file), _REMEDY)
+    config = load_settings(None if project.config is None else file.parent / project.config, Configuration)
+    return _at_level(config, project.service_level, file)
+
+
+def _at_level(config: Configuration, level: str | None, file: Path) -> Configuration:
+    if level is None:
+        return config
+    if level not in config.safety.service_levels:
+        known = ", ".join(sorted(config.safety.service_levels))
+        raise ConfigError("is no service level", place=f"{file}: service_level", found=repr(level), expected=known)
+    return config.model_copy(update={"hazards": config.hazards.model_copy(update={"service_level": level})})

@@ -1,0 +1,138 @@
+"""A project brought up to date: what is made, what is left alone, what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+import cli
+from tests.conftest import SmallTrial
+
+
+def nmea(lines: int = 40) -> str:
+    """A receiver that stands still on the site, 1 Hz."""
+    body = [f"GPGGA,1012{second:02d}.00,5001.2000,N,01400.0000,E,1,08,1.0,250.0,M,45.0,M,," for second in range(lines)]
+    dates = [f"GPRMC,1012{second:02d}.00,A,5001.2000,N,01400.0000,E,0.0,0.0,030325,,,A" for second in range(lines)]
+    return "".join(f"${text}*{_sum(text):02X}\r\n" for pair in zip(dates, body, strict=True) for text in pair)
+
+
+def _sum(text: str) -> int:
+    total = 0
+    for letter in text:
+        total ^= ord(letter)
+    return total
+
+
+@pytest.fixture
+def project(tmp_path: Path, small_trial: SmallTrial, monkeypatch: pytest.MonkeyPatch, in_process: None) -> Path:
+    """A folder with a site, one run by the contract, and a project of it."""
+    shutil.copytree(small_trial.site, tmp_path / "site")
+    shutil.copytree(small_trial.paths[0], tmp_path / "runs" / "run0")
+    (tmp_path / "balise.toml").write_text('[replay]\nruns = ["runs/run0"]\n')
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def call(*arguments: str) -> int:
+    return cli._guarded(list(arguments), debug=False)
+
+
+def states(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """Runs, tables of runs and their pages; tables and page over all runs are written each time."""
+    files = [path for path in sorted(folder.rglob("run*/*")) if path.is_file()]
+    return {str(path): (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+
+
+def test_second_call_finds_all_up_to_date(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("run") == 0
+    assert "up to date" not in capsys.readouterr().out
+    before = states(project)
+    assert (project / "result/report/index.html").exists()
+    assert call("run") == 0
+    assert "All was up to date." in capsys.readouterr().out
+    assert states(project) == before
+
+
+def test_commands_take_what_is_not_given(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("run", "-q") == 0
+    for command in (["verify"], ["report"], ["inspect"], ["inspect", "runs/run0"], ["safety"]):
+        assert call(*command) == 0, command
+        assert "balise: from balise.toml: " in capsys.readouterr().err
+    assert call("sql", "SELECT run_id FROM runs", "--csv", "-") == 0
+    said = capsys.readouterr()
+    assert said.out == "run_id\nrun0\n"
+    assert "out result" in said.err
+
+
+def test_an_option_wins(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("run", "-q") == 0
+    assert call("verify", "nowhere") == 2
+    said = capsys.readouterr().err
+    assert "nowhere" in said
+    assert "out result" not in said
+
+
+def test_another_folder_is_named(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (project / "elsewhere").mkdir()
+    monkeypatch.chdir(project / "elsewhere")
+    assert call("run", "-q", "--project", "..") == 0
+    assert call("verify", "-q", "--project", "..") == 0
+
+
+def test_an_edited_log_is_converted_and_replayed_again(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (project / "still.nmea").write_text(nmea())
+    (project / "balise.toml").write_text('[[convert]]\nto = "made/still"\n[[convert.logs]]\nfiles = ["still.nmea"]\n')
+    assert call("run") in (0, 1)
+    first = pl.read_parquet(project / "made/still/gnss.parquet").height
+    assert call("run") in (0, 1)
+    assert "0 converted, 1 up to date" in capsys.readouterr().err
+    (project / "still.nmea").write_text(nmea(20))
+    assert call("run") in (0, 1)
+    assert "1 converted, 0 up to date" in capsys.readouterr().err
+    assert (first, pl.read_parquet(project / "made/still/gnss.parquet").height) == (40, 20)
+
+
+def test_what_the_project_did_not_make_stays(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (project / "still.nmea").write_text(nmea())
+    (project / "balise.toml").write_text('[[convert]]\nto = "runs/run0"\n[[convert.logs]]\nfiles = ["still.nmea"]\n')
+    before = (project / "runs/run0/gnss.parquet").read_bytes()
+    assert call("run") == 2
+    assert "did not make it" in capsys.readouterr().err
+    assert (project / "runs/run0/gnss.parquet").read_bytes() == before
+
+
+def test_a_log_that_cannot_be_converted_stops_before_the_replay(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (project / "noise.ubx").write_bytes(b"nothing of a receiver")
+    text = '[[convert]]\nto = "made/x"\n[[convert.logs]]\nfiles = ["noise.ubx"]\n[replay]\nruns = ["runs/run0"]\n'
+    (project / "balise.toml").write_text(text)
+    assert call("run") == 1
+    assert "noise.ubx: holds no message of a known receiver" in capsys.readouterr().err
+    assert not (project / "result").exists()
+
+
+def test_a_run_taken_out_is_no_part_of_the_figures(project: Path, small_trial: SmallTrial) -> None:
+    shutil.copytree(small_trial.paths[1], project / "runs" / "run1")
+    (project / "balise.toml").write_text('[replay]\nruns = ["runs"]\n')
+    assert call("run", "-q") == 0
+    (project / "balise.toml").write_text('[replay]\nruns = ["runs/run1"]\n')
+    assert call("run", "-q") == 2
+    assert call("run", "-q", "--prune") == 0
+    assert pl.read_parquet(project / "result/campaign/runs.parquet")["run_id"].unique().to_list() == ["run1"]
+    assert call("verify", "-q") == 0
+
+
+def test_unknown_keys_are_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (project / "balise.toml").write_text('[replay]\nrun = ["runs"]\n')
+    assert call("run") == 2
+    assert "unknown key `replay.run` (did you mean `runs`?)" in capsys.readouterr().err
+
+
+def test_a_configuration_of_that_name_is_no_project(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (project / "balise.toml").write_text("[hazards]\nfailure_limit_m = 12.0\n")
+    assert call("inspect", "runs/run0", "--config", "balise.toml") == 0
+    assert "from balise.toml" not in capsys.readouterr().err
