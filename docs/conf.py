@@ -6,12 +6,8 @@ from sphinx.application import Sphinx
 
 from schemas.version import VERSION
 
-PAGES = (
-    *("field-engineer", "analyst", "assessor", "domain"),
-    *("campaigns", "line", "claim", "undetected", "experiments", "fault-catalogue", "scenarios"),
-    *("configuration", "dictionary", "json", "architecture", "developer"),
-)
-"""Pages of this folder as the menu shows them; a page that is missing here is an error of the build."""
+FIRST = ("project", "field-engineer", "analyst", "assessor", "domain")
+"""Pages with which the menu begins; the others follow in the order of their names."""
 
 project = "balise"
 version = release = VERSION
@@ -39,5 +35,5 @@ def setup(app: Sphinx) -> None:
 def _add_menu(app: Sphinx, page: str, source: list[str]) -> None:
     """README.md holds no menu: those who read it as a file have the folder."""
     if page == root_doc:
-        entries = "\n".join([*(f"docs/{name}" for name in PAGES), "SECURITY", "CHANGELOG"])
-        source[0] += f"\n```{{toctree}}\n:hidden:\n\n{entries}\n```\n"
+        entries = "\n".join([*(f"docs/{name}" for name in FIRST), "docs/*", "SECURITY", "CHANGELOG"])
+        source[0] += f"\n```{{toctree}}\n:hidden:\n:glob:\n\n{entries}\n```\n"

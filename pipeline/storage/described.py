@@ -10,7 +10,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.storage.parquet import metadata_of, parquet_bytes, read_parquet, reading
+from pipeline.storage.parquet import metadata_of, parquet_bytes, read_parquet
 from schemas.conform import meanings
 from schemas.tables import CONTRACT_VERSION
 
@@ -41,11 +41,8 @@ class FileDescription:
 def describe(content: bytes) -> FileDescription:
     """What a Parquet file of this program or another says of itself. Raises `ParquetError`."""
     frame = read_parquet(content)
-    with reading():
-        fields = pq.read_schema(pa.BufferReader(content))
-        columns = [
-            (name, _kind_text(kind), *_unit_and_meaning(fields.field(name))) for name, kind in frame.schema.items()
-        ]
+    fields = pq.read_schema(pa.BufferReader(content))
+    columns = [(name, _kind_text(kind), *_unit_and_meaning(fields.field(name))) for name, kind in frame.schema.items()]
     names = ("column", "dtype", "unit", "meaning")
     table = pl.DataFrame(columns, schema=dict.fromkeys(names, pl.String), orient="row")
     # The encoded schema is for programs. What comes first says what the file is.

@@ -62,7 +62,7 @@ _ERRORS = (
 
 
 @contextmanager
-def reading() -> Iterator[None]:
+def _reading() -> Iterator[None]:
     """Turns what pyarrow and polars raise into one error of one line."""
     try:
         yield
@@ -92,7 +92,7 @@ class TableReader:
 
     def add(self, source: bytes | Path) -> None:
         """Read one more. Raises `ParquetError`."""
-        with reading():
+        with _reading():
             place = pa.BufferReader(source) if isinstance(source, bytes) else source
             file = pq.ParquetFile(place, page_checksum_verification=True)
             kind = file.schema_arrow.remove_metadata()
@@ -108,7 +108,7 @@ class TableReader:
         """All that was read, in order. Raises `ParquetError`."""
         if not self._tables:
             return pl.DataFrame(height=sum(self.heights))
-        with reading():
+        with _reading():
             whole = self._tables[0] if len(self._tables) == 1 else pa.concat_tables(self._tables).combine_chunks()
             return pl.DataFrame(pl.from_arrow(whole)).select(self._wanted)
 
@@ -123,7 +123,7 @@ class TableReader:
 
 def metadata_of(content: bytes) -> dict[str, str]:
     """The file's key-value metadata. Raises `ParquetError`."""
-    with reading():
+    with _reading():
         metadata = pq.read_metadata(pa.BufferReader(content)).metadata or {}
         return {name.decode(errors="replace"): value.decode(errors="replace") for name, value in metadata.items()}
 
@@ -138,7 +138,7 @@ def rows_of(content: bytes) -> int:
 
 def without_checksums(content: bytes) -> bool:
     """Whether some column has no checksum, so that damage to it may stay unseen. Raises `ParquetError`."""
-    with reading():
+    with _reading():
         metadata = pq.read_metadata(pa.BufferReader(content))
         groups = (metadata.row_group(number) for number in range(metadata.num_row_groups) if metadata.num_rows)
         parts = (group.column(number) for group in groups for number in range(metadata.num_columns))
