@@ -379,9 +379,15 @@ def claim(
         _tell(as_json, answer, {title: for_reading(found)}, "", *found.notes)
 
 
-@_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12", of_project=True)
+@_command(
+    "balise inspect monday.mcap",
+    "balise inspect line9",
+    "balise inspect line9 --result week12",
+    "balise inspect week12/runs/run_id=monday/runs.parquet",
+    of_project=True,
+)
 def inspect(
-    path: Annotated[str, Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
+    path: Annotated[str, Argument(help="A log, a CSV or Parquet file, a site, or a result of `balise replay`.")],
     result: Annotated[str | None, Option(help="Result of runs on this site, to check its survey.")] = None,
     site: Annotated[str | None, Option(help="Site to compare a log with.")] = None,
     vehicle: VehicleFile = None,
