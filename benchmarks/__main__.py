@@ -20,6 +20,7 @@ MODULES = (
     "calibration",
     "topologies",
     "campaign",
+    "compact",
     "interruptions",
     "experiment",
     "relink",
