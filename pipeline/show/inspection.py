@@ -17,7 +17,10 @@ from pipeline.results.figures.head import head_of, run_verdicts
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.show.kinds import Kind, kind_at
 from pipeline.show.terminal import show_tables
+from pipeline.storage import files
 from pipeline.storage.address import Address, redacted
+from pipeline.storage.described import PREFIX, describe
+from pipeline.storage.parquet import ParquetError
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
@@ -54,12 +57,24 @@ def inspect_path(
         return inspect_result(path)
     if kind is Kind.CSV:
         return inspect_csv(Path(path))
+    if kind is Kind.TABLE:
+        return inspect_table(path)
     return inspect_log(path, config, None if site is None else read_site(site, config.site), vehicle)
 
 
 def inspect_csv(path: Path) -> dict[str, pl.DataFrame]:
     """A mapping to begin with; the columns stand in it."""
     return {STARTING_CONFIG: pl.DataFrame({"toml": draft_mapping(path).splitlines()})}
+
+
+def inspect_table(path: Address) -> dict[str, pl.DataFrame]:
+    """What a single Parquet file says of itself, and its columns with unit and meaning."""
+    try:
+        found = describe(files.read_bytes(path))
+    except ParquetError as error:
+        raise UsageError(f"cannot be read: {error}", place=redacted(str(path)), expected="a Parquet file") from None
+    metadata = {key.removeprefix(PREFIX): value for key, value in found.metadata.items()}
+    return {"File": _figures({"rows": found.rows, **metadata}), "Columns": found.columns}
 
 
 def show(tables: Mapping[str, pl.DataFrame]) -> None:

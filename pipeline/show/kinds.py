@@ -19,6 +19,7 @@ class Kind(Enum):
     SITE = "site"
     RESULT = "result"
     CSV = "csv"
+    TABLE = "table"
 
 
 def kind_at(path: Address) -> Kind:
@@ -34,10 +35,13 @@ def kind_at(path: Address) -> Kind:
         return Kind.LOG
     if name_of(path).lower().endswith(".csv"):
         return Kind.CSV
+    if name_of(path).lower().endswith(".parquet") and not names:
+        return Kind.TABLE
     raise UsageError(
         "is neither a log, a site nor a result",
         place=redacted(str(path)),
-        expected="RUN.mcap, SITE.geojson, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
+        expected="RUN.mcap, SITE.geojson, FILE.parquet, or a folder with gnss.parquet (log), track.parquet (site) or"
+        " runs/ (result)",
         remedy="`balise convert` makes runs of receiver logs and CSV files.",
     )
 

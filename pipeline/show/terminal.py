@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
@@ -25,6 +26,12 @@ _PLAIN = "\x1b[0m"
 # Right is green, wrong red, not known grey; the word itself says it where there are no colours.
 _COLOURS = {"unsafe": "\x1b[1;31m", "failed": "\x1b[31m", "unproven": "\x1b[90m", "safe": "\x1b[32m"}
 _VERDICT_WORD = re.compile(r"(?<![\w-])(?:unsafe|failed|unproven|safe)(?![\w-])")
+# Where not all columns fit, these stay, the first of them first.
+_MATTERS = (
+    *("verdict", "run_id", "key", "value", "unsafe_accepted", "failures", "failures_beyond_budget", "hazards"),
+    *("hazards_1a", "hazards_1b", "hazards_shift", "hazards_wrong_track", "missed_detections"),
+    *("why", "faults", "reasons", "error", "availability"),
+)
 # Control characters that JSON itself lets stand.
 _STEERING = re.compile("[\x7f-\x9f]")
 
@@ -47,13 +54,25 @@ def show_tables(tables: Mapping[str, pl.DataFrame]) -> None:
         print()
 
 
+def show_text(text: str) -> None:
+    """Print a sentence: on a terminal in lines that fit, in a pipe in one."""
+    if sys.stdout.isatty():
+        width = shutil.get_terminal_size().columns
+        text = textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)
+    print(text)
+
+
 def table_lines(frame: pl.DataFrame, width: int | None = None) -> list[str]:
     """A frame as aligned text, two blanks between columns, in lines of at most `width` characters."""
     columns = [
-        Column(name, [_text(value) for value in frame[name].to_list()], dtype.is_numeric())
+        Column(name, [_text(value) for value in frame[name].to_list()], dtype.is_numeric(), _rank(name))
         for name, dtype in frame.schema.items()
     ]
     return fitted(columns, width) if columns else []
+
+
+def _rank(name: str) -> float:
+    return _MATTERS.index(name) if name in _MATTERS else math.inf
 
 
 def screen_width() -> int | None:

@@ -7,14 +7,8 @@ from dataclasses import dataclass, field
 import polars as pl
 
 from pipeline.stages.clean import CleanCounts
-from pipeline.stages.clean.clean import (
-    ClockAdvice,
-    clean,
-    no_advice,
-    of_the_journey,
-    require_one_journey,
-    require_two_times,
-)
+from pipeline.stages.clean.clean import ClockAdvice, clean, no_advice, of_the_journey
+from pipeline.stages.clean.journey import require_one_journey, require_two_times
 from pipeline.stages.evidence import TrainEvidence, evidence_of
 from pipeline.stages.matching import Match, match
 from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of
@@ -49,7 +43,7 @@ class PreparedRun:
         if solution not in self._fixes:
             fixes = self.run.gnss.filter(pl.col("solution") == solution)
             require_two_times(fixes, "gnss", f" of solution {solution!r}")
-            require_one_journey(fixes, f"gnss of solution {solution!r}")
+            require_one_journey(fixes, f"gnss of solution {solution!r}", self.config.ingest)
             self._fixes[solution] = fixes
         return self._fixes[solution]
 

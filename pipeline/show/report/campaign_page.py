@@ -12,6 +12,7 @@ import polars as pl
 from pipeline.results.figures.campaign_figures import failures_of
 from pipeline.results.figures.head import head_of, run_verdicts, word_of
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.results.places import origin_of
 from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.show.report.columns import Row, figures, frame_table
 from pipeline.show.report.ground import availability_map
@@ -91,6 +92,7 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     ]
     safety = made.config.safety
     data = {
+        "origin": None if made.site is None else origin_of(made.site),
         "order": solutions,
         "solutions": {name: _solution_data(name, campaign, made) for name in solutions},
         "levels": [[level, safety.allowed_time_to_detect_s(level)] for level in safety.service_levels],

@@ -25,7 +25,7 @@ _LONG = 40
 # A table shows so many columns, which fit a screen and a sheet of paper; a switch shows the rest.
 _SHOWN_COLUMNS = 10
 # What a page takes along: it is one file.
-_SHARED_SCRIPTS = ("tables.js", "scales.js", "plots.js")
+_SHARED_SCRIPTS = ("tables.js", "scales.js", "plots.js", "plans.js")
 
 
 @dataclass(frozen=True)

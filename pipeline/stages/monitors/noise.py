@@ -17,9 +17,10 @@ from pipeline.stages.monitors.axis import AxisSeries, error_model
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, MonitorConfig
 
-# M = (second difference)^2 / 4 is exact for a random walk; for white noise it is 6 / 4 of it, so on the safe side
-# (DOMAIN section 3).
-_OF_WALK = 4.0
+# M = (second difference)^2 / 4 is exact for a random walk; for white noise, whose second differences have six times its
+# variance, it is 6 / 4 of it, so on the safe side (DOMAIN section 3).
+OF_WALK = 4.0
+OF_WHITE_NOISE = 6.0
 
 
 class NoiseMeter:
@@ -100,6 +101,7 @@ class NoiseMeter:
             # A sigma stated too large hides white noise at long lags; after a restart it is there all the same.
             noise_m2[:, index] = np.maximum(expected_m2, shorter_m2)
             grown = _ratio(noise_m2[:, index] - shorter_m2, more_m2)
+            # The same ratio again, from growth to grown to the next: a decline goes on, a rise does not.
             growth = grown * np.minimum(1.0, _ratio(grown, growth))
         return noise_m2
 
@@ -213,7 +215,7 @@ class _Sampler:
             oldest=rows.oldest,
             renewal=self.renewal[rows.last],
             quantiles=quantiles,
-            noise_m2=(shown_m2 / gaussian_m2 - self._model_m2(lag_s, rows)) / _OF_WALK,
+            noise_m2=(shown_m2 / gaussian_m2 - self._model_m2(lag_s, rows)) / OF_WALK,
             stated_m2=_stated_m2(self._series, rows.last, config),
             window=round(max(config.noise_window_s, config.noise_window_lags * lag_s) / spacing_s),
             # No sample begins where the run does: rounded up, logs faster than 2 Hz waited for a renewal more.
