@@ -92,6 +92,8 @@ class IngestConfig(Settings):
     unpacked_limit_s: Positive = 900.0
     # Rows are held in memory: five receivers at 10 Hz for four days. A file can declare any number of them.
     rows_limit: Annotated[int, Field(strict=True, gt=0)] = 20_000_000
+    # No train is under way for a week; memory follows the time, so that a wrong date must not make a journey.
+    longest_journey_h: Annotated[Number, Field(gt=0, le=8_784)] = 168.0
     # A receiver before its first fix, or a week rollover, affects few rows; more is another recording. Ours.
     wrong_dates_share: Annotated[Number, Field(ge=0, lt=1)] = 0.1
     correct: tuple[StreamCorrection, ...] = ()

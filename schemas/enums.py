@@ -394,3 +394,20 @@ class Direction(StrEnum):
 
     GROWING = "growing"
     FALLING = "falling"
+
+
+class LeftOut(StrEnum):
+    """Why no fault is put in at an epoch of a recorded run, the strongest last."""
+
+    TOO_SOON = "too_soon"
+    NOT_RIGHT = "not_right"
+    NO_TVB = "no_tvb"
+    AMBIGUOUS = "ambiguous"
+    ALARM = "alarm"
+
+
+class OwnError(StrEnum):
+    """Whether the error of a recorded position without a fault is known, or taken to be none."""
+
+    MEASURED = "measured"
+    ASSUMED = "assumed"

@@ -84,9 +84,11 @@ BALISE_PLACE = "balises: "
 """What the place of a finding on a balise begins with."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Site:
     """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`.
+
+    A site is equal to itself alone: what is made of it is kept beside it.
 
     `files`: name, size [bytes] and SHA-256 of each file that it was read from; `digest` is over names and contents.
     """

@@ -66,12 +66,22 @@ EXPERIMENTS: dict[str, Experiment] = {
 }
 
 
-def experiment_of(name: str) -> Experiment:
-    """The experiment of this name. Raises `UsageError` with the nearest where there is none."""
-    if name not in EXPERIMENTS:
-        from schemas.errors import UsageError
-        from schemas.near import did_you_mean
+RECORDED = "recorded"
+"""The one on the user's own recordings: it takes runs and a site (`datasets.experiment.recorded`)."""
 
-        known = ", ".join(EXPERIMENTS)
-        raise UsageError(f"is not an experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=known)
+
+def experiment_of(name: str, on_recordings: bool = False) -> Experiment:
+    """The experiment of this name. Raises `UsageError` with the nearest where there is none.
+
+    `on_recordings`: runs or what belongs to them were named, which only `recorded` takes.
+    """
+    from schemas.errors import UsageError
+    from schemas.near import did_you_mean
+
+    if name not in EXPERIMENTS:
+        known = [*EXPERIMENTS, RECORDED]
+        raise UsageError(f"is not an experiment{did_you_mean(name, known)}", place=name, expected=", ".join(known))
+    if on_recordings:
+        remedy = f"`balise experiment {RECORDED}` does."
+        raise UsageError("takes no runs, site, vehicle or plan", place=f"experiment {name}", remedy=remedy)
     return EXPERIMENTS[name]

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from pipeline.campaign.ground import site_of
 from pipeline.campaign.plan import Plan, RunJob, find_runs
 from pipeline.campaign.recorded_log import RecordedLog
-from pipeline.campaign.worker import site_of
 from pipeline.read.site.route import with_route
 from pipeline.results.workers import mapped
 from schemas.config import Configuration, digest_of

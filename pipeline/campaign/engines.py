@@ -15,12 +15,15 @@ from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from types import FrameType
 
+from pipeline.campaign.ground import held, hold
 from pipeline.campaign.interruption import StopRun, answered
 from pipeline.campaign.outcome import Result, RunFailure, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import fail_run, replay_one
 from pipeline.results.workers import single_threaded_children
+from schemas.config import SiteConfig
+from schemas.run import Site
 
 # Without it (Windows) nothing could end a run in this process that takes too long.
 HAS_ALARM = hasattr(signal, "SIGALRM")
@@ -174,7 +177,7 @@ class _WorkerSlot:
             self.kill()
         if self._executor is None:
             context = multiprocessing.get_context("spawn")
-            self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin_worker)
+            self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin_worker, initargs=(held(),))
             before = set(multiprocessing.active_children())
             # Deaf to Ctrl-C from its start on: that is the parent's to answer.
             with single_threaded_children(), answered([signal.SIGINT], signal.SIG_IGN):
@@ -183,8 +186,10 @@ class _WorkerSlot:
         return self._executor
 
 
-def _begin_worker() -> None:
-    """Runs first in a worker: leave Ctrl-C to the parent, and go when the parent goes."""
+def _begin_worker(sites: list[tuple[Site, SiteConfig]]) -> None:
+    """Runs first in a worker: leave Ctrl-C to the parent, go when the parent goes, hold what the parent has read."""
+    for site, config in sites:
+        hold(site, config)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_go_with_parent, daemon=True).start()
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pipeline import storage
+from pipeline.campaign.ground import hold
 from pipeline.read.site.read import read_site, refuse_unrelated
 from pipeline.results import store
 from pipeline.results.manifest import SettingsFiles, listing, settings_files, unaltered
@@ -88,6 +89,7 @@ def make_plan(
         raise UsageError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
     ground = read_site(site, config.site)
     refuse_unrelated(ground, site)
+    hold(ground, config.site)
     base = RunJob(
         run_id="",
         address="",

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
 
 import polars as pl
 
 from pipeline import storage
 from pipeline.campaign import lock
+from pipeline.campaign.ground import site_of
 from pipeline.campaign.interruption import ENDING
 from pipeline.campaign.outcome import (
     RunFailure,
@@ -22,15 +22,12 @@ from pipeline.campaign.outcome import (
 from pipeline.campaign.plan import RunJob, digests
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
-from pipeline.read.site.read import read_site
 from pipeline.read.site.route import with_route
 from pipeline.results import store
 from pipeline.results.manifest import sha256, tables_noted
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
 from pipeline.storage import files
-from pipeline.storage.address import redacted
-from schemas.config import SiteConfig
 from schemas.enums import RunStatus
 from schemas.errors import OutputError, SiteError, UsageError
 from schemas.run import RunLog, RunTables, Site
@@ -102,18 +99,6 @@ def _write_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> 
     if job.campaign:
         lock.check_held(job.out, job.campaign)
     store.write_run(tables, job.out, metadata)
-
-
-@lru_cache(maxsize=2)
-def site_of(address: str, digest: str, config: SiteConfig) -> Site:
-    """The site, read once per worker."""
-    storage.reach(address)  # or a worker that the store does not answer would end the campaign, not fail its run
-    site = read_site(address, config)
-    if site.digest != digest:
-        raise SiteError(
-            "has changed since the campaign began", place=redacted(address), remedy="Start the campaign again."
-        )
-    return site
 
 
 def _same_software(job: RunJob) -> None:

@@ -7,14 +7,8 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.stages.clean import CleanCounts
-from pipeline.stages.clean.clean import (
-    ClockAdvice,
-    clean,
-    no_advice,
-    of_the_journey,
-    require_one_journey,
-    require_two_times,
-)
+from pipeline.stages.clean.clean import ClockAdvice, clean, no_advice, of_the_journey
+from pipeline.stages.clean.journey import require_one_journey, require_two_times
 from pipeline.stages.evidence import TrainEvidence, evidence_of
 from pipeline.stages.matching import Match, match
 from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of
@@ -47,7 +41,7 @@ class PreparedRun:
         """The positions of one solution; `InputError` unless they are those of one journey."""
         fixes = self.run.gnss.filter(pl.col("solution") == solution)
         require_two_times(fixes, "gnss", f" of solution {solution!r}")
-        require_one_journey(fixes, f"gnss of solution {solution!r}")
+        require_one_journey(fixes, f"gnss of solution {solution!r}", self.config.ingest)
         return fixes
 
     def ranges(self, solution: str) -> pl.DataFrame | None:

@@ -113,7 +113,7 @@ class _Placer:
         self.survey = survey
         self.config = config
         self.ground = network_of(track, network.links)
-        self.segments = segments_of(track)
+        self.everywhere = segments_of(track).search()
 
     def placed(self, row: dict[str, Any]) -> tuple[str, float]:
         filled = {key for key, value in row.items() if value is not None}
@@ -132,7 +132,7 @@ class _Placer:
     def _at_coordinates(self, row: dict[str, Any]) -> tuple[str, float]:
         point = points_of(np.array([row["latitude_deg"]]), np.array([row["longitude_deg"]]))
         far_m = self.config.balise_beside_m
-        near = candidates_of(point, self.ground, self.segments, 2 * far_m)
+        near = candidates_of(point, self.ground, self.everywhere, 2 * far_m)
         ranked = sorted(zip(near.distance_m.tolist(), near.element.tolist(), near.along_m.tolist(), strict=True))
         wanted = row.get("netelement_id")
         if wanted is not None:

@@ -16,6 +16,7 @@ from pipeline.make.survey.sources import read_surveys
 from pipeline.make.survey.trace import clean_traces
 from pipeline.read.site.checks import remarks
 from pipeline.read.site.describe import without_balises
+from pipeline.stages.track.survey import track_of
 from pipeline.storage.parquet import parquet_bytes
 from pipeline.storage.writing import replace_files
 from schemas.config import Configuration, Vehicle
@@ -85,7 +86,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
     balises = _balises(wish, network, survey, config)
     track = network.track
-    remarked = remarks(track, network.links, balises, None, survey.declared_m, config.site)
+    remarked = remarks(track_of(track), network.links, balises, None, survey.declared_m, config.site)
     if remarked.breaches:
         raise SiteError(remarked.breaches[0], place=", ".join(map(str, wish.surveys)))
     findings = (

@@ -9,12 +9,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.lds.windows import DEFAULTS, minimal_spacing_m, window_m
-from pipeline.stages.matching.candidates import candidates_of, segments_of
+from pipeline.stages.matching.candidates import candidates_of, search_about
 from pipeline.stages.track.geodesy import points_of
-from pipeline.stages.track.network import Network, network_of
+from pipeline.stages.track.network import Network, network_of, surveyed
 from pipeline.stages.track.path import valid_along_measure
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
-from pipeline.stages.track.survey import SurveyedTrack, places_along, track_of
+from pipeline.stages.track.survey import SurveyedTrack, places_along
 from schemas.arrays import Floats
 from schemas.config import LdsConfig, MatchingConfig, SiteConfig
 from schemas.enums import BaliseKind
@@ -41,7 +41,7 @@ def window_findings(site: Site, config: LdsConfig = DEFAULTS, limits: SiteConfig
     """
     if site.balises is None:
         return []
-    network = network_of(track_of(site.track), site.links)
+    network = network_of(surveyed(site), site.links)
     findings: dict[tuple[str, str], Finding] = {}
     for (_,), balises in site.balises.filter("linked").group_by("kind", maintain_order=True):
         points = _points(balises, network)
@@ -132,7 +132,7 @@ def parallel_findings(site: Site, config: MatchingConfig) -> list[Finding]:
     """
     if site.route is not None:
         return []
-    network = network_of(track_of(site.track), site.links)
+    network = network_of(surveyed(site), site.links)
     return [
         _finding(site, network, stretch, config)
         for stretch in _stretches(network, config)
@@ -156,7 +156,8 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelSt
     odds = np.log(config.ambiguity_probability / (1.0 - config.ambiguity_probability))
     limit_m = np.sqrt(2.0 * odds * (config.cross_bias_sigma_m**2 + survey_m**2))
     points = points_of(along.latitude_deg, along.longitude_deg)
-    near_track = candidates_of(points, network, segments_of(track), float(limit_m.max()))
+    reach_m = float(limit_m.max())
+    near_track = candidates_of(points, network, search_about(points.surface, network, reach_m), reach_m)
     of_sample = element[near_track.step]
     # Two surveys never end at the same place.
     near = (near_track.beyond_m <= config.survey_sigma_default_m) & (of_sample < near_track.element)

@@ -10,15 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import (
     GAP_COUNTS_M,
     MEASURE_TOLERANCE_M,
     SurveyedTrack,
     end_places,
-    geometric_m,
-    track_of,
 )
 from schemas.arrays import Bools, Floats, Ints, ints
 from schemas.config import SiteConfig
@@ -37,7 +34,7 @@ class Remarks:
 
 
 def remarks(
-    frame: pl.DataFrame,
+    track: SurveyedTrack,
     links: pl.DataFrame,
     balises: pl.DataFrame | None,
     route: pl.DataFrame | None,
@@ -45,13 +42,14 @@ def remarks(
     config: SiteConfig,
 ) -> Remarks:
     """All checks over the tables of a site."""
-    track = track_of(frame)
     known, findings = relations_to_nowhere(track, links)
-    passable, turning = _relations_that_turn_back(track, known)
-    collected = Remarks(passable, config, [*findings, *_relations_that_differ(known), *turning])
+    related = _related_ends(track, known)
+    inward = outward(track).reshape(-1, 3)
+    passable, turning = _relations_that_turn_back(known, related, inward)
+    collected = Remarks(passable, config, [*findings, *_relations_that_differ(known, related), *turning])
     _check_elements(track, declared_length_m, collected)
-    _check_gaps(track, collected)
-    collected.findings += _near_misses(track, known, config)
+    _check_gaps(track, related, collected)
+    collected.findings += _near_misses(track, related, inward, config)
     if balises is not None:
         _check_balises(track, balises, collected)
     if route is not None:
@@ -60,24 +58,28 @@ def remarks(
 
 
 def drop_repeated_points(file: str, frame: pl.DataFrame, breaches: list[str]) -> tuple[pl.DataFrame, list[Finding]]:
-    """A point that repeats its predecessor adds nothing but a segment of no length: dropped, and reported."""
-    same = pl.all_horizontal(
-        (pl.col(name) == pl.col(name).shift(1)).fill_null(False).over("netelement_id")
-        for name in ("latitude_deg", "longitude_deg")
-    )
-    marked = frame.with_columns(same.alias("_repeats"))
-    counts = marked.group_by("netelement_id", maintain_order=True).agg(
-        pl.len().alias("points"), pl.col("_repeats").sum().alias("repeats")
-    )
+    """A point that repeats its predecessor adds nothing but a segment of no length: dropped, and reported.
+
+    `frame`: the points of an element follow each other.
+    """
+    names = ("netelement_id", "latitude_deg", "longitude_deg")
+    element = frame["netelement_id"].rle_id().to_numpy()
+    repeats = np.zeros(frame.height, dtype=np.bool_)
+    repeats[1:] = np.all([(of[1:] == of[:-1]) for of in (element, *(frame[name].to_numpy() for name in names[1:]))], 0)
+    points = np.bincount(element)
+    repeated = np.bincount(element, repeats).astype(np.int64)
+    first = np.cumsum(points) - points
     notes = []
-    for name, points, repeats in counts.iter_rows():
-        if points - repeats < 2:
-            breaches.append(f"{file}: element {name} has {points - repeats} distinct points; expected at least 2")
-        if repeats:
-            remedy = "Remove them from the survey." if repeats > 1 else "Remove it from the survey."
-            text = f"{repeats} of {points} points repeat the one before and are left out"
+    for number in np.flatnonzero((repeated > 0) | (points < 2)).tolist():
+        name = frame["netelement_id"][int(first[number])]
+        left = int(points[number] - repeated[number])
+        if left < 2:
+            breaches.append(f"{file}: element {name} has {left} distinct points; expected at least 2")
+        if repeated[number]:
+            remedy = "Remove them from the survey." if repeated[number] > 1 else "Remove it from the survey."
+            text = f"{repeated[number]} of {points[number]} points repeat the one before and are left out"
             notes.append(Finding("warning", f"{file}: element {name}", text, remedy))
-    return marked.filter(~pl.col("_repeats")).drop("_repeats"), notes
+    return frame.filter(pl.Series(~repeats)), notes
 
 
 def relations_to_nowhere(track: SurveyedTrack, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
@@ -91,11 +93,14 @@ def relations_to_nowhere(track: SurveyedTrack, links: pl.DataFrame) -> tuple[pl.
     return links.filter(known), findings
 
 
-def _relations_that_differ(links: pl.DataFrame) -> Iterator[Finding]:
+def _relations_that_differ(links: pl.DataFrame, related: tuple[Ints, Ints]) -> Iterator[Finding]:
     """Two ends that are related more than once, and not alike: `network_of` allows what either allows."""
+    ends = np.sort(np.column_stack(related), axis=1)
+    _, same, times = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    repeated = links.filter(pl.Series(times[same.ravel()] > 1, dtype=pl.Boolean))
     words: dict[tuple[tuple[str, int], tuple[str, int]], list[str]] = {}
     from_other = {Navigability.AB.value: Navigability.BA.value, Navigability.BA.value: Navigability.AB.value}
-    for a, a_end, b, b_end, way in links.iter_rows():
+    for a, a_end, b, b_end, way in repeated.iter_rows():
         if (a, a_end) <= (b, b_end):
             words.setdefault(((a, a_end), (b, b_end)), []).append(way)
         else:
@@ -116,13 +121,14 @@ def _related_ends(track: SurveyedTrack, links: pl.DataFrame) -> tuple[Ints, Ints
     return sides[0], sides[1]
 
 
-def _relations_that_turn_back(track: SurveyedTrack, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+def _relations_that_turn_back(
+    links: pl.DataFrame, related: tuple[Ints, Ints], inward: Floats
+) -> tuple[pl.DataFrame, list[Finding]]:
     """No train gets round a corner of less than a right angle: such a relation, as between the two branches of a
     switch, is not navigable, whatever it says.
     """
-    side_a, side_b = _related_ends(track, links)
-    directions = outward(track).reshape(-1, 3)
-    acute = pl.Series(np.einsum("ij,ij->i", directions[side_a], directions[side_b]) > 0.0, dtype=pl.Boolean)
+    side_a, side_b = related
+    acute = pl.Series(np.einsum("ij,ij->i", inward[side_a], inward[side_b]) > 0.0, dtype=pl.Boolean)
     back = acute & (links["navigability"] != Navigability.NONE.value)
     findings = [
         Finding(
@@ -140,7 +146,7 @@ def _relations_that_turn_back(track: SurveyedTrack, links: pl.DataFrame) -> tupl
 
 def outward(track: SurveyedTrack) -> np.ndarray:
     """Direction from each end into its element, earth-centred and not normed: `[element, 0 start or 1 end]`."""
-    surface = points_of(track.latitude_deg, track.longitude_deg).surface
+    surface = track.surface
     start = track.first[:-1]
     stop = track.first[1:]
     directions = np.zeros((len(track.ids), 2, 3))
@@ -161,7 +167,7 @@ def outward(track: SurveyedTrack) -> np.ndarray:
 
 def _check_elements(track: SurveyedTrack, declared_length_m: dict[str, float], collected: Remarks) -> None:
     """Length, declared length, height and vertex spacing of each element."""
-    geometric = geometric_m(track)
+    geometric = track.geometric_m
     length_m = geometric[track.first[1:] - 1]
     stated_m = np.array([declared_length_m.get(name, np.nan) for name in track.ids])
     tolerance_m = np.maximum(MEASURE_TOLERANCE_M, collected.config.length_share * length_m)
@@ -202,7 +208,7 @@ def chord_errors_m(track: SurveyedTrack) -> Floats:
     Of the turns at its two ends the smaller one: the other may be that of a curve which only begins there. 0 for an
     element of one chord, and at the last vertex of each element.
     """
-    surface = points_of(track.latitude_deg, track.longitude_deg).surface
+    surface = track.surface
     steps = np.diff(surface, axis=0, append=surface[-1:])
     lengths = np.linalg.norm(steps, axis=1)
     units = steps / np.maximum(lengths, 1e-12)[:, None]
@@ -218,9 +224,9 @@ def chord_errors_m(track: SurveyedTrack) -> Floats:
     return np.asarray(errors)
 
 
-def _check_gaps(track: SurveyedTrack, collected: Remarks) -> None:
+def _check_gaps(track: SurveyedTrack, related: tuple[Ints, Ints], collected: Remarks) -> None:
     """Ends that a relation joins must meet, in place and, where both have one, in height."""
-    end_a, end_b = _related_ends(track, collected.links)
+    end_a, end_b = related
     places = end_places(track).reshape(-1, 3)
     gaps = np.linalg.norm(places[end_a] - places[end_b], axis=1)
     heights = track.height_m[np.column_stack([track.first[:-1], track.first[1:] - 1]).ravel()]
@@ -239,19 +245,20 @@ def _check_gaps(track: SurveyedTrack, collected: Remarks) -> None:
             collected.findings.append(Finding("warning", "links", text, "Correct the heights."))
 
 
-def _near_misses(track: SurveyedTrack, links: pl.DataFrame, config: SiteConfig) -> Iterator[Finding]:
+def _near_misses(
+    track: SurveyedTrack, related: tuple[Ints, Ints], inward: Floats, config: SiteConfig
+) -> Iterator[Finding]:
     """Free ends from which a train could go on: to a near end of another element, or to one that faces it."""
-    ends = [(name, position) for name in track.ids for position in (0, 1)]
-    joined = {(row[0], row[1]) for row in links.iter_rows()} | {(row[2], row[3]) for row in links.iter_rows()}
-    free = np.array([end not in joined for end in ends])
+    free = np.ones(2 * len(track.ids), dtype=np.bool_)
+    free[np.concatenate(related)] = False
     places = end_places(track).reshape(-1, 3)
-    inward = outward(track).reshape(-1, 3)
-    inward /= np.maximum(np.linalg.norm(inward, axis=1), 1e-9)[:, None]
+    inward = inward / np.maximum(np.linalg.norm(inward, axis=1), 1e-9)[:, None]
     for end_a, end_b, gap in _nearly_met(places, inward, free, config):
-        (a, position_a) = ends[end_a]
-        (b, position_b) = ends[end_b]
-        if a != b:
-            text = f"end {position_a} of {a} and end {position_b} of {b} are {gap:.2f} m apart and not linked"
+        element_a, position_a = divmod(end_a, 2)
+        element_b, position_b = divmod(end_b, 2)
+        if element_a != element_b:
+            ends = f"end {position_a} of {track.ids[element_a]} and end {position_b} of {track.ids[element_b]}"
+            text = f"{ends} are {gap:.2f} m apart and not linked"
             remedy = "Survey the missing piece, or add the relation, if trains run there."
             yield Finding("warning", "links", text, remedy)
 

@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 import polars as pl
 
-from pipeline.stages.track.network import Network, network_of
-from pipeline.stages.track.survey import SurveyedTrack, track_of
+from pipeline.stages.track.network import network_of, surveyed
+from pipeline.stages.track.survey import SurveyedTrack
 from schemas.run import Finding, Site
 
 
@@ -17,12 +17,12 @@ def describe_site(site: Site) -> dict[str, object]:
 
     `parts` counts connected pieces of network, `switches` ends from which more than one way leads on.
     """
-    track = track_of(site.track)
+    track = surveyed(site)
     network = network_of(track, site.links)
     spacing = np.concatenate([np.diff(track.measure_m[part]) for _, _, part in track.elements()])
     known = track.sigma_m[np.isfinite(track.sigma_m)]
     kinds = [] if site.balises is None else site.balises["kind"].cast(str).to_list()
-    ways = [len(edges) for edges in network.successors]
+    ways = np.diff(network.successors.first)
     return {
         "elements": len(track.ids),
         "points": len(track.measure_m),
@@ -35,9 +35,9 @@ def describe_site(site: Site) -> dict[str, object]:
         "sigma_median_m": float(np.median(known)) if len(known) else None,
         "without_sigma": int(np.isnan(track.sigma_m).sum()),
         "relations": dict(sorted(Counter(site.links["navigability"].cast(str).to_list()).items())),
-        "parts": _parts(network),
-        "switches": sum(count > 1 for count in ways),
-        "open_ends": sum(count == 0 for count in ways),
+        "parts": len(np.unique(network.connected)),
+        "switches": int((ways > 1).sum()),
+        "open_ends": int((ways == 0).sum()),
         "balises": dict(sorted(Counter(kinds).items())),
         "route_elements": None if site.route is None else site.route.height,
         "box_deg": (
@@ -59,7 +59,7 @@ def without_balises(balises: pl.DataFrame | None) -> tuple[Finding, ...]:
 
 def elements_table(site: Site) -> pl.DataFrame:
     """Per net element its id, length [m], points, balises, and the elements that a train can reach from either end."""
-    track = track_of(site.track)
+    track = surveyed(site)
     reached: dict[tuple[str, int], list[str]] = {}
     for a, a_end, b, b_end, way in site.links.iter_rows():
         if way != "none":
@@ -86,15 +86,3 @@ def _dimensions(track: SurveyedTrack) -> str:
     if all(flat):
         return "2-D"
     return "3-D" if not any(flat) else f"mixed: {sum(flat)} of {len(flat)} elements 2-D"
-
-
-def _parts(network: Network) -> int:
-    """Connected pieces of the network, whatever the navigability."""
-    # They take long to load, and a log needs none.
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = [(start // 2, edge.to // 2) for start, edges in enumerate(network.successors) for edge in edges]
-    rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-    joined = coo_array((np.ones(len(rows)), (rows, columns)), shape=(network.count, network.count))
-    return int(connected_components(joined, directed=False, return_labels=False))

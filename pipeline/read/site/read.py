@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ from pipeline.read.site.checks import drop_repeated_points, remarks
 from pipeline.read.site.geojson import GeoJsonNetwork, read_network
 from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
-from pipeline.stages.track.survey import geometric_m, track_of
+from pipeline.stages.track.network import surveyed
+from pipeline.stages.track.survey import SurveyedTrack, track_of
 from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.storage.parquet import without_checksums
@@ -46,25 +47,26 @@ def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
     """
     files = _files(path)
     breaches: list[str] = []
-    track, network, notes = _read_track(files, config, breaches)
+    survey, network, notes = _read_track(files, config, breaches)
     links = _read_links(files, network, breaches)
     raw = _load(files, "balises", breaches)
     balises = None if raw is None else typed_table(raw, "balises", breaches)
     name = next((name for name in files if name.startswith("route.")), None)
     route = None if name is None else route_table(name, files[name], breaches)
     route = None if route is None else route.drop("leg")  # that of every run over this site, in one piece
-    if breaches or track is None or links is None:
+    if breaches or survey is None or links is None:
         raise _refusal(path, breaches)
+    table, track = survey
     lengths = network.declared_length_m if network else {}
     unchecked = [name for name, data in files.items() if name.endswith(".parquet") and without_checksums(data)]
     notes += [Finding("note", name, "has no page checksums: damage to it may not be seen") for name in unchecked]
-    if _is_unrelated(track, links, files):
+    if _is_unrelated(track.ids, links, files):
         notes.append(Finding("warning", "links", _UNRELATED, _MAKE_A_SITE))
     found = remarks(track, links, balises, route, lengths, config)
     if found.breaches:
         raise _refusal(path, found.breaches)
-    return Site(
-        track=conform(track, Track),
+    site = Site(
+        track=conform(table, Track),
         links=conform(found.links, Links),
         balises=None if balises is None else conform(balises, Balises),
         route=None if route is None else conform(route, Route),
@@ -72,12 +74,14 @@ def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
         digest=_digest(files),
         files=tuple((name, len(data), hashlib.sha256(data).hexdigest()) for name, data in sorted(files.items())),
     )
+    surveyed.keep(site, track)
+    return site
 
 
 def refuse_unrelated(site: Site, place: Path | str) -> None:
     """A replay on lines that nothing joins finds the train on none of them for long. Raises `SiteError`."""
     names = [name for name, _, _ in site.files]
-    if _is_unrelated(site.track, site.links, names):
+    if _is_unrelated(surveyed(site).ids, site.links, names):
         raise SiteError(_UNRELATED, place=shown(place), remedy=_MAKE_A_SITE)
 
 
@@ -85,10 +89,10 @@ _UNRELATED = "the GeoJSON has lines but no net relations: no train gets from one
 _MAKE_A_SITE = "Make a site of it: `balise site FILE --out SITE` joins lines where they meet."
 
 
-def _is_unrelated(track: pl.DataFrame, links: pl.DataFrame, files: Collection[str]) -> bool:
+def _is_unrelated(elements: Sequence[str], links: pl.DataFrame, files: Collection[str]) -> bool:
     """Several lines of GeoJSON that say nothing of how they meet; tables of a site say it by an empty one too."""
     only_lines = not any(name.startswith("links.") for name in files) and "track.geojson" in files
-    return only_lines and links.is_empty() and track["netelement_id"].n_unique() > 1
+    return only_lines and links.is_empty() and len(elements) > 1
 
 
 def _files(folder: Path | str) -> dict[str, bytes]:
@@ -136,7 +140,8 @@ def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable 
 
 def _read_track(
     files: dict[str, bytes], config: SiteConfig, breaches: list[str]
-) -> tuple[pl.DataFrame | None, GeoJsonNetwork | None, list[Finding]]:
+) -> tuple[tuple[pl.DataFrame, SurveyedTrack] | None, GeoJsonNetwork | None, list[Finding]]:
+    """The track as a table and as arrays, the rest of a GeoJSON file, findings."""
     network: GeoJsonNetwork | None = None
     if "track.geojson" in files:
         network = read_network("track.geojson", files["track.geojson"], breaches)
@@ -149,7 +154,7 @@ def _read_track(
     if frame.is_empty():
         breaches.append(f"{raw.file}: has no points of net elements")
         return None, network, []
-    frame = to_wgs84(raw, frame, config, breaches)
+    frame = _by_element(to_wgs84(raw, frame, config, breaches))
     frame, notes = drop_repeated_points(raw.file, frame, breaches)
     if network and network.ignored:
         text = f"{network.ignored} features are not used: they are neither net element nor relation"
@@ -223,23 +228,33 @@ def _beyond_deg(area: Any, longitude_deg: float, latitude_deg: float) -> float:
     return float(max(along, area.south - latitude_deg, latitude_deg - area.north, 0.0))
 
 
-def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:
-    """Points by element. Declared measures where an element has them at every point, geometric where at none."""
-    ordered = frame.with_columns(_first=pl.int_range(pl.len())).with_columns(
-        pl.col("_first").min().over("netelement_id"), _missing=pl.col("measure_m").null_count().over("netelement_id")
-    )
-    ordered = ordered.sort("_first", maintain_order=True)
-    falls = pl.col("measure_m").diff() <= 0
-    checked = ordered.group_by("netelement_id", maintain_order=True).agg(
-        points=pl.len(), missing=pl.col("_missing").first(), falls=falls.any(), at=falls.arg_true().first(),
-        measure_m=pl.col("measure_m").filter(falls).first(),
-    )  # fmt: skip
-    for name, points, missing, falling, at, measure_m in checked.iter_rows():
-        if 0 < missing < points:
+def _by_element(frame: pl.DataFrame) -> pl.DataFrame:
+    """Points element by element, in the order in which elements come up first."""
+    name = frame["netelement_id"]
+    if name.rle_id()[-1] + 1 == name.n_unique():
+        return frame
+    ordered = frame.with_columns(_first=pl.int_range(pl.len()).min().over("netelement_id"))
+    return ordered.sort("_first", maintain_order=True).drop("_first")
+
+
+def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> tuple[pl.DataFrame, SurveyedTrack]:
+    """Declared measures where an element has them at every point, geometric where at none."""
+    track = track_of(frame)
+    start = track.first[:-1]
+    points = np.diff(track.first)
+    unknown = np.isnan(track.measure_m)
+    missing = np.add.reduceat(unknown.astype(np.int64), start)
+    falls = np.diff(track.measure_m, prepend=np.nan) <= 0.0
+    falls[start] = False
+    falling = np.logical_or.reduceat(falls, start)
+    for element in np.flatnonzero(((missing > 0) & (missing < points)) | (falling & (missing == 0))).tolist():
+        name = track.ids[element]
+        if missing[element]:
             breaches.append(f"{file}: column measure_m: element {name} has a measure at some points only")
-        elif falling and missing == 0:
+        else:
+            at = int(np.argmax(falls[track.vertices(element)]))
+            measure_m = track.measure_m[start[element] + at]
             text = f"element {name} does not increase at point {at} ({measure_m:g} m)"
             breaches.append(f"{file}: column measure_m: {text}")
-    geometric = pl.Series(geometric_m(track_of(ordered.with_columns(measure_m=pl.lit(0.0)))))
-    measure_m = pl.when(pl.col("_missing") > 0).then(geometric).otherwise("measure_m")
-    return ordered.with_columns(measure_m=measure_m).select(frame.columns)
+    measured = track.measured(np.where(np.repeat(missing > 0, points), track.geometric_m, track.measure_m))
+    return frame.with_columns(measure_m=pl.Series(measured.measure_m)), measured

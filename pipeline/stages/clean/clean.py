@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.stages.clean.journey import DAY_NS, require_spans, require_two_times
 from pipeline.stages.clean.placeholders import without_placeholders
-from schemas.arrays import NS_PER_S, Bools
+from schemas.arrays import Bools
 from schemas.config import Configuration
 from schemas.errors import InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -25,7 +26,6 @@ _KEYS: dict[Stream, list[str]] = {
 _SOURCES = ("solution", "sensor")
 """Columns that part a stream into sources, each with its own order of time."""
 _PLACE = ("latitude_deg", "longitude_deg")
-_DAY_NS = 86_400 * NS_PER_S
 # Streams that say something only of positions: without them a run is replayed all the same.
 _OF_POSITIONS: tuple[Stream, ...] = ("satellites", "reference", "balise_reads")
 ClockAdvice = Callable[[RunLog], str]
@@ -70,8 +70,8 @@ def clean(
     A few rows more than a day from the others (a receiver that did not know the date yet), all before 1970, and single
     reads, reference and satellites of another day than the positions are left out; placeholders stay as epochs without
     a fix.
-    Raises `InputError` where no solution or not the odometer has two different times, or both have no time in common:
-    nothing can be replayed.
+    Raises `InputError` where no solution or not the odometer has two different times, both have no time in common, or
+    a stream lasts longer than a journey: nothing can be replayed.
     """
     dated = _dated_streams(run, config.ingest.wrong_dates_share)
     streams: dict[str, pl.DataFrame] = {}
@@ -85,6 +85,7 @@ def clean(
     streams["gnss"], placeholders = _with_fixes(streams["gnss"], config)
     cleaned = replace(run, notes=_noted(run.notes, counts), other_odometers=others or run.other_odometers)
     cleaned = cleaned.with_streams(**streams)
+    require_spans(cleaned, config.ingest)
     _require_times(cleaned, clock_advice)
     return cleaned, CleanCounts(_solution_counts(*dated["gnss"], placeholders), counts)
 
@@ -187,7 +188,7 @@ def _strays(frame: pl.DataFrame, few: float) -> Bools:
     """Rows before 1970, and rows more than a day away from most of their solution, if at most the share `few`."""
     t_ns = frame["t"].cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy()
     stray: Bools = t_ns < 0
-    if not t_ns.size or int(t_ns.max()) - int(t_ns.min()) <= _DAY_NS:
+    if not t_ns.size or int(t_ns.max()) - int(t_ns.min()) <= DAY_NS:
         return stray
     solutions = frame["solution"].to_numpy() if "solution" in frame.columns else np.zeros(t_ns.size)
     for name in np.unique(solutions[~stray]):
@@ -200,7 +201,7 @@ def _strays(frame: pl.DataFrame, few: float) -> Bools:
 def _far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
     """Times outside the largest group without a gap of more than a day."""
     order = np.argsort(t_ns, kind="stable")
-    group = np.concatenate(([0], np.cumsum(np.diff(t_ns[order]) > _DAY_NS)))
+    group = np.concatenate(([0], np.cumsum(np.diff(t_ns[order]) > DAY_NS)))
     far = np.zeros(t_ns.size, dtype=np.bool_)
     far[order] = group != np.bincount(group).argmax()
     return far
@@ -212,23 +213,9 @@ def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
     if not known.size:
         return np.zeros(t.len(), dtype=np.bool_)
     known = np.sort(known)
-    at = np.searchsorted(np.minimum(known, np.iinfo(np.int64).max - _DAY_NS) + _DAY_NS, t_ns)
-    far: Bools = (at == known.size) | (t_ns < known[np.minimum(at, known.size - 1)] - _DAY_NS)
+    at = np.searchsorted(np.minimum(known, np.iinfo(np.int64).max - DAY_NS) + DAY_NS, t_ns)
+    far: Bools = (at == known.size) | (t_ns < known[np.minimum(at, known.size - 1)] - DAY_NS)
     return far
-
-
-def require_one_journey(fixes: pl.DataFrame, place: str) -> None:
-    """Refuse a cleaned solution with a gap of more than a day: that is not one journey."""
-    gaps = np.diff(fixes["t"].to_physical().to_numpy()) > _DAY_NS
-    if gaps.any():
-        row = int(gaps.argmax())
-        raise InputError(
-            "holds positions more than a day apart",
-            place=f"{place}, column t",
-            found=f"{fixes['t'][row]} and {fixes['t'][row + 1]}",
-            expected="the times of one journey",
-            remedy="Split the recording, or correct its times.",
-        )
 
 
 def _of_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
@@ -259,18 +246,6 @@ def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, Strea
     ordered = frame if late == 0 and frame["t"].is_sorted() else frame.sort("t", maintain_order=True)
     unique = ordered.unique(subset=keys, keep="first", maintain_order=True)
     return unique, StreamCounts(frame.height - unique.height, late)
-
-
-def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
-    """Refuse a cleaned stream with fewer than two times."""
-    if stream.height < 2:
-        raise InputError(
-            f"all rows have the same time{of}" if stream.height else f"no row has a time after 1970{of}",
-            place=f"{place}, column t",
-            found=f"{stream.height} distinct time{'' if stream.height == 1 else 's'}",
-            expected="at least two epochs at different times",
-            remedy="Check the recorder's time stamps, or `time` in the [ingest] mapping.",
-        )
 
 
 def _require_common_time(run: RunLog, clock_advice: ClockAdvice) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.network import Edge, Network
 from pipeline.stages.track.path import Place
@@ -70,5 +72,5 @@ def _before(network: Network, chain: Chain, until_m: float) -> list[Chain]:
     ]
 
 
-def _runnable(edges: list[Edge]) -> list[Edge]:
+def _runnable(edges: Sequence[Edge]) -> list[Edge]:
     return [edge for edge in edges if edge.forward or edge.backward]

@@ -176,21 +176,16 @@ def _sheets(gaps: Sequence[Gap], facing: Set[int], network: Network) -> set[bool
     ):
         return both
     decided = [
-        {network.usable[way.chain.oriented[0]] for way in gap.ways or [] if way.closed} for gap in gaps if gap.closed
+        {bool(network.usable[way.chain.oriented[0]]) for way in gap.ways or [] if way.closed}
+        for gap in gaps
+        if gap.closed
     ]
-    decided += [{network.usable[oriented]} for oriented in facing]
+    decided += [{bool(network.usable[oriented])} for oriented in facing]
     return set.intersection(both, *decided)
 
 
 def _connected(elements: set[int], network: Network) -> bool:
-    seen: set[int] = set()
-    ahead = [2 * next(iter(elements))] if elements else []
-    while ahead:
-        oriented = ahead.pop()
-        if oriented // 2 not in seen:
-            seen.add(oriented // 2)
-            ahead += [edge.to for side in (oriented, oriented ^ 1) for edge in network.successors[side]]
-    return elements <= seen
+    return len(set(network.connected[list(elements)].tolist())) <= 1
 
 
 def _reaching(gap: Gap, sheets: set[bool], counter: Counter, network: Network, config: Configuration) -> Gap:

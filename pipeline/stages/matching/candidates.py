@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network
-from pipeline.stages.track.segments import Feet, Polyline, downhill
+from pipeline.stages.track.once import Once
+from pipeline.stages.track.segments import Box, Feet, Polyline, box_about, downhill
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
 
@@ -32,8 +33,23 @@ class Segments(Polyline):
     height_end_m: Floats
     heading_rad: Floats
     vertex: Ints
-    tree: cKDTree
+    probe: Floats
     probe_segment: Ints
+
+    def search(self, box: Box | None = None) -> Search:
+        """All probes, or those in a box: a run is looked for about itself, not in all of a network."""
+        inside = np.arange(len(self.probe)) if box is None else box.touched_by(self.probe, self.probe)
+        tree = cKDTree(self.probe[inside], balanced_tree=False, compact_nodes=False)
+        return Search(self, tree, self.probe_segment[inside])
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search tree over probes, and the segment of each."""
+
+    segments: Segments
+    tree: cKDTree
+    segment: Ints
 
 
 @dataclass(frozen=True)
@@ -76,6 +92,7 @@ class Candidates:
 _COLUMNS = tuple(column.name for column in fields(Candidates) if column.name != "first")
 
 
+@Once
 def segments_of(track: SurveyedTrack) -> Segments:
     """Segments of all elements with probes for the search."""
     places = points_of(track.latitude_deg, track.longitude_deg)
@@ -98,17 +115,23 @@ def segments_of(track: SurveyedTrack) -> Segments:
         height_end_m=track.height_m[head + 1],
         heading_rad=np.arctan2(east, north),
         vertex=head,
-        tree=cKDTree(probes, balanced_tree=False, compact_nodes=False),
+        probe=probes,
         probe_segment=probe_segment,
     )
 
 
-def candidates_of(points: Points, network: Network, segments: Segments, reach_m: float) -> Candidates:
+def search_about(places: Floats, network: Network, reach_m: float) -> Search:
+    """Where to look for candidates of these places, up to a reach [m]."""
+    return segments_of(network.track).search(box_about(places, reach_m + PROBE_SPACING_M))
+
+
+def candidates_of(points: Points, network: Network, search: Search, reach_m: float) -> Candidates:
     """For every point the nearest place on each element whose distance is within reach [m]."""
+    segments = search.segments
     tree = cKDTree(points.surface)
-    pairs = tree.sparse_distance_matrix(segments.tree, reach_m + PROBE_SPACING_M, output_type="ndarray")
+    pairs = tree.sparse_distance_matrix(search.tree, reach_m + PROBE_SPACING_M, output_type="ndarray")
     step = pairs["i"].astype(np.int64)
-    segment = segments.probe_segment[pairs["j"]]
+    segment = search.segment[pairs["j"]]
     order = np.lexsort((pairs["v"], segments.element[segment], step))
     step = step[order]
     segment = segment[order]
@@ -128,7 +151,8 @@ def overtaken(candidates: Candidates, network: Network) -> Bools:
     """
     past_m = _past_ends_m(candidates)
     row, end = np.nonzero(np.isfinite(past_m))
-    edge_first, edge_to = network.edges
+    edge_first = network.successors.first
+    edge_to = network.successors.to
     leaving = 2 * candidates.element[row] + 1 - end
     number = np.diff(edge_first)[leaving]
     edge = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number - edge_first[leaving], number)

@@ -59,7 +59,7 @@ def match(
     arrays = replace(arrays, height_m=arrays.height_m - vehicle.antenna_height_m)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
-    network = network_in_pieces(site)
+    network = network_in_pieces(site).unsearched()
     pinned = pins_of(arrays, site, network.track, balise_reads)
     path, assignment, ambiguous, posterior = find_path(arrays, odometry, network, pinned, config)
     epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)

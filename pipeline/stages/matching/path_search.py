@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial import cKDTree
 
-from pipeline.stages.matching.candidates import Candidates, Segments, candidates_of, merged, overtaken, segments_of
+from pipeline.stages.matching.candidates import Candidates, Search, candidates_of, merged, overtaken, search_about
 from pipeline.stages.matching.decode import Decoded, aligned, decode, legs_of, positions_m
 from pipeline.stages.matching.doubt import Doubt, Posterior, doubt_of, posterior_of, stretches
 from pipeline.stages.matching.epochs import Assignment
@@ -66,8 +66,9 @@ def _trellis(
     by its movement which way the train turned.
     """
     rows = spaced(fixes, believed, config)
-    segments = segments_of(network.track)
-    wide = _candidates(fixes, rows, network, segments, config)
+    farthest_m = max(config.far_reach_factor * config.reach_m, config.jump_aside_m + config.reach_m)
+    where = search_about(fixes.points.surface[fixes.valid], network, farthest_m)
+    wide = _candidates(fixes, rows, network, where, config)
     nearest = np.full(len(rows), np.inf)
     np.minimum.at(nearest, wide.step, wide.distance_m)
     near = np.flatnonzero(nearest <= config.reach_m)
@@ -79,22 +80,22 @@ def _trellis(
     kept = judged[wide.step] & (wide.distance_m <= nearest[wide.step] + config.reach_m)
     candidates = wide.take(np.flatnonzero(kept), len(rows)).renumbered(judged)
     steps = steps_of(fixes, rows[judged], way)
-    candidates = with_tracks_aside(candidates, fixes, believed, steps, network, segments, config)
+    candidates = with_tracks_aside(candidates, fixes, believed, steps, network, where, config)
     survey_sigma_m = network.survey_sigmas_m(config.survey_sigma_default_m)[candidates.vertex]
     like = likelihood_of(fixes, steps, candidates, survey_sigma_m, config)
     like = like.with_pins(_pins(steps, pinned, candidates))
     return trellis_of(network, steps, candidates, survey_sigma_m, like, config)
 
 
-def _candidates(fixes: Fixes, rows: Ints, network: Network, segments: Segments, config: MatchingConfig) -> Candidates:
+def _candidates(fixes: Fixes, rows: Ints, network: Network, where: Search, config: MatchingConfig) -> Candidates:
     """Places within reach; within far reach where no track is near."""
     points = fixes.points.take(rows)
-    candidates = candidates_of(points, network, segments, (1.0 + _NEAR) * config.reach_m)
+    candidates = candidates_of(points, network, where, (1.0 + _NEAR) * config.reach_m)
     nearest_m = np.full(len(rows), np.inf)
     np.minimum.at(nearest_m, candidates.step, candidates.distance_m)
     far = np.flatnonzero(nearest_m > _NEAR * config.reach_m)
     if len(far):
-        wide = candidates_of(points.take(far), network, segments, config.far_reach_factor * config.reach_m)
+        wide = candidates_of(points.take(far), network, where, config.far_reach_factor * config.reach_m)
         near = candidates.take(np.flatnonzero(nearest_m[candidates.step] <= _NEAR * config.reach_m), len(rows))
         candidates = merged(near, wide, far)
     return candidates.take(np.flatnonzero(~overtaken(candidates, network)), len(rows))
@@ -136,7 +137,7 @@ def with_tracks_aside(
     believed: Ints,
     steps: Steps,
     network: Network,
-    segments: Segments,
+    where: Search,
     config: MatchingConfig,
 ) -> Candidates:
     """About jumps, also candidates as far off as the jump was long, on elements that are candidates elsewhere.
@@ -149,7 +150,7 @@ def with_tracks_aside(
     wider = np.flatnonzero(aside_m > 0)
     if len(wider) == 0:
         return candidates
-    far = candidates_of(fixes.points.take(steps.epoch[wider]), network, segments, float(aside_m.max()) + config.reach_m)
+    far = candidates_of(fixes.points.take(steps.epoch[wider]), network, where, float(aside_m.max()) + config.reach_m)
     known = candidates.step * network.count + candidates.element
     step = wider[far.step]
     kept = (far.distance_m <= aside_m[step] + config.reach_m) & np.isin(far.element, np.unique(candidates.element))
@@ -176,7 +177,7 @@ def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig)
 
 def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) -> InputError:
     """The error for a run of which no epoch is within reach of any track."""
-    tree = cKDTree(points_of(track.latitude_deg, track.longitude_deg).surface)
+    tree = cKDTree(track.surface)
     rows = np.flatnonzero(fixes.valid)
     nearest_m, vertex = tree.query(fixes.points.surface[rows])
     row = int(np.argmin(nearest_m))

@@ -158,9 +158,8 @@ def trellis_of(
 
 
 def _states(network: Network, candidates: Candidates, steps: int) -> States:
-    usable = np.array(network.usable)
     both = np.column_stack([2 * candidates.element, 2 * candidates.element + 1])
-    index = np.flatnonzero(usable[both].ravel())
+    index = np.flatnonzero(network.usable[both].ravel())
     oriented = both.ravel()[index]
     candidate = index // 2
     backward = (oriented % 2).astype(bool)

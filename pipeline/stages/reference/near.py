@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.stages.track.geodesy import Points, points_of
+from pipeline.stages.track.geodesy import Points
 from pipeline.stages.track.network import Network
-from pipeline.stages.track.segments import SAMPLE_SPACING_M, Polyline, on_segments
+from pipeline.stages.track.segments import SAMPLE_SPACING_M, Polyline, box_about, on_segments
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
 
@@ -67,11 +67,16 @@ def near_elements(points: Points, sigma_m: Floats, network: Network, factor: flo
     """
     track = network.track
     element_of = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
-    surface = points_of(track.latitude_deg, track.longitude_deg).surface
+    surface = track.surface
     starts = np.flatnonzero(element_of[1:] == element_of[:-1])
+    survey_sigma_m = network.survey_sigmas_m(unstated_m)
+    reach_m = factor * np.hypot(sigma_m, survey_sigma_m[starts].max(initial=0.0))
+    if len(points):
+        box = box_about(points.surface, float(reach_m.max()))
+        starts = starts[box.touched_by(surface[starts], surface[starts + 1])]
     line = Polyline(surface[starts], surface[starts + 1])
-    segment_sigma_m = network.survey_sigmas_m(unstated_m)[starts]
-    sample, segment = _candidates(points, line, factor * np.hypot(sigma_m, segment_sigma_m.max(initial=0.0)))
+    segment_sigma_m = survey_sigma_m[starts]
+    sample, segment = _candidates(points, line, reach_m)
     feet = on_segments(points.take(sample), line, segment)
     fraction = np.clip(feet.fraction, 0.0, 1.0)
     low_m = track.measure_m[starts[segment]]

@@ -20,26 +20,26 @@ _LEAST_M = 0.02
 _LONGEST_M = 2000.0
 
 
-def chord_sigmas_m(track: SurveyedTrack, successors: Sequence[Sequence[int]]) -> Floats:
+def chord_sigmas_m(track: SurveyedTrack, here: Ints, there: Ints) -> Floats:
     """Sigma of the distance between chord and curve [m] for the segment that begins at each vertex.
 
-    `successors`: of each oriented element. It follows from the shape alone: points on a chord and borders of net
-    elements change nothing.
+    `here`, `there`: oriented elements, each with one that follows it. It follows from the shape alone: points on a
+    chord and borders of net elements change nothing.
     """
     length_m, heading_rad = _segments(track)
     first = track.first[:-1]
     last = track.first[1:] - 2
     enter = np.column_stack([heading_rad[first, 0], heading_rad[last, 1] + np.pi]).ravel()
     leave = np.column_stack([heading_rad[last, 1], heading_rad[first, 0] + np.pi]).ravel()
-    onward = [_straightest(leave[oriented], enter, ways) for oriented, ways in enumerate(successors)]
-    chains = _chains([to for to, _ in onward])
+    onward, onward_turn_rad = _straightest(leave, enter, here, there)
+    chains = _chains(onward.tolist())
     # Points of all chains one after the other: a vertex each, and one at the end of each chain.
     vertex, against, ends = _points(track, chains)
     begin = heading_rad[vertex, against] + np.pi * against
     end = heading_rad[vertex, 1 - against] + np.pi * against
     turn_rad = _wrapped(begin - np.roll(end, 1))
-    turn_rad[np.append(0, ends[:-1] + 1)] = [onward[chain[0] ^ 1][1] for chain in chains]
-    turn_rad[ends] = [onward[chain[-1]][1] for chain in chains]
+    turn_rad[np.append(0, ends[:-1] + 1)] = onward_turn_rad[[chain[0] ^ 1 for chain in chains]]
+    turn_rad[ends] = onward_turn_rad[[chain[-1] for chain in chains]]
     step_m = length_m[vertex]
     step_m[ends] = 3.0 * _ONE_POINT_M
     way_m = np.append(0.0, np.cumsum(step_m)[:-1])
@@ -61,10 +61,16 @@ def _segments(track: SurveyedTrack) -> tuple[Floats, Floats]:
     return np.linalg.norm(along, axis=1), np.column_stack(headings)
 
 
-def _straightest(leave_rad: float, enter_rad: Floats, ways: Sequence[int]) -> tuple[int, float]:
-    """The successor that an oriented element goes on to with the least turn, and that turn; -1 without one."""
-    turns = [(to, float(_wrapped(enter_rad[[to]] - leave_rad)[0])) for to in ways]
-    return min(turns, key=lambda way: abs(way[1]), default=(-1, 0.0))
+def _straightest(leave_rad: Floats, enter_rad: Floats, here: Ints, there: Ints) -> tuple[Ints, Floats]:
+    """The successor that each oriented element goes on to with the least turn, and that turn; -1 without one."""
+    turns_rad = _wrapped(enter_rad[there] - leave_rad[here])
+    order = np.lexsort((np.abs(turns_rad), here))
+    least = order[np.diff(here[order], prepend=-1) > 0]
+    onward = np.full(len(leave_rad), -1)
+    turn_rad = np.zeros(len(leave_rad))
+    onward[here[least]] = there[least]
+    turn_rad[here[least]] = turns_rad[least]
+    return onward, turn_rad
 
 
 def _chains(onward: Sequence[int]) -> list[list[int]]:
@@ -87,22 +93,20 @@ def _chains(onward: Sequence[int]) -> list[list[int]]:
 
 def _points(track: SurveyedTrack, chains: Sequence[Sequence[int]]) -> tuple[Ints, Ints, Ints]:
     """Vertices at which the segments of chains begin, whether they are run against their measure, ends of chains."""
-    parts: list[Ints] = []
-    senses: list[int] = []
-    ends: list[int] = []
-    count = 0
-    for chain in chains:
-        for oriented in chain:
-            part = np.arange(track.first[oriented // 2], track.first[oriented // 2 + 1] - 1)
-            parts.append(part[::-1] if oriented % 2 else part)
-            senses.append(oriented % 2)
-            count += len(part)
-        parts.append(parts[-1][-1:])
-        senses.append(senses[-1])
-        ends.append(count)
-        count += 1
-    against = np.repeat(senses, [len(part) for part in parts])
-    return np.concatenate(parts), against, np.array(ends)
+    oriented = np.concatenate([np.array(chain) for chain in chains])
+    lengths = np.cumsum([len(chain) for chain in chains])
+    element = oriented // 2
+    against = oriented % 2
+    counts = np.diff(track.first)[element] - 1
+    counts[lengths - 1] += 1
+    member = np.repeat(np.arange(len(oriented)), counts)
+    number = np.arange(len(member)) - np.repeat(np.cumsum(counts) - counts, counts)
+    # The last point of a chain stands for its end, at the vertex before.
+    number = np.minimum(number, (np.diff(track.first)[element] - 2)[member])
+    ahead = track.first[element][member] + number
+    back = track.first[element + 1][member] - 2 - number
+    vertex = np.where(against[member] == 1, back, ahead)
+    return vertex, against[member], np.cumsum(counts)[lengths - 1] - 1
 
 
 def _sigmas_m(way_m: Floats, turn_rad: Floats, ends: Ints) -> Floats:

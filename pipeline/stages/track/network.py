@@ -7,8 +7,10 @@ a switch comes out on another predecessor. So direction of travel is no state of
 
 from __future__ import annotations
 
+import copy
 import heapq
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -18,6 +20,7 @@ import polars as pl
 
 from pipeline.stages.track.chords import chord_sigmas_m
 from pipeline.stages.track.leg import Visit
+from pipeline.stages.track.once import Once
 from pipeline.stages.track.survey import (
     SurveyedTrack,
     end_places,
@@ -27,7 +30,7 @@ from pipeline.stages.track.survey import (
     track_in_parts,
     track_of,
 )
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, ints
 from schemas.enums import Navigability
 from schemas.run import Site
 
@@ -50,34 +53,62 @@ class Reach(NamedTuple):
     barred_backward: int
 
 
+@dataclass(frozen=True)
+class Ways:
+    """All ways on, as arrays: `first[one] : first[one + 1]` are those from an oriented element, in their order."""
+
+    first: Ints
+    to: Ints
+    gap_m: Floats
+    forward: Bools
+    backward: Bools
+    _known: dict[int, tuple[Edge, ...]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.first) - 1
+
+    def __getitem__(self, oriented: int) -> tuple[Edge, ...]:
+        """Ways on from one: a run asks for those of few of the elements that a network may have."""
+        known = self._known.get(oriented)
+        if known is None:
+            part = slice(int(self.first[oriented]), int(self.first[oriented + 1]))
+            columns = (self.to, self.gap_m, self.forward, self.backward)
+            known = tuple(Edge(*row) for row in zip(*(column[part].tolist() for column in columns), strict=True))
+            self._known[oriented] = known
+        return known
+
+    @cached_property
+    def here(self) -> Ints:
+        """The oriented element that each way leads on from."""
+        return np.repeat(np.arange(len(self)), np.diff(self.first))
+
+
 @dataclass
 class Network:
-    """Oriented elements `2 * element` (in the sense of its measure) and `2 * element + 1` (against it)."""
+    """Oriented elements `2 * element` (in the sense of its measure) and `2 * element + 1` (against it).
+
+    `parts`: per oriented element the number of the part of the network that it is connected with. `usable`: one
+    orientation of each such part, both where a loop turns trains round; `orientable`: no part has such a loop.
+    """
 
     track: SurveyedTrack
-    successors: list[list[Edge]]
-    usable: list[bool]
+    successors: Ways
+    parts: Ints
+    usable: Bools
     orientable: bool
-    pairs: frozenset[tuple[int, int]] = field(init=False)
     _known: dict[int, tuple[float, dict[int, Reach]]] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        self.pairs = frozenset((oriented, edge.to) for oriented, edges in enumerate(self.successors) for edge in edges)
+    def unsearched(self) -> Network:
+        """The same network without what was looked for in it: no run's answers may depend on runs before it."""
+        self.segment_sigmas_m  # noqa: B018  worked out once, for all copies
+        again = copy.copy(self)
+        again._known = {}
+        return again
 
     @cached_property
-    def edges(self) -> tuple[Ints, Ints]:
-        """All ways on: `to[first[one] : first[one + 1]]` are the successors of an oriented element."""
-        first = np.concatenate([[0], np.cumsum([len(edges) for edges in self.successors])])
-        return first, np.array([edge.to for edges in self.successors for edge in edges], dtype=np.int64)
-
-    @cached_property
-    def parts(self) -> Ints:
-        """Per oriented element the number of the part of the network that it is connected with."""
-        return connected_parts(self.successors)
-
-    @cached_property
-    def _chord_sigmas_m(self) -> Floats:
-        return chord_sigmas_m(self.track, [[edge.to for edge in edges] for edges in self.successors])
+    def segment_sigmas_m(self) -> Floats:
+        """Sigma of the distance between chord and curve for the segment that begins at each vertex [m]."""
+        return chord_sigmas_m(self.track, self.successors.here, self.successors.to)
 
     def survey_sigmas_m(self, unstated_m: float) -> Floats:
         """Sigma of the survey across the segment that begins at each vertex [m]: of its points, and of its chords.
@@ -85,7 +116,12 @@ class Network:
         `unstated_m`: of points without one.
         """
         stated_m = np.where(np.isfinite(self.track.sigma_m), self.track.sigma_m, unstated_m)
-        return np.asarray(np.hypot(np.maximum(stated_m, np.append(stated_m[1:], 0.0)), self._chord_sigmas_m))
+        return np.asarray(np.hypot(np.maximum(stated_m, np.append(stated_m[1:], 0.0)), self.segment_sigmas_m))
+
+    @cached_property
+    def connected(self) -> Ints:
+        """Per net element the number of the part that it is connected with, whichever way trains would run."""
+        return np.asarray(self.parts.reshape(-1, 2).min(axis=1))
 
     @property
     def count(self) -> int:
@@ -106,11 +142,13 @@ class Network:
 
     def linked(self, first: int, second: int) -> bool:
         """Whether one is a direct successor of the other, either way round."""
-        return (first, second) in self.pairs or (second, first) in self.pairs
+        return any(
+            edge.to == there for here, there in ((first, second), (second, first)) for edge in self.successors[here]
+        )
 
     def linked_ends(self) -> Bools:
         """Per element, whether a relation leads on from its start and from its end."""
-        onward = np.array([bool(edges) for edges in self.successors])
+        onward = np.diff(self.successors.first) > 0
         return onward.reshape(-1, 2)[:, ::-1]
 
     def _search(self, source: int, limit_m: float) -> dict[int, Reach]:
@@ -149,69 +187,82 @@ BARRED_DETOUR_M = 10_000.0
 
 def network_of(track: SurveyedTrack, links: pl.DataFrame) -> Network:
     """The network of a site; gaps between linked ends count as track. Pieces of one element are joined in order."""
-    successors: list[list[Edge]] = [[] for _ in range(2 * len(track.ids))]
-    for number in range(1, len(track.ids)):
-        if track.ids[number] == track.ids[number - 1]:
-            successors[2 * number - 2].append(Edge(2 * number, 0.0, True, True))
-            successors[2 * number + 1].append(Edge(2 * number - 1, 0.0, True, True))
     usable_links = links.filter(pl.col("navigability") != Navigability.NONE.value)
     element_a, position_a = _linked_ends(track, usable_links, "a")
     element_b, position_b = _linked_ends(track, usable_links, "b")
     ends = end_places(track)
-    gap = gaps_m(ends[element_a, position_a], ends[element_b, position_b]).tolist()
-    leaving = (2 * element_a + 1 - position_a).tolist()
-    entering = (2 * element_b + position_b).tolist()
-    for row, way in enumerate(usable_links["navigability"].cast(pl.String).to_list()):
-        there = way in (Navigability.AB.value, Navigability.BOTH.value)
-        back = way in (Navigability.BA.value, Navigability.BOTH.value)
-        _add(successors[leaving[row]], Edge(entering[row], gap[row], there, back))
-        _add(successors[entering[row] ^ 1], Edge(leaving[row] ^ 1, gap[row], back, there))
-    usable, orientable = oriented_sheet(successors)
-    return Network(track, successors, usable, orientable)
+    gap_m = gaps_m(ends[element_a, position_a], ends[element_b, position_b])
+    way = usable_links["navigability"].cast(pl.String)
+    there = way.is_in([Navigability.AB.value, Navigability.BOTH.value]).to_numpy()
+    back = way.is_in([Navigability.BA.value, Navigability.BOTH.value]).to_numpy()
+    leaving = 2 * element_a + 1 - position_a
+    entering = 2 * element_b + position_b
+    # Piece by piece first, then each relation there and back, in their order.
+    piece = np.flatnonzero(np.array([one == other for one, other in itertools.pairwise(track.ids)], dtype=np.bool_))
+    joined = np.ones(2 * len(piece), dtype=np.bool_)
+    ways = _ways(
+        2 * len(track.ids),
+        np.concatenate([_in_turn(2 * piece, 2 * piece + 3), _in_turn(leaving, entering ^ 1)]),
+        np.concatenate([_in_turn(2 * piece + 2, 2 * piece + 1), _in_turn(entering, leaving ^ 1)]),
+        np.concatenate([np.zeros(2 * len(piece)), np.repeat(gap_m, 2)]),
+        np.concatenate([joined, _in_turn(there, back)]),
+        np.concatenate([joined, _in_turn(back, there)]),
+    )
+    return _oriented(track, ways)
+
+
+def _in_turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Of two columns the rows in turn."""
+    return np.column_stack([first, second]).ravel()
 
 
 def _linked_ends(track: SurveyedTrack, links: pl.DataFrame, side: str) -> tuple[Ints, Ints]:
     """Elements of one side of the links and the ends linked; of an element in pieces the first or the last one."""
-    last = {name: number for number, name in enumerate(track.ids)}
-    position = links[f"position_{side}"].to_numpy().astype(np.int64)
-    ends = zip(links[f"netelement_{side}"].to_list(), position.tolist(), strict=True)
-    return np.array([(last if end else track.index)[name] for name, end in ends], dtype=np.int64), position
+    names = pl.Series(track.ids, dtype=pl.String)
+    every = pl.DataFrame({"name": names, "number": np.arange(len(names))})
+    numbers = every.group_by("name").agg(first=pl.col("number").min(), last=pl.col("number").max())
+    linked = links.select(name=pl.col(f"netelement_{side}").cast(pl.String), end=f"position_{side}")
+    both = linked.join(numbers, on="name", how="left", maintain_order="left")
+    element = both.select(pl.when(pl.col("end") == 1).then("last").otherwise("first")).to_series()
+    return ints(element), ints(both["end"])
 
 
-def _add(edges: list[Edge], edge: Edge) -> None:
-    """Relations given twice, or once from each side, are one edge with what either allows."""
-    for index, known in enumerate(edges):
-        if known.to == edge.to:
-            edges[index] = Edge(edge.to, edge.gap_m, known.forward or edge.forward, known.backward or edge.backward)
-            return
-    edges.append(edge)
+def _ways(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backward: Bools) -> Ways:
+    """Ways in the order given; relations given twice, or once from each side, are one way with what either allows."""
+    _, begins, same = np.unique(here * count + to, return_index=True, return_inverse=True)
+    allowed = np.zeros((2, len(begins)), dtype=np.bool_)
+    np.logical_or.at(allowed[0], same, forward)
+    np.logical_or.at(allowed[1], same, backward)
+    order = np.lexsort((begins, here[begins]))
+    first = np.searchsorted(here[begins[order]], np.arange(count + 1))
+    return Ways(first, to[begins[order]], gap_m[begins[order]], allowed[0][order], allowed[1][order])
 
 
-def oriented_sheet(successors: list[list[Edge]]) -> tuple[list[bool], bool]:
-    """Usable oriented elements: one orientation of each connected part, both where a loop turns trains round.
-
-    And whether no part has such a loop (`Network.orientable`).
-    """
-    part = connected_parts(successors)
+def _oriented(track: SurveyedTrack, ways: Ways) -> Network:
+    """The network over these ways, with the orientations in use of each connected part."""
+    part = connected_parts(len(ways), ways.here, ways.to)
     turned = part.reshape(-1, 2)[:, ::-1].ravel()
     # Of a part and its mirror image the one that holds the first element in the sense of its measure.
-    first = np.full(int(part.max()) + 1, len(part))
+    first = np.full(len(part), len(part))
     np.minimum.at(first, part[::2], np.arange(0, len(part), 2))
-    usable = first[part] <= first[turned]
-    return usable.tolist(), bool((part != turned).all())
+    return Network(track, ways, part, first[part] <= first[turned], bool((part != turned).all()))
 
 
-def connected_parts(successors: list[list[Edge]]) -> Ints:
-    """Per oriented element the number of the part of the network that it is connected with."""
-    # They take long to load, and a log needs none.
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+def connected_parts(count: int, here: Ints, there: Ints) -> Ints:
+    """Per place the number of the part that it is connected with, which is that of its first place.
 
-    count = len(successors)
-    here = np.repeat(np.arange(count), [len(edges) for edges in successors])
-    there = np.array([edge.to for edges in successors for edge in edges], dtype=np.int64)
-    graph = coo_array((np.ones(len(here)), (here, there)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    Written out: the library for graphs takes longer to load than a run to replay.
+    """
+    part = np.arange(count)
+    while True:
+        least = np.minimum(part[here], part[there])
+        if (part[here] == least).all() and (part[there] == least).all():
+            return part
+        # The first place of each part follows that of the part beside it, and then every place its first one.
+        np.minimum.at(part, part[here], least)
+        np.minimum.at(part, part[there], least)
+        while (part[part] != part).any():
+            part = part[part]
 
 
 # `Site.route` names directions as the site reader writes them: from an element's start to its end, or back.
@@ -231,39 +282,45 @@ def network_along(track: SurveyedTrack, visits: list[Visit]) -> Network:
     pieces = pieces_of(track)
     parts = [(visit, part) for visit in visits for part in pieces[visit.element][:: 1 if visit.forward else -1]]
     split = track_in_parts(track, [(visit.element, part) for visit, part in parts])
-    usable = [visit.forward == (side == 0) for visit, _ in parts for side in (0, 1)]
+    usable = np.array([visit.forward == (side == 0) for visit, _ in parts for side in (0, 1)])
     along = [Visit(number, visit.forward) for number, (visit, _) in enumerate(parts)]
-    return Network(split, _joined(split, along), usable, orientable=True)
+    ways = _joined(split, along)
+    return Network(split, ways, connected_parts(len(ways), ways.here, ways.to), usable, orientable=True)
 
 
-def _joined(track: SurveyedTrack, visits: list[Visit]) -> list[list[Edge]]:
-    """Successors of each oriented element by the relations that the route uses, and no other."""
-    successors: list[list[Edge]] = [[] for _ in range(2 * len(track.ids))]
+def _joined(track: SurveyedTrack, visits: Sequence[Visit]) -> Ways:
+    """Ways on from each oriented element by the relations that the route uses, and no other."""
+    element = np.array([visit.element for visit in visits], dtype=np.int64)
+    forward = np.array([visit.forward for visit in visits], dtype=np.int64)
     ends = end_places(track)
-    for here, there in itertools.pairwise(visits):
-        gap = float(
-            gaps_m(ends[[here.element], [int(here.forward)]], ends[[there.element], [int(not there.forward)]])[0]
-        )
-        leaving = 2 * here.element + (not here.forward)
-        entering = 2 * there.element + (not there.forward)
-        for start, end in ((leaving, entering), (entering ^ 1, leaving ^ 1)):
-            if all(edge.to != end for edge in successors[start]):
-                successors[start].append(Edge(end, gap, True, True))
-    return successors
+    gap_m = gaps_m(ends[element[:-1], forward[:-1]], ends[element[1:], 1 - forward[1:]])
+    oriented = 2 * element + 1 - forward
+    here = _in_turn(oriented[:-1], oriented[1:] ^ 1)
+    there = _in_turn(oriented[1:], oriented[:-1] ^ 1)
+    both = np.ones(len(here), dtype=np.bool_)
+    return _ways(2 * len(track.ids), here, there, np.repeat(gap_m, 2), both, both)
 
 
+@Once
+def surveyed(site: Site) -> SurveyedTrack:
+    """The track of a site as arrays."""
+    return track_of(site.track)
+
+
+@Once
 def network_in_pieces(site: Site) -> Network:
     """The network of a site, or of nothing but its route, with elements that turn round in pieces that do not."""
-    track = track_of(site.track)
-    if site.route is None:
-        return network_of(in_pieces(track), site.links)
-    return network_along(track, visits_of(track, site.route))
+    track = surveyed(site)
+    if site.route is not None:
+        return network_along(track, visits_of(track, site.route))
+    pieces = in_pieces(track)
+    return site_network(site) if pieces is track else network_of(pieces, site.links)
 
 
+@Once
 def site_network(site: Site) -> Network:
     """The network of a site; where it gives a route, the elements of the survey with its relations alone."""
-    track = track_of(site.track)
+    track = surveyed(site)
     if site.route is None:
         return network_of(track, site.links)
-    successors = _joined(track, visits_of(track, site.route))
-    return Network(track, successors, *oriented_sheet(successors))
+    return _oriented(track, _joined(track, visits_of(track, site.route)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,29 @@ if TYPE_CHECKING:
 
 # Search points along long segments: close enough that the nearest one leads to the nearest segment.
 SAMPLE_SPACING_M = 20.0
+# Numerics: so far about the places asked for, a network is looked through first; a run is on a small part of it.
+_ABOUT_M = 10_000.0
+
+
+@dataclass(frozen=True)
+class Box:
+    """What lies within a reach of some places, along the three axes."""
+
+    low_m: Floats
+    high_m: Floats
+
+    def touched_by(self, start: Floats, end: Floats) -> Ints:
+        """Segments that may come into it: all that do are among them."""
+        outside = ((np.maximum(start, end) < self.low_m) | (np.minimum(start, end) > self.high_m)).any(axis=1)
+        return np.flatnonzero(~outside)
+
+    def holds(self, other: Box) -> bool:
+        return bool((self.low_m <= other.low_m).all() and (self.high_m >= other.high_m).all())
+
+
+def box_about(places: Floats, reach_m: float) -> Box:
+    """`places`: one at least, earth-centred [m]."""
+    return Box(places.min(axis=0) - reach_m, places.max(axis=0) + reach_m)
 
 
 @dataclass(frozen=True)
@@ -25,8 +48,31 @@ class Polyline:
     start: Floats
     end: Floats
 
+    # Where was looked last, with the search tree over its samples.
+    _looked: list[tuple[Box, Tree, Ints]] = field(default_factory=list, init=False, repr=False)
+
     def __len__(self) -> int:
         return len(self.start)
+
+    def nearest_sample(self, places: Floats) -> tuple[Floats, Ints]:
+        """Distance [m] of each place from the nearest sample, and the segment of that."""
+        if len(places) == 0:
+            return np.zeros(0), np.zeros(0, dtype=np.int64)
+        if not self._looked or not self._looked[0][0].holds(box_about(places, _ABOUT_M)):
+            box = box_about(places, 2.0 * _ABOUT_M)
+            rows = box.touched_by(self.start, self.end)
+            # Where nothing is near, the nearest is anywhere.
+            rows = rows if len(rows) else np.arange(len(self))
+            tree, segment = Polyline(self.start[rows], self.end[rows]).samples
+            self._looked[:] = [(box, tree, rows[segment])]
+        _, tree, segment = self._looked[0]
+        distance_m, sample = tree.query(places)
+        if (distance_m <= _ABOUT_M).all():
+            return distance_m, segment[sample]
+        # A sample elsewhere may be nearer than that.
+        tree, segment = self.samples
+        distance_m, sample = tree.query(places)
+        return distance_m, segment[sample]
 
     @cached_property
     def samples(self) -> tuple[Tree, Ints]:
@@ -78,9 +124,8 @@ def nearest(points: Points, line: Polyline) -> Feet:
     """The nearest place on the line: nearest sample, then downhill over neighbouring segments."""
     if len(points) == 0:
         return no_feet(0)
-    tree, segment = line.samples
-    _, sample = tree.query(points.surface)
-    return held_to_line(downhill(points, line, segment[sample]), len(line))
+    _, segment = line.nearest_sample(points.surface)
+    return held_to_line(downhill(points, line, segment), len(line))
 
 
 def downhill(points: Points, line: Polyline, segment: Ints, line_of: Ints | None = None) -> Feet:

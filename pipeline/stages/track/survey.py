@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,7 +28,7 @@ MEASURE_TOLERANCE_M = 0.5
 _DIRECTION_OVER_M = 10.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SurveyedTrack:
     """Net elements, each a run of vertices `first[e] : first[e + 1]`, in the order of the survey.
 
@@ -54,6 +54,31 @@ class SurveyedTrack:
     def end_m(self) -> Floats:
         """Measure at which each element ends [m]."""
         return self.measure_m[self.first[1:] - 1]
+
+    @cached_property
+    def surface(self) -> Floats:
+        """Earth-centred places of the vertices at height zero [m]."""
+        return points_of(self.latitude_deg, self.longitude_deg).surface
+
+    @cached_property
+    def geometric_m(self) -> Floats:
+        """Distance of each vertex from the first of its element, along the element [m]: 3-D where it has heights."""
+        step_m = distances_m(self.latitude_deg, self.longitude_deg, np.nan_to_num(self.height_m))
+        measure_m = np.zeros(len(self.latitude_deg))
+        points = np.diff(self.first)
+        for count in np.unique(points).tolist():
+            # Elements of as many points as rows of one table, each summed up from its first point on.
+            begin = self.first[:-1][points == count][:, None]
+            measure_m[begin + np.arange(1, count)] = np.cumsum(step_m[begin + np.arange(count - 1)], axis=1)
+        return measure_m
+
+    def measured(self, measure_m: Floats) -> SurveyedTrack:
+        """The same elements with these measures [m]."""
+        length_m = measure_m[self.first[1:] - 1] - measure_m[self.first[:-1]]
+        again = replace(self, measure_m=measure_m, length_m=length_m)
+        # Places and ways do not depend on measures.
+        vars(again).update(surface=self.surface, geometric_m=self.geometric_m)
+        return again
 
     def along_m(self, oriented: int, measure_m: float) -> float:
         """Distance of a measure from where the oriented element (`Network`) is entered [m]."""
@@ -144,20 +169,10 @@ def geometric_measures_m(latitude_deg: Floats, longitude_deg: Floats, height_m: 
     return np.concatenate([[0.0], np.cumsum(distances_m(latitude_deg, longitude_deg, heights))])
 
 
-def geometric_m(track: SurveyedTrack) -> Floats:
-    """Distance of each vertex from the first of its element, along the element [m]: 3-D where it has heights."""
-    step_m = distances_m(track.latitude_deg, track.longitude_deg, np.nan_to_num(track.height_m))
-    measure_m = np.zeros(len(track.latitude_deg))
-    for first, last in itertools.pairwise(track.first.tolist()):
-        np.cumsum(step_m[first : last - 1], out=measure_m[first + 1 : last])
-    return measure_m
-
-
 def end_places(track: SurveyedTrack) -> Floats:
     """Earth-centred places [m] of the ends of elements at height zero: `[element, 0 start or 1 end]`."""
     vertices = np.column_stack([track.first[:-1], track.first[1:] - 1]).ravel()
-    places = points_of(track.latitude_deg[vertices], track.longitude_deg[vertices])
-    return places.surface.reshape(-1, 2, 3)
+    return track.surface[vertices].reshape(-1, 2, 3)
 
 
 def gaps_m(left: Floats, entered: Floats) -> Floats:
@@ -177,10 +192,9 @@ def _all_or_none(height_m: Floats, first: Ints) -> Floats:
 
 def in_pieces(track: SurveyedTrack) -> SurveyedTrack:
     """The track with its elements in pieces, each of its element's name and measures, in order."""
-    pieces = pieces_of(track)
-    if all(len(parts) == 1 for parts in pieces):
+    if not any(_cuts(track)):
         return track
-    return track_in_parts(track, [(element, part) for element, parts in enumerate(pieces) for part in parts])
+    return track_in_parts(track, [(element, part) for element, parts in enumerate(pieces_of(track)) for part in parts])
 
 
 def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
@@ -188,8 +202,18 @@ def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
 
     A piece ends where it has turned by more than a right angle since its start.
     """
+    pieces = []
+    for element, inside in enumerate(_cuts(track)):
+        whole = track.vertices(element)
+        ends = [whole.start, *inside, whole.stop - 1]
+        pieces.append([slice(begin, end + 1) for begin, end in itertools.pairwise(ends)])
+    return pieces
+
+
+def _cuts(track: SurveyedTrack) -> list[list[int]]:
+    """Per element the vertices between its pieces."""
     owner, vertex = _spaced_vertices(track)
-    along = np.diff(points_of(track.latitude_deg[vertex], track.longitude_deg[vertex]).surface, axis=0)
+    along = np.diff(track.surface[vertex], axis=0)
     same_element = owner[:-1] == owner[1:]
     start = np.searchsorted(owner, np.arange(len(track.ids)))
     turned = same_element & (np.einsum("ij,ij->i", along, along[np.minimum(start[owner[:-1]], len(along) - 1)]) < 0.0)
@@ -200,12 +224,7 @@ def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
             if along[number] @ along[since] < 0.0:
                 cuts[element].append(int(vertex[number]))
                 since = number
-    pieces = []
-    for element, inside in enumerate(cuts):
-        whole = track.vertices(element)
-        ends = [whole.start, *inside, whole.stop - 1]
-        pieces.append([slice(begin, end + 1) for begin, end in itertools.pairwise(ends)])
-    return pieces
+    return cuts
 
 
 def _spaced_vertices(track: SurveyedTrack) -> tuple[Ints, Ints]:

@@ -219,6 +219,7 @@ def _refuse_what_does_not_fit(prepared: PreparedRun, solution: str) -> None:
     run = prepared.recorded
     config = prepared.config
     mounted = Vehicle(antenna_height_m=prepared.vehicle.antenna_height_m)
+    prepared.fixes(solution)
     fit = fit_run(run, solution, mounted, config.plausibility, prepared.site)
     refuse_impossible(fit, run.run_id, config.ingest)
 

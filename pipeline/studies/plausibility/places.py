@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import points_of
-from pipeline.stages.track.survey import track_of
+from pipeline.stages.track.network import surveyed
 from pipeline.studies.plausibility.causes import Datum, datums_at, explain_factor
 from pipeline.studies.plausibility.check import Check, FitState, KnownCause, correction, fits, misfit, not_checked
 from pipeline.studies.plausibility.clocks import StreamLag
@@ -97,7 +97,7 @@ def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
 
 def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:
     """Latitude and longitude of the balises on their net elements [deg]."""
-    track = track_of(site.track)
+    track = surveyed(site)
     places = {}
     rows = () if site.balises is None else site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
     for name, element, measure_m in rows:

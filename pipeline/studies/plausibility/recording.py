@@ -36,7 +36,7 @@ class Recording:
 
     @cached_property
     def line(self) -> SurveyLine | None:
-        return None if self.site is None else line_of(self.site.track)
+        return None if self.site is None else line_of(self.site)
 
     @cached_property
     def reference(self) -> Places | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import polars as pl
 
 from pipeline.stages.clean.clean import CleanCounts, clean
+from pipeline.stages.clean.journey import require_one_journey
 from pipeline.studies.plausibility.check import FitState
 from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run, lines_of
 from schemas.config import Configuration, Vehicle
@@ -57,9 +58,14 @@ def fit_report(
         problems = (str(error),)
         if cleaned.gnss.height < 2:
             return FitReport({}, problems)
-    fits = {
-        name: fit_run(cleaned, name, vehicle or Vehicle(), config.plausibility, site) for name in cleaned.solutions()
-    }
+    fits: dict[str, Fit] = {}
+    for name in cleaned.solutions():
+        try:
+            require_one_journey(cleaned.gnss.filter(pl.col("solution") == name), f"solution {name!r}", config.ingest)
+        except InputError as error:
+            problems += (str(error),)
+        else:
+            fits[name] = fit_run(cleaned, name, vehicle or Vehicle(), config.plausibility, site)
     tables = {"Fit": _checks(fits, counts)}
     mending: dict[str, str] = {}
     for fit in fits.values():

@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import polars as pl
 
 from pipeline.stages.track.geodesy import Points, points_of
+from pipeline.stages.track.network import surveyed
+from pipeline.stages.track.once import Once
 from pipeline.stages.track.segments import Polyline, on_segments
-from pipeline.stages.track.survey import track_of
 from pipeline.studies.plausibility.records import MOVING_MPS, Places
 from pipeline.studies.plausibility.robust import LEAST, Shift, explains, regressed, sampled, steady
 from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
+from schemas.run import Site
 
 # Two records are of one place within so much: the worst known datum is 700 m off, most 100 to 200.
 _SAME_PLACE_M = 400.0
@@ -145,7 +146,7 @@ class SurveyLine(Polyline):
         if np.any(np.abs(latitude_deg) > 90.0):
             return float("inf")
         rows = slice(None, None, max(1, len(latitude_deg) // 100))
-        return float(np.median(self.samples[0].query(points_of(latitude_deg[rows], longitude_deg[rows]).surface)[0]))
+        return float(np.median(self.nearest_sample(points_of(latitude_deg[rows], longitude_deg[rows]).surface)[0]))
 
 
 @dataclass(frozen=True)
@@ -164,10 +165,11 @@ class SurveyFit(Shift):
     up_m: Floats
 
 
-def line_of(frame: pl.DataFrame) -> SurveyLine:
+@Once
+def line_of(site: Site) -> SurveyLine:
     """The segments of a site's track."""
-    track = track_of(frame)
-    surface = points_of(track.latitude_deg, track.longitude_deg).surface
+    track = surveyed(site)
+    surface = track.surface
     within = np.setdiff1d(np.arange(len(surface) - 1), track.first[1:-1] - 1)
     rows = within[np.any(surface[within] != surface[within + 1], axis=1)]
     return SurveyLine(surface[rows], surface[rows + 1], track.height_m[rows], track.height_m[rows + 1])
@@ -185,8 +187,7 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float, start_m: tuple[flo
 
     def beside(shift_m: Floats) -> tuple[Floats, Floats, Floats]:
         """Direction across the track at the nearest segment of each moved position, how far it is, and its height."""
-        tree, segment = line.samples
-        nearest = segment[tree.query(points.surface + np.einsum("ijk,j->ik", axes, shift_m))[1]]
+        _, nearest = line.nearest_sample(points.surface + np.einsum("ijk,j->ik", axes, shift_m))
         along = np.einsum("ijk,ik->ij", axes, line.end[nearest] - line.start[nearest])
         across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
         feet = on_segments(points, line, nearest)

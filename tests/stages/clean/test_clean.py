@@ -6,7 +6,8 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.stages.clean.clean import StreamCounts, clean, require_one_journey
+from pipeline.stages.clean.clean import StreamCounts, clean
+from pipeline.stages.clean.journey import require_one_journey
 from schemas.config import AlignConfig, Configuration, IngestConfig
 from schemas.errors import InputError
 from schemas.run import RunLog
@@ -85,7 +86,7 @@ def test_a_journey_of_several_days_is_whole():
     times = [NOW_NS + hour * DAY_NS // 24 for hour in range(72)]
     cleaned, counts = clean(RunLog("r", gnss(times)))
     assert (cleaned.gnss.height, counts.solutions["primary"]) == (72, StreamCounts())
-    require_one_journey(cleaned.gnss, "gnss")
+    require_one_journey(cleaned.gnss, "gnss", IngestConfig())
 
 
 def test_two_journeys_in_one_recording_are_refused():
@@ -94,7 +95,7 @@ def test_two_journeys_in_one_recording_are_refused():
     )
     assert counts.solutions["primary"].far_off == 0
     with pytest.raises(InputError, match=r"more than a day apart.*2024-10-04.* and 2024-10-07.*Split"):
-        require_one_journey(cleaned.gnss, "gnss")
+        require_one_journey(cleaned.gnss, "gnss", IngestConfig())
 
 
 def test_doubles_of_the_same_place_do_not_contradict():
