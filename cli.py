@@ -225,7 +225,9 @@ def trial(
     if not track:
         from schemas.errors import UsageError
 
-        remedy = "Give a map (GPX, KML, GeoJSON, ...), a table of points, a run with a reference, or a site: --track line.gpx"
+        remedy = (
+            "Give a map (GPX, GeoJSON, ...), a table of points, a run with a reference, or a site: --track line.gpx"
+        )
         raise UsageError("needs the line that the train ran on", place="--track", remedy=remedy)
     raws, balises = _spacing(raws, balises)
     day = None if date is None else date.date()

@@ -193,7 +193,12 @@ def _notes_of(ride: Ride) -> list[str]:
 
 
 def _solution(ride: Ride, files: Sequence[SeenLog]) -> str:
-    return "primary" if files is ride.receivers[0] else stem_of(files[0].path)
+    """The first receiver is `primary`, others are named after their logs."""
+    place = next(number for number, other in enumerate(ride.receivers) if other is files)
+    stems = [stem_of(others[0].path) for others in ride.receivers]
+    if place == 0:
+        return "primary"
+    return stems[place] if stems.count(stems[place]) == 1 else f"{stems[place]}_{place + 1}"
 
 
 def _entry(ride: Ride, folder: Path, day: date | None) -> ConvertEntry:
