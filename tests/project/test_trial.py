@@ -134,8 +134,8 @@ def test_wrong_calls(raw: Path, arguments: list[str], message: str, capsys: pyte
 
 
 def test_corrections_are_proposed_and_accepted(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (raw / "raw" / "still.nmea").write_text(nmea(100, step_m=20.0))
-    rows = (f"2025-03-03T10:{12 + s // 60:02d}:{s % 60:02d}Z;{s * 0.02:.5f}" for s in range(100))
+    (raw / "raw" / "still.nmea").write_text(nmea(100, acceleration_mps2=0.2))
+    rows = (f"2025-03-03T10:{12 + s // 60:02d}:{s % 60:02d}Z;{1e-4 * s**2:.5f}" for s in range(100))
     (raw / "raw" / "plc.csv").write_text("time;km\n" + "\n".join(rows) + "\n")
     base = ("trial", "raw", "--track", "line.gpx", "--json")
     assert call(*base, "--to", "asked") == 0
