@@ -695,19 +695,22 @@ def line(
 
 @_command(
     "balise export week12 monday --out monday.mcap --site line9",
-    "balise export week12 monday --out monday.geojson --site line9",
+    "balise export week12 monday --out monday.gpkg --site line9",
 )
 def export(
     out: ResultFolder,
     run: Annotated[str, Argument(help="Id of the run.")],
-    to: Annotated[Path, _file("--out", "--to", help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")],
+    to: Annotated[
+        Path,
+        _file("--out", "--to", help="F.mcap (with a Foxglove layout), .geojson, .gpx, .gpkg or .parquet (GeoParquet)."),
+    ],
     site: Annotated[str | None, Option(help="Site, for positions on the ground.")] = None,
     log: Annotated[str | None, Option(help="The recorded run, for its raw positions.")] = None,
     ros: Annotated[bool, Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
-    """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
+    """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or for maps."""
     from pipeline.show.export import export_run
 
     recorded = _log(log, _configuration(config), True) if log else None
