@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network
@@ -13,6 +13,9 @@ from pipeline.stages.track.once import Once
 from pipeline.stages.track.segments import Box, Feet, Polyline, box_about, downhill
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 # Every place on an element has a search point within this distance along it. Numerics: it decides how many points are
 # searched, not which elements are within reach.
@@ -36,6 +39,8 @@ class Segments(Polyline):
 
     def search(self, box: Box | None = None) -> Search:
         """Of all segments, or of those in a box: a run is looked for about itself, not in all of a network."""
+        from scipy.spatial import cKDTree  # takes long to load, and a log needs none
+
         rows = np.arange(len(self)) if box is None else box.touched_by(self.start, self.end)
         probes, segment = self._probes(rows)
         return Search(self, cKDTree(probes, balanced_tree=False, compact_nodes=False), segment)
@@ -126,6 +131,8 @@ def search_about(places: Floats, network: Network, reach_m: float) -> Search:
 
 def candidates_of(points: Points, network: Network, search: Search, reach_m: float) -> Candidates:
     """For every point the nearest place on each element whose distance is within reach [m]."""
+    from scipy.spatial import cKDTree
+
     segments = search.segments
     tree = cKDTree(points.surface)
     pairs = tree.sparse_distance_matrix(search.tree, reach_m + PROBE_SPACING_M, output_type="ndarray")
