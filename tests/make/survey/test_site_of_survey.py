@@ -133,6 +133,28 @@ def test_doubtful_places_are_told(tmp_path: Path) -> None:
     assert "no point has a height" in text
 
 
+def test_trams_are_no_part_of_a_railway(tmp_path: Path) -> None:
+    railway = way("way/1", (0, 0), (300, 0))
+    tram = way("way/2", (300, 0), (600, 0), kind="tram")
+    site = site_of(written(tmp_path, "both.geojson", railway, tram))
+    assert site.track["netelement_id"].unique().to_list() == ["way/1"]
+    assert "1 lines with railway=tram are left out: the railway beside them is another network" in told(site)
+    alone = site_of(written(tmp_path, "tram.geojson", tram))
+    assert alone.track["netelement_id"].unique().to_list() == ["way/2"]
+
+
+def test_surveys_have_the_headers_of_logs(tmp_path: Path) -> None:
+    latitude, longitude = degrees(np.array([0.0, 300.0, 600.0]), np.zeros(3))
+    path = tmp_path / "strecke.csv"
+    pl.DataFrame({"Gleis": ["A"] * 3, "Geo-Breite [deg]": latitude, "Länge": longitude, "Höhe": [1.0] * 3}).write_csv(
+        path
+    )
+    site = site_of(path)
+    assert site.track["netelement_id"].unique().to_list() == ["A"]
+    assert site.track["height_m"].to_list() == [1.0] * 3
+    assert site.track["latitude_deg"].to_list() == pytest.approx(latitude.tolist())
+
+
 def track_csv(path: Path, east_m: np.ndarray, **columns: Any) -> Path:
     latitude, longitude = degrees(east_m, 0.0 * east_m)
     pl.DataFrame({"lat": latitude, "lon": longitude, **columns}).write_csv(path)
