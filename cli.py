@@ -10,6 +10,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from datetime import datetime
 from functools import cache, partial
 from pathlib import Path
@@ -540,31 +541,62 @@ def calibrate(
     _tell(as_json, {**measured, "runs": found.runs, "sigmas": found.sigmas}, tables, *words)
 
 
-@_command("balise experiment list", "balise experiment diagnostics --repetitions 50")
+@_command(
+    "balise experiment list",
+    "balise experiment diagnostics --repetitions 50",
+    "balise experiment recorded good/*.mcap --site line9 --vehicle train7.toml --plan plan.toml --out pmd",
+)
 def experiment(
     name: Annotated[str, Argument(help="Name of the experiment; `list` prints all names.")],
+    runs: Annotated[list[str] | None, Argument(help="Fault-free recorded runs (`recorded` only).")] = None,
+    site: Annotated[str | None, Option(help="Site of these runs.")] = None,
+    vehicle: VehicleFile = None,
+    plan: Annotated[Path | None, _file(help="Faults, counts and banks (TOML, `recorded` only).")] = None,
+    solution: Solution = "primary",
     out: OutFolder = Path("experiment-out"),
-    repetitions: Annotated[int | None, Option(min=1, help="Number of repetitions; default: as published.")] = None,
-    seed: Annotated[int, Option(help="Seed of all random numbers.")] = 1,
+    repetitions: Annotated[
+        int | None, Option(min=1, help="Number of repetitions, of `recorded` per cell; default: as published.")
+    ] = None,
+    seed: Annotated[int | None, Option(min=0, help="Seed of all random numbers; default: 1, or the plan's.")] = None,
     jobs: Jobs = 0,
-    config: Annotated[Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue` only).")] = None,
+    config: Annotated[
+        Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue`, `recorded` only).")
+    ] = None,
+    noise_of: Annotated[
+        Path | None, _file(help="Result of fault-free runs whose noise replaces the published one (`rare` only).")
+    ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Repeat a published experiment, by default with its own number of runs."""
-    from datasets.experiment import EXPERIMENTS, experiment_of
+    """Repeat a published experiment, by default with its own number of runs, or on recorded runs (`recorded`)."""
+    from datasets.experiment import EXPERIMENTS, RECORDED, experiment_of
 
     if name == "list":
-        _tell(as_json, {"experiments": list(EXPERIMENTS)}, {}, *EXPERIMENTS)
+        names = [*EXPERIMENTS, RECORDED]
+        _tell(as_json, {"experiments": names}, {}, *names)
         return
-    wanted = experiment_of(name)
     from pipeline.results.workers import watched
     from pipeline.show.terminal import how_far
 
-    bank = None if config is None else _configuration(config)
     with watched(None if quiet else how_far("pieces of work")):
-        files = wanted(out, repetitions, seed, jobs, bank)
-    _tell(as_json, {"experiment": name, "out": out, "files": files}, {}, *map(str, files))
+        if name == RECORDED:
+            from datasets.experiment.recorded.command import recorded_experiment, shown
+
+            settings = _configuration(config)
+            made = recorded_experiment(
+                runs or [], site, out, plan, vehicle, settings, seed, repetitions, solution, jobs
+            )
+        else:
+            wanted = experiment_of(name, on_recordings=bool(runs or site or vehicle or plan))
+            bank = None if config is None else _configuration(config)
+            files = wanted(out, repetitions, 1 if seed is None else seed, jobs, bank, noise_of)
+    if name != RECORDED:
+        _tell(as_json, {"experiment": name, "out": out, "files": files}, {}, *map(str, files))
+        return
+    for run_id, error in made.failed.items():
+        _say(f"{run_id} is not used: {error}")
+    _tell(as_json, {"experiment": name, "out": out, **made.tables}, shown(made), f"\nBegin with {made.page}")
+    raise Exit(RUNS_NOT_OK if made.failed else OK)
 
 
 @_command(
@@ -704,12 +736,33 @@ def verify(
         settings = _configuration(config) if config else None
         found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs))
     if as_json:
-        compared = [{"compared": one.compared, "problems": one.table} for one in found]
+        compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
         _print_json({"agrees": not any(one.problems for one in found), "comparisons": compared})
     for one in found if not as_json else []:
         if one.problems or not quiet:
             _tell(False, None, {"": one.table} if one.problems else {}, one.sentence)
     raise Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
+
+
+@_command("balise compact week12", "balise compact s3://trial/week12 --runs-per-file 5000")
+def compact(
+    out: Result,
+    runs_per_file: Annotated[int, Option(min=1, help="Runs of one file at most; long runs are fewer.")] = 2000,
+    undo: Annotated[bool, Option("--undo", help="Give each run files of its own again, with the same bytes.")] = False,
+    jobs: Jobs = 0,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Put the tables of many runs into few files. Every command reads both forms, also mixed."""
+    from pipeline.campaign import compact as packing
+    from pipeline.show.terminal import how_far
+
+    progress = None if quiet else how_far("runs")
+    found = packing.undo(out, progress) if undo else packing.compact(out, runs_per_file, jobs, progress)
+    left_out = [f"{run} keeps files of its own: {reason}" for run, reason in found.left_out.items()]
+    if as_json or not quiet:
+        _tell(as_json, asdict(found), {}, found.sentence, *left_out)
+    raise Exit(RUNS_NOT_OK if left_out else OK)
 
 
 @_command("balise diff week11 week12", "balise diff week11 week12 --detail")

@@ -22,7 +22,7 @@ from datasets.faults import (
 )
 from datasets.inject_ranges import inject_ranges
 from datasets.line import RailPlaces, shifted
-from datasets.run_path import displacement_m
+from datasets.run_path import DrivenWay, displacement_m, driven_way
 from datasets.trial import write_run_as
 from pipeline.read.ingest import read_run
 from schemas.arrays import Floats
@@ -71,14 +71,32 @@ def inject_all(run: RunLog, faults: Iterable[FaultSpec], site: Site | None = Non
     return run
 
 
-def inject(run: RunLog, fault: FaultSpec, site: Site | None = None) -> RunLog:
-    """The run with the fault added, and a `faults` stream that says so.
+class Recording:
+    """What a fault needs to know of the whole recorded run, also where it is added to a part of it."""
+
+    def __init__(self, run: RunLog, site: Site | None = None) -> None:
+        self._run = run
+        self._site = site
+        self._ways: dict[str, DrivenWay] = {}
+        self.first_ns, self.last_ns = _span_ns(run)
+
+    def way(self, solution: str) -> DrivenWay:
+        """The way of this solution, found once."""
+        if solution not in self._ways:
+            self._ways[solution] = driven_way(self._run, solution, self._site)
+        return self._ways[solution]
+
+
+def inject(run: RunLog, fault: FaultSpec, site: Site | None = None, whole: Recording | None = None) -> RunLog:
+    """The run with the fault added, and a `faults` stream that says so; `whole`: the recording that `run` is part of.
 
     Times count from the run's first GNSS epoch. Position faults keep the recorded noise: they are added to it.
     Along and across the track follow the site where one is given, else the run's own way. Range faults need
     the `satellites` stream. Recorded velocities stay as they are. Random noise hangs on run and fault alone.
     """
-    first_ns, last_ns = _span_ns(run)
+    whole = whole or Recording(run, site)
+    first_ns = whole.first_ns
+    last_ns = whole.last_ns
     if fault.begins_s() * NS_PER_S > last_ns - first_ns:
         raise ConfigError(
             "begins after the end of the run", place=f"fault {fault.kind.value}", found=f"{fault.start_s} s"
@@ -93,7 +111,7 @@ def inject(run: RunLog, fault: FaultSpec, site: Site | None = None) -> RunLog:
     elif fault.hits_ranges:
         changed = inject_ranges(run, fault, first_ns, rng)
     else:
-        changed = run.with_streams(gnss=_positions(run, fault, first_ns, rng, site))
+        changed = run.with_streams(gnss=_positions(run, fault, whole, rng))
     faults = faults_table([fault], first_ns, last_ns)
     if run.faults is not None:
         faults = pl.concat([run.faults, faults]).sort("t_start", maintain_order=True)
@@ -112,43 +130,35 @@ def _seconds(frame: pl.DataFrame, first_ns: int) -> Floats:
     return seconds
 
 
-def _positions(
-    run: RunLog, fault: FaultSpec, first_ns: int, rng: np.random.Generator, site: Site | None
-) -> pl.DataFrame:
+def _positions(run: RunLog, fault: FaultSpec, whole: Recording, rng: np.random.Generator) -> pl.DataFrame:
     parts = []
     for solution in run.gnss["solution"].unique(maintain_order=True):
         part = run.gnss.with_row_index("row").filter(pl.col("solution") == solution)
         if fault.solution in (None, solution):
-            part = _position_fault(run, fault, part, solution, first_ns, rng, site)
+            part = _position_fault(fault, part, solution, whole, rng)
         parts.append(part)
     return pl.concat(parts).sort("row").drop("row")
 
 
 def _position_fault(
-    run: RunLog,
-    fault: FaultSpec,
-    part: pl.DataFrame,
-    solution: str,
-    first_ns: int,
-    rng: np.random.Generator,
-    site: Site | None,
+    fault: FaultSpec, part: pl.DataFrame, solution: str, whole: Recording, rng: np.random.Generator
 ) -> pl.DataFrame:
-    t_s = _seconds(part, first_ns)
+    t_s = _seconds(part, whole.first_ns)
     if fault.kind is FaultKind.OUTAGE:
         return part.filter(pl.Series(~active(fault, t_s)))
     if fault.kind is FaultKind.LATENCY:
         return _late(part, fault, t_s)
     size = offset_m(fault, t_s, rng)
-    return _moved(part, _vectors(run, fault.target, solution, part, size, site))
+    return _moved(part, _vectors(fault.target, solution, part, size, whole))
 
 
-def _vectors(run: RunLog, axis: str, solution: str, part: pl.DataFrame, size_m: Floats, site: Site | None) -> Floats:
+def _vectors(axis: str, solution: str, part: pl.DataFrame, size_m: Floats, whole: Recording) -> Floats:
     """Displacement east, north, up of each epoch [m]."""
     zeros = np.zeros(size_m.size)
     if axis in ("along", "cross"):
         t_ns = part["t"].to_physical().to_numpy()
         ahead, left = (size_m, zeros) if axis == "along" else (zeros, size_m)
-        return displacement_m(run, solution, t_ns, ahead, left, site)
+        return displacement_m(whole.way(solution), t_ns, ahead, left)
     return np.column_stack([size_m if axis == name else zeros for name in ("east", "north", "up")])
 
 

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
+from schemas.experiment import EXPERIMENT_TABLES
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
 from schemas.line import LINE_TABLES
 from schemas.tables import CONTRACT_VERSION, TABLES
@@ -39,6 +40,7 @@ def groups() -> dict[str, Mapping[str, type[dy.Schema]]]:
         "Output tables": TABLES,
         "Campaign tables": CAMPAIGN_TABLES,
         "Line tables": LINE_TABLES,
+        "Tables of `experiment recorded`": EXPERIMENT_TABLES,
     }
 
 

@@ -34,6 +34,7 @@ class Experiment:
         seed: int = 1,
         jobs: int = 1,
         config: Configuration | None = None,
+        recorded: Path | None = None,
     ) -> list[Path]:
         if config is not None and not self.configured:
             from schemas.errors import UsageError
@@ -44,12 +45,17 @@ class Experiment:
                 expected="the published settings",
                 remedy="`rare`, `bank` and `catalogue` judge the bank of a configuration.",
             )
+        if recorded is not None and self.name != "rare":
+            from schemas.errors import UsageError
+
+            raise UsageError("takes no recorded noise", place=f"experiment {self.name}", expected="`experiment rare`")
         from datasets.experiment.tables import write
 
-        module = import_module(f"datasets.experiment.{self.module}")
+        module = import_module(f"datasets.experiment.{self.module if recorded is None else 'rare_recorded'}")
         count = repetitions or module.REPETITIONS
         settings = {"experiment": self.name, "repetitions": count, "seed": seed} | getattr(module, "SETTINGS", {})
-        return write(out, module.made(count, seed, jobs, config), settings)
+        noise = () if recorded is None else (recorded,)
+        return write(out, module.made(*noise, count, seed, jobs, config), settings)
 
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -66,12 +72,22 @@ EXPERIMENTS: dict[str, Experiment] = {
 }
 
 
-def experiment_of(name: str) -> Experiment:
-    """The experiment of this name. Raises `UsageError` with the nearest where there is none."""
-    if name not in EXPERIMENTS:
-        from schemas.errors import UsageError
-        from schemas.near import did_you_mean
+RECORDED = "recorded"
+"""The one on the user's own recordings: it takes runs and a site (`datasets.experiment.recorded`)."""
 
-        known = ", ".join(EXPERIMENTS)
-        raise UsageError(f"is not an experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=known)
+
+def experiment_of(name: str, on_recordings: bool = False) -> Experiment:
+    """The experiment of this name. Raises `UsageError` with the nearest where there is none.
+
+    `on_recordings`: runs or what belongs to them were named, which only `recorded` takes.
+    """
+    from schemas.errors import UsageError
+    from schemas.near import did_you_mean
+
+    if name not in EXPERIMENTS:
+        known = [*EXPERIMENTS, RECORDED]
+        raise UsageError(f"is not an experiment{did_you_mean(name, known)}", place=name, expected=", ".join(known))
+    if on_recordings:
+        remedy = f"`balise experiment {RECORDED}` does."
+        raise UsageError("takes no runs, site, vehicle or plan", place=f"experiment {name}", remedy=remedy)
     return EXPERIMENTS[name]

@@ -10,6 +10,7 @@ import polars as pl
 from pipeline import storage
 from pipeline.results import catalogue, manifest, store
 from pipeline.results.figures.campaign_figures import derived_tables
+from pipeline.results.marker import metadata_of, sha256
 from pipeline.results.software import software_digest
 from pipeline.storage.address import Address, join
 from schemas.campaign import CAMPAIGN_TABLES
@@ -44,13 +45,13 @@ def _is_current(out: Address, key: str) -> bool:
     expected = manifest.earlier(out)["files"]
     return all(
         content is not None
-        and store.metadata_of(content).get(_MADE_FROM) == key
-        and expected.get(name, {}).get("sha256") == manifest.sha256(content)
+        and metadata_of(content).get(_MADE_FROM) == key
+        and expected.get(name, {}).get("sha256") == sha256(content)
         for name, content in contents.items()
     )
 
 
 def campaign_key(out: Address, config: Configuration) -> str:
     """The digest of all that decides these tables: program, configuration and every marker, which names its tables."""
-    runs = [(run, manifest.sha256(content)) for run, content in store.markers(out)]
+    runs = [(marker.run_id, marker.sha256) for marker in store.markers(out)]
     return hashlib.sha256(repr((software_digest(), digest_of(config), runs)).encode()).hexdigest()

@@ -1,0 +1,157 @@
+"""One run as it was recorded, by one bank: what it raised without a fault, and where it may be used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import polars as pl
+
+from datasets.experiment.recorded.plan import Bank
+from datasets.inject import Recording
+from pipeline.one_run import ride_alone
+from pipeline.stages.epochs.clock import Clock, met, unambiguous
+from pipeline.stages.evidence import TrainEvidence
+from pipeline.stages.judge.case import Case
+from pipeline.stages.judge.judge import Judged, judge
+from pipeline.stages.ride import Ride
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
+from schemas.config import Configuration, Vehicle
+from schemas.enums import Judgement, LeftOut, OwnError
+from schemas.errors import InputError
+from schemas.run import RunLog, Site
+
+_REASONS = tuple(LeftOut)
+# Satellites must stand beside so many of the positions: a range fault moves only these.
+_RANGES_BESIDE = 0.99
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """One solution of a run, replayed and judged without a fault.
+
+    `recording`: the run as read, for faults; `epochs`: judged; `alarms`: episodes.
+    """
+
+    run: RunLog
+    site: Site
+    bank: Bank
+    ride: Ride
+    evidence: TrainEvidence
+    epochs: pl.DataFrame
+    alarms: pl.DataFrame
+    recording: Recording
+
+    @property
+    def solution(self) -> str:
+        return self.ride.solution.name
+
+    @property
+    def config(self) -> Configuration:
+        return self.bank.config
+
+    @cached_property
+    def t_ns(self) -> Ints:
+        return times_ns(self.epochs)
+
+    @cached_property
+    def own_error(self) -> OwnError:
+        """Whether the recorded position's own error is known: somewhere a reference or reads call it right."""
+        known = (self.epochs["judgement"] == Judgement.RIGHT.value).any()
+        return OwnError.MEASURED if known else OwnError.ASSUMED
+
+    @cached_property
+    def own_m(self) -> tuple[Floats, Floats]:
+        """Least and largest own error in the direction of travel [m]; 0 where nothing in the run can say it."""
+        if self.own_error is OwnError.ASSUMED:
+            zero = np.zeros(self.t_ns.size)
+            return zero, zero
+        return floats(self.epochs, "error_low_m"), floats(self.epochs, "error_high_m")
+
+    @cached_property
+    def alarming(self) -> Bools:
+        """A monitor fails, or the position is negated."""
+        return flags(self.epochs, "alarm") | flags(self.epochs, "negated")
+
+    @cached_property
+    def clock(self) -> Clock:
+        return Clock.of(self.epochs, self.config)
+
+    def hours(self) -> float:
+        """Time held by epochs at which a monitor could have failed [h]."""
+        return float(self.clock.held_s[self.watched].sum()) / 3600.0
+
+    @cached_property
+    def watched(self) -> Bools:
+        """Some monitor had a verdict."""
+        states = pl.any_horizontal(pl.col(r"^.*_state$").cast(pl.String).is_in(["pass", "fail"]))
+        return met(self.epochs, states)
+
+    def left_out(self, quiet_s: float) -> Ints:
+        """Per epoch the reason (number in `LeftOut`) why no fault begins there, -1 where one may."""
+        config = self.config
+        after_gap = np.diff(self.t_ns, prepend=self.t_ns[:1]) > self.clock.limit_s * NS_PER_S
+        # Without an odometer there is no TVB at all: a position in use has to do.
+        validated = flags(self.epochs, "in_use" if self.ride.odometry is None else "tvb")
+        doubtful = np.zeros(self.t_ns.size, dtype=bool)
+        if self.own_error is OwnError.MEASURED:
+            doubtful = ~met(self.epochs, pl.col("judgement") == Judgement.RIGHT.value)
+        reason = np.full(self.t_ns.size, -1)
+        for why, where in (
+            (LeftOut.NOT_RIGHT, doubtful),
+            (LeftOut.NO_TVB, ~validated | after_gap),
+            (LeftOut.AMBIGUOUS, ~met(self.epochs, unambiguous(config)) & floats_known(self.epochs, "path_m")),
+            (LeftOut.ALARM, self.alarming),
+        ):
+            reason[where] = _REASONS.index(why)
+        return _with_quiet(reason, self.t_ns, quiet_s)
+
+    def satellites_at(self, t_ns: int) -> list[str]:
+        """Satellites used at this epoch, in order of name."""
+        ranges = self.ride.prepared.ranges(self.solution)
+        if ranges is None:
+            return []
+        stamp = pl.lit(t_ns).cast(pl.Datetime("ns", "UTC"))
+        return ranges.filter((pl.col("t") == stamp) & pl.col("used"))["sv"].unique().sort().to_list()
+
+    @cached_property
+    def has_ranges(self) -> bool:
+        """Satellites stand beside nearly all positions, so that a range fault can move them."""
+        ranges = self.ride.prepared.ranges(self.solution)
+        if ranges is None or ranges.is_empty():
+            return False
+        return float(np.isin(self.t_ns, times_ns(ranges)).mean()) >= _RANGES_BESIDE
+
+
+def floats_known(frame: pl.DataFrame, column: str) -> Bools:
+    """Where a nullable number is known."""
+    return frame[column].is_not_null().to_numpy()
+
+
+def _with_quiet(reason: Ints, t_ns: Ints, quiet_s: float) -> Ints:
+    """Epochs too soon after what is left out, or after the first epoch, are left out too."""
+    bad_ns = np.where(reason >= 0, t_ns, t_ns[0])
+    soon = t_ns - np.maximum.accumulate(bad_ns) < quiet_s * NS_PER_S
+    return np.where((reason < 0) & soon, _REASONS.index(LeftOut.TOO_SOON), reason)
+
+
+def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution: str) -> Baseline:
+    """Replay and judge the run as it is. Raises `InputError` where faults were injected, or it cannot be replayed."""
+    if run.faults is not None and run.faults.height:
+        raise InputError(
+            "holds injected faults already",
+            place=f"{run.run_id}: faults",
+            found=f"{run.faults.height} rows",
+            expected="a run as it was recorded",
+        )
+    ride = ride_alone(run, site, vehicle, bank.config, solution)
+    evidence = ride.prepared.evidence()
+    judged = _judged(ride, evidence)
+    return Baseline(run, site, bank, ride, evidence, judged.epochs, judged.alarms, Recording(run, site))
+
+
+def _judged(ride: Ride, evidence: TrainEvidence) -> Judged:
+    prepared = ride.prepared
+    reference = prepared.run.reference
+    return judge(Case(ride.solution, evidence, ride.odometry, prepared.vehicle, prepared.config, reference))

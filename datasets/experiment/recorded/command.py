@@ -1,0 +1,364 @@
+"""The whole experiment: runs as recorded, instants, faults and their replays, tables, pictures and the page."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import polars as pl
+import pyarrow.parquet as pq
+
+from datasets.experiment.recorded.baseline import Baseline, baseline_of
+from datasets.experiment.recorded.draw import Onset, Room, numbered, onsets_of, room_of
+from datasets.experiment.recorded.injection import injected
+from datasets.experiment.recorded.outcome import outcome_row
+from datasets.experiment.recorded.page import recorded_page
+from datasets.experiment.recorded.pictures import pictures
+from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan, banks_of, load_plan
+from datasets.experiment.recorded.tables import Quiet, banks_table, cells_table, places_table, pmd_table
+from datasets.experiment.tables import Row
+from pipeline import storage
+from pipeline.campaign import find_runs
+from pipeline.read.ingest import read_run
+from pipeline.read.site.read import read_site
+from pipeline.results.software import software_digest
+from pipeline.results.workers import mapped
+from pipeline.storage.parquet import parquet_bytes
+from schemas.arrays import flags
+from schemas.config import Configuration, Vehicle, digest_of, load_settings, to_toml
+from schemas.conform import conform, dtypes
+from schemas.enums import RunStatus
+from schemas.errors import ConfigError, InputError, UsageError
+from schemas.experiment import EXPERIMENT_TABLES, ExperimentInjections, ExperimentRuns
+from schemas.run import Site
+from schemas.version import SOFTWARE
+
+# Injections that one process takes on at once, and that are not made again when the command is repeated.
+_PIECE = 20
+PAGE = "index.html"
+_PIECES = "pieces"
+_SHOWN = (
+    *("bank", "cell", "injections", "passes", "noticed", "time_to_detect_median_s", "failures"),
+    *("pmd_at_failure", "pmd_at_failure_high"),
+)
+_SHOWN_OF_BANKS = (
+    *("bank", "hours", "alarms", "alarm_rate_per_h", "alarm_rate_high_per_h", "injections", "passes", "noticed"),
+    *("failures", "missed_at_failure", "pmd_at_failure", "pmd_at_failure_high", "in_use_max_m"),
+)
+_LOST_KEY = "balise.lost"
+_LOST = {"bank": pl.String, "cell": pl.String, "reason": pl.String}
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the command names."""
+
+    runs: tuple[tuple[str, str], ...]
+    site: str
+    vehicle: Path | None
+    config: Configuration
+    banks: tuple[Bank, ...]
+    solution: str
+    quiet_s: float
+    digest: str
+
+
+@dataclass(frozen=True)
+class Made:
+    """The tables by name, and the runs that could not be used, with the reason."""
+
+    tables: dict[str, pl.DataFrame]
+    failed: dict[str, str]
+    page: Path
+
+
+@dataclass(frozen=True)
+class _Surveyed:
+    """A run without a fault, by all banks; `error` where it cannot be used."""
+
+    run_id: str
+    row: Row
+    room: Room | None = None
+    quiet: tuple[Quiet, ...] = ()
+    run_digest: str = ""
+    error: InputError | None = None
+
+
+@dataclass(frozen=True)
+class Part:
+    """What became of the injections of a piece; `lost`: bank, cell and reason of those that were not possible."""
+
+    frame: pl.DataFrame
+    lost: tuple[tuple[str, str, str], ...]
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Some injections of one run and bank, and the file that keeps what became of them."""
+
+    inputs: Inputs
+    address: str
+    bank: Bank
+    onsets: tuple[Onset, ...]
+    file: Path
+
+
+def recorded_experiment(
+    runs: Sequence[str],
+    site: str | None,
+    out: Path,
+    plan_file: Path | None,
+    vehicle: Path | None,
+    config: Configuration,
+    seed: int | None,
+    per_cell: int | None,
+    solution: str,
+    jobs: int,
+) -> Made:
+    """Run the experiment; what is in `out` of the same inputs is not made again. Writes tables, pictures and a page."""
+    if not runs or site is None:
+        raise UsageError("needs recorded runs and --site", place="experiment recorded")
+    plan = load_plan(plan_file)
+    given = {"seed": seed, "per_cell": per_cell}
+    plan = plan.model_copy(update={name: value for name, value in given.items() if value is not None})
+    inputs = _inputs(runs, site, vehicle, config, solution, plan, banks_of(plan, plan_file, config))
+    surveyed = mapped(_survey, [(inputs, run) for run in inputs.runs], jobs)
+    rooms = [one.room for one in surveyed if one.room is not None]
+    if not rooms:
+        raise next(one.error for one in surveyed if one.error is not None)
+    cells = plan.cells(inputs.banks[0].config.hazards.failure_limit_m)
+    drawn = onsets_of(rooms, cells, plan)
+    _refuse_lack_of_room(cells, drawn, rooms, plan_file)
+    digests = {one.run_id: one.run_digest for one in surveyed}
+    pieces = _pieces(inputs, numbered(cells, drawn), digests, out)
+    tables = _tables(mapped(_made_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
+    _write(out, tables, plan)
+    _forget_others(pieces, out)
+    return Made(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, out / PAGE)
+
+
+def _inputs(
+    runs: Sequence[str],
+    site: str,
+    vehicle: Path | None,
+    config: Configuration,
+    solution: str,
+    plan: RecordedPlan,
+    banks: tuple[Bank, ...],
+) -> Inputs:
+    """What the command names; the digest stands for all that decides an outcome but the run and the fault."""
+    ground = read_site(site, config.site)
+    settings = [(bank.name, digest_of(bank.config, load_settings(bank.vehicle or vehicle, Vehicle))) for bank in banks]
+    decides = (_own_digest(), ground.digest, digest_of(config), settings, solution, plan.quiet_s)
+    digest = hashlib.sha256(repr(decides).encode()).hexdigest()
+    return Inputs(tuple(find_runs(runs).items()), site, vehicle, config, banks, solution, plan.quiet_s, digest)
+
+
+def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
+    inputs, (run_id, address) = task
+    nothing = dict.fromkeys(ExperimentRuns.column_names())
+    try:
+        baselines = [_baseline(inputs, address, bank) for bank in inputs.banks]
+    except InputError as error:
+        row = {**nothing, "run_id": run_id, "status": RunStatus.FAILED.value, "error": str(error), "injections": 0}
+        return _Surveyed(run_id, row, error=error)
+    first = baselines[0]
+    room = replace(room_of(baselines, inputs.quiet_s), run_id=run_id)
+    row = {
+        **nothing,
+        "run_id": run_id,
+        "status": RunStatus.OK.value,
+        "own_error": first.own_error.value,
+        "duration_s": first.clock.duration_s,
+        **room.seconds_left_out(),
+        "longest_watch_s": room.longest_s(),
+        "has_odometer": room.has_odometer,
+        "has_ranges": room.has_ranges,
+    }
+    return _Surveyed(run_id, row, room, tuple(map(_quiet, baselines)), first.run.input_digest)
+
+
+def _quiet(base: Baseline) -> Quiet:
+    held_s = base.clock.held_s
+    tvb_s = float(held_s[flags(base.epochs, "tvb")].sum())
+    return Quiet(base.bank.name, 1, base.hours(), base.alarms.height, tvb_s, float(held_s.sum()))
+
+
+_KEPT: dict[tuple[str, str, str], Baseline] = {}
+"""The last run and banks of this process: it takes the pieces of a run and bank one after the other."""
+
+
+def _baseline(inputs: Inputs, address: str, bank: Bank) -> Baseline:
+    key = (inputs.digest, address, bank.name)
+    if key not in _KEPT:
+        run = read_run(address, inputs.config.ingest, True)
+        vehicle = load_settings(bank.vehicle or inputs.vehicle, Vehicle)
+        made = baseline_of(run, _site(inputs.site, inputs.digest, inputs.config), vehicle, bank, inputs.solution)
+        while len(_KEPT) > 1:
+            _KEPT.pop(next(iter(_KEPT)))
+        _KEPT[key] = made
+    return _KEPT[key]
+
+
+_SITES: dict[str, Site] = {}
+
+
+def _site(address: str, digest: str, config: Configuration) -> Site:
+    """Read once by each process."""
+    if digest not in _SITES:
+        _SITES.clear()
+        _SITES[digest] = read_site(address, config.site)
+    return _SITES[digest]
+
+
+def _refuse_lack_of_room(
+    cells: Sequence[Cell], drawn: dict[str, list[tuple[str, int, float]]], rooms: Sequence[Room], plan_file: Path | None
+) -> None:
+    """A plan of the user's is done whole or not at all; the default takes what there is, and says so in `cells`."""
+    if not any(drawn.values()):
+        longest_s = max(room.longest_s() for room in rooms)
+        shortest_s = min(cell.watch_s for cell in cells)
+        raise InputError(
+            "no run has room for any fault of the plan",
+            place=", ".join(room.run_id for room in rooms),
+            found=f"at most {longest_s:.0f} s without an alarm after an instant at which nothing is left out",
+            expected=f"{shortest_s:.0f} s",
+            remedy="`experiment_runs` of a longer run says what is left out and why.",
+        )
+    if plan_file is None:
+        return
+    for cell in cells:
+        count = len(drawn[cell.name])
+        if count == cell.count:
+            continue
+        if not any(room.takes(cell) for room in rooms):
+            lacking = "satellites beside its positions" if cell.hits_satellite else "an odometer"
+            raise ConfigError(f"no run has {lacking}", place=f"{plan_file}: {cell.name}")
+        raise ConfigError(
+            "has no room for so many injections",
+            place=f"{plan_file}: {cell.name}",
+            found=f"room for {count}, each watched for {cell.watch_s:.0f} s",
+            expected=f"{cell.count}",
+            remedy="Give more or longer runs, fewer injections, or a smaller `apart_s` or `watch_s`.",
+        )
+
+
+def _pieces(inputs: Inputs, onsets: Sequence[Onset], digests: dict[str, str], out: Path) -> list[_Piece]:
+    """Pieces by run and bank, so that a process prepares each as rarely as can be."""
+    addresses = dict(inputs.runs)
+    return [
+        _piece(inputs, addresses[run_id], bank, rows[at : at + _PIECE], digests[run_id], out)
+        for run_id in sorted({onset.run_id for onset in onsets})
+        for bank in inputs.banks
+        for rows in [[onset for onset in onsets if onset.run_id == run_id]]
+        for at in range(0, len(rows), _PIECE)
+    ]
+
+
+def _piece(inputs: Inputs, address: str, bank: Bank, onsets: Sequence[Onset], run_digest: str, out: Path) -> _Piece:
+    made_of = (inputs.digest, run_digest, bank.name, [(one.number, one.cell, one.t_ns, one.lot) for one in onsets])
+    name = hashlib.sha256(repr(made_of).encode()).hexdigest()
+    return _Piece(inputs, address, bank, tuple(onsets), out / _PIECES / f"{name}.parquet")
+
+
+def _made_piece(piece: _Piece) -> Part:
+    """Replay the injections of a piece, or read what an earlier call made of them."""
+    content = storage.content_of(piece.file)
+    if content is not None:
+        return _read_part(content)
+    base = _baseline(piece.inputs, piece.address, piece.bank)
+    rows: list[Row] = []
+    lost: list[tuple[str, str, str]] = []
+    for onset in piece.onsets:
+        try:
+            found = injected(base, onset)
+        except InputError as error:
+            lost.append((piece.bank.name, onset.cell.name, str(error)))
+            continue
+        rows.append({"bank": piece.bank.name, **outcome_row(base, onset, found)})
+    frame = conform(pl.DataFrame(rows, schema=dtypes(ExperimentInjections)), ExperimentInjections)
+    storage.write_bytes(piece.file, parquet_bytes(frame, {_LOST_KEY: json.dumps(lost)}))
+    return Part(frame, tuple(lost))
+
+
+def _read_part(content: bytes) -> Part:
+    table = pq.read_table(io.BytesIO(content))
+    lost = json.loads((table.schema.metadata or {})[_LOST_KEY.encode()])
+    frame = pl.read_parquet(io.BytesIO(content))
+    return Part(conform(frame, ExperimentInjections), tuple((bank, cell, why) for bank, cell, why in lost))
+
+
+def _tables(
+    parts: Sequence[Part],
+    surveyed: Sequence[_Surveyed],
+    cells: Sequence[Cell],
+    plan: RecordedPlan,
+    banks: Sequence[str],
+) -> dict[str, pl.DataFrame]:
+    frames = [part.frame for part in parts]
+    injections = pl.concat(frames) if frames else ExperimentInjections.create_empty()
+    order = pl.col("bank").replace_strict({name: number for number, name in enumerate(banks)}, return_dtype=pl.Int64)
+    injections = injections.sort(order, "injection_id")
+    lost = pl.DataFrame([row for part in parts for row in part.lost], schema=_LOST, orient="row")
+    of_cells = cells_table(injections, banks, cells, plan, lost)
+    into = dict(injections.filter(bank=banks[0]).group_by("run_id").len().iter_rows())
+    runs = [{**one.row, "injections": into.get(one.run_id, 0)} for one in surveyed]
+    return {
+        "injections": conform(injections, ExperimentInjections),
+        "cells": of_cells,
+        "pmd": pmd_table(injections, banks, cells, plan),
+        "places": places_table(injections, cells, plan),
+        "banks": banks_table(injections, [_together(name, surveyed) for name in banks], of_cells, plan),
+        "runs": conform(pl.DataFrame(runs, schema=dtypes(ExperimentRuns)), ExperimentRuns),
+    }
+
+
+def _together(bank: str, surveyed: Sequence[_Surveyed]) -> Quiet:
+    """All runs without a fault, as this bank saw them."""
+    parts = [quiet for one in surveyed for quiet in one.quiet if quiet.bank == bank]
+    sums = {name: sum(getattr(part, name) for part in parts) for name in ("hours", "alarms", "tvb_s", "recorded_s")}
+    return Quiet(bank=bank, runs=len(parts), **sums)
+
+
+def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> None:
+    for name, table in tables.items():
+        contract = EXPERIMENT_TABLES[f"experiment_{name}"]
+        notes = {
+            column: {"unit": str((kind.metadata or {}).get("unit", "")), "meaning": kind.description or ""}
+            for column, kind in contract.columns().items()
+        }
+        metadata = {"balise.table": f"experiment_{name}", "balise.software": SOFTWARE}
+        storage.write_bytes(out / f"{name}.parquet", parquet_bytes(table, metadata, notes))
+    storage.write_bytes(out / "plan.toml", to_toml(plan).encode())
+    drawn = pictures(tables)
+    for name, (_, drawing) in drawn.items():
+        storage.write_bytes(out / f"{name}.svg", drawing.encode())
+    storage.write_bytes(out / PAGE, recorded_page(tables, drawn, plan).encode())
+
+
+def _forget_others(pieces: Sequence[_Piece], out: Path) -> None:
+    """Pieces of other plans, or of other inputs, go."""
+    kept = {piece.file.name for piece in pieces}
+    for file in (out / _PIECES).glob("*.parquet"):
+        if file.name not in kept:
+            file.unlink(missing_ok=True)
+
+
+@cache
+def _own_digest() -> str:
+    """Of the program and of what puts the faults in."""
+    digest = hashlib.sha256(software_digest().encode())
+    for source in sorted(Path(__file__).parents[2].rglob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+def shown(made: Made) -> dict[str, pl.DataFrame]:
+    """What the screen shows: cells that were replayed, and banks."""
+    cells = made.tables["cells"].filter(pl.col("injections") > 0)
+    return {"Cells": cells.select(_SHOWN), "Banks": made.tables["banks"].select(_SHOWN_OF_BANKS)}

@@ -1,0 +1,134 @@
+"""A plot of lines with bands as SVG: axes, ticks, curves, key; the same content gives the same bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from math import isfinite, log10
+
+WIDTH, HEIGHT = 900.0, 420.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 690.0, 16.0, 370.0
+COLOURS = ("#1f5fa8", "#c4561a", "#2b8a3e", "#7a3fa0", "#a1821a", "#0b7285", "#b02a4a", "#555555")
+
+Scale = Callable[[float], float]
+Point = tuple[float, float]
+
+
+def linear(value: float) -> float:
+    return value
+
+
+def both_ways_log(value: float) -> float:
+    """Linear about zero, logarithmic far from it, for times before and after."""
+    return log10(1.0 + abs(value)) * (1.0 if value >= 0.0 else -1.0)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Title, scale, and the values that it spans and names."""
+
+    title: str
+    low: float
+    high: float
+    ticks: Sequence[float]
+    scale: Scale = linear
+
+    def share(self, value: float) -> float:
+        """Where on the axis, 0 to 1; what lies beyond stands at its end."""
+        low = self.scale(self.low)
+        high = self.scale(self.high)
+        return min(max((self.scale(value) - low) / (high - low), 0.0), 1.0)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A named line; `band`: lower and upper y of each point; `marks`: points drawn as open triangles (more than)."""
+
+    name: str
+    points: Sequence[Point]
+    colour: str
+    dashed: bool = False
+    band: Sequence[Point] = ()
+    marks: Sequence[Point] = field(default=())
+
+
+def plot(title: str, x: Axis, y: Axis, curves: Sequence[Curve]) -> str:
+    """The whole picture as one SVG element."""
+    parts = [*_frame(x, y), *(part for curve in curves for part in _curve(curve, x, y)), *_key(curves)]
+    return svg(title, HEIGHT, parts)
+
+
+def svg(title: str, height: float, parts: Sequence[str]) -> str:
+    """An SVG element that stands for itself, on white."""
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH:.0f} {height:.0f}" role="img" '
+        f'aria-label="{escape(title)}" font-family="sans-serif" font-size="12">'
+        f'<rect width="{WIDTH:.0f}" height="{height:.0f}" fill="#ffffff"/>{"".join(parts)}</svg>'
+    )
+
+
+def text(x: float, y: float, words: str, anchor: str = "start") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="#222222">{escape(words)}</text>'
+
+
+def _across(axis: Axis, value: float) -> float:
+    return _LEFT + axis.share(value) * (_RIGHT - _LEFT)
+
+
+def _up(axis: Axis, value: float) -> float:
+    return _BOTTOM - axis.share(value) * (_BOTTOM - _TOP)
+
+
+def _frame(x: Axis, y: Axis) -> list[str]:
+    size = f'width="{_RIGHT - _LEFT}" height="{_BOTTOM - _TOP}"'
+    box = f'<rect x="{_LEFT}" y="{_TOP}" {size} fill="none" stroke="#888888"/>'
+    parts = [box, text((_LEFT + _RIGHT) / 2, HEIGHT - 8, x.title, "middle"), text(_LEFT, _TOP - 4, y.title)]
+    for value in x.ticks:
+        at = _across(x, value)
+        parts += [_line(at, _TOP, at, _BOTTOM), text(at, _BOTTOM + 16, f"{value:g}", "middle")]
+    for value in y.ticks:
+        at = _up(y, value)
+        parts += [_line(_LEFT, at, _RIGHT, at), text(_LEFT - 6, at + 4, f"{value:g}", "end")]
+    return parts
+
+
+def _line(x1: float, y1: float, x2: float, y2: float) -> str:
+    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="#dddddd"/>'
+
+
+def _curve(curve: Curve, x: Axis, y: Axis) -> list[str]:
+    at = [(_across(x, px), _up(y, py)) for px, py in curve.points if isfinite(py)]
+    parts = []
+    if curve.band:
+        lows = [(_across(x, px), _up(y, low)) for (px, _), (low, _) in zip(curve.points, curve.band, strict=True)]
+        highs = [(_across(x, px), _up(y, high)) for (px, _), (_, high) in zip(curve.points, curve.band, strict=True)]
+        parts.append(f'<polygon points="{_joined([*lows, *reversed(highs)])}" fill="{curve.colour}" opacity="0.10"/>')
+    dash = ' stroke-dasharray="6 4"' if curve.dashed else ""
+    parts.append(
+        f'<polyline points="{_joined(at)}" fill="none" stroke="{curve.colour}" stroke-width="1.6"{dash}>'
+        f"<title>{escape(curve.name)}</title></polyline>"
+    )
+    for px, py in curve.marks:
+        left = _across(x, px)
+        top = _up(y, py)
+        corners = [(left - 5, top + 4), (left + 5, top + 4), (left, top - 5)]
+        parts.append(f'<polygon points="{_joined(corners)}" fill="#ffffff" stroke="{curve.colour}"/>')
+    return parts
+
+
+def _joined(points: Sequence[Point]) -> str:
+    return " ".join(f"{px:.1f},{py:.1f}" for px, py in points)
+
+
+def _key(curves: Sequence[Curve]) -> list[str]:
+    parts = []
+    left = _RIGHT + 10
+    for number, curve in enumerate(curves):
+        at = _TOP + 10 + 16 * number
+        dash = ' stroke-dasharray="6 4"' if curve.dashed else ""
+        parts.append(
+            f'<line x1="{left}" y1="{at}" x2="{left + 24}" y2="{at}" stroke="{curve.colour}" stroke-width="2"{dash}/>'
+        )
+        parts.append(text(_RIGHT + 40, at + 4, curve.name))
+    return parts

@@ -1,0 +1,217 @@
+"""What became of one injected fault: noticed when and by what, failed when, in use how long, balises accepted wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from datasets.experiment.recorded.baseline import Baseline
+from datasets.experiment.recorded.draw import Onset
+from datasets.experiment.recorded.injection import Injected
+from datasets.experiment.tables import Row
+from pipeline.stages.epochs.clock import met, unambiguous
+from pipeline.stages.judge.in_use import reaction_s, time_in_use
+from pipeline.stages.judge.judgement import RIGHT, UNKNOWN, WRONG
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of, times_ns
+from schemas.enums import MonitorState
+from schemas.tables import MONITORS, SCALES
+
+# Epochs before the onset that the time in use is reckoned from: a negation in force there has no part in it.
+_LEAD_S = 30.0
+# DOMAIN section 5.3: the first wrong epoch of so much time is the failure.
+_LASTING_S = 1.0
+
+
+@dataclass(frozen=True)
+class Watch:
+    """The epochs of an injected run from a little before the onset on, beside those of the fault-free run.
+
+    `moved_m`: by what the fault has moved the position in the direction of travel, NaN where not known; `low_m`,
+    `high_m`: the error; `code`: the judgement; `begin`: the first epoch of the fault.
+    """
+
+    epochs: pl.DataFrame
+    t_ns: Ints
+    moved_m: Floats
+    low_m: Floats
+    high_m: Floats
+    code: Ints
+    begin: int
+
+
+def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
+    """The row of `schemas.experiment.Injections`, but for the bank."""
+    watch = _watch(base, onset, found)
+    after = watch.t_ns >= onset.t_ns
+    alarm = flags(watch.epochs, "alarm") & after
+    noticed_ns = int(watch.t_ns[alarm.argmax()]) if alarm.any() else None
+    failure_ns, may_ns = _failure(watch)
+    use = time_in_use(watch.epochs, watch.code, base.config)
+    in_use = flags(use, "in_use") & after
+    delay_ns = round(reaction_s(watch.t_ns, base.config) * NS_PER_S)
+    stopped_from = np.inf if noticed_ns is None else noticed_ns + delay_ns
+    unnoticed = after if noticed_ns is None else after & (watch.t_ns < noticed_ns)
+    return {
+        **_what(onset, found),
+        **_where(base, onset),
+        "t_onset": onset.t_ns,
+        "watched_s": (found.end_ns - onset.t_ns) / NS_PER_S,
+        "noticed": noticed_ns is not None,
+        "monitors": _failing(watch, int(alarm.argmax())) if noticed_ns is not None else [],
+        "time_to_detect_s": _seconds(noticed_ns, onset.t_ns),
+        "time_to_failure_s": _seconds(failure_ns, onset.t_ns),
+        "time_to_failure_may_s": _seconds(may_ns, onset.t_ns),
+        "time_since_failure_s": _seconds(noticed_ns, failure_ns),
+        "time_since_failure_may_s": _seconds(noticed_ns, may_ns),
+        "stopped": _stopped(watch, flags(use, "in_use"), stopped_from) if noticed_ns is not None else None,
+        "hazardous_s": float(floats(use, "wrong_s")[after].sum()),
+        "hazardous_may_s": float(floats(use, "used_s")[after & (watch.code != RIGHT)].sum()),
+        "unnoticed_m": _largest(watch.moved_m, unnoticed),
+        "in_use_m": _largest(watch.moved_m, in_use),
+        "tvb_lost_s": _tvb_lost_s(base, watch, onset, found.end_ns),
+        **_accepted(base, onset, found),
+    }
+
+
+def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
+    lead_ns = onset.t_ns - round(_LEAD_S * NS_PER_S)
+    epochs = found.ride.solution.epochs
+    all_ns = times_ns(epochs)
+    epochs = epochs.filter(pl.Series(all_ns >= lead_ns))
+    t_ns = times_ns(epochs)
+    row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
+    same = base.t_ns[row] == t_ns
+    moved_m, astray = _moved_m(base, found, epochs, row)
+    moved_m = np.where(same, moved_m, np.nan)
+    own_low_m, own_high_m = (values[row] for values in base.own_m)
+    low_m = own_low_m + moved_m
+    high_m = own_high_m + moved_m
+    limit_m = base.config.hazards.failure_limit_m
+    code = np.full(t_ns.size, UNKNOWN)
+    with np.errstate(invalid="ignore"):
+        code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
+        code[(low_m > limit_m) | (high_m < -limit_m)] = WRONG
+    code[astray & met(epochs, unambiguous(base.config))] = WRONG
+    return Watch(epochs, t_ns, moved_m, low_m, high_m, code, int(np.searchsorted(t_ns, onset.t_ns)))
+
+
+def _moved_m(base: Baseline, found: Injected, epochs: pl.DataFrame, row: Ints) -> tuple[Floats, Bools]:
+    """By what the position lies further along the fault-free run's path [m]; and where it lies off that path."""
+    path = base.ride.match.path
+    element = epochs["netelement_id"].replace_strict(path.track.index, default=-1, return_dtype=pl.Int64)
+    number = element.fill_null(-1).to_numpy()
+    measure_m = floats(epochs, "measure_m")
+    near_m = floats(base.epochs, "path_m")[row]
+    leg = ints(base.epochs["leg"], 0)[row]
+    at_m = np.full(number.size, np.nan)
+    for index, route in enumerate(path.routes(path.track.index)):
+        rows = np.flatnonzero((leg == index) & (number >= 0) & np.isfinite(near_m))
+        at_m[rows], _ = route.coordinate(number[rows], measure_m[rows], near_m[rows])
+    sense = ints(base.epochs["direction"], 1)[row]
+    return (at_m - near_m) * sense, (number >= 0) & np.isfinite(near_m) & ~np.isfinite(at_m)
+
+
+def _failure(watch: Watch) -> tuple[int | None, int | None]:
+    """The first wrong epoch of a second of them, else the first (DOMAIN section 5.3); and the first that may be.
+
+    The latter: the first of the unbroken unknown or wrong epochs that lead there.
+    """
+    wrong = watch.code == WRONG
+    wrong[: watch.begin] = False
+    firsts, lasts = runs_of(wrong)
+    if not firsts.size:
+        return None, None
+    lasting = watch.t_ns[lasts] - watch.t_ns[firsts] >= _LASTING_S * NS_PER_S
+    first = int(firsts[lasting.argmax()])
+    before = np.flatnonzero(watch.code[watch.begin : first] == RIGHT)
+    may = watch.begin + int(before[-1]) + 1 if before.size else watch.begin
+    return int(watch.t_ns[first]), int(watch.t_ns[may])
+
+
+def _stopped(watch: Watch, in_use: Bools, from_ns: float) -> bool:
+    """After the reaction to the first alarm a wrong position was in use no more."""
+    return not bool((in_use & (watch.code == WRONG) & (watch.t_ns > from_ns)).any())
+
+
+def _failing(watch: Watch, epoch: int) -> list[str]:
+    states = watch.epochs.row(epoch, named=True)
+    return [name for name in MONITORS if states.get(f"{name}_state") == MonitorState.FAIL.value]
+
+
+def _largest(moved_m: Floats, where: Bools) -> float:
+    return float(np.abs(moved_m[where & np.isfinite(moved_m)]).max(initial=0.0))
+
+
+def _tvb_lost_s(base: Baseline, watch: Watch, onset: Onset, end_ns: int) -> float:
+    """Time with a TVB in the fault-free run less that with the fault, over the watch [s]."""
+    there = (base.t_ns >= onset.t_ns) & (base.t_ns <= end_ns) & flags(base.epochs, "tvb")
+    had = set(base.t_ns[there].tolist())
+    has = set(watch.t_ns[(watch.t_ns >= onset.t_ns) & flags(watch.epochs, "tvb")].tolist())
+    period_s = base.clock.period_s or 0.0
+    return len(had - has) * period_s
+
+
+def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
+    """Balises accepted since the onset, and of them those whose position was wrong there, or may have been."""
+    accepted = found.ride.solution.accepted.filter(pl.col("t") >= pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC")))
+    t_ns = times_ns(accepted)
+    row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
+    train_m, sense = _train_at(base, t_ns, row)
+    at_m, _ = _moved_m(base, found, accepted, row)
+    at_m = at_m * sense + floats(base.epochs, "path_m")[row]
+    own_low_m, own_high_m = (values[row] for values in base.own_m)
+    moved_m = (at_m - train_m) * sense
+    limit_m = base.config.hazards.failure_limit_m
+    low_m = own_low_m + moved_m
+    high_m = own_high_m + moved_m
+    wrong = (low_m > limit_m) | (high_m < -limit_m)
+    right = (low_m >= -limit_m) & (high_m <= limit_m)
+    ids = accepted["balise_id"]
+    return {
+        "accepted": accepted.height,
+        "accepted_wrong": int(wrong.sum()),
+        "accepted_unknown": int((~wrong & ~right).sum()),
+        "accepted_wrong_ids": ids.filter(pl.Series(wrong, dtype=pl.Boolean)).to_list(),
+    }
+
+
+def _train_at(base: Baseline, t_ns: Ints, row: Ints) -> tuple[Floats, Ints]:
+    """Where the fault-free position was on its path at these times [m], and the direction of travel."""
+    path_m = floats(base.epochs, "path_m")
+    known = np.isfinite(path_m)
+    at_m = np.interp(t_ns.astype(np.float64), base.t_ns[known].astype(np.float64), path_m[known])
+    return at_m, ints(base.epochs["direction"], 1)[row]
+
+
+def _what(onset: Onset, found: Injected) -> Row:
+    cell = onset.cell
+    return {
+        "injection_id": onset.number,
+        "cell": cell.name,
+        "run_id": onset.run_id,
+        "solution": found.ride.solution.name,
+        "kind": cell.fault.kind.value,
+        "target": found.fault.target,
+        "direction": cell.direction,
+        "amount": cell.amount,
+        "unit": cell.fault.unit,
+        "duration_s": found.fault.duration_s,
+        "start_s": found.fault.start_s,
+    }
+
+
+def _where(base: Baseline, onset: Onset) -> Row:
+    """The place and what the bank knew there, in the fault-free run."""
+    epoch = base.epochs.row(int(np.searchsorted(base.t_ns, onset.t_ns)), named=True)
+    fixes = base.ride.solution.fixes
+    stamp = pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC"))
+    satellites = fixes.filter(pl.col("t") == stamp)["satellites"].to_list()
+    kept = ("netelement_id", "measure_m", "path_m", "speed_mps", "curvature_per_m", "sigma_along_m")
+    thresholds = {f"along_{scale}_threshold": epoch[f"along_{scale}_threshold"] for scale in SCALES}
+    return {name: epoch[name] for name in kept} | {"satellites": satellites[0] if satellites else None} | thresholds
+
+
+def _seconds(until_ns: int | None, since_ns: int | None) -> float | None:
+    return None if until_ns is None or since_ns is None else (until_ns - since_ns) / NS_PER_S

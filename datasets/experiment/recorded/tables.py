@@ -1,0 +1,248 @@
+"""The injections as figures: per cell, Pmd against T_dsf, by place, and bank against bank.
+
+Counting. All injections of a cell are watched for equally long, so the Kaplan-Meier curve is the plain share not yet
+noticed, and T_D beyond the watch is only known to be longer: no quantile is told from it. Injections whose watches
+overlap share the noise that decides them. So a share is that of all injections, and its bounds are those of Clopper and
+Pearson on as many trials as there are passes: watches of one run that neither overlap nor are shorter than `pass_s`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+from scipy.stats import binom
+
+from datasets.experiment.recorded.plan import Cell, RecordedPlan
+from datasets.experiment.tables import Row
+from pipeline.stages.run_row.bounds import CONFIDENCE, UNKNOWN, clopper_pearson, columns_of, poisson_rate
+from schemas.arrays import NS_PER_S, Floats, floats, times_ns
+from schemas.conform import conform
+from schemas.experiment import ExperimentBanks, ExperimentCells, ExperimentPlaces, ExperimentPmd
+
+_PMD_STEPS = 40
+# Shares of few passes are whole numbers of them but for rounding.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Quiet:
+    """One bank on the recorded runs without a fault: alarms in so many hours, share of time with a TVB."""
+
+    bank: str
+    runs: int
+    hours: float
+    alarms: int
+    tvb_s: float
+    recorded_s: float
+
+
+def passes(frame: pl.DataFrame, pass_s: float) -> int:
+    """The largest number of watches that share no time, at least `pass_s` each: of those left the first to end."""
+    length_ns = np.maximum(floats(frame, "watched_s"), pass_s) * NS_PER_S
+    begin_ns = times_ns(frame, "t_onset")
+    end_ns = begin_ns + length_ns.round().astype(np.int64)
+    runs = frame["run_id"].to_list()
+    free_ns: dict[str, int] = {}
+    count = 0
+    for row in np.argsort(end_ns, kind="stable").tolist():
+        if begin_ns[row] >= free_ns.get(runs[row], np.iinfo(np.int64).min):
+            free_ns[runs[row]] = int(end_ns[row])
+            count += 1
+    return count
+
+
+def bounded_share(name: str, hits: int, trials: int, independent: int) -> Row:
+    """A share of all trials, with the bounds that as many hits among the independent ones alone would have."""
+    if not trials or not independent:
+        return columns_of(name, UNKNOWN)
+    expected = hits / trials * independent
+    low = clopper_pearson(int(np.floor(expected + _ROUNDING)), independent).low
+    high = clopper_pearson(int(np.ceil(expected - _ROUNDING)), independent).high
+    return {name: hits / trials, f"{name}_low": low, f"{name}_high": high}
+
+
+def cells_table(
+    injections: pl.DataFrame, banks: Sequence[str], cells: Sequence[Cell], plan: RecordedPlan, lost: pl.DataFrame
+) -> pl.DataFrame:
+    """One row per bank and cell; `lost`: `bank, cell, reason` of the instants that could not take the fault."""
+    rows = [
+        _cell_row(
+            cell, bank, injections.filter(bank=bank, cell=cell.name), lost.filter(bank=bank, cell=cell.name), plan
+        )
+        for bank in banks
+        for cell in cells
+    ]
+    return conform(pl.DataFrame(rows, infer_schema_length=None), ExperimentCells)
+
+
+def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, plan: RecordedPlan) -> Row:
+    noticed = int(frame["noticed"].sum())
+    independent = passes(frame, plan.pass_s)
+    failed = frame.drop_nulls("time_to_failure_s")
+    missed = _missed(failed, 0.0, "time_since_failure_may_s")
+    short = cell.count - frame.height - lost.height
+    reason = f"{short} found no room in the runs" if short else None
+    return {
+        **_names(cell, bank),
+        "wanted": cell.count,
+        "injections": frame.height,
+        "not_possible": lost.height,
+        "reason": "; ".join([*lost["reason"].unique().sort().to_list(), *([reason] if reason else [])]) or None,
+        "watched_s": cell.watch_s,
+        "passes": independent,
+        "noticed": noticed,
+        **bounded_share("noticed_share", noticed, frame.height, independent),
+        **_time_to_detect(frame, independent),
+        "failures": failed.height,
+        "missed_at_failure": missed,
+        **bounded_share("pmd_at_failure", missed, failed.height, passes(failed, plan.pass_s)),
+        "stopped": int(frame["stopped"].sum()),
+        "noticed_not_stopped": int((~frame["stopped"].drop_nulls()).sum()),
+        "accepted_wrong": int(frame["accepted_wrong"].sum()),
+        "hazardous_max_s": frame["hazardous_s"].max(),
+        "unnoticed_max_m": frame["unnoticed_m"].max(),
+        "in_use_max_m": frame["in_use_m"].max(),
+        "tvb_lost_median_s": frame["tvb_lost_s"].median(),
+    }
+
+
+def _names(cell: Cell, bank: str) -> Row:
+    return {
+        "bank": bank,
+        "cell": cell.name,
+        "kind": cell.fault.kind.value,
+        "target": cell.target,
+        "direction": cell.direction,
+        "amount": cell.amount,
+        "unit": cell.fault.unit,
+    }
+
+
+def _time_to_detect(frame: pl.DataFrame, independent: int) -> Row:
+    """Quantiles of T_D; the median's bounds by order statistics of the passes."""
+    times_s = np.sort(frame["time_to_detect_s"].fill_null(np.inf).to_numpy())
+    tail = (1.0 - CONFIDENCE) / 2.0
+    below = max(int(binom.ppf(tail, independent, 0.5)) - 1, 0) / independent if independent else 0.0
+    names = ("median", "median_low", "median_high", "p95", "max")
+    shares = (0.5, below, 1.0 - below, 0.95, 1.0)
+    return {f"time_to_detect_{name}_s": _quantile(times_s, share) for name, share in zip(names, shares, strict=True)}
+
+
+def _quantile(ordered: Floats, share: float) -> float | None:
+    """The smallest time by which this share was noticed; None where it was not."""
+    if not ordered.size:
+        return None
+    value = float(ordered[max(int(np.ceil(share * ordered.size - _ROUNDING)) - 1, 0)])
+    return value if np.isfinite(value) else None
+
+
+def _missed(failed: pl.DataFrame, time_s: float, since: str) -> int:
+    return int((failed[since].fill_null(np.inf) > time_s).sum())
+
+
+def pmd_table(
+    injections: pl.DataFrame, banks: Sequence[str], cells: Sequence[Cell], plan: RecordedPlan
+) -> pl.DataFrame:
+    """Pmd at times since failure, of the cells in which some position failed."""
+    rows = [row for bank in banks for cell in cells for row in _pmd_rows(injections, bank, cell, plan)]
+    return conform(pl.DataFrame(rows, schema=ExperimentPmd.create_empty().schema), ExperimentPmd)
+
+
+def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPlan) -> Iterator[Row]:
+    failed = injections.filter(bank=bank, cell=cell.name).drop_nulls("time_to_failure_s")
+    if failed.is_empty():
+        return
+    independent = passes(failed, plan.pass_s)
+    for time_s in _times_since_failure_s(failed).tolist():
+        missed = _missed(failed, time_s, "time_since_failure_may_s")
+        yield {
+            **_names(cell, bank),
+            "time_since_failure_s": time_s,
+            "trials": failed.height,
+            "passes": independent,
+            "missed": missed,
+            **bounded_share("pmd", missed, failed.height, independent),
+            "missed_certain": _missed(failed, time_s, "time_since_failure_s"),
+        }
+
+
+def _times_since_failure_s(failed: pl.DataFrame) -> Floats:
+    """From the onset, as far before the failure as it lies in the median, to where the first watch ends."""
+    before_s = float(np.median(floats(failed, "time_to_failure_s")))
+    after_s = float((failed["watched_s"] - failed["time_to_failure_s"]).min())  # type: ignore[arg-type]
+    times = np.concatenate(
+        [np.linspace(-before_s, 0.0, _PMD_STEPS + 1), np.linspace(0.0, after_s, _PMD_STEPS // 2 + 1)]
+    )
+    return np.unique(times.round(1))
+
+
+def places_table(injections: pl.DataFrame, cells: Sequence[Cell], plan: RecordedPlan) -> pl.DataFrame:
+    """Pieces of line by bank; a piece without an onset has no row."""
+    if injections.is_empty():
+        return ExperimentPlaces.create_empty()
+    watch_s = {cell.name: cell.watch_s for cell in cells}
+    lasting_s = pl.col("time_to_detect_s").fill_null(pl.col("cell").replace_strict(watch_s, return_dtype=pl.Float64))
+    usual_s = lasting_s.median().over("bank", "cell")
+    piece = (pl.col("measure_m") / plan.place_m).floor()
+    whole_s = pl.col("time_to_detect_s").fill_null(np.inf).median()
+    return conform(
+        injections.drop_nulls(["netelement_id", "measure_m"])
+        .with_columns(slowness=pl.when(usual_s > 0.0).then(lasting_s / usual_s), piece=piece)
+        .group_by("bank", "netelement_id", "piece")
+        .agg(
+            injections=pl.len(),
+            cells=pl.col("cell").n_unique(),
+            noticed=pl.col("noticed").sum(),
+            slowness=pl.col("slowness").median(),
+            time_to_detect_median_s=pl.when(whole_s.is_finite()).then(whole_s),
+            unnoticed_max_m=pl.col("unnoticed_m").max(),
+            in_use_max_m=pl.col("in_use_m").max(),
+            accepted_wrong=pl.col("accepted_wrong").sum(),
+            hazardous_max_s=pl.col("hazardous_s").max(),
+            curvature_per_m=pl.col("curvature_per_m").abs().median(),
+            speed_mps=pl.col("speed_mps").abs().median(),
+        )
+        .with_columns(from_m=pl.col("piece") * plan.place_m, to_m=(pl.col("piece") + 1.0) * plan.place_m)
+        .sort("bank", "netelement_id", "from_m"),
+        ExperimentPlaces,
+    )
+
+
+def banks_table(
+    injections: pl.DataFrame, quiet: Sequence[Quiet], cells: pl.DataFrame, plan: RecordedPlan
+) -> pl.DataFrame:
+    """Detection against false alarms, bank by bank."""
+    rows = [_bank_row(injections.filter(bank=one.bank), one, cells.filter(bank=one.bank), plan) for one in quiet]
+    return conform(pl.DataFrame(rows, infer_schema_length=None), ExperimentBanks)
+
+
+def _bank_row(frame: pl.DataFrame, quiet: Quiet, cells: pl.DataFrame, plan: RecordedPlan) -> Row:
+    failed = frame.drop_nulls("time_to_failure_s")
+    independent = passes(failed, plan.pass_s)
+    missed = _missed(failed, 0.0, "time_since_failure_may_s")
+    slowest = cells.filter(pl.col("injections") > 0).sort(
+        pl.col("time_to_detect_median_s").fill_null(np.inf), descending=True, maintain_order=True
+    )
+    return {
+        "bank": quiet.bank,
+        "runs": quiet.runs,
+        "hours": quiet.hours,
+        "alarms": quiet.alarms,
+        **columns_of("alarm_rate", poisson_rate(quiet.alarms, quiet.hours), "_per_h"),
+        "tvb_share": quiet.tvb_s / quiet.recorded_s if quiet.recorded_s else None,
+        "injections": frame.height,
+        "passes": independent,
+        "noticed": int(frame["noticed"].sum()),
+        "failures": failed.height,
+        "missed_at_failure": missed,
+        **bounded_share("pmd_at_failure", missed, failed.height, independent),
+        "slowest_cell": slowest["cell"].first() if slowest.height else None,
+        "noticed_not_stopped": int((~frame["stopped"].drop_nulls()).sum()),
+        "accepted_wrong": int(frame["accepted_wrong"].sum()),
+        "hazardous_s": float(frame["hazardous_s"].sum()),
+        "in_use_max_m": frame["in_use_m"].max(),
+        "tvb_lost_s": float(frame["tvb_lost_s"].sum()),
+    }
