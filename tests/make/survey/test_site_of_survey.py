@@ -22,7 +22,7 @@ from pipeline.stages.track.geodesy import moved_deg
 from pipeline.storage.parquet import without_checksums
 from schemas.config import Configuration, SurveyConfig, Vehicle
 from schemas.enums import TravelAlong
-from schemas.errors import BaliseError
+from schemas.errors import BaliseError, SiteError
 from schemas.run import Site
 
 INFRABEL = Path(__file__).parents[4] / "shared" / "data" / "infrabel" / "network_airport.geojson"
@@ -343,6 +343,15 @@ def test_a_jump_of_the_reference_is_told_and_is_no_track(tmp_path: Path) -> None
     site = site_of(run)
     assert "run: 5 positions to which no train can have come are left out" in told(site)
     assert site.track["measure_m"].max() == pytest.approx(996.0, abs=0.1)
+
+
+def test_a_kmz_whose_directory_lies_before_its_begin_is_one_error(tmp_path: Path) -> None:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("doc.kml", "<kml/>")
+    (tmp_path / "line.kmz").write_bytes(packed.getvalue()[4:])
+    with pytest.raises(SiteError, match="cannot be unpacked"):
+        site_of(tmp_path / "line.kmz")
 
 
 BAD = {
