@@ -195,10 +195,8 @@ def _status_of(summary: CampaignSummary, fail_on: str | None) -> int:
 
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
     from pipeline.campaign.calibrated import calibrated
-    from pipeline.results.workers import watched
-    from pipeline.show.terminal import how_far
 
-    with watched(None if quiet else how_far("runs looked at to calibrate")):
+    with _telling("runs looked at to calibrate", quiet):
         return calibrated(plan, runs, jobs)
 
 
@@ -337,7 +335,9 @@ def safety(
         from pipeline.studies.safety.assessment import assess
 
         again = replay_again(logs or [], site, _vehicle(vehicle), jobs, progress_watch)
-        show(assess(out, None if config is None else _configuration(config), again), as_json)
+        with _telling("runs of several solutions"):
+            found = assess(out, None if config is None else _configuration(config), again)
+        show(found, as_json)
         return
     from pipeline.show.terminal import show_tables
     from pipeline.studies.safety import safety_tables
@@ -367,7 +367,9 @@ def claim(
 
     wanted = load_profile(profile)
     ground = _ground(site, _used(out)) if site else None
-    found = hold(out, wanted, ground, read_areas(site, ground) if site and ground else None, front_ahead)
+    areas = read_areas(site, ground) if site and ground else None
+    with _telling("runs"):
+        found = hold(out, wanted, ground, areas, front_ahead)
     if csv is not None:
         write_csv(found.table, csv)
     if as_json or str(csv) != "-":
@@ -377,9 +379,15 @@ def claim(
         _tell(as_json, answer, {title: for_reading(found)}, "", *found.notes)
 
 
-@_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12", of_project=True)
+@_command(
+    "balise inspect monday.mcap",
+    "balise inspect line9",
+    "balise inspect line9 --result week12",
+    "balise inspect week12/runs/run_id=monday/runs.parquet",
+    of_project=True,
+)
 def inspect(
-    path: Annotated[str, Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
+    path: Annotated[str, Argument(help="A log, a CSV or Parquet file, a site, or a result of `balise replay`.")],
     result: Annotated[str | None, Option(help="Result of runs on this site, to check its survey.")] = None,
     site: Annotated[str | None, Option(help="Site to compare a log with.")] = None,
     vehicle: VehicleFile = None,
@@ -520,13 +528,16 @@ def calibrate(
 ) -> None:
     """Measure odometer scale, GNSS latency, fast noise and the monitors' sigmas on fault-free runs."""
     from pipeline.campaign import find_runs
+    from pipeline.results.workers import told
     from pipeline.storage import write_bytes
     from pipeline.studies.calibration.calibrate import calibrate as measure
     from schemas.config import to_toml
 
     settings = _configuration(config)
-    logs = [_log(address, settings) for address in find_runs(runs).values()]
-    found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
+    with _telling("runs read"):
+        logs = [_log(address, settings) for address in told(find_runs(runs).values())]
+    with _telling("runs measured"):
+        found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
     vehicle_found = found.vehicle.model_dump()
     measured = {"out": out, "vehicle": vehicle_found, "monitors": found.monitors, "alarms": found.alarms}
@@ -575,10 +586,7 @@ def experiment(
         names = [*EXPERIMENTS, RECORDED]
         _tell(as_json, {"experiments": names}, {}, *names)
         return
-    from pipeline.results.workers import watched
-    from pipeline.show.terminal import how_far
-
-    with watched(None if quiet else how_far("pieces of work")):
+    with _telling("pieces of work", quiet):
         if name == RECORDED:
             from datasets.experiment.recorded.command import recorded_experiment, shown
 
@@ -635,11 +643,13 @@ def sql(
         _tell(as_json, answer, {"": answer})
 
 
-@_command("balise report week12 --site line9", of_project=True)
+@_command("balise report week12 --site line9", "balise report week12 --run monday", of_project=True)
 def report(
     out: ResultFolder,
     site: Annotated[str | None, Option(help="Site, for plans of the track.")] = None,
     jobs: Annotated[int, Option(min=0, help="Pages at the same time; 0: one per core if there are many.")] = 0,
+    run: Annotated[str | None, Option(help="Write the page of this run alone.")] = None,
+    most: Annotated[int, Option("--pages", min=0, help="No pages of runs unasked where there are more runs.")] = 1000,
     quiet: Quiet = False,
     as_json: Json = False,
     project: OfProject = None,
@@ -648,10 +658,11 @@ def report(
 
     Pages of runs that have not changed since the last report are left as they are.
     """
-    from pipeline.show.report import write_report
-    from pipeline.show.terminal import how_far
+    from pipeline.show.report import write_page, write_report
 
-    pages = write_report(out, _ground(site, _used(out)) if site else None, jobs, None if quiet else how_far("pages"))
+    ground = _ground(site, _used(out)) if site else None
+    with _telling("pages", quiet):
+        pages = write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
     if as_json or not quiet:
         _tell(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
 
@@ -679,7 +690,8 @@ def line(
 
     given, keys = None if points is None else read_points(points), "docs/line.md lists every key."
     decided = settings_from({} if criteria is None else read_toml(criteria), LineCriteria, str(criteria), keys)
-    result = study_line(out, _ground(site, _used(out)), decided, solution, given)
+    with _telling("runs"):
+        result = study_line(out, _ground(site, _used(out)), decided, solution, given)
     files = write_line(result, to or out / "line")
     tables = {"pieces": result.pieces, "proposals": result.proposals}
     answer = {"page": files[0], "files": files, **tables, "remarks": list(result.remarks)}
@@ -729,12 +741,14 @@ def verify(
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
     from pipeline.campaign.verify import recompute
     from pipeline.campaign.verify import verify as compare
-    from pipeline.show.terminal import how_far
+    from pipeline.show.progress import progress_watch
 
-    found = [compare(out, None if quiet else how_far("runs"))]
+    with _telling("runs", quiet):
+        found = [compare(out)]
     if logs:
         settings = _configuration(config) if config else None
-        found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs))
+        shown = [] if quiet else [progress_watch()]
+        found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs, shown))
     if as_json:
         compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
         _print_json({"agrees": not any(one.problems for one in found), "comparisons": compared})
@@ -755,10 +769,9 @@ def compact(
 ) -> None:
     """Put the tables of many runs into few files. Every command reads both forms, also mixed."""
     from pipeline.campaign import compact as packing
-    from pipeline.show.terminal import how_far
 
-    progress = None if quiet else how_far("runs")
-    found = packing.undo(out, progress) if undo else packing.compact(out, runs_per_file, jobs, progress)
+    with _telling("runs", quiet):
+        found = packing.undo(out) if undo else packing.compact(out, runs_per_file, jobs)
     left_out = [f"{run} keeps files of its own: {reason}" for run, reason in found.left_out.items()]
     if as_json or not quiet:
         _tell(as_json, asdict(found), {}, found.sentence, *left_out)
@@ -776,7 +789,8 @@ def diff(
     from pipeline.results.diff.results import diff_results
     from schemas.errors import visible
 
-    found = diff_results(out_a, out_b)
+    with _telling("runs"):
+        found = diff_results(out_a, out_b)
     if as_json:
         _print_json(found.as_dict())
     else:
@@ -873,6 +887,14 @@ def _show(table: pl.DataFrame, title: str = "") -> None:
     from pipeline.show.terminal import show_table
 
     show_table(table, title)
+
+
+def _telling(things: str, quiet: bool = False) -> contextlib.AbstractContextManager[None]:
+    """Say on standard error how many of how many of these things are done, and how long the others will take."""
+    from pipeline.results.workers import watched
+    from pipeline.show.terminal import how_far
+
+    return watched(None if quiet else how_far(things))
 
 
 def _tell(as_json: bool, value: Any, tables: Mapping[str, pl.DataFrame], *words: str) -> None:

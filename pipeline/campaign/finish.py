@@ -13,9 +13,9 @@ from pipeline.results.figures.campaign_figures import derived_tables
 from pipeline.results.marker import metadata_of, sha256
 from pipeline.results.software import software_digest
 from pipeline.storage.address import Address, join
+from pipeline.storage.described import table_bytes
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import Configuration, digest_of
-from schemas.tables import CONTRACT_VERSION
 from schemas.version import SOFTWARE
 
 _MADE_FROM = "made_from"
@@ -33,9 +33,10 @@ def write_campaign(out: Address, config: Configuration, made: Collection[str] = 
 def campaign_files(tables: Mapping[str, pl.DataFrame], config: Configuration, key: str) -> Iterator[tuple[str, bytes]]:
     """Name and content of each of these tables, from the small tables of all runs."""
     derived = derived_tables(tables["runs"], tables["hazards"], tables["passages"], tables["alarms"], config)
-    made = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config), _MADE_FROM: key}
+    made = {"software": SOFTWARE, "config_digest": digest_of(config), _MADE_FROM: key}
     for name, table in derived.items():
-        yield f"campaign/{name}.parquet", store.parquet_bytes(table, {"table": f"campaign/{name}", **made})
+        schema = CAMPAIGN_TABLES[f"campaign_{name}"]
+        yield f"campaign/{name}.parquet", table_bytes(table, f"campaign/{name}", schema, made)
 
 
 def _is_current(out: Address, key: str) -> bool:

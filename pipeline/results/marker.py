@@ -9,7 +9,8 @@ from pathlib import Path
 
 import polars as pl
 
-PREFIX = "balise."
+from pipeline.storage.described import PREFIX
+
 NAME = "runs"
 """The table whose file marks a run complete."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote, unquote
 
@@ -19,13 +19,14 @@ import pyarrow as pa
 from pipeline import storage
 from pipeline.results import packed_tables, packs
 from pipeline.results.marker import NAME as _MARKER
-from pipeline.results.marker import PREFIX, Marker, sha256
+from pipeline.results.marker import Marker, sha256
 from pipeline.results.source import conjuncts, source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join, redacted, shown
+from pipeline.storage.described import PREFIX
 from pipeline.storage.files import exists, read_bytes
 from schemas.config import Configuration, Settings, Vehicle, settings_from, to_toml, toml_of
-from schemas.conform import conform, dtypes
+from schemas.conform import conform, dtypes, meanings
 from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES
@@ -82,16 +83,7 @@ def write_files(out: Address, run_id: str, contents: Mapping[str, bytes]) -> Non
 def table_bytes(frame: pl.DataFrame, table: str, metadata: Mapping[str, str]) -> bytes:
     """A table as Parquet, held to its contract, with unit and meaning in the field of each column."""
     checked = conform(frame, TABLES[table])
-    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata}, _fields(table))
-
-
-@cache
-def _fields(table: str) -> dict[str, dict[str, str]]:
-    """Unit and meaning of each column, as CONTRACT section 3 wants them in every file."""
-    return {
-        name: {"unit": str((column.metadata or {}).get("unit", "")), "meaning": column.description or ""}
-        for name, column in TABLES[table].columns().items()
-    }
+    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata}, meanings(TABLES[table]))
 
 
 def parquet_bytes(
