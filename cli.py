@@ -591,7 +591,14 @@ def experiment(
         return
     for run_id, error in made.failed.items():
         _say(f"{run_id} is not used: {error}")
-    _tell(as_json, {"experiment": name, "out": out, **made.tables}, shown(made), f"\nBegin with {made.page}")
+    _tell(
+        as_json,
+        {"experiment": name, "out": out, **made.tables},
+        shown(made),
+        "",
+        *made.remarks,
+        f"\nBegin with {made.page}",
+    )
     raise Exit(RUNS_NOT_OK if made.failed else OK)
 
 

@@ -17,7 +17,7 @@ from datasets.experiment.recorded.baseline import Baseline, baseline_of
 from datasets.experiment.recorded.draw import Onset, Room, numbered, onsets_of, room_of
 from datasets.experiment.recorded.injection import injected
 from datasets.experiment.recorded.outcome import outcome_row
-from datasets.experiment.recorded.page import recorded_page
+from datasets.experiment.recorded.page import recorded_page, remarks_on
 from datasets.experiment.recorded.pictures import pictures
 from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan, banks_of, load_plan
 from datasets.experiment.recorded.tables import Quiet, banks_table, cells_table, places_table, pmd_table
@@ -76,6 +76,11 @@ class Made:
     failed: dict[str, str]
     page: Path
 
+    @property
+    def remarks(self) -> list[str]:
+        """What the figures do not prove."""
+        return remarks_on(self.tables)
+
 
 @dataclass(frozen=True)
 class _Surveyed:
@@ -127,6 +132,8 @@ def recorded_experiment(
     given = {"seed": seed, "per_cell": per_cell}
     plan = plan.model_copy(update={name: value for name, value in given.items() if value is not None})
     inputs = _inputs(runs, site, vehicle, config, solution, plan, banks_of(plan, plan_file, config))
+    # An earlier call may have found other runs at these addresses.
+    _KEPT.clear()
     surveyed = mapped(_survey, [(inputs, run) for run in inputs.runs], jobs)
     rooms = [one.room for one in surveyed if one.room is not None]
     if not rooms:
@@ -226,9 +233,9 @@ def _refuse_lack_of_room(
         raise InputError(
             "no run has room for any fault of the plan",
             place=", ".join(room.run_id for room in rooms),
-            found=f"at most {longest_s:.0f} s without an alarm after an instant at which nothing is left out",
+            found=f"at most {longest_s:.0f} s without an alarm from an instant that may be used; {_left_out(rooms)}",
             expected=f"{shortest_s:.0f} s",
-            remedy="`experiment_runs` of a longer run says what is left out and why.",
+            remedy="Give longer runs, or runs in which less is wrong.",
         )
     if plan_file is None:
         return
@@ -246,6 +253,15 @@ def _refuse_lack_of_room(
             expected=f"{cell.count}",
             remedy="Give more or longer runs, fewer injections, or a smaller `apart_s` or `watch_s`.",
         )
+
+
+def _left_out(rooms: Sequence[Room]) -> str:
+    """Time that may be used, and why the rest may not."""
+    sums: dict[str, float] = {}
+    for room in rooms:
+        for name, seconds in room.seconds_left_out().items():
+            sums[name] = sums.get(name, 0.0) + seconds
+    return ", ".join(f"{name.removesuffix('_s')} {seconds:.0f} s" for name, seconds in sums.items() if seconds)
 
 
 def _pieces(inputs: Inputs, onsets: Sequence[Onset], digests: dict[str, str], out: Path) -> list[_Piece]:
