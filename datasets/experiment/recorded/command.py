@@ -70,11 +70,11 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Made:
-    """The tables by name, and the runs that could not be used, with the reason."""
+    """The tables by name, the runs that could not be used, with the reason, and what was written, the page first."""
 
     tables: dict[str, pl.DataFrame]
     failed: dict[str, str]
-    page: Path
+    files: list[Path]
 
     @property
     def remarks(self) -> list[str]:
@@ -144,9 +144,9 @@ def recorded_experiment(
     digests = {one.run_id: one.run_digest for one in surveyed}
     pieces = _pieces(inputs, numbered(cells, drawn), digests, out)
     tables = _tables(mapped(_made_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
-    _write(out, tables, plan)
+    files = _write(out, tables, plan)
     _forget_others(pieces, out)
-    return Made(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, out / PAGE)
+    return Made(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, files)
 
 
 def _inputs(
@@ -341,20 +341,24 @@ def _together(bank: str, surveyed: Sequence[_Surveyed]) -> Quiet:
     return Quiet(bank=bank, runs=len(parts), **sums)
 
 
-def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> None:
-    for name, table in tables.items():
-        contract = EXPERIMENT_TABLES[f"experiment_{name}"]
-        notes = {
-            column: {"unit": str((kind.metadata or {}).get("unit", "")), "meaning": kind.description or ""}
-            for column, kind in contract.columns().items()
-        }
-        metadata = {"balise.table": f"experiment_{name}", "balise.software": SOFTWARE}
-        storage.write_bytes(out / f"{name}.parquet", parquet_bytes(table, metadata, notes))
-    storage.write_bytes(out / "plan.toml", to_toml(plan).encode())
+def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> list[Path]:
     drawn = pictures(tables)
-    for name, (_, drawing) in drawn.items():
-        storage.write_bytes(out / f"{name}.svg", drawing.encode())
-    storage.write_bytes(out / PAGE, recorded_page(tables, drawn, plan).encode())
+    contents = {PAGE: recorded_page(tables, drawn, plan).encode(), "plan.toml": to_toml(plan).encode()}
+    contents |= {f"{name}.parquet": _table_bytes(name, table) for name, table in tables.items()}
+    contents |= {f"{name}.svg": drawing.encode() for name, (_, drawing) in drawn.items()}
+    for name, content in contents.items():
+        storage.write_bytes(out / name, content)
+    return [out / name for name in contents]
+
+
+def _table_bytes(name: str, table: pl.DataFrame) -> bytes:
+    """A table as Parquet, with unit and meaning in the field of each column."""
+    columns = EXPERIMENT_TABLES[f"experiment_{name}"].columns()
+    notes = {
+        column: {"unit": str((kind.metadata or {}).get("unit", "")), "meaning": kind.description or ""}
+        for column, kind in columns.items()
+    }
+    return parquet_bytes(table, {"balise.table": f"experiment_{name}", "balise.software": SOFTWARE}, notes)
 
 
 def _forget_others(pieces: Sequence[_Piece], out: Path) -> None:
