@@ -9,7 +9,7 @@ TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 POLAR
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 STAMP := $(VENV)/.balise-installed
 
-.PHONY: install demo test quick stress check lint types bench mutations dictionary lock clean
+.PHONY: install demo test quick stress check lint types bench docs mutations dictionary lock clean
 
 install: $(STAMP)
 
@@ -44,6 +44,11 @@ check: lint types test
 
 bench: install
 	$(BIN)/python -m benchmarks
+
+# The documentation as a site. A broken link or a page that is not in the menu is an error. Needs no network.
+docs: install
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c docs . build/docs
+	@echo "build/docs/index.html"
 
 mutations: install
 	$(BIN)/python -m benchmarks.mutations

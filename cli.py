@@ -10,6 +10,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from datetime import datetime
 from functools import cache, partial
 from pathlib import Path
@@ -376,9 +377,15 @@ def claim(
         _tell(as_json, answer, {title: for_reading(found)}, "", *found.notes)
 
 
-@_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12", of_project=True)
+@_command(
+    "balise inspect monday.mcap",
+    "balise inspect line9",
+    "balise inspect line9 --result week12",
+    "balise inspect week12/runs/run_id=monday/runs.parquet",
+    of_project=True,
+)
 def inspect(
-    path: Annotated[str, Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
+    path: Annotated[str, Argument(help="A log, a CSV or Parquet file, a site, or a result of `balise replay`.")],
     result: Annotated[str | None, Option(help="Result of runs on this site, to check its survey.")] = None,
     site: Annotated[str | None, Option(help="Site to compare a log with.")] = None,
     vehicle: VehicleFile = None,
@@ -561,6 +568,9 @@ def experiment(
     config: Annotated[
         Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue`, `recorded` only).")
     ] = None,
+    noise_of: Annotated[
+        Path | None, _file(help="Result of fault-free runs whose noise replaces the published one (`rare` only).")
+    ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -585,7 +595,7 @@ def experiment(
         else:
             wanted = experiment_of(name, on_recordings=bool(runs or site or vehicle or plan))
             bank = None if config is None else _configuration(config)
-            files = wanted(out, repetitions, 1 if seed is None else seed, jobs, bank)
+            files = wanted(out, repetitions, 1 if seed is None else seed, jobs, bank, noise_of)
     if name != RECORDED:
         _tell(as_json, {"experiment": name, "out": out, "files": files}, {}, *map(str, files))
         return
@@ -734,12 +744,33 @@ def verify(
         settings = _configuration(config) if config else None
         found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs))
     if as_json:
-        compared = [{"compared": one.compared, "problems": one.table} for one in found]
+        compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
         _print_json({"agrees": not any(one.problems for one in found), "comparisons": compared})
     for one in found if not as_json else []:
         if one.problems or not quiet:
             _tell(False, None, {"": one.table} if one.problems else {}, one.sentence)
     raise Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
+
+
+@_command("balise compact week12", "balise compact s3://trial/week12 --runs-per-file 5000")
+def compact(
+    out: Result,
+    runs_per_file: Annotated[int, Option(min=1, help="Runs of one file at most; long runs are fewer.")] = 2000,
+    undo: Annotated[bool, Option("--undo", help="Give each run files of its own again, with the same bytes.")] = False,
+    jobs: Jobs = 0,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Put the tables of many runs into few files. Every command reads both forms, also mixed."""
+    from pipeline.campaign import compact as packing
+    from pipeline.show.terminal import how_far
+
+    progress = None if quiet else how_far("runs")
+    found = packing.undo(out, progress) if undo else packing.compact(out, runs_per_file, jobs, progress)
+    left_out = [f"{run} keeps files of its own: {reason}" for run, reason in found.left_out.items()]
+    if as_json or not quiet:
+        _tell(as_json, asdict(found), {}, found.sentence, *left_out)
+    raise Exit(RUNS_NOT_OK if left_out else OK)
 
 
 @_command("balise diff week11 week12", "balise diff week11 week12 --detail")

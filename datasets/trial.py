@@ -22,10 +22,11 @@ from datasets.odometer import odometer_stream
 from datasets.receiver import TrainOnLine, gnss_streams, reference_stream
 from datasets.scenario import LogKind, RunSpec, Scenario
 from pipeline.storage import replace_files
-from pipeline.storage.parquet import parquet_bytes
+from pipeline.storage.described import table_bytes
 from schemas.config import Vehicle, settings_from, to_toml
 from schemas.errors import OutputError
-from schemas.run import STREAMS, RunLog, Site
+from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
+from schemas.run import STREAMS, RunLog, Site, Stream
 
 # Runs of a trial start one hour after the other.
 _RUN_SPACING = timedelta(hours=1)
@@ -99,7 +100,7 @@ def write_site(site: Site, folder: Path) -> None:
     for name in ("track", "links", "balises", "route"):
         table: pl.DataFrame | None = getattr(site, name)
         if table is not None:
-            (folder / f"{name}.parquet").write_bytes(parquet_bytes(table))
+            (folder / f"{name}.parquet").write_bytes(table_bytes(table, name, SITE_SCHEMAS[name], {}))
 
 
 def write_run_log(run: RunLog, folder: Path, log: LogKind = "parquet") -> Path:
@@ -116,9 +117,14 @@ def write_run_as(run: RunLog, path: Path, log: LogKind | None = None) -> None:
         write_mcap(run, path, encoding=log)
         return
     # No stream that an earlier run left here may be taken for one of this run, and without GNSS none is a run.
-    streams = {f"{name}.parquet": run.stream(name) for name in STREAMS}
-    contents = {file: None if table is None else parquet_bytes(table) for file, table in streams.items()}
+    contents = {f"{name}.parquet": _stream_bytes(name, run.stream(name), path.name) for name in STREAMS}
     replace_files(path, contents, marker="gnss.parquet")
+
+
+def _stream_bytes(name: Stream, stream: pl.DataFrame | None, run_id: str) -> bytes | None:
+    if stream is None:
+        return None
+    return table_bytes(stream, name, STREAM_SCHEMAS[name], {"run_id": run_id})
 
 
 def _start_ns(scenario: Scenario, spec: RunSpec) -> int:

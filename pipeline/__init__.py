@@ -11,8 +11,9 @@ if TYPE_CHECKING:
     from pipeline.one_run import replay
     from pipeline.read.ingest import read_run
     from pipeline.read.site.read import read_site
+    from pipeline.results.store import read_table
 
-__all__ = ["read_run", "read_site", "replay"]
+__all__ = ["read_run", "read_site", "read_table", "replay"]
 
 
 def __getattr__(name: str) -> Any:
@@ -29,4 +30,8 @@ def __getattr__(name: str) -> Any:
         from pipeline.read.site.read import read_site
 
         return read_site
+    if name == "read_table":
+        from pipeline.results.store import read_table
+
+        return read_table
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,7 +15,7 @@ from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.stages.ride import Ride, ride_of
 from pipeline.stages.run_row.notes import ride_notes
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
-from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run, refuse_impossible
+from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit
 from pipeline.studies.undetected.columns import Undetected
 from pipeline.studies.undetected.ride import unnoticed_of
 from schemas.config import Configuration, Vehicle
@@ -74,7 +74,7 @@ def _place_solutions(prepared: PreparedRun) -> _Placed:
     errors: dict[str, InputError] = {}
     for name in prepared.run.solutions():
         try:
-            fits[name] = _fit(prepared, name)
+            fits[name] = required_fit(prepared, name, prepared.vehicle)
             matches[name] = prepared.match(name)
         except InputError as error:
             # A receiver that never had a fix must not take the run's other solutions with it.
@@ -82,15 +82,6 @@ def _place_solutions(prepared: PreparedRun) -> _Placed:
     if not matches:
         raise next(iter(errors.values()))
     return _Placed(fits, matches, errors)
-
-
-def _fit(prepared: PreparedRun, solution: str) -> Fit:
-    """Whether the streams fit each other; raises `InputError` where no train can have driven what they hold."""
-    prepared.fixes(solution)
-    config = prepared.config
-    fit = fit_run(prepared.recorded, solution, prepared.vehicle, config.plausibility, prepared.site)
-    refuse_impossible(fit, f"{prepared.run.run_id}: solution {solution!r}", config.ingest)
-    return fit
 
 
 def _replay_solution(prepared: PreparedRun, solution: str, placed: _Placed, evidence: TrainEvidence) -> Tables:

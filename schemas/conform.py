@@ -48,6 +48,15 @@ def dtypes(schema: type[dy.Schema]) -> dict[str, pl.DataType]:
     return {rule.name: rule.dtype for rule in _rules(schema)}
 
 
+@lru_cache(maxsize=64)
+def meanings(schema: type[dy.Schema]) -> dict[str, dict[str, str]]:
+    """Unit and meaning of each column, as they stand in the fields of every file."""
+    return {
+        name: {"unit": str((column.metadata or {}).get("unit", "")), "meaning": column.description or ""}
+        for name, column in schema.columns().items()
+    }
+
+
 def _cast(series: pl.Series, dtype: pl.DataType) -> pl.Series:
     return series if series.dtype == dtype else series.cast(dtype)
 

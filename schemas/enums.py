@@ -206,6 +206,24 @@ class MisfitPlace(StrEnum):
     IN_REFERENCE = "in_reference"
 
 
+class NotShown(StrEnum):
+    """Why the data neither meet nor break a requirement; the words are in `schemas/words.toml`."""
+
+    BEFORE_LOG = "before_log"
+    AT_SWITCH_ON = "at_switch_on"
+    SINCE_SWITCH_ON = "since_switch_on"
+    WITHOUT_POWER = "without_power"
+    WITHIN_WINDOW = "within_window"
+    NOT_RECORDED = "not_recorded"
+    NO_LONG_WAY = "no_long_way"
+    NO_EVENT_ON_WAYS = "no_event_on_ways"
+    NOTHING_RECORDED = "nothing_recorded"
+    EVIDENCE_SILENT = "evidence_silent"
+    NO_PROBABILITY = "no_probability"
+    PARTLY_SILENT = "partly_silent"
+    TOO_FEW = "too_few"
+
+
 class Note(StrEnum):
     """What the notes of a run say; their words are in `schemas/words.toml`."""
 

@@ -13,7 +13,7 @@ from enum import StrEnum
 from importlib.resources import files
 from typing import Any, TypeVar
 
-from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, Reason, Remedy
+from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, NotShown, Reason, Remedy
 
 Code = TypeVar("Code", bound=StrEnum)
 BETWEEN = "; "
@@ -42,6 +42,7 @@ REASONS = _sentences(Reason, "reasons")
 CAUSES = _sentences(MisfitCause, "causes")
 MISFIT_PLACES = _sentences(MisfitPlace, "misfit_places")
 LOST = _sentences(LostTo, "lost")
+NOT_SHOWN = _sentences(NotShown, "not_shown")
 REMEDIES = _sentences(Remedy, "remedies")
 
 

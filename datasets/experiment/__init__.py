@@ -34,6 +34,7 @@ class Experiment:
         seed: int = 1,
         jobs: int = 1,
         config: Configuration | None = None,
+        recorded: Path | None = None,
     ) -> list[Path]:
         if config is not None and not self.configured:
             from schemas.errors import UsageError
@@ -44,12 +45,17 @@ class Experiment:
                 expected="the published settings",
                 remedy="`rare`, `bank` and `catalogue` judge the bank of a configuration.",
             )
+        if recorded is not None and self.name != "rare":
+            from schemas.errors import UsageError
+
+            raise UsageError("takes no recorded noise", place=f"experiment {self.name}", expected="`experiment rare`")
         from datasets.experiment.tables import write
 
-        module = import_module(f"datasets.experiment.{self.module}")
+        module = import_module(f"datasets.experiment.{self.module if recorded is None else 'rare_recorded'}")
         count = repetitions or module.REPETITIONS
         settings = {"experiment": self.name, "repetitions": count, "seed": seed} | getattr(module, "SETTINGS", {})
-        return write(out, module.made(count, seed, jobs, config), settings)
+        noise = () if recorded is None else (recorded,)
+        return write(out, module.made(*noise, count, seed, jobs, config), settings)
 
 
 EXPERIMENTS: dict[str, Experiment] = {

@@ -231,11 +231,23 @@ def linear_bank(geometry: Geometry, heading_deg: float, spec: BankSpec) -> Linea
     return _assemble(spec, axes, covariances, np.exp(-dt_s / TAUS_S), vectors @ geometry.ramp_direction)
 
 
-def _assemble(spec: BankSpec, axes: tuple[str, ...], covariances: Floats, phi: Floats, slope: Floats) -> LinearBank:
+def bank_along(spec: BankSpec, variances_m2: Floats, taus_s: Floats, white_m: float) -> LinearBank:
+    """The monitors along the track of a train whose positions have these errors; the fault is a ramp along the track.
+
+    `variances_m2`, `taus_s` (sources,): Gauss-Markov errors in the order of `SOURCES`. `white_m`: white noise on
+    position.
+    """
+    covariances = variances_m2[:, None, None]
+    return _assemble(spec, AXES[:1], covariances, np.exp(-1.0 / spec.rate_hz / taus_s), np.ones(1), white_m)
+
+
+def _assemble(
+    spec: BankSpec, axes: tuple[str, ...], covariances: Floats, phi: Floats, slope: Floats, white_m: float = 0.0
+) -> LinearBank:
     count = len(axes)
     gauss_markov = len(SOURCES) * len(axes)
     position_white = np.full(count, spec.map_m)
-    position_white[0] = spec.odometer_m if spec.reading == "position" else 0.0
+    position_white[0] = np.hypot(white_m, spec.odometer_m) if spec.reading == "position" else white_m
     sources = gauss_markov + count
     alphas = 1.0 - (1.0 - np.array(spec.weights)) ** (1.0 / spec.rate_hz)
     alpha = np.tile(alphas, count)

@@ -14,8 +14,9 @@ from scipy.stats import binom
 
 from pipeline import storage
 from pipeline.stages.run_row.bounds import CONFIDENCE, clopper_pearson
-from pipeline.storage.parquet import parquet_bytes
+from pipeline.storage.described import noted_bytes
 from schemas.arrays import Floats
+from schemas.version import SOFTWARE
 
 # By name: tables, and pages and pictures under their whole name.
 Contents = Mapping[str, pl.DataFrame | str | bytes]
@@ -81,10 +82,11 @@ def table(rows: list[Row]) -> pl.DataFrame:
 
 def write(out: Path, contents: Contents, settings: Mapping[str, object]) -> list[Path]:
     """Every content and `settings.json`, which made them; the same content gives the same bytes."""
-    files = {**contents, "settings.json": json.dumps(dict(settings), indent=2, sort_keys=True) + "\n"}
+    made = json.dumps(dict(settings), indent=2, sort_keys=True) + "\n"
+    files = {**contents, "settings.json": made}
     for name, content in files.items():
         if isinstance(content, pl.DataFrame):
-            content = parquet_bytes(content)
+            content = noted_bytes(content, {"table": name, "software": SOFTWARE, "settings": made})
         storage.write_bytes(_path(out, name), content.encode() if isinstance(content, str) else content)
     return [_path(out, name) for name in files]
 

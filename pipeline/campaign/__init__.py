@@ -6,7 +6,8 @@ Touches files, stores, processes and clusters; what one run says is made by `pip
 A campaign from `plan` to tables: `run`. Runs are handed to an engine (`engines`, `cluster`) by `loop`; one run from its
 log (`recorded_log`) to its tables: `worker`; what became of it: `outcome`; the tables over all runs: `finish`. Which
 runs are complete: `resume`. One campaign at a time: `lock`. How to stop: `interruption`. Times that somebody waits:
-`waits`. Whether a result is what it says: `verify`; the same logs with other settings: `again`, `calibrated`.
+`waits`. Whether a result is what it says: `verify`; many runs in few files: `compact`; the same logs with other
+settings: `again`, `calibrated`.
 """
 
 from pipeline.campaign.interruption import Interrupted

@@ -10,11 +10,12 @@ import polars as pl
 from pipeline import storage
 from pipeline.results import catalogue, manifest, store
 from pipeline.results.figures.campaign_figures import derived_tables
+from pipeline.results.marker import metadata_of, sha256
 from pipeline.results.software import software_digest
 from pipeline.storage.address import Address, join
+from pipeline.storage.described import table_bytes
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import Configuration, digest_of
-from schemas.tables import CONTRACT_VERSION
 from schemas.version import SOFTWARE
 
 _MADE_FROM = "made_from"
@@ -32,9 +33,10 @@ def write_campaign(out: Address, config: Configuration, made: Collection[str] = 
 def campaign_files(tables: Mapping[str, pl.DataFrame], config: Configuration, key: str) -> Iterator[tuple[str, bytes]]:
     """Name and content of each of these tables, from the small tables of all runs."""
     derived = derived_tables(tables["runs"], tables["hazards"], tables["passages"], tables["alarms"], config)
-    made = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config), _MADE_FROM: key}
+    made = {"software": SOFTWARE, "config_digest": digest_of(config), _MADE_FROM: key}
     for name, table in derived.items():
-        yield f"campaign/{name}.parquet", store.parquet_bytes(table, {"table": f"campaign/{name}", **made})
+        schema = CAMPAIGN_TABLES[f"campaign_{name}"]
+        yield f"campaign/{name}.parquet", table_bytes(table, f"campaign/{name}", schema, made)
 
 
 def _is_current(out: Address, key: str) -> bool:
@@ -44,13 +46,13 @@ def _is_current(out: Address, key: str) -> bool:
     expected = manifest.earlier(out)["files"]
     return all(
         content is not None
-        and store.metadata_of(content).get(_MADE_FROM) == key
-        and expected.get(name, {}).get("sha256") == manifest.sha256(content)
+        and metadata_of(content).get(_MADE_FROM) == key
+        and expected.get(name, {}).get("sha256") == sha256(content)
         for name, content in contents.items()
     )
 
 
 def campaign_key(out: Address, config: Configuration) -> str:
     """The digest of all that decides these tables: program, configuration and every marker, which names its tables."""
-    runs = [(run, manifest.sha256(content)) for run, content in store.markers(out)]
+    runs = [(marker.run_id, marker.sha256) for marker in store.markers(out)]
     return hashlib.sha256(repr((software_digest(), digest_of(config), runs)).encode()).hexdigest()

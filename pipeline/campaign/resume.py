@@ -1,8 +1,8 @@
 """Which runs are complete and unchanged, known without opening a log or a table.
 
-`OUT/.catalogue/complete` keeps the outcome of each run with a proof: a digest over the states (size, times, inode) of
-its log and of its `runs` file, and over all that decides its tables. It may be deleted at any time. A run whose proof
-is another one goes to a worker, which holds contents against each other. Local results of local logs only.
+`OUT/.catalogue/complete` keeps the outcome of each run with a proof: a digest over the states (size, times, inode)
+of its log and all that decides its tables, and one over the state of its marker. It may be deleted at any time. A run
+whose proof is another one goes to a worker, which holds contents against each other. Local results of local logs only.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,10 +19,10 @@ from pydantic import TypeAdapter
 from pipeline import storage
 from pipeline.campaign.plan import Plan, RunJob, digests
 from pipeline.campaign.waits import WAITS
-from pipeline.results import catalogue, store
+from pipeline.results import catalogue, packs, store
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
-from pipeline.storage.address import is_url
+from pipeline.storage.address import is_url, join
 from schemas.arrays import NS_PER_S
 from schemas.errors import OutputError
 
@@ -36,17 +36,29 @@ def proof_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
         return ""
     if max(file.changed_ns for file in log) > time.time_ns() - WAITS.settled_s * NS_PER_S:
         return ""
-    try:
-        return _digest(job, log)
-    except OSError:
-        return ""
+    place = _places(job.out, [job.run_id]).get(job.run_id)
+    return "" if place is None else f"{_made_of(job, log)} {place}"
 
 
 def unchanged(plan: Plan) -> list[RunOutcome]:
     """The outcomes of the runs of a plan that are complete, and whose log nobody has touched since."""
-    known = kept(plan.out)
+    known = in_place(plan.out)
     candidates = ((job, known[job.run_id]) for job in plan.jobs if job.run_id in known)
     return [replace(outcome, skipped=True) for job, outcome in candidates if _holds(job, outcome)]
+
+
+def in_place(out: str) -> dict[str, RunOutcome]:
+    """The outcomes that are kept of runs whose marker nobody has touched since."""
+    known = kept(out)
+    places = _places(out, list(known))
+    return {run: outcome for run, outcome in known.items() if outcome.proof.partition(" ")[2] == places.get(run)}
+
+
+def keep_in_place(out: str, known: Mapping[str, RunOutcome]) -> None:
+    """Keep these outcomes of runs that lie elsewhere now, with the same content."""
+    places = _places(out, list(known))
+    proofs = {run: outcome.proof.partition(" ")[0] for run, outcome in known.items()}
+    _keep(out, [replace(outcome, proof=f"{proofs[run]} {places[run]}") for run, outcome in known.items()])
 
 
 def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
@@ -55,10 +67,13 @@ def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
         return
     named = {job.run_id for job in plan.jobs}
     others = [outcome for run_id, outcome in kept(plan.out).items() if run_id not in named]
-    rows = [replace(outcome, attempts=1) for outcome in (*others, *outcomes) if outcome.proof]
+    _keep(plan.out, [replace(outcome, attempts=1) for outcome in (*others, *outcomes) if outcome.proof])
+
+
+def _keep(out: str, outcomes: list[RunOutcome]) -> None:
     # It can be done without, and so must not hide why a campaign ends.
     with contextlib.suppress(OutputError):
-        catalogue.keep(plan.out, _NAME, software_digest(), _OUTCOMES.dump_json(rows))
+        catalogue.keep(out, _NAME, software_digest(), _OUTCOMES.dump_json(outcomes))
 
 
 def kept(out: str) -> dict[str, RunOutcome]:
@@ -75,11 +90,23 @@ def _holds(job: RunJob, outcome: RunOutcome) -> bool:
     if is_url(job.address) or (job.write_route and not Path(job.write_route).exists()):
         return False
     try:
-        return _digest(job, storage.signature(Path(job.address))) == outcome.proof
+        return _made_of(job, storage.signature(Path(job.address))) == outcome.proof.partition(" ")[0]
     except OSError:
         return False
 
 
-def _digest(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
-    marker = storage.signature(Path(store.table_address(job.out, "runs", job.run_id)))
-    return hashlib.sha256(repr((job.address, log, marker, digests(job, ""))).encode()).hexdigest()
+def _made_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
+    return hashlib.sha256(repr((job.address, log, digests(job, ""))).encode()).hexdigest()
+
+
+def _places(out: str, runs: Sequence[str]) -> dict[str, str]:
+    """What changes with the marker of each of these runs that is there: with its `runs` file, or its pack's index."""
+    packed = store.packed(out, runs)
+    files = {run: store.table_address(out, "runs", run) for run in runs}
+    files |= {run: join(out, packs.file_name(packs.INDEX, place.pack.name)) for run, place in packed.items()}
+    states = {file: storage.version(file) for file in set(files.values())}
+    return {
+        run: hashlib.sha256(state.encode()).hexdigest()
+        for run, file in files.items()
+        if (state := states[file]) is not None
+    }

@@ -7,6 +7,7 @@ import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any
 
 import polars as pl
@@ -17,9 +18,10 @@ from pipeline.campaign.finish import campaign_files, campaign_key
 from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
-from pipeline.results import catalogue, store
+from pipeline.results import catalogue, packs, store
 from pipeline.results.figures.head import word_of
-from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest, sha256
+from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest
+from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
 from pipeline.storage.address import Address, join, redacted
@@ -41,12 +43,28 @@ _COLUMNS = ("what", "found", "expected")
 _OWN_FILES = (NAME, lock.NAME, lock.HELD, "replay.log")
 
 
+class NotCompared(StrEnum):
+    """What of a result could not be made again, and so was compared with nothing."""
+
+    CATALOGUE = "catalogue"
+    """Tables that this build cannot read, or that do not agree themselves."""
+    CAMPAIGN_TABLES = "campaign_tables"
+    """The same, or runs made by another build of the program."""
+
+
+_NOT_COMPARED = {
+    NotCompared.CATALOGUE: "the copies in .catalogue",
+    NotCompared.CAMPAIGN_TABLES: "the tables in campaign/, which the build that made them can make again",
+}
+
+
 @dataclass(frozen=True)
 class Verification:
     """What was compared and what differs: `what, found, expected`, digests shortened."""
 
     compared: str
     problems: tuple[Problem, ...]
+    not_compared: tuple[NotCompared, ...] = ()
 
     @property
     def table(self) -> pl.DataFrame:
@@ -54,9 +72,9 @@ class Verification:
 
     @property
     def sentence(self) -> str:
-        if not self.problems:
-            return f"{self.compared}: all agree"
-        return f"{self.compared}: {len(self.problems)} do not agree"
+        left_out = " and ".join(_NOT_COMPARED[item] for item in self.not_compared)
+        rest = f"; not compared: {left_out}" if left_out else ""
+        return f"{self.compared}: {f'{len(self.problems)} do not' if self.problems else 'all'} agree{rest}"
 
 
 def verify(out: Address, progress: Progress | None = None) -> Verification:
@@ -71,6 +89,7 @@ def verify(out: Address, progress: Progress | None = None) -> Verification:
     named = manifest["runs"]
     problems = [_only_in_one(run, run in there) for run in sorted(there.keys() ^ named.keys())]
     problems += _differences("", *(_digests(of["files"]) for of in (again, manifest)))
+    problems += _packs(out)
     problems += _differences("page ", _pages(out), _digests(manifest.get("pages", {})))
     problems += _differences("site ", *(_sites(of["sites"]) for of in (again, manifest)))
     runs = sorted(there.keys() & named.keys())
@@ -80,18 +99,21 @@ def verify(out: Address, progress: Progress | None = None) -> Verification:
             progress(min(first + _RUNS_AT_ONCE, len(runs)), len(runs))
     known = {*manifest["files"], *again["files"], *_OWN_FILES}
     problems += [(name, "there", "not in the manifest") for name in _other_files(out, {*there, *named}, known)]
+    not_compared = tuple(NotCompared)
     if not problems:
-        problems = _made_again(out, {run["software_digest"] for run in there.values()})
+        problems, not_compared = _made_again(out, {run["software_digest"] for run in there.values()})
     files = len(manifest["files"]) + len(manifest.get("pages", {})) + len(TABLES) * len(runs)
-    return Verification(f"{files} files of {len(runs)} runs against {NAME}", tuple(problems))
+    return Verification(f"{files} files of {len(runs)} runs against {NAME}", tuple(problems), not_compared)
 
 
 def _of_runs(out: Address, runs: Sequence[str], there: dict[str, Any], named: dict[str, Any]) -> Iterator[Problem]:
     """Provenance and tables of some runs; and of tables that agree with the manifest, what the marker says of them."""
-    contents = _tables(out, runs)
     of_run = {run: metadata.get("run_id", "") for run, metadata in store.completed_runs(out, runs).items()}
+    packed = store.packed(out, runs)
+    contents = _tables(out, [run for run in runs if run not in packed])
     for run in runs:
-        present = _parts(there[run]) | contents[run]
+        # What stands in its pack was found the same as its files, and the files of the pack are compared.
+        present = _parts(there[run]) | contents.get(run, there[run]["tables"])
         expected = _parts(named[run]) | named[run]["tables"]
         yield from _differences(f"run {run}, ", present, expected)
         yield from _differences(f"marker of run {run}, ", there[run]["tables"], named[run]["tables"])
@@ -169,6 +191,13 @@ def _manifest(out: Address) -> Manifest:
     return manifest
 
 
+def _packs(out: Address) -> Iterator[Problem]:
+    """Files of packs against the list of packs, which the manifest names."""
+    for pack in packs.listed(out):
+        expected = packs.file_digests(pack)
+        yield from _differences("", {name: sha256(storage.content_of(join(out, name))) for name in expected}, expected)
+
+
 def _only_in_one(run: str, is_there: bool) -> Problem:
     """A run that only one of the two has; a call that was ended leaves some that the manifest does not name yet."""
     if is_there:
@@ -190,14 +219,14 @@ def _pages(out: Address) -> dict[str, str]:
 
 def _other_files(out: Address, runs: set[str], known: set[str]) -> Iterator[str]:
     """Files that are neither known, nor of a run, nor of `balise line`; pages and catalogue are looked at elsewhere."""
-    of_runs = {f"{table}/run_id={store.file_name(run)}/{table}.parquet" for table in TABLES for run in runs}
-    expected = of_runs | known
+    of_runs = {f"{table}/{store.folder_name(run)}/{table}.parquet" for table in TABLES for run in runs}
+    expected = of_runs | known | {name for pack in packs.listed(out) for name in packs.file_digests(pack)}
     for name in storage.files_below(out):
         if name not in expected and not name.startswith((f"{catalogue.FOLDER}/", "report/", "line/")):
             yield name
 
 
-def _made_again(out: Address, software: set[str]) -> list[Problem]:
+def _made_again(out: Address, software: set[str]) -> tuple[list[Problem], tuple[NotCompared, ...]]:
     """The catalogue and the campaign's tables against the runs' own tables, which agree with the manifest.
 
     The campaign's tables can be made again by the build that made them, with the configuration that lies there.
@@ -211,13 +240,14 @@ def _made_again(out: Address, software: set[str]) -> list[Problem]:
     stale = [t for t, copy in copies.items() if copy is not None and not (t in tables and copy.equals(tables[t]))]
     problems = [(f"{catalogue.FOLDER}/{table}", "other rows", "those of the runs' tables") for table in stale]
     if len(tables) < len(catalogue.CATALOGUED):
-        return problems
+        return problems, tuple(NotCompared)
     problems += _outcomes(out, tables)
     config = store.read_config(out)
-    if config is not None and software == {software_digest()}:
-        for name, content in campaign_files(tables, config, campaign_key(out, config)):
-            problems += _differences("", {name: sha256(content)}, {name: sha256(storage.content_of(join(out, name)))})
-    return problems
+    if config is None or software != {software_digest()}:
+        return problems, (NotCompared.CAMPAIGN_TABLES,)
+    for name, content in campaign_files(tables, config, campaign_key(out, config)):
+        problems += _differences("", {name: sha256(content)}, {name: sha256(storage.content_of(join(out, name)))})
+    return problems, ()
 
 
 def _outcomes(out: Address, tables: Mapping[str, pl.DataFrame]) -> Iterator[Problem]:

@@ -24,7 +24,8 @@ from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
 from pipeline.read.site.route import with_route
 from pipeline.results import store
-from pipeline.results.manifest import sha256, tables_noted
+from pipeline.results.manifest import tables_noted
+from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
 from pipeline.storage import files
@@ -121,10 +122,8 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
 
 def _is_whole(job: RunJob, marker: Mapping[str, str]) -> bool:
     """The tables that the outcome is read from are those that the marker was written with."""
-    places = {name: str(store.table_address(job.out, name, job.run_id)) for name in _OUTCOME}
-    contents = storage.read_many(list(places.values()))
     expected = tables_noted(marker)
-    return all(sha256(contents.get(place)) == expected.get(name) for name, place in places.items())
+    return all(sha256(store.content_of(job.out, name, job.run_id)) == expected.get(name) for name in _OUTCOME)
 
 
 def _earlier(job: RunJob, log: RecordedLog) -> RunOutcome:

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.results.store import parquet_bytes
 from pipeline.storage import write_bytes
+from pipeline.storage.described import noted_bytes
 from schemas.errors import UsageError
+from schemas.version import SOFTWARE
 
 # Excel has no nanoseconds and no time zones, and a sheet ends here.
 _MOST_ROWS = 1_048_575
@@ -51,7 +52,7 @@ def write_csv(answer: pl.DataFrame, file: Path) -> None:
 
 def write_parquet(answer: pl.DataFrame, file: Path) -> None:
     """Parquet with the types of the tables."""
-    write_bytes(file, parquet_bytes(answer, {}))
+    write_bytes(file, noted_bytes(answer, {"table": "answer of `balise sql`", "software": SOFTWARE}))
 
 
 def write_xlsx(answer: pl.DataFrame, file: Path) -> None:

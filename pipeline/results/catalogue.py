@@ -13,7 +13,7 @@ from urllib.parse import unquote
 import polars as pl
 
 from pipeline import storage
-from pipeline.results import store
+from pipeline.results import packs, store
 from pipeline.results.source import source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, join
@@ -57,18 +57,32 @@ def address_of(out: Address, name: str) -> Address:
 def states(out: Address, tables: Sequence[str]) -> RunStates | None:
     """What changes with the content of these tables, per complete run in order; None where files have no version."""
     versions = [storage.versions(join(out, name), f"{name}.parquet") for name in (_MARKER, *tables)]
-    markers, *others = [of_runs for of_runs in versions if of_runs is not None]
-    if not markers or len(others) < len(tables):
+    known = [of_runs for of_runs in versions if of_runs is not None]
+    of_packs = _states_of_packs(out, tables)
+    if of_packs is None or len(known) < len(versions):
         return None
+    markers, *others = known
+    of_files = {
+        unquote(folder.removeprefix("run_id=")): repr((marker, [files.get(folder) for files in others]))
+        for folder, marker in markers.items()
+        if folder.startswith("run_id=")
+    }
     contract = "".join(f"{name} {dtype}\n" for table in tables for name, dtype in dtypes(TABLES[table]).items())
-    begun = hashlib.sha256(contract.encode())
-    of_runs = {}
-    for folder, marker in markers.items():
-        if folder.startswith("run_id="):
-            state = begun.copy()
-            state.update(repr((marker, [files.get(folder) for files in others])).encode())
-            of_runs[unquote(folder.removeprefix("run_id="))] = state.hexdigest()[:_STATE]
-    return dict(sorted(of_runs.items()))
+    return {
+        run: hashlib.sha256(f"{contract}{state}".encode()).hexdigest()[:_STATE]
+        for run, state in sorted((of_packs | of_files).items())
+    }
+
+
+def _states_of_packs(out: Address, tables: Sequence[str]) -> dict[str, str] | None:
+    """What changes with the files of the pack of each packed run; None where they have no version."""
+    of_runs: dict[str, str] = {}
+    for pack, rows in packs.by_pack(packs.find(out)):
+        versions = [storage.version(join(out, packs.file_name(part, pack.name))) for part in (packs.INDEX, *tables)]
+        if None in versions:
+            return None
+        of_runs |= {run: repr((versions, row)) for run, row in rows.items()}
+    return of_runs
 
 
 def gather(out: Address) -> dict[str, pl.DataFrame]:

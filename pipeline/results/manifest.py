@@ -7,7 +7,6 @@ them. The names of configuration and vehicle files, and the digests of pages, ar
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 import re
@@ -21,7 +20,8 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from pipeline import storage
-from pipeline.results import store
+from pipeline.results import packs, store
+from pipeline.results.marker import sha256
 from pipeline.storage import FileDigest, files
 from pipeline.storage.address import Address, join, redacted
 from schemas.errors import UsageError
@@ -120,9 +120,11 @@ def unaltered(out: Address, runs: Sequence[str]) -> dict[str, dict[str, str]]:
     if not runs:
         return {}
     named = earlier(out)["runs"]
-    found = ((run, store.metadata_of(content), content) for run, content in store.markers(out, runs))
+    found = ((marker, marker.metadata) for marker in store.markers(out, runs))
     return {
-        run: metadata for run, metadata, content in found if not _is_altered(named.get(run), _run(metadata, content))
+        marker.run_id: metadata
+        for marker, metadata in found
+        if not _is_altered(named.get(marker.run_id), _run(metadata, marker.sha256))
     }
 
 
@@ -142,11 +144,11 @@ def gathered(out: Address, before: Manifest) -> Manifest:
     """The manifest as the files of the result say; of the one before what no file says."""
     runs: dict[str, Any] = {}
     sites: dict[str, Any] = {}
-    for run_id, content in store.markers(out):
-        metadata = store.metadata_of(content)
+    for marker in store.markers(out):
+        metadata = marker.metadata
         site = metadata.get("site_digest", "").partition(" ")[0]
         sites[site] = _files(metadata.get("site_files"))
-        runs[run_id] = _run(metadata, content)
+        runs[marker.run_id] = _run(metadata, marker.sha256)
     used = {run["config_digest"] for run in runs.values()}
     pages = {"pages": before["pages"]} if before.get("pages") else {}
     return {
@@ -187,11 +189,12 @@ def earlier(out: Address) -> Manifest:
 
 
 def own_file_names(out: Address) -> list[str]:
-    """What belongs to no single run: the settings and the campaign's tables, from the result's folder on."""
+    """What belongs to no single run, from the result's folder on: settings, list of packs, tables of the campaign."""
     campaign = join(out, "campaign")
     there = files.list_dir(campaign) if files.exists(campaign) else []
     settings = ["config.toml", *(["vehicle.toml"] if files.exists(join(out, "vehicle.toml")) else [])]
-    return [*settings, *(f"campaign/{name}" for name in there if re.fullmatch(r"\w+\.parquet", name))]
+    packed = [packs.LIST] if files.exists(join(out, packs.LIST)) else []
+    return [*settings, *packed, *(f"campaign/{name}" for name in there if re.fullmatch(r"\w+\.parquet", name))]
 
 
 def _frame() -> Manifest:
@@ -221,9 +224,9 @@ def _packages() -> Mapping[str, str]:
     return MappingProxyType({name: version(name) for name in sorted(needed, key=str.lower)})
 
 
-def _run(metadata: Mapping[str, str], marker: bytes) -> dict[str, Any]:
+def _run(metadata: Mapping[str, str], runs_sha256: str) -> dict[str, Any]:
     """What one run was made from, and the digests of its tables."""
-    digests = tables_noted(metadata) | {"runs": sha256(marker)}
+    digests = tables_noted(metadata) | {"runs": runs_sha256}
     site, _, route = metadata.get("site_digest", "").partition(" ")
     return {
         "status": metadata.get("status"),
@@ -266,8 +269,3 @@ def _write(out: Address, manifest: Manifest) -> None:
     content = (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode()
     if storage.content_of(join(out, NAME)) != content:
         storage.write_bytes(join(out, NAME), content)
-
-
-def sha256(content: bytes | None) -> str:
-    """The digest of a file's content; empty for a file that is not there."""
-    return "" if content is None else hashlib.sha256(content).hexdigest()

@@ -1,29 +1,36 @@
-"""Result tables on disk: one small Parquet file per run and table, Hive-partitioned (CONTRACT section 3)."""
+"""Result tables on disk: one small Parquet file per run and table, Hive-partitioned (CONTRACT section 3).
+
+Runs that `balise compact` has packed are read from their packs; a run with files of its own is read from these.
+"""
 
 from __future__ import annotations
 
-import hashlib
+import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote, unquote
 
+import numpy as np
 import polars as pl
+import pyarrow as pa
 
 from pipeline import storage
+from pipeline.results import packed_tables, packs
+from pipeline.results.marker import NAME as _MARKER
+from pipeline.results.marker import Marker, sha256
 from pipeline.results.source import conjuncts, source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join, redacted, shown
+from pipeline.storage.described import PREFIX
 from pipeline.storage.files import exists, read_bytes
 from schemas.config import Configuration, Settings, Vehicle, settings_from, to_toml, toml_of
-from schemas.conform import conform, dtypes
+from schemas.conform import conform, dtypes, meanings
 from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES
 
-PREFIX = "balise."
-_MARKER = "runs"
 # Of 255 bytes that file systems allow, `run_id=` takes seven.
 LONGEST_NAME = 248
 # Files read before they become one frame.
@@ -32,7 +39,7 @@ _AT_ONCE = 256
 
 def table_address(out: Address, table: str, run_id: str) -> Address:
     """`OUT/hazards/run_id=R/hazards.parquet`."""
-    return join(join(join(out, table), _partition(run_id)), f"{table}.parquet")
+    return join(join(join(out, table), folder_name(run_id)), f"{table}.parquet")
 
 
 def file_name(run_id: str) -> str:
@@ -50,17 +57,21 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
     """
     noted = {"run_id": tables.run_id, **metadata}
     others = {name: table_bytes(getattr(tables, name), name, noted) for name in TABLES if name != _MARKER}
-    digests = json.dumps({name: hashlib.sha256(content).hexdigest() for name, content in others.items()})
+    digests = json.dumps({name: sha256(content) for name, content in others.items()})
     last = table_bytes(tables.runs, _MARKER, {**noted, "tables": digests})
-    contents = [*others.items(), (_MARKER, last)]
-    marker = table_address(out, _MARKER, tables.run_id)
+    write_files(out, tables.run_id, {**others, _MARKER: last})
+
+
+def write_files(out: Address, run_id: str, contents: Mapping[str, bytes]) -> None:
+    """Write the files of a run by their tables, the marker last."""
+    marker = table_address(out, _MARKER, run_id)
     if is_url(out):
         # An object store shows each object as soon as it is staged.
         storage.remove(marker)
     staged: list[tuple[Address, Address]] = []
     try:
-        for name, content in contents:
-            staged.append(storage.stage(table_address(out, name, tables.run_id), content))
+        for name in sorted(contents, key=lambda name: name == _MARKER):
+            staged.append(storage.stage(table_address(out, name, run_id), contents[name]))
         if not is_url(out):
             storage.remove(marker)
         storage.commit(staged)
@@ -72,16 +83,7 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
 def table_bytes(frame: pl.DataFrame, table: str, metadata: Mapping[str, str]) -> bytes:
     """A table as Parquet, held to its contract, with unit and meaning in the field of each column."""
     checked = conform(frame, TABLES[table])
-    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata}, _fields(table))
-
-
-@cache
-def _fields(table: str) -> dict[str, dict[str, str]]:
-    """Unit and meaning of each column, as CONTRACT section 3 wants them in every file."""
-    return {
-        name: {"unit": str((column.metadata or {}).get("unit", "")), "meaning": column.description or ""}
-        for name, column in TABLES[table].columns().items()
-    }
+    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata}, meanings(TABLES[table]))
 
 
 def parquet_bytes(
@@ -103,7 +105,7 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
     if table not in TABLES:
         raise UsageError("is not a table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]
-    if run_id is not None and not exists(table_address(out, _MARKER, run_id)):
+    if run_id is not None and not (_own(out, [run_id]) or packs.find(out, [run_id])):
         known = ", ".join(run_ids(out)[:10]) or "no complete run"
         raise UsageError(f"has no run {run_id!r}", place=shown(out), found=known)
     return scan_runs(out, table, runs)
@@ -135,25 +137,49 @@ def _asked(runs: Sequence[str], predicate: pl.Expr | None) -> list[str]:
 def tables_of(out: Address, table: str, runs: Sequence[str], columns: Sequence[str] | None = None) -> pl.DataFrame:
     """These columns (all) of one table of these runs, read now. Raises `UsageError` as `scan_runs`."""
     wanted = ["run_id", *dtypes(TABLES[table])] if columns is None else columns
+    if not runs:
+        return pl.DataFrame(schema={"run_id": pl.String(), **dtypes(TABLES[table])}).select(wanted)
+    of_table = [name for name in wanted if name != "run_id"]
+    in_packs = packed(out, runs)
+    own = [run for run in runs if run not in in_packs]
+    check = partial(_check_columns, table)
+    parts = [*_read_own(out, table, own, of_table), *packed_tables.read_rows(out, table, in_packs, of_table, check)]
+    heights = {run: height for of_part, _ in parts for run, height in of_part.items()}
+    names = pl.Series("run_id", runs, pl.String).gather(np.repeat(np.arange(len(runs)), [heights[run] for run in runs]))
+    return _in_order(runs, heights, [frame for _, frame in parts]).with_columns(names).select(wanted)
+
+
+def _in_order(runs: Sequence[str], heights: Mapping[str, int], parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
+    """The rows of the parts, where the runs come in the order of `heights`, in the order of `runs`."""
+    whole = parts[0] if len(parts) == 1 else pl.concat(parts)
+    if list(heights) == list(runs):
+        return whole
+    begins = dict(zip(heights, itertools.accumulate(heights.values(), initial=0), strict=False))
+    return pl.concat([whole.slice(begins[run], heights[run]) for run in runs])
+
+
+def _read_own(
+    out: Address, table: str, runs: Sequence[str], columns: Sequence[str]
+) -> Iterator[tuple[dict[str, int], pl.DataFrame]]:
+    """From the runs' own files: how many rows each run has, and the rows; nothing without runs."""
     run = ""
 
-    def own(recorded: Mapping[str, pl.DataType]) -> list[str]:
+    def checked(recorded: Mapping[str, pl.DataType]) -> Sequence[str]:
         _check_columns(table, run, recorded)
-        return [name for name in wanted if name != "run_id"]
+        return columns
 
     places = [str(table_address(out, table, run)) for run in runs]
     contents = storage.read_many(places) if is_url(out) else {}
-    reader = parquet.TableReader(own)
+    reader = parquet.TableReader(checked)
     try:
         for run, place in zip(runs, places, strict=True):
             if is_url(out) and place not in contents:
                 raise _unreadable(table, run, "no such object")
             reader.add(contents[place] if is_url(out) else Path(place))
-        frame = reader.frame()
+        if runs:
+            yield dict(zip(runs, reader.heights, strict=True)), reader.frame()
     except parquet.ParquetError as error:
         raise _unreadable(table, run, str(error)) from None
-    names = pl.Series("run_id", [run for run, height in zip(runs, reader.heights, strict=True) for _ in range(height)])
-    return frame.with_columns(names.cast(pl.String)).select(wanted)
 
 
 def _unreadable(table: str, run_id: str, reason: str) -> UsageError:
@@ -183,11 +209,27 @@ def _check_columns(table: str, run_id: str, recorded: Mapping[str, pl.DataType])
 
 def run_ids(out: Address) -> list[str]:
     """The complete runs of a result, sorted."""
+    return sorted({*own_runs(out), *packs.find(out)})
+
+
+def own_runs(out: Address) -> list[str]:
+    """The complete runs that have files of their own, sorted."""
     folders = [name for name in storage.folders_in(join(out, _MARKER)) if name.startswith("run_id=")]
-    runs = [unquote(name.removeprefix("run_id=")) for name in folders]
-    if not is_url(out):
-        runs = [run for run in runs if Path(table_address(out, _MARKER, run)).exists()]
-    return sorted(runs)
+    runs = sorted(unquote(name.removeprefix("run_id=")) for name in folders)
+    return runs if is_url(out) else _own(out, runs)
+
+
+def _own(out: Address, among: Iterable[str]) -> list[str]:
+    """Those of these runs that have files of their own."""
+    return [run for run in among if exists(table_address(out, _MARKER, run))]
+
+
+def packed(out: Address, among: Iterable[str]) -> dict[str, packs.PackedRun]:
+    """Those of these runs that are read from packs, in order."""
+    places = packs.find(out, among)
+    # A store lists all of them as fast as it answers for a few.
+    own = set(own_runs(out) if is_url(out) and len(places) > 1 else _own(out, places))
+    return {run: place for run, place in places.items() if run not in own}
 
 
 def complete_runs(out: Address) -> list[str]:
@@ -210,33 +252,63 @@ def check_site(site: Site | None, replayed_digest: str | None, run_id: str) -> N
 
 def completed_runs(out: Address, among: Sequence[str] | None = None) -> dict[str, dict[str, str]]:
     """Metadata of each complete run, or of those among these, without reading any table."""
-    return {run: metadata_of(content) for run, content in markers(out, among)}
+    return {marker.run_id: marker.metadata for marker in markers(out, among)}
 
 
-def markers(out: Address, among: Sequence[str] | None = None) -> Iterator[tuple[str, bytes]]:
-    """The `runs` table of each complete run, or of those among these, as it lies there."""
+def markers(out: Address, among: Sequence[str] | None = None) -> Iterator[Marker]:
+    """The marker of each complete run in the order of their ids, or of those among these."""
     runs = run_ids(out) if among is None else among
     for first in range(0, len(runs), _AT_ONCE):
-        some = {str(table_address(out, _MARKER, run)): run for run in runs[first : first + _AT_ONCE]}
-        yield from ((some[place], content) for place, content in storage.read_many(list(some)).items())
+        some = runs[first : first + _AT_ONCE]
+        in_packs = packed(out, some)
+        places = {run: str(table_address(out, _MARKER, run)) for run in some if run not in in_packs}
+        contents = storage.read_many(list(places.values()))
+        found = {marker.run_id: marker for marker in packs.markers(out, in_packs)}
+        found |= {run: Marker.of_file(run, contents[place]) for run, place in places.items() if place in contents}
+        yield from (found[run] for run in some if run in found)
 
 
-def metadata_of(source: Path | bytes) -> dict[str, str]:
-    """The metadata that `write_run` was given; nothing for a file that cannot be read."""
-    try:
-        metadata = pl.read_parquet_metadata(source)
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError):
-        return {}
-    return {key.removeprefix(PREFIX): value for key, value in metadata.items() if key.startswith(PREFIX)}
+def marker_of(out: Address, run_id: str) -> Marker | None:
+    """The marker of one run; none where it is not complete."""
+    return next(markers(out, [run_id]), None)
+
+
+def packed_frame(out: Address, table: str, run_id: str) -> pl.DataFrame | None:
+    """One table of a packed run with whatever columns its build of the program wrote; none of a run with own files."""
+    place = packed(out, [run_id]).get(run_id)
+    return None if place is None else pl.DataFrame(pl.from_arrow(packed_tables.of_run(out, table, place)))
+
+
+def content_of(out: Address, table: str, run_id: str) -> bytes | None:
+    """The file of one table of a run, or what was its file before it was packed; none where there is neither."""
+    in_packs = packed(out, [run_id])
+    if not in_packs:
+        return storage.content_of(table_address(out, table, run_id))
+    (marker,) = packs.markers(out, in_packs)
+    return file_bytes(packed_tables.of_run(out, table, in_packs[run_id]), table, marker.metadata)
+
+
+def file_bytes(rows: pa.Table, table: str, of_marker: Mapping[str, str]) -> bytes:
+    """The file of one table of a run from its rows and the metadata of its marker, as `write_run` wrote it."""
+    noted = {key: value for key, value in of_marker.items() if table == _MARKER or key != "tables"} | {"table": table}
+    metadata = {f"{PREFIX}{key}": value for key, value in sorted(noted.items())}
+    return parquet.encoded(rows.replace_schema_metadata(metadata))
+
+
+def remove_own(out: Address, runs: Sequence[str]) -> None:
+    """Remove the files of runs that a pack holds too; the markers go first, so that no run is complete in part."""
+    for table in (_MARKER, *(name for name in TABLES if name != _MARKER)):
+        storage.remove_folders([join(join(out, table), folder_name(run)) for run in runs])
 
 
 def sweep(out: Address) -> None:
-    """Remove what interrupted campaigns left: tables without a marker, and unfinished files."""
-    complete = {_partition(run) for run in run_ids(out)}
+    """Remove what interrupted calls left: tables without a marker, packs that are not listed, and unfinished files."""
+    complete = {folder_name(run) for run in own_runs(out)}
     for table in TABLES:
         for folder in storage.folders_in(join(out, table)):
             if folder.startswith("run_id=") and folder not in complete:
                 storage.remove_folder(join(join(out, table), folder))
+    packs.sweep(out)
     if not is_url(out):
         for folder in _folders(Path(out)):
             _remove_unfinished(folder)
@@ -295,5 +367,6 @@ def write_vehicle(out: Address, vehicle: Vehicle) -> None:
         storage.remove(address)
 
 
-def _partition(run_id: str) -> str:
+def folder_name(run_id: str) -> str:
+    """The folder of a run in that of a table."""
     return f"run_id={file_name(run_id)}"

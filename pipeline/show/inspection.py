@@ -18,6 +18,8 @@ from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.show.terminal import show_tables
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
+from pipeline.storage.described import PREFIX, describe
+from pipeline.storage.parquet import ParquetError
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
@@ -59,10 +61,13 @@ def inspect_path(
         return inspect_log(path, config, None if site is None else read_site(site, config.site), vehicle)
     if name_of(path).lower().endswith(".csv"):
         return inspect_csv(Path(path))
+    if name_of(path).lower().endswith(".parquet") and not names:
+        return inspect_table(path)
     raise UsageError(
         "is neither a log, a site nor a result",
         place=redacted(str(path)),
-        expected="RUN.mcap, SITE.geojson, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
+        expected="RUN.mcap, SITE.geojson, FILE.parquet, or a folder with gnss.parquet (log), track.parquet (site) or"
+        " runs/ (result)",
         remedy="`balise convert` makes runs of receiver logs and CSV files.",
     )
 
@@ -70,6 +75,16 @@ def inspect_path(
 def inspect_csv(path: Path) -> dict[str, pl.DataFrame]:
     """A mapping to begin with; the columns stand in it."""
     return {STARTING_CONFIG: pl.DataFrame({"toml": draft_mapping(path).splitlines()})}
+
+
+def inspect_table(path: Address) -> dict[str, pl.DataFrame]:
+    """What a single Parquet file says of itself, and its columns with unit and meaning."""
+    try:
+        found = describe(files.read_bytes(path))
+    except ParquetError as error:
+        raise UsageError(f"cannot be read: {error}", place=redacted(str(path)), expected="a Parquet file") from None
+    metadata = {key.removeprefix(PREFIX): value for key, value in found.metadata.items()}
+    return {"File": _figures({"rows": found.rows, **metadata}), "Columns": found.columns}
 
 
 def show(tables: Mapping[str, pl.DataFrame]) -> None:

@@ -5,6 +5,7 @@ All that ingest reads goes through here, so that both kinds behave alike. Raises
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -16,6 +17,9 @@ from pipeline.storage.objects import kind_of
 from schemas.errors import InputError
 
 T = TypeVar("T")
+
+# Fetched of an object at once [bytes].
+_LEAST_PART = 262_144
 
 
 def exists(path: Address) -> bool:
@@ -45,6 +49,42 @@ def read_bytes(path: Address) -> bytes:
     """The whole content."""
     with local_copy(path) as file:
         return _local(file, lambda present: _regular(present).read_bytes())
+
+
+def in_parts(path: Address) -> Path | io.BufferedReader:
+    """What a reader takes that asks for parts of a file; of an address those parts alone are fetched."""
+    return io.BufferedReader(_Parts(str(path)), _LEAST_PART) if is_url(path) else Path(path)
+
+
+class _Parts(io.RawIOBase):
+    """An object that never changes, fetched in parts."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._size = size_of(address)
+        self._at = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        end = min(self._at + len(buffer), self._size)
+        if end <= self._at:
+            return 0
+        part = on_store(self._address, lambda store, path: store.cat_file(path, self._at, end), kind=InputError)
+        buffer[: len(part)] = part
+        self._at += len(part)
+        return len(part)
 
 
 def require_regular(path: Address) -> None:

@@ -29,8 +29,19 @@ def versions(folder: Address, name: str) -> dict[str, str] | None:
     return None if None in of_parts.values() else {part: str(version) for part, version in of_parts.items()}
 
 
+def sizes(folder: Address, name: str) -> dict[str, int]:
+    """The size [bytes] of `folder/*/name`, by the folder between."""
+    if is_url(folder):
+        listed = on_store(folder, lambda store, path: store.find(path, detail=True))
+        return {place.split("/")[-2]: info["size"] for place, info in listed.items() if place.endswith(f"/{name}")}
+    places = ((part, Path(folder, part, name)) for part in folders_in(folder))
+    return {part: place.stat().st_size for part, place in places if place.exists()}
+
+
 def version(address: Address) -> str | None:
-    """What changes with the content of an object, or of the objects in a folder; none where that is not known."""
+    """What changes with the content of a file, or of the files in a folder; none where that is not known."""
+    if not is_url(address):
+        return repr(signature(Path(address))) if Path(address).exists() else None
     return version_in(on_store(address, objects_at, kind=InputError))
 
 

@@ -149,6 +149,7 @@ def arrivals(store: _PatientStore) -> Any:
     from fsspec.callbacks import Callback
 
     class Arrivals(Callback):  # type: ignore[misc]
+        # fsspec asks for it before each file (`Callback.branch_coro`).
         def branched(self, *_: object, **__: object) -> Callback:
             return self
 

@@ -5,11 +5,14 @@ Polars neither writes nor verifies them (2.1), so both go through pyarrow.
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
+import numpy as np
 import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -36,20 +39,78 @@ def parquet_bytes(
     notes = columns or {}
     fields = [field.with_metadata({**(field.metadata or {}), **notes.get(field.name, {})}) for field in table.schema]
     schema = pa.schema(fields, metadata=dict(sorted((metadata or {}).items())) or None)
-    buffer = io.BytesIO()
-    pq.write_table(
-        table.cast(schema),
-        buffer,
-        row_group_size=_ROWS_PER_GROUP,
-        compression="zstd",
-        compression_level=_COMPRESSION_LEVEL,
-        use_dictionary=[name for name, kind in frame.schema.items() if kind in (pl.String, pl.Enum, pl.Categorical)],
-        write_page_checksum=True,
-    )
-    return buffer.getvalue()
+    return encoded(table.cast(schema))
+
+
+def encoded(table: pa.Table) -> bytes:
+    """A table with its metadata as a file: what `as_written` gives becomes the bytes that it came from."""
+    writer = GroupedWriter(table.schema, _ROWS_PER_GROUP)
+    writer.add(table)
+    return writer.content()
+
+
+class GroupedWriter:
+    """One Parquet file from tables of one schema, one below the other.
+
+    A row group ends with a table, as soon as it has `rows_per_group`; a table that is longer fills several.
+    """
+
+    def __init__(self, schema: pa.Schema, rows_per_group: int) -> None:
+        self._rows_per_group = rows_per_group
+        self._buffer = io.BytesIO()
+        self._waiting: list[pa.Table] = []
+        self._rows = 0
+        self._writer = pq.ParquetWriter(
+            self._buffer,
+            schema,
+            compression="zstd",
+            compression_level=_COMPRESSION_LEVEL,
+            use_dictionary=[field.name for field in schema if _has_dictionary(field.type)],
+            write_page_checksum=True,
+        )
+
+    def add(self, table: pa.Table) -> None:
+        self._waiting.append(table)
+        self._rows += table.num_rows
+        if self._rows >= self._rows_per_group:
+            self._flush()
+
+    def content(self) -> bytes:
+        """The whole file; nothing can be added then."""
+        self._flush()
+        self._writer.close()
+        return self._buffer.getvalue()
+
+    def _flush(self) -> None:
+        if self._waiting:
+            self._writer.write_table(pa.concat_tables(self._waiting), self._rows_per_group)
+        self._waiting = []
+        self._rows = 0
+
+
+def _has_dictionary(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_dictionary(kind) or pa.types.is_large_string(kind))
+
+
+def as_written(source: bytes) -> pa.Table:
+    """A whole table with the schema and the metadata that it was written with. Raises `ParquetError`."""
+    with _reading():
+        file = pq.ParquetFile(pa.BufferReader(source), page_checksum_verification=True)
+        return file.read(use_threads=False).cast(written_schema(file.metadata))
+
+
+def written_schema(metadata: pq.FileMetaData) -> pa.Schema:
+    """The schema as its writer had it; reading renames the elements of lists and shuffles metadata."""
+    kept = metadata.metadata or {}
+    if b"ARROW:schema" not in kept:
+        raise ValueError("was not written by this program")
+    return pa.ipc.read_schema(pa.BufferReader(base64.b64decode(kept[b"ARROW:schema"])))
 
 
 ColumnTypes = dict[str, pl.DataType]
+Span = tuple[int, int]
+"""The first row, and the one after the last."""
+
 # A panic of polars is a BaseException: it has one for metadata of a column that is not UTF-8.
 _ERRORS = (
     pa.ArrowException,
@@ -116,9 +177,7 @@ class TableReader:
         names = list(kind.names)
         if len(set(names)) < len(names):
             raise ValueError("two columns have the same name")
-        # Not `empty_table()`: through it pyarrow imports pandas, where that is installed, in every process.
-        empty = pl.DataFrame(pl.from_arrow(pa.Table.from_batches([], kind)))
-        return list(names if self._choose is None else self._choose(dict(empty.schema)))
+        return list(names if self._choose is None else self._choose(dict(_empty(kind).schema)))
 
 
 def metadata_of(content: bytes) -> dict[str, str]:
@@ -159,3 +218,62 @@ def _has_crc(head: bytes) -> bool:
 
 
 _NEXT_I32 = 0x15
+
+
+class GroupedFile:
+    """A file of many row groups, of which those are read that hold the rows asked for."""
+
+    def __init__(self, source: Path | IO[bytes], metadata: pq.FileMetaData | None = None) -> None:
+        with _reading():
+            self._file = pq.ParquetFile(
+                source, metadata=metadata, page_checksum_verification=True, pre_buffer=not isinstance(source, Path)
+            )
+            self.metadata: pq.FileMetaData = self._file.metadata
+            heights = [self.metadata.row_group(number).num_rows for number in range(self.metadata.num_row_groups)]
+        # The first row of each group, and the one after the last.
+        self._starts = np.cumsum([0, *heights])
+
+    def columns(self) -> ColumnTypes:
+        """All columns and their types. Raises `ParquetError`."""
+        with _reading():
+            return dict(_empty(self._file.schema_arrow.remove_metadata()).schema)
+
+    def groups(self, spans: Sequence[Span]) -> list[int]:
+        """The numbers of the row groups that hold these rows."""
+        return sorted({number for span in spans for number in self._groups(span)})
+
+    def _groups(self, span: Span) -> range:
+        if span[0] >= span[1]:
+            return range(0)
+        first, last = np.searchsorted(self._starts, [span[0], span[1] - 1], side="right") - 1
+        return range(int(first), int(last) + 1)
+
+    def read(self, groups: Sequence[int], columns: Sequence[str] | None = None) -> pa.Table:
+        """Whole row groups, one below the other. Raises `ParquetError`."""
+        with _reading():
+            return self._file.read_row_groups(list(groups), columns=columns).replace_schema_metadata(None)
+
+    def rows(self, spans: Sequence[Span], table: pa.Table, groups: Sequence[int]) -> pa.Table:
+        """Of a table that was read of these groups the rows of the spans, which are in order and apart."""
+        begins = np.cumsum([0, *(self._starts[number + 1] - self._starts[number] for number in groups)])
+        before = {number: int(self._starts[number] - begins[place]) for place, number in enumerate(groups)}
+        asked = [(span, before[self._groups(span)[0]]) for span in _joined(spans)]
+        parts = [table.slice(first - left_out, end - first) for (first, end), left_out in asked]
+        return pa.concat_tables(parts) if parts else table.slice(0, 0)
+
+
+def _joined(spans: Sequence[Span]) -> list[Span]:
+    """Spans that follow one another without a gap as one; empty ones left out."""
+    joined: list[Span] = []
+    for first, end in spans:
+        if first == end:
+            continue
+        if joined and joined[-1][1] == first:
+            first = joined.pop()[0]
+        joined.append((first, end))
+    return joined
+
+
+def _empty(kind: pa.Schema) -> pl.DataFrame:
+    # Not `empty_table()`: through it pyarrow imports pandas, where that is installed, in every process.
+    return pl.DataFrame(pl.from_arrow(pa.Table.from_batches([], kind)))

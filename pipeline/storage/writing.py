@@ -11,7 +11,7 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import IO, Any
@@ -173,6 +173,18 @@ def remove_folder(address: Address) -> None:
         _remove_remote(address, lambda store, path: store.rm(path, recursive=True))
     else:
         shutil.rmtree(address, ignore_errors=True)
+
+
+def remove_folders(folders: Sequence[Address]) -> None:
+    """Remove folders that lie in one with all that is in them, so that a power cut does not bring one back."""
+    for folder in folders:
+        if is_url(folder):
+            remove_folder(folder)
+            continue
+        with as_output_error(folder), contextlib.suppress(FileNotFoundError):
+            shutil.rmtree(folder)
+    if folders and not is_url(folders[0]):
+        _sync([Path(folders[0])])
 
 
 def _remove_remote(address: Address, operation: Callable[[Any, str], None]) -> None:

@@ -1,12 +1,24 @@
-"""What keeps figures over runs from being those of traffic: the sentences that safety, claim and line share."""
+"""What figures over runs are worth, and what they leave out: sentences as safety, claim and line write them.
+
+The words stand in `schemas/words.toml`; here and in the rooms is decided which of them apply, with which figures.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import polars as pl
 
 from schemas.enums import TRUTH, RunStatus
+from schemas.words import say
 
 _FAILED = pl.col("status").cast(pl.String) == RunStatus.FAILED.value
+
+
+def sentences(section: str, said: Mapping[str, object]) -> list[str]:
+    """The words of what there is: falsy means that there is nothing to say; a tuple holds several figures."""
+    figures = {name: value if isinstance(value, tuple) else (value,) for name, value in said.items() if value}
+    return [say(section, name, *values) for name, values in figures.items()]
 
 
 def failed_runs(runs: pl.DataFrame) -> list[str]:
@@ -14,20 +26,20 @@ def failed_runs(runs: pl.DataFrame) -> list[str]:
     number = runs["run_id"].n_unique()
     whole = runs.filter(_FAILED.all().over("run_id"))["run_id"].n_unique()
     alone = runs.filter(_FAILED & ~_FAILED.all().over("run_id")).group_by("solution").agg(pl.col("run_id").n_unique())
-    return [f"{whole} of {number} runs failed and are left out of all figures."] * bool(whole) + [
-        f"{solution}: {count} of {number} runs failed with this solution alone and are left out of its figures."
-        for solution, count in alone.sort("solution").iter_rows()
+    counts = alone.sort("solution").iter_rows()
+    return [
+        *sentences("studies", {"failed": (whole, number) if whole else ()}),
+        *(say("studies", "failed_alone", solution, count, number) for solution, count in counts),
     ]
 
 
 def runs_without_truth(runs: pl.DataFrame, consequence: str) -> list[str]:
     """Runs that nothing but the odometer, or nothing at all, can judge."""
     blind = runs.filter(~pl.col("evidence").cast(pl.String).is_in(TRUTH).fill_null(value=False)).height
-    reservation = f"{blind} of {runs.height} runs have neither a reference nor balise reads: {consequence}"
-    return [reservation] if blind else []
+    return sentences("studies", {"without_truth": (blind, runs.height, consequence) if blind else ()})
 
 
 def several_settings(runs: pl.DataFrame, consequence: str) -> list[str]:
     """Runs of different configurations or vehicle files in one result."""
     kinds = runs.filter(~_FAILED)["config_digest"].n_unique()
-    return [f"The runs were replayed with {kinds} settings or vehicle files{consequence}"] if kinds > 1 else []
+    return sentences("studies", {"several_settings": (kinds, consequence) if kinds > 1 else ()})

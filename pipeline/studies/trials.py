@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.stages.run_row.bounds import CONFIDENCE, Estimate, clopper_pearson
+from pipeline.studies.reservations import sentences
 from schemas.enums import RunVerdict
 
 # Share of the distance by which two records of one journey differ at most.
@@ -35,12 +36,7 @@ def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
     left = runs.height - kept.height
     ends_before = pl.col("t_end").shift().cum_max().over("solution")
     overlapping = kept.sort("solution", "t_start").filter(pl.col("t_start") < ends_before).height
-    remarks = {
-        f"{left} runs begin and end with another one: counted once, as one journey.": left,
-        f"{overlapping} runs overlap in time with another one. If they are pieces of one recording, the bounds are "
-        "too favourable: remove what repeats others.": overlapping,
-    }
-    return kept.sort("run_id", "solution"), [text for text, count in remarks.items() if count]
+    return kept.sort("run_id", "solution"), sentences("studies", {"one_journey": left, "overlapping": overlapping})
 
 
 @dataclass(frozen=True)

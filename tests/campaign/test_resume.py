@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pipeline import storage
 from pipeline.campaign import make_plan, resume, run_campaign
+from pipeline.campaign.compact import compact
 from pipeline.campaign.outcome import failure_of
+from pipeline.campaign.verify import verify
 from pipeline.campaign.waits import WAITS
 from pipeline.results import store
 from schemas.config import Configuration, LdsConfig
@@ -41,7 +44,7 @@ def test_nothing_is_opened_where_nothing_changed(
     trial, out = settled
     plan = plan_of(trial, out)
     (whole,) = run_campaign(plan).outcomes
-    for place in (f"{store.__name__}.metadata_of", f"{store.__name__}.read_table"):
+    for place in ("pipeline.results.marker.metadata_of", f"{store.__name__}.read_table"):
         monkeypatch.setattr(place, never)
     monkeypatch.setattr(storage, "file_digests", never)
     monkeypatch.setattr("pipeline.campaign.finish.write_campaign", lambda *_: None)
@@ -94,3 +97,25 @@ def test_what_the_disk_did_not_give_is_no_failure_of_the_log() -> None:
             with pytest.raises(InputError) as found:
                 raise InputError("cannot be read") from None
         assert failure_of(found.value, lasting=True).lasting == lasting
+
+
+def test_packed_runs_are_known_and_new_ones_replayed(
+    settled: tuple[SmallTrial, Path], small_trial: SmallTrial, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trial, out = settled
+    (before,) = run_campaign(plan_of(trial, out)).outcomes
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "file_digests", never)
+        assert compact(out).packed == 1
+        assert verify(out).problems == ()
+        (known,) = run_campaign(plan_of(trial, out)).outcomes
+    assert replace(known, proof="") == replace(before, proof="")
+    shutil.copytree(small_trial.paths[1], trial.runs / "run1")
+    assert run_campaign(plan_of(trial, out)).skipped == 1
+    assert (store.run_ids(out), store.own_runs(out)) == (["run0", "run1"], ["run1"])
+    shutil.rmtree(out / ".catalogue")
+    assert run_campaign(plan_of(trial, out)).skipped == 2
+    assert verify(out).problems == ()
+    assert run_campaign(plan_of(trial, out), force=True).skipped == 0
+    assert compact(out).packed == 2
+    assert verify(out).problems == ()

@@ -9,16 +9,22 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import dataframely as dy
 import polars as pl
 import pytest
 import typer
 
 import cli
 from pipeline.read.ingest import read_run
+from pipeline.storage.described import describe
+from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import IngestConfig
+from schemas.conform import meanings
+from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
+from schemas.tables import CONTRACT_VERSION
 from tests.conftest import SmallTrial
 from tests.make.receivers.messages import sentence
 
@@ -202,6 +208,37 @@ def test_inspect_logs(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -
     bad = balise("inspect", tmp_path / "bad.mcap")
     assert bad.status == 1
     assert "does not start with the MCAP magic bytes" in bad.out
+
+
+def test_a_single_file_says_what_it_is(balise: Balise, result: Path, tmp_path: Path) -> None:
+    """Mailed to a colleague, without the folders that it was in."""
+    sent = shutil.copy(result / "epochs/run_id=run1/epochs.parquet", tmp_path / "sent.parquet")
+    found = json.loads(balise("inspect", sent, "--json").out)
+    figures = {row["figure"]: row["value"] for row in found["File"]}
+    assert (figures["table"], figures["run_id"], figures["contract"]) == ("epochs", "run1", CONTRACT_VERSION)
+    assert {"software", "config_digest", "log_digest", "site_digest"} <= set(figures)
+    meant = {row["column"]: (row["unit"], row["meaning"]) for row in found["Columns"]}
+    assert meant["confidence_m"][0] == "m"
+    assert all(meaning for _, meaning in meant.values())
+    broken = tmp_path / "broken.parquet"
+    broken.write_bytes(b"PAR1")
+    assert balise("inspect", broken).status == 2
+
+
+@pytest.mark.parametrize(
+    ("folder", "schemas"), [("run", STREAM_SCHEMAS), ("site", SITE_SCHEMAS), ("campaign", CAMPAIGN_TABLES)]
+)
+def test_every_parquet_file_has_its_name_and_meanings(
+    small_trial: SmallTrial, result: Path, folder: str, schemas: Mapping[str, type[dy.Schema]]
+) -> None:
+    places = {"run": small_trial.paths[0], "site": small_trial.site, "campaign": result / "campaign"}
+    for file in places[folder].glob("*.parquet"):
+        found = describe(file.read_bytes())
+        name = f"campaign_{file.stem}" if folder == "campaign" else file.stem
+        assert found.metadata["balise.table"].replace("/", "_") == name
+        told = {row["column"]: (row["unit"], row["meaning"]) for row in found.columns.iter_rows(named=True)}
+        assert told == {key: tuple(note.values()) for key, note in meanings(schemas[name]).items() if key in told}
+        assert all(meaning for _, meaning in told.values())
 
 
 def test_convert_into_a_run_that_exists(balise: Balise, tmp_path: Path) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
+import polars as pl
+import pyarrow as pa
 import pytest
 
-from tests.docs.blocks import PAGES, Block, blocks
+from schemas.tables import TABLES
+from tests.docs.blocks import PAGES, ROOT, Block, blocks
 
 
 def language(block: Block) -> str:
@@ -41,6 +45,32 @@ def test_sql_outside_runs_in_duckdb(block: Block, workspace: Path, monkeypatch: 
     monkeypatch.chdir(workspace)
     with duckdb.connect() as connection:
         assert connection.execute(block.text).fetchall()
+
+
+def test_run_ids_are_text(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readers of hive partitions make a number of `007` and a date of `2025-06-13` unless they are told."""
+    ids = {"drift_early": "007", "jump_two": "2025-06-13"}
+    for table in TABLES:
+        for run, run_id in ids.items():
+            shutil.copytree(workspace / "OUT" / table / f"run_id={run}", tmp_path / "OUT" / table / f"run_id={run_id}")
+    monkeypatch.chdir(tmp_path)
+    python = [block for block in blocks(ROOT / "README.md") if "run_id" in block.text and language(block) == "python"]
+    analyst = next(block for block in blocks(ROOT / "docs" / "analyst.md") if block.language == "python")
+    for block in (*python, analyst):
+        names: dict[str, Any] = {}
+        exec(block.text, names)
+        names.pop("campaign_runs", None)
+        read = [run_ids(value) for value in names.values() if isinstance(value, pl.LazyFrame | pa.Table)]
+        assert set().union(*read) == set(ids.values())
+    (sql,) = chosen("sql")
+    with pytest.importorskip("duckdb").connect() as connection:
+        assert {row[0] for row in connection.execute(sql.text).fetchall()} == set(ids.values())
+
+
+def run_ids(table: pl.LazyFrame | pa.Table) -> set[Any]:
+    if isinstance(table, pa.Table):
+        return set(table["run_id"].to_pylist())
+    return set(table.select("run_id").collect()["run_id"]) if "run_id" in table.collect_schema() else set()
 
 
 def test_there_are_such_blocks() -> None:

@@ -7,6 +7,7 @@ import hashlib
 import json
 import random
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import dataframely as dy
@@ -34,7 +35,7 @@ def tables_of(run_id: str, solutions: tuple[str, ...] = ("primary",)) -> RunTabl
     blank = {"status": "ok", "config_digest": "c", "input_digest": "i", "software": "s", "contract": "1"}
     rows = [
         {
-            name: _value(name, column, {**blank, "solution": solution})
+            name: value_of(name, column, {**blank, "solution": solution})
             for name, column in TABLES["runs"].columns().items()
         }
         for solution in solutions
@@ -45,7 +46,7 @@ def tables_of(run_id: str, solutions: tuple[str, ...] = ("primary",)) -> RunTabl
     )
 
 
-def _value(name: str, column: dy.Column, known: dict[str, str]) -> object:
+def value_of(name: str, column: dy.Column, known: Mapping[str, object]) -> object:
     if name in known:
         return known[name]
     if column.nullable:

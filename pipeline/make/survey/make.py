@@ -17,11 +17,12 @@ from pipeline.make.survey.trace import clean_traces
 from pipeline.read.site.checks import remarks
 from pipeline.read.site.describe import without_balises
 from pipeline.stages.track.survey import track_of
-from pipeline.storage.parquet import parquet_bytes
+from pipeline.storage.described import table_bytes
 from pipeline.storage.writing import replace_files
 from schemas.config import Configuration, Vehicle
 from schemas.enums import TravelAlong
 from schemas.errors import SiteError, UsageError
+from schemas.inputs import SITE_SCHEMAS
 from schemas.run import Finding, Site
 
 _FILES = ("track", "links", "balises", "route")
@@ -113,7 +114,11 @@ def write_made(site: Site, page: str, out: Path, force: bool) -> None:
         raise UsageError("holds a site", place=str(out), remedy="Name another folder, or replace it with --force.")
     contents = {f"{name}.{suffix}": None for name in _FILES for suffix in ("csv", "geojson", "parquet")}
     tables = {"track": site.track, "links": site.links, "balises": site.balises}
-    written = {f"{name}.parquet": parquet_bytes(table) for name, table in tables.items() if table is not None}
+    written = {
+        f"{name}.parquet": table_bytes(table, name, SITE_SCHEMAS[name], {})
+        for name, table in tables.items()
+        if table is not None
+    }
     findings = pl.DataFrame([asdict(one) for one in site.findings], schema=list(Finding.__dataclass_fields__))
     beside = {"findings.csv": findings.write_csv().encode(), "site.html": page.encode()}
     replace_files(out, {**contents, **written, **beside}, marker="track.parquet")

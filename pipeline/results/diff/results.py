@@ -146,10 +146,12 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str) -> RunDiff:
     verdicts: tuple[str, ...] = ()
     balises: tuple[str, ...] = ()
     for table, contract in TABLES.items():
-        a, b = (_content(out, table, run_id) for out in (out_a, out_b))
-        if a == b:
+        a, b = (_recorded(out, table, run_id) for out in (out_a, out_b))
+        if isinstance(a, bytes) and isinstance(b, bytes) and a == b:
             continue
         frame_a, frame_b = (_frame(out, table, run_id, content) for out, content in ((out_a, a), (out_b, b)))
+        if frame_a.equals(frame_b):
+            continue
         if table == "hazards":
             differing, hazards = compare_hazards(frame_a, frame_b)
         else:
@@ -165,18 +167,20 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str) -> RunDiff:
     return RunDiff(run_id, verdicts, balises, tuple(hazards), tuple(changed), tuple(item.column for item in made))
 
 
-def _frame(out: Address, table: str, run_id: str, content: bytes) -> pl.DataFrame:
+def _frame(out: Address, table: str, run_id: str, recorded: bytes | pl.DataFrame) -> pl.DataFrame:
     try:
-        return read_parquet(content)
+        return read_parquet(recorded) if isinstance(recorded, bytes) else recorded
     except ParquetError as error:
         place = redacted(str(store.table_address(out, table, run_id)))
         raise UsageError(f"cannot be read: {error}", place=place, remedy="Replay the run again with --force.") from None
 
 
-def _content(out: Address, table: str, run_id: str) -> bytes:
+def _recorded(out: Address, table: str, run_id: str) -> bytes | pl.DataFrame:
+    """The run's own file, or its rows in a pack."""
+    if (packed := store.packed_frame(out, table, run_id)) is not None:
+        return packed
     address = store.table_address(out, table, run_id)
-    content = storage.content_of(address)
-    if content is None:
+    if (content := storage.content_of(address)) is None:
         place = redacted(str(address))
         raise UsageError("is missing from a complete run", place=place, remedy="Replay the run again with --force.")
     return content

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.results.store import check_site, metadata_of, read_run, table_address
+from pipeline.results.store import check_site, completed_runs, read_run
 from pipeline.show.export.gis import run_geojson, run_gpx
 from pipeline.show.export.mcap_file import PositionMessage, run_topics, write_topics
 from pipeline.stages.provenance import input_digest
@@ -48,7 +48,7 @@ def export_run(
 
 def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) -> None:
     """Site and log have to be those of the replay, as far as the result tells."""
-    known = metadata_of(Path(str(table_address(out, "runs", tables.run_id)))).get("site_digest", "")
+    known = completed_runs(out, [tables.run_id])[tables.run_id].get("site_digest", "")
     check_site(site, known, tables.run_id)
     digest = site.digest if site is not None else known
     if log is not None and log.input_digest and digest:

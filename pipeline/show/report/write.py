@@ -14,16 +14,16 @@ import polars as pl
 from pipeline import storage
 from pipeline.results import catalogue
 from pipeline.results.figures.campaign_figures import derived_tables
-from pipeline.results.manifest import note_pages, sha256
+from pipeline.results.manifest import note_pages
+from pipeline.results.marker import sha256
 from pipeline.results.software import software_digest
 from pipeline.results.store import (
     check_site,
     complete_runs,
+    completed_runs,
     file_name,
-    metadata_of,
     read_config,
     read_run,
-    table_address,
 )
 from pipeline.results.workers import each
 from pipeline.show.report.campaign_page import Campaign, campaign_page
@@ -131,7 +131,7 @@ def _known(out: Path, pages: Sequence[_Page]) -> dict[str, pl.DataFrame]:
 
 def _written(page: _Page) -> pl.DataFrame:
     """Write the page; returns the row to keep of it."""
-    metadata = metadata_of(Path(table_address(page.out, "runs", page.run)))
+    metadata = completed_runs(page.out, [page.run])[page.run]
     check_site(page.made.site, metadata.get("site_digest"), page.run)
     tables = read_run(page.out, page.run)
     judged = (tables.epochs, tables.hazards, tables.alarms, tables.runs)

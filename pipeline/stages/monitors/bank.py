@@ -18,7 +18,7 @@ from pipeline.stages.epochs.verdicts import (
     verdicts,
 )
 from pipeline.stages.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, run_axis
-from pipeline.stages.monitors.noise import NoiseMeter
+from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE, NoiseMeter
 from pipeline.stages.monitors.recursion import AxisState
 from pipeline.stages.monitors.series import FIRST_EPOCH, Axis, axes_of
 from schemas.arrays import Bools, Floats, Ints
@@ -28,8 +28,8 @@ from schemas.tables import SCALES
 
 NOISE_UNKNOWN = "noise not yet known"
 NOISE_TOO_LARGE = "noise too large"
-# Second differences of white noise have six times its variance, and M is a fourth of it (DOMAIN section 3).
-WHITE_PART = float(np.sqrt(4.0 / 6.0))
+WHITE_PART = float(np.sqrt(OF_WALK / OF_WHITE_NOISE))
+"""White noise over what is measured, which is taken for a random walk."""
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,10 @@ from pipeline.stages.monitors.axis import AxisSeries, error_model
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, MonitorConfig
 
-# M = (second difference)^2 / 4 is exact for a random walk; for white noise it is 6 / 4 of it, so on the safe side
-# (DOMAIN section 3).
-_OF_WALK = 4.0
+# M = (second difference)^2 / 4 is exact for a random walk; for white noise, whose second differences have six times its
+# variance, it is 6 / 4 of it, so on the safe side (DOMAIN section 3).
+OF_WALK = 4.0
+OF_WHITE_NOISE = 6.0
 
 
 class NoiseMeter:
@@ -213,7 +214,7 @@ class _Sampler:
             oldest=rows.oldest,
             renewal=self.renewal[rows.last],
             quantiles=quantiles,
-            noise_m2=(shown_m2 / gaussian_m2 - self._model_m2(lag_s, rows)) / _OF_WALK,
+            noise_m2=(shown_m2 / gaussian_m2 - self._model_m2(lag_s, rows)) / OF_WALK,
             stated_m2=_stated_m2(self._series, rows.last, config),
             window=round(max(config.noise_window_s, config.noise_window_lags * lag_s) / spacing_s),
             # No sample begins where the run does: rounded up, logs faster than 2 Hz waited for a renewal more.

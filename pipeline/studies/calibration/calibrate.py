@@ -16,7 +16,7 @@ from pipeline.stages.monitors.axis import error_model
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.monitors.single import doppler_monitor
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.prepare import PreparedRun, prepare
+from pipeline.stages.prepare import prepare
 from pipeline.studies.calibration.sigmas import (
     COMPARED,
     SigmaFit,
@@ -27,7 +27,7 @@ from pipeline.studies.calibration.sigmas import (
     worst_fit,
 )
 from pipeline.studies.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
-from pipeline.studies.plausibility.fit import clock_advice, fit_run, refuse_impossible
+from pipeline.studies.plausibility.fit import clock_advice, required_fit
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
@@ -99,7 +99,8 @@ def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, so
     prepared = prepare(log, site, vehicle, config, clock_advice)
     if solution not in prepared.run.solutions():
         return Observed(log.run_id, None, {}, None, ())
-    _refuse_what_does_not_fit(prepared, solution)
+    # A run with a wrong unit or clock would teach its error to every other run.
+    required_fit(prepared, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m))
     match = prepared.match(solution)
     odometry = None if prepared.odometry is None else prepared.odometry.oriented(match.odometer_sign)
     estimate = None if odometry is None else _estimate(match, odometry, config)
@@ -212,16 +213,6 @@ def _vehicle(base: Vehicle, runs: Sequence[RunEstimate], latency_unknown_s: floa
     if latency.sigma <= 0.5 * latency_unknown_s:
         measured |= {"gnss_latency_s": latency.value, "gnss_latency_sigma_s": latency.sigma}
     return base.model_copy(update=measured)
-
-
-def _refuse_what_does_not_fit(prepared: PreparedRun, solution: str) -> None:
-    """A run with a wrong unit or clock would teach its error to every other run."""
-    run = prepared.recorded
-    config = prepared.config
-    mounted = Vehicle(antenna_height_m=prepared.vehicle.antenna_height_m)
-    prepared.fixes(solution)
-    fit = fit_run(run, solution, mounted, config.plausibility, prepared.site)
-    refuse_impossible(fit, run.run_id, config.ingest)
 
 
 def _refuse_figures_of_no_train(vehicle: Vehicle, place: str, config: Configuration) -> None:

@@ -14,11 +14,12 @@ from pipeline.studies.claim.front import front_of
 from pipeline.studies.claim.profile import RequirementProfile
 from pipeline.studies.claim.requirements import ALL, ClaimRide, Requirement, Tallies, requirements, tallies
 from pipeline.studies.claim.tally import S_PER_H, Compliance, Kind, Tally, drawn
-from pipeline.studies.reservations import failed_runs, runs_without_truth, several_settings
+from pipeline.studies.reservations import failed_runs, runs_without_truth, sentences, several_settings
 from pipeline.studies.trials import distinct
 from schemas.config import Configuration
-from schemas.enums import RunStatus
+from schemas.enums import NotShown, RunStatus
 from schemas.run import Site
+from schemas.words import NOT_SHOWN, say
 
 SCHEMA = {
     **dict.fromkeys(("solution", "requirement", "applies_to", "limit", "demanded", "finding"), pl.String),
@@ -61,11 +62,7 @@ def claim(
             of_run = _once_a_day(of_run, (run["solution"], run["t_start"].date()), days)
         _add(by_solution[run["solution"]], of_run)
     outside_h = sum(counts["no_area", ALL].held_s for counts in by_solution.values()) / S_PER_H
-    notes = [*twice, *_notes(runs, outside_h, areas, ahead_m)]
-    if profile.method.independent == "run":
-        notes.append(
-            'Runs of one day count as independent; `method.independent = "day"` of a profile counts one a day.'
-        )
+    notes = [*twice, *_notes(runs, outside_h, areas, ahead_m, profile)]
     return Claim(profile, claim_table(by_solution, profile), notes)
 
 
@@ -135,67 +132,57 @@ def _row(solution: str, requirement: Requirement, counts: Tally) -> dict[str, An
         "hours_known": counts.known_s / S_PER_H,
         "hours_needed": shown.needed_h,
         "clause": requirement.clause,
-        "reason": _reason(requirement, shown.finding, counts),
+        "reason": NOT_SHOWN[_reason(requirement, counts)] if shown.finding is Compliance.NOT_SHOWN else None,
     }
 
 
 # What a recording cannot say of a requirement, however long it is.
 _NEVER = {
-    ("start", "last position"): "no recording says what the unit knew at switch-on; worst: time to a position in use",
-    ("start", "cold movement"): "no recording says what the unit knew at switch-on",
-    ("start", "nothing known"): "a recording begins after switch-on, so times are too short; worst: time to a TVB or "
-    "an accepted balise",
-    ("cold_movement", ALL): "a train without power records nothing",
-    ("speed_accuracy", ALL): "speed is compared as a mean over a window; what lies within it is not seen",
-    ("availability", ALL): "the confidence of speed is not recorded, and gaps of the log are not counted",
+    ("start", "last position"): NotShown.BEFORE_LOG,
+    ("start", "cold movement"): NotShown.AT_SWITCH_ON,
+    ("start", "nothing known"): NotShown.SINCE_SWITCH_ON,
+    ("cold_movement", ALL): NotShown.WITHOUT_POWER,
+    ("speed_accuracy", ALL): NotShown.WITHIN_WINDOW,
+    ("availability", ALL): NotShown.NOT_RECORDED,
 }
 
 
-def _reason(requirement: Requirement, finding: Compliance, counts: Tally) -> str | None:
-    """Why a requirement is not shown, in words."""
-    if finding is not Compliance.NOT_SHOWN:
-        return None
+def _reason(requirement: Requirement, counts: Tally) -> NotShown:
+    """Why a requirement is not shown."""
     if requirement.key in _NEVER:
         return _NEVER[requirement.key]
     if requirement.name == "way_without_balise":
-        return "no run is long enough" if not counts.trials else "no event on ways long enough; that is no proof"
+        return NotShown.NO_EVENT_ON_WAYS if counts.trials else NotShown.NO_LONG_WAY
     if not counts.held_s and not counts.trials:
-        return "nothing recorded to which it applies"
+        return NotShown.NOTHING_RECORDED
     if not counts.known_s:
-        return "the evidence says nothing of it: too wide, missing, or the position in doubt"
+        return NotShown.EVIDENCE_SILENT
     if requirement.demand.kind is Kind.ALWAYS:
-        return "no exceedance was seen, and no number of hours proves a maximum that is demanded without a probability"
-    if counts.events == 0 and counts.known_s < counts.held_s:
-        return "too few runs or hours; part of the time the evidence does not say"
-    return "too few runs or hours"
+        return NotShown.NO_PROBABILITY
+    return NotShown.PARTLY_SILENT if counts.events == 0 and counts.known_s < counts.held_s else NotShown.TOO_FEW
 
 
-def _notes(runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahead_m: float) -> list[str]:
+def _notes(
+    runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahead_m: float, profile: RequirementProfile
+) -> list[str]:
     """What the reader must know before the rows."""
-    notes = failed_runs(runs)
-    if areas is None:
-        notes.append("Without areas (`--site` with areas.csv or areas.parquet) nothing is said of limits by area type.")
-    notes += runs_without_truth(runs, "they can show no error small.")
-    settings = several_settings(
-        runs,
-        ": trains may differ. Errors do not depend on where the front end is, but areas are looked up with one "
-        "distance for all.",
-    )
-    notes += settings
-    if not settings and not ahead_m:
-        notes.append("Areas are looked up at the balise antenna; `--front-ahead` puts the front end ahead of it.")
-    if outside_h and areas is not None:
-        notes.append(f"{outside_h:.3g} h lie outside all areas: no limit by area type applied there.")
+    settings = several_settings(runs, say("claim", "trains"))
     late = runs["latency_sigma_s"].null_count()
-    if late:
-        notes.append(f"{late} of {runs.height} runs have no figure of latency: safe front ends are not widened for it.")
-    notes.append(
-        "No recording can show maxima demanded without a probability (MAPO, MAPU, MASO, MASU, below 30 km/h, way "
-        "without balise), accuracy of speed, start of mission, cold movement and availability: they can "
-        "only be found broken. `--csv` has the reasons."
-    )
-    notes.append("Nothing is said of the rear end: the length of the train is not recorded.")
-    return notes
+    said: dict[str, Any] = {
+        "at_antenna": not settings and not ahead_m,
+        "outside": outside_h if areas is not None else 0.0,
+        "no_latency": (late, runs.height) if late else (),
+        "only_broken": True,
+        "rear_end": True,
+        "by_day": profile.method.independent == "run",
+    }
+    return [
+        *failed_runs(runs),
+        *sentences("claim", {"no_areas": areas is None}),
+        *runs_without_truth(runs, say("claim", "blind")),
+        *settings,
+        *sentences("claim", said),
+    ]
 
 
 def for_reading(claim: Claim) -> pl.DataFrame:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pipeline.stages.prepare import PreparedRun
 from pipeline.studies.plausibility.check import Check, FitState, not_checked
 from pipeline.studies.plausibility.clocks import clock_checks
 from pipeline.studies.plausibility.odometer import odometer_checks
@@ -12,7 +13,7 @@ from pipeline.studies.plausibility.places import read_stamp_checks, reads_lag, r
 from pipeline.studies.plausibility.recording import recording_of
 from pipeline.studies.plausibility.velocity import velocity_checks
 from pipeline.studies.plausibility.written import reference_elsewhere, written_checks
-from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
+from schemas.config import PlausibilityConfig, Vehicle
 from schemas.enums import MisfitCause, Note
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
@@ -82,14 +83,19 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
     return Fit((*checks, *clock_checks(of, lags)))
 
 
-def refuse_impossible(fit: Fit, place: str, config: IngestConfig) -> None:
-    """One error for a run that cannot be as recorded, unless the configuration lets it pass."""
+def required_fit(prepared: PreparedRun, solution: str, vehicle: Vehicle) -> Fit:
+    """The fit of a solution; raises `InputError` where it has no journey, or no train can have driven it (unless the
+    configuration lets that pass).
+    """
+    prepared.fixes(solution)
+    config = prepared.config
+    fit = fit_run(prepared.recorded, solution, vehicle, config.plausibility, prepared.site)
     impossible = fit.impossible
-    if not impossible or config.plausibility == "warn":
-        return
+    if not impossible or config.ingest.plausibility == "warn":
+        return fit
     raise InputError(
         "does not fit: " + "; ".join(check.sentence for check in impossible),
-        place=place,
+        place=f"{prepared.run.run_id}: solution {solution!r}",
         expected="streams of one journey, in the units and times of the contract",
         remedy='To replay it all the same: [ingest] plausibility = "warn". ' + remedy_of(impossible),
     )

@@ -1,4 +1,4 @@
-"""What the figures of a result do and do not show, in sentences for an assessor."""
+"""What the figures of a result do and do not show, in sentences for an assessor (`schemas/words.toml`, `[safety]`)."""
 
 from __future__ import annotations
 
@@ -7,142 +7,120 @@ from typing import Any
 import polars as pl
 
 from pipeline.results.figures.head import figures_beside, head_of, run_verdicts
-from pipeline.studies.reservations import failed_runs, several_settings
+from pipeline.studies.reservations import failed_runs, sentences, several_settings
 from schemas.enums import RunStatus, Verdict
-from schemas.words import beside_words
+from schemas.words import beside_words, say
 
-Row = dict[str, object]
+Row = dict[str, Any]
 
 
 def verdict_statement(runs: pl.DataFrame) -> str:
     """The verdict of the campaign with its counts and the figures beside it: the first words of what is said."""
     head = head_of(run_verdicts(runs).values())
-    return f"{head}." if head.verdict is None else f"{head}; {beside_words(figures_beside(runs))}."
+    return f"{head}." if head.verdict is None else say("safety", "verdict", head, beside_words(figures_beside(runs)))
 
 
 def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     """What keeps the figures from being those of traffic, and what they leave out."""
-    injected = runs.filter(pl.col("faults_injected").fill_null(value=False))["run_id"].n_unique()
     number = runs["run_id"].n_unique()
-    sentences = failed_runs(runs)
-    if injected:
-        sentences.insert(
-            0,
-            f"Faults were injected into {injected} of {number} runs: rates of hazards, misses and outages per hour are "
-            "those of the trial, not of traffic.",
-        )
+    injected = runs.filter(pl.col("faults_injected").fill_null(value=False))["run_id"].n_unique()
     partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
-    if partial:
-        sentences.append(f"{partial} of {number} runs are partial: only what was read of them counts.")
-    limits = ": each verdict is by its own limits; those shown are the last ones."
-    return [*sentences, *several_settings(runs, limits), *_unjudged(runs, alarms)]
+    return [
+        *sentences("safety", {"injected": (injected, number) if injected else ()}),
+        *failed_runs(runs),
+        *sentences("safety", {"partial": (partial, number) if partial else ()}),
+        *several_settings(runs, say("safety", "limits")),
+        *_unjudged(runs, alarms),
+    ]
 
 
 def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     """Per solution: the time and the alarms that nothing could judge."""
-    sentences = []
+    said = []
     done = runs.filter(pl.col("status") != RunStatus.FAILED).sort("solution")
     for (solution,), rows in done.group_by("solution", maintain_order=True):
-        held_s, seen_s = (float(rows[name].sum()) for name in ("held_s", "evidence_s"))
-        if held_s - seen_s >= 1.0:  # less is not worth saying
-            without = rows["evidence"].null_count()
-            sentences.append(
-                f"{solution}: in {(held_s - seen_s) / 3600.0:.3g} of {held_s / 3600.0:.3g} h the position could not be"
-                f" checked ({without} of {rows.height} runs have no evidence at all). No rate counts this time."
-            )
-        open_cases = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
-        if open_cases.height:
-            sentences.append(
-                f"{solution}: {open_cases.height} alarms in {open_cases['run_id'].n_unique()} runs could not be"
-                " checked. The rate of false alarms leaves these runs out."
-            )
-    return sentences
+        held_h, seen_h = (float(rows[name].sum()) / 3600.0 for name in ("held_s", "evidence_s"))
+        if held_h - seen_h >= 1.0 / 3600.0:  # less is not worth saying
+            runs_blind = rows["evidence"].null_count()
+            said.append(say("safety", "unchecked_time", solution, held_h - seen_h, held_h, runs_blind, rows.height))
+        unknown = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
+        if unknown.height:
+            said.append(say("safety", "unchecked_alarms", solution, unknown.height, unknown["run_id"].n_unique()))
+    return said
 
 
 def slow_receivers(levels: pl.DataFrame) -> list[str]:
     """Service levels whose allowed time is over before the next epoch can block a position (TVB section 5)."""
     slow = levels.filter(~pl.col("receiver_quick_enough"))
+    counted = slow.group_by("solution", "service_level", "allowed_s", maintain_order=True).agg(
+        pl.col("run_id").n_unique(), pl.col("receiver_needs_s").max()
+    )
     return [
-        f"{solution}: the receiver is too slow for {level} in {runs} runs: one period and the reaction take up to "
-        f"{needed_s:.4g} s, {allowed_s:.4g} s are allowed."
-        for solution, level, allowed_s, runs, needed_s in slow.group_by(
-            "solution", "service_level", "allowed_s", maintain_order=True
-        )
-        .agg(pl.col("run_id").n_unique(), pl.col("receiver_needs_s").max())
-        .iter_rows()
+        say("safety", "slow_receiver", solution, level, runs, needed_s, allowed_s)
+        for solution, level, allowed_s, runs, needed_s in counted.iter_rows()
     ]
 
 
 def level_statements(detection: pl.DataFrame) -> list[str]:
     """Per solution: how many failures were in use no longer than each service level allows."""
-    sentences = []
-    for (solution,), rows in detection.filter(pl.col("failures") > 0).group_by("solution", maintain_order=True):
-        levels = [_level(row) for row in rows.iter_rows(named=True)]
-        sentences.append(f"{solution}: of {rows['failures'][0]} position failures in use " + ", ".join(levels) + ".")
-    return sentences
+    failed = detection.filter(pl.col("failures") > 0).group_by("solution", maintain_order=True)
+    return [
+        say("safety", "levels", solution, rows["failures"][0], ", ".join(map(_level, rows.iter_rows(named=True))))
+        for (solution,), rows in failed
+    ]
 
 
-def _level(row: dict[str, Any]) -> str:
+def _level(row: Row) -> str:
     unknown = row["failures"] - row["within"] - row["exceeded"]
-    beside = f" and {unknown} unknown" if unknown else ""
-    level = f"{row['allowed_s']:.4g} s ({row['service_level']}{_within_bounds(row)})"
-    return f"{row['within']} in time{beside} for {level}"
+    beside = say("safety", "unknown_besides", unknown) if unknown else ""
+    return say("safety", "level", row["within"], beside, row["allowed_s"], row["service_level"], _within_bounds(row))
 
 
-def _within_bounds(row: dict[str, Any]) -> str:
+def _within_bounds(row: Row) -> str:
     """The bounds of the share of failures that a truth judged; nothing without any."""
     if row["within_share"] is None:
         return ""
-    of = "" if row["failures_judged"] == row["failures"] else f" of the {row['failures_judged']} judged by a truth"
-    return f"; 95 %{of}: {row['within_share_low']:.1%} to {row['within_share_high']:.1%}"
+    judged = row["failures_judged"]
+    of = "" if judged == row["failures"] else say("safety", "judged_by_truth", judged)
+    return say("safety", "share_in_time", of, row["within_share_low"], row["within_share_high"])
 
 
 def plain_statements(figures: pl.DataFrame) -> list[str]:
-    """What the figures do and do not show, one sentence or two per solution."""
-    return [_statement(row) for row in figures.iter_rows(named=True)]
+    """What the figures do and do not show, one paragraph per solution."""
+    return [" ".join(sentences("safety", _statement(row))) for row in figures.iter_rows(named=True)]
 
 
-def _statement(row: dict[str, Any]) -> str:
-    claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
-    head = " ".join([_failures(row), _missed(row), _acceptances(row)])
-    if row["share_p1"]:
-        head += f" Position wrong and not blocked: {row['share_p1']:.3%} of the time in runs with a truth."
-    if row["hours_still_needed"] == 0.0:
-        return f"{head} This proves a {claim} by counting."
-    return (
-        f"{head} Fault-free hours still needed to prove a {claim} by counting: {row['hours_still_needed']:.3g} h of"
-        f" {row['hours_needed']:.3g} h. No trial reaches that: the claim has to rest on the time to detect."
-    )
+def _statement(row: Row) -> dict[str, object]:
+    """What is said of one solution, in this order."""
+    proved = row["hours_still_needed"] == 0.0
+    needed = (row["thr_vb_per_h"], row["hours_still_needed"], row["hours_needed"])
+    return {
+        "failures": _failures(row),
+        "missed": _missed(row),
+        "accepted": _accepted(row),
+        "not_blocked": row["share_p1"],
+        "proved": row["thr_vb_per_h"] if proved else (),
+        "not_proved": () if proved else needed,
+    }
 
 
-def _failures(row: dict[str, Any]) -> str:
+def _failures(row: Row) -> tuple[object, ...]:
     within = row["failures_within_budget"]
     beyond = row["failures_beyond_budget"]
     unknown = row["failures"] - within - beyond
-    beside = f", {unknown} unknown" if unknown else ""
-    return (
-        f"{row['solution']}: {row['failures']} position failures in use, at a virtual balise or not: {within} in time,"
-        f" {beyond} too late{beside}. Hours judged: {row['hours_with_evidence']:.6g}, of these"
-        f" {row['hours_with_truth']:.6g} by a truth (reference or balise reads)."
-    )
+    beside = say("safety", "unknown", unknown) if unknown else ""
+    hours = (row["hours_with_evidence"], row["hours_with_truth"])
+    return (row["solution"], row["failures"], within, beyond, beside, *hours)
 
 
-def _missed(row: dict[str, Any]) -> str:
-    known = row["missed_known"]
-    missed = row["missed_judged"]
-    sentence = f"No monitor found {missed} of {known} faults with a failure that a truth judged"
-    if row["missed"] > missed:
-        sentence += f"; {row['missed'] - missed} more are known by the odometer alone, and shares leave them out"
-    return f"{sentence}."
+def _missed(row: Row) -> tuple[object, ...]:
+    more = row["missed"] - row["missed_judged"]
+    beside = say("safety", "missed_by_odometer", more) if more > 0 else ""
+    return row["missed_judged"], row["missed_known"], beside
 
 
-def _acceptances(row: dict[str, Any]) -> str:
-    judged = row["accepted_judged"]
-    unsafe = row["unsafe_judged"]
-    seen = row["unsafe_accepted"]
-    sentence = f"Of {judged} accepted virtual balises judged by a truth {unsafe} were accepted despite a wrong position"
-    if seen > unsafe:
-        sentence += f", and {seen - unsafe} more by the odometer alone"
-    if row["unproven_accepted"]:
-        sentence += f"; {row['unproven_accepted']} accepted ones could not be checked"
-    return f"{sentence}."
+def _accepted(row: Row) -> tuple[object, ...]:
+    more = row["unsafe_accepted"] - row["unsafe_judged"]
+    beside = say("safety", "accepted_by_odometer", more) if more > 0 else ""
+    unchecked = say("safety", "accepted_unchecked", row["unproven_accepted"]) if row["unproven_accepted"] else ""
+    return row["accepted_judged"], row["unsafe_judged"], beside, unchecked

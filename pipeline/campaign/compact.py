@@ -1,0 +1,77 @@
+"""`balise compact`: the tables of many runs in few files, while no campaign writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from pipeline.campaign import resume
+from pipeline.campaign.lock import locked
+from pipeline.results import catalogue, packs, store
+from pipeline.results.manifest import write_manifest
+from pipeline.results.outcome import RunOutcome
+from pipeline.results.packing import RUNS_PER_PACK, pack_runs, unpack
+from pipeline.storage.address import Address, is_url
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Compaction:
+    """How a result lies now: runs in packs, packs, runs with files of their own; `left_out`: these with the reason."""
+
+    packed: int
+    packs: int
+    own: int
+    left_out: Mapping[str, str]
+
+    @property
+    def sentence(self) -> str:
+        files = "1 file" if self.packs == 1 else f"{self.packs} files"
+        return f"{self.packed} runs lie in {files} per table, {self.own} in files of their own"
+
+
+def compact(
+    out: Address, runs_per_pack: int = RUNS_PER_PACK, jobs: int = 1, progress: Progress | None = None
+) -> Compaction:
+    """Pack all complete runs. Ended at any instant, it has lost nothing, and the next call does the rest.
+
+    Raises `UsageError` without a complete run, `OutputError` while a campaign writes there.
+    """
+    store.complete_runs(out)
+    left_out: dict[str, str] = {}
+    done = 0
+    with locked(out):
+        store.sweep(out)
+        known = {} if is_url(out) else resume.in_place(str(out))
+        for packed, total in pack_runs(out, runs_per_pack, jobs):
+            left_out |= packed.left_out
+            done += len(packed.runs) + len(packed.left_out)
+            if progress is not None:
+                progress(done, total)
+        return _finished(out, left_out, known)
+
+
+def undo(out: Address, progress: Progress | None = None) -> Compaction:
+    """Give every run files of its own again, with the bytes that they had."""
+    store.complete_runs(out)
+    total = len(packs.find(out))
+    done = 0
+    with locked(out):
+        store.sweep(out)
+        known = {} if is_url(out) else resume.in_place(str(out))
+        for runs in unpack(out):
+            done += runs
+            if progress is not None:
+                progress(done, total)
+        return _finished(out, {}, known)
+
+
+def _finished(out: Address, left_out: Mapping[str, str], known: Mapping[str, RunOutcome]) -> Compaction:
+    """Write what follows from where runs lie; `known`: outcomes of runs that need not be looked into again."""
+    write_manifest(out)
+    catalogue.gather(out)
+    if known:
+        resume.keep_in_place(str(out), known)
+    own = len(store.own_runs(out))
+    return Compaction(len(store.run_ids(out)) - own, len(packs.listed(out)), own, left_out)

@@ -1,0 +1,105 @@
+"""The rows of packed runs: of each file of a pack the row groups that hold the runs asked for, and no others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.results import packs
+from pipeline.results.packs import Pack, PackedRun
+from pipeline.storage import files
+from pipeline.storage.address import Address, join
+from pipeline.storage.parquet import ColumnTypes, GroupedFile, ParquetError, Span, written_schema
+from schemas.errors import InputError
+
+
+class _File(NamedTuple):
+    """One table of a pack; a pack never changes, and its name follows from its content."""
+
+    out: str
+    table: str
+    name: str
+    sha256: str
+
+
+def read_rows(
+    out: Address,
+    table: str,
+    runs: Mapping[str, PackedRun],
+    columns: Sequence[str],
+    check: Callable[[str, ColumnTypes], object],
+) -> Iterator[tuple[dict[str, int], pl.DataFrame]]:
+    """These columns of one table, pack by pack: how many rows each run has, and the rows, one run after the other.
+
+    `check`, given a run, may refuse the columns that there are. Raises `UsageError` for a file that cannot be read.
+    """
+    for pack, rows in packs.by_pack(runs):
+        file = _file_of(out, table, pack)
+        spans = packs.index_of(out, pack).spans(table, rows.values())
+        heights = {run_id: end - first for run_id, (first, end) in zip(rows, spans, strict=True)}
+        check(next(iter(rows)), _columns(file))
+        if columns:
+            yield heights, pl.DataFrame(pl.from_arrow(_read(file, spans, columns))).select(columns)
+        else:
+            yield heights, pl.DataFrame(height=sum(heights.values()))
+
+
+def of_run(out: Address, table: str, place: PackedRun) -> pa.Table:
+    """The table of one run as `as_written` gives it."""
+    return next(as_written(out, table, place.pack, [place.row]))
+
+
+def as_written(out: Address, table: str, pack: Pack, rows: Sequence[int]) -> Iterator[pa.Table]:
+    """The table of each of these runs with the schema that its own file had, without metadata."""
+    file = _file_of(out, table, pack)
+    spans = packs.index_of(out, pack).spans(table, rows)
+    schema = written_schema(_footer(file)).remove_metadata()
+    begin = 0
+    whole = _read(file, spans, None).cast(schema).drop_columns("run_id")
+    for first, end in spans:
+        yield whole.slice(begin, end - first)
+        begin += end - first
+
+
+def _file_of(out: Address, table: str, pack: Pack) -> _File:
+    return _File(str(out), table, pack.name, pack.sha256[table])
+
+
+def _read(file: _File, spans: Sequence[Span], columns: Sequence[str] | None) -> pa.Table:
+    try:
+        source = _opened(file, _footer(file))
+        numbers = source.groups(spans)
+        if len(numbers) > 1:
+            return source.rows(spans, source.read(numbers, columns), numbers)
+        # Whoever asks for one run after the other finds the next ones in the same group.
+        kept = _group(file, numbers[0], None if columns is None else tuple(columns)) if numbers else None
+        return source.read([], columns) if kept is None else source.rows(spans, kept, numbers)
+    except (ParquetError, InputError) as error:
+        raise packs.unusable(file.out, packs.file_name(file.table, file.name), str(error)) from None
+
+
+def _opened(file: _File, footer: pq.FileMetaData | None = None) -> GroupedFile:
+    return GroupedFile(files.in_parts(join(file.out, packs.file_name(file.table, file.name))), footer)
+
+
+@lru_cache(maxsize=32)
+def _footer(file: _File) -> pq.FileMetaData:
+    try:
+        return _opened(file).metadata
+    except (ParquetError, InputError) as error:
+        raise packs.unusable(file.out, packs.file_name(file.table, file.name), str(error)) from None
+
+
+@lru_cache(maxsize=32)
+def _columns(file: _File) -> ColumnTypes:
+    return _opened(file, _footer(file)).columns()
+
+
+@lru_cache(maxsize=16)
+def _group(file: _File, number: int, columns: tuple[str, ...] | None) -> pa.Table:
+    return _opened(file, _footer(file)).read([number], columns)

@@ -1,0 +1,279 @@
+"""Runs into packs, and out of them again: nothing is removed before what replaces it is whole and counts."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import polars as pl
+import pyarrow as pa
+
+from pipeline import storage
+from pipeline.results import packed_tables, packs, store
+from pipeline.results.manifest import tables_noted
+from pipeline.results.marker import NAME as MARKER
+from pipeline.results.marker import Marker, sha256
+from pipeline.results.packs import Pack, PackedRun
+from pipeline.results.workers import each
+from pipeline.storage import parquet
+from pipeline.storage.address import Address, join
+from schemas.errors import UsageError
+from schemas.tables import TABLES
+
+RUNS_PER_PACK = 2000
+# Of what goes into a pack, as its runs' own files [bytes]: it is written in memory.
+_LARGEST_PACK = 256 * 2**20
+# Few enough that a run is found in little, many enough that the heads of the groups stay small.
+_ROWS_PER_GROUP = 16_384
+_RUNS_AT_ONCE = 32
+# Hexadecimal digits of the name of a pack.
+_NAME = 16
+
+
+class _UnfitError(Exception):
+    """The run cannot be packed; `str` says why."""
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """A run as it lies there: its marker, and its tables as they were written, without metadata."""
+
+    marker: Marker
+    tables: Mapping[str, pa.Table]
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What one pack is made of: runs of one build of the program. `own`: those among them with files of their own."""
+
+    out: str
+    software_digest: str
+    runs: tuple[str, ...]
+    own: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A pack that was written, if any, and the runs in it; `left_out`: those that cannot be packed, and why."""
+
+    pack: Pack | None
+    runs: tuple[str, ...]
+    left_out: Mapping[str, str]
+
+
+def pack_runs(out: Address, runs_per_pack: int, jobs: int) -> Iterator[tuple[Packed, int]]:
+    """Pack all runs that have files of their own: each pack as soon as it counts, and how many runs there are to do.
+
+    A pack with runs that were replayed since, and one that is less than half full, is made anew.
+    """
+    own = frozenset(store.own_runs(out))
+    steps = list(_planned(out, own, runs_per_pack))
+    total = sum(len(step.runs) for step in steps)
+    made: list[Pack] = []
+    for packed in each(_write_pack, steps, jobs):
+        made += [] if packed.pack is None else [packed.pack]
+        _count(out, made, own)
+        store.remove_own(out, [run for run in packed.runs if run in own])
+        yield packed, total
+    packs.sweep(out)
+
+
+def _planned(out: Address, own: frozenset[str], runs_per_pack: int) -> Iterator[_Step]:
+    """By the build that made them, as only runs of one build are sure to have the same columns."""
+    by_build = {marker.run_id: marker.metadata.get("software_digest", "") for marker in store.markers(out, sorted(own))}
+    size_of = _sizes(out, own)
+    packed = packs.find(out)
+    for pack in packs.listed(out):
+        rest = [run for run in packs.index_of(out, pack).run_ids if packed[run].pack == pack and run not in by_build]
+        stale = len(rest) < pack.runs
+        small = pack.runs < runs_per_pack / 2 and pack.bytes < _LARGEST_PACK / 2
+        if stale or (small and pack.software_digest in by_build.values()):
+            by_build |= dict.fromkeys(rest, pack.software_digest)
+            size_of |= dict.fromkeys(rest, pack.bytes // pack.runs)
+    for build in sorted(set(by_build.values())):
+        of_build = sorted(run for run, made_by in by_build.items() if made_by == build)
+        for runs in _portions(of_build, size_of, runs_per_pack):
+            yield _Step(str(out), build, runs, own.intersection(runs))
+
+
+def _sizes(out: Address, own: Iterable[str]) -> dict[str, int]:
+    """Size of all tables of each run [bytes]."""
+    of_tables = [storage.sizes(join(out, table), f"{table}.parquet") for table in TABLES]
+    return {run: sum(sizes.get(store.folder_name(run), 0) for sizes in of_tables) for run in own}
+
+
+def _portions(runs: Sequence[str], size_of: Mapping[str, int], most: int) -> Iterator[tuple[str, ...]]:
+    portion: list[str] = []
+    size = 0
+    for run in runs:
+        if portion and (len(portion) >= most or size + size_of[run] > _LARGEST_PACK):
+            yield tuple(portion)
+            portion = []
+            size = 0
+        portion.append(run)
+        size += size_of[run]
+    if portion:
+        yield tuple(portion)
+
+
+def _count(out: Address, made: Sequence[Pack], own: frozenset[str]) -> None:
+    """List the packs made so far, after those that hold a run that is found nowhere else."""
+    names = {pack.name for pack in made}
+    elsewhere = own.union(*(packs.index_of(out, pack).run_ids for pack in made))
+    before = [pack for pack in packs.listed(out) if pack.name not in names]
+    needed = [pack for pack in before if not elsewhere.issuperset(packs.index_of(out, pack).run_ids)]
+    packs.write_list(out, [*needed, *made])
+
+
+def _write_pack(step: _Step) -> Packed:
+    """Write the files of one pack, read them again, and hold each run against what it was."""
+    left_out: dict[str, str] = {}
+    while True:
+        writer = _PackWriter()
+        for run in step.runs:
+            if run not in left_out:
+                try:
+                    writer.add(_own(step.out, run) if run in step.own else _of_pack(step.out, run))
+                except (_UnfitError, parquet.ParquetError) as error:
+                    left_out[run] = str(error)
+        if not writer.run_ids:
+            return Packed(None, (), left_out)
+        pack = writer.write(step)
+        wrong = list(_not_the_same(step, pack))
+        if not wrong:
+            return Packed(pack, tuple(writer.run_ids), left_out)
+        left_out |= dict.fromkeys(wrong, "its files cannot be made again byte for byte by this build of the program")
+
+
+class _PackWriter:
+    """Gathers runs, and writes them as one pack."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[str | int, ...]] = []
+        self._schemas: dict[str, pa.Schema] = {}
+        self._writers: dict[str, parquet.GroupedWriter] = {}
+
+    @property
+    def run_ids(self) -> list[str]:
+        return [str(row[0]) for row in self._rows]
+
+    def add(self, run: _Recorded) -> None:
+        """Raises `_UnfitError` where its columns are not those of the others."""
+        tables = {name: _named(run.marker.run_id, table) for name, table in run.tables.items()}
+        for name, table in tables.items():
+            if not table.schema.equals(self._schemas.setdefault(name, table.schema), check_metadata=True):
+                raise _UnfitError("it has other columns than runs of the same build of the program")
+        for name, table in tables.items():
+            if name not in self._writers:
+                self._writers[name] = parquet.GroupedWriter(table.schema, _ROWS_PER_GROUP)
+            self._writers[name].add(table)
+        metadata = json.dumps(run.marker.metadata, ensure_ascii=False)
+        heights = [tables[name].num_rows for name in TABLES]
+        self._rows.append((run.marker.run_id, run.marker.sha256, metadata, *heights))
+
+    def write(self, step: _Step) -> Pack:
+        """Put the files in their places, where nobody looks before they are listed."""
+        index = pl.DataFrame(self._rows, schema=packs.INDEX_COLUMNS, orient="row")
+        name = hashlib.sha256(repr(index.select("run_id", "sha256").rows()).encode()).hexdigest()[:_NAME]
+        contents = {table: writer.content() for table, writer in self._writers.items()}
+        contents[packs.INDEX] = parquet.parquet_bytes(index)
+        for part, content in contents.items():
+            storage.write_bytes(join(step.out, packs.file_name(part, name)), content)
+        return Pack(
+            name=name,
+            runs=index.height,
+            bytes=sum(map(len, contents.values())),
+            software_digest=step.software_digest,
+            sha256={part: sha256(content) for part, content in contents.items()},
+        )
+
+
+def _named(run_id: str, table: pa.Table) -> pa.Table:
+    """With the id of the run in the first column."""
+    field = pa.field("run_id", pa.large_string())
+    return table.add_column(0, field, pa.array([run_id] * table.num_rows, field.type))
+
+
+def _own(out: str, run_id: str) -> _Recorded:
+    """A run from its own files. Raises `_UnfitError` where they are not what its marker says."""
+    places = {name: str(store.table_address(out, name, run_id)) for name in TABLES}
+    contents = storage.read_many(list(places.values()))
+    marker = Marker.of_file(run_id, contents.get(places[MARKER], b""))
+    noted = _digests(marker)
+    for name, place in places.items():
+        if sha256(contents.get(place)) != noted.get(name):
+            raise _UnfitError(f"its table `{name}` is not the one that its marker names")
+    tables = {name: parquet.as_written(contents[place]).replace_schema_metadata(None) for name, place in places.items()}
+    return _Recorded(marker, tables)
+
+
+def _of_pack(out: str, run_id: str) -> _Recorded:
+    """A run from the pack where it is now."""
+    places = packs.find(out, [run_id])
+    (marker,) = packs.markers(out, places)
+    return _Recorded(marker, {name: packed_tables.of_run(out, name, places[run_id]) for name in TABLES})
+
+
+def _digests(marker: Marker) -> dict[str, str]:
+    """The digests of the files that a run has, or had before it was packed."""
+    return {**tables_noted(marker.metadata), MARKER: marker.sha256}
+
+
+def _not_the_same(step: _Step, pack: Pack) -> Iterator[str]:
+    """Runs of a new pack whose own files do not follow from it, or that are not what they were in the pack before."""
+    for marker, tables in _runs_in(step.out, pack):
+        if marker.run_id in step.own:
+            same = _digests(marker) == {name: sha256(content) for name, content in _files(marker, tables)}
+        else:
+            before = _of_pack(step.out, marker.run_id)
+            same = marker == before.marker and all(
+                table.equals(before.tables[name], check_metadata=True) for name, table in tables.items()
+            )
+        if not same:
+            yield marker.run_id
+
+
+def _runs_in(out: str, pack: Pack) -> Iterator[tuple[Marker, dict[str, pa.Table]]]:
+    """Every run of a pack: its marker and its tables, some runs at a time in memory."""
+    run_ids = packs.index_of(out, pack).run_ids
+    markers = packs.markers(out, {run: PackedRun(pack, row) for row, run in enumerate(run_ids)})
+    for first in range(0, len(run_ids), _RUNS_AT_ONCE):
+        rows = range(first, min(first + _RUNS_AT_ONCE, len(run_ids)))
+        parts = {name: packed_tables.as_written(out, name, pack, rows) for name in TABLES}
+        for _ in rows:
+            yield next(markers), {name: next(tables) for name, tables in parts.items()}
+
+
+def _files(marker: Marker, tables: Mapping[str, pa.Table]) -> Iterator[tuple[str, bytes]]:
+    """The run's own files."""
+    metadata = marker.metadata
+    for name, table in tables.items():
+        yield name, store.file_bytes(table, name, metadata)
+
+
+def unpack(out: Address) -> Iterator[int]:
+    """Give all packed runs files of their own again, the same bytes; of each pack how many runs it held.
+
+    Raises `UsageError` where this build of the program cannot make the same bytes: the pack stays.
+    """
+    for pack in packs.listed(out):
+        here = {run for run, place in packs.find(out).items() if place.pack == pack}.difference(store.own_runs(out))
+        for marker, tables in _runs_in(str(out), pack):
+            if marker.run_id in here:
+                files = dict(_files(marker, tables))
+                _check_unpacked(out, pack, marker, files)
+                store.write_files(out, marker.run_id, files)
+        packs.write_list(out, [other for other in packs.listed(out) if other != pack])
+        packs.sweep(out)
+        yield pack.runs
+
+
+def _check_unpacked(out: Address, pack: Pack, marker: Marker, files: Mapping[str, bytes]) -> None:
+    if {name: sha256(content) for name, content in files.items()} != _digests(marker):
+        raise UsageError(
+            "cannot be made again byte for byte by this build of the program",
+            place=f"files of run {marker.run_id}",
+            remedy="Use the build that packed it: it can still be read from its pack by this one.",
+        )

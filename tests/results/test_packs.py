@@ -1,0 +1,236 @@
+"""Many runs in few files: nothing is lost, nothing is read twice, and every question has the same answer."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from pipeline.campaign.compact import compact, undo
+from pipeline.results import catalogue, packs, store
+from pipeline.results.diff import diff_results
+from pipeline.results.query import run_sql
+from pipeline.storage.parquet import GroupedFile
+from schemas.errors import UsageError
+from schemas.run import RunTables
+from schemas.tables import TABLES
+from tests.results.test_store import METADATA, files_in, tables_of, value_of
+
+AT = datetime(2026, 11, 23, tzinfo=UTC)
+
+
+def with_alarms(run_id: str, count: int, availability: float = 0.5) -> RunTables:
+    """A run of two solutions with so many alarms."""
+    bare = tables_of(run_id, ("primary", "second"))
+    known = {"solution": "primary", "t_start": AT, "t_end": AT, "verdict": "unknown", "suspect": "unknown"}
+    rows = [
+        {
+            name: value_of(name, column, {**known, "alarm_id": number})
+            for name, column in TABLES["alarms"].columns().items()
+        }
+        for number in range(count)
+    ]
+    alarms = pl.DataFrame(rows, schema=bare.alarms.schema)
+    runs = bare.runs.with_columns(availability=pl.lit(availability))
+    return RunTables(run_id, bare.hazards, bare.passages, alarms, bare.epochs, runs)
+
+
+RUNS = {"a b": 2, "c/d": 0, "e": 3, "f": 1}
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    for run_id, count in RUNS.items():
+        store.write_run(with_alarms(run_id, count), tmp_path / "out", METADATA)
+    return tmp_path / "out"
+
+
+def content(out: Path) -> dict[str, list[tuple[object, ...]]]:
+    """Every value of a result, and every marker."""
+    tables = {name: store.read_table(out, name).collect().rows() for name in TABLES}
+    markers = [(marker.run_id, marker.sha256, *sorted(marker.metadata.items())) for marker in store.markers(out)]
+    return {**tables, "markers": [tuple(map(str, marker)) for marker in markers]}
+
+
+def without_copies(out: Path) -> dict[str, bytes]:
+    kept = (catalogue.FOLDER, "manifest.json", ".held")
+    return {name: data for name, data in files_in(out).items() if not name.startswith(kept)}
+
+
+def test_every_question_has_the_same_answer(out: Path, tmp_path: Path) -> None:
+    before = content(out)
+    shutil.copytree(out, tmp_path / "own")
+    found = compact(out, runs_per_pack=3)
+    assert (found.packed, found.packs, found.own, found.left_out) == (4, 2, 0, {})
+    assert content(out) == before
+    assert store.run_ids(out) == sorted(RUNS)
+    assert diff_results(tmp_path / "own", out).same
+    assert diff_results(out, tmp_path / "own").same
+    asked = run_sql(out, "SELECT run_id, alarm_id FROM alarms WHERE run_id <> 'e' ORDER BY run_id, alarm_id")
+    assert asked.rows() == [("a b", 0), ("a b", 1), ("f", 0)]
+    assert run_sql(out, "SELECT run_id FROM runs WHERE run_id IN ('c/d', 'f') AND solution = 'second'").height == 2
+    assert store.read_run(out, "c/d").alarms.is_empty()
+    with pytest.raises(UsageError, match="has no run 'g'"):
+        store.read_table(out, "alarms", "g")
+
+
+def test_other_programs_read_the_files_of_packs(out: Path) -> None:
+    compact(out, runs_per_pack=3)
+    read = pl.scan_parquet(out / "alarms/*/*.parquet", hive_partitioning=True, hive_schema={"run_id": pl.String})
+    assert read.group_by("run_id").len().sort("run_id").collect().rows() == [("a b", 2), ("e", 3), ("f", 1)]
+
+
+def test_out_of_packs_come_the_same_bytes(out: Path) -> None:
+    before = without_copies(out)
+    compact(out, runs_per_pack=3)
+    assert not any("run_id=" in name for name in without_copies(out))
+    assert {store.content_of(out, name, "e") for name in TABLES} == {
+        before[f"{name}/run_id=e/{name}.parquet"] for name in TABLES
+    }
+    undo(out)
+    assert without_copies(out) == before
+
+
+def test_own_files_count_before_packs(out: Path) -> None:
+    """A run that was replayed again, and one that is new, beside packs; then packed again."""
+    compact(out, runs_per_pack=3)
+    store.write_run(with_alarms("c/d", 4, availability=0.25), out, METADATA)
+    store.write_run(with_alarms("d", 1), out, METADATA)
+    counts = [("a b", 2), ("c/d", 4), ("d", 1), ("e", 3), ("f", 1)]
+    both = content(out)
+    for _ in range(2):
+        assert run_sql(out, "SELECT run_id, count(*) AS n FROM alarms GROUP BY 1 ORDER BY 1").rows() == counts
+        availability = run_sql(out, "SELECT availability FROM runs WHERE run_id = 'c/d'")
+        assert availability["availability"].to_list() == [0.25, 0.25]
+        assert content(out) == both
+        compact(out, runs_per_pack=3)
+    # Whoever reads the files of packs alone finds each run once.
+    assert pl.read_parquet(out / "alarms/compact/*.parquet").height == 11
+    assert sum(pack.runs for pack in packs.listed(out)) == 5
+
+
+def test_what_is_packed_stays_as_it_is(out: Path) -> None:
+    compact(out, runs_per_pack=2)
+    before = without_copies(out)
+    compact(out, runs_per_pack=2)
+    assert without_copies(out) == before
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+def kill_at(instant: int, patch: pytest.MonkeyPatch) -> None:
+    """From this change of the disk on there is no other."""
+    left = [instant]
+
+    def deadly(change: Callable[..., None]) -> Callable[..., None]:
+        def changed(*arguments: object, **named: object) -> None:
+            left[0] -= 1
+            if left[0] < 0:
+                raise Killed
+            change(*arguments, **named)
+
+        return changed
+
+    for name in ("replace", "unlink", "rmdir"):
+        patch.setattr(os, name, deadly(getattr(os, name)))
+
+
+def test_killed_at_any_instant_nothing_is_lost(tmp_path: Path) -> None:
+    """With a run in a pack that has been replayed since, and a new one."""
+    out = tmp_path / "out"
+    for run_id in ("a b", "c/d"):
+        store.write_run(with_alarms(run_id, 2), out, METADATA)
+    compact(out, runs_per_pack=2)
+    store.write_run(with_alarms("c/d", 4, availability=0.25), out, METADATA)
+    store.write_run(with_alarms("b", 1), out, METADATA)
+    expected = content(out)
+    for instant in range(0, 1000, 8):
+        trial = tmp_path / f"trial{instant}"
+        shutil.copytree(out, trial)
+        with pytest.MonkeyPatch.context() as patch:
+            kill_at(instant, patch)
+            try:
+                compact(trial, runs_per_pack=2)
+                break
+            except Killed:
+                pass
+        assert content(trial) == expected, instant
+        assert compact(trial, runs_per_pack=2).own == 0
+        assert content(trial) == expected, instant
+        assert pl.read_parquet(trial / "alarms/compact/*.parquet").height == 7
+        assert not [name for name in without_copies(trial) if "run_id=" in name or name.endswith(".tmp")]
+        shutil.rmtree(trial)
+    assert instant > 30
+
+
+def test_a_run_is_found_without_reading_the_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.results.packing._ROWS_PER_GROUP", 4)
+    for number in range(8):
+        store.write_run(with_alarms(f"r{number}", 2), tmp_path, METADATA)
+    compact(tmp_path)
+    read: list[list[int]] = []
+    whole = GroupedFile.read
+    monkeypatch.setattr(
+        GroupedFile, "read", lambda file, groups, columns: (read.append(list(groups)), whole(file, groups, columns))[1]
+    )
+    assert store.read_table(tmp_path, "alarms", "r5").collect()["run_id"].to_list() == ["r5", "r5"]
+    assert store.tables_of(tmp_path, "alarms", ["r0", "r6"], ["alarm_id"]).height == 4
+    assert read == [[2], [0, 3]]
+
+
+def test_a_file_that_is_not_what_its_marker_says_is_not_packed(out: Path) -> None:
+    place = Path(store.table_address(out, "alarms", "e"))
+    place.write_bytes(Path(store.table_address(out, "alarms", "f")).read_bytes())
+    before = place.read_bytes()
+    found = compact(out)
+    assert found.left_out == {"e": "its table `alarms` is not the one that its marker names"}
+    assert (found.packed, found.own) == (3, 1)
+    assert place.read_bytes() == before
+
+
+def test_what_another_build_wrote_is_not_packed(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would not come out again as it was."""
+    before = without_copies(out)
+    monkeypatch.setattr("pipeline.storage.parquet._has_dictionary", lambda _: False)
+    found = compact(out)
+    assert found.left_out.keys() == RUNS.keys()
+    assert without_copies(out) == before
+
+
+@pytest.mark.parametrize("place", ["list", "index", "table"])
+def test_damage_is_an_error(out: Path, place: str) -> None:
+    compact(out)
+    # What a pack holds is remembered by its place.
+    out = shutil.copytree(out, out.with_name("copy"))
+    (pack,) = packs.listed(out)
+    file = {"list": packs.LIST, "index": f"compact/{pack.name}.parquet", "table": f"runs/compact/{pack.name}.parquet"}
+    data = bytearray((out / file[place]).read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    (out / file[place]).write_bytes(bytes(data))
+    with pytest.raises(UsageError, match="cannot be read"):
+        store.read_table(out, "runs").collect()
+
+
+def test_in_an_object_store(out: Path) -> None:
+    import fsspec
+
+    fsspec.filesystem("memory").put(str(out), "/packs-test", recursive=True)
+    address = "memory://packs-test"
+    before = content(out)
+    assert compact(address, runs_per_pack=3).packed == 4
+    assert {name: store.read_table(address, name).collect().rows() for name in TABLES} == {
+        name: before[name] for name in TABLES
+    }
+    store.write_run(with_alarms("c/d", 4), address, METADATA)
+    assert run_sql(address, "SELECT run_id FROM alarms WHERE run_id = 'c/d'").height == 4
+    undo(address)
+    assert json.loads(json.dumps(store.run_ids(address))) == sorted(RUNS)
+    assert packs.listed(address) == []
