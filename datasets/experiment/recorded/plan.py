@@ -115,7 +115,7 @@ class RecordedPlan(Settings):
     # The recorded position's own error may delay the failure by what the fault needs for so much more.
     margin_m: NonNegative = 5.0
     # A range error reaches the position along the track with at least so much of it, for the length of the watch alone.
-    satellite_gain: Annotated[Number, Field(gt=0, le=1)] = 0.5
+    satellite_gain: Annotated[Number, Field(gt=0, le=1)] = 0.2
     # No watch is longer.
     longest_s: Positive = 3600.0
     # The run must have been free of faults for so long before the instant.
