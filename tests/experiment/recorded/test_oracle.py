@@ -64,7 +64,7 @@ def _first_alarm_s(tables: RunTables, onset: Onset, watched_s: float) -> float |
 def test_detects_at_the_same_epoch_as_a_replay_from_the_start(journey: Journey, fault: PlannedFault) -> None:
     config = Configuration()
     base = _baseline(journey, config)
-    onsets = _drawn(base, fault, 2)
+    onsets = _drawn(base, fault, 1)
     assert onsets
     for onset in onsets:
         found = injected(base, onset)
