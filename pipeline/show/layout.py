@@ -1,11 +1,13 @@
 """Tables of text that fit a width.
 
-Headings break at `_` and long texts at blanks. A table that is too wide all the same is turned, one line per column,
-where it has few rows; else columns are left out, and the last line says how many.
+Headings break at `_` and long texts at blanks, no word. A table that is too wide all the same is turned, one line per
+column, where it has few rows; else those columns stay that matter most, their long texts below each row, and the last
+line says how many are left out.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
 from collections.abc import Sequence
@@ -14,19 +16,23 @@ from itertools import zip_longest
 
 _GAP = 2
 _HEADING_LINES = 3
-# A text column is not folded to less than this, or than its longest word within reason.
+# A text column is not folded to less than this, or than its longest word; one beyond reason breaks at its signs.
 _NARROWEST = 10
-_LONGEST_WORD = 24
+_LONGEST_WORD = 40
+_LONG_TEXT = 24
+_INDENT = "    "
+_NOTHING = ("-", "", "none")
 _FEW_ROWS = 5
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column as text; numbers stand to the right and are never folded."""
+    """A column as text; numbers stand to the right and are never folded. `rank`: the smaller, the more it matters."""
 
     heading: str
     cells: Sequence[str]
     is_number: bool = False
+    rank: float = math.inf
 
     @property
     def natural(self) -> int:
@@ -46,7 +52,12 @@ class Column:
     def unfolded(self) -> int:
         """Characters that leave all but long texts in one line."""
         widest = max(map(len, self.cells), default=0)
-        return max(widest if self.is_number else min(widest, _LONGEST_WORD), self.least_heading)
+        return max(min(widest, _LONG_TEXT), self.least)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it has rows and no value."""
+        return bool(self.cells) and set(self.cells) <= {"-", ""}
 
     @property
     def least_heading(self) -> int:
@@ -69,25 +80,33 @@ def fitted(columns: Sequence[Column], width: int | None) -> list[str]:
         turned = _turned(columns, rows)
         if _total([column.least for column in turned]) <= width:
             return fitted(turned, width)
-    return _first_columns(columns, width)
+    return _what_matters(columns, width)
 
 
-def _first_columns(columns: Sequence[Column], width: int) -> list[str]:
-    """As many columns from the left as fit, those without any value left out, and a line that says so."""
-    kept: list[Column] = []
-    for column in columns:
-        if column.cells and set(column.cells) <= {"-", ""}:
-            continue
-        if kept and _total([item.unfolded for item in kept] + [column.unfolded]) > width:
-            break
-        kept.append(column)
-    kept = kept or [columns[0]]
+def _what_matters(columns: Sequence[Column], width: int) -> list[str]:
+    """The first column with a value and those of the least rank that fit, in their order.
+
+    Texts that matter and are long, or do not fit beside the others, stand below each row. The last line says how many
+    columns are left out.
+    """
+    first, *others = [column for column in columns if not column.is_empty] or columns[:1]
+    chosen = [first]
+    below = []
+    for column in sorted(others, key=lambda column: column.rank):
+        is_text = not column.is_number and column.rank < math.inf
+        fits = _total([item.unfolded for item in (*chosen, column)]) <= width
+        if is_text and (not fits or column.natural > 2 * _LONG_TEXT):
+            below.append(column)
+        elif fits:
+            chosen.append(column)
+    kept = [column for column in columns if column in chosen]
     widths = _shared_out([column.unfolded for column in kept], [column.natural for column in kept], width)
+    out = len(columns) - len(kept) - len(below)
     note = (
-        f"{len(columns) - len(kept)} of {len(columns)} columns are left out: they do not fit {width} characters or hold"
+        f"{out} of {len(columns)} columns are left out: they do not fit {width} characters or hold"
         " no value. Ask for fewer columns, or for all with --json."
     )
-    return [*_lines(kept, widths, broken=True), *textwrap.wrap(note, width)]
+    return [*_lines(kept, widths, broken=True, below=below, width=width), *(textwrap.wrap(note, width) if out else [])]
 
 
 def _turned(columns: Sequence[Column], rows: int) -> list[Column]:
@@ -109,19 +128,23 @@ def _shared_out(least: list[int], wanted: list[int], width: int) -> list[int]:
     return widths
 
 
-def _lines(columns: Sequence[Column], widths: list[int], broken: bool) -> list[str]:
+def _lines(
+    columns: Sequence[Column], widths: list[int], broken: bool, below: Sequence[Column] = (), width: int = 0
+) -> list[str]:
+    """Headings and rows; the columns `below` under each row, in lines of at most `width` characters."""
     rights = [column.is_number for column in columns]
     headings = [_broken_heading(c.heading, w) if broken else [c.heading] for c, w in zip(columns, widths, strict=True)]
     deepest = max(map(len, headings))
     lines = _row([[""] * (deepest - len(part)) + part for part in headings], widths, rights)
     if not any(column.heading for column in columns):
         lines = []
-    for cells in zip(*(column.cells for column in columns), strict=True):
-        folded = [
-            [cell] if len(cell) <= width else textwrap.wrap(cell, width, break_on_hyphens=False) or [""]
-            for cell, width in zip(cells, widths, strict=True)
-        ]
-        lines += _row(folded, widths, rights)
+    for row, cells in enumerate(zip(*(column.cells for column in columns), strict=True)):
+        lines += _row([_folded(cell, width) for cell, width in zip(cells, widths, strict=True)], widths, rights)
+        for column in below:
+            if column.cells[row] not in _NOTHING:
+                lines += [
+                    _INDENT + part for part in _folded(f"{column.heading}: {column.cells[row]}", width - len(_INDENT))
+                ]
     return lines
 
 
@@ -132,6 +155,24 @@ def _row(parts: list[list[str]], widths: list[int], rights: list[bool]) -> list[
         (" " * _GAP).join(f"{c:{s}{w}}" for c, s, w in zip(cells, signs, widths, strict=True)).rstrip()
         for cells in zip_longest(*parts, fillvalue="")
     ]
+
+
+class _Words(textwrap.TextWrapper):
+    """Breaks at blanks; a word that is longer than the line behind its signs."""
+
+    def _split(self, text: str) -> list[str]:
+        return [
+            piece
+            for word in super()._split(text)
+            for piece in (re.split(r"(?<=[_/.,:=-])", word) if len(word) > self.width else [word])
+            if piece
+        ]
+
+
+def _folded(cell: str, width: int) -> list[str]:
+    if len(cell) <= width:
+        return [cell]
+    return _Words(width, break_on_hyphens=False).wrap(cell) or [""]
 
 
 class _Headings(textwrap.TextWrapper):

@@ -11,30 +11,16 @@ import numpy as np
 import polars as pl
 
 from pipeline.results.places import ground_of
+from pipeline.show.line_strips import SIGNS, strips
 from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import page, pairs, script_json, section, tiles
 from pipeline.storage import write_bytes
 from pipeline.studies.line import LineResult, site_balises
 from schemas.arrays import floats
 from schemas.config import to_toml
-from schemas.line import LineBalises, LineCause, LineDirection, LinePieces, LineProposals, PieceClass
+from schemas.line import LineBalises, LineDirection, LinePieces, LineProposals, PieceClass
 from schemas.version import SOFTWARE
 
-_TONES = {PieceClass.SUITABLE: "right", PieceClass.UNSUITABLE: "wrong", PieceClass.UNKNOWN: "unknown"}
-_SIGNS = {
-    LineCause.UNSAFE_ACCEPTANCE: "U",
-    LineCause.WRONG: "W",
-    LineCause.WRONG_TRACK: "N",
-    LineCause.CLAIMED_WRONGLY: "M",
-    LineCause.OUTAGE: "O",
-    LineCause.AMBIGUOUS: "T",
-    LineCause.CONFIDENCE: "C",
-    LineCause.ALARM: "A",
-    LineCause.FEW_SATELLITES: "S",
-}
-_WIDTH = 1100.0
-_LANE = 22.0
-_ROW_PIECES = 100
 _OPEN = ("piece_class", "cause", "netelement_id", "from_m", "to_m", "direction", "passes", "right", "lost")
 _COLUMNS = (*_OPEN, "wrong_in_use", "few_satellites", "claimed_wrongly", "unknown", "unjudged", "after_alarm",
             "loss_share", "unsafe_high",
@@ -99,7 +85,7 @@ def line_page(result: LineResult) -> str:
         [
             _tiles(pieces),
             section("limits", "What these runs cannot say", _list(result.remarks)),
-            section("line", "The line", _key(), *_strips(pieces, balises)),
+            section("line", "The line", _key(), *_strips(result, passed)),
             section(
                 "proposals",
                 "Proposals side by side",
@@ -127,7 +113,9 @@ def _tiles(pieces: pl.DataFrame) -> str:
                 .select((pl.col("to_m") - pl.col("from_m")).sum())
                 .item()
             )
-            rows.append((f"{kind.value}, {side.value} measure", f"{length_m / 1000.0:.2f} km", tone))
+            rows.append(
+                (f"{kind.value}, {side.value} measure", f"{length_m / 1000.0:.2f} km", tone if length_m else "")
+            )
     return tiles(rows)
 
 
@@ -143,63 +131,19 @@ def _list(texts: Sequence[str]) -> str:
 
 
 def _key() -> str:
-    words = ", ".join(f"{sign} {cause.value.replace('_', ' ')}" for cause, sign in _SIGNS.items())
+    words = ", ".join(f"{sign} {cause.value.replace('_', ' ')}" for cause, sign in SIGNS.items())
     return (
-        '<p class="keys">Upper lane growing, lower lane falling measure. Full height suitable, half height unknown, '
-        f"full height with a letter unsuitable: {escape(words)}. Balises of the first proposal below: "
-        "| virtual, ‖ physical.</p>"
+        '<p class="keys">Kilometres count from the begin of each line. Upper lane: travel with them, lower: against '
+        "them. Full height suitable, half height unknown, full height with a letter unsuitable: "
+        f"{escape(words)}. Balises of the first proposal below: | virtual, ‖ physical.</p>"
     )
 
 
-def _strips(pieces: pl.DataFrame, balises: pl.DataFrame) -> list[str]:
-    """A drawing per net element that was passed, long ones over several rows."""
-    spoken = _with_passes(pieces)["netelement_id"].unique()
-    shown = pieces.filter(pl.col("netelement_id").is_in(spoken.implode()))
+def _strips(result: LineResult, passed: pl.DataFrame) -> list[str]:
+    """Of all net elements that were passed, with the balises of the first proposal."""
+    if passed.is_empty():
+        return ['<p class="none">Nothing is drawn: no run says anything of any piece.</p>']
+    pieces = result.pieces.filter(pl.col("netelement_id").is_in(passed["netelement_id"].unique().implode()))
+    balises = result.balises
     first = balises.filter(pl.col("proposal") == balises["proposal"][0]) if balises.height else balises
-    drawings = []
-    for (name,), of_element in shown.group_by("netelement_id", maintain_order=True):
-        start = int(of_element["piece"].min() or 0)  # type: ignore[arg-type]
-        for (row,), part in of_element.group_by((pl.col("piece") - start) // _ROW_PIECES, maintain_order=True):
-            drawings.append(_strip(str(name), part, first.filter(pl.col("netelement_id") == name), int(row)))
-    return drawings
-
-
-def _strip(name: str, part: pl.DataFrame, balises: pl.DataFrame, row: int) -> str:
-    begin_m, end_m = float(part["from_m"].min()), float(part["to_m"].max())  # type: ignore[arg-type]
-    scale = _WIDTH / max(_ROW_PIECES * (end_m - begin_m) / (part.height / 2), 1e-9)
-    marks = [_block(piece, begin_m, scale) for piece in part.iter_rows(named=True)]
-    for at_m, kind in (
-        balises.filter(pl.col("measure_m").is_between(begin_m, end_m)).select("measure_m", "kind").iter_rows()
-    ):
-        x = 40.0 + (at_m - begin_m) * scale
-        marks.append(f'<text x="{x:.1f}" y="66" text-anchor="middle">{"|" if kind == "virtual" else "‖"}</text>')
-    title = f"{name}, {begin_m:.0f} to {end_m:.0f} m"
-    caption = f"<figcaption><h3>{escape(title)}</h3></figcaption>"
-    return (
-        f'<figure id="strip-{escape(name)}-{row}">{caption}<div class="plot"><svg viewBox="0 0 1160 72" role="img" '
-        f'aria-label="{escape(title)}"><text x="4" y="16">→</text><text x="4" y="42">←</text>{"".join(marks)}</svg>'
-        "</div></figure>"
-    )
-
-
-def _block(piece: dict[str, object], begin_m: float, scale: float) -> str:
-    kind = PieceClass(str(piece["piece_class"]))
-    cause = LineCause(str(piece["cause"]))
-    from_m = float(str(piece["from_m"]))
-    to_m = float(str(piece["to_m"]))
-    x = 40.0 + (from_m - begin_m) * scale
-    width = max((to_m - from_m) * scale - 0.6, 0.5)
-    top = 2.0 if piece["direction"] == LineDirection.GROWING.value else 28.0
-    height = _LANE / 2 if kind is PieceClass.UNKNOWN else _LANE
-    summary = f"{kind.value}, {cause.value}; {piece['passes']} passes, {piece['lost']} lost"
-    title = f"{from_m:.0f} to {to_m:.0f} m, {piece['direction']}: {summary}"
-    sign = _SIGNS.get(cause, "") if kind is PieceClass.UNSUITABLE else ""
-    letter = (
-        f'<text class="name" x="{x + width / 2:.1f}" y="{top + 16:.0f}" text-anchor="middle">{sign}</text>'
-        if sign
-        else ""
-    )
-    return (
-        f'<g><title>{escape(title)}</title><rect class="bars tone-{_TONES[kind]}" x="{x:.1f}" '
-        f'y="{top + _LANE - height:.0f}" width="{width:.1f}" height="{height:.0f}"/>{letter}</g>'
-    )
+    return strips(pieces, result.line.site.links, first)

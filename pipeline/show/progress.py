@@ -6,6 +6,7 @@ import contextlib
 import json
 import sys
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
@@ -17,7 +18,7 @@ from pipeline import storage
 from pipeline.results.figures.head import word_of
 from pipeline.results.outcome import CampaignSummary, RunOutcome, UnderWay
 from pipeline.show.campaign import ending_rows, outcome_line, outcome_rows, remedy_lines, summary_line
-from pipeline.show.terminal import duration_text, show_table, to_json
+from pipeline.show.terminal import duration_text, show_table, show_text, to_json
 from pipeline.storage.address import is_url, join, redacted
 from schemas.enums import RunStatus
 from schemas.errors import visible
@@ -25,6 +26,9 @@ from schemas.version import SOFTWARE
 
 # Between two lines of progress in a pipe.
 _SAY_S = 5.0
+# Characters of the bar; of both counts and the time beside it, of 100,000 runs.
+_BAR = 12
+_COUNTS = 24
 
 
 class CampaignWatch:
@@ -74,14 +78,18 @@ class CampaignWatch:
 
     def line(self, under_way: UnderWay = ()) -> str:
         """One line: done, failed, rate, time left, slow runs."""
-        parts = [f"{self.done}/{self.total} runs", f"{self.failed} failed or partial"]
+        return ", ".join([f"{self.done}/{self.total} runs", *self.parts(under_way)])
+
+    def parts(self, under_way: UnderWay = ()) -> list[str]:
+        """What is said beside how many are done, what matters most first."""
+        parts = [f"{self.failed} failed or partial"]
         if self.skipped:
             parts.append(f"{self.skipped} skipped")
         if self.rate_per_s is not None and self.left_s is not None:
-            parts += [f"{self.rate_per_s:.2f} runs/s", f"{duration_text(self.left_s)} left"]
+            parts += [f"{duration_text(self.left_s)} left", f"{self.rate_per_s:.2f} runs/s"]
         if slow := slowest(under_way):
             parts.append("longest now: " + ", ".join(f"{visible(run)} ({duration_text(age_s)})" for run, age_s in slow))
-        return ", ".join(parts)
+        return parts
 
     def figures(self, under_way: UnderWay = ()) -> dict[str, object]:
         """The same for programs."""
@@ -89,6 +97,16 @@ class CampaignWatch:
         slow = [{"run_id": run, "seconds": round(age_s, 3)} for run, age_s in slowest(under_way)]
         times = {"rate_per_s": _rounded(self.rate_per_s), "left_s": _rounded(self.left_s)}
         return {**counts, **times, "slow": slow}
+
+
+def as_fits(parts: Sequence[str], room: int) -> str:
+    """As many of the parts as `room` characters take, the first in any case."""
+    text = parts[0]
+    for part in parts[1:]:
+        if len(text) + len(part) + 2 > room:
+            break
+        text += f", {part}"
+    return text
 
 
 def slowest(under_way: UnderWay) -> list[tuple[str, float]]:
@@ -157,13 +175,14 @@ class BarWatch(CampaignWatch):
 
     def begin(self, runs: int, out: str) -> None:
         super().begin(runs, out)
-        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+        columns = (BarColumn(_BAR), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
         self._bar = Progress(*columns, console=Console(stderr=True))
         self._task = self._bar.add_task("", total=runs)
         self._bar.start()
 
     def look(self, under_way: UnderWay) -> None:
-        text = self.line(under_way).partition(", ")[2]
+        room = self._bar.console.width - _BAR - _COUNTS
+        text = as_fits(self.parts(under_way), room)
         self._bar.update(self._task, completed=self.done, description=text)
 
     def noted(self, text: str) -> None:
@@ -241,7 +260,7 @@ def summary_answer(summary: CampaignSummary, out: str) -> dict[str, object]:
 
 def _show_ending(summary: CampaignSummary, out: str, most: int = 25) -> None:
     """The verdicts, the worst first; of many runs those that are not safe."""
-    print(summary_line(summary))
+    show_text(summary_line(summary))
     rows = ending_rows(summary)
     remarkable = rows.filter(rows["verdict"] != "safe")
     shown = rows if rows.height <= most else remarkable.head(most)

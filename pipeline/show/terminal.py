@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
@@ -25,6 +26,12 @@ _PLAIN = "\x1b[0m"
 # Right is green, wrong red, not known grey; the word itself says it where there are no colours.
 _COLOURS = {"unsafe": "\x1b[1;31m", "failed": "\x1b[31m", "unproven": "\x1b[90m", "safe": "\x1b[32m"}
 _VERDICT_WORD = re.compile(r"(?<![\w-])(?:unsafe|failed|unproven|safe)(?![\w-])")
+# Where not all columns fit, these stay, the first of them first.
+_MATTERS = (
+    *("verdict", "run_id", "key", "value", "unsafe_accepted", "failures", "failures_beyond_budget", "hazards"),
+    *("hazards_1a", "hazards_1b", "hazards_shift", "hazards_wrong_track", "missed_detections"),
+    *("why", "faults", "reasons", "error", "availability"),
+)
 # Control characters that JSON itself lets stand.
 _STEERING = re.compile("[\x7f-\x9f]")
 
@@ -47,13 +54,25 @@ def show_tables(tables: Mapping[str, pl.DataFrame]) -> None:
         print()
 
 
+def show_text(text: str) -> None:
+    """Print a sentence: on a terminal in lines that fit, in a pipe in one."""
+    if sys.stdout.isatty():
+        width = shutil.get_terminal_size().columns
+        text = textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)
+    print(text)
+
+
 def table_lines(frame: pl.DataFrame, width: int | None = None) -> list[str]:
     """A frame as aligned text, two blanks between columns, in lines of at most `width` characters."""
     columns = [
-        Column(name, [_text(value) for value in frame[name].to_list()], dtype.is_numeric())
+        Column(name, [_text(value) for value in frame[name].to_list()], dtype.is_numeric(), _rank(name))
         for name, dtype in frame.schema.items()
     ]
     return fitted(columns, width) if columns else []
+
+
+def _rank(name: str) -> float:
+    return _MATTERS.index(name) if name in _MATTERS else math.inf
 
 
 def screen_width() -> int | None:
@@ -127,8 +146,12 @@ def _plain(value: Any) -> Any:
 
 
 def how_far(things: str) -> Callable[[int, int], None]:
-    """Says on standard error how many of how many things are done: in one line that changes, in a pipe every 5 s."""
+    """Says on standard error how many of how many things are done: in one line that changes, in a pipe every 5 s.
+
+    The time left is that of the things done so far, which need not take as long as the others.
+    """
     on_terminal = sys.stderr.isatty()
+    begun_s = time.monotonic()
     said_s = time.monotonic() - (_SAID_EVERY_S if on_terminal else 0.0)
 
     def progress(done: int, total: int) -> None:
@@ -136,8 +159,10 @@ def how_far(things: str) -> Callable[[int, int], None]:
         last = on_terminal and done == total
         if last or time.monotonic() - said_s >= (_CHANGED_EVERY_S if on_terminal else _SAID_EVERY_S):
             said_s = time.monotonic()
-            text = f"{done}/{total} {things}"
-            begin, end = ("\r", "\n" if last else "") if on_terminal else ("", "\n")
+            left = "" if done in (0, total) else duration_text((said_s - begun_s) / done * (total - done))
+            text = f"{done}/{total} {things}" + (f", {left} left" if left else "")
+            # What is left of a longer line is wiped out.
+            begin, end = ("\r\x1b[K", "\n" if last else "") if on_terminal else ("", "\n")
             print(f"{begin}{text}", end=end, file=sys.stderr, flush=True)
 
     return progress

@@ -55,7 +55,7 @@ def test_counts_in_one_line(clock: Clock, plan: Plan) -> None:
     clock.now_s += 4.0
     line = watch.line([("quick", 1.0), ("slow", 90.0), ("slower", 120.0)])
     assert line == (
-        "3/10 runs, 1 failed or partial, 1 skipped, 0.50 runs/s, 14 s left, "
+        "3/10 runs, 1 failed or partial, 1 skipped, 14 s left, 0.50 runs/s, "
         "longest now: slower (2 min 0 s), slow (1 min 30 s)"
     )
 

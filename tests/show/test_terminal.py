@@ -5,6 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
+from pipeline.show.progress import as_fits
 from pipeline.show.terminal import table_lines
 
 WIDE = pl.DataFrame({f"column_{number}": [number * 1000.0 + row for row in range(9)] for number in range(30)})
@@ -49,6 +50,41 @@ def test_long_texts_are_folded_at_blanks_and_headings_at_underscores() -> None:
 def test_columns_without_any_value_go_first() -> None:
     frame = WIDE.with_columns(column_0=pl.lit(None, pl.Float64))
     assert all(not line.strip().startswith("-") for line in table_lines(frame, 80))
+
+
+RUN = "2025-03-03_jump_one_no_odometer_train00"
+COUNTS = ("unsafe_accepted", "failures", "hazards_1b")
+RUNS = pl.DataFrame(
+    {"verdict": ["unsafe"] * 9, "run_id": [RUN] * 9, **{f"column_{number}": [0.25] * 9 for number in range(20)}}
+    | {name: [3] * 9 for name in COUNTS}
+    | {"why": ["VBs accepted despite a wrong position: 1; position failures in use for longer than allowed: 1"] * 9}
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_what_matters_stays_and_no_word_breaks(width: int) -> None:
+    """Counts of what went wrong stand behind twenty others; the reason stands below each run."""
+    lines = table_lines(RUNS, width)
+    assert max(map(len, lines)) <= width
+    heading, first = " ".join(lines[:3]), next(at for at, line in enumerate(lines) if line.startswith("unsafe"))
+    assert {"unsafe_", "accepted", "failures", "hazards_"} <= set(heading.split())
+    assert lines[first].split()[:2] == ["unsafe", RUN]
+    assert lines[first].split().count("3") == 3
+    assert lines[first + 1].startswith("    why: VBs accepted despite a wrong position: 1; ")
+    words = {word for line in lines[first : first + 3] for word in line.split()}
+    assert words <= {"why:", RUN, *" ".join(map(str, RUNS.row(0))).split()}
+
+
+def test_a_word_longer_than_the_line_breaks_behind_its_signs() -> None:
+    path = "results/of_week_12/" + "x" * 30 + "/runs.parquet"
+    lines = table_lines(pl.DataFrame({"file": [path]}), 40)
+    assert lines[1].endswith("/")
+    assert "".join(lines[1:]) == path
+
+
+@pytest.mark.parametrize(("room", "told"), [(10, "2 failed or partial"), (44, "2 failed or partial, 5 min 3 s left")])
+def test_progress_says_what_fits(room: int, told: str) -> None:
+    assert as_fits(["2 failed or partial", "5 min 3 s left", "1.32 runs/s"], room) == told
 
 
 def test_in_a_pipe_nothing_is_left_out() -> None:

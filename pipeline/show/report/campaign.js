@@ -96,17 +96,13 @@
     return [...lines, ...groups, middles, ...(map.hazards.length ? [hazards] : [])];
   }
 
-  function mapPlot(id, own, box = null) {
+  function mapPlot(id, own) {
     const map = own.map;
     if (!map.pieces.length) { empty(id, "No position of a moving train was matched to the track."); return; }
-    const layers = mapLayers(map);
     const [xs, ys] = ["x", "y"].map((key) => map.pieces.flatMap((piece) => piece[key]));
-    const names = { kind: "names", names: map.elements, lo: -0.7, hi: map.elements.length - 0.3 };
-    const [x, y] = box ?? [Plots.range(xs, 100), map.geographic ? Plots.range(ys, 100) : names];
-    draw(id, { height: map.geographic ? 420 : Math.min(900, 90 + 34 * map.elements.length), layers, equal: map.geographic,
-      x: { ...x, title: map.geographic ? "east [m]" : "measure on the net element [m]" },
-      y: map.geographic ? { ...y, title: "north [m]" } : names,
-      zoomBox: (wx, wy) => mapPlot(id, own, [{ lo: wx[0], hi: wx[1] }, { lo: wy[0], hi: wy[1] }]), whole: () => mapPlot(id, own) });
+    Plans.show(id, { layers: mapLayers(map), xs, ys, geographic: map.geographic, height: Math.min(900, 90 + 34 * map.elements.length),
+      x: { ...Plots.range(xs, 100), title: "measure on the net element [m]" },
+      y: { kind: "names", names: map.elements, lo: -0.7, hi: map.elements.length - 0.3 } });
   }
 
   data.order.forEach((name, index) => {

@@ -25,7 +25,7 @@ _LONG = 40
 # A table shows so many columns, which fit a screen and a sheet of paper; a switch shows the rest.
 _SHOWN_COLUMNS = 10
 # What a page takes along: it is one file.
-_SHARED_SCRIPTS = ("tables.js", "scales.js", "plots.js")
+_SHARED_SCRIPTS = ("tables.js", "scales.js", "plots.js", "plans.js")
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,9 @@ def instant(value: datetime) -> str:
 
 
 def link(href: str, text: str, **attributes: str) -> str:
+    """A link; where there is no page to go to, the text alone."""
+    if not href:
+        return escape(text)
     extra = "".join(f' {name.replace("_", "-")}="{escape(value)}"' for name, value in attributes.items())
     return f'<a href="{escape(href)}"{extra}>{escape(text)}</a>'
 

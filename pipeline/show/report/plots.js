@@ -5,6 +5,7 @@ const Plots = (() => {
   const SPACE = "http://www.w3.org/2000/svg";
   const EDGE = { left: 78, time: 128, names: 128, right: 14, top: 10, bottom: 40 };
   const NEAR_PX = 12;
+  const LETTERS_PX = 13;
   const SHAPES = {
     right: ["circle", 5], read: ["square", 4.5], lost: ["diamond", 6.5], unknown: ["ring", 5], wrong: ["cross", 6.5],
     hazard: ["cross", 6],
@@ -94,18 +95,36 @@ const Plots = (() => {
     }
   }
 
+  // Axes of a plan: which way is north, and how long is a round number of metres.
+  function compass(svg, spec, sx, frame) {
+    const [x, y] = [frame.x1 - 24, frame.y0 + 26];
+    const [dx, dy] = [Math.sin(spec.compass), -Math.cos(spec.compass)];
+    const at = (along, aside) => `${(x + along * dx - aside * dy).toFixed(1)} ${(y + along * dy + aside * dx).toFixed(1)}`;
+    make("path", { d: `M${at(-12, 0)}L${at(12, 0)}M${at(5, 4)}L${at(12, 0)}L${at(5, -4)}`, class: "line" }, svg);
+    write(svg, x + 19 * dx, y + 19 * dy + 4, "N", { "text-anchor": "middle", class: "name" });
+    const [length, text] = Scales.round((spec.x.hi - spec.x.lo) / 6);
+    const [left, right] = [frame.x0 + 12, frame.x0 + 12 + sx.at(spec.x.lo + length) - sx.at(spec.x.lo)];
+    make("path", { d: `M${left} ${frame.y1 - 16}v6H${right.toFixed(1)}v-6`, class: "line" }, svg);
+    write(svg, (left + right) / 2, frame.y1 - 16, text, { "text-anchor": "middle", class: "name" });
+  }
+
   function axes(svg, spec, sx, sy, frame) {
+    if (spec.compass !== undefined) { compass(svg, spec, sx, frame); return; }
     for (const [value, text] of Scales.ticks(spec.x, frame.x1 - frame.x0)) {
       const x = sx.at(value);
       if (spec.x.kind !== "names") make("path", { d: `M${x.toFixed(1)} ${frame.y0}V${frame.y1}`, class: "grid" }, svg);
       write(svg, x, frame.y1 + 15, text, { "text-anchor": "middle" });
     }
+    let last = Infinity;
     for (const [value, text] of Scales.ticks({ ...spec.y, upright: true }, frame.y1 - frame.y0)) {
       const y = sy.at(value);
+      if (Math.abs(last - y) < LETTERS_PX) continue;
+      last = y;
       if (spec.y.kind !== "names") make("path", { d: `M${frame.x0} ${y.toFixed(1)}H${frame.x1}`, class: "grid" }, svg);
       write(svg, frame.x0 - 6, y + 4, text, { "text-anchor": "end" });
     }
     if (spec.x.title) write(svg, (frame.x0 + frame.x1) / 2, frame.y1 + 33, spec.x.title, { "text-anchor": "middle" });
+    if (spec.y.kind === "bent") write(svg, frame.x0 + 6, frame.y1 - 6, `logarithmic beyond ±${Scales.number(spec.y.knee)}`, { class: "name" });
     const middle = (frame.y0 + frame.y1) / 2;
     if (spec.y.title) write(svg, 14, middle, spec.y.title, { "text-anchor": "middle", transform: `rotate(-90 14 ${middle})` });
   }
@@ -156,8 +175,8 @@ const Plots = (() => {
     place.closest("figure").classList.remove("nothing");
     const width = place.clientWidth;
     if (!width) return;
-    const left = spec.x.kind === "time" ? EDGE.time : spec.y.kind === "names" ? EDGE.names : EDGE.left;
-    const frame = { x0: left, x1: width - EDGE.right, y0: EDGE.top, y1: spec.height - (spec.x.title ? EDGE.bottom : 24) };
+    const left = spec.compass !== undefined ? EDGE.right : spec.x.kind === "time" ? EDGE.time : spec.y.kind === "names" ? EDGE.names : EDGE.left;
+    const frame = { x0: left, x1: width - EDGE.right, y0: EDGE.top, y1: spec.height - (spec.x.title ? EDGE.bottom : spec.compass !== undefined ? EDGE.right : 24) };
     let { x, y } = spec;
     if (spec.equal) [x, y] = Scales.equal(x, y, frame.x1 - frame.x0, frame.y1 - frame.y0);
     const shown = { ...spec, x, y };
@@ -197,14 +216,28 @@ const Plots = (() => {
       return low && wanted - values[low - 1] < values[low] - wanted ? low - 1 : low;
     }
 
-    function marksNear(layer, px, py, sx, sy) {
+    function markNear(layer, px, py, sx, sy) {
       let best = NEAR_PX;
       let found = null;
       for (let i = 0; i < layer.x.length; i += 1) {
         const away = Math.hypot(sx.at(layer.x[i]) - px, sy.at(layer.y[i]) - py);
         if (away < best) { best = away; found = i; }
       }
+      return found;
+    }
+
+    function marksNear(layer, px, py, sx, sy) {
+      const found = markNear(layer, px, py, sx, sy);
       return found === null ? [] : [layer.tell ? layer.tell(found) : layer.name];
+    }
+
+    // A click takes the mark under the pointer, the one on top, else the place itself.
+    function pick(spec, px, py, sx, sy) {
+      for (const layer of spec.layers.filter((one) => one.type === "marks").reverse()) {
+        const found = markNear(layer, px, py, sx, sy);
+        if (found !== null) { spec.pick(layer.x[found], layer.y[found], layer.tell?.(found)); return; }
+      }
+      spec.pick(sx.value(px), sy.value(py));
     }
 
     function told(spec, px, py, sx, sy) {
@@ -257,7 +290,10 @@ const Plots = (() => {
         start = null;
         if (box) box.remove();
         box = null;
-        if (Math.abs(to[0] - from[0]) < 5) return;
+        if (Math.abs(to[0] - from[0]) < 5) {
+          if (spec.pick && Math.abs(to[1] - from[1]) < 5) pick(spec, ...to, sx, sy);
+          return;
+        }
         const xs = [sx.value(from[0]), sx.value(to[0])].sort((a, b) => a - b);
         if (spec.zoom) spec.zoom(...xs);
         else spec.zoomBox(xs, [sy.value(from[1]), sy.value(to[1])].sort((a, b) => a - b));

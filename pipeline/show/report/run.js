@@ -22,7 +22,7 @@
     TVB: ["right"], "no TVB": ["lost"], right: ["right"], unknown: ["unknown", "could not be checked"], wrong: ["wrong"],
     "no alarm": ["calm"], alarm: ["wrong"], pass: ["right", "passed"], not_evaluated: ["faint", "not evaluated"], fail: ["wrong", "failed"],
   };
-  const state = { solution: null, index: 0, lo: 0, hi: 0, hazard: null, box: null };
+  const state = { solution: null, index: 0, lo: 0, hi: 0, hazard: null };
   const prepared = new Map();
 
   function prepare(name) {
@@ -103,11 +103,12 @@
     return [layers, rules];
   }
 
-  function timePlot(now, name, unit, layers, height, { levels = [], y = null, least = 0, none = "There was no epoch." } = {}) {
+  function timePlot(now, name, unit, layers, height, { levels = [], y = null, least = 0, knee = 0, none = "There was no epoch." } = {}) {
     const id = `plot-s${state.index}-${name}`;
     const known = layers.filter(Boolean);
     if (!known.length) { empty(id, none); return; }
-    const upright = y ?? { ...range([...known.flatMap((layer) => layer.y), ...levels], least), title: unit, unit };
+    const even = y ?? { ...range([...known.flatMap((layer) => layer.y), ...levels], least), title: unit, unit };
+    const upright = knee ? Scales.wide(even, knee) : even;
     const [shades, rules] = hazardMarks(now, upright);
     draw(id, { height, layers: [...shades, ...known], rules: [...rules, ...levels.map((level) => ({ y: level }))],
       x: { kind: "time", lo: state.lo, hi: state.hi }, y: upright, zoom: show, whole: showAll });
@@ -186,7 +187,9 @@
     const limit = data.limits.failure_limit_m;
     const errors = some.map((one) => one.error_m).filter((error) => error !== null);
     const most = Math.max(1.3 * limit, ...errors.map(Math.abs));
-    const floor = -1.12 * most;
+    // A logarithmic axis needs more than an even one to have room.
+    const [above, under, least] = most > 4 * limit ? [2, -2.5, -4] : [1.12, -1.12, -1.25];
+    const floor = under * most;
     const layers = marksOf(some, (one) => one.path_m / 1000, (one) => one.error_m ?? floor,
       (one) => `${one.id}: ${one.status}, ${one.error_m === null ? "error not known" : `${number(one.error_m)} m`}`);
     for (const layer of layers) {
@@ -195,7 +198,7 @@
     }
     draw(id, { height: 280, layers, rules: [{ y: limit }, { y: -limit }, { y: 0, look: "solid faint" }],
       x: { ...range(some.map((one) => one.path_m / 1000), 0.1), title: "path position [km]" },
-      y: { lo: -1.25 * most, hi: 1.12 * most, title: "location error [m]" } });
+      y: Scales.wide({ lo: least * most, hi: above * most, title: "location error [m]" }, limit) });
   }
 
   const LOOKS = ["a", "b", "c", "d", "e"];
@@ -233,11 +236,11 @@
     bandPlot(now, "bands", "lds");
     timePlot(now, "speed", "km/h", [line(now, "speed_mps", "speed", "a", KMH)], 180, { least: 5, none: "No speed is known." });
     const along = line(now, "error_along_m", "error", "a") ?? line(now, "residual_m", "GNSS minus odometer", "a");
-    timePlot(now, "along", "m", [...confidence(now), ...unnoticed(now), along], 250, { levels: along ? [-limit, limit] : [], none: "No truth and no odometer to hold positions against." });
+    timePlot(now, "along", "m", [...confidence(now), ...unnoticed(now), along], 250, { knee: limit, levels: along ? [-limit, limit] : [], none: "No truth and no odometer to hold positions against." });
     timePlot(now, "across", "m", [
       line(now, "error_cross_m", "across", "a") ?? line(now, "cross_track_m", "across, residual", "a"),
       line(now, "error_up_m", "height", "b") ?? line(now, "vertical_m", "height, residual", "b"),
-    ], 220, { least: 1, none: "No position was matched to the track." });
+    ], 220, { least: 1, knee: limit, none: "No position was matched to the track." });
     linkingPlot(now);
     timePlot(now, "exposure", "s", [line(now, "exposure_s", "exposure", "a")], 180, { least: 1, none: "No balise was accepted and no position validated." });
     monitorPlots(now);
@@ -261,26 +264,20 @@
   }
 
   // The plan follows the time axis: it shows where the train was in that stretch.
-  function planRanges({ plan, t0 }) {
-    const rows = [...plan.t.keys()].filter((row) => inView(plan.t[row] + t0));
-    return [range(rows.map((row) => plan.x[row]), 60), range(rows.map((row) => plan.y[row]), plan.geographic ? 60 : 4)];
-  }
-
   function planPlot(now) {
     const id = `plot-s${state.index}-plan`;
     const { plan, t0 } = now;
     if (!plan.x.length) { empty(id, "No position was matched to the track."); return; }
-    const titles = plan.geographic ? ["east [m]", "north [m]"] : ["path position [m]", "across, left positive [m]"];
-    const [x, y] = state.box ?? planRanges(now);
     const track = plan.track.map((element, index) => ({ type: "line", look: "track", name: index ? "" : "track",
       x: unpack(element.x), y: unpack(element.y) }));
     const places = plan.balises.filter((one) => one.x !== null);
     const balises = marksOf(places, (one) => one.x, (one) => one.y, (one) => `${one.id}: ${one.outcomes} (${one.place})`);
     for (const layer of balises) layer.labels = places.filter((one) => one.outcome === layer.tone).map((one) => one.id);
     for (const layer of balises) layer.name = `balise: ${layer.name}`;
-    draw(id, { height: 460, layers: [...track, ...gnssLayers(plan, t0), ...balises], equal: plan.geographic,
-      x: { ...x, title: titles[0] }, y: { ...y, title: titles[1] }, whole: () => { state.box = null; planPlot(now); },
-      zoomBox: (wx, wy) => { state.box = [{ lo: wx[0], hi: wx[1] }, { lo: wy[0], hi: wy[1] }]; planPlot(now); } });
+    const rows = [...plan.t.keys()].filter((row) => inView(plan.t[row] + t0));
+    const [xs, ys] = [plan.x, plan.y].map((axis) => rows.map((row) => axis[row]));
+    Plans.show(id, { layers: [...track, ...gnssLayers(plan, t0), ...balises], xs, ys, geographic: plan.geographic, height: 260,
+      x: { ...range(xs, 60), title: "path position [m]" }, y: { ...range(ys, 4), title: "across, left positive [m]" } });
   }
 
   function stanfordPlot(now) {
@@ -320,7 +317,6 @@
     const span = Math.max(LEAST_MS, Math.min(hi - lo, last - first + 2 * room));
     state.lo = Math.max(first - room, Math.min(lo, last + room - span));
     state.hi = state.lo + span;
-    state.box = null;
     timePlots(now);
     planPlot(now);
     say(now);

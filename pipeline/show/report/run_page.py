@@ -12,6 +12,7 @@ import polars as pl
 
 from pipeline.results.figures.campaign_tables import campaign_balises, with_truth
 from pipeline.results.figures.known_counts import known_counts
+from pipeline.results.places import origin_of
 from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.show.report.columns import Row, figures, frame_table
 from pipeline.show.report.ground import plan_data
@@ -96,6 +97,7 @@ def run_page(
     hazards = made.config.hazards
     data = {
         "run": tables.run_id,
+        "origin": None if made.site is None else origin_of(made.site),
         "monitors": monitor_lines(),
         "limits": {
             "ci_limit_m": made.config.lds.ci_limit_m,

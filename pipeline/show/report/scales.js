@@ -38,21 +38,53 @@ const Scales = (() => {
     return ticks;
   }
 
+  // Even up to the knee on both sides of zero, logarithmic beyond: 20 m can be read beside 500 m.
+  const STRETCH = 1.5;
+  const bent = (knee) => (value) => {
+    const size = Math.abs(value) / knee;
+    return Math.sign(value) * (size <= 1 ? size : 1 + STRETCH * Math.log10(size));
+  };
+  const unbent = (knee) => (inner) => {
+    const size = Math.abs(inner);
+    return Math.sign(inner) * knee * (size <= 1 ? size : 10 ** ((size - 1) / STRETCH));
+  };
+
+  // Such an axis where values go far beyond the knee, else an even one.
+  const wide = (axis, knee) => (Math.max(-axis.lo, axis.hi) > 4 * knee ? { ...axis, kind: "bent", knee } : axis);
+
+  function bends({ lo, hi, knee }) {
+    const values = [0, knee / 2, knee];
+    for (let power = 10 ** Math.floor(Math.log10(knee)); power <= Math.max(-lo, hi); power *= 10) {
+      values.push(...[1, 2, 5].map((digit) => digit * power).filter((value) => value > knee * 1.2));
+    }
+    const both = values.flatMap((value) => (value ? [-value, value] : [0])).filter((value) => value >= lo && value <= hi);
+    return both.sort((a, b) => a - b).map((value) => [value, number(value)]);
+  }
+
   // `at` maps a value to pixels, `value` back; a logarithmic axis has its range in powers of ten.
   function scale(axis, from, to) {
-    const { lo, hi } = axis;
-    const inner = axis.kind === "log" ? Math.log10 : (value) => value;
+    const same = (value) => value;
+    const [inner, outer] = axis.kind === "log" ? [Math.log10, same] : axis.kind === "bent" ? [bent(axis.knee), unbent(axis.knee)] : [same, same];
+    const [lo, hi] = axis.kind === "bent" ? [inner(axis.lo), inner(axis.hi)] : [axis.lo, axis.hi];
     return {
       at: (value) => from + ((inner(value) - lo) / (hi - lo)) * (to - from),
-      value: (px) => lo + ((px - from) / (to - from)) * (hi - lo),
+      value: (px) => outer(lo + ((px - from) / (to - from)) * (hi - lo)),
     };
   }
 
   function ticks(axis, room) {
     if (axis.kind === "names") return axis.names.map((name, row) => [row, name]);
+    if (axis.kind === "bent") return bends(axis);
     if (axis.kind === "time") return times(axis.lo, axis.hi, room / 90);
     if (axis.kind === "log") return powers(axis.lo, axis.hi).map(([power, text]) => [10 ** power, text]);
     return nice(axis.lo, axis.hi, room / (axis.upright ? 45 : 90));
+  }
+
+  // A round length of at most so many metres, and its text.
+  function round(most) {
+    const power = 10 ** Math.floor(Math.log10(most));
+    const length = [5, 2, 1].find((one) => one * power <= most) * power;
+    return [length, length < 1000 ? `${number(length)} m` : `${number(length / 1000)} km`];
   }
 
   // One metre is as long in both directions: the range that has room to spare is widened.
@@ -65,5 +97,5 @@ const Scales = (() => {
     return [widened(x, width), widened(y, height)];
   }
 
-  return { number, clock, scale, ticks, equal };
+  return { number, clock, scale, ticks, equal, round, wide };
 })();

@@ -1,15 +1,12 @@
 "use strict";
 // The page of a site: its plan, with ids.
 (() => {
-  const { data, draw, range, unpack } = Plots;
+  const { data, unpack } = Plots;
   const KINDS = { virtual: ["right", "virtual balise"], physical: ["read", "physical balise"] };
   const lines = data.elements.map((one) => ({ name: one.name, x: unpack(one.x), y: unpack(one.y) }));
-  const all = (axis) => range(lines.flatMap((one) => Array.from(one[axis])), 60);
   const middle = (values) => values[Math.floor(values.length / 2)];
-  let box = null;
 
   function plan() {
-    const [x, y] = box ?? [all("x"), all("y")];
     const track = lines.map((one, index) => ({ type: "line", look: "track", name: index ? "" : "net element", x: one.x, y: one.y }));
     const ids = { type: "marks", shape: ["circle", 1.5], tone: "unknown", name: "", labels: lines.map((one) => one.name),
       x: lines.map((one) => middle(one.x)), y: lines.map((one) => middle(one.y)), tell: (i) => `net element ${lines[i].name}` };
@@ -18,9 +15,8 @@
       return { type: "marks", tone, name, labels: shown.map((one) => one.id), x: shown.map((one) => one.x), y: shown.map((one) => one.y),
         tell: (i) => `${shown[i].id}: ${shown[i].place}` };
     }).filter((layer) => layer.x.length);
-    draw("plot-site", { height: 560, layers: [...track, ids, ...marks], equal: true,
-      x: { ...x, title: "east [m]" }, y: { ...y, title: "north [m]" }, whole: () => { box = null; plan(); },
-      zoomBox: (wx, wy) => { box = [{ lo: wx[0], hi: wx[1] }, { lo: wy[0], hi: wy[1] }]; plan(); } });
+    const [xs, ys] = ["x", "y"].map((axis) => lines.flatMap((one) => Array.from(one[axis])));
+    Plans.show("plot-site", { layers: [...track, ids, ...marks], xs, ys, geographic: true });
   }
 
   plan();

@@ -44,7 +44,8 @@ def site_page(name: str, site: Site) -> str:
     )
     heading = f"<h1>Site {escape(name)}</h1>"
     # Metres east and north of the first point.
-    plan = {"elements": [packed_line(*line) for line in element_lines_m(site)], "balises": _marks(site)}
+    elements_m = [packed_line(*line) for line in element_lines_m(site)]
+    plan = {"origin": origin_of(site), "elements": elements_m, "balises": _marks(site)}
     return page(f"Site {name}", heading, body, script_json(plan), "site.js", SOFTWARE)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from pyproj import Transformer
 
 from pipeline.show.report import page_name
 from tests.show.report.conftest import FAILED, REASON, RUNS
@@ -138,6 +139,40 @@ def test_dragging_over_one_drawing_zooms_all(browser: Chrome, out: Path) -> None
     begin, end = shown_s(browser)
     assert end - begin == pytest.approx((hi - lo) * 200 / frame_px, rel=0.02)
     assert lo < begin < end < hi
+
+
+def test_coordinates_of_a_plan(browser: Chrome, out: Path) -> None:
+    """Places up to 60 km away against PROJ; a click tells the place, and nothing is fetched for it."""
+    visit(browser, out, "runs/jump_two.html")
+    latitude, longitude = 50.02, 14.41
+    to_plane = Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 +step "
+        f"+proj=topocentric +ellps=WGS84 +lon_0={longitude} +lat_0={latitude} +h_0=0"
+    )
+    for north, east in ((0.0, 0.0), (0.2, 0.3), (-0.4, -0.5)):
+        x, y, _ = to_plane.transform(longitude + east, latitude + north, 0.0)
+        found = browser.execute_script("return Plans.geodetic(...arguments)", [latitude, longitude], x, y)
+        assert found == pytest.approx([latitude + north, longitude + east], abs=1e-7)
+    before = browser.find_element("css selector", "#figure-s0-plan output").text
+    browser.find_element("css selector", "#plot-s0-plan svg[data-drawn]").click()
+    place = browser.find_element("css selector", "#figure-s0-plan .place")
+    told = place.find_element("css selector", "output").text
+    assert told != before
+    assert told.replace(", ", "/") in place.find_element("css selector", "a").get_attribute("href")
+    assert [url for url in requested(browser) if not url.startswith(("data:", "file:"))] == []
+
+
+def test_small_errors_are_seen_beside_large_ones(browser: Chrome, out: Path) -> None:
+    """A jump of 500 m: the limit of 20 m stands at more than a tenth of the height."""
+    visit(browser, out, "runs/jump_two.html")
+    script = """const axis = Scales.wide({ lo: -25, hi: 525 }, 20), scale = Scales.scale(axis, 100, 0);
+        return [scale.at(525), scale.at(20) - scale.at(40), scale.at(0) - scale.at(20), scale.value(scale.at(303))]"""
+    top, doubled, limit, back = browser.execute_script(script)
+    assert (top, back) == (pytest.approx(0.0), pytest.approx(303.0))
+    assert doubled > 5.0
+    assert limit > 10.0
+    texts = browser.find_element("id", "plot-s0-along").text
+    assert "logarithmic beyond ±20" in texts
 
 
 def column(browser: Chrome, index: int) -> list[str]:
