@@ -45,7 +45,11 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "tests/stages/judge",
     ),
     "pipeline/stages/matching": ("tests/stages/matching", "tests/replay"),
-    "pipeline/stages/run_row/verdict.py": ("tests/stages/run_row", "tests/stages/judge"),
+    "pipeline/stages/run_row": ("tests/stages/run_row", "tests/stages/judge"),
+    "pipeline/stages/clean": ("tests/stages/clean", "tests/replay"),
+    "pipeline/stages/track": ("tests/stages/track", "tests/read/site", "tests/stages/matching"),
+    "pipeline/stages/reference": ("tests/stages/evidence", "tests/replay"),
+    "pipeline/studies/undetected": ("tests/studies/undetected",),
 }
 _FAILED = re.compile(r"^(?:FAILED|ERROR) ([^ ]+::.*?|[^ ]+)(?: - .*)?$", re.MULTILINE)
 _CAUGHT, _PASSED, _NO_TESTS = 1, 0, 5

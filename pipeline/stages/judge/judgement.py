@@ -160,6 +160,7 @@ def judge_positions(
     limit_m = config.failure_limit_m
     low_m = np.full(size, np.inf)
     high_m = np.full(size, -np.inf)
+    # True as long as it holds for every alternative seen so far.
     right, ahead, behind, elsewhere = (np.ones(size, dtype=np.bool_) for _ in range(4))
     judged = np.zeros(size, dtype=np.bool_)
     sense = _path_sense(positions, legs)
@@ -231,9 +232,10 @@ def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence
     for number, leg in enumerate(legs):
         part = np.flatnonzero(positions.leg[rows] == number)
         train_m[part], along[part] = leg.coordinate(element[part], measure_m[part], path_m[part])
+    # The train's route counts against the path of the solution.
     against = along * sense < 0
     ahead_m = path_m - train_m
-    # `against`: the train's route counts against the path of the solution.
+    # The place of the position, if it were on the train's route: as far from the train's.
     onward_m = middle_m + np.where(against, -ahead_m, ahead_m)
     off_track = ~np.isfinite(train_m) | there.route.covers(np.nan_to_num(onward_m, nan=-np.inf))
     low_m = ahead_m - np.where(against, middle_m - there.low_m, there.high_m - middle_m)

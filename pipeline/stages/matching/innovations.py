@@ -53,25 +53,35 @@ def _errors_m(first: Ints, parted_m: Floats, tolerance_m: Floats, sense: Floats,
     all errors are shifted by their median: a single track that leads aside does not move the others. (By the smallest
     error, a crossover would become the measure of both tracks and shift them as it leads aside.)
     """
+    if not parted_m.any():
+        return np.zeros(parted_m.size)
     parted = parted_m.tolist()
     limit = tolerance_m.tolist()
     side = sense.tolist()
     origin = before.tolist()
-    errors = [0.0] * len(parted)
     begins = first.tolist()
-    lasting = keep.tolist()
-    for step in range(1, len(lasting) if parted_m.any() else 0):
+    errors = [0.0] * len(parted)
+    for step, lasting in enumerate(keep.tolist()[1:], start=1):
         rows = [row for row in range(begins[step], begins[step + 1]) if origin[row] >= 0]
+        # In the sense of the track that all are judged on; `side` turns an error into it and back.
         grown = [side[row] * errors[origin[row]] + parted[row] for row in rows]
         if any(grown):
-            clipped = [min(max(error, -limit[row]), limit[row]) for row, error in zip(rows, grown, strict=True)]
-            # As far as no other leaves its tolerance: that would be a parting that counts nowhere.
-            lowest = max(error - limit[row] for row, error in zip(rows, clipped, strict=True))
-            highest = min(error + limit[row] for row, error in zip(rows, clipped, strict=True))
-            shift = min(max(_common_m(clipped, limit[rows[0]]), lowest), highest)
-            for row, error in zip(rows, clipped, strict=True):
-                errors[row] = lasting[step] * side[row] * (error - shift)
+            shifted = _differences_m(grown, [limit[row] for row in rows])
+            for row, error in zip(rows, shifted, strict=True):
+                errors[row] = lasting * side[row] * error
     return np.array(errors)
+
+
+def _differences_m(errors_m: list[float], limits_m: list[float]) -> list[float]:
+    """Errors of one step within their tolerances, less what is common to them.
+
+    They are shifted only as far as none leaves its tolerance: that would be a parting that counts nowhere.
+    """
+    clipped = [min(max(error, -limit), limit) for error, limit in zip(errors_m, limits_m, strict=True)]
+    lowest = max(error - limit for error, limit in zip(clipped, limits_m, strict=True))
+    highest = min(error + limit for error, limit in zip(clipped, limits_m, strict=True))
+    shift = min(max(_common_m(clipped, limits_m[0]), lowest), highest)
+    return [error - shift for error in clipped]
 
 
 def _common_m(errors_m: list[float], limit_m: float) -> float:

@@ -236,17 +236,9 @@ def _before(states: States, stays: Bools, pairs: Pairs) -> Ints:
     """
     count, step = _counted(states.first)
     before = np.where(stays[step], np.arange(len(step)) - count[step], -1).tolist()
-    possible = np.flatnonzero(np.isfinite(pairs.score))
-    origins = pairs.before[possible]
-    states_after = pairs.after[possible]
-    cost = np.abs(states.offset_m[states_after] - states.offset_m[origins]) - pairs.score[possible]
-    order = np.lexsort((cost, states_after))
-    leading: dict[int, list[tuple[int, float]]] = {}
-    for origin, state, step_cost in zip(
-        origins[order].tolist(), states_after[order].tolist(), cost[order].tolist(), strict=True
-    ):
-        leading.setdefault(state, []).append((origin, step_cost))
+    leading = _leading(states, pairs)
     offset_m = states.offset_m.tolist()
+    # Of the chain of states that ends in each state: the step at which it began, and its movement aside so far.
     begun = step.tolist()
     aside_m = [0.0] * len(before)
     for state, origin in enumerate(before):
@@ -257,6 +249,20 @@ def _before(states: States, stays: Bools, pairs: Pairs) -> Ints:
             aside_m[state] = aside_m[origin] + abs(offset_m[state] - offset_m[origin])
         before[state] = origin
     return np.array(before, dtype=np.int64)
+
+
+def _leading(states: States, pairs: Pairs) -> dict[int, list[tuple[int, float]]]:
+    """By state those that a possible move leads from, cheapest first; cost: movement aside less the log-probability."""
+    possible = np.flatnonzero(np.isfinite(pairs.score))
+    origins = pairs.before[possible]
+    states_after = pairs.after[possible]
+    cost = np.abs(states.offset_m[states_after] - states.offset_m[origins]) - pairs.score[possible]
+    order = np.lexsort((cost, states_after))
+    leading: dict[int, list[tuple[int, float]]] = {}
+    moves = zip(states_after[order].tolist(), origins[order].tolist(), cost[order].tolist(), strict=True)
+    for state, origin, move_cost in moves:
+        leading.setdefault(state, []).append((origin, move_cost))
+    return leading
 
 
 def _ways(network: Network, steps: Steps, states: States, config: MatchingConfig) -> StepDistances:

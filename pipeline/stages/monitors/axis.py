@@ -156,6 +156,7 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
     """Increments from each epoch to the next, with what scale and latency leave uncertain."""
     dt, fresh = time_steps(epochs.t_s, config.align.gap_reset_s)
     zero = np.zeros(dt.size)
+    # New at each epoch: a stamp's error times the speed, and the digits. The odometer's rows lose theirs by and by.
     memoryless_m = np.hypot(epochs.jitter_s * odometer.distance_m / dt, epochs.digits_m)
     beside = [(np.abs(memoryless_m), np.ones(dt.size))]
     if epochs.rows_m is not None:

@@ -101,6 +101,7 @@ class NoiseMeter:
             # A sigma stated too large hides white noise at long lags; after a restart it is there all the same.
             noise_m2[:, index] = np.maximum(expected_m2, shorter_m2)
             grown = _ratio(noise_m2[:, index] - shorter_m2, more_m2)
+            # The same ratio again, from growth to grown to the next: a decline goes on, a rise does not.
             growth = grown * np.minimum(1.0, _ratio(grown, growth))
         return noise_m2
 

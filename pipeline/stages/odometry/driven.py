@@ -107,24 +107,27 @@ def evenly_driven(
     stood: the last row near the place of the stand is one more point, from which it departs.
     """
     width_m = hysteresis_m(sigma_m, config)
-    held = with_hysteresis(distance_m, width_m)
-    steps = np.diff(held, prepend=np.nan)
+    steps = np.diff(with_hysteresis(distance_m, width_m), prepend=np.nan)
     # A hysteresis that narrows with the speed moves the held distance too: only rows that move themselves count.
     moves = np.flatnonzero((steps != 0) & (np.diff(distance_m, prepend=np.nan) != 0))
-    at_s = t_s[moves].tolist()
-    at_m = distance_m[moves].tolist()
     elapsed_s = np.diff(t_s[moves])
     way_m = np.abs(np.diff(distance_m[moves]))
     # At a turn, and at first, the hysteresis delays the row by twice the width: the way to it is longer by that.
     turned = steps[moves[1:]] * np.nan_to_num(steps[moves[:-1]]) <= 0
     stood = way_m - np.where(turned, 2.0 * width_m[moves[1:]], 0.0) <= least_mps * elapsed_s
-    # From the last stand to the first, so that the places of those before stay where they are in the lists.
+    points = list(zip(t_s[moves].tolist(), distance_m[moves].tolist(), strict=True))
+    # From the last stand to the first, so that the places of those before stay where they are in the list.
     for gap in np.flatnonzero(stood & (elapsed_s > 0))[::-1].tolist():
         between = slice(int(moves[gap]), int(moves[gap + 1]))
-        stood_m = float(np.median(distance_m[between]))
-        # A uniform error of sigma s has its edges at sqrt(3) s.
-        near = np.abs(distance_m[between] - stood_m) <= np.sqrt(3.0) * sigma_m[between]
-        last = between.start + int(np.flatnonzero(near)[-1]) if near.any() else between.start
-        at_s.insert(gap + 1, float(t_s[last]))
-        at_m.insert(gap + 1, stood_m)
-    return np.array([*at_s, t_s[-1]]), np.array([*at_m, at_m[-1]])
+        points.insert(gap + 1, _departure(t_s[between], distance_m[between], sigma_m[between]))
+    points.append((float(t_s[-1]), points[-1][1]))
+    at_s, at_m = np.array(points).T
+    return at_s, at_m
+
+
+def _departure(t_s: Floats, distance_m: Floats, sigma_m: Floats) -> tuple[float, float]:
+    """The last time of a stand near its place, and the place: from there the train departs."""
+    place_m = float(np.median(distance_m))
+    # A uniform error of sigma s has its edges at sqrt(3) s.
+    near = np.flatnonzero(np.abs(distance_m - place_m) <= np.sqrt(3.0) * sigma_m)
+    return float(t_s[near[-1] if near.size else 0]), place_m

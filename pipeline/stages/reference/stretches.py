@@ -350,16 +350,20 @@ def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], 
         if 0 <= onward < len(chain.oriented) and chain.oriented[onward] == stay.oriented:
             here = onward
         elif stay.back:
-            gap_m = next(edge.gap_m for edge in network.successors[stay.oriented] if edge.to == last)
-            entry_m = chain.entry_m[here] - gap_m - network.length_m(stay.oriented)
+            entry_m = chain.entry_m[here] - _gap_m(network, stay.oriented, last) - network.length_m(stay.oriented)
             grown = Chain((stay.oriented, *chain.oriented[here:]), (entry_m, *chain.entry_m[here:]))
+            # At its first element the chain itself grows backwards; further on another branch begins.
             chains = [*chains[: None if here else -1], grown]
             here = 0
         else:
-            gap_m = next(edge.gap_m for edge in network.successors[last] if edge.to == stay.oriented)
-            entry_m = chain.entry_m[here] + network.length_m(last) + gap_m
+            entry_m = chain.entry_m[here] + network.length_m(last) + _gap_m(network, last, stay.oriented)
             grown = Chain((*chain.oriented[:onward], stay.oriented), (*chain.entry_m[:onward], entry_m))
             chains = [*chains[: None if onward < len(chain.oriented) else -1], grown]
             here = onward
         placed.append((len(chains) - 1, chains[-1].entry_m[here]))
     return chains, placed
+
+
+def _gap_m(network: Network, from_oriented: int, to_oriented: int) -> float:
+    """Way between the ends of two linked net elements [m]."""
+    return next(edge.gap_m for edge in network.successors[from_oriented] if edge.to == to_oriented)

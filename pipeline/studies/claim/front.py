@@ -201,22 +201,26 @@ def speed_errors(front: Front, window_s: float) -> SpeedErrors:
     clock = front.clock
     pairs = _windows(front, round(window_s * NS_PER_S))
     first, last = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-    length = (clock.t_ns[last] - clock.t_ns[first]) / NS_PER_S
-    steps = 0.5 * (front.speed_mps[1:] + front.speed_mps[:-1]) * clock.held_s[:-1]
-    way = np.concatenate(([0.0], np.cumsum(np.nan_to_num(steps))))
-    sense = front.direction[first]
-    estimated = sense * (way[last] - way[first])
-    # The evidence calls the position itself right at both ends.
-    known = front.proved[first] & front.proved[last]
+    length_s = (clock.t_ns[last] - clock.t_ns[first]) / NS_PER_S
+    steps_m = 0.5 * (front.speed_mps[1:] + front.speed_mps[:-1]) * clock.held_s[:-1]
+    until_m = np.concatenate(([0.0], np.cumsum(np.nan_to_num(steps_m))))
+    estimated_m = front.direction[first] * (until_m[last] - until_m[first])
+    least_m, most_m = _driven_m(front, first, last)
+    # The more the train drove, the lower the estimate lies beside it.
+    low_kmh = (estimated_m - most_m) / length_s * KMH_PER_MPS
+    high_kmh = (estimated_m - least_m) / length_s * KMH_PER_MPS
+    fastest = np.array([np.abs(front.speed_mps[begin : end + 1]).max() for begin, end in pairs], dtype=np.float64)
+    return SpeedErrors(clock.t_ns[last], length_s, fastest * KMH_PER_MPS, low_kmh, high_kmh)
+
+
+def _driven_m(front: Front, first: Ints, last: Ints) -> tuple[Floats, Floats]:
+    """Least and largest way of the train over windows by the evidence [m]; NaN unless it calls both ends right."""
     begin_m = _train_m(front, first)
     end_m = _train_m(front, last)
     # The estimate is a mean over the time before each epoch: how late that is while the speed changes is not known.
     late_m = front.speed_late_s * np.abs(front.speed_mps[last] - front.speed_mps[first])
-    least = end_m[0] - begin_m[1] - late_m
-    most = end_m[1] - begin_m[0] + late_m
-    low, high = (np.where(known, (estimated - way_m) / length, np.nan) for way_m in (most, least))
-    fastest = np.array([np.abs(front.speed_mps[begin : end + 1]).max() for begin, end in pairs], dtype=np.float64)
-    return SpeedErrors(clock.t_ns[last], length, *(speed * KMH_PER_MPS for speed in (fastest, low, high)))
+    late_m = np.where(front.proved[first] & front.proved[last], late_m, np.nan)
+    return end_m[0] - begin_m[1] - late_m, end_m[1] - begin_m[0] + late_m
 
 
 def _train_m(front: Front, rows: Ints) -> Floats:
