@@ -9,14 +9,14 @@ import re
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from typer import Argument, Exit, Option, Typer
+from typer import Argument, Exit, Option, Typer, confirm
 from typer.core import TyperCommand
 from typer.main import get_command
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.campaign import CampaignSummary, Interrupted, Plan
+    from pipeline.project.trial import Wanted
     from schemas.config import Configuration, Vehicle
     from schemas.run import RunLog
     from schemas.run import Site as Ground
@@ -195,11 +196,80 @@ def _status_of(summary: CampaignSummary, fail_on: str | None) -> int:
 
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
     from pipeline.campaign.calibrated import calibrated
-    from pipeline.results.workers import watched
-    from pipeline.show.terminal import how_far
 
-    with watched(None if quiet else how_far("runs looked at to calibrate")):
+    with _telling("runs looked at to calibrate", quiet):
         return calibrated(plan, runs, jobs)
+
+
+@_command(
+    'balise trial morning.ubx odometer.csv --track line.gpx --balises "every 1000" --to week12',
+    "balise trial raw --track line9 --reference raw/rover.pos --to week12 --accept-corrections",
+)
+def trial(
+    raws: Annotated[list[Path], _place(metavar="RAW...", help=_LOGS + " Folders of these.")],
+    to: Annotated[Path, _file("--to", "--out", help="Folder of the project.")],
+    track: Annotated[list[Path] | None, _file(help="The line: maps (GPX, GeoJSON, ...), points, or a site.")] = None,
+    balises: Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")] = None,
+    reference: Annotated[list[Path] | None, _file(help="Of the logs, one whose positions are the truth.")] = None,
+    date: Annotated[datetime | None, Option(formats=["%Y-%m-%d"], help="Day (UTC) of NMEA logs without one.")] = None,
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    accept_corrections: Annotated[bool, Option("--accept-corrections", help="Accept what is proposed.")] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write a project for raw logs: which stream each feeds, which are of one ride, what has to be corrected."""
+    from pipeline.project.trial import Wanted
+
+    if not track:
+        from schemas.errors import UsageError
+
+        remedy = (
+            "Give a map (GPX, GeoJSON, ...), a table of points, a run with a reference, or a site: --track line.gpx"
+        )
+        raise UsageError("needs the line that the train ran on", place="--track", remedy=remedy)
+    raws, balises = _spacing(raws, balises)
+    day = None if date is None else date.date()
+    wanted = Wanted(raws, track, balises, reference or (), day, vehicle, config)
+    _write_project(wanted, to, accept_corrections, force, as_json)
+
+
+@_command("balise init week12")
+def init(
+    folder: Annotated[Path, _place(help="Folder of the project.")] = Path(),
+    accept_corrections: Annotated[bool, Option("--accept-corrections", help="Accept what is proposed.")] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write a project for what lies in a folder: logs, runs, a survey or a site, balises, settings; or an empty one."""
+    from pipeline.project.init import wanted_in
+
+    _write_project(wanted_in(folder), folder, accept_corrections, force, as_json)
+
+
+def _spacing(raws: list[Path], balises: str | None) -> tuple[list[Path], str | None]:
+    """`--balises every 1000` without quotes leaves its number among the logs."""
+    if balises != "every":
+        return raws, balises
+    number = next((raw for raw in raws if raw.name.isdigit() and not raw.exists()), None)
+    return [raw for raw in raws if raw is not number], "every" if number is None else f"every {number}"
+
+
+def _write_project(wanted: Wanted, folder: Path, accept: bool, force: bool, as_json: bool) -> None:
+    from datasets.recordings import recordings
+    from pipeline.project.init import answer_of, refuse_existing, words_of, write_project
+    from pipeline.project.trial import draft_project
+
+    def asked(run_id: str, found: Sequence[str], lines: Sequence[str]) -> bool:
+        if accept or as_json or not sys.stdin.isatty():
+            return accept
+        _say("\n".join([f"\n{run_id} does not fit as recorded:", *found, *lines]))
+        return confirm("Accept these corrections?", err=True)
+
+    refuse_existing(folder, force)
+    drafted = draft_project(wanted, folder, recordings(), asked)
+    file = write_project(drafted, folder)
+    _tell(as_json, answer_of(drafted, file), {"Logs": drafted.logs}, *words_of(drafted, file))
 
 
 @_command("balise run", "balise run --project week12 --jobs 4")
@@ -337,7 +407,9 @@ def safety(
         from pipeline.studies.safety.assessment import assess
 
         again = replay_again(logs or [], site, _vehicle(vehicle), jobs, progress_watch)
-        show(assess(out, None if config is None else _configuration(config), again), as_json)
+        with _telling("runs of several solutions"):
+            found = assess(out, None if config is None else _configuration(config), again)
+        show(found, as_json)
         return
     from pipeline.show.terminal import show_tables
     from pipeline.studies.safety import safety_tables
@@ -367,7 +439,9 @@ def claim(
 
     wanted = load_profile(profile)
     ground = _ground(site, _used(out)) if site else None
-    found = hold(out, wanted, ground, read_areas(site, ground) if site and ground else None, front_ahead)
+    areas = read_areas(site, ground) if site and ground else None
+    with _telling("runs"):
+        found = hold(out, wanted, ground, areas, front_ahead)
     if csv is not None:
         write_csv(found.table, csv)
     if as_json or str(csv) != "-":
@@ -526,13 +600,16 @@ def calibrate(
 ) -> None:
     """Measure odometer scale, GNSS latency, fast noise and the monitors' sigmas on fault-free runs."""
     from pipeline.campaign import find_runs
+    from pipeline.results.workers import told
     from pipeline.storage import write_bytes
     from pipeline.studies.calibration.calibrate import calibrate as measure
     from schemas.config import to_toml
 
     settings = _configuration(config)
-    logs = [_log(address, settings) for address in find_runs(runs).values()]
-    found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
+    with _telling("runs read"):
+        logs = [_log(address, settings) for address in told(find_runs(runs).values())]
+    with _telling("runs measured"):
+        found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
     vehicle_found = found.vehicle.model_dump()
     measured = {"out": out, "vehicle": vehicle_found, "monitors": found.monitors, "alarms": found.alarms}
@@ -581,10 +658,7 @@ def experiment(
         names = [*EXPERIMENTS, RECORDED]
         _tell(as_json, {"experiments": names}, {}, *names)
         return
-    from pipeline.results.workers import watched
-    from pipeline.show.terminal import how_far
-
-    with watched(None if quiet else how_far("pieces of work")):
+    with _telling("pieces of work", quiet):
         if name == RECORDED:
             from datasets.experiment.recorded.command import recorded_experiment, shown
 
@@ -601,7 +675,9 @@ def experiment(
         return
     for run_id, error in made.failed.items():
         _say(f"{run_id} is not used: {error}")
-    _tell(as_json, {"experiment": name, "out": out, **made.tables}, shown(made), f"\nBegin with {made.page}")
+    if as_json or not quiet:
+        answer = {"experiment": name, "out": out, "files": made.files}
+        _tell(as_json, answer, shown(made), "", *made.remarks, f"\nBegin with {made.files[0]}")
     raise Exit(RUNS_NOT_OK if made.failed else OK)
 
 
@@ -641,11 +717,13 @@ def sql(
         _tell(as_json, answer, {"": answer})
 
 
-@_command("balise report week12 --site line9", of_project=True)
+@_command("balise report week12 --site line9", "balise report week12 --run monday", of_project=True)
 def report(
     out: ResultFolder,
     site: Annotated[str | None, Option(help="Site, for plans of the track.")] = None,
     jobs: Annotated[int, Option(min=0, help="Pages at the same time; 0: one per core if there are many.")] = 0,
+    run: Annotated[str | None, Option(help="Write the page of this run alone.")] = None,
+    most: Annotated[int, Option("--pages", min=0, help="No pages of runs unasked where there are more runs.")] = 1000,
     quiet: Quiet = False,
     as_json: Json = False,
     project: OfProject = None,
@@ -654,10 +732,11 @@ def report(
 
     Pages of runs that have not changed since the last report are left as they are.
     """
-    from pipeline.show.report import write_report
-    from pipeline.show.terminal import how_far
+    from pipeline.show.report import write_page, write_report
 
-    pages = write_report(out, _ground(site, _used(out)) if site else None, jobs, None if quiet else how_far("pages"))
+    ground = _ground(site, _used(out)) if site else None
+    with _telling("pages", quiet):
+        pages = write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
     if as_json or not quiet:
         _tell(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
 
@@ -685,7 +764,8 @@ def line(
 
     given, keys = None if points is None else read_points(points), "docs/line.md lists every key."
     decided = settings_from({} if criteria is None else read_toml(criteria), LineCriteria, str(criteria), keys)
-    result = study_line(out, _ground(site, _used(out)), decided, solution, given)
+    with _telling("runs"):
+        result = study_line(out, _ground(site, _used(out)), decided, solution, given)
     files = write_line(result, to or out / "line")
     tables = {"pieces": result.pieces, "proposals": result.proposals}
     answer = {"page": files[0], "files": files, **tables, "remarks": list(result.remarks)}
@@ -695,19 +775,22 @@ def line(
 
 @_command(
     "balise export week12 monday --out monday.mcap --site line9",
-    "balise export week12 monday --out monday.geojson --site line9",
+    "balise export week12 monday --out monday.gpkg --site line9",
 )
 def export(
     out: ResultFolder,
     run: Annotated[str, Argument(help="Id of the run.")],
-    to: Annotated[Path, _file("--out", "--to", help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")],
+    to: Annotated[
+        Path,
+        _file("--out", "--to", help="F.mcap (with a Foxglove layout), .geojson, .gpx, .gpkg or .parquet (GeoParquet)."),
+    ],
     site: Annotated[str | None, Option(help="Site, for positions on the ground.")] = None,
     log: Annotated[str | None, Option(help="The recorded run, for its raw positions.")] = None,
     ros: Annotated[bool, Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
-    """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
+    """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or for maps."""
     from pipeline.show.export import export_run
 
     recorded = _log(log, _configuration(config), True) if log else None
@@ -735,12 +818,14 @@ def verify(
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
     from pipeline.campaign.verify import recompute
     from pipeline.campaign.verify import verify as compare
-    from pipeline.show.terminal import how_far
+    from pipeline.show.progress import progress_watch
 
-    found = [compare(out, None if quiet else how_far("runs"))]
+    with _telling("runs", quiet):
+        found = [compare(out)]
     if logs:
         settings = _configuration(config) if config else None
-        found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs))
+        shown = [] if quiet else [progress_watch()]
+        found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs, shown))
     if as_json:
         compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
         _print_json({"agrees": not any(one.problems for one in found), "comparisons": compared})
@@ -761,10 +846,9 @@ def compact(
 ) -> None:
     """Put the tables of many runs into few files. Every command reads both forms, also mixed."""
     from pipeline.campaign import compact as packing
-    from pipeline.show.terminal import how_far
 
-    progress = None if quiet else how_far("runs")
-    found = packing.undo(out, progress) if undo else packing.compact(out, runs_per_file, jobs, progress)
+    with _telling("runs", quiet):
+        found = packing.undo(out) if undo else packing.compact(out, runs_per_file, jobs)
     left_out = [f"{run} keeps files of its own: {reason}" for run, reason in found.left_out.items()]
     if as_json or not quiet:
         _tell(as_json, asdict(found), {}, found.sentence, *left_out)
@@ -782,7 +866,8 @@ def diff(
     from pipeline.results.diff.results import diff_results
     from schemas.errors import visible
 
-    found = diff_results(out_a, out_b)
+    with _telling("runs"):
+        found = diff_results(out_a, out_b)
     if as_json:
         _print_json(found.as_dict())
     else:
@@ -879,6 +964,14 @@ def _show(table: pl.DataFrame, title: str = "") -> None:
     from pipeline.show.terminal import show_table
 
     show_table(table, title)
+
+
+def _telling(things: str, quiet: bool = False) -> contextlib.AbstractContextManager[None]:
+    """Say on standard error how many of how many of these things are done, and how long the others will take."""
+    from pipeline.results.workers import watched
+    from pipeline.show.terminal import how_far
+
+    return watched(None if quiet else how_far(things))
 
 
 def _tell(as_json: bool, value: Any, tables: Mapping[str, pl.DataFrame], *words: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipeline.campaign import resume
@@ -11,9 +11,8 @@ from pipeline.results import catalogue, packs, store
 from pipeline.results.manifest import write_manifest
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.packing import RUNS_PER_PACK, pack_runs, unpack
+from pipeline.results.workers import tell
 from pipeline.storage.address import Address, is_url
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -31,9 +30,7 @@ class Compaction:
         return f"{self.packed} runs lie in {files} per table, {self.own} in files of their own"
 
 
-def compact(
-    out: Address, runs_per_pack: int = RUNS_PER_PACK, jobs: int = 1, progress: Progress | None = None
-) -> Compaction:
+def compact(out: Address, runs_per_pack: int = RUNS_PER_PACK, jobs: int = 1) -> Compaction:
     """Pack all complete runs. Ended at any instant, it has lost nothing, and the next call does the rest.
 
     Raises `UsageError` without a complete run, `OutputError` while a campaign writes there.
@@ -47,12 +44,11 @@ def compact(
         for packed, total in pack_runs(out, runs_per_pack, jobs):
             left_out |= packed.left_out
             done += len(packed.runs) + len(packed.left_out)
-            if progress is not None:
-                progress(done, total)
+            tell(done, total)
         return _finished(out, left_out, known)
 
 
-def undo(out: Address, progress: Progress | None = None) -> Compaction:
+def undo(out: Address) -> Compaction:
     """Give every run files of its own again, with the bytes that they had."""
     store.complete_runs(out)
     total = len(packs.find(out))
@@ -62,8 +58,7 @@ def undo(out: Address, progress: Progress | None = None) -> Compaction:
         known = {} if is_url(out) else resume.in_place(str(out))
         for runs in unpack(out):
             done += runs
-            if progress is not None:
-                progress(done, total)
+            tell(done, total)
         return _finished(out, {}, known)
 
 

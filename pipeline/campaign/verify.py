@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
@@ -18,19 +18,20 @@ from pipeline.campaign.finish import campaign_files, campaign_key
 from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
+from pipeline.campaign.watch import Follower
 from pipeline.results import catalogue, packs, store
 from pipeline.results.figures.head import word_of
 from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest
 from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
+from pipeline.results.workers import tell
 from pipeline.storage.address import Address, join, redacted
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
-Progress = Callable[[int, int], None]
 Problem = tuple[str, str, str]
 _RUNS_AT_ONCE = 50
 # Of the outcome of a run, what its tables say.
@@ -77,7 +78,7 @@ class Verification:
         return f"{self.compared}: {f'{len(self.problems)} do not' if self.problems else 'all'} agree{rest}"
 
 
-def verify(out: Address, progress: Progress | None = None) -> Verification:
+def verify(out: Address) -> Verification:
     """Hold every file of a result against `OUT/manifest.json`, and the manifest against the runs' own metadata.
 
     Provenance is read from the markers again, the catalogue and the campaign's tables are made again from the runs'
@@ -95,8 +96,7 @@ def verify(out: Address, progress: Progress | None = None) -> Verification:
     runs = sorted(there.keys() & named.keys())
     for first in range(0, len(runs), _RUNS_AT_ONCE):
         problems += _of_runs(out, runs[first : first + _RUNS_AT_ONCE], there, named)
-        if progress is not None:
-            progress(min(first + _RUNS_AT_ONCE, len(runs)), len(runs))
+        tell(min(first + _RUNS_AT_ONCE, len(runs)), len(runs))
     known = {*manifest["files"], *again["files"], *_OWN_FILES}
     problems += [(name, "there", "not in the manifest") for name in _other_files(out, {*there, *named}, known)]
     not_compared = tuple(NotCompared)
@@ -129,6 +129,7 @@ def recompute(
     vehicle: Vehicle,
     routes: Address | None = None,
     jobs: int = 1,
+    watches: Sequence[Follower] = (),
 ) -> Verification:
     """Replay logs again, in a folder of their own, and hold logs, site and tables against the manifest.
 
@@ -144,7 +145,7 @@ def recompute(
         known = [_as_made(job, named[job.run_id]["config_digest"]) for job in plan.jobs if job.run_id in named]
         ready = tuple(job for job in known if job.config_digest == named[job.run_id]["config_digest"])
         if ready:
-            run_campaign(replace(plan, jobs=ready), jobs=jobs)
+            run_campaign(replace(plan, jobs=ready), jobs=jobs, watches=watches)
         again = gathered(folder, earlier(folder))["runs"]
     others = [named[job.run_id]["config_digest"] for job in known if job not in ready]
     problems = [
@@ -175,7 +176,7 @@ def _parts(run: dict[str, Any]) -> dict[str, str | None]:
 
 
 def _sites(sites: dict[str, Any]) -> dict[str, str]:
-    return {f"{site[:12]}, {file['name']}": file["sha256"] for site, files in sites.items() for file in files}
+    return {f"{site}, {file['name']}": file["sha256"] for site, files in sites.items() for file in files}
 
 
 def _digests(files: dict[str, Any]) -> dict[str, str]:

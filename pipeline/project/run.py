@@ -18,6 +18,7 @@ from pipeline.read.ingest import read_run
 from pipeline.read.site.read import read_site
 from pipeline.results import store
 from pipeline.results.manifest import settings_files
+from pipeline.results.workers import watched
 from pipeline.show.report import write_report
 from pipeline.show.report.site_page import site_page
 from pipeline.storage.address import is_url
@@ -288,6 +289,7 @@ def _report(steps: _Steps, plan: Plan) -> Path | None:
         return None
     out = Path(steps.opened.place(steps.opened.project.out))
     site = read_site(steps.opened.place(steps.opened.project.site), plan.config.site)
-    page = write_report(out, site, 0, steps.call.pages)[0]
+    with watched(steps.call.pages):
+        page = write_report(out, site)[0]
     steps.call.said("report", str(page))
     return page

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -25,18 +25,25 @@ _THREADS = (
 
 def mapped(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> list[R]:
     """`function` of every task; `jobs` processes, or this one for a single job or task."""
-    progress = _PROGRESS.get()
-    results = []
-    for result in each(function, tasks, jobs):
-        results.append(result)
-        if progress is not None:
-            progress(len(results), len(tasks))
-    return results
+    return [result for _, result in zip(told(tasks), each(function, tasks, jobs), strict=True)]
+
+
+def told(items: Collection[T]) -> Iterator[T]:
+    """The items, one after the other; whoever watches hears how many of how many are done."""
+    for done, item in enumerate(items, start=1):
+        yield item
+        tell(done, len(items))
+
+
+def tell(done: int, total: int) -> None:
+    """Tell whoever watches how much is done."""
+    if (progress := _PROGRESS.get()) is not None:
+        progress(done, total)
 
 
 @contextmanager
 def watched(progress: Callable[[int, int], None] | None) -> Iterator[None]:
-    """Tell how many of how many tasks of each `mapped` inside are done."""
+    """Tell how many of how many tasks of each `mapped`, and items of each `told` inside are done."""
     before = _PROGRESS.set(progress)
     try:
         yield

@@ -146,8 +146,12 @@ def _plain(value: Any) -> Any:
 
 
 def how_far(things: str) -> Callable[[int, int], None]:
-    """Says on standard error how many of how many things are done: in one line that changes, in a pipe every 5 s."""
+    """Says on standard error how many of how many things are done: in one line that changes, in a pipe every 5 s.
+
+    The time left is that of the things done so far, which need not take as long as the others.
+    """
     on_terminal = sys.stderr.isatty()
+    begun_s = time.monotonic()
     said_s = time.monotonic() - (_SAID_EVERY_S if on_terminal else 0.0)
 
     def progress(done: int, total: int) -> None:
@@ -155,8 +159,10 @@ def how_far(things: str) -> Callable[[int, int], None]:
         last = on_terminal and done == total
         if last or time.monotonic() - said_s >= (_CHANGED_EVERY_S if on_terminal else _SAID_EVERY_S):
             said_s = time.monotonic()
-            text = f"{done}/{total} {things}"
-            begin, end = ("\r", "\n" if last else "") if on_terminal else ("", "\n")
+            left = "" if done in (0, total) else duration_text((said_s - begun_s) / done * (total - done))
+            text = f"{done}/{total} {things}" + (f", {left} left" if left else "")
+            # What is left of a longer line is wiped out.
+            begin, end = ("\r\x1b[K", "\n" if last else "") if on_terminal else ("", "\n")
             print(f"{begin}{text}", end=end, file=sys.stderr, flush=True)
 
     return progress

@@ -44,7 +44,7 @@ from schemas.words import notes_apart
 @dataclass(frozen=True)
 class Campaign:
     """Tables of all runs, `run_id` in front, and `derived` from them by the name of their file; `pieces` as from
-    `availability_pieces`; `hrefs` of the runs' pages; `architectures` as from `added`.
+    `availability_pieces`; `hrefs` of the runs' pages, as far as there are; `architectures` as from `added`.
     """
 
     runs: pl.DataFrame
@@ -84,7 +84,7 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     body = [
         tiles((f"runs {name}", str(count), _TONES[name] if count else "") for name, count in counts.items()),
         pairs(_facts(campaign, solutions)),
-        section("runs", "Runs", _runs_table(campaign)),
+        section("runs", "Runs", _pages_on_demand(campaign), _runs_table(campaign)),
         *(_solution(f"s{index}", name, campaign, len(solutions) > 1) for index, name in enumerate(solutions)),
         architectures_section("architectures", campaign.architectures),
         _map_in_doubt(campaign.derived["map"]),
@@ -98,7 +98,8 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
         "levels": [[level, safety.allowed_time_to_detect_s(level)] for level in safety.service_levels],
         "limits": {"failure_limit_m": made.config.hazards.failure_limit_m},
     }
-    way = "" if named is None else f'<p class="ways">{link(campaign.hrefs[named], f"Open run {named}")}</p>'
+    href = campaign.hrefs.get(named or "", "")
+    way = f'<p class="ways">{link(href, f"Open run {named}")}</p>' if href else ""
     count = plural(campaign.runs["run_id"].n_unique(), "run")
     heading = verdict_head(head.word, head.worst, head.reasons, head.beside) + way + f"<h1>Campaign of {count}</h1>"
     foot = ", ".join(campaign.runs["software"].unique().sort().to_list())
@@ -155,7 +156,7 @@ def _runs_table(campaign: Campaign) -> str:
     special = {
         "verdict": lambda row: Cell(word := word_of(row["verdict"]), str(row["order"]), badge(word)),
         "run_id": lambda row: Cell(
-            row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"], data_run="")
+            row["run_id"], row["run_id"], link(campaign.hrefs.get(row["run_id"], ""), row["run_id"], data_run="")
         ),
         "balises_accepted": _accepted,
         "notes": _notes,
@@ -213,10 +214,17 @@ def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
     )
 
 
+def _pages_on_demand(campaign: Campaign) -> str:
+    """How to get the pages that are not there."""
+    without = campaign.runs.filter(~pl.col("run_id").is_in(list(campaign.hrefs)))["run_id"].n_unique()
+    command = "<code>balise report OUT --run RUN</code>"
+    return f"<p>{plural(without, 'run')} without a page: {command} writes one.</p>" if without else ""
+
+
 def _hazards_table(key: str, hazards: pl.DataFrame, campaign: Campaign) -> str:
     special = {
         "run_id": lambda row: hazard_cell(
-            row, f"{row['run_id']} {row['hazard_id']}", campaign.hrefs[row["run_id"]], data_hazard=""
+            row, f"{row['run_id']} {row['hazard_id']}", campaign.hrefs.get(row["run_id"], ""), data_hazard=""
         ),
     }
     ordered = hazards.sort(

@@ -144,6 +144,10 @@ _STEPS_M = (10.0, 50.0, 100.0, 500.0, 1000.0, 5000.0)
 _PLACE = ("solution", "netelement_id", "from_m")
 
 
+PIECE_COLUMNS = ("solution", "netelement_id", "measure_m", "moving", "tvb", "alarm")
+"""Columns of the epochs that `availability_pieces` takes."""
+
+
 def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
     """Per solution, net element and piece of it: epochs while moving, those with a valid TVB, alarms.
 

@@ -76,6 +76,9 @@ def instant(value: datetime) -> str:
 
 
 def link(href: str, text: str, **attributes: str) -> str:
+    """A link; where there is no page to go to, the text alone."""
+    if not href:
+        return escape(text)
     extra = "".join(f' {name.replace("_", "-")}="{escape(value)}"' for name, value in attributes.items())
     return f'<a href="{escape(href)}"{extra}>{escape(text)}</a>'
 

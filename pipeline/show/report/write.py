@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import quote
@@ -24,22 +24,28 @@ from pipeline.results.store import (
     file_name,
     read_config,
     read_run,
+    tables_of,
 )
-from pipeline.results.workers import each
+from pipeline.results.workers import mapped, told
 from pipeline.show.report.campaign_page import Campaign, campaign_page
-from pipeline.show.report.ground import availability_pieces, together
+from pipeline.show.report.ground import PIECE_COLUMNS, availability_pieces, together
 from pipeline.show.report.run_page import Made, Neighbours, run_page
 from pipeline.storage import files
 from pipeline.storage.parquet import parquet_bytes, read_parquet
+from pipeline.studies.safety.assessment import compare_architectures
 from pipeline.studies.safety.side_by_side import side_by_side
 from pipeline.studies.safety.tally import COUNTS, added
 from schemas.config import Configuration, to_toml
+from schemas.errors import UsageError
 from schemas.run import Site
 from schemas.tables import TABLES
 
 # Kept of each run until it changes: what its page was made from, the digest of the page, and what the run adds to the
 # page of the campaign, rows of `availability_pieces` and `side_by_side`.
 _KEPT = "pages"
+MOST_PAGES = 1000
+"""Runs of a campaign of which each gets a page unasked."""
+_RUNS_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
@@ -54,48 +60,72 @@ class _Page:
     made_of: str = ""
 
 
-def write_report(
-    out: Path, site: Site | None = None, jobs: int = 0, progress: Callable[[int, int], None] | None = None
-) -> list[Path]:
-    """Write `OUT/report`: `index.html`, `runs/RUN.html`; returns the files, the index first.
+def write_report(out: Path, site: Site | None = None, jobs: int = 0, most_pages: int = MOST_PAGES) -> list[Path]:
+    """Write `OUT/report`: `index.html`, and `runs/RUN.html` unless there are more than `most_pages`; the index first.
 
     The pages open from disk and make no request. Plans need the site; without it
     places are drawn along the path. Pages of runs that are no longer in the result are removed; those that were made
     from these very tables, settings and program are left as they are. `jobs` processes make the others, by
-    default one per core where there are many; `progress` receives how many pages of how many are done.
+    default one per core where there are many.
     """
+    states = catalogue.states(out, tuple(TABLES)) or {}
+    pages = _pages(out, site, states, most_pages)
+    rows = _known(out, pages)
+    left = [page for page in pages if page.run not in rows] if len(pages) <= most_pages else []
+    # Starting a process takes as long as some pages.
+    jobs = jobs or min(os.cpu_count() or 1, 1 + len(left) // 20)
+    rows |= zip((page.run for page in left), mapped(_written, left, jobs), strict=True)
+    there = [page for page in pages if page.run in rows]
+    _keep(out, states, [rows[page.run] for page in there])
+    folder = out / "report" / "runs"
+    for name in set(files.list_dir(folder) if folder.exists() else []) - {page.path.name for page in there}:
+        if name.endswith(".html"):
+            storage.remove(folder / name)
+    hrefs = {page.run: f"runs/{quote(page.path.name)}" for page in there}
+    index = out / "report" / "index.html"
+    made = pages[0].made
+    of_runs = _of_pages(list(rows.values())) if len(there) == len(pages) else _of_tables(out, made)
+    storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, *of_runs), made).encode())
+    return _noted(out, [index, *(page.path for page in there)])
+
+
+def write_page(out: Path, run_id: str, site: Site | None = None, most_pages: int = MOST_PAGES) -> Path:
+    """Write the page of one run alone. Raises `UsageError` where it is not in the result."""
+    states = catalogue.states(out, tuple(TABLES)) or {}
+    pages = {page.run: page for page in _pages(out, site, states, most_pages)}
+    if run_id not in pages:
+        raise UsageError(f"has no run {run_id!r}", place=str(out), found=", ".join([*pages][:10]))
+    known = _known(out, list(pages.values()))
+    known[run_id] = _written(pages[run_id])
+    _keep(out, states, [known[run] for run in pages if run in known])
+    _noted(out, [out / "report" / name for name in storage.files_below(out / "report")])
+    return pages[run_id].path
+
+
+def _pages(out: Path, site: Site | None, states: catalogue.RunStates, most_pages: int) -> list[_Page]:
+    """The pages that there may be; of more than `most_pages` none leads to its neighbours, which may have none."""
     names = {run: page_name(run) for run in complete_runs(out)}
     config = read_config(out)
     made = Made(config or Configuration(), None if config is None else to_toml(config), site)
-    states = catalogue.states(out, tuple(TABLES)) or {}
-    ways = [None, *((run, quote(name)) for run, name in names.items()), None]
+    ways = [None, *((run, quote(name)) if len(names) <= most_pages else None for run, name in names.items()), None]
     folder = out / "report" / "runs"
-    index = out / "report" / "index.html"
-    pages = [
+    return [
         _with_digest(_Page(out, run, folder / name, made, Neighbours(ways[at], ways[at + 2])), states.get(run))
         for at, (run, name) in enumerate(names.items())
     ]
-    shares = _known(out, pages)
-    left = [page for page in pages if page.run not in shares]
-    # Starting a process takes as long as some pages.
-    jobs = jobs or min(os.cpu_count() or 1, 1 + len(left) // 20)
-    for page, share in zip(left, each(_written, left, jobs), strict=True):
-        shares[page.run] = share
-        if progress is not None:
-            progress(len(shares), len(pages))
-    rows = pl.concat([shares[run] for run in names])
+
+
+def _keep(out: Path, states: catalogue.RunStates, rows: Sequence[pl.DataFrame]) -> None:
     # Runs that changed while they were read must not pass for what was read.
-    if states and states == catalogue.states(out, tuple(TABLES)):
-        catalogue.keep(out, _KEPT, software_digest(), parquet_bytes(rows))
-    for name in set(files.list_dir(folder)) - set(names.values()):
-        if name.endswith(".html"):
-            storage.remove(folder / name)
-    hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
-    storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, rows), made).encode())
-    written = [index, *(page.path for page in pages)]
-    contents = {page.relative_to(out / "report").as_posix(): storage.content_of(page) for page in written}
+    if rows and states and states == catalogue.states(out, tuple(TABLES)):
+        catalogue.keep(out, _KEPT, software_digest(), parquet_bytes(pl.concat(rows)))
+
+
+def _noted(out: Path, pages: list[Path]) -> list[Path]:
+    """The pages, once the manifest names them."""
+    contents = {page.relative_to(out / "report").as_posix(): storage.content_of(page) for page in pages}
     note_pages(out, {name: content for name, content in contents.items() if content is not None})
-    return written
+    return pages
 
 
 def page_name(run_id: str) -> str:
@@ -149,14 +179,33 @@ def _unlisted(rows: pl.DataFrame, name: str) -> pl.DataFrame:
     return rows[name].explode().drop_nulls().struct.unnest()
 
 
-def _campaign(out: Path, made: Made, hrefs: dict[str, str], rows: pl.DataFrame) -> Campaign:
+def _of_pages(rows: Sequence[pl.DataFrame]) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Pieces and architectures of all runs, where all of them have a page."""
+    together_rows = pl.concat(rows)
+    return together(_unlisted(together_rows, "pieces")), added([_unlisted(together_rows, "tallies")])
+
+
+def _of_tables(out: Path, made: Made) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """The same from the tables; the pieces may be longer, as those of many runs are counted at once."""
+    names = complete_runs(out)
+    for run, metadata in completed_runs(out).items():
+        check_site(made.site, metadata.get("site_digest"), run)
+    portions = [names[first : first + _RUNS_AT_ONCE] for first in range(0, len(names), _RUNS_AT_ONCE)]
+    pieces = [availability_pieces(tables_of(out, "epochs", some, PIECE_COLUMNS).lazy()) for some in told(portions)]
+    runs, hazards, alarms = (catalogue.scan(out, table).collect() for table in ("runs", "hazards", "alarms"))
+    return together(pl.concat(pieces)), added(compare_architectures(out, runs, hazards, alarms, made.config).values())
+
+
+def _campaign(
+    out: Path, made: Made, hrefs: dict[str, str], pieces: pl.DataFrame, architectures: pl.DataFrame
+) -> Campaign:
     tables = {table: catalogue.scan(out, table).collect() for table in catalogue.CATALOGUED}
     return Campaign(
         runs=tables["runs"],
         hazards=tables["hazards"],
         passages=tables["passages"],
         derived=derived_tables(tables["runs"], tables["hazards"], tables["passages"], tables["alarms"], made.config),
-        pieces=together(_unlisted(rows, "pieces")),
+        pieces=pieces,
         hrefs=hrefs,
-        architectures=added([_unlisted(rows, "tallies")]),
+        architectures=architectures,
     )

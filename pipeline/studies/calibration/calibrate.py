@@ -10,6 +10,7 @@ import polars as pl
 import tomli_w
 
 from pipeline.one_run import replay
+from pipeline.results.workers import told
 from pipeline.stages.alignment.align import align
 from pipeline.stages.matching import Match
 from pipeline.stages.monitors.axis import error_model
@@ -88,7 +89,7 @@ def calibrate(
     config = config or Configuration()
     base = vehicle or Vehicle()
     _check_solution(logs, solution)
-    return calibration_of([observe(log, site, base, config, solution) for log in logs], base, config)
+    return calibration_of([observe(log, site, base, config, solution) for log in told(logs)], base, config)
 
 
 def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> Observed:

@@ -9,6 +9,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.results import store
+from pipeline.results.workers import told
 from pipeline.storage.address import Address
 from pipeline.studies.claim.front import front_of
 from pipeline.studies.claim.profile import RequirementProfile
@@ -56,7 +57,7 @@ def claim(
     by_solution: dict[str, Tallies] = defaultdict(dict)
     days: set[tuple[object, ...]] = set()
     # Which run of a day is its trial is drawn before an error is looked at, and apart from its instant.
-    for run in sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}")):
+    for run in told(sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}"))):
         of_run = _tallies_of(out, run, config, profile, areas, ahead_m)
         if profile.method.independent == "day" and run["t_start"] is not None:
             of_run = _once_a_day(of_run, (run["solution"], run["t_start"].date()), days)

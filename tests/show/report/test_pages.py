@@ -18,7 +18,8 @@ from typer.testing import CliRunner
 from cli import app
 from pipeline.read.site.route import route_table
 from pipeline.results.store import write_run
-from pipeline.show.report import page_name, write_report
+from pipeline.results.workers import watched
+from pipeline.show.report import page_name, write_page, write_report
 from pipeline.show.report.campaign_page import RUN_COLUMNS
 from pipeline.show.report.route_found import found_route
 from schemas.campaign import STANFORD
@@ -309,7 +310,8 @@ def test_only_pages_of_what_changed_are_made_again(replayed: dict[str, RunTables
     for run_id in ("kept", "cut", "changed"):
         write_run(RunTables(**{**vars(replayed["jump_two"]), "run_id": run_id}), tmp_path, {})
     told: list[tuple[int, int]] = []
-    write_report(tmp_path, jobs=2, progress=lambda done, total: told.append((done, total)))
+    with watched(lambda done, total: told.append((done, total))):
+        write_report(tmp_path, jobs=2)
     assert told == [(1, 3), (2, 3), (3, 3)]
     pages = {name: tmp_path / "report" / "runs" / f"{name}.html" for name in ("kept", "cut", "changed")}
     whole = pages["cut"].read_bytes()
@@ -321,6 +323,24 @@ def test_only_pages_of_what_changed_are_made_again(replayed: dict[str, RunTables
     assert pages["kept"].stat().st_mtime_ns == before["kept"][0]
     assert pages["cut"].read_bytes() == whole
     assert pages["changed"].read_bytes() != before["changed"][1]
+
+
+def test_above_the_limit_pages_are_written_on_demand(replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    for run_id in ("one", "two", "three"):
+        write_run(RunTables(**{**vars(replayed["jump_two"]), "run_id": run_id}), tmp_path, {})
+    write_report(tmp_path)
+    whole = data_of(tmp_path, "index.html")
+    (index,) = write_report(tmp_path, most_pages=2)
+    page = index.read_text()
+    assert "3 runs without a page: <code>balise report OUT --run RUN</code>" in page
+    assert "runs/two.html" not in page
+    assert data_of(tmp_path, "index.html")["solutions"] == whole["solutions"]
+    assert write_page(tmp_path, "two", most_pages=2) == tmp_path / "report/runs/two.html"
+    assert write_report(tmp_path, most_pages=2) == [index, tmp_path / "report/runs/two.html"]
+    assert "runs/two.html" in index.read_text()
+    assert "2 runs without a page" in index.read_text()
+    with pytest.raises(UsageError, match="has no run 'four'"):
+        write_page(tmp_path, "four")
 
 
 def test_a_table_that_is_gone_is_an_error_of_the_result(replayed: dict[str, RunTables], tmp_path: Path) -> None:
