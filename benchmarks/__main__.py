@@ -27,6 +27,7 @@ MODULES = (
     "plausibility",
     "line",
     "undetected",
+    "recorded",
 )
 
 
