@@ -689,7 +689,9 @@ def experiment(
         return
     for run_id, error in made.failed.items():
         _say(f"{run_id} is not used: {error}")
-    _tell(as_json, {"experiment": name, "out": out, **made.tables}, shown(made), f"\nBegin with {made.page}")
+    if as_json or not quiet:
+        answer = {"experiment": name, "out": out, "files": made.files}
+        _tell(as_json, answer, shown(made), "", *made.remarks, f"\nBegin with {made.files[0]}")
     raise Exit(RUNS_NOT_OK if made.failed else OK)
 
 

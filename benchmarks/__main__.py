@@ -28,6 +28,7 @@ MODULES = (
     "plausibility",
     "line",
     "undetected",
+    "recorded",
 )
 
 

@@ -278,6 +278,8 @@ def _decode(frame: Frame, gathered: Gathered) -> None:
 # What is left out though it is almost a log, and what to do.
 _OTHER = "Convert it to CSV and give a mapping, if the receiver is another one."
 _ALMOST = {
+    rb"\A.{20,60}C?RINEX VER": "RINEX holds ranges, no positions: compute them first, "
+    "for example with rnx2rtkp of RTKLIB, and convert the .pos file that it writes.",
     rb"\$[A-Z]{2}(GGA|GNS|RMC),[^*\r\n]*\r?\n": "NMEA without checksums cannot be checked: let the logger keep them.",
     rb"(?m)^<(BEST|PSR|INS)": "Abbreviated ASCII of NovAtel has no checksums: log BESTPOSA or BESTPOSB.",
     rb"\A\s*\d{4}(/\d\d/\d\d|\s+\d+\.\d+\s)": "If it is of RTKLIB, let it write its header (out-outhead = on).",
