@@ -9,14 +9,14 @@ import re
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from typer import Argument, Exit, Option, Typer
+from typer import Argument, Exit, Option, Typer, confirm
 from typer.core import TyperCommand
 from typer.main import get_command
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.campaign import CampaignSummary, Interrupted, Plan
+    from pipeline.project.trial import Wanted
     from schemas.config import Configuration, Vehicle
     from schemas.run import RunLog
     from schemas.run import Site as Ground
@@ -153,6 +154,7 @@ def replay(
     project: OfProject = None,
 ) -> None:
     """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
+    _check_named(runs)
     from pipeline.campaign import Interrupted, make_plan, run_campaign
     from pipeline.results.manifest import settings_files
     from pipeline.show.progress import show_summary, watches
@@ -173,6 +175,16 @@ def replay(
         raise _stopped(interrupted, out, quiet, as_json, places) from None
     show_summary(summary, out, quiet, as_json, **places)
     raise Exit(_status_of(summary, fail_on))
+
+
+def _check_named(runs: list[str]) -> None:
+    """What is mistyped is said before anything is loaded; of stores, when they are asked for the runs."""
+    from pipeline.storage import require_match
+    from pipeline.storage.address import is_url
+
+    for name in runs:
+        if not is_url(name):
+            require_match(name)
 
 
 def _stopped(interrupted: Interrupted, out: str, quiet: bool, as_json: bool, places: Mapping[str, str]) -> Exit:
@@ -198,6 +210,77 @@ def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
 
     with _telling("runs looked at to calibrate", quiet):
         return calibrated(plan, runs, jobs)
+
+
+@_command(
+    'balise trial morning.ubx odometer.csv --track line.gpx --balises "every 1000" --to week12',
+    "balise trial raw --track line9 --reference raw/rover.pos --to week12 --accept-corrections",
+)
+def trial(
+    raws: Annotated[list[Path], _place(metavar="RAW...", help=_LOGS + " Folders of these.")],
+    to: Annotated[Path, _file("--to", "--out", help="Folder of the project.")],
+    track: Annotated[list[Path] | None, _file(help="The line: maps (GPX, GeoJSON, ...), points, or a site.")] = None,
+    balises: Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")] = None,
+    reference: Annotated[list[Path] | None, _file(help="Of the logs, one whose positions are the truth.")] = None,
+    date: Annotated[datetime | None, Option(formats=["%Y-%m-%d"], help="Day (UTC) of NMEA logs without one.")] = None,
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    accept_corrections: Annotated[bool, Option("--accept-corrections", help="Accept what is proposed.")] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write a project for raw logs: which stream each feeds, which are of one ride, what has to be corrected."""
+    from pipeline.project.trial import Wanted
+
+    if not track:
+        from schemas.errors import UsageError
+
+        remedy = (
+            "Give a map (GPX, GeoJSON, ...), a table of points, a run with a reference, or a site: --track line.gpx"
+        )
+        raise UsageError("needs the line that the train ran on", place="--track", remedy=remedy)
+    raws, balises = _spacing(raws, balises)
+    day = None if date is None else date.date()
+    wanted = Wanted(raws, track, balises, reference or (), day, vehicle, config)
+    _write_project(wanted, to, accept_corrections, force, as_json)
+
+
+@_command("balise init week12")
+def init(
+    folder: Annotated[Path, _place(help="Folder of the project.")] = Path(),
+    accept_corrections: Annotated[bool, Option("--accept-corrections", help="Accept what is proposed.")] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write a project for what lies in a folder: logs, runs, a survey or a site, balises, settings; or an empty one."""
+    from pipeline.project.init import wanted_in
+
+    _write_project(wanted_in(folder), folder, accept_corrections, force, as_json)
+
+
+def _spacing(raws: list[Path], balises: str | None) -> tuple[list[Path], str | None]:
+    """`--balises every 1000` without quotes leaves its number among the logs."""
+    if balises != "every":
+        return raws, balises
+    number = next((raw for raw in raws if raw.name.isdigit() and not raw.exists()), None)
+    return [raw for raw in raws if raw is not number], "every" if number is None else f"every {number}"
+
+
+def _write_project(wanted: Wanted, folder: Path, accept: bool, force: bool, as_json: bool) -> None:
+    from datasets.recordings import recordings
+    from pipeline.project.init import answer_of, refuse_existing, words_of, write_project
+    from pipeline.project.trial import draft_project
+
+    def asked(run_id: str, found: Sequence[str], lines: Sequence[str]) -> bool:
+        if accept or as_json or not sys.stdin.isatty():
+            return accept
+        _say("\n".join([f"\n{run_id} does not fit as recorded:", *found, *lines]))
+        return confirm("Accept these corrections?", err=True)
+
+    refuse_existing(folder, force)
+    drafted = draft_project(wanted, folder, recordings(), asked)
+    file = write_project(drafted, folder)
+    _tell(as_json, answer_of(drafted, file), {"Logs": drafted.logs}, *words_of(drafted, file))
 
 
 @_command("balise run", "balise run --project week12 --jobs 4")
@@ -396,6 +479,9 @@ def inspect(
     project: OfProject = None,
 ) -> None:
     """Describe a log, a site or a result, and list what needs attention."""
+    from pipeline.show.kinds import kind_at
+
+    kind_at(path)  # what is mistyped is said before anything is loaded
     from pipeline.show.inspection import inspect_path, show
 
     settings = _configuration(config)
@@ -603,7 +689,9 @@ def experiment(
         return
     for run_id, error in made.failed.items():
         _say(f"{run_id} is not used: {error}")
-    _tell(as_json, {"experiment": name, "out": out, **made.tables}, shown(made), f"\nBegin with {made.page}")
+    if as_json or not quiet:
+        answer = {"experiment": name, "out": out, "files": made.files}
+        _tell(as_json, answer, shown(made), "", *made.remarks, f"\nBegin with {made.files[0]}")
     raise Exit(RUNS_NOT_OK if made.failed else OK)
 
 
@@ -701,19 +789,22 @@ def line(
 
 @_command(
     "balise export week12 monday --out monday.mcap --site line9",
-    "balise export week12 monday --out monday.geojson --site line9",
+    "balise export week12 monday --out monday.gpkg --site line9",
 )
 def export(
     out: ResultFolder,
     run: Annotated[str, Argument(help="Id of the run.")],
-    to: Annotated[Path, _file("--out", "--to", help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")],
+    to: Annotated[
+        Path,
+        _file("--out", "--to", help="F.mcap (with a Foxglove layout), .geojson, .gpx, .gpkg or .parquet (GeoParquet)."),
+    ],
     site: Annotated[str | None, Option(help="Site, for positions on the ground.")] = None,
     log: Annotated[str | None, Option(help="The recorded run, for its raw positions.")] = None,
     ros: Annotated[bool, Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
-    """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
+    """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or for maps."""
     from pipeline.show.export import export_run
 
     recorded = _log(log, _configuration(config), True) if log else None

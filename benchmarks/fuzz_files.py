@@ -1,6 +1,6 @@
 """Damage what no checksum of the container covers: messages and schemas of logs, tables, networks and settings.
 
-    python -m benchmarks.fuzz_files --count 5000 --seed 1
+    python -m benchmarks.fuzz_files --count 5000
 
 Messages and schemas are changed inside a log that is written anew, so that its checksums are right, and what is read
 is held against the stock decoders. Of Parquet, what is read must be what was written. CSV, GeoJSON and TOML may say
@@ -12,11 +12,12 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import secrets
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -206,10 +207,10 @@ def cases() -> dict[str, Case]:
     }
 
 
-def fuzz(count: int, seed: int = 1, first: int = 0) -> FuzzReport:
-    """Run cases `first` to `first + count`."""
+def fuzz(count: int, seed: int = 1, first: int = 0, chosen: Mapping[str, Case] | None = None) -> FuzzReport:
+    """Run cases `first` to `first + count`, of these kinds."""
     report = FuzzReport(seed, first, count, Counter(), Counter())
-    known = cases()
+    known = cases() if chosen is None else chosen
     with tempfile.TemporaryDirectory() as name:
         for number in range(first, first + count):
             random = np.random.default_rng((seed, number))
@@ -243,13 +244,16 @@ def _outcome(case: Case, random: Random, folder: Path) -> str:
         return f"WRONG {type(error).__name__}: {error}"[:300]
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=5000)
-    parser.add_argument("--seed", type=int, default=1)
+def main(about: str | None = __doc__, chosen: Mapping[str, Case] | None = None, count: int = 5000) -> int:
+    """The command line of this benchmark, and of the others on its frame; without a seed a fresh one is drawn."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=count)
+    parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--first", type=int, default=0)
     given = parser.parse_args()
-    report = fuzz(given.count, given.seed, given.first)
+    seed = secrets.randbits(32) if given.seed is None else given.seed
+    print(f"seed {seed}", flush=True)
+    report = fuzz(given.count, seed, given.first, chosen)
     for name, number in sorted(report.mutations.items()):
         print(f"{name:25s} {number:7d}")
     for failure in report.failures[:20]:

@@ -12,6 +12,7 @@ import argparse
 import io
 import json
 import resource
+import secrets
 import struct
 import sys
 import tempfile
@@ -220,11 +221,13 @@ def _peak_mb() -> float:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("bench-out/fuzz_ingest.json"))
     arguments = parser.parse_args()
-    report = fuzz(arguments.count, arguments.seed, arguments.first)
+    seed = secrets.randbits(32) if arguments.seed is None else arguments.seed
+    print(f"seed {seed}", flush=True)
+    report = fuzz(arguments.count, seed, arguments.first)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps(vars(report), indent=2, sort_keys=True) + "\n")
     for name, number in sorted(report.mutations.items()):

@@ -13,6 +13,7 @@ from datasets.trial import write_run_as
 from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
+from pipeline.read.ingest.correct import corrected
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import visible
@@ -53,7 +54,9 @@ def convert_logs(
     else:
         converted = as_run(found, to.name.removesuffix(".mcap"), purpose, settings.fix_sigma)
     write_run_as(converted.run, to)
-    return Conversion(to, converted.run.gnss.height, converted.dropped, fit_report(converted.run, settings))
+    # Written as recorded: a replay with the same configuration corrects it, once.
+    as_replayed = corrected(converted.run, settings.ingest.correct)
+    return Conversion(to, converted.run.gnss.height, converted.dropped, fit_report(as_replayed, settings))
 
 
 def known_recording(path: Path) -> Converted | None:

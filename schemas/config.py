@@ -39,7 +39,7 @@ class StreamMapping(Settings):
     the log time), `log`, `publish` or `field:PATH`; numbers there are nanoseconds (integers) or seconds
     (floats) unless `factors.t` gives the seconds per unit, counted from `time_epoch` (of `excel`: days). CSV files may
     name two columns, `field:DATE + TIME`, or with epoch `gps` the week and its seconds; `date_order` says what
-    01.02.2025 means where the whole file leaves it open.
+    01.02.2025 means where the whole file leaves it open, `time_zone` (IANA) of which place times without a zone are.
     """
 
     topic: str
@@ -50,6 +50,7 @@ class StreamMapping(Settings):
     time: str = Field(default="auto", pattern=r"^(auto|log|publish|field:.+)$")
     time_scale: Literal["utc", "gps"] = "utc"
     time_epoch: Literal["unix", "gps", "excel"] = "unix"
+    time_zone: str | None = None
     date_order: Literal["auto", "day_first", "month_first"] = "auto"
     solution: str = "primary"
 

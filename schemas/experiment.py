@@ -22,8 +22,12 @@ _CELL: dict[str, dy.Column] = {
     "cell": text("kind, target, amount and direction of the fault"),
     "kind": text("kind of the fault, as in a fault file"),
     "target": text("what it hits; in `injections` the satellite that was drawn"),
-    "direction": text("ahead or behind the train; null where the fault has no direction", nullable=True),
-    "amount": dy.Float64(description="rate, size, duration, latency or scale, in `unit`; negative behind"),
+    "direction": text(
+        "ahead, behind, left, right, ...; of a range longer or shorter; null without a direction", nullable=True
+    ),
+    "amount": dy.Float64(
+        description="rate, size, duration, latency or scale, in `unit`; negative in the second direction"
+    ),
     "unit": text("unit of the amount"),
 }
 

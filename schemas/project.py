@@ -170,7 +170,11 @@ def load_configuration(file: Path | None) -> Configuration:
     """A configuration file, or the configuration that a project file stands for."""
     if file is None or not is_project(data := read_toml(file)):
         return load_settings(file, Configuration)
-    project = settings_from(data, Project, str(file), _REMEDY)
+    return configuration_of(settings_from(data, Project, str(file), _REMEDY), file)
+
+
+def configuration_of(project: Project, file: Path) -> Configuration:
+    """The configuration that a project at this file stands for."""
     config = load_settings(None if project.config is None else file.parent / project.config, Configuration)
     return _at_level(config, project.service_level, file)
 

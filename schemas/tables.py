@@ -145,6 +145,12 @@ class Passages(dy.Schema):
         "m", "largest fault ahead of the train that no monitor would have noticed; not proved on curves", min=0
     )
     undetected_behind_m = real("m", "the same behind it; null as all of these where not computed", min=0)
+    undetected_ahead_in_use_m = real(
+        "m",
+        "largest fault ahead still in use, alarms or not; null before the first TVB and where nothing bounds it",
+        min=0,
+    )
+    undetected_behind_in_use_m = real("m", "the same behind it", min=0)
     undetected_range_ahead_m = real("m", "largest of these by one range at fault, the pseudorange monitor heard", min=0)
     undetected_range_behind_m = real("m", "the same behind it", min=0)
     undetected_since = instant("such a fault began after here: the last independent fix", nullable=True)
@@ -233,6 +239,12 @@ class _EpochsAfterMonitors(dy.Schema):
         "m", "largest fault ahead of the train that no monitor would have noticed; not proved on curves", min=0
     )
     undetected_behind_m = real("m", "the same behind it; both null where not computed", min=0)
+    undetected_ahead_in_use_m = real(
+        "m",
+        "largest fault ahead still in use, alarms or not; null before the first TVB and where nothing bounds it",
+        min=0,
+    )
+    undetected_behind_in_use_m = real("m", "the same behind it", min=0)
 
 
 def _monitor_columns(monitor: Monitor) -> dict[str, dy.Column]:

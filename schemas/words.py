@@ -121,9 +121,16 @@ def beside_words(run: Mapping[str, Any]) -> str:
     return ", ".join([accepted, available, *([] if margin_m is None else [say("verdicts", "margin", margin_m)])])
 
 
-def unnoticed_words(largest_m: float | None) -> str:
-    """How large an error may stay unnoticed; `largest_m`: the largest while in use, where it was computed."""
-    return say("verdicts", "unnoticed_not_known") if largest_m is None else say("verdicts", "unnoticed", largest_m)
+def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) -> str:
+    """How large an error may stay unnoticed; `largest_m`: the largest while in use, where it was computed.
+
+    `beyond_share`: of the epochs in use, with one beyond the failure limit.
+    """
+    if largest_m is None:
+        return say("verdicts", "unnoticed_not_known")
+    return say("verdicts", "unnoticed", largest_m) + (
+        say("verdicts", "unnoticed_beyond", beyond_share) if beyond_share else ""
+    )
 
 
 def noise_words(widened: Mapping[str, tuple[float, float]]) -> str:

@@ -67,6 +67,7 @@ _SLOW = (
     "studies/plausibility",
     "stages/monitors/test_pseudorange.py",
     "project/test_run.py",
+    "project/test_trial.py",
     "replay/test_channels.py",
     "replay/test_evidence.py",
     "replay/test_moving.py",

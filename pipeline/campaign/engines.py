@@ -17,7 +17,7 @@ from types import FrameType
 
 from pipeline.campaign.ground import held, hold
 from pipeline.campaign.interruption import StopRun, answered
-from pipeline.campaign.outcome import Result, RunFailure, overdue
+from pipeline.campaign.outcome import NO_MEMORY, Result, RunFailure, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import fail_run, replay_one
@@ -129,11 +129,18 @@ class LocalEngine(Engine):
         return isinstance(error, BrokenExecutor)
 
     def collected(self, result: Result) -> None:
-        self._idle.append(self._busy.pop(result))
+        slot = self._busy.pop(result)
+        if _was_without_memory(result):
+            slot.kill()  # what it still holds would be lacking to the next run
+        self._idle.append(slot)
 
     def close(self) -> None:
         for slot in (*self._idle, *self._busy.values()):
             slot.kill()
+
+
+def _was_without_memory(result: Result) -> bool:
+    return not result.cancelled() and result.exception() is None and result.result().error == NO_MEMORY
 
 
 class _WorkerSlot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import traceback
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ class RunFailure:
 
 
 Result = Future[RunOutcome]
+NO_MEMORY = "not enough memory. Give it more memory or fewer --jobs; the next call tries it again."
 
 
 class ChangedError(InputError):
@@ -68,11 +70,22 @@ def failure_of(error: BaseException, lasting: bool) -> RunFailure:
     if isinstance(error, BaliseError):
         again = isinstance(error, InputError) and not isinstance(error, ChangedError) and not _is_of_the_machine(error)
         return RunFailure(redacted(str(error)), lasting and again)
-    if isinstance(error, MemoryError):
-        return RunFailure("not enough memory", lasting=False)
+    if _lacks_memory(error):
+        return RunFailure(NO_MEMORY, lasting=False)
     text = f"defect of the program: {type(error).__name__}: {error}"
     trace = "".join(traceback.format_exception(error))
     return RunFailure(text, lasting=False, trace=trace)
+
+
+def _lacks_memory(error: BaseException | None) -> bool:
+    """Also where a library could not be loaded for want of it."""
+    while error is not None:
+        without = isinstance(error, OSError) and error.errno == errno.ENOMEM
+        unloaded = isinstance(error, ImportError) and ("map segment" in str(error) or "allocate" in str(error))
+        if isinstance(error, MemoryError) or without or unloaded:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _is_of_the_machine(error: BaseException | None) -> bool:

@@ -176,7 +176,7 @@ def _parts(run: dict[str, Any]) -> dict[str, str | None]:
 
 
 def _sites(sites: dict[str, Any]) -> dict[str, str]:
-    return {f"{site[:12]}, {file['name']}": file["sha256"] for site, files in sites.items() for file in files}
+    return {f"{site}, {file['name']}": file["sha256"] for site, files in sites.items() for file in files}
 
 
 def _digests(files: dict[str, Any]) -> dict[str, str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from pipeline.make.receivers import Converted, Gatherings, Purpose, as_run, extended, gather
 from pipeline.project.opened import Opened
+from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import UsageError
@@ -61,7 +62,7 @@ def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: 
         paths = []
         for log in logs:
             for path in _paths(opened, log, entry):
-                known = None if log.mappings() or day else recordings.known(path)
+                known = None if log.mappings() or day else _known(path, ingest, recordings)
                 if known is None:
                     paths.append(path)
                 else:
@@ -69,6 +70,13 @@ def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: 
         if paths:
             parts.append(_Part(purpose, gather(paths, ingest, day)))
     return parts
+
+
+def _known(path: Path, config: IngestConfig, recordings: Recordings) -> Converted | None:
+    """A public recording, or a folder that is a run already."""
+    if (path / "gnss.parquet").is_file():
+        return Converted(read_run(path, config, with_digest=False), {})
+    return recordings.known(path)
 
 
 def _call_of(log: LogEntry) -> tuple[Purpose, date | None]:

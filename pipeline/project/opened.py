@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -11,7 +12,7 @@ from typing import Any
 from pipeline.storage.address import is_url
 from schemas.config import Configuration, Vehicle, load_settings, read_toml
 from schemas.errors import UsageError
-from schemas.project import FILE_NAME, NO_VEHICLE, Project, is_project, load_configuration, load_project
+from schemas.project import FILE_NAME, NO_VEHICLE, Project, configuration_of, is_project, load_project
 
 MEASURED_VEHICLE = "vehicle_measured.toml"
 MEASURED_CONFIG = "config_measured.toml"
@@ -30,8 +31,8 @@ class Opened:
         return self.file.parent
 
     def place(self, named: str) -> str:
-        """A path of the file, or an address."""
-        return named if is_url(named) else str(self.folder / Path(named).expanduser())
+        """A path of the file, or an address. `..` is taken off by name, as `named_from` puts it there."""
+        return named if is_url(named) else os.path.normpath(self.folder / Path(named).expanduser())
 
     def path(self, named: str | None) -> Path | None:
         return None if named is None else Path(self.place(named))
@@ -59,7 +60,7 @@ class Opened:
 
     def given_config(self) -> Configuration:
         """The configuration as written, before anything is measured."""
-        return load_configuration(self.file)
+        return configuration_of(self.project, self.file)
 
     def given_vehicle(self) -> Vehicle:
         return load_settings(self.path(self.project.vehicle), Vehicle)

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import lzma
+import struct
+import tarfile
 import time
+import zipfile
+import zlib
 from typing import IO
+
+import pyarrow as pa
 
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 
+# What the readers of archives raise for damage, a password, a method that they do not know, a disk that is full.
+UNPACKING = (
+    *(OSError, EOFError, RuntimeError, NotImplementedError, ValueError, IndexError, MemoryError),
+    *(zlib.error, lzma.LZMAError, zipfile.BadZipFile, tarfile.TarError, pa.ArrowException, struct.error),
+)
 _PIECE = 1024 * 1024
 _MIB = 1024 * 1024
 # Below this a ratio says nothing: a small log of a train that stands packs to hardly anything.

@@ -12,11 +12,15 @@ import cli
 from tests.conftest import SmallTrial
 
 
-def nmea(lines: int = 40) -> str:
-    """A receiver that stands still on the site, 1 Hz."""
-    body = [f"GPGGA,1012{second:02d}.00,5001.2000,N,01400.0000,E,1,08,1.0,250.0,M,45.0,M,," for second in range(lines)]
-    dates = [f"GPRMC,1012{second:02d}.00,A,5001.2000,N,01400.0000,E,0.0,0.0,030325,,,A" for second in range(lines)]
-    return "".join(f"${text}*{_sum(text):02X}\r\n" for pair in zip(dates, body, strict=True) for text in pair)
+def nmea(lines: int = 40, acceleration_mps2: float = 0.0) -> str:
+    """A receiver at 1 Hz that goes north, faster and faster."""
+    pairs = []
+    for second in range(lines):
+        place = f"50{1.2 + acceleration_mps2 / 2 * second**2 / 1852:010.7f},N,01400.0000000,E"
+        clock = f"10{12 + second // 60:02d}{second % 60:02d}.00"
+        pairs.append(f"GPRMC,{clock},A,{place},{acceleration_mps2 * second * 1.943844:.3f},0.0,030325,,,A")
+        pairs.append(f"GPGGA,{clock},{place},1,08,1.0,250.0,M,45.0,M,,")
+    return "".join(f"${text}*{_sum(text):02X}\r\n" for text in pairs)
 
 
 def _sum(text: str) -> int:

@@ -17,7 +17,7 @@ from datasets.experiment.recorded.baseline import Baseline, baseline_of
 from datasets.experiment.recorded.draw import Onset, Room, numbered, onsets_of, room_of
 from datasets.experiment.recorded.injection import injected
 from datasets.experiment.recorded.outcome import outcome_row
-from datasets.experiment.recorded.page import recorded_page
+from datasets.experiment.recorded.page import recorded_page, remarks_on
 from datasets.experiment.recorded.pictures import pictures
 from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan, banks_of, load_plan
 from datasets.experiment.recorded.tables import Quiet, banks_table, cells_table, places_table, pmd_table
@@ -70,11 +70,16 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Made:
-    """The tables by name, and the runs that could not be used, with the reason."""
+    """The tables by name, the runs that could not be used, with the reason, and what was written, the page first."""
 
     tables: dict[str, pl.DataFrame]
     failed: dict[str, str]
-    page: Path
+    files: list[Path]
+
+    @property
+    def remarks(self) -> list[str]:
+        """What the figures do not prove."""
+        return remarks_on(self.tables)
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,8 @@ def recorded_experiment(
     given = {"seed": seed, "per_cell": per_cell}
     plan = plan.model_copy(update={name: value for name, value in given.items() if value is not None})
     inputs = _inputs(runs, site, vehicle, config, solution, plan, banks_of(plan, plan_file, config))
+    # An earlier call may have found other runs at these addresses.
+    _KEPT.clear()
     surveyed = mapped(_survey, [(inputs, run) for run in inputs.runs], jobs)
     rooms = [one.room for one in surveyed if one.room is not None]
     if not rooms:
@@ -137,9 +144,9 @@ def recorded_experiment(
     digests = {one.run_id: one.run_digest for one in surveyed}
     pieces = _pieces(inputs, numbered(cells, drawn), digests, out)
     tables = _tables(mapped(_made_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
-    _write(out, tables, plan)
+    files = _write(out, tables, plan)
     _forget_others(pieces, out)
-    return Made(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, out / PAGE)
+    return Made(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, files)
 
 
 def _inputs(
@@ -226,9 +233,9 @@ def _refuse_lack_of_room(
         raise InputError(
             "no run has room for any fault of the plan",
             place=", ".join(room.run_id for room in rooms),
-            found=f"at most {longest_s:.0f} s without an alarm after an instant at which nothing is left out",
+            found=f"at most {longest_s:.0f} s without an alarm from an instant that may be used; {_left_out(rooms)}",
             expected=f"{shortest_s:.0f} s",
-            remedy="`experiment_runs` of a longer run says what is left out and why.",
+            remedy="Give longer runs, or runs in which less is wrong.",
         )
     if plan_file is None:
         return
@@ -246,6 +253,15 @@ def _refuse_lack_of_room(
             expected=f"{cell.count}",
             remedy="Give more or longer runs, fewer injections, or a smaller `apart_s` or `watch_s`.",
         )
+
+
+def _left_out(rooms: Sequence[Room]) -> str:
+    """Time that may be used, and why the rest may not."""
+    sums: dict[str, float] = {}
+    for room in rooms:
+        for name, seconds in room.seconds_left_out().items():
+            sums[name] = sums.get(name, 0.0) + seconds
+    return ", ".join(f"{name.removesuffix('_s')} {seconds:.0f} s" for name, seconds in sums.items() if seconds)
 
 
 def _pieces(inputs: Inputs, onsets: Sequence[Onset], digests: dict[str, str], out: Path) -> list[_Piece]:
@@ -325,20 +341,24 @@ def _together(bank: str, surveyed: Sequence[_Surveyed]) -> Quiet:
     return Quiet(bank=bank, runs=len(parts), **sums)
 
 
-def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> None:
-    for name, table in tables.items():
-        contract = EXPERIMENT_TABLES[f"experiment_{name}"]
-        notes = {
-            column: {"unit": str((kind.metadata or {}).get("unit", "")), "meaning": kind.description or ""}
-            for column, kind in contract.columns().items()
-        }
-        metadata = {"balise.table": f"experiment_{name}", "balise.software": SOFTWARE}
-        storage.write_bytes(out / f"{name}.parquet", parquet_bytes(table, metadata, notes))
-    storage.write_bytes(out / "plan.toml", to_toml(plan).encode())
+def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> list[Path]:
     drawn = pictures(tables)
-    for name, (_, drawing) in drawn.items():
-        storage.write_bytes(out / f"{name}.svg", drawing.encode())
-    storage.write_bytes(out / PAGE, recorded_page(tables, drawn, plan).encode())
+    contents = {PAGE: recorded_page(tables, drawn, plan).encode(), "plan.toml": to_toml(plan).encode()}
+    contents |= {f"{name}.parquet": _table_bytes(name, table) for name, table in tables.items()}
+    contents |= {f"{name}.svg": drawing.encode() for name, (_, drawing) in drawn.items()}
+    for name, content in contents.items():
+        storage.write_bytes(out / name, content)
+    return [out / name for name in contents]
+
+
+def _table_bytes(name: str, table: pl.DataFrame) -> bytes:
+    """A table as Parquet, with unit and meaning in the field of each column."""
+    columns = EXPERIMENT_TABLES[f"experiment_{name}"].columns()
+    notes = {
+        column: {"unit": str((kind.metadata or {}).get("unit", "")), "meaning": kind.description or ""}
+        for column, kind in columns.items()
+    }
+    return parquet_bytes(table, {"balise.table": f"experiment_{name}", "balise.software": SOFTWARE}, notes)
 
 
 def _forget_others(pieces: Sequence[_Piece], out: Path) -> None:

@@ -22,8 +22,8 @@ _REASONS = tuple(LeftOut)
 class Room:
     """Where faults may begin in one run, by all banks; arrays per epoch.
 
-    `left_out`: number of the reason in `LeftOut`, -1 where a fault may begin; `free_ns`: the next alarm or negation, or
-    the last epoch.
+    `left_out`: number of the reason in `LeftOut`, -1 where a fault may begin; `free_ns`: before the next alarm or
+    negation, or the last epoch.
     """
 
     run_id: str
@@ -62,7 +62,8 @@ def room_of(baselines: Sequence[Baseline], quiet_s: float) -> Room:
     first = baselines[0]
     left_out = np.max([base.left_out(quiet_s) for base in baselines], axis=0)
     alarming = np.logical_or.reduce([base.alarming for base in baselines])
-    ends_ns = np.where(alarming, first.t_ns, first.t_ns[-1])
+    # An alarm at the very end of a watch would be taken for one of the fault.
+    ends_ns = np.where(alarming, first.t_ns - 1, first.t_ns[-1])
     return Room(
         run_id=first.run.run_id,
         first_ns=first.recording.first_ns,

@@ -103,7 +103,7 @@ def _curve(curve: Curve, x: Axis, y: Axis) -> list[str]:
     if curve.band:
         lows = [(_across(x, px), _up(y, low)) for (px, _), (low, _) in zip(curve.points, curve.band, strict=True)]
         highs = [(_across(x, px), _up(y, high)) for (px, _), (_, high) in zip(curve.points, curve.band, strict=True)]
-        parts.append(f'<polygon points="{_joined([*lows, *reversed(highs)])}" fill="{curve.colour}" opacity="0.10"/>')
+        parts.append(f'<polygon points="{_joined([*lows, *reversed(highs)])}" fill="{curve.colour}" opacity="0.06"/>')
     dash = ' stroke-dasharray="6 4"' if curve.dashed else ""
     parts.append(
         f'<polyline points="{_joined(at)}" fill="none" stroke="{curve.colour}" stroke-width="1.6"{dash}>'

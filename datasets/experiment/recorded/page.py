@@ -34,7 +34,7 @@ def recorded_page(tables: Mapping[str, pl.DataFrame], drawn: Mapping[str, tuple[
     cells = tables["cells"]
     body = "\n".join(
         [
-            section("limits", "What this does not prove", _list(_remarks(tables))),
+            section("limits", "What this does not prove", _list(remarks_on(tables))),
             section("pictures", "Pictures", *(_figure(name, *picture) for name, picture in drawn.items())),
             section(
                 "banks",
@@ -55,7 +55,7 @@ def recorded_page(tables: Mapping[str, pl.DataFrame], drawn: Mapping[str, tuple[
     return page("Faults in recorded runs", heading, body, script_json({}), "line.js", SOFTWARE)
 
 
-def _remarks(tables: Mapping[str, pl.DataFrame]) -> list[str]:
+def remarks_on(tables: Mapping[str, pl.DataFrame]) -> list[str]:
     """The limits that hold always, and those of these runs."""
     runs = tables["runs"]
     remarks = list(_LIMITS)

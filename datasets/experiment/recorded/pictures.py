@@ -13,7 +13,7 @@ from datasets.faults import FaultKind
 
 _TIMES_S = (-3000.0, -1000.0, -300.0, -100.0, -30.0, -10.0, -3.0, 0.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 _DETECT_S = (0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0)
-_RATES = (0.001, 0.01, 0.1, 1.0, 10.0)
+_TARGETS = {"along": "along the track", "cross": "across the track", "satellite": "in one satellite's range"}
 _STRIP_LEFT = 150.0
 _STRIP_WIDTH = 730.0
 _LANE = 20.0
@@ -29,12 +29,12 @@ def pictures(tables: dict[str, pl.DataFrame]) -> dict[str, tuple[str, str]]:
     drawn: dict[str, tuple[str, str]] = {}
     for (bank,), pmd in tables["pmd"].filter(ramps).group_by("bank", maintain_order=True):
         for (target,), part in pmd.group_by("target", maintain_order=True):
-            title = f"Pmd over the time since failure, ramps of {target}, {bank}"
+            title = f"Pmd over the time since failure: ramps, {_TARGETS.get(str(target), target)}, {bank}"
             drawn[f"pmd_{bank}_{target}"] = title, _pmd(title, part)
     for (target,), part in (
         tables["cells"].filter(ramps, pl.col("injections") > 0).group_by("target", maintain_order=True)
     ):
-        title = f"T_D over the rate of a ramp of {target}"
+        title = f"T_D over the rate: ramps, {_TARGETS.get(str(target), target)}"
         drawn[f"time_to_detect_{target}"] = title, _time_to_detect(title, part)
     for (bank,), places in tables["places"].group_by("bank", maintain_order=True):
         title = f"The line: largest unnoticed error (upper lane) and slowness of detection (lower lane), {bank}"
@@ -63,11 +63,9 @@ def _pmd(title: str, pmd: pl.DataFrame) -> str:
 
 def _time_to_detect(title: str, cells: pl.DataFrame) -> str:
     curves = list(_detection_curves(cells))
-    rates = [abs(rate) for rate in cells["amount"]]
+    rates = cells["amount"].abs().unique().sort().to_list()
     longest_s = float(cells["watched_s"].max())  # type: ignore[arg-type]
-    across = Axis(
-        "rate [m/s]", min(rates) / 1.5, max(rates) * 1.5, [r for r in _RATES if min(rates) <= r <= max(rates)], log10
-    )
+    across = Axis("rate [m/s]", rates[0] / 1.5, rates[-1] * 1.5, rates, log10)
     up = Axis(
         "T_D [s]: median and bounds; △ not noticed in the watch", 0.05, 2.0 * longest_s, _within(longest_s), log10
     )
@@ -95,7 +93,7 @@ def _detection_curves(cells: pl.DataFrame) -> Iterator[Curve]:
                 for rate, time_s in known.select("rate", "time_to_detect_median_s").iter_rows()
             ],
             colour=COLOURS[banks.index(bank) % len(COLOURS)],
-            dashed=direction == "behind",
+            dashed=float(part["amount"][0]) < 0.0,
             band=[(max(lowest, 0.05), highest) for lowest, highest in band.iter_rows()],
             marks=list(unnoticed.select("rate", "watched_s").iter_rows()),
         )

@@ -35,6 +35,14 @@ _AMOUNTS = {
 """Per kind its list in the plan, the quantity of the fault, and its unit."""
 _LISTS = ("rates_mps", "sizes_m", "durations_s", "latencies_s", "scales")
 _SIGNED = (FaultKind.RAMP, FaultKind.STEP, FaultKind.BIAS)
+_WAYS = {
+    "along": ("ahead", "behind"),
+    "cross": ("left", "right"),
+    "up": ("up", "down"),
+    "east": ("east", "west"),
+    "north": ("north", "south"),
+}
+"""What a positive and a negative fault is called by target; of ranges longer and shorter."""
 SATELLITE = "satellite"
 """Target of the range of one satellite, drawn for each injection among those used there."""
 Amounts = tuple[Positive, ...]
@@ -43,7 +51,7 @@ Amounts = tuple[Positive, ...]
 class PlannedFault(Settings):
     """One kind of fault, in several amounts; each amount and direction is a cell of the experiment.
 
-    `target` as in a fault file, or `satellite`. `both_ways`: ramps, steps and biases ahead and behind. `duration_s`:
+    `target` as in a fault file, or `satellite`. `both_ways`: ramps, steps and biases in both directions. `duration_s`:
     how long it lasts, else to the end of the watch. `watch_s`: how long it is watched, else as `Cell` says.
     `per_cell`: injections in each of its cells.
     """
@@ -107,7 +115,7 @@ class RecordedPlan(Settings):
     # The recorded position's own error may delay the failure by what the fault needs for so much more.
     margin_m: NonNegative = 5.0
     # A range error reaches the position along the track with at least so much of it, for the length of the watch alone.
-    satellite_gain: Annotated[Number, Field(gt=0, le=1)] = 0.5
+    satellite_gain: Annotated[Number, Field(gt=0, le=1)] = 0.2
     # No watch is longer.
     longest_s: Positive = 3600.0
     # The run must have been free of faults for so long before the instant.
@@ -142,8 +150,9 @@ class RecordedPlan(Settings):
 class Cell:
     """One fault of one amount in one direction, `count` times.
 
-    `amount`: signed, + ahead of the train. `watch_s`: until the fault alone has moved the position by the failure limit
-    and a margin, and `after_s` more; a fault that ends is watched for `after_s` beyond its end.
+    `amount`: signed, + ahead of the train, to its left, or a longer range. `watch_s`: until the fault alone has moved
+    the position by the failure limit and a margin, and `after_s` more; a fault that ends is watched for `after_s`
+    beyond its end.
     """
 
     name: str
@@ -154,10 +163,8 @@ class Cell:
 
     @property
     def direction(self) -> str | None:
-        """`ahead` or `behind`; None where the fault has no direction along the track."""
-        if self.fault.kind not in _SIGNED:
-            return None
-        return "ahead" if self.amount > 0 else "behind"
+        """Where it moves the position, or the range; None where the fault has no direction."""
+        return _direction(self.fault, self.target, self.amount)
 
     @property
     def hits_satellite(self) -> bool:
@@ -181,7 +188,8 @@ def _cells(plan: RecordedPlan, fault: PlannedFault, limit_m: float) -> Iterator[
         for sign in signs:
             target = SATELLITE if fault.target == SATELLITE else fault.spec(amount, 1.0, "G01").target
             words = [fault.kind.value, target, f"{amount:g} {fault.unit}"]
-            words += [("ahead" if sign > 0 else "behind")] if fault.kind in _SIGNED else []
+            way = _direction(fault, target, sign)
+            words += [] if way is None else [way]
             words += [f"for {fault.duration_s:g} s"] if fault.duration_s is not None else []
             words += [f"in {fault.solution}"] if fault.solution is not None else []
             yield Cell(
@@ -191,6 +199,13 @@ def _cells(plan: RecordedPlan, fault: PlannedFault, limit_m: float) -> Iterator[
                 count=fault.per_cell or plan.per_cell,
                 watch_s=_watch_s(plan, fault, amount, limit_m),
             )
+
+
+def _direction(fault: PlannedFault, target: str, amount: float) -> str | None:
+    if fault.kind not in _SIGNED:
+        return None
+    more, less = _WAYS.get(target, ("longer", "shorter"))
+    return more if amount > 0.0 else less
 
 
 def _watch_s(plan: RecordedPlan, fault: PlannedFault, amount: float, limit_m: float) -> float:

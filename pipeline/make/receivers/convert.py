@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import date
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import polars as pl
 
@@ -135,22 +135,51 @@ def _joined(parts: list[tuple[Path, Streams]]) -> Streams:
 
 
 def _refuse_overlaps(parts: list[tuple[Path, Streams]]) -> None:
-    """Two receivers under one name would be read as one that jumps between their positions."""
-    spans: list[tuple[Any, Any, Any, Path]] = [
-        (name, fixes["t"].min(), fixes["t"].max(), log)
-        for log, streams in parts
-        if "gnss" in streams
-        for (name,), fixes in streams["gnss"].drop_nulls("t").group_by("solution", maintain_order=True)
-    ]
-    for (name, start, end, log), (of, since, until, other) in combinations(spans, 2):
-        if name == of and log != other and start < until and since < end:
+    """Two recorders under one name would be read as one that jumps between their values."""
+    spans = [span for log, streams in parts for span in _spans(log, streams)]
+    for one, two in combinations(spans, 2):
+        if one.name == two.name and one.log != two.log and one.start < two.end and two.start < one.end:
             raise InputError(
-                "two logs hold positions of the same time under one solution",
-                place=f"{log}, {other}",
-                found=f"solution {name} in both, from {max(start, since)} on",
-                expected="one receiver per call",
-                remedy="Convert the second log into the same run with --solution NAME, or --stream reference.",
+                f"two logs hold {_VALUES[one.stream][1]} of the same time under one {one.name[0]}",
+                place=f"{one.log}, {two.log}",
+                found=f"{' '.join(one.name[:2])} in both, from {max(one.start, two.start)} on",
+                expected="one recorder per call" if one.stream == "gnss" else "one recorder",
+                remedy=_VALUES[one.stream][2],
             )
+
+
+class _Span(NamedTuple):
+    """From when to when a log holds values under a name."""
+
+    log: Path
+    stream: Stream
+    name: tuple[str, str, str]
+    start: Any
+    end: Any
+
+
+# By stream: the column that tells recorders apart, what they would be mixed of, and what to do.
+_VALUES: dict[Stream, tuple[str, str, str]] = {
+    "gnss": (
+        "solution",
+        "positions",
+        "Convert the second log into the same run with --solution NAME, or --stream reference.",
+    ),
+    "odometer": ("sensor", "odometer values", "Leave one of them out, or name its `sensor` in the mapping."),
+}
+
+
+def _spans(log: Path, streams: Streams) -> Iterator[_Span]:
+    """Of GNSS by solution, of odometers by sensor and column: one log may hold the distance, another the speed."""
+    for stream, (key, _, _) in _VALUES.items():
+        if stream not in streams:
+            continue
+        frame = streams[stream].drop_nulls("t")
+        frame = frame if key in frame.columns else frame.with_columns(pl.lit("primary").alias(key))
+        columns = ["t"] if stream == "gnss" else [name for name in ("distance_m", "speed_mps") if name in frame.columns]
+        for column in columns:
+            for (name,), rows in frame.drop_nulls(column).group_by(key, maintain_order=True):
+                yield _Span(log, stream, (key, str(name), column), rows["t"].min(), rows["t"].max())
 
 
 def _convert_one(log: Path, config: IngestConfig, date: date | None) -> tuple[Streams, Mapping[str, int]]:
@@ -249,6 +278,8 @@ def _decode(frame: Frame, gathered: Gathered) -> None:
 # What is left out though it is almost a log, and what to do.
 _OTHER = "Convert it to CSV and give a mapping, if the receiver is another one."
 _ALMOST = {
+    rb"\A.{20,60}C?RINEX VER": "RINEX holds ranges, no positions: compute them first, "
+    "for example with rnx2rtkp of RTKLIB, and convert the .pos file that it writes.",
     rb"\$[A-Z]{2}(GGA|GNS|RMC),[^*\r\n]*\r?\n": "NMEA without checksums cannot be checked: let the logger keep them.",
     rb"(?m)^<(BEST|PSR|INS)": "Abbreviated ASCII of NovAtel has no checksums: log BESTPOSA or BESTPOSB.",
     rb"\A\s*\d{4}(/\d\d/\d\d|\s+\d+\.\d+\s)": "If it is of RTKLIB, let it write its header (out-outhead = on).",

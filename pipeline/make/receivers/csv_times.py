@@ -19,7 +19,7 @@ from pipeline.read.ingest.stamps import (
 from pipeline.read.ingest.timescale import WEEK_NS
 from schemas.arrays import NS_PER_S
 from schemas.config import StreamMapping
-from schemas.errors import InputError
+from schemas.errors import ConfigError, InputError
 
 # Whole numbers below are seconds, above nanoseconds; between them lie milliseconds and microseconds.
 _MOST_SECONDS = 9 * 10**9
@@ -49,6 +49,14 @@ def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Seri
     columns = [table[name] for name in time_columns(table, mapping)]
     place = f"{path}: column {' + '.join(column.name for column in columns)}"
     is_text = [column.dtype == pl.String for column in columns]
+    if mapping.time_zone is not None and not (all(is_text) or mapping.time_epoch == "excel"):
+        raise InputError(
+            "holds numbers, which count the same everywhere",
+            place=place,
+            found=f"time_zone = {mapping.time_zone}",
+            expected="texts or days of Excel, which may be of local time",
+            remedy="Remove time_zone from the mapping.",
+        )
     if len(columns) == 2 and mapping.time_epoch == "gps" and not any(is_text):
         return _week_and_seconds(columns[0], columns[1], mapping, place)
     if mapping.time_epoch == "excel" and not any(is_text):
@@ -93,7 +101,11 @@ def _days(columns: list[pl.Series], mapping: StreamMapping, place: str) -> pl.Se
     days = sum((column.cast(pl.Float64) for column in columns[1:]), columns[0].cast(pl.Float64))
     wrong = ~days.is_between(LEAST_DAY, MOST_DAY).fill_null(True)
     _refuse(wrong, days, place, "holds no days of Excel", f"{LEAST_DAY} to {MOST_DAY}")
-    return time_source(("days",), {"days": "float"}, mapping).instants(pl.DataFrame({"days": days}), "t")
+    written = time_source(("days",), {"days": "float"}, mapping).instants(pl.DataFrame({"days": days}), "t")
+    if mapping.time_zone is None:
+        return written
+    local_ns = written.to_physical()
+    return _from_zone(local_ns, local_ns.is_not_null(), mapping.time_zone, place).cast(written.dtype)
 
 
 def _texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
@@ -116,7 +128,26 @@ def _texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
         raise InputError(f"holds no times: {str(error).splitlines()[0]}", place=place, expected=_FORMS) from None
     _refuse(whole.is_null() & texts.is_not_null(), texts, place, "holds no times", _FORMS)
     fraction = parts["f"].fill_null("0").str.pad_end(9, "0").cast(pl.Int64)
-    return whole + fraction - _offset_ns(parts["zone"])
+    written_ns = whole + fraction
+    if mapping.time_zone is not None:
+        written_ns = _from_zone(written_ns, parts["zone"].is_null(), mapping.time_zone, place)
+    return written_ns - _offset_ns(parts["zone"])
+
+
+def _from_zone(local_ns: pl.Series, local: pl.Series, zone: str, place: str) -> pl.Series:
+    """UTC of what clocks of a place show, where times are local. What they show twice or never is refused."""
+    civil = local_ns.cast(pl.Datetime("ns"))
+    try:
+        instants = civil.dt.replace_time_zone(zone, ambiguous="null", non_existent="null")
+    except pl.exceptions.PolarsError:
+        raise ConfigError(
+            "is no time zone", place="time_zone", found=zone, expected="a name such as Europe/Berlin"
+        ) from None
+    unclear = local & instants.is_null() & local_ns.is_not_null()
+    remedy = "Let the logger write UTC or the offset (+02:00), or leave these rows out."
+    expected = "each time once; clocks show an hour twice in autumn, and leave one out in spring"
+    _refuse(unclear, civil, place, f"holds a time that is not clear in {zone}", expected, remedy)
+    return pl.select(pl.when(local).then(instants.to_physical()).otherwise(local_ns)).to_series()
 
 
 def _offset_ns(zone: pl.Series) -> pl.Series:

@@ -8,7 +8,6 @@ import lzma
 import re
 import tarfile
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,17 +16,12 @@ from typing import IO, Any
 
 import pyarrow as pa
 
-from pipeline.storage.budget import Budget
+from pipeline.storage.budget import UNPACKING, Budget
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 
 BAG_FOLDER = "metadata.yaml"
 _DEEPEST = 3  # archives in archives; one that holds itself has no end
-# What the readers raise for damage, a password, a method that they do not know, a disk that is full.
-_ERRORS = (
-    *(OSError, EOFError, RuntimeError, NotImplementedError, ValueError, MemoryError),
-    *(zlib.error, lzma.LZMAError, zipfile.BadZipFile, tarfile.TarError, pa.ArrowException),
-)
 
 
 @contextmanager
@@ -51,7 +45,7 @@ def _all_logs(log: Path, place: Path, budget: Budget) -> list[Path]:
     try:
         _unpack(log, place, budget)
         return [inner for entry in sorted(place.iterdir()) for inner in _logs(entry, _DEEPEST, budget)]
-    except _ERRORS as error:
+    except UNPACKING as error:
         raise InputError(
             f"cannot be unpacked: {error}",
             place=str(log),

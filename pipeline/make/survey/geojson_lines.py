@@ -15,6 +15,7 @@ from schemas.errors import SiteError, listed
 
 # https://wiki.openstreetmap.org/wiki/Key:railway: what a train can run on today.
 _IN_USE = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "funicular", "monorail", "miniature")
+_TRAM = "tram"
 _CROSSINGS = ("railway_crossing", "tram_crossing_railway")
 _IDS = ("@id", "id", "netelement_id", "osm_id", "full_id", "name")
 
@@ -42,7 +43,9 @@ def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig) -> Surv
 def survey_of_features(place: str, stem: str, features: list[Feature]) -> Survey:
     """A piece of each line, without railways that no train runs on. Raises `SiteError`."""
     survey = Survey()
+    kinds = {_kind(tags) for tags, geometry in features if next(_lines(geometry), None) is not None}
     railways = any(tags.get("railway") is not None for tags, _ in features)
+    used = set(_IN_USE) - ({_TRAM} if "rail" in kinds else set())
     left_out: Counter[str] = Counter()
     for number, (tags, geometry) in enumerate(features):
         kind = _kind(tags) if railways else "line"
@@ -50,13 +53,15 @@ def survey_of_features(place: str, stem: str, features: list[Feature]) -> Survey
         if geometry.get("type") == "Point" and kind in (*_CROSSINGS, "switch"):
             longitude, latitude, _ = _numbers(f"{place}: feature {number}", geometry.get("coordinates"))
             (survey.switches_deg if kind == "switch" else survey.crossings_deg).append((latitude, longitude))
-        elif lines and (not railways or kind in _IN_USE):
+        elif lines and (not railways or kind in used):
             name = next((str(tags[key]).strip() for key in _IDS if tags.get(key) not in (None, "")), stem)
             survey.pieces += [_piece(f"{place}: feature {number}", name, line) for line in lines]
         elif lines:
             left_out[kind] += 1
     for kind, count in sorted(left_out.items()):
-        survey.report("note", place, f"{count} lines with railway={kind} are left out: no train runs there")
+        reason = "the railway beside them is another network" if kind == _TRAM else "no train runs there"
+        remedy = "Where trains use them, give them as a file of their own." if kind == _TRAM else ""
+        survey.report("note", place, f"{count} lines with railway={kind} are left out: {reason}", remedy)
     return survey
 
 

@@ -7,22 +7,12 @@ import re
 import polars as pl
 
 from pipeline.make.survey.pieces import COLUMNS, Survey, piece_of
+from pipeline.read.ingest.guesses import SURVEY, word_of
 from pipeline.read.site.read import to_wgs84
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table
 from schemas.config import SiteConfig
 from schemas.errors import SiteError
 
-_NAMES = {
-    "netelement_id": ("netelementid", "netelement", "element", "track", "trackid", "line", "lineid"),
-    "latitude_deg": ("latitudedeg", "latitude", "lat"),
-    "longitude_deg": ("longitudedeg", "longitude", "lon", "lng", "long"),
-    "x_m": ("xm", "x", "easting", "eastingm", "east", "eastm"),
-    "y_m": ("ym", "y", "northing", "northingm", "north", "northm"),
-    "height_m": ("heightm", "height", "h", "elevation", "ele", "altitude", "alt", "z", "zm"),
-    "line_km": ("linekm", "km", "kilometre", "kilometer", "kilometrage", "chainagekm", "kp", "pk", "lrskm"),
-    "line_m": ("linem", "chainage", "chainagem", "station", "stationm"),
-    "sigma_m": ("sigmam", "sigma", "accuracy", "accuracym"),
-}
 NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "line_km", "sigma_m")
 
 
@@ -85,9 +75,9 @@ def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None, config: SiteC
 
 
 def _renamed(place: str, frame: pl.DataFrame) -> pl.DataFrame:
-    by_name = {alias: name for name, aliases in _NAMES.items() for alias in aliases}
-    plain = {name: re.sub(r"\[.*?\]|\(.*?\)|[^a-z]", "", name.lower()) for name in frame.columns}
-    meanings = {name: by_name[word] for name, word in plain.items() if word in by_name}
+    words = {name: word_of(name) for name in frame.columns}
+    fitting = {name: [key for key, pattern in SURVEY.items() if re.fullmatch(pattern, words[name])] for name in words}
+    meanings = {name: keys[0] for name, keys in fitting.items() if keys}
     twice = sorted({name for name in meanings.values() if list(meanings.values()).count(name) > 1})
     if twice:
         same = [name for name, meaning in meanings.items() if meaning in twice]

@@ -12,6 +12,7 @@ from xml.parsers import expat
 
 from pipeline.make.survey.pieces import MOST_BYTES, Survey, piece_of
 from pipeline.read.site.geojson import number_of
+from pipeline.storage.budget import UNPACKING
 from schemas.errors import SiteError
 
 _ENDS_OF_LINE = ("trkseg", "rte", "LineString", "Track")
@@ -44,7 +45,7 @@ def read_kmz(place: str, stem: str, data: bytes) -> Survey:
                 raise SiteError("holds no KML", place=place, expected="a KMZ with doc.kml")
             with packed.open(name) as file:
                 content = file.read(MOST_BYTES + 1)
-    except (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, EOFError) as error:
+    except UNPACKING as error:
         raise SiteError(f"cannot be unpacked ({error})", place=place, expected="a KMZ, which is a zip file") from None
     if len(content) > MOST_BYTES:
         raise SiteError("unpacks to too much", place=place, expected=f"at most {MOST_BYTES // 1_000_000} MB of KML")

@@ -33,7 +33,7 @@ def draft_mapping(path: Path) -> str:
     words = {name: word_of(name) for name in table.columns if name.strip()}
     time = _time_lines(table, words, units)
     parts = [part for stream in COLUMNS if (part := _stream(stream, table, words, path.name, time, units))]
-    parts = parts or _reads(words, path.name, time)
+    parts += _reads(words, path.name, time)
     head = f"# Draft from the header of {path.name}: check each line, above all units and the scale of the times.\n"
     columns = f"# Columns: {', '.join(map(one_line, table.columns))}\n"
     return head + columns + ("\n".join(parts) if parts else _EMPTY.format(topic=json.dumps(path.name)))
@@ -51,7 +51,7 @@ def _stream(
 
 
 def _reads(words: Words, file: str, time: tuple[list[str], float | None]) -> list[str]:
-    """The mapping of balise reads, of a table that is nothing else."""
+    """The mapping of balise reads; of a table that holds more, rows without a balise are no reads."""
     balise = first(words, WORDS["balise"])
     if balise is None:
         return []

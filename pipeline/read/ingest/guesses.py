@@ -13,6 +13,9 @@ from schemas.run import Stream
 
 _FILE: dict[str, Any] = tomllib.loads((files("pipeline.read.ingest") / "guesses.toml").read_text(encoding="utf-8"))
 COLUMNS: Mapping[Stream, Mapping[str, str]] = _FILE["columns"]
+SURVEY: Mapping[str, str] = _FILE["survey"] | {
+    name: COLUMNS["gnss"][name] for name in ("latitude_deg", "longitude_deg")
+}
 WORDS: Mapping[str, str] = _FILE["words"]
 UNITS: Mapping[str, float] = _FILE["units"]
 _POSITION = {"latitude_deg", "longitude_deg"}

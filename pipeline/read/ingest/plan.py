@@ -90,6 +90,8 @@ def _by_schema(sample: Sample) -> Source | None:
 
 def mapped_source(sample: Sample, stream: Stream, mapping: StreamMapping) -> Source:
     """The source that the configuration makes of a channel."""
+    if mapping.time_zone is not None and sample.channel.encoding != "csv":
+        raise InputError("time_zone is for CSV: other logs count their times", place=sample.channel.place)
     known = _by_schema(sample)
     recipe = mapped_recipe(known.recipe if known else None, sample.fields, stream, mapping)
     return _source(sample, recipe, mapping)

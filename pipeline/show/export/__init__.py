@@ -1,6 +1,6 @@
 """Results for other programs: MCAP viewers and geographic information systems.
 
-In: a run, its result and its site. Out: MCAP, GeoJSON, GPX.
+In: a run, its result and its site. Out: MCAP, GeoJSON, GPX, GeoPackage, GeoParquet.
 Touches files. It computes nothing that a table does not hold.
 """
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from pipeline.results.store import check_site, completed_runs, read_run
 from pipeline.show.export.gis import run_geojson, run_gpx
+from pipeline.show.export.layers import geopackage_bytes, geoparquet_bytes, layers_of
 from pipeline.show.export.mcap_file import PositionMessage, run_topics, write_topics
 from pipeline.stages.provenance import input_digest
 from pipeline.storage import write_bytes
@@ -15,7 +16,7 @@ from schemas.errors import UsageError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import AXES, OTHER_MONITORS, SCALES
 
-SUFFIXES = (".mcap", ".geojson", ".gpx")
+SUFFIXES = (".mcap", ".geojson", ".gpx", ".gpkg", ".parquet")
 
 
 def export_run(
@@ -29,8 +30,9 @@ def export_run(
     """Write a run of the result `out`; returns the files, and what they lack for want of site or log.
 
     `.mcap` holds raw (from the log), GNSS, matched and true positions, track, balises, monitors, LDS, hazards,
-    alarms and passages; beside it goes `NAME.layout.json` for Foxglove. `.geojson` and `.gpx` hold matched
-    positions and hazards and need the site. `positions` chooses foxglove.LocationFix or ROS 2 NavSatFix.
+    alarms and passages; beside it goes `NAME.layout.json` for Foxglove. `positions` chooses foxglove.LocationFix or
+    ROS 2 NavSatFix. The others need the site. `.geojson` and `.gpx` hold matched positions and hazards, `.gpkg` and
+    `.parquet` epochs, passages and hazards with all their columns; GeoParquet has a file for each table.
     """
     if to.suffix.lower() not in SUFFIXES:
         raise UsageError("has an unknown suffix", place=str(to), expected=" or ".join(SUFFIXES))
@@ -42,6 +44,11 @@ def export_run(
         raise UsageError(
             "positions on the ground need the site", place=str(to), remedy="Give the site of the replay with --site."
         )
+    if to.suffix.lower() == ".gpkg":
+        write_bytes(to, geopackage_bytes(layers_of(tables, site), to))
+        return [to], []
+    if to.suffix.lower() == ".parquet":
+        return _write_geoparquet(tables, to, site), []
     make = run_geojson if to.suffix.lower() == ".geojson" else run_gpx
     return [_write_text(to, make(tables, site))], []
 
@@ -68,6 +75,15 @@ def _write_mcap(
     layout = to.with_suffix(".layout.json")
     first = str(tables.epochs["solution"][0])
     return [to, _write_text(layout, layout_json(first, site is not None))], missing
+
+
+def _write_geoparquet(tables: RunTables, to: Path, site: Site) -> list[Path]:
+    """A file holds one table: epochs under the name asked for, the others beside it."""
+    files = []
+    for name, layer in layers_of(tables, site).items():
+        files.append(to if name == "epochs" else to.with_suffix(f".{name}.parquet"))
+        write_bytes(files[-1], geoparquet_bytes(layer, name, tables.run_id))
+    return files
 
 
 def _write_text(path: Path, text: str) -> Path:

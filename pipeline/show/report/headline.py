@@ -57,7 +57,7 @@ def _withstands(run: Row) -> str:
     used_s, judged_s = run["in_use_s"], run["in_use_judged_s"]
     judge = JUDGES.get(run["evidence"])
     judged = say("verdicts", "judged", judge, judged_s / used_s) if judge and used_s and judged_s is not None else ""
-    return _sentences(judged, unnoticed_words(run["undetected_max_m"]))
+    return _sentences(judged, unnoticed_words(run["undetected_max_m"], run["undetected_share_beyond"]))
 
 
 def _of_solution(row: Row) -> str:

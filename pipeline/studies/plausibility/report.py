@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import polars as pl
 
@@ -17,10 +18,11 @@ from schemas.run import RunLog, Site, Stream
 
 @dataclass(frozen=True)
 class FitReport:
-    """Tables by title, and what keeps the run from being replayed."""
+    """Tables by title, what keeps the run from being replayed, and the lines that mend it by what to do with them."""
 
     tables: dict[str, pl.DataFrame]
     problems: tuple[str, ...]
+    mending: Mapping[str, str] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
         """For programs: what keeps the run from being replayed, every check, and the lines that mend it."""
@@ -75,7 +77,7 @@ def fit_report(
         tables["Lines that mend it"] = pl.DataFrame({"toml": text.splitlines()})
     failing = fits.values() if config.ingest.plausibility == "fail" and not problems else ()
     impossible = dict.fromkeys(check.sentence for fit in failing for check in fit.impossible)
-    return FitReport(tables, problems + tuple(impossible))
+    return FitReport(tables, problems + tuple(impossible), mending)
 
 
 def _in_order(run: RunLog) -> RunLog:

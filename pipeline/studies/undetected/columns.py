@@ -13,6 +13,7 @@ from pipeline.stages.lds.relink import Held
 from pipeline.stages.monitors.bank import AxisRecord
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
+from pipeline.studies.undetected.in_use import Returns, in_use_errors
 from pipeline.studies.undetected.position_tests import bounded, range_bounds, with_channel
 from pipeline.studies.undetected.spacing import largest_spacing
 from pipeline.studies.undetected.watched import FaultWindow, Watched, watched, windows
@@ -23,6 +24,7 @@ from schemas.enums import BaliseKind
 from schemas.tables import SCALES, Epochs, Passages
 
 EPOCH_COLUMNS = ("undetected_ahead_m", "undetected_behind_m")
+IN_USE_COLUMNS = ("undetected_ahead_in_use_m", "undetected_behind_in_use_m")
 RANGE_COLUMNS = ("undetected_range_ahead_m", "undetected_range_behind_m")
 
 
@@ -94,17 +96,25 @@ def undetected_of(
         low_m, high_m = range_bounds(epochs, ranges, config)
         of_range = _both(bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts, config.undetected)
     spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
+    in_use = in_use_errors(rows, parts, errors.error_m, _returns(rows, epochs, vehicle, config), config)
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
     facing = ints(epochs["direction"], unknown=1)
     names = _names(diagnosis.bank, config)
     least = config.undetected.holding_share
     before = np.where(at >= 0, np.append(before_m, np.nan)[at], np.nan)
-    of_passages = _at_passages(at, rows, errors, of_range, facing, names, least)
+    of_passages = _at_passages(at, rows, errors, in_use, of_range, facing, names, least)
     return Undetected(
-        _at_epochs(rows, errors, facing),
+        _at_epochs(rows, errors.error_m, in_use, facing),
         of_passages.with_columns(physical_before_m=pl.Series(before, nan_to_null=True)),
         spacing,
     )
+
+
+def _returns(rows: Watched, epochs: pl.DataFrame, vehicle: Vehicle, config: Configuration) -> Returns | None:
+    """None where no negated position returns between fixes: re-link off, or no vehicle file to compare with."""
+    if not config.lds.relink or vehicle.odometer_scale is None or vehicle.odometer_scale_sigma is None:
+        return None
+    return Returns.of(rows, epochs, vehicle.odometer_scale_sigma)
 
 
 def rows_of(diagnosis: Diagnosis, vehicle: Vehicle, config: Configuration) -> Watched:
@@ -145,18 +155,20 @@ def _names(bank: AxisRecord, config: Configuration) -> list[str]:
     return [*along, "channel" if config.undetected.solutions_at_fault == "one" else "link_distance"]
 
 
-def _at_epochs(rows: Watched, errors: _BothWays, facing: Ints) -> pl.DataFrame:
+def _at_epochs(rows: Watched, error_m: Floats, in_use_m: Floats, facing: Ints) -> pl.DataFrame:
     """Ahead and behind in the direction of travel, row for row with all epochs."""
-    columns = np.full((2, facing.size), np.nan)
-    columns[:, rows.epoch] = _faced(errors, facing[rows.epoch])
+    columns = np.full((4, facing.size), np.nan)
+    columns[:2, rows.epoch] = _faced(error_m, facing[rows.epoch])
+    columns[2:, rows.epoch] = _faced(in_use_m, facing[rows.epoch])
+    names = (*EPOCH_COLUMNS, *IN_USE_COLUMNS)
     return pl.DataFrame(
-        [pl.Series(name, values, nan_to_null=True) for name, values in zip(EPOCH_COLUMNS, columns, strict=True)]
+        [pl.Series(name, values, nan_to_null=True) for name, values in zip(names, columns, strict=True)]
     )
 
 
-def _faced(errors: _BothWays, facing: Ints) -> Floats:
+def _faced(error_m: Floats, facing: Ints) -> Floats:
     """Ahead and behind, shape (2, rows), for these directions of travel along growing path."""
-    return np.where(facing > 0, errors.error_m, errors.error_m[::-1])
+    return np.where(facing > 0, error_m, error_m[::-1])
 
 
 def rows_of_passages(
@@ -182,13 +194,21 @@ def rows_of_passages(
 
 
 def _at_passages(
-    at: Ints, rows: Watched, errors: _BothWays, of_range: _BothWays | None, facing: Ints, names: list[str], least: float
+    at: Ints,
+    rows: Watched,
+    errors: _BothWays,
+    in_use_m: Floats,
+    of_range: _BothWays | None,
+    facing: Ints,
+    names: list[str],
+    least: float,
 ) -> pl.DataFrame:
     known = (at >= 0) & (errors.since_ns[at] >= 0) if rows.rows else np.zeros(at.size, dtype=np.bool_)
     at = np.where(known, at, 0)
-    values = dict(zip(EPOCH_COLUMNS, _taken(errors, at, known, rows, facing), strict=True))
+    values = dict(zip(EPOCH_COLUMNS, _taken(errors.error_m, at, known, rows, facing), strict=True))
+    values |= dict(zip(IN_USE_COLUMNS, _taken(in_use_m, at, known, rows, facing), strict=True))
     nothing = np.full((2, at.size), np.nan)
-    ranges = nothing if of_range is None else _taken(of_range, at, known, rows, facing)
+    ranges = nothing if of_range is None else _taken(of_range.error_m, at, known, rows, facing)
     values |= dict(zip(RANGE_COLUMNS, ranges, strict=True))
     since = [int(errors.since_ns[row]) if yes else None for row, yes in zip(at, known, strict=True)]
     holding = [
@@ -200,10 +220,10 @@ def _at_passages(
     )
 
 
-def _taken(errors: _BothWays, at: Ints, known: Bools, rows: Watched, facing: Ints) -> Floats:
+def _taken(error_m: Floats, at: Ints, known: Bools, rows: Watched, facing: Ints) -> Floats:
     if not rows.rows:
         return np.full((2, at.size), np.nan)
-    return np.where(known, _faced(errors, facing[rows.epoch])[:, at], np.nan)
+    return np.where(known, _faced(error_m, facing[rows.epoch])[:, at], np.nan)
 
 
 def _holding(errors: _BothWays, row: int, names: list[str], least: float) -> list[str]:

@@ -251,3 +251,55 @@ def test_a_draft_of_balise_reads(tmp_path):
     log.write_text("time,balise\n2025-06-13T12:00:00Z,PB1\n2025-06-13T12:01:00Z,PB2\n")
     config = settings_from(tomllib.loads(draft_mapping(log)), Configuration, "x").ingest
     assert gather([log], config).streams["balise_reads"]["balise_id"].to_list() == ["PB1", "PB2"]
+
+
+BERLIN = {"time_zone": "Europe/Berlin"}
+
+
+@pytest.mark.parametrize(
+    ("time", "expected"),
+    [
+        ("2025-06-01 14:00:00.25", "2025-06-01T12:00:00.250"),  # CEST, UTC+2
+        ("15.01.2025 13:00:00", "2025-01-15T12:00:00"),  # CET, UTC+1
+        ("2025-06-01T14:00:00+03:00", "2025-06-01T11:00:00"),  # what is written counts
+        ("2025-10-26 02:30:00+02:00", "2025-10-26T00:30:00"),
+        ("2025-10-26 03:00:00", "2025-10-26T02:00:00"),
+    ],
+)
+def test_local_times_by_their_zone(converted, time, expected):
+    t = converted(f"t,lat,lon\n{time},50.5,4.5\n", **BERLIN)["t"]
+    assert t.dt.to_string("%Y-%m-%dT%H:%M:%S%.f").to_list() == [expected]
+
+
+@pytest.mark.parametrize("time", ["2025-10-26 02:30:00", "2025-03-30 02:30:00"])
+def test_hours_that_clocks_show_twice_or_never_are_refused(converted, time):
+    with pytest.raises(
+        InputError, match=r"not clear in Europe/Berlin; found .* 02:30:00 in row 1; expected each time once"
+    ):
+        converted(f"t,lat,lon\n{time},50.5,4.5\n", **BERLIN)
+
+
+def test_zones_of_times_that_have_none(converted):
+    with pytest.raises(InputError, match="holds numbers, which count the same everywhere"):
+        converted("t,lat,lon\n1748779200,50.5,4.5\n", **BERLIN)
+    with pytest.raises(ConfigError, match="is no time zone; found Europe/Berlino"):
+        converted("t,lat,lon\n2025-06-01 14:00:00,50.5,4.5\n", time_zone="Europe/Berlino")
+    # 45,809.5 days after 1899-12-30: 2025-06-01, noon.
+    t = converted("t,lat,lon\n45809.5,50.5,4.5\n", **BERLIN, time_epoch="excel")["t"]
+    assert t.dt.to_string("%FT%T").to_list() == ["2025-06-01T10:00:00"]
+
+
+def test_reads_beside_other_columns_are_offered(tmp_path):
+    log = tmp_path / "plc.csv"
+    log.write_text("time,speed [km/h],balise_id\n2025-06-01T12:00:00Z,36,\n2025-06-01T12:00:01Z,36,B7\n")
+    config = settings_from(tomllib.loads(draft_mapping(log)), Configuration, "x")
+    streams = gather([log], config.ingest).streams
+    assert streams["odometer"].height == 2
+    assert streams["balise_reads"]["balise_id"].to_list() == ["B7"]
+
+
+def test_ranges_without_positions_name_the_next_step(tmp_path):
+    log = tmp_path / "rover.obs"
+    log.write_text("     3.04           OBSERVATION DATA    M                   RINEX VERSION / TYPE\n")
+    with pytest.raises(InputError, match=r"holds no message.*RINEX holds ranges, no positions.*rnx2rtkp.*\.pos"):
+        gather([log])

@@ -22,7 +22,7 @@ from pipeline.stages.track.geodesy import moved_deg
 from pipeline.storage.parquet import without_checksums
 from schemas.config import Configuration, SurveyConfig, Vehicle
 from schemas.enums import TravelAlong
-from schemas.errors import BaliseError
+from schemas.errors import BaliseError, SiteError
 from schemas.run import Site
 
 INFRABEL = Path(__file__).parents[4] / "shared" / "data" / "infrabel" / "network_airport.geojson"
@@ -131,6 +131,28 @@ def test_doubtful_places_are_told(tmp_path: Path) -> None:
     assert "end 0 lies 2." in text
     assert "track: same: 1 of its 1 segments stand in the survey already" in text
     assert "no point has a height" in text
+
+
+def test_trams_are_no_part_of_a_railway(tmp_path: Path) -> None:
+    railway = way("way/1", (0, 0), (300, 0))
+    tram = way("way/2", (300, 0), (600, 0), kind="tram")
+    site = site_of(written(tmp_path, "both.geojson", railway, tram))
+    assert site.track["netelement_id"].unique().to_list() == ["way/1"]
+    assert "1 lines with railway=tram are left out: the railway beside them is another network" in told(site)
+    alone = site_of(written(tmp_path, "tram.geojson", tram))
+    assert alone.track["netelement_id"].unique().to_list() == ["way/2"]
+
+
+def test_surveys_have_the_headers_of_logs(tmp_path: Path) -> None:
+    latitude, longitude = degrees(np.array([0.0, 300.0, 600.0]), np.zeros(3))
+    path = tmp_path / "strecke.csv"
+    pl.DataFrame({"Gleis": ["A"] * 3, "Geo-Breite [deg]": latitude, "Länge": longitude, "Höhe": [1.0] * 3}).write_csv(
+        path
+    )
+    site = site_of(path)
+    assert site.track["netelement_id"].unique().to_list() == ["A"]
+    assert site.track["height_m"].to_list() == [1.0] * 3
+    assert site.track["latitude_deg"].to_list() == pytest.approx(latitude.tolist())
 
 
 def track_csv(path: Path, east_m: np.ndarray, **columns: Any) -> Path:
@@ -262,7 +284,9 @@ def test_gpx_kml_and_kmz_give_the_same_line_and_the_same_ids_each_time(tmp_path:
     assert "heights are taken as ellipsoidal" in (tmp_path / "one" / "findings.csv").read_text()
     page = (tmp_path / "one" / "site.html").read_text()
     assert all(word in page for word in ("default-src 'none'", "VB3", "Line 36"))
-    assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org/2000/svg", "")
+    assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org/2000/svg", "").replace(
+        "https://www.openstreetmap.org/?", ""
+    )  # a link, opened by a click
     with pytest.raises(BaliseError, match="holds a site"):
         write_made(sites[0], "", tmp_path / "one", force=False)
 
@@ -321,6 +345,15 @@ def test_a_jump_of_the_reference_is_told_and_is_no_track(tmp_path: Path) -> None
     site = site_of(run)
     assert "run: 5 positions to which no train can have come are left out" in told(site)
     assert site.track["measure_m"].max() == pytest.approx(996.0, abs=0.1)
+
+
+def test_a_kmz_whose_directory_lies_before_its_begin_is_one_error(tmp_path: Path) -> None:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("doc.kml", "<kml/>")
+    (tmp_path / "line.kmz").write_bytes(packed.getvalue()[4:])
+    with pytest.raises(SiteError, match="cannot be unpacked"):
+        site_of(tmp_path / "line.kmz")
 
 
 BAD = {

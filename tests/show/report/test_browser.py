@@ -83,11 +83,15 @@ def test_no_script_of_others_runs(browser: Chrome, out: Path) -> None:
 
 
 def test_hazards_zoom_and_keys(browser: Chrome, out: Path) -> None:
+    from selenium.webdriver.support.ui import WebDriverWait
+
     visit(browser, out, "runs/jump_two.html")
     script = "return JSON.parse(document.getElementById('data').textContent).solutions.primary.hazards[0]"
     hazard = browser.execute_script(script)
     before = shown_s(browser)
     browser.find_element("css selector", "a[data-hazard='0']").click()
+    # The page hears of its new address after the click.
+    WebDriverWait(browser, 30).until(lambda opened: shown_s(opened) != before)
     lo, hi = shown_s(browser)
     assert before[0] < lo <= hazard["t_onset"] / 1000.0
     assert hazard["t_detected"] / 1000.0 <= hi < before[1]
@@ -105,7 +109,7 @@ def test_hazards_zoom_and_keys(browser: Chrome, out: Path) -> None:
     press(browser, "n")
     assert shown_s(browser) == (lo, hi)
     press(browser, "[")
-    assert browser.current_url.endswith("jump_one_no_odometer.html")
+    WebDriverWait(browser, 30).until(lambda opened: opened.current_url.endswith("jump_one_no_odometer.html"))
     assert errors(browser) == []
 
 

@@ -100,15 +100,25 @@ def test_the_verdict_is_the_first_word(report: Path, page: str, word: str, reaso
 def test_a_safe_run_says_what_it_rests_on(tmp_path: Path) -> None:
     """40 of 50 s in use judged; the largest unnoticed error is said where it was computed, else that it was not."""
     used = SAFE | {"in_use_s": 50.0, "in_use_judged_s": 40.0}
-    for run_id, largest in (("known", {"undetected_max_m": 14.26}), ("silent", {})):
+    for run_id, largest in (
+        ("known", {"undetected_max_m": 14.26, "undetected_share_beyond": 0.0}),
+        ("beyond", {"undetected_max_m": 29.0, "undetected_share_beyond": 0.125}),
+        ("silent", {}),
+    ):
         write_run(run_of(run_id, used | largest, []), tmp_path, {})
     write_report(tmp_path)
     banner = {
         name: (tmp_path / "report" / page).read_text().partition("<header>")[2].partition("</p>")[0]
-        for name, page in (("known", "runs/known.html"), ("silent", "runs/silent.html"), ("all", "index.html"))
+        for name, page in (
+            ("known", "runs/known.html"),
+            ("beyond", "runs/beyond.html"),
+            ("silent", "runs/silent.html"),
+            ("all", "index.html"),
+        )
     }
     assert "Judged by balise reads for 80% of the time in use." in banner["known"]
     assert "The largest error that no monitor would have noticed was 14.3 m (not proved on curves)." in banner["known"]
+    assert "29.0 m (not proved on curves), beyond the failure limit for 12.5% of the epochs in use." in banner["beyond"]
     for name in ("silent", "all"):
         assert "no monitor would have noticed was not computed (`balise replay --undetected`)" in banner[name]
 

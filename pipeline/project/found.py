@@ -1,0 +1,109 @@
+"""What lies in a folder: logs, surveys, sites, settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.make.receivers.bags import is_bag
+from pipeline.make.survey.map_files import MAP_SUFFIXES
+from pipeline.project.looking import is_run
+from pipeline.read.ingest.csv_text import read_log_table
+from pipeline.read.ingest.guesses import WORDS, columns_in, first, word_of
+from schemas.config import Configuration, Vehicle, read_toml, settings_from
+from schemas.errors import BaliseError
+from schemas.project import FILE_NAME
+
+_SITE_FILES = ("track.parquet", "track.csv", "track.geojson")
+_LINES = (".gpx", ".kml", ".kmz", ".geojson", ".json", *MAP_SUFFIXES)
+# Parts of a Shapefile, and what a desktop leaves behind.
+_BESIDE = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".ini", ".db", ".md", ".html", ".pdf")
+
+
+@dataclass
+class Found:
+    """Paths by what they are for."""
+
+    logs: list[Path] = field(default_factory=list)
+    surveys: list[Path] = field(default_factory=list)
+    sites: list[Path] = field(default_factory=list)
+    balises: list[Path] = field(default_factory=list)
+    vehicles: list[Path] = field(default_factory=list)
+    configs: list[Path] = field(default_factory=list)
+
+
+def is_site(path: Path) -> bool:
+    """A folder with a track."""
+    return path.is_dir() and any((path / name).exists() for name in _SITE_FILES)
+
+
+def is_one_log(path: Path) -> bool:
+    """A file, a run, a bag, or a public recording: not a folder of logs."""
+    return path.is_file() or is_run(path) or is_bag(path) or (path / "processed_log").is_dir()
+
+
+def logs_below(folder: Path) -> list[Path]:
+    """What may be a log in a folder and those below it."""
+    return look_around(folder).logs
+
+
+def look_around(folder: Path) -> Found:
+    """Sort what lies in a folder and those below it, by names and headers; results and hidden files are passed over."""
+    found = Found()
+    for path in _walk(folder):
+        _sort(path, found)
+    return found
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith(".") or path.name == FILE_NAME or (path / "manifest.json").is_file():
+            continue
+        if path.is_dir() and not is_site(path) and not is_one_log(path):
+            yield from _walk(path)
+        elif path.is_dir() or path.suffix.lower() not in _BESIDE:
+            yield path
+
+
+def _sort(path: Path, found: Found) -> None:
+    suffix = path.suffix.lower()
+    if is_site(path):
+        found.sites.append(path)
+    elif suffix == ".toml":
+        _sort_settings(path, found)
+    elif suffix in _LINES:
+        found.surveys.append(path)
+    elif suffix == ".csv" and path.is_file():
+        _sort_table(path, found)
+    else:
+        found.logs.append(path)
+
+
+def _sort_settings(path: Path, found: Found) -> None:
+    """A vehicle or a configuration file: what it can be read as."""
+    for kind, into in ((Vehicle, found.vehicles), (Configuration, found.configs)):
+        try:
+            settings_from(read_toml(path), kind, str(path))
+        except BaliseError:
+            continue
+        into.append(path)
+        return
+
+
+def _sort_table(path: Path, found: Found) -> None:
+    """A table without a time is no log: it lists balises, or points of a line."""
+    try:
+        table = read_log_table(path, infer=True).table
+    except BaliseError:
+        found.logs.append(path)
+        return
+    words = {name: word_of(name) for name in table.columns if name.strip()}
+    if any(first(words, WORDS[kind]) for kind in ("time", "date", "clock", "week")):
+        found.logs.append(path)
+    elif first(words, WORDS["balise"]):
+        found.balises.append(path)
+    elif columns_in("reference", words):
+        found.surveys.append(path)
+    else:
+        found.logs.append(path)

@@ -1,0 +1,135 @@
+"""One log looked at: which streams it feeds, from when to when, and the mapping that its header suggests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import date, datetime
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from pipeline.make.receivers import gather
+from pipeline.make.receivers.convert import UnknownError
+from pipeline.make.receivers.csv import TABLES, names_file
+from pipeline.project.convert import Recordings
+from pipeline.read.ingest import read_run
+from pipeline.read.ingest.csv_draft import draft_mapping
+from pipeline.storage import files
+from schemas.config import IngestConfig, settings_from, toml_of
+from schemas.enums import Fix
+from schemas.errors import InputError
+from schemas.run import STREAMS, Stream
+
+
+@dataclass(frozen=True)
+class StreamSpan:
+    """Rows of a stream, and the times of the first and the last."""
+
+    rows: int
+    start: datetime
+    end: datetime
+
+
+@dataclass(frozen=True)
+class SeenLog:
+    """A log and what it feeds; `mapping`: of a table, by stream; `is_run`: needs no conversion."""
+
+    path: Path
+    spans: Mapping[Stream, StreamSpan]
+    mapping: Mapping[str, list[dict[str, Any]]] = field(default_factory=dict)
+    is_run: bool = False
+    mostly_fixed: bool = False
+
+    @property
+    def has_positions(self) -> bool:
+        return "gnss" in self.spans
+
+    @property
+    def start(self) -> datetime:
+        """Of the positions, else of all streams."""
+        return min(span.start for span in self._spans())
+
+    @property
+    def end(self) -> datetime:
+        return max(span.end for span in self._spans())
+
+    def overlaps(self, other: SeenLog) -> bool:
+        return self.start < other.end and other.start < self.end
+
+    def _spans(self) -> list[StreamSpan]:
+        return [self.spans["gnss"]] if self.has_positions else list(self.spans.values())
+
+
+def look_at(path: Path, config: IngestConfig, day: date | None, recordings: Recordings) -> SeenLog:
+    """Read a log to see what it feeds. Raises `InputError` where nothing can be made of it."""
+    if is_run(path):
+        run = read_run(path, config, with_digest=False)
+        streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
+        return _seen(path, streams, is_run=True)
+    known = None if names_file(config, path) else recordings.known(path)
+    if known is not None:
+        return _seen(path, known.gathered().streams)
+    if path.suffix.lower() == ".csv" and not names_file(config, path):
+        return _table(path, config)
+    try:
+        return _seen(path, gather([path], config, day).streams)
+    except UnknownError:
+        if path.suffix.lower() not in TABLES:
+            raise
+        return _table(path, config)
+
+
+def is_run(path: Path) -> bool:
+    """An MCAP log, or a folder with streams as the contract names them."""
+    names = set(files.list_dir(path)) if path.is_dir() else set()
+    return path.suffix.lower() == ".mcap" or bool(names & {f"{stream}.parquet" for stream in STREAMS})
+
+
+def _seen(
+    path: Path,
+    streams: Mapping[Stream, pl.DataFrame],
+    mapping: Mapping[str, list[dict[str, Any]]] | None = None,
+    is_run: bool = False,
+) -> SeenLog:
+    spans: dict[Stream, StreamSpan] = {}
+    for name, frame in streams.items():
+        times = frame.to_series(0).drop_nulls()
+        if len(times):
+            spans[name] = StreamSpan(frame.height, times.min(), times.max())  # type: ignore[arg-type]
+    if not spans:
+        raise InputError("holds no row with a time", place=str(path), expected="positions, distances, speeds or reads")
+    gnss = streams.get("gnss")
+    fixed = 0 if gnss is None else (gnss["fix"].cast(pl.String) == Fix.RTK_FIXED.value).sum()
+    return SeenLog(path, spans, mapping or {}, is_run, mostly_fixed=gnss is not None and 2 * fixed > gnss.height)
+
+
+def _table(path: Path, config: IngestConfig) -> SeenLog:
+    """A table by the mapping that its header suggests."""
+    drafted = toml_of(draft_mapping(path).encode(), f"mapping of {path}").get("ingest")
+    mapping: dict[str, Any] = drafted if isinstance(drafted, dict) else {}
+    mapping = {stream: entries if isinstance(entries, list) else [entries] for stream, entries in mapping.items()}
+    if not mapping or any("time" not in entry for entries in mapping.values() for entry in entries):
+        raise _undecided(path, "the names of its columns do not tell " + ("its time" if mapping else "what they are"))
+    for entries in mapping.values():
+        for entry in entries:
+            entry["topic"] = path.name
+    ingest = settings_from({**config.model_dump(exclude_defaults=True), **mapping}, IngestConfig, str(path))
+    try:
+        streams = gather([path], ingest).streams
+    except InputError as error:
+        raise _undecided(path, error.message, error) from None
+    own = {name: [{k: v for k, v in entry.items() if k != "topic"} for entry in of] for name, of in mapping.items()}
+    return _seen(path, streams, own)
+
+
+def _undecided(path: Path, why: str, error: InputError | None = None) -> InputError:
+    hint = f"`balise inspect {path}` prints a draft: complete it as config.toml, and add --config config.toml."
+    return InputError(
+        f"needs a mapping of its columns: {why}",
+        place=str(path) if error is None else error.place,
+        found=None if error is None else error.found,
+        expected=None if error is None else error.expected,
+        remedy=" ".join(filter(None, [error.remedy if error else None, hint])),
+    )

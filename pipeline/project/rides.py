@@ -1,0 +1,96 @@
+"""Which logs are of one ride: those of the same time, and those of one recorder that follow each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from pipeline.project.looking import SeenLog
+
+# Recorders begin a new file every hour or every so many megabytes, and lose a few seconds between two at most.
+_NEXT_FILE_S = 60.0
+# Packed logs are named as what is in them.
+_PACKED = (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz")
+
+
+@dataclass
+class Ride:
+    """One run to be: `receivers` first the one under the name `primary`; of each the files that follow each other."""
+
+    run_id: str
+    receivers: list[list[SeenLog]] = field(default_factory=list)
+    references: list[SeenLog] = field(default_factory=list)
+    others: list[SeenLog] = field(default_factory=list)
+
+    @property
+    def logs(self) -> list[SeenLog]:
+        return [*(log for files in self.receivers for log in files), *self.references, *self.others]
+
+    @property
+    def is_ready(self) -> bool:
+        """A single run that needs no conversion."""
+        return [log.is_run for log in self.logs] == [True]
+
+
+def rides_of(logs: Sequence[SeenLog], references: Sequence[Path]) -> tuple[list[Ride], list[SeenLog]]:
+    """The rides in order of time, and the logs that are of none of them.
+
+    Logs without positions belong to every ride whose time they share; to the only ride whatever their clock says, so
+    that a wrong clock is found by comparing streams.
+    """
+    rides: list[Ride] = []
+    positions = [log for log in logs if log.has_positions and log.path not in references]
+    for log in sorted(positions, key=lambda log: (log.start, logs.index(log))):
+        _place(log, rides)
+    alone: list[SeenLog] = []
+    for log in logs:
+        if log in positions:
+            continue
+        homes = rides if len(rides) == 1 else [ride for ride in rides if any(map(log.overlaps, _tested(ride)))]
+        for ride in homes:
+            (ride.references if log.path in references else ride.others).append(log)
+        if not homes:
+            alone.append(log)
+    # The receiver named first is the one under test.
+    for ride in rides:
+        ride.receivers.sort(key=lambda files: min(map(logs.index, files)))
+    return _with_own_names(rides), alone
+
+
+def _place(log: SeenLog, rides: list[Ride]) -> None:
+    """A log continues a file of its kind, is another receiver of a ride, or begins a ride."""
+    for ride in rides:
+        for files in ride.receivers:
+            gap_s = (log.start - files[-1].end).total_seconds()
+            if log.path.suffix == files[-1].path.suffix and 0 <= gap_s <= _NEXT_FILE_S and not log.is_run:
+                files.append(log)
+                return
+    for ride in rides:
+        if any(map(log.overlaps, _tested(ride))):
+            ride.receivers.append([log])
+            return
+    rides.append(Ride(stem_of(log.path), [[log]]))
+
+
+def _tested(ride: Ride) -> list[SeenLog]:
+    return [log for files in ride.receivers for log in files]
+
+
+def stem_of(path: Path) -> str:
+    """The name of a log without its suffixes of packing and of kind."""
+    while path.suffix.lower() in _PACKED and path.stem:
+        path = path.with_suffix("")
+    return path.name if path.is_dir() else path.stem
+
+
+def _with_own_names(rides: list[Ride]) -> list[Ride]:
+    """Run ids by the first log of each ride; logs of one name in several folders take the folder's name too."""
+    firsts = [ride.receivers[0][0].path for ride in rides]
+    stems = [stem_of(path) for path in firsts]
+    named: list[Ride] = []
+    for ride, path, stem in zip(rides, firsts, stems, strict=True):
+        unique = stem if stems.count(stem) == 1 else f"{path.resolve().parent.name}_{stem}"
+        taken = sum(known.run_id == unique or known.run_id.startswith(f"{unique}_") for known in named)
+        named.append(replace(ride, run_id=f"{unique}_{taken + 1}" if taken else unique))
+    return named

@@ -1,0 +1,290 @@
+"""From raw logs, a line and balises to a project: `balise trial`."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import tomli_w
+
+from pipeline.make.survey.make import make_site
+from pipeline.project.convert import Recordings, run_of_logs
+from pipeline.project.found import is_one_log, is_site, logs_below
+from pipeline.project.looking import SeenLog, look_at
+from pipeline.project.opened import Opened, named_from
+from pipeline.project.rides import Ride, rides_of, stem_of
+from pipeline.project.run import wish_for
+from pipeline.read.ingest import read_run
+from pipeline.read.ingest.correct import corrected
+from pipeline.read.site.read import read_site
+from pipeline.studies.plausibility.check import CONFIGURATION, FitState
+from pipeline.studies.plausibility.report import FitReport, fit_report
+from schemas.config import IngestConfig, StreamCorrection, settings_from, toml_of
+from schemas.errors import BaliseError, InputError, UsageError
+from schemas.project import FILE_NAME, ConvertEntry, Project, ReplayEntry, TrackEntry
+from schemas.run import Site
+
+_ROUNDS = 4  # a clock shows when the unit is right, an axis when the clock is
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the user named: logs, line, balises; `references`: those of the logs that are the truth.
+
+    `strict`: a log that cannot be read is an error, not a remark.
+    """
+
+    raws: Sequence[Path]
+    track: Sequence[Path] = ()
+    balises: str | None = None
+    references: Sequence[Path] = ()
+    day: date | None = None
+    vehicle: Path | None = None
+    config: Path | None = None
+    strict: bool = True
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Corrections of one run, why, and whether they were accepted."""
+
+    run_id: str
+    found: tuple[str, ...]
+    corrections: tuple[StreamCorrection, ...]
+    accepted: bool
+
+
+@dataclass
+class Drafted:
+    """A project to be written, and what there is to say of it."""
+
+    opened: Opened
+    logs: pl.DataFrame
+    proposals: list[Proposal] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+
+Accept = Callable[[str, Sequence[str], Sequence[str]], bool]
+"""Asked once per run: its id, what does not fit, and the lines that would mend it."""
+
+
+def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: Accept) -> Drafted:
+    """Look at all logs, sort them into rides, and propose what mends those that do not fit.
+
+    Raises `InputError` for a log that was named and cannot be read, `SiteError` or `UsageError` for the line.
+    """
+    folder = folder.absolute()
+    base = _base(wanted, folder)
+    remarks: list[str] = []
+    logs = _looked_at(wanted, base.given_config().ingest, recordings, remarks)
+    rides, alone = rides_of(logs, [path.absolute() for path in wanted.references])
+    if not rides and logs:
+        raise InputError("no log holds positions", place=", ".join(str(log.path) for log in logs), expected="GNSS")
+    remarks += [_unused(log) for log in alone]
+    drafted = Drafted(base, _table_of(rides), [], remarks)
+    drafted.remarks += _without_odometer(rides)
+    drafted.remarks += [note for ride in rides for note in _notes_of(ride)]
+    site = _site(base)
+    entries = []
+    ready = []
+    for ride in rides:
+        proposal, entry = _checked(ride, base, site, recordings, wanted.day, accept)
+        drafted.proposals += [proposal] if proposal else []
+        if ride.is_ready and proposal is None:
+            ready.append(named_from(ride.logs[0].path, folder))
+        else:
+            entries.append(entry)
+    replay = ReplayEntry(runs=tuple(ready))
+    drafted.opened = Opened(base.file, base.project.model_copy(update={"convert": tuple(entries), "replay": replay}))
+    return drafted
+
+
+def _base(wanted: Wanted, folder: Path) -> Opened:
+    """The project without its runs."""
+
+    def named(path: Path | None) -> str | None:
+        return None if path is None else named_from(path.absolute(), folder)
+
+    given: dict[str, Any] = {"vehicle": named(wanted.vehicle), "config": named(wanted.config)}
+    sites = [path for path in wanted.track if is_site(path)]
+    if sites and (len(wanted.track) > 1 or wanted.balises):
+        raise UsageError(
+            "is a site already",
+            place=str(sites[0]),
+            expected="a site alone, or surveys to make one of",
+            remedy="Its balises stand in its file balises.csv or balises.parquet; leave --balises out.",
+        )
+    if sites:
+        given["site"] = named(sites[0])
+    elif wanted.track:
+        for path in wanted.track:
+            if not path.exists():
+                raise UsageError(
+                    "does not exist", place=f"--track {path}", expected="a map, a table of points, or a site"
+                )
+        balises = wanted.balises
+        if balises is not None and not balises.startswith("every"):
+            if not Path(balises).is_file():
+                raise UsageError("does not exist", place=f"--balises {balises}", expected="a table, or `every 1000`")
+            balises = named(Path(balises))
+        given["track"] = TrackEntry(survey=tuple(filter(None, map(named, wanted.track))), balises=balises)
+    return Opened(folder / FILE_NAME, Project(**{name: value for name, value in given.items() if value is not None}))
+
+
+def _looked_at(wanted: Wanted, config: IngestConfig, recordings: Recordings, remarks: list[str]) -> list[SeenLog]:
+    """Every log that was named; of folders those that are logs, the others are told."""
+    seen: dict[Path, SeenLog] = {}
+    surveys = {path.absolute() for path in wanted.track} | {Path(wanted.balises or "").absolute()}
+    for raw in [*_expanded(wanted.raws), *wanted.references]:
+        whole = is_one_log(raw)
+        for path in [raw] if whole else logs_below(raw):
+            place = path.absolute()
+            if place in seen or place in surveys:
+                continue
+            try:
+                seen[place] = replace(look_at(path, config, wanted.day, recordings), path=place)
+            except BaliseError as error:
+                if whole and wanted.strict:
+                    raise
+                remarks.append(f"not used: {error}")
+    return list(seen.values())
+
+
+def _expanded(raws: Sequence[Path]) -> list[Path]:
+    """The files and folders that were named; patterns too, which not every shell resolves."""
+    found: list[Path] = []
+    for raw in raws:
+        matches = [raw] if raw.exists() else sorted(map(Path, glob.glob(str(raw), recursive=True)))
+        if not matches:
+            raise UsageError("does not exist", place=str(raw), expected="a log, a folder of logs, or a pattern")
+        found += matches
+    return found
+
+
+def _unused(log: SeenLog) -> str:
+    streams = ", ".join(log.spans)
+    return (
+        f"not used: {log.path}: {streams} from {log.start:%Y-%m-%d %H:%M:%S} to {log.end:%H:%M:%S}, in no ride's time"
+    )
+
+
+def _without_odometer(rides: Sequence[Ride]) -> list[str]:
+    bare = [ride.run_id for ride in rides if not any("odometer" in log.spans for log in ride.logs)]
+    which = "no run has an odometer" if len(bare) == len(rides) else f"without odometer: {', '.join(bare)}"
+    return [f"{which}; nothing is monitored along the track"] if bare else []
+
+
+def _notes_of(ride: Ride) -> list[str]:
+    notes: list[str] = []
+    if len(ride.receivers) > 1:
+        names = ", ".join(f"{files[0].path.name} ({_solution(ride, files)})" for files in ride.receivers)
+        notes.append(f"{ride.run_id}: receivers of the same time, each a solution of its own: {names}")
+        notes += [
+            f"{ride.run_id}: {files[0].path.name} is RTK-fixed; if it is the truth, add --reference {files[0].path}"
+            for files in ride.receivers
+            if files[0].mostly_fixed and not ride.references
+        ]
+    return notes
+
+
+def _solution(ride: Ride, files: Sequence[SeenLog]) -> str:
+    """The first receiver is `primary`, others are named after their logs."""
+    place = next(number for number, other in enumerate(ride.receivers) if other is files)
+    stems = [stem_of(others[0].path) for others in ride.receivers]
+    if place == 0:
+        return "primary"
+    return stems[place] if stems.count(stems[place]) == 1 else f"{stems[place]}_{place + 1}"
+
+
+def _entry(ride: Ride, folder: Path, day: date | None) -> ConvertEntry:
+    """The ride as a `[[convert]]` table."""
+    logs: list[dict[str, Any]] = []
+    for files in ride.receivers:
+        name = _solution(ride, files)
+        # A log of several solutions has their names itself.
+        logs.append({"files": [log.path for log in files], "solution": None if name == "primary" else name})
+        logs[-1] |= files[0].mapping
+    logs += [{"files": [log.path], "stream": "reference", **log.mapping} for log in ride.references]
+    logs += [{"files": [log.path], **log.mapping} for log in ride.others]
+    for log in logs:
+        log["date"] = day if any(path.suffix.lower() not in (".csv", ".mcap") for path in log["files"]) else None
+        log["files"] = [named_from(path, folder) for path in log["files"]]
+    # A run that lies where converted ones go is not overwritten by its correction.
+    home = "converted" if folder / "runs" / ride.run_id in [log.path for log in ride.logs] else "runs"
+    return settings_from(
+        {"to": f"{home}/{ride.run_id}", "logs": [{k: v for k, v in log.items() if v is not None} for log in logs]},
+        ConvertEntry,
+        str(folder / FILE_NAME),
+    )
+
+
+def _checked(
+    ride: Ride, base: Opened, site: Site | None, recordings: Recordings, day: date | None, accept: Accept
+) -> tuple[Proposal | None, ConvertEntry]:
+    """What mends a ride whose streams do not fit each other, and the ride with it where that is accepted."""
+    config = base.given_config()
+    vehicle = base.given_vehicle()
+    entry = _entry(ride, base.folder, day)
+    if ride.is_ready:
+        run = read_run(ride.logs[0].path, config.ingest, with_digest=False)
+    else:
+        run = run_of_logs(base, entry, config, recordings).run
+    corrections: list[StreamCorrection] = []
+    found: list[str] = []
+    for _ in range(_ROUNDS):
+        report = fit_report(run, config, site, vehicle)
+        fresh = _corrections_of(report)
+        if not fresh:
+            break
+        found += [sentence for sentence in _sentences(report) if sentence not in found]
+        corrections += fresh
+        run = corrected(run, fresh)
+    if not corrections:
+        return None, entry
+    accepted = accept(ride.run_id, found, correction_lines(corrections))
+    proposal = Proposal(ride.run_id, tuple(found), tuple(corrections), accepted)
+    return proposal, entry.model_copy(update={"correct": tuple(corrections)}) if accepted else entry
+
+
+def correction_lines(corrections: Sequence[StreamCorrection]) -> list[str]:
+    """Corrections as they stand in a project."""
+    tables = [tomli_w.dumps(correction.model_dump(exclude_defaults=True)) for correction in corrections]
+    return [line for table in tables for line in ("[[convert.correct]]", *table.splitlines())]
+
+
+def _corrections_of(report: FitReport) -> list[StreamCorrection]:
+    lines = report.mending.get(CONFIGURATION, "")
+    ingest = toml_of(lines.encode(), "lines that mend it").get("ingest")
+    return list(settings_from(ingest, IngestConfig, "lines that mend it").correct) if isinstance(ingest, dict) else []
+
+
+def _sentences(report: FitReport) -> list[str]:
+    states = (FitState.MISFIT.value, FitState.IMPOSSIBLE.value)
+    rows = report.tables["Fit"].filter(pl.col("state").is_in(states)).iter_rows(named=True)
+    return [f"{row['check']}: {row['found']}" + (f" ({row['cause']})" if row["cause"] else "") for row in rows]
+
+
+def _site(base: Opened) -> Site | None:
+    """The line as far as it is known: made here to be looked at, not written."""
+    config = base.given_config()
+    if base.project.track is not None:
+        return make_site(wish_for(base, base.project.track), base.given_vehicle(), config)
+    named = base.place(base.project.site)
+    return read_site(named, config.site) if Path(named).exists() else None
+
+
+def _table_of(rides: Sequence[Ride]) -> pl.DataFrame:
+    columns = ("run_id", "log", "feeds", "rows", "from", "to")
+    rows = []
+    for ride in rides:
+        for log in ride.logs:
+            for stream, span in log.spans.items():
+                feeds = "reference" if log in ride.references and stream == "gnss" else stream
+                start, end = (f"{time:%Y-%m-%d %H:%M:%S}" for time in (span.start, span.end))
+                rows.append((ride.run_id, log.path.name, feeds, str(span.rows), start, end))
+    return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row").cast({"rows": pl.Int64})

@@ -1,0 +1,150 @@
+"""Raw logs to a project: streams, rides, corrections, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+import cli
+from pipeline.project.looking import SeenLog, StreamSpan
+from pipeline.project.rides import rides_of
+from schemas.project import Project, load_project
+from tests.conftest import SmallTrial
+from tests.project.test_run import nmea
+
+MORNING = datetime(2025, 3, 3, 6)
+ODOMETER = "time;v_kmh\n" + "".join(f"2025-03-03T10:12:{second:02d}Z;0.0\n" for second in range(40))
+
+
+def log(name: str, begin_min: float, end_min: float, stream: str = "gnss") -> SeenLog:
+    times = (MORNING + timedelta(minutes=minute) for minute in (begin_min, end_min))
+    return SeenLog(Path(name), {stream: StreamSpan(10, *times)})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize(
+    ("logs", "rides"),
+    [
+        ([log("a.ubx", 0, 60), log("b.ubx", 60.5, 120)], [["a.ubx+b.ubx"]]),
+        ([log("a.ubx", 0, 60), log("b.ubx", 90, 120)], [["a.ubx"], ["b.ubx"]]),
+        ([log("b.sbf", 1, 61), log("a.ubx", 0, 60)], [["b.sbf", "a.ubx"]]),
+        ([log("a.ubx", 0, 60), log("o.csv", 700, 760, "odometer")], [["a.ubx", "o.csv"]]),
+        (
+            [log("a.ubx", 0, 60), log("b.ubx", 90, 120), log("o.csv", 95, 119, "odometer")],
+            [["a.ubx"], ["b.ubx", "o.csv"]],
+        ),
+        (
+            [log("a.ubx", 0, 60), log("b.ubx", 90, 120), log("o.csv", 0, 120, "odometer")],
+            [["a.ubx", "o.csv"], ["b.ubx", "o.csv"]],
+        ),
+    ],
+)
+def test_logs_of_one_ride(logs: list[SeenLog], rides: list[list[str]]) -> None:
+    found, alone = rides_of(logs, [])
+    assert alone == []
+    told = [
+        ["+".join(file.path.name for file in files) for files in ride.receivers]
+        + [other.path.name for other in ride.others]
+        for ride in found
+    ]
+    assert told == rides
+
+
+def test_a_log_of_no_ride_is_told() -> None:
+    _, alone = rides_of([log("a.ubx", 0, 1), log("b.ubx", 90, 91), log("o.csv", 30, 31, "odometer")], [])
+    assert [one.path.name for one in alone] == ["o.csv"]
+
+
+def test_logs_of_one_name_have_ids_of_their_own() -> None:
+    found, _ = rides_of([log("/x/mon/log.ubx", 0, 1), log("/x/tue/log.ubx", 90, 91)], [])
+    assert [ride.run_id for ride in found] == ["mon_log", "tue_log"]
+
+
+@pytest.fixture
+def raw(tmp_path: Path, small_trial: SmallTrial, monkeypatch: pytest.MonkeyPatch, in_process: None) -> Path:
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw" / "still.nmea").write_text(nmea())
+    (tmp_path / "raw" / "plc.csv").write_text(ODOMETER)
+    (tmp_path / "raw" / "notes.txt").write_text("nothing of interest\n")
+    (tmp_path / "line.gpx").write_text(
+        '<gpx version="1.1"><trk><trkseg><trkpt lat="50.01" lon="14.0"/><trkpt lat="50.03" lon="14.0"/>'
+        "</trkseg></trk></gpx>"
+    )
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def call(*arguments: str) -> int:
+    return cli._guarded(list(arguments), debug=False)
+
+
+def written(folder: Path) -> Project:
+    return load_project(folder / "balise.toml")
+
+
+def test_two_commands_from_logs_to_report(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("trial", "raw", "--track", "line.gpx", "--balises", "every 500", "--to", "week12") == 0
+    said = capsys.readouterr().out
+    assert "not used: raw/notes.txt" in said
+    assert said.endswith("now: balise run --project week12\n")
+    (entry,) = written(raw / "week12").convert
+    assert [found.files for found in entry.logs] == [("../raw/still.nmea",), ("../raw/plc.csv",)]
+    (odometer,) = entry.logs[1].odometer
+    assert (odometer.fields, odometer.time) == ({"speed_mps": "v_kmh"}, "field:time")
+    assert odometer.factors["speed_mps"] == pytest.approx(1 / 3.6)
+    assert call("run", "--project", "week12") == 0
+    assert (raw / "week12/result/report/index.html").exists()
+
+
+def test_a_folder_is_a_project_by_one_word(raw: Path) -> None:
+    assert call("init", ".") == 0
+    project = written(raw)
+    assert project.track is not None
+    assert (project.track.survey, [entry.to for entry in project.convert]) == (("line.gpx",), ["runs/still"])
+    assert call("init", ".") == 2
+
+
+def test_every_key_of_the_comment_is_one(tmp_path: Path) -> None:
+    assert call("init", str(tmp_path)) == 0
+    text = (tmp_path / "balise.toml").read_text()
+    listed = text[text.index("# All other keys") :].splitlines()[1:]
+    lines = [line.removeprefix("#").removeprefix(" ") for line in listed]
+    # Several vehicles and a calibration exclude each other.
+    (tmp_path / "all.toml").write_text("\n".join(line for line in lines if not line.startswith("vehicles")))
+    assert load_project(tmp_path / "all.toml").model_fields_set == set(Project.model_fields) - {"vehicles"}
+    assert any(line.startswith("vehicles") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["raw"], "--track: needs the line"),
+        (["raw", "--track", "nowhere.gpx"], "--track nowhere.gpx: does not exist"),
+        (["nowhere", "--track", "line.gpx"], "nowhere: does not exist"),
+        (["raw/notes.txt", "--track", "line.gpx"], "raw/notes.txt: needs a mapping of its columns"),
+        (["raw/plc.csv", "--track", "line.gpx"], "no log holds positions"),
+    ],
+)
+def test_wrong_calls(raw: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("trial", *arguments, "--to", "week12") in (1, 2)
+    assert message in capsys.readouterr().err
+    assert not (raw / "week12").exists()
+
+
+def test_corrections_are_proposed_and_accepted(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (raw / "raw" / "still.nmea").write_text(nmea(100, acceleration_mps2=0.2))
+    rows = (f"2025-03-03T10:{12 + s // 60:02d}:{s % 60:02d}Z;{1e-4 * s**2:.5f}" for s in range(100))
+    (raw / "raw" / "plc.csv").write_text("time;km\n" + "\n".join(rows) + "\n")
+    base = ("trial", "raw", "--track", "line.gpx", "--json")
+    assert call(*base, "--to", "asked") == 0
+    (proposed,) = json.loads(capsys.readouterr().out)["corrections"]
+    assert proposed["accepted"] is False
+    assert "factors" in "".join(proposed["toml"])
+    assert written(raw / "asked").convert[0].correct == ()
+    assert call("run", "--project", "asked") == 1  # kilometres taken as metres cannot be
+    assert call(*base, "--to", "yes", "--accept-corrections") == 0
+    (correction,) = written(raw / "yes").convert[0].correct
+    assert (correction.stream, correction.factors) == ("odometer", {"distance_m": 1000.0})
+    assert call("run", "--project", "yes") == 0

@@ -1,0 +1,129 @@
+"""The largest error still in use, worked by hand on a train that stands still but for its fault, and against faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import sqrt
+
+import numpy as np
+import polars as pl
+import pytest
+
+from benchmarks.relink import journey
+from pipeline.one_run import replay
+from pipeline.studies.undetected.in_use import Returns, in_use_errors
+from pipeline.studies.undetected.watched import NO_ROW, FaultWindow, Watched
+from schemas.arrays import Floats
+from schemas.config import Configuration, LdsConfig, MonitorConfig, UndetectedConfig
+
+ROWS, FIRST, UNNOTICED_M, THRESHOLD_MPS = 700, 5, 1.0, 0.1
+CONFIG = Configuration(monitors=MonitorConfig(ewma_alphas=(0.3, 0.2, 0.1)))
+WINDOW = FaultWindow(0, ROWS - 1, 0, 0.0)
+
+
+def rows() -> Watched:
+    """One row a second, one average with weight 0.1, nothing recorded moves."""
+    zero = np.zeros(ROWS)
+    return Watched(
+        epoch=np.arange(ROWS),
+        t_s=np.arange(float(ROWS)),
+        fresh=np.arange(ROWS) == 0,
+        free=zero > 0,
+        fastest_m=zero + 5.0,
+        way_s=zero + 1.0,
+        rate_mps=zero,
+        least_mps=zero - 1.0,
+        most_mps=zero + 1.0,
+        weight=zero[:, None] + 0.1,
+        average_mps=zero[:, None],
+        threshold_mps=zero[:, None] + THRESHOLD_MPS,
+        low_m=zero - np.inf,
+        high_m=zero + np.inf,
+        anchor=np.full(ROWS, NO_ROW),
+        held_low_m=zero - np.inf,
+        held_high_m=zero + np.inf,
+        learned_m=zero,
+        learned_late_m=zero,
+    )
+
+
+def returns(first: int = FIRST) -> Returns:
+    """TVBs from `first` on; sigma 1 m, no scale error."""
+    zero = np.zeros(ROWS)
+    return Returns(zero, zero + 1.0, zero, zero, zero.astype(np.int64), np.arange(ROWS) >= first, 0.0)
+
+
+def largest(given: Returns | None, config: Configuration = CONFIG, watched: Watched | None = None) -> Floats:
+    unnoticed = np.full((2, ROWS), UNNOTICED_M)
+    ahead, behind = in_use_errors(watched or rows(), [WINDOW], unnoticed, given, config)
+    np.testing.assert_array_equal(ahead, behind)
+    return ahead
+
+
+def bound_m(waited_s: float) -> float:
+    """k_T sqrt(2 sigma^2 + 0.05^2 t), here below half the failure limit."""
+    return 5.3267 * sqrt(2.0 + 0.0025 * waited_s)
+
+
+def test_from_the_first_tvb_to_the_return_and_on() -> None:
+    """TVB at 5 s, no bound before; an alarm right after may be over at 35 s; held for 10 s, growth from 9 s on."""
+    found = largest(returns())
+    assert np.isnan(found[:FIRST]).all()
+    assert found[FIRST:35] == pytest.approx([UNNOTICED_M] * 30)
+    assert found[35:44] == pytest.approx([UNNOTICED_M + bound_m(t) for t in range(30, 39)], rel=1e-4)
+    # From row 44 on: w / way = 10 s of threshold at the end, 9 at the start, and each row's own in between.
+    grown = UNNOTICED_M + bound_m(39) + THRESHOLD_MPS * (10 + 9 + (100 - 44 - 1))
+    assert found[100] == pytest.approx(grown, rel=1e-4)
+
+
+def test_without_a_return_it_is_the_unnoticed_error() -> None:
+    assert largest(None) == pytest.approx([UNNOTICED_M] * ROWS)
+
+
+def test_without_a_validated_position_nothing_bounds_it() -> None:
+    assert np.isnan(largest(returns(first=ROWS))).all()
+
+
+def test_a_lost_distance_ends_the_bound() -> None:
+    lost = replace(returns(), counter=(np.arange(ROWS) >= 300).astype(np.int64))
+    found = largest(lost)
+    assert np.isfinite(found[FIRST:300]).all()
+    assert np.isnan(found[300:]).all()
+
+
+def test_a_threshold_not_known_after_the_hold_leaves_no_bound() -> None:
+    blind = rows()
+    blind.threshold_mps[60] = np.inf
+    found = largest(returns(), watched=blind)
+    assert np.isfinite(found[FIRST:60]).all()
+    assert np.isnan(found[61:]).all()
+
+
+def test_without_a_hold_growth_counts_from_the_return() -> None:
+    monitors = MonitorConfig(ewma_alphas=(0.3, 0.2, 0.1), disabled=("link_distance",))
+    found = largest(returns(), Configuration(monitors=monitors))
+    assert found[40] == pytest.approx(UNNOTICED_M + bound_m(30) + THRESHOLD_MPS * (10 + 9 + 4), rel=1e-4)
+
+
+@pytest.mark.parametrize("step_m", [6.0, -6.0])
+def test_a_noticed_fault_that_returns_stays_within_the_bound(step_m: float) -> None:
+    """A step of 6 m, found at once and back after 30 s, for it is within the bound of the re-link; later a drift."""
+    t_s = np.arange(1_600.0)
+    fault_m = np.where(t_s >= 150, step_m, 0.0) + np.sign(step_m) * 0.005 * np.maximum(t_s - 300.0, 0.0)
+    computed = Configuration(undetected=UndetectedConfig(compute=True), lds=LdsConfig())
+    bounds = _replayed(np.zeros(t_s.size), t_s, computed)
+    epochs = _replayed(fault_m, t_s, Configuration())
+    used = (epochs["lds_mode"] != "fail_safe").to_numpy() & epochs["withheld_for"].is_null().to_numpy()
+    name = "ahead" if step_m > 0 else "behind"
+    bound = bounds[f"undetected_{name}_in_use_m"].cast(pl.Float64).fill_null(np.inf).to_numpy()
+    unnoticed = bounds[f"undetected_{name}_m"].cast(pl.Float64).fill_null(np.inf).to_numpy()
+    assert epochs["alarm"][150]
+    assert used[200:].any()
+    assert (np.abs(fault_m) <= bound)[used].all()
+    assert (unnoticed <= bound).all()
+
+
+def _replayed(fault_m: Floats, t_s: Floats, config: Configuration) -> pl.DataFrame:
+    made = journey(np.random.default_rng(3), t_s, fault_m, 1.0)
+    run = made.run.with_streams(odometer=made.run.odometer.with_columns(sensor=pl.lit("primary")))
+    return replay(run, made.site, made.vehicle, config).epochs
