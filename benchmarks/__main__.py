@@ -21,6 +21,7 @@ MODULES = (
     "calibration",
     "topologies",
     "campaign",
+    "compact",
     "interruptions",
     "experiment",
     "relink",
