@@ -154,6 +154,7 @@ def replay(
     project: OfProject = None,
 ) -> None:
     """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
+    _check_named(runs)
     from pipeline.campaign import Interrupted, make_plan, run_campaign
     from pipeline.results.manifest import settings_files
     from pipeline.show.progress import show_summary, watches
@@ -174,6 +175,16 @@ def replay(
         raise _stopped(interrupted, out, quiet, as_json, places) from None
     show_summary(summary, out, quiet, as_json, **places)
     raise Exit(_status_of(summary, fail_on))
+
+
+def _check_named(runs: list[str]) -> None:
+    """What is mistyped is said before anything is loaded; of stores, when they are asked for the runs."""
+    from pipeline.storage import require_match
+    from pipeline.storage.address import is_url
+
+    for name in runs:
+        if not is_url(name):
+            require_match(name)
 
 
 def _stopped(interrupted: Interrupted, out: str, quiet: bool, as_json: bool, places: Mapping[str, str]) -> Exit:
@@ -468,6 +479,9 @@ def inspect(
     project: OfProject = None,
 ) -> None:
     """Describe a log, a site or a result, and list what needs attention."""
+    from pipeline.show.kinds import kind_at
+
+    kind_at(path)  # what is mistyped is said before anything is loaded
     from pipeline.show.inspection import inspect_path, show
 
     settings = _configuration(config)

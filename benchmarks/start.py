@@ -1,9 +1,10 @@
-"""Processor time that commands take before they do anything: nothing is loaded that is not needed."""
+"""Processor time of commands that do little, and of one short run: whole processes, with compiled modules there."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.results import Figure
@@ -11,30 +12,51 @@ from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
 
 _LIGHT = {"help": ["--help"], "version": ["--version"], "experiment list": ["experiment", "list"]}
-_LIGHT_S, _BEFORE_READING_S = 0.4, 1.0
+_LIGHT_S, _INSPECT_S, _MISTYPED_S, _REPLAY_S, _BEFORE_READING_S = 0.4, 0.5, 0.4, 1.2, 1.0
 _TIMES = 5
-_SAY = "import time\nprint('processor', time.process_time())\n"
-# Stops where the worker would read the log.
-_REPLAY = """
+# One process that runs the command as often as wanted, so that what is measured is the command alone.
+_COST = """
+import resource, subprocess, sys
+subprocess.run([sys.executable, '-m', 'cli', *sys.argv[1:]], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+"""
+# Stops where the worker would read the log, and tells what takes long to load and is there already.
+_BEFORE_READING = """
 import os, sys, time, cli
 import pipeline.campaign.worker as worker
 def stop(*given, **named):
-    print('processor', time.process_time(), flush=True)
+    print(len({'scipy', 'duckdb', 'rich', 'jinja2'} & set(sys.modules)), time.process_time(), flush=True)
     os._exit(0)
-for name in ('read_run', 'RecordedLog'):
-    if hasattr(worker, name):
-        setattr(worker, name, stop)
+worker.RecordedLog = stop
 cli._guarded(sys.argv[1:], False)
 """
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a command took, its workers among it: processor time, and the memory of its largest process."""
+
+    processor_s: float
+    peak_mb: float
 
 
 def measure(out: Path) -> list[Figure]:
     """Shortest of some goes of each command [s of processor time]."""
     site, log = _trial(out)
-    given = ["replay", str(log), "--site", str(site), "--out", str(out / "result"), "--force", "--quiet"]
-    light = f"import sys, cli\ncli._guarded(sys.argv[1:], False)\n{_SAY}"
-    figures = [Figure(name, _shortest(light, words), "s", _LIGHT_S) for name, words in _LIGHT.items()]
-    return [*figures, Figure("replay before it reads", _shortest(_REPLAY, given), "s", _BEFORE_READING_S)]
+    empty = out / "empty"
+    empty.mkdir(parents=True, exist_ok=True)
+    given = ["--site", str(site), "--out", str(out / "result"), "--force", "--quiet"]
+    loaded, before_s = _before_reading(["replay", str(log), *given])
+    return [
+        *(Figure(name, cost_of(words).processor_s, "s", _LIGHT_S) for name, words in _LIGHT.items()),
+        Figure("inspect of an empty folder", cost_of(["inspect", str(empty)]).processor_s, "s", _INSPECT_S),
+        Figure("inspect of a mistyped path", cost_of(["inspect", f"{log}x"]).processor_s, "s", _MISTYPED_S),
+        Figure("replay of a mistyped path", cost_of(["replay", f"{log}x", *given]).processor_s, "s", _MISTYPED_S),
+        Figure("replay before it reads", before_s, "s", _BEFORE_READING_S),
+        Figure("heavy libraries loaded before it reads", loaded, "", 0.0),
+        Figure("replay of seven minutes, cold", cost_of(["replay", str(log), *given]).processor_s, "s", _REPLAY_S),
+    ]
 
 
 def _trial(out: Path) -> tuple[Path, Path]:
@@ -43,10 +65,18 @@ def _trial(out: Path) -> tuple[Path, Path]:
     return out / "site", write_run_log(build_run(scenario, scenario.runs[-1]), out / "runs")
 
 
-def _shortest(code: str, arguments: list[str]) -> float:
-    return min(_processor_s(code, arguments) for _ in range(_TIMES))
+def cost_of(arguments: list[str]) -> Cost:
+    """The cheapest of some goes of a command."""
+    costs = [Cost(*_printed(_COST, arguments)) for _ in range(_TIMES)]
+    return min(costs, key=lambda cost: cost.processor_s)
 
 
-def _processor_s(code: str, arguments: list[str]) -> float:
+def _before_reading(arguments: list[str]) -> tuple[float, float]:
+    loaded, seconds = zip(*(_printed(_BEFORE_READING, arguments) for _ in range(_TIMES)), strict=True)
+    return max(loaded), min(seconds)
+
+
+def _printed(code: str, arguments: list[str]) -> tuple[float, float]:
     done = subprocess.run([sys.executable, "-c", code, *arguments], text=True, capture_output=True, check=True)
-    return float(done.stdout.split()[-1])
+    first, second = map(float, done.stdout.split()[-2:])
+    return first, second

@@ -8,21 +8,28 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import polars as pl
+import tomli_w
 
 from datasets.comparison import checks_table, compare
 from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
-from pipeline.campaign import RunOutcome, make_plan, run_campaign
+from pipeline import storage
+from pipeline.campaign import RunOutcome, run_campaign
+from pipeline.project.opened import open_project
+from pipeline.project.run import plan_of
 from pipeline.read.ingest.run import read_run as read_log
 from pipeline.read.site.read import read_site
 from pipeline.results.figures.head import CampaignHead, head_of, word_of, worst_verdict
-from pipeline.results.manifest import settings_files
 from pipeline.results.store import read_run
 from pipeline.show.progress import CampaignWatch
 from pipeline.show.report import write_report
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration
+from schemas.project import FILE_NAME, NO_VEHICLE
 from schemas.run import RunTables
 
+_HEAD = (
+    "# The demo as a project: `balise run`, `balise verify` and `balise sql` need no option here (docs/project.md).\n"
+)
 Progress = Callable[[str], None]
 
 
@@ -91,14 +98,14 @@ def _classes(hazards: pl.DataFrame) -> str:
 
 
 def demo(out: Path, seed: int | None = None, progress: Progress | None = None, jobs: int = 1) -> DemoResult:
-    """Write the trial under `out` (`site/`, `runs/`, `vehicle.toml`), replay it to `tables/`, compare, and write pages.
+    """Write the trial under `out` as a project, replay it to `tables/`, compare, and write pages.
 
     Another `seed` than the scenario's own draws other errors; what has to be found is the same.
     `progress` receives a line for each run written and replayed.
     """
     scenario = demo_scenario(seed)
     paths = write_trial(scenario, out, None if progress is None else lambda run_id: progress(f"{run_id}: written"))
-    _replay_trial(scenario, paths, out, progress, jobs)
+    _replay_trial(scenario, out, progress, jobs)
     tables = tuple(read_run(out / "tables", spec.id) for spec in scenario.runs)
     config = Configuration()
     logs = (read_log(path, config.ingest) for path in paths)
@@ -107,16 +114,14 @@ def demo(out: Path, seed: int | None = None, progress: Progress | None = None, j
     return DemoResult(scenario, checks_table(checks), tables, write_report(out / "tables", site, jobs)[0])
 
 
-def _replay_trial(scenario: Scenario, paths: list[Path], out: Path, progress: Progress | None, jobs: int) -> None:
-    """As `balise replay` would, first the runs without vehicle file."""
+def _replay_trial(scenario: Scenario, out: Path, progress: Progress | None, jobs: int) -> None:
+    """As `balise run` would: the trial is a project, some of whose runs have no vehicle file."""
+    bare = {spec.id: NO_VEHICLE for spec in scenario.runs if not spec.vehicle}
+    named = {"vehicle": "vehicle.toml", "vehicles": bare} if scenario.vehicle else {}
+    project = {"site": "site", "out": "tables", **named, "replay": {"runs": ["runs/*"]}}
+    storage.write_bytes(out / FILE_NAME, (_HEAD + tomli_w.dumps(project)).encode())
     watches = [] if progress is None else [_Replayed(progress)]
-    for has_vehicle in (False, True):
-        logs = [str(path) for spec, path in zip(scenario.runs, paths, strict=True) if spec.vehicle is has_vehicle]
-        vehicle = scenario.vehicle if has_vehicle and scenario.vehicle else Vehicle()
-        given = settings_files(None, out / "vehicle.toml" if has_vehicle and scenario.vehicle else None)
-        if logs:
-            plan = make_plan(logs, out / "site", out / "tables", vehicle=vehicle, given=given)
-            run_campaign(plan, jobs=jobs, force=True, watches=watches)
+    run_campaign(plan_of(open_project(out)), jobs=jobs, force=True, watches=watches)
 
 
 class _Replayed(CampaignWatch):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import polars as pl
+if TYPE_CHECKING:
+    import polars as pl
 
 Stream = Literal["gnss", "odometer", "satellites", "reference", "balise_reads", "faults"]
 STREAMS: tuple[Stream, ...] = (

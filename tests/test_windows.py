@@ -5,6 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import unquote
+
+from pipeline.results.store import file_name
 
 ROOT = Path(__file__).parents[1]
 _HIDDEN = """
@@ -27,3 +30,9 @@ def test_every_module_is_imported_without_posix() -> None:
         [sys.executable, "-c", _HIDDEN, "cli", *modules], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert ended.returncode == 0, ended.stderr[-2000:]
+
+
+def test_run_ids_become_names_that_windows_takes() -> None:
+    name = file_name('a<b>:"c/d\\e|f?g*h\x01')
+    assert set(name).isdisjoint('<>:"/\\|?*\x01')
+    assert unquote(name) == 'a<b>:"c/d\\e|f?g*h\x01'

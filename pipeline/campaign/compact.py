@@ -56,7 +56,7 @@ def undo(out: Address) -> Compaction:
     with locked(out):
         store.sweep(out)
         known = {} if is_url(out) else resume.in_place(str(out))
-        for runs in unpack(out):
+        for runs in unpack(out, packs.listed(out)):
             done += runs
             tell(done, total)
         return _finished(out, {}, known)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import glob
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from pipeline import storage
 from pipeline.campaign.ground import hold
@@ -15,7 +13,7 @@ from pipeline.results import store
 from pipeline.results.manifest import SettingsFiles, listing, settings_files, unaltered
 from pipeline.results.software import software_digest
 from pipeline.storage import files
-from pipeline.storage.address import Address, check_public, is_url, join, name_of, redacted, stem_of
+from pipeline.storage.address import Address, is_url, join, name_of, redacted, stem_of
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.errors import InputError, UsageError
 from schemas.run import STREAMS
@@ -178,22 +176,8 @@ def _check_name(run_id: str, address: Address) -> None:
 
 
 def _expand(name: str) -> list[Address]:
-    matches = _matches(name)
-    if not matches:
-        raise UsageError(
-            "no such run", place=redacted(name), expected="RUN.mcap, a run folder, a folder of runs or a glob"
-        )
+    matches = storage.require_match(name)
     return [run for match in matches for run in ([match] if _is_run(match) else _runs_in(match))]
-
-
-def _matches(name: str) -> list[Address]:
-    if is_url(name):
-        check_public(name)
-        # A question mark in a web address begins its query.
-        return storage.glob_remote(name) if glob.has_magic(name) and not name.startswith("http") else [name]
-    if Path(name).exists():
-        return [Path(name)]
-    return sorted(Path(match) for match in glob.glob(name, recursive=True))
 
 
 def _is_run(address: Address) -> bool:

@@ -18,6 +18,7 @@ from pipeline.read.ingest import read_run
 from pipeline.read.site.read import read_site
 from pipeline.results import store
 from pipeline.results.manifest import settings_files
+from pipeline.results.packing import remove_runs
 from pipeline.results.workers import watched
 from pipeline.show.report import write_report
 from pipeline.show.report.site_page import site_page
@@ -25,7 +26,6 @@ from pipeline.storage.address import is_url
 from schemas.config import Configuration, Vehicle, digest_of, load_settings, to_toml
 from schemas.errors import InputError, UsageError
 from schemas.project import CalibrateEntry, ConvertEntry, TrackEntry, load_configuration
-from schemas.tables import TABLES
 
 Said = Callable[[str, str], None]
 """Receives a step and what there is to say of it."""
@@ -265,9 +265,7 @@ def _only_these(plan: Plan, call: Call) -> None:
     named = {job.run_id for job in plan.jobs}
     others = _others(plan.out, named)
     if others and call.prune:
-        for run_id in others:
-            for table in reversed(TABLES):
-                storage.remove_folder(Path(store.table_address(plan.out, table, run_id)).parent)
+        remove_runs(plan.out, others)
         call.said("replay", f"removed the results of {', '.join(others)}")
         others = _others(plan.out, named)
     if others:

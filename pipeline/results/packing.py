@@ -253,12 +253,19 @@ def _files(marker: Marker, tables: Mapping[str, pa.Table]) -> Iterator[tuple[str
         yield name, store.file_bytes(table, name, metadata)
 
 
-def unpack(out: Address) -> Iterator[int]:
-    """Give all packed runs files of their own again, the same bytes; of each pack how many runs it held.
+def remove_runs(out: Address, runs: Sequence[str]) -> None:
+    """Remove the results of these runs; the others of their packs have files of their own then."""
+    for _ in unpack(out, [pack for pack in packs.listed(out) if set(packs.index_of(out, pack).run_ids) & set(runs)]):
+        pass
+    store.remove_own(out, runs)
+
+
+def unpack(out: Address, asked: Sequence[Pack]) -> Iterator[int]:
+    """Give the runs of these packs files of their own again, the same bytes; of each pack how many runs it held.
 
     Raises `UsageError` where this build of the program cannot make the same bytes: the pack stays.
     """
-    for pack in packs.listed(out):
+    for pack in asked:
         here = {run for run, place in packs.find(out).items() if place.pack == pack}.difference(store.own_runs(out))
         for marker, tables in _runs_in(str(out), pack):
             if marker.run_id in here:

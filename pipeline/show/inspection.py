@@ -11,22 +11,22 @@ import polars as pl
 
 from pipeline.read.ingest.csv_draft import draft_mapping
 from pipeline.read.ingest.describe import StreamSummary, TopicSummary, describe_log
-from pipeline.read.site.read import is_geojson, read_site
+from pipeline.read.site.read import read_site
 from pipeline.results import store
 from pipeline.results.figures.head import head_of, run_verdicts
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.show.kinds import Kind, kind_at
 from pipeline.show.terminal import show_tables
 from pipeline.storage import files
-from pipeline.storage.address import Address, name_of, redacted
+from pipeline.storage.address import Address, redacted
 from pipeline.storage.described import PREFIX, describe
 from pipeline.storage.parquet import ParquetError
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
-from schemas.run import STREAMS, Finding, Site
+from schemas.run import Finding, Site
 
 STARTING_CONFIG = "Configuration to begin with"
-_SITE_FILES = {"track.parquet", "track.csv", "track.geojson"}
 _RUN_COLUMNS = (
     *("verdict", "run_id", "solution", "reasons", "part_verdict", "proof_margin_m", "remedies", "status"),
     *("duration_s", "distance_m", "gnss_rate_hz", "availability", "lost_to", "lost_to_share", "lost_to_monitor"),
@@ -48,28 +48,18 @@ def inspect_path(
     `result`: runs over a site, for what they say of its survey. `site`, `vehicle`: what a log is held against.
     """
     config = config or Configuration()
-    if not files.exists(path):
-        raise UsageError("does not exist", place=redacted(str(path)))
-    names = set(files.list_dir(path)) if files.is_dir(path) else set()
-    if names & _SITE_FILES or (is_geojson(path) and not names):
+    kind = kind_at(path)
+    if kind is Kind.SITE:
         return inspect_site(path, result, config)
     if result is not None:
         raise UsageError("is not a site", place=redacted(str(path)), expected="a site, to compare the result with")
-    if "runs" in names and store.run_ids(path):
+    if kind is Kind.RESULT:
         return inspect_result(path)
-    if name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
-        return inspect_log(path, config, None if site is None else read_site(site, config.site), vehicle)
-    if name_of(path).lower().endswith(".csv"):
+    if kind is Kind.CSV:
         return inspect_csv(Path(path))
-    if name_of(path).lower().endswith(".parquet") and not names:
+    if kind is Kind.TABLE:
         return inspect_table(path)
-    raise UsageError(
-        "is neither a log, a site nor a result",
-        place=redacted(str(path)),
-        expected="RUN.mcap, SITE.geojson, FILE.parquet, or a folder with gnss.parquet (log), track.parquet (site) or"
-        " runs/ (result)",
-        remedy="`balise convert` makes runs of receiver logs and CSV files.",
-    )
+    return inspect_log(path, config, None if site is None else read_site(site, config.site), vehicle)
 
 
 def inspect_csv(path: Path) -> dict[str, pl.DataFrame]:

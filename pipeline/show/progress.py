@@ -11,9 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
 from pipeline import storage
 from pipeline.results.figures.head import word_of
 from pipeline.results.outcome import CampaignSummary, RunOutcome, UnderWay
@@ -174,6 +171,10 @@ class BarWatch(CampaignWatch):
     """A progress bar on a terminal."""
 
     def begin(self, runs: int, out: str) -> None:
+        # Takes long to load, and a pipe has no bar.
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
         super().begin(runs, out)
         columns = (BarColumn(_BAR), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
         self._bar = Progress(*columns, console=Console(stderr=True))

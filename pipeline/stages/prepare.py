@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import polars as pl
 
@@ -36,13 +36,17 @@ class PreparedRun:
     counts: CleanCounts
     odometers: tuple[Odometry, ...]
     odometry: Odometry | None
+    # Made anew with every run, so that `replace` cannot hand on those of another.
+    _fixes: dict[str, pl.DataFrame] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def fixes(self, solution: str) -> pl.DataFrame:
-        """The positions of one solution; `InputError` unless they are those of one journey."""
-        fixes = self.run.gnss.filter(pl.col("solution") == solution)
-        require_two_times(fixes, "gnss", f" of solution {solution!r}")
-        require_one_journey(fixes, f"gnss of solution {solution!r}", self.config.ingest)
-        return fixes
+        """The positions of one solution, checked once; `InputError` unless they are those of one journey."""
+        if solution not in self._fixes:
+            fixes = self.run.gnss.filter(pl.col("solution") == solution)
+            require_two_times(fixes, "gnss", f" of solution {solution!r}")
+            require_one_journey(fixes, f"gnss of solution {solution!r}", self.config.ingest)
+            self._fixes[solution] = fixes
+        return self._fixes[solution]
 
     def ranges(self, solution: str) -> pl.DataFrame | None:
         """Its satellites, where they were recorded."""

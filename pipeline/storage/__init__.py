@@ -8,7 +8,16 @@ whole or not at all; `identity` tells whether content is still the same; `object
 patience with those that fail; `objects` is what they say of an object, and whether what came is that.
 """
 
-from pipeline.storage.fetching import content_of, files_below, folders_in, glob_remote, local_copy, reach, read_many
+from pipeline.storage.fetching import (
+    content_of,
+    files_below,
+    folders_in,
+    glob_remote,
+    local_copy,
+    reach,
+    read_many,
+    require_match,
+)
 from pipeline.storage.identity import (
     FileDigest,
     FileState,
@@ -57,6 +66,7 @@ __all__ = [
     "remove",
     "remove_folder",
     "remove_folders",
+    "require_match",
     "replace_files",
     "signature",
     "sizes",

@@ -59,3 +59,8 @@ def stem_of(path: Address) -> str:
 def join(path: Address, name: str) -> Address:
     """What has this name in a folder."""
     return f"{str(path).rstrip('/')}/{name}" if is_url(path) else Path(path) / name
+
+
+def is_geojson(address: Address) -> bool:
+    """By its name: a network as registers of infrastructure export it, net elements and net relations in one file."""
+    return name_of(address).lower().endswith(".geojson")

@@ -12,10 +12,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from pipeline.storage.address import Address, is_url, name_of
+from pipeline.storage.address import Address, check_public, is_url, name_of, redacted
 from pipeline.storage.object_store import arrivals, on_store, opened
 from pipeline.storage.objects import AlteredError, Listing, check_copy, entries_of, kind_of, objects_at, version_in
-from schemas.errors import InputError, OutputError
+from schemas.errors import InputError, OutputError, UsageError
 
 
 def reach(address: Address) -> None:
@@ -58,6 +58,24 @@ def _names_below(store: Any, place: str, before: str) -> Iterator[str]:
             yield from _names_below(store, entry["name"].rstrip("/"), f"{name}/")
         else:
             yield name
+
+
+def require_match(name: str) -> list[Address]:
+    """What a run, a folder or a pattern names; an address as it is. Raises `UsageError` where that is nothing."""
+    if matches := _matches(name):
+        return matches
+    expected = "RUN.mcap, a run folder, a folder of runs or a glob"
+    raise UsageError("no such run", place=redacted(name), expected=expected)
+
+
+def _matches(name: str) -> list[Address]:
+    if is_url(name):
+        check_public(name)
+        # A question mark in a web address begins its query.
+        return [*glob_remote(name)] if glob.has_magic(name) and not name.startswith("http") else [name]
+    if Path(name).exists():
+        return [Path(name)]
+    return [*sorted(Path(match) for match in glob.glob(name, recursive=True))]
 
 
 def glob_remote(pattern: str) -> list[Address]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import errno
 import inspect
@@ -133,6 +132,8 @@ class _PatientStore:
         return content
 
     async def _within(self, operation: Callable[..., Awaitable[T]], *args: object, **kwargs: object) -> T:
+        import asyncio  # whoever asks a store has loaded it already
+
         task = asyncio.ensure_future(operation(*args, **kwargs))
         while not task.done():
             await asyncio.wait({task}, timeout=min(_LOOK_S, self._limit_s))

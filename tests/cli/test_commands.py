@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -422,6 +423,24 @@ def test_every_help_has_examples(balise: Balise, command: str) -> None:
     told = balise(command, "-h")
     assert told.status == 0
     assert f"balise {command}" in told.out.partition("Examples:")[2]
+
+
+@pytest.mark.parametrize("command", sorted(typer.main.get_command(cli.app).commands))  # type: ignore[attr-defined]
+def test_examples_of_the_help_have_options_that_exist(command: str) -> None:
+    known = typer.main.get_command(cli.app).commands[command]  # type: ignore[attr-defined]
+    options = {option for parameter in known.params for option in parameter.opts}
+    examples = [line for line in known.epilog.splitlines() if line.startswith("balise ")]
+    assert examples
+    for line in examples:
+        words = shlex.split(line.partition(" | ")[0])
+        assert words[1] == command
+        assert {word for word in words if word.startswith("--")} <= options
+
+
+def test_a_misspelled_option_is_answered_with_those_there_are(balise: Balise) -> None:
+    said = balise("report", "OUT", "--jbos", "2")
+    assert said.status == 2
+    assert "--jobs" in said.err
 
 
 def test_reader_that_goes_away(result: Path) -> None:

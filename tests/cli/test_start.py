@@ -43,7 +43,10 @@ def said(code: str, *arguments: str | Path) -> list[str]:
     return subprocess.run(command, cwd=ROOT, text=True, capture_output=True, check=True).stdout.splitlines()
 
 
-@pytest.mark.parametrize("arguments", [["-h"], ["replay", "--help"], ["--version"], ["experiment", "list"]])
+MISTYPED = [["inspect", "/nowhere"], ["replay", "/nowhere", "--site", "/nowhere", "--out", "/nowhere"]]
+
+
+@pytest.mark.parametrize("arguments", [["-h"], ["replay", "--help"], ["--version"], ["experiment", "list"], *MISTYPED])
 def test_what_needs_no_table_loads_no_tables(arguments: list[str]) -> None:
     assert said(LOADED, *arguments)[-1] == "[]"
 

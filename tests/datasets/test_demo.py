@@ -10,6 +10,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+import cli
 from datasets.comparison import checks_table, compare, describe_faults
 from datasets.demo import DemoResult, demo, demo_scenario
 from datasets.trial import build_run
@@ -34,6 +35,15 @@ def test_the_demo_verifies(result: DemoResult) -> None:
     logs = [str(folder / "runs" / run) for run in ("clean.mcap", "odometer_scale")]
     again = recompute(tables, logs, folder / "site", None, vehicle)
     assert (again.problems, again.compared) == ((), f"2 of {len(result.tables)} runs replayed again")
+
+
+def test_the_demo_is_a_project_that_is_up_to_date(
+    result: DemoResult, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(result.page.parents[2])
+    assert cli._guarded(["run", "--jobs", "1"], debug=False) == 0
+    assert "All was up to date." in capfd.readouterr().out
+    assert cli._guarded(["verify"], debug=False) == 0
 
 
 def test_the_replay_finds_what_was_injected(result: DemoResult) -> None:

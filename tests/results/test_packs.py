@@ -13,7 +13,7 @@ import polars as pl
 import pytest
 
 from pipeline.campaign.compact import compact, undo
-from pipeline.results import catalogue, packs, store
+from pipeline.results import catalogue, packing, packs, store
 from pipeline.results.diff import diff_results
 from pipeline.results.query import run_sql
 from pipeline.storage.parquet import GroupedFile
@@ -95,6 +95,14 @@ def test_out_of_packs_come_the_same_bytes(out: Path) -> None:
     }
     undo(out)
     assert without_copies(out) == before
+
+
+def test_runs_are_removed_from_packs(out: Path) -> None:
+    compact(out, runs_per_pack=3)
+    before = content(out)
+    packing.remove_runs(out, ["c/d"])
+    assert store.run_ids(out) == ["a b", "e", "f"]
+    assert content(out) == {name: [row for row in rows if row[0] != "c/d"] for name, rows in before.items()}
 
 
 def test_own_files_count_before_packs(out: Path) -> None:

@@ -16,7 +16,7 @@ from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
 from pipeline.stages.track.network import surveyed
 from pipeline.stages.track.survey import SurveyedTrack, track_of
-from pipeline.storage.address import join, name_of, shown
+from pipeline.storage.address import is_geojson, join, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.storage.parquet import without_checksums
 from schemas.config import SiteConfig
@@ -114,11 +114,6 @@ def _files(folder: Path | str) -> dict[str, bytes]:
         return {name: read_bytes(join(folder, name)) for name in present}
     except InputError as error:
         raise SiteError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
-
-
-def is_geojson(address: Path | str) -> bool:
-    """By its name: a network as registers of infrastructure export it, net elements and net relations in one file."""
-    return name_of(address).lower().endswith(".geojson")
 
 
 def _digest(files: dict[str, bytes]) -> str:

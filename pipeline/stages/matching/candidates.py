@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network
@@ -13,6 +13,9 @@ from pipeline.stages.track.once import Once
 from pipeline.stages.track.segments import Box, Feet, Polyline, box_about, downhill
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 # Every place on an element has a search point within this distance along it. Numerics: it decides how many points are
 # searched, not which elements are within reach.
@@ -23,24 +26,41 @@ BEND_M = 2.0
 
 @dataclass(frozen=True)
 class Segments(Polyline):
-    """All segments of the network, element by element; `first[e] : first[e + 1]` are those of element e."""
+    """All segments of the network, element by element; `first[e] : first[e + 1]` are those of element e.
+
+    `vertex` at which each begins; `length_m` of each, and `way_m`: of all up to the end of each.
+    """
 
     element: Ints
     first: Ints
-    measure_start_m: Floats
-    measure_end_m: Floats
-    height_start_m: Floats
-    height_end_m: Floats
-    heading_rad: Floats
     vertex: Ints
-    probe: Floats
-    probe_segment: Ints
+    length_m: Floats
+    way_m: Floats
 
     def search(self, box: Box | None = None) -> Search:
-        """All probes, or those in a box: a run is looked for about itself, not in all of a network."""
-        inside = np.arange(len(self.probe)) if box is None else box.touched_by(self.probe, self.probe)
-        tree = cKDTree(self.probe[inside], balanced_tree=False, compact_nodes=False)
-        return Search(self, tree, self.probe_segment[inside])
+        """Of all segments, or of those in a box: a run is looked for about itself, not in all of a network."""
+        from scipy.spatial import cKDTree  # takes long to load, and a log needs none
+
+        rows = np.arange(len(self)) if box is None else box.touched_by(self.start, self.end)
+        probes, segment = self._probes(rows)
+        return Search(self, cKDTree(probes, balanced_tree=False, compact_nodes=False), segment)
+
+    def _probes(self, rows: Ints) -> tuple[Floats, Ints]:
+        """Search points on some segments: along long ones several, along runs of short ones only some."""
+        # Whether one is needed depends on the segment before.
+        some = np.union1d(rows, np.maximum(rows - 1, 0))
+        pieces = np.maximum(1, np.ceil(self.length_m[some] / (0.25 * PROBE_SPACING_M))).astype(np.int64)
+        segment = np.repeat(some, pieces)
+        number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        fraction = (number + 0.5) / np.repeat(pieces, pieces)
+        place = self.way_m[segment] - self.length_m[segment] * (1.0 - fraction)
+        bucket = np.floor(place / (0.75 * PROBE_SPACING_M))
+        new = np.ones(len(segment), dtype=np.bool_)
+        new[1:] = (bucket[1:] != bucket[:-1]) | (np.diff(self.element[segment]) != 0)
+        kept = np.flatnonzero(new & np.isin(segment, rows))
+        chosen = segment[kept]
+        start = self.start[chosen]
+        return start + fraction[kept][:, None] * (self.end[chosen] - start), chosen
 
 
 @dataclass(frozen=True)
@@ -94,30 +114,14 @@ _COLUMNS = tuple(column.name for column in fields(Candidates) if column.name != 
 
 @Once
 def segments_of(track: SurveyedTrack) -> Segments:
-    """Segments of all elements with probes for the search."""
-    places = points_of(track.latitude_deg, track.longitude_deg)
+    """Segments of all elements."""
     owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
     head = np.flatnonzero(owner[:-1] == owner[1:])
-    start = places.surface[head]
-    end = places.surface[head + 1]
-    along = end - start
-    east = np.einsum("ij,ij->i", along, places.east[head])
-    north = np.einsum("ij,ij->i", along, places.north[head])
-    probes, probe_segment = _probes(start, end, owner[head])
-    return Segments(
-        start=start,
-        end=end,
-        element=owner[head],
-        first=np.searchsorted(owner[head], np.arange(len(track.ids) + 1)),
-        measure_start_m=track.measure_m[head],
-        measure_end_m=track.measure_m[head + 1],
-        height_start_m=track.height_m[head],
-        height_end_m=track.height_m[head + 1],
-        heading_rad=np.arctan2(east, north),
-        vertex=head,
-        probe=probes,
-        probe_segment=probe_segment,
-    )
+    start = track.surface[head]
+    end = track.surface[head + 1]
+    length_m = np.linalg.norm(end - start, axis=1)
+    first = np.searchsorted(owner[head], np.arange(len(track.ids) + 1))
+    return Segments(start, end, owner[head], first, head, length_m, np.cumsum(length_m))
 
 
 def search_about(places: Floats, network: Network, reach_m: float) -> Search:
@@ -127,6 +131,8 @@ def search_about(places: Floats, network: Network, reach_m: float) -> Search:
 
 def candidates_of(points: Points, network: Network, search: Search, reach_m: float) -> Candidates:
     """For every point the nearest place on each element whose distance is within reach [m]."""
+    from scipy.spatial import cKDTree
+
     segments = search.segments
     tree = cKDTree(points.surface)
     pairs = tree.sparse_distance_matrix(search.tree, reach_m + PROBE_SPACING_M, output_type="ndarray")
@@ -200,14 +206,15 @@ def _candidates(points: int, network: Network, segments: Segments, step: Ints, f
     segment = feet.segment
     element = segments.element[segment]
     held = np.clip(feet.fraction, 0.0, 1.0)
-    measure = segments.measure_start_m[segment]
-    span = segments.measure_end_m[segment] - measure
+    track = network.track
+    vertex = segments.vertex[segment]
+    measure = track.measure_m[vertex]
+    span = track.measure_m[vertex + 1] - measure
     at_start = (segment == segments.first[element]) & (feet.fraction < 0)
     at_end = (segment == segments.first[element + 1] - 1) & (feet.fraction > 1)
     past = np.where(at_start, -1, np.where(at_end, 1, 0))
     corner = (past == 0) & (held != feet.fraction)
     side = np.where(feet.offset_m < 0, -1.0, 1.0)
-    track = network.track
     along = measure + held * span - track.measure_m[track.first[element]]
     linked = network.linked_ends()
     return Candidates(
@@ -219,26 +226,20 @@ def _candidates(points: int, network: Network, segments: Segments, step: Ints, f
         beyond_m=np.abs(feet.fraction - held) * span * (past != 0),
         offset_m=np.where(corner, side * feet.distance_m, feet.offset_m),
         distance_m=feet.distance_m,
-        height_m=(1.0 - held) * segments.height_start_m[segment] + held * segments.height_end_m[segment],
-        heading_rad=segments.heading_rad[segment],
-        vertex=segments.vertex[segment],
+        height_m=(1.0 - held) * track.height_m[vertex] + held * track.height_m[vertex + 1],
+        heading_rad=_headings_rad(track, vertex),
+        vertex=vertex,
         past=past,
         linked_start=linked[element, 0],
         linked_end=linked[element, 1],
     )
 
 
-def _probes(start: Floats, end: Floats, element: Ints) -> tuple[Floats, Ints]:
-    """Search points: along long segments several, along runs of short ones only some."""
-    lengths = np.linalg.norm(end - start, axis=1)
-    pieces = np.maximum(1, np.ceil(lengths / (0.25 * PROBE_SPACING_M))).astype(np.int64)
-    segment = np.repeat(np.arange(len(start)), pieces)
-    number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    fraction = (number + 0.5) / pieces[segment]
-    place = np.cumsum(lengths)[segment] - lengths[segment] * (1.0 - fraction)
-    bucket = np.floor(place / (0.75 * PROBE_SPACING_M))
-    new = np.ones(len(segment), dtype=bool)
-    new[1:] = (bucket[1:] != bucket[:-1]) | (element[segment[1:]] != element[segment[:-1]])
-    kept = np.flatnonzero(new)
-    chosen = segment[kept]
-    return start[chosen] + fraction[kept][:, None] * (end - start)[chosen], chosen
+def _headings_rad(track: SurveyedTrack, vertex: Ints) -> Floats:
+    """Heading of the segments that begin at these vertices, clockwise from north."""
+    some, which = np.unique(vertex, return_inverse=True)
+    places = points_of(track.latitude_deg[some], track.longitude_deg[some])
+    along = track.surface[some + 1] - track.surface[some]
+    east = np.einsum("ij,ij->i", along, places.east)
+    north = np.einsum("ij,ij->i", along, places.north)
+    return np.asarray(np.arctan2(east, north)[which])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
-from scipy.spatial import cKDTree
 
 from pipeline.stages.matching.candidates import Candidates, Search, candidates_of, merged, overtaken, search_about
 from pipeline.stages.matching.decode import Decoded, aligned, decode, legs_of, positions_m
@@ -177,6 +176,8 @@ def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig)
 
 def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) -> InputError:
     """The error for a run of which no epoch is within reach of any track."""
+    from scipy.spatial import cKDTree
+
     tree = cKDTree(track.surface)
     rows = np.flatnonzero(fixes.valid)
     nearest_m, vertex = tree.query(fixes.points.surface[rows])

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.stages.track.geodesy import points_of
+from pipeline.stages.track.geodesy import sines
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Floats, Ints
 
@@ -53,11 +53,16 @@ def chord_sigmas_m(track: SurveyedTrack, here: Ints, there: Ints) -> Floats:
 
 def _segments(track: SurveyedTrack) -> tuple[Floats, Floats]:
     """Length [m] of the segment that begins at each vertex, and its heading [rad] as seen from its start and end."""
-    places = points_of(track.latitude_deg, track.longitude_deg)
-    along = np.diff(places.surface, axis=0, append=places.surface[-1:])
-    sides = [(along, places.east, places.north)]
-    sides.append((along, np.roll(places.east, -1, axis=0), np.roll(places.north, -1, axis=0)))
-    headings = [np.arctan2(np.sum(way * east, axis=1), np.sum(way * north, axis=1)) for way, east, north in sides]
+    along = np.diff(track.surface, axis=0, append=track.surface[-1:])
+    x_m, y_m, z_m = along.T
+    sin_lat, cos_lat, sin_lon, cos_lon = sines(track.latitude_deg, track.longitude_deg)
+    headings = []
+    for _ in range(2):
+        # As seen from a vertex: the way along its unit vectors east and north (`geodesy.points_of`).
+        east_m = x_m * -sin_lon + y_m * cos_lon
+        north_m = x_m * (-sin_lat * cos_lon) + y_m * (-sin_lat * sin_lon) + z_m * cos_lat
+        headings.append(np.arctan2(east_m, north_m))
+        sin_lat, cos_lat, sin_lon, cos_lon = (np.roll(of, -1) for of in (sin_lat, cos_lat, sin_lon, cos_lon))
     return np.linalg.norm(along, axis=1), np.column_stack(headings)
 
 

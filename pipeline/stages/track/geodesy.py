@@ -37,7 +37,7 @@ class Points:
 
 def points_of(latitude_deg: Floats, longitude_deg: Floats) -> Points:
     """The places of positions, heights left out: horizontal work needs none, and many recordings have none."""
-    sin_lat, cos_lat, sin_lon, cos_lon = _sines(latitude_deg, longitude_deg)
+    sin_lat, cos_lat, sin_lon, cos_lon = sines(latitude_deg, longitude_deg)
     zeros = np.zeros_like(sin_lat)
     return Points(
         surface=_ecef(sin_lat, cos_lat, sin_lon, cos_lon, zeros),
@@ -48,12 +48,17 @@ def points_of(latitude_deg: Floats, longitude_deg: Floats) -> Points:
 
 def earth_centred_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
     """Earth-centred, earth-fixed coordinates [m], shape (n, 3)."""
-    return _ecef(*_sines(latitude_deg, longitude_deg), np.asarray(height_m, dtype=np.float64))
+    return _ecef(*sines(latitude_deg, longitude_deg), np.asarray(height_m, dtype=np.float64))
 
 
 def distances_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
     """Straight 3-D distances between consecutive points [m], one fewer than points."""
-    steps = np.diff(earth_centred_m(latitude_deg, longitude_deg, height_m), axis=0)
+    return steps_m(earth_centred_m(latitude_deg, longitude_deg, height_m))
+
+
+def steps_m(places: Floats) -> Floats:
+    """Straight distances between consecutive places [m], one fewer than places."""
+    steps = np.diff(places, axis=0)
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", steps, steps)))
 
 
@@ -87,7 +92,8 @@ def moved_deg(
     )
 
 
-def _sines(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def sines(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Sine and cosine of latitude, sine and cosine of longitude."""
     latitude = np.radians(latitude_deg)
     longitude = np.radians(longitude_deg)
     return np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)

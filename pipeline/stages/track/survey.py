@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.stages.track.geodesy import distances_m, points_of
+from pipeline.stages.track.geodesy import distances_m, earth_centred_m, steps_m
 from schemas.arrays import Floats, Ints, floats, ints
 
 # Both belong to how a site is read, as the limits of its check do: a site is the same for every run and configuration.
@@ -58,12 +58,15 @@ class SurveyedTrack:
     @cached_property
     def surface(self) -> Floats:
         """Earth-centred places of the vertices at height zero [m]."""
-        return points_of(self.latitude_deg, self.longitude_deg).surface
+        return earth_centred_m(self.latitude_deg, self.longitude_deg, np.zeros(len(self.latitude_deg)))
 
     @cached_property
     def geometric_m(self) -> Floats:
         """Distance of each vertex from the first of its element, along the element [m]: 3-D where it has heights."""
-        step_m = distances_m(self.latitude_deg, self.longitude_deg, np.nan_to_num(self.height_m))
+        places = self.surface
+        if not np.isnan(self.height_m).all():
+            places = earth_centred_m(self.latitude_deg, self.longitude_deg, np.nan_to_num(self.height_m))
+        step_m = steps_m(places)
         measure_m = np.zeros(len(self.latitude_deg))
         points = np.diff(self.first)
         for count in np.unique(points).tolist():

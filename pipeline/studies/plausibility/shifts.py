@@ -170,8 +170,9 @@ def line_of(site: Site) -> SurveyLine:
     """The segments of a site's track."""
     track = surveyed(site)
     surface = track.surface
-    within = np.setdiff1d(np.arange(len(surface) - 1), track.first[1:-1] - 1)
-    rows = within[np.any(surface[within] != surface[within + 1], axis=1)]
+    within = np.any(surface[:-1] != surface[1:], axis=1)
+    within[track.first[1:-1] - 1] = False
+    rows = np.flatnonzero(within)
     return SurveyLine(surface[rows], surface[rows + 1], track.height_m[rows], track.height_m[rows + 1])
 
 
