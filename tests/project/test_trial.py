@@ -154,18 +154,18 @@ def test_corrections_are_proposed_and_accepted(raw: Path, capsys: pytest.Capture
 def test_a_logger_of_local_time_is_corrected_in_all_its_streams_and_the_receiver_is_not(raw: Path) -> None:
     (raw / "raw" / "still.nmea").write_text(nmea(100, acceleration_mps2=0.2))
     # Winter in Berlin is an hour ahead of UTC. At 0.1 m per s squared the reads are at 40, 160, 360, 640 m.
-    rows = (
-        f"03.03.2025 11:{12 + s // 60:02d}:{s % 60:02d};{0.1 * s**2:.2f};{f'B{s}' if s in (20, 40, 60, 80) else ''}"
-        for s in range(100)
-    )
-    (raw / "raw" / "plc.csv").write_text(
-        "\n".join(["Zeit;Weg [m];Balise", *rows]).replace(".", ",").replace("03,03,", "03.03.") + "\n"
-    )
+    reads = {20: "B20", 40: "B40", 60: "B60", 80: "B80"}
+    lines = ["Zeit;Weg [m];Balise"]
+    for s in range(100):
+        way = f"{0.1 * s**2:.2f}".replace(".", ",")
+        lines.append(f"03.03.2025 11:{12 + s // 60:02d}:{s % 60:02d};{way};{reads.get(s, '')}")
+    (raw / "raw" / "plc.csv").write_text("\n".join(lines) + "\n")
     # A degree of the meridian is 111,229 m here; the ride begins at 50.02 degrees.
     places = (f"B{s};{50.02 + 0.1 * s**2 / 111229:.7f};14.0;physisch" for s in (20, 40, 60, 80))
     (raw / "balisen.csv").write_text("\n".join(["Name;Breite;Länge;Art", *places]) + "\n")
     (raw / "line.gpx").write_text(
-        '<gpx version="1.1"><trk><trkseg><trkpt lat="50.01" lon="14.0"/><trkpt lat="50.04" lon="14.0"/></trkseg></trk></gpx>'
+        '<gpx version="1.1"><trk><trkseg><trkpt lat="50.01" lon="14.0"/><trkpt lat="50.04" lon="14.0"/>'
+        "</trkseg></trk></gpx>"
     )
     (raw / "settings.toml").write_text("[hazards]\n")
     base = ("trial", "raw", "--track", "line.gpx", "--balises", "balisen.csv", "--config", "settings.toml")
