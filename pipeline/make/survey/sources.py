@@ -21,7 +21,7 @@ from schemas.errors import SiteError
 
 # A variance of zero means "not known" in a `gnss` stream.
 _LEAST_SIGMA_M = 1e-3
-_RECORDED = "A recorded drive becomes one by `balise convert LOG --out DRIVE --stream reference`."
+_RECORDED = "Of a recorded drive: `balise convert LOG --out DRIVE`, then the same with --stream reference."
 _KINDS = "GPX, KML, KMZ, GeoJSON, GeoPackage, Shapefile, FlatGeobuf, CSV, Parquet, or a run with a reference"
 
 
