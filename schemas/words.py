@@ -6,6 +6,7 @@ a column or a verdict changing (`tests/replay/test_rewording.py`).
 
 from __future__ import annotations
 
+import shlex
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -117,7 +118,7 @@ def beside_words(run: Mapping[str, Any]) -> str:
     """What stands beside every verdict: balises accepted of those on the path, availability, proof margin."""
     share, margin_m = run["availability"], run["proof_margin_m"]
     accepted = say("verdicts", "accepted", run["balises_accepted"], run["balises_on_path"])
-    available = say("verdicts", "stood") if share is None else say("verdicts", "available", share)
+    available = say("verdicts", "no_motion") if share is None else say("verdicts", "available", share)
     return ", ".join([accepted, available, *([] if margin_m is None else [say("verdicts", "margin", margin_m)])])
 
 
@@ -151,4 +152,5 @@ PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options":
 
 def remedy_words(remedy: Remedy | str, **places: str) -> str:
     """What would mend it, with the command that does; `places`: paths known where it is shown."""
-    return REMEDIES[Remedy(remedy)].format(**PLACES | places)
+    quoted = {name: text if name == "options" else shlex.quote(text) for name, text in places.items()}
+    return REMEDIES[Remedy(remedy)].format(**PLACES | quoted)

@@ -36,7 +36,8 @@ class PreparedRun:
     counts: CleanCounts
     odometers: tuple[Odometry, ...]
     odometry: Odometry | None
-    _fixes: dict[str, pl.DataFrame] = field(default_factory=dict)
+    # Made anew with every run, so that `replace` cannot hand on those of another.
+    _fixes: dict[str, pl.DataFrame] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def fixes(self, solution: str) -> pl.DataFrame:
         """The positions of one solution, checked once; `InputError` unless they are those of one journey."""

@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 # Part of "the same bytes": none of these may follow a library's default.
 _COMPRESSION_LEVEL = 3
 _ROWS_PER_GROUP = 262_144
+_BYTES_OF_A_VALUE = 8
 
 
 class ParquetError(ValueError):
@@ -197,6 +198,18 @@ def rows_of(content: bytes) -> int:
         metadata = pq.read_metadata(pa.BufferReader(content))
         groups = (metadata.row_group(number).num_rows for number in range(metadata.num_row_groups))
         return int(max(metadata.num_rows, sum(groups)))
+
+
+def unpacked_size(content: bytes) -> int:
+    """What the table takes in memory at least, by the numbers of values that it declares [bytes].
+
+    Values that are the same in every row take hardly anything in the file. Raises `ParquetError`.
+    """
+    with _reading():
+        metadata = pq.read_metadata(pa.BufferReader(content))
+        groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+        values: int = sum(group.column(number).num_values for group in groups for number in range(metadata.num_columns))
+    return max(values, rows_of(content)) * _BYTES_OF_A_VALUE
 
 
 def without_checksums(content: bytes) -> bool:

@@ -21,6 +21,7 @@ from schemas.errors import SiteError
 
 # A variance of zero means "not known" in a `gnss` stream.
 _LEAST_SIGMA_M = 1e-3
+_RECORDED = "A recorded drive becomes one by `balise convert LOG --out DRIVE --stream reference`."
 _KINDS = "GPX, KML, KMZ, GeoJSON, GeoPackage, Shapefile, FlatGeobuf, CSV, Parquet, or a run with a reference"
 
 
@@ -52,7 +53,9 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
             return read_points(place, path.stem, data, epsg, config.site)
         case _ if suffix in MAP_SUFFIXES:
             return read_map(path, data)
-    raise SiteError("is no survey that is known", place=place, found=suffix or "no suffix", expected=_KINDS)
+    raise SiteError(
+        "is no survey that is known", place=place, found=suffix or "no suffix", expected=_KINDS, remedy=_RECORDED
+    )
 
 
 def content_of_survey(path: Path) -> bytes:
