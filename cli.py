@@ -54,8 +54,9 @@ class _OfProject(TyperCommand):
 
             named = given.pop("project", None)
             missing = [option.name for option in self.params if given.get(option.name or "") in (None, [], ())]
-            # A single word is the query, though the result comes first.
-            shifted = self.name == "sql" and "query" in missing and "out" not in missing
+            # A single word is the query or the run, though the result comes first.
+            second = {"sql": "query", "export": "run"}.get(self.name or "")
+            shifted = second in missing and "out" not in missing
             missing = ["out"] if shifted else missing
             say = None if given.get("quiet") else _say
             ctx.default_map = taken_from_project(named, self.name or "", missing, say)
@@ -790,6 +791,7 @@ def line(
 @_command(
     "balise export week12 monday --out monday.mcap --site line9",
     "balise export week12 monday --out monday.gpkg --site line9",
+    of_project=True,
 )
 def export(
     out: ResultFolder,
@@ -803,6 +805,7 @@ def export(
     ros: Annotated[bool, Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or for maps."""
     from pipeline.show.export import export_run

@@ -117,7 +117,7 @@ def beside_words(run: Mapping[str, Any]) -> str:
     """What stands beside every verdict: balises accepted of those on the path, availability, proof margin."""
     share, margin_m = run["availability"], run["proof_margin_m"]
     accepted = say("verdicts", "accepted", run["balises_accepted"], run["balises_on_path"])
-    available = say("verdicts", "stood") if share is None else say("verdicts", "available", share)
+    available = say("verdicts", "unmoved") if share is None else say("verdicts", "available", share)
     return ", ".join([accepted, available, *([] if margin_m is None else [say("verdicts", "margin", margin_m)])])
 
 

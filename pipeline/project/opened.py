@@ -103,6 +103,7 @@ def values_for(command: str, opened: Opened) -> dict[str, Any]:
         "replay": {"runs": opened.runs(), "site": site, "out": out, **settings, **_replay_values(opened)},
         "report": {"out": out, "site": site},
         "sql": {"out": out},
+        "export": {"out": out, "site": site, "config": opened.config_file},
         "verify": {"out": out, "site": site, "route": route, **settings},
         "safety": {"out": out, "site": site, "vehicle": opened.vehicle_file},
         "line": {"out": out, "site": site, **_line_values(opened)},

@@ -88,7 +88,7 @@ def balises_of_list(
     Raises `SiteError` for a balise that no track, or more than one, can be meant for.
     """
     place = str(path)
-    table = placed_table(place, content_of_survey(path), epsg, config.site)
+    table = placed_table(place, content_of_survey(path, config.survey), epsg, config.site)
     track = track_of(network.track)
     if "balise_id" not in table.columns:
         table = table.with_columns(balise_id=pl.Series([f"B{row}" for row in range(1, table.height + 1)]))

@@ -9,13 +9,13 @@ import polars as pl
 
 from pipeline.make.survey.geojson_lines import read_geojson
 from pipeline.make.survey.map_files import MAP_SUFFIXES, read_map
-from pipeline.make.survey.pieces import MOST_BYTES, Survey, piece_of, with_own_names
+from pipeline.make.survey.pieces import Survey, piece_of, refuse_large, with_own_names
 from pipeline.make.survey.tables import read_points
 from pipeline.make.survey.xml_lines import read_kmz, read_xml
 from pipeline.read.ingest.run import read_run
 from pipeline.stages.matching.fixes import fixes_of
 from pipeline.stages.matching.steps import believable, travelled
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, SurveyConfig, Vehicle
 from schemas.enums import Fix
 from schemas.errors import SiteError
 
@@ -40,12 +40,12 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
     if path.is_dir() or suffix == ".mcap":
         return read_recorded(path, vehicle, config)
     place = str(path)
-    data = content_of_survey(path)
+    data = content_of_survey(path, config.survey)
     match suffix:
         case ".gpx" | ".kml":
             return read_xml(place, path.stem, data)
         case ".kmz":
-            return read_kmz(place, path.stem, data)
+            return read_kmz(place, path.stem, data, config.survey)
         case ".geojson" | ".json":
             return read_geojson(place, path.stem, data, config.site)
         case ".csv" | ".txt" | ".parquet":
@@ -55,13 +55,12 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
     raise SiteError("is no survey that is known", place=place, found=suffix or "no suffix", expected=_KINDS)
 
 
-def content_of_survey(path: Path) -> bytes:
+def content_of_survey(path: Path, config: SurveyConfig) -> bytes:
     """The file, unless it is too large to be one."""
     try:
         if not path.is_file():
             raise SiteError("is no regular file", place=str(path))
-        if path.stat().st_size > MOST_BYTES:
-            raise SiteError("is too large", place=str(path), expected=f"at most {MOST_BYTES // 1_000_000} MB")
+        refuse_large(path.stat().st_size, str(path), config)
         return path.read_bytes()
     except OSError as error:
         raise SiteError(f"cannot be read: {error.strerror}", place=str(path)) from None
