@@ -306,7 +306,7 @@ def run(
     out = opened.place(opened.project.out)
     files = (("vehicle", opened.vehicle_file), ("config", opened.config_file))
     named = "".join(f" --{name} {file}" for name, file in files if file)
-    places = {"site": opened.place(opened.project.site), "options": named}
+    places = {"site": opened.place(opened.project.site), "options": named, **opened.words}
     pages = None if quiet or as_json else how_far("pages")
     at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
     call = Call(_steps(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)

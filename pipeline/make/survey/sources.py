@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from pipeline.make.receivers import as_run, gather
+from pipeline.make.receivers.convert import UnknownError
 from pipeline.make.survey.geojson_lines import read_geojson
 from pipeline.make.survey.map_files import MAP_SUFFIXES, read_map
 from pipeline.make.survey.pieces import Survey, piece_of, refuse_large, with_own_names
@@ -18,10 +20,11 @@ from pipeline.stages.matching.steps import believable, travelled
 from schemas.config import Configuration, SurveyConfig, Vehicle
 from schemas.enums import Fix
 from schemas.errors import SiteError
+from schemas.run import RunLog
 
 # A variance of zero means "not known" in a `gnss` stream.
 _LEAST_SIGMA_M = 1e-3
-_KINDS = "GPX, KML, KMZ, GeoJSON, GeoPackage, Shapefile, FlatGeobuf, CSV, Parquet, or a run with a reference"
+_KINDS = "GPX, KML, KMZ, GeoJSON, GeoPackage, Shapefile, FlatGeobuf, CSV, Parquet, a run, or a log of RTK"
 
 
 def read_surveys(paths: list[Path], epsg: int | None, vehicle: Vehicle, config: Configuration) -> Survey:
@@ -52,7 +55,17 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
             return read_points(place, path.stem, data, epsg, config.site)
         case _ if suffix in MAP_SUFFIXES:
             return read_map(path, data)
-    raise SiteError("is no survey that is known", place=place, found=suffix or "no suffix", expected=_KINDS)
+    return _of_receiver(path, vehicle, config)
+
+
+def _of_receiver(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
+    """The line of a drive as a receiver recorded it."""
+    try:
+        run = as_run(gather([path], config.ingest), path.stem, correct=config.ingest.correct).run
+    except UnknownError:
+        found = path.suffix.lower() or "no suffix"
+        raise SiteError("is no survey that is known", place=str(path), found=found, expected=_KINDS) from None
+    return _of_run(run, path, vehicle, config)
 
 
 def content_of_survey(path: Path, config: SurveyConfig) -> bytes:
@@ -71,7 +84,10 @@ def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey
 
     Raises `InputError` where the run cannot be read, `SiteError` where it has no position better than GNSS alone.
     """
-    run = read_run(str(path), config.ingest, with_digest=False)
+    return _of_run(read_run(str(path), config.ingest, with_digest=False), path, vehicle, config)
+
+
+def _of_run(run: RunLog, path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
     points = run.reference
     if points is None:
         fixed = run.gnss.filter(pl.col("fix").cast(pl.String) == Fix.RTK_FIXED.value)

@@ -9,7 +9,6 @@ import polars as pl
 
 from pipeline.read.ingest import novatel
 from pipeline.read.ingest.recipe import Recipe, deviations, fix_from, unless
-from schemas.enums import Fix
 
 # Of the messages of one receiver, as for its own files: the position of the receiver before that of the inertial unit.
 _RECEIVER = 2
