@@ -164,13 +164,12 @@ def test_a_vehicle_is_measured_once_and_used(project: Path, capsys: pytest.Captu
 
 
 def test_each_run_is_calibrated_on_the_others(project: Path, small_trial: SmallTrial) -> None:
-    shutil.copytree(small_trial.paths[1], project / "runs" / "run1")
-    (project / "config.toml").write_text("[calibration]\nleast_runs = 1\n")
-    text = 'config = "config.toml"\n[replay]\nruns = ["runs"]\ncalibrate = ["runs"]\n'
-    (project / "balise.toml").write_text(text)
+    for number in (1, 2):
+        shutil.copytree(small_trial.paths[number], project / "runs" / f"run{number}")
+    (project / "balise.toml").write_text('[replay]\nruns = ["runs"]\ncalibrate = ["runs"]\n')
     assert call("run", "-q") == 0
     rows = pl.read_parquet(project / "result/campaign/runs.parquet").select("run_id", "calibrated_by").rows()
-    assert dict(rows)["run1"] == ["run0"]
+    assert dict(rows)["run1"] == ["run0", "run2"]
 
 
 def test_an_interrupted_conversion_goes_on(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
