@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import shlex
 import signal
 import sys
 import traceback
@@ -166,15 +167,16 @@ def replay(
     plan = make_plan(runs, site, out, settings, _vehicle(vehicle), route, write_route, given)
     plan = _calibrated(plan, calibrate, jobs, quiet) if calibrate else plan
     shown = watches(quiet, as_json)
-    options = "".join(f" --{name} {file}" for name, file in (("vehicle", vehicle), ("config", config)) if file)
-    places = {"site": site, "options": options}
+    settings_given = (("vehicle", vehicle), ("config", config))
+    options = "".join(f" --{name} {shlex.quote(str(file))}" for name, file in settings_given if file)
+    places: dict[str, str] = {"site": site, "options": options}
     try:
         summary = run_campaign(
             plan, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit, watches=shown
         )
     except Interrupted as interrupted:
         raise _stopped(interrupted, out, quiet, as_json, places) from None
-    show_summary(summary, out, quiet, as_json, **places)
+    show_summary(summary, out, quiet, as_json, has_pages=False, **places)
     raise Exit(_status_of(summary, fail_on))
 
 
@@ -195,7 +197,7 @@ def _stopped(interrupted: Interrupted, out: str, quiet: bool, as_json: bool, pla
     # A terminal that was closed takes no more words.
     with contextlib.suppress(OSError):
         if interrupted.summary is not None:
-            show_summary(interrupted.summary, out, quiet, as_json, **places)
+            show_summary(interrupted.summary, out, quiet, as_json, has_pages=False, **places)
         print("balise: interrupted; repeat the command to continue", file=sys.stderr)
     return Exit(128 + interrupted.signum)
 
@@ -305,7 +307,7 @@ def run(
     options = opened.project.replay
     out = opened.place(opened.project.out)
     files = (("vehicle", opened.vehicle_file), ("config", opened.config_file))
-    named = "".join(f" --{name} {file}" for name, file in files if file)
+    named = "".join(f" --{name} {shlex.quote(str(file))}" for name, file in files if file)
     places = {"site": opened.place(opened.project.site), "options": named, **opened.words}
     pages = None if quiet or as_json else how_far("pages")
     at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
@@ -317,7 +319,7 @@ def run(
     if as_json:
         _print_json({**summary_answer(ended.summary, out), "page": ended.page, "changed": ended.changed})
     else:
-        show_summary(ended.summary, out, quiet, False, **places)
+        show_summary(ended.summary, out, quiet, False, has_pages=ended.page is not None, **places)
     if not (quiet or as_json):
         print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
     raise Exit(_status_of(ended.summary, options.fail_on))

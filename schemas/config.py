@@ -268,8 +268,8 @@ class AlignConfig(Settings):
     fastest_mps: Positive = 200.0
     bunched_stamps_m: NonNegative = 20.0
     reset_back_m: NonNegative = 5.0
-    # Over a reset between two rows the speed about it counts where no braking changes the way by more than this, as at
-    # 1 Hz: a tenth of the odometer's fixed error.
+    # Over a reset between two rows the speed about it counts where braking x dt^2 / 4 is no more than this, as at 1 Hz:
+    # a tenth of the odometer's fixed error.
     reset_doubt_m: NonNegative = 0.5
     # Speeds give the distance over such a jump if, over the whole run, they differ from it by a smaller share:
     # another unit or sign differs by more than a half, slip and scale by some percent.

@@ -6,6 +6,7 @@ a column or a verdict changing (`tests/replay/test_rewording.py`).
 
 from __future__ import annotations
 
+import shlex
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -118,7 +119,7 @@ def beside_words(run: Mapping[str, Any]) -> str:
     """What stands beside every verdict: balises accepted of those on the path, availability, proof margin."""
     share, margin_m = run["availability"], run["proof_margin_m"]
     accepted = say("verdicts", "accepted", run["balises_accepted"], run["balises_on_path"])
-    available = say("verdicts", "unmoved") if share is None else say("verdicts", "available", share)
+    available = say("verdicts", "no_motion") if share is None else say("verdicts", "available", share)
     return ", ".join([accepted, available, *([] if margin_m is None else [say("verdicts", "margin", margin_m)])])
 
 
@@ -154,5 +155,7 @@ def remedy_words(remedy: Remedy | str, **places: str) -> str:
     """What would mend it, with the command that does; `places`: paths known where it is shown, with `project` the keys
     of that file in place of options.
     """
+    plain = ("options", "of_project", "again")
+    quoted = {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
     words = REMEDIES_OF_PROJECT if "project" in places else REMEDIES
-    return words[Remedy(remedy)].format(**PLACES | places)
+    return words[Remedy(remedy)].format(**PLACES | quoted)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ import pytest
 
 import cli
 from pipeline.project.convert import run_of_logs
+from pipeline.project.made import Product, Record
 from pipeline.project.opened import Opened
 from schemas.enums import Remedy
+from schemas.errors import InputError, UsageError
 from schemas.project import Project
 from schemas.words import remedy_words
 from tests.conftest import SmallTrial
@@ -136,6 +139,52 @@ def test_a_run_taken_out_is_no_part_of_the_figures(project: Path, small_trial: S
     assert call("run", "-q", "--prune") == 0
     assert pl.read_parquet(project / "result/campaign/runs.parquet")["run_id"].unique().to_list() == ["run1"]
     assert call("verify", "-q") == 0
+
+
+def test_runs_taken_out_are_removed_from_compact_files(project: Path, small_trial: SmallTrial) -> None:
+    shutil.copytree(small_trial.paths[1], project / "runs" / "run1")
+    (project / "balise.toml").write_text('[replay]\nruns = ["runs"]\n')
+    assert call("run", "-q") == 0
+    assert call("compact", "-q", "result") == 0
+    (project / "balise.toml").write_text('[replay]\nruns = ["runs/run1"]\n')
+    assert call("run", "-q") == 2
+    assert call("run", "-q", "--prune") == 0
+    assert pl.read_parquet(project / "result/campaign/runs.parquet")["run_id"].unique().to_list() == ["run1"]
+    assert call("verify", "-q") == 0
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_killed_before_it_is_noted_a_product_is_made_again(tmp_path: Path, known: bool) -> None:
+    """Files that the killed call left are nobody else's; a file that a failing call did not touch may be."""
+    made = tmp_path / "runs/a.parquet"
+    made.parent.mkdir()
+
+    def make(content: bytes, error: BaseException | None = None) -> Callable[[], list[Path]]:
+        def making() -> list[Path]:
+            if content:
+                made.write_bytes(content)
+            if error is not None:
+                raise error
+            return [made]
+
+        return making
+
+    if known:
+        Record(tmp_path).bring(Product("run a", made, "old"), make(b"old"))
+    with pytest.raises(Killed):
+        Record(tmp_path).bring(Product("run a", made, "new"), make(b"ha", Killed()))
+    assert Record(tmp_path).bring(Product("run a", made, "new"), make(b"half"))
+    assert not Record(tmp_path).bring(Product("run a", made, "new"), make(b"no"))
+    with pytest.raises(InputError):
+        Record(tmp_path).bring(Product("run a", made, "third"), make(b"", InputError("damaged", place="log")))
+    made.write_bytes(b"by hand")
+    with pytest.raises(UsageError, match="was changed"):
+        Record(tmp_path).bring(Product("run a", made, "third"), make(b"no"))
+    assert made.read_bytes() == b"by hand"
 
 
 def test_unknown_keys_are_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,6 +23,7 @@ from schemas.conform import conform
 from schemas.experiment import ExperimentBanks, ExperimentCells, ExperimentPlaces, ExperimentPmd
 
 _PMD_STEPS = 40
+_QUANTILES = {"median": 0.5, "p95": 0.95, "max": 1.0}
 # Shares of few passes are whole numbers of them but for rounding.
 _ROUNDING = 1e-9
 
@@ -81,7 +82,7 @@ def cells_table(
 def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, plan: RecordedPlan) -> Row:
     noticed = int(frame["noticed"].sum())
     independent = passes(frame, plan.pass_s)
-    failed = frame.drop_nulls("time_to_failure_s")
+    failed = _failed(frame)
     missed = _missed(failed, 0.0, "time_since_failure_may_s")
     short = cell.count - frame.height - lost.height
     reason = f"{short} found no room in the runs" if short else None
@@ -124,11 +125,19 @@ def _names(cell: Cell, bank: str) -> Row:
 def _time_to_detect(frame: pl.DataFrame, independent: int) -> Row:
     """Quantiles of T_D; the median's bounds by order statistics of the passes."""
     times_s = np.sort(frame["time_to_detect_s"].fill_null(np.inf).to_numpy())
+    bounds = _median_bounds(times_s, independent)
+    quantiles = {f"time_to_detect_{name}_s": _quantile(times_s, share) for name, share in _QUANTILES.items()}
+    return {**quantiles, "time_to_detect_median_low_s": bounds[0], "time_to_detect_median_high_s": bounds[1]}
+
+
+def _median_bounds(times_s: Floats, independent: int) -> tuple[float | None, float | None]:
+    """None of fewer than six passes: the least and the largest of five enclose the median with 93.75 % only."""
     tail = (1.0 - CONFIDENCE) / 2.0
-    below = max(int(binom.ppf(tail, independent, 0.5)) - 1, 0) / independent if independent else 0.0
-    names = ("median", "median_low", "median_high", "p95", "max")
-    shares = (0.5, below, 1.0 - below, 0.95, 1.0)
-    return {f"time_to_detect_{name}_s": _quantile(times_s, share) for name, share in zip(names, shares, strict=True)}
+    order = int(binom.ppf(tail, independent, 0.5)) if independent else 0
+    if order < 1:
+        return None, None
+    below = (order - 1) / independent
+    return _quantile(times_s, below), _quantile(times_s, 1.0 - below)
 
 
 def _quantile(ordered: Floats, share: float) -> float | None:
@@ -137,6 +146,13 @@ def _quantile(ordered: Floats, share: float) -> float | None:
         return None
     value = float(ordered[max(int(np.ceil(share * ordered.size - _ROUNDING)) - 1, 0)])
     return value if np.isfinite(value) else None
+
+
+def _failed(frame: pl.DataFrame) -> pl.DataFrame:
+    """Positions that certainly failed, and those that may have and were not noticed by then: none of these vanishes."""
+    late = pl.col("time_since_failure_may_s").fill_null(np.inf) > 0.0
+    certain = pl.col("time_to_failure_s").is_not_null()
+    return frame.filter(certain | (pl.col("time_to_failure_may_s").is_not_null() & late))
 
 
 def _missed(failed: pl.DataFrame, time_s: float, since: str) -> int:
@@ -152,7 +168,7 @@ def pmd_table(
 
 
 def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPlan) -> Iterator[Row]:
-    failed = injections.filter(bank=bank, cell=cell.name).drop_nulls("time_to_failure_s")
+    failed = _failed(injections.filter(bank=bank, cell=cell.name))
     if failed.is_empty():
         return
     independent = passes(failed, plan.pass_s)
@@ -165,14 +181,15 @@ def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPla
             "passes": independent,
             "missed": missed,
             **bounded_share("pmd", missed, failed.height, independent),
-            "missed_certain": _missed(failed, time_s, "time_since_failure_s"),
+            "missed_certain": _missed(failed.drop_nulls("time_to_failure_s"), time_s, "time_since_failure_s"),
         }
 
 
 def _times_since_failure_s(failed: pl.DataFrame) -> Floats:
     """From the onset, as far before the failure as it lies in the median, to where the first watch ends."""
-    before_s = float(np.median(floats(failed, "time_to_failure_s")))
-    after_s = float((failed["watched_s"] - failed["time_to_failure_s"]).min())  # type: ignore[arg-type]
+    failure_s = failed["time_to_failure_s"].fill_null(failed["time_to_failure_may_s"])
+    before_s = float(np.median(failure_s.to_numpy()))
+    after_s = float((failed["watched_s"] - failure_s).min())  # type: ignore[arg-type]
     times = np.concatenate(
         [np.linspace(-before_s, 0.0, _PMD_STEPS + 1), np.linspace(0.0, after_s, _PMD_STEPS // 2 + 1)]
     )
@@ -220,7 +237,7 @@ def banks_table(
 
 
 def _bank_row(frame: pl.DataFrame, quiet: Quiet, cells: pl.DataFrame, plan: RecordedPlan) -> Row:
-    failed = frame.drop_nulls("time_to_failure_s")
+    failed = _failed(frame)
     independent = passes(failed, plan.pass_s)
     missed = _missed(failed, 0.0, "time_since_failure_may_s")
     slowest = cells.filter(pl.col("injections") > 0).sort(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from datetime import date
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import polars as pl
 
@@ -149,9 +149,9 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
                 except UnknownError as error:
                     if plain == log:
                         raise
-                    strangers.append(error)
+                    strangers.append(_in_archive(error, plain, log))
                 except NoEpochError as error:
-                    failures.append(error)
+                    failures.append(error if plain == log else _in_archive(error, plain, log))
                 else:
                     parts.append((log if plain == log else log / plain.name, found.streams))
                     held.append(found.corrections)
@@ -176,6 +176,15 @@ def _common(
             own = [correction for correction in made if correction.stream == name]
             _refuse_unlike(common.setdefault(name, own), own, name, log)
     return tuple(correction for own in common.values() for correction in own)
+
+
+E = TypeVar("E", bound=InputError)
+
+
+def _in_archive(error: E, plain: Path, log: Path) -> E:
+    """An error that is told when the folder where an archive was unpacked is gone."""
+    error.place = str(error.place).replace(str(plain), str(log / plain.name))
+    return error
 
 
 class NoEpochError(InputError):
@@ -300,7 +309,8 @@ def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputErr
     """What there is in place of positions tells what to change at the receiver."""
     met = Counter(name_of(frame) for frame in frames(content, lambda: None))
     if not met:
-        hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, content)), _OTHER)
+        head = content[:_HEAD]
+        hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, head)), _OTHER)
         return UnknownError(
             "holds no message of a known receiver" if content else "is empty",
             place=str(log),
@@ -354,6 +364,8 @@ _ALMOST = {
     rb"\A\s*\d{4}(/\d\d/\d\d|\s+\d+\.\d+\s)": "If it is of RTKLIB, let it write its header (out-outhead = on).",
 }
 _MOST_NAMES = 20
+# Where a hint is looked for: what begins with gigabytes of something else is no such file.
+_HEAD = 1024 * 1024
 _UNFIT = "message that does not fit its definition"
 
 

@@ -25,6 +25,7 @@ from schemas.run import RunLog
 # A variance of zero means "not known" in a `gnss` stream.
 _LEAST_SIGMA_M = 1e-3
 _KINDS = "GPX, KML, KMZ, GeoJSON, GeoPackage, Shapefile, FlatGeobuf, CSV, Parquet, a run, or a log of RTK"
+_RECORDED = "A recorded drive becomes one by `balise convert LOG --out DRIVE --stream reference`."
 
 
 def read_surveys(paths: list[Path], epsg: int | None, vehicle: Vehicle, config: Configuration) -> Survey:
@@ -64,7 +65,9 @@ def _of_receiver(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
         run = as_run(gather([path], config.ingest), path.stem, correct=config.ingest.correct).run
     except UnknownError:
         found = path.suffix.lower() or "no suffix"
-        raise SiteError("is no survey that is known", place=str(path), found=found, expected=_KINDS) from None
+        raise SiteError(
+            "is no survey that is known", place=str(path), found=found, expected=_KINDS, remedy=_RECORDED
+        ) from None
     return _of_run(run, path, vehicle, config)
 
 

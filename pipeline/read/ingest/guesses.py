@@ -16,6 +16,8 @@ COLUMNS: Mapping[Stream, Mapping[str, str]] = _FILE["columns"]
 SURVEY: Mapping[str, str] = _FILE["survey"] | {
     name: COLUMNS["gnss"][name] for name in ("latitude_deg", "longitude_deg")
 }
+BALISE_LIST: Mapping[str, list[str]] = _FILE["balise_list"]
+BALISE_KINDS: Mapping[str, str] = _FILE["balise_kinds"]
 WORDS: Mapping[str, str] = _FILE["words"]
 UNITS: Mapping[str, float] = _FILE["units"]
 _POSITION = {"latitude_deg", "longitude_deg"}
