@@ -55,8 +55,9 @@ class _OfProject(TyperCommand):
 
             named = given.pop("project", None)
             missing = [option.name for option in self.params if given.get(option.name or "") in (None, [], ())]
-            # A single word is the query, though the result comes first.
-            shifted = self.name == "sql" and "query" in missing and "out" not in missing
+            # A single word is the query or the run, though the result comes first.
+            second = {"sql": "query", "export": "run"}.get(self.name or "")
+            shifted = second in missing and "out" not in missing
             missing = ["out"] if shifted else missing
             say = None if given.get("quiet") else _say
             ctx.default_map = taken_from_project(named, self.name or "", missing, say)
@@ -307,7 +308,7 @@ def run(
     out = opened.place(opened.project.out)
     files = (("vehicle", opened.vehicle_file), ("config", opened.config_file))
     named = "".join(f" --{name} {shlex.quote(str(file))}" for name, file in files if file)
-    places = {"site": opened.place(opened.project.site), "options": named}
+    places = {"site": opened.place(opened.project.site), "options": named, **opened.words}
     pages = None if quiet or as_json else how_far("pages")
     at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
     call = Call(_steps(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)
@@ -792,6 +793,7 @@ def line(
 @_command(
     "balise export week12 monday --out monday.mcap --site line9",
     "balise export week12 monday --out monday.gpkg --site line9",
+    of_project=True,
 )
 def export(
     out: ResultFolder,
@@ -805,6 +807,7 @@ def export(
     ros: Annotated[bool, Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or for maps."""
     from pipeline.show.export import export_run

@@ -74,6 +74,12 @@ class StreamCorrection(Settings):
     shift_north_m: Shift = 0.0
     shift_up_m: Shift = 0.0
 
+    @property
+    def changes(self) -> str:
+        """What it changes, in the words of the configuration."""
+        changed = self.model_dump(exclude_defaults=True, exclude={"stream"})
+        return ", ".join(f"{name} {value}" for name, value in changed.items())
+
 
 class IngestConfig(Settings):
     """Which topics feed which stream (empty: recognised by schema name), and limits of plausible values."""
@@ -566,6 +572,8 @@ class SiteConfig(Settings):
 class SurveyConfig(Settings):
     """A site from a survey of the line (`balise site`)."""
 
+    # 100 MB hold some two million points: more is no line that a person checks.
+    size_limit_mb: Annotated[Number, Field(gt=0, le=100_000)] = 100.0
     # Two places that are nearer are one; maps write seven decimals of a degree, 1 cm.
     same_place_m: Positive = 0.05
     # Tracks lie 3.5 m and more apart, RTK scatters by centimetres: lines that are nearer are one track.

@@ -45,6 +45,7 @@ MISFIT_PLACES = _sentences(MisfitPlace, "misfit_places")
 LOST = _sentences(LostTo, "lost")
 NOT_SHOWN = _sentences(NotShown, "not_shown")
 REMEDIES = _sentences(Remedy, "remedies")
+REMEDIES_OF_PROJECT = REMEDIES | {Remedy(code): text for code, text in WORDS["remedies_of_project"].items()}
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,10 @@ PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options":
 
 
 def remedy_words(remedy: Remedy | str, **places: str) -> str:
-    """What would mend it, with the command that does; `places`: paths known where it is shown."""
-    quoted = {name: text if name == "options" else shlex.quote(text) for name, text in places.items()}
-    return REMEDIES[Remedy(remedy)].format(**PLACES | quoted)
+    """What would mend it, with the command that does; `places`: paths known where it is shown, with `project` the keys
+    of that file in place of options.
+    """
+    plain = ("options", "of_project", "again")
+    quoted = {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
+    words = REMEDIES_OF_PROJECT if "project" in places else REMEDIES
+    return words[Remedy(remedy)].format(**PLACES | quoted)

@@ -20,7 +20,7 @@ from pipeline.project.opened import Opened, named_from
 from pipeline.project.rides import Ride, rides_of, stem_of
 from pipeline.project.run import wish_for
 from pipeline.read.ingest import read_run
-from pipeline.read.ingest.correct import corrected
+from pipeline.read.ingest.correct import corrected_further
 from pipeline.read.site.read import read_site
 from pipeline.studies.plausibility.check import CONFIGURATION, FitState
 from pipeline.studies.plausibility.report import FitReport, fit_report
@@ -261,7 +261,7 @@ def _checked(
             sentences = [text.replace(say("misfit_places", "in_stream", "GNSS"), mine) for text in sentences]
         found += [sentence for sentence in sentences if sentence not in found]
         corrections += fresh
-        run = corrected(run, fresh)
+        run = corrected_further(run, fresh)
     if not corrections:
         return None, entry
     accepted = accept(ride.run_id, found, correction_lines(corrections))

@@ -45,6 +45,8 @@ class PreparedRun:
             fixes = self.run.gnss.filter(pl.col("solution") == solution)
             require_two_times(fixes, "gnss", f" of solution {solution!r}")
             require_one_journey(fixes, f"gnss of solution {solution!r}", self.config.ingest)
+            # Solutions come one after the other: the last one alone is kept.
+            self._fixes.clear()
             self._fixes[solution] = fixes
         return self._fixes[solution]
 

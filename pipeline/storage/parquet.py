@@ -36,11 +36,14 @@ def parquet_bytes(
 
     `columns`: what stands in the fields beside what polars notes of its own types (enums).
     """
-    table = frame.rechunk().to_arrow()
     notes = columns or {}
-    fields = [field.with_metadata({**(field.metadata or {}), **notes.get(field.name, {})}) for field in table.schema]
-    schema = pa.schema(fields, metadata=dict(sorted((metadata or {}).items())) or None)
-    return encoded(table.cast(schema))
+    plain = frame.clear().to_arrow().schema
+    fields = [field.with_metadata({**(field.metadata or {}), **notes.get(field.name, {})}) for field in plain]
+    writer = GroupedWriter(pa.schema(fields, metadata=dict(sorted((metadata or {}).items())) or None), _ROWS_PER_GROUP)
+    # A row group at a time: the table is never there twice.
+    for first in range(0, max(frame.height, 1), _ROWS_PER_GROUP):
+        writer.add(frame.slice(first, _ROWS_PER_GROUP).rechunk().to_arrow().cast(writer.schema))
+    return writer.content()
 
 
 def encoded(table: pa.Table) -> bytes:
@@ -57,6 +60,7 @@ class GroupedWriter:
     """
 
     def __init__(self, schema: pa.Schema, rows_per_group: int) -> None:
+        self.schema = schema
         self._rows_per_group = rows_per_group
         self._buffer = io.BytesIO()
         self._waiting: list[pa.Table] = []

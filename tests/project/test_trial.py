@@ -137,7 +137,7 @@ def test_wrong_calls(raw: Path, arguments: list[str], message: str, capsys: pyte
 def test_corrections_are_proposed_and_accepted(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (raw / "raw" / "still.nmea").write_text(nmea(100, acceleration_mps2=0.2))
     rows = (f"2025-03-03T10:{12 + s // 60:02d}:{s % 60:02d}Z;{1e-4 * s**2:.5f}" for s in range(100))
-    (raw / "raw" / "plc.csv").write_text("time;km\n" + "\n".join(rows) + "\n")
+    (raw / "raw" / "plc.csv").write_text("time;dist\n" + "\n".join(rows) + "\n")
     base = ("trial", "raw", "--track", "line.gpx", "--json")
     assert call(*base, "--to", "asked") == 0
     (proposed,) = json.loads(capsys.readouterr().out)["corrections"]
@@ -149,6 +149,38 @@ def test_corrections_are_proposed_and_accepted(raw: Path, capsys: pytest.Capture
     (correction,) = written(raw / "yes").convert[0].correct
     assert (correction.stream, correction.factors) == ("odometer", {"distance_m": 1000.0})
     assert call("run", "--project", "yes") == 0
+
+
+@pytest.mark.parametrize("answer", [True, False])
+def test_corrections_are_asked_for_on_a_terminal(
+    raw: Path, answer: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (raw / "raw" / "still.nmea").write_text(nmea(100, acceleration_mps2=0.2))
+    rows = (f"2025-03-03T10:{12 + s // 60:02d}:{s % 60:02d}Z;{1e-4 * s**2:.5f}" for s in range(100))
+    (raw / "raw" / "plc.csv").write_text("time;dist\n" + "\n".join(rows) + "\n")
+    asked: list[str] = []
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr(cli, "confirm", lambda question, **_: asked.append(question) or answer)
+    assert call("trial", "raw", "--track", "line.gpx", "--to", "week12") == 0
+    assert asked == ["Accept these corrections?"]
+    assert "still does not fit as recorded:" in capsys.readouterr().err
+    assert bool(written(raw / "week12").convert[0].correct) is answer
+
+
+def test_a_drive_recorded_with_rtk_is_the_line(raw: Path) -> None:
+    rows = (f"2025/03/03 10:12:{s:02d}.000 {50.01 + s * 1e-4:.9f} 14.000000000 250.0 1 8\n" for s in range(40))
+    head = "%  UTC                  latitude(deg) longitude(deg)  height(m)   Q  ns\n"
+    (raw / "drive.pos").write_text(head + "".join(rows))
+    assert call("trial", "raw", "--track", "drive.pos", "--to", "week12") == 0
+    assert written(raw / "week12").track.survey == ("../drive.pos",)  # type: ignore[union-attr]
+    assert call("run", "--project", "week12") in (0, 1)
+    assert (raw / "week12/site/track.parquet").exists()
+
+
+def test_a_column_called_by_its_unit_counts_in_it(raw: Path) -> None:
+    (raw / "raw" / "plc.csv").write_text("time;km\n2025-03-03T10:12:00Z;0.0\n2025-03-03T10:12:39Z;0.0\n")
+    assert call("trial", "raw", "--track", "line.gpx", "--to", "week12") == 0
+    assert written(raw / "week12").convert[0].logs[1].odometer[0].factors == {"distance_m": 1000.0}
 
 
 def test_a_logger_of_local_time_is_corrected_in_all_its_streams_and_the_receiver_is_not(raw: Path) -> None:

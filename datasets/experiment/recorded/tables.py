@@ -10,14 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
+from scipy.special import betaincinv
 from scipy.stats import binom
 
 from datasets.experiment.recorded.plan import Cell, RecordedPlan
 from datasets.experiment.tables import Row
-from pipeline.stages.run_row.bounds import CONFIDENCE, UNKNOWN, clopper_pearson, columns_of, poisson_rate
+from pipeline.stages.run_row.bounds import CONFIDENCE, UNKNOWN, columns_of, poisson_rate
 from schemas.arrays import NS_PER_S, Floats, floats, times_ns
 from schemas.conform import conform
 from schemas.experiment import ExperimentBanks, ExperimentCells, ExperimentPlaces, ExperimentPmd
@@ -40,28 +42,48 @@ class Quiet:
     recorded_s: float
 
 
-def passes(frame: pl.DataFrame, pass_s: float) -> int:
-    """The largest number of watches that share no time, at least `pass_s` each: of those left the first to end."""
+class Passes(NamedTuple):
+    """Independent passes: their number, and the number of passes of equal size that they are worth."""
+
+    number: int
+    worth: float
+
+
+def passes(frame: pl.DataFrame, pass_s: float) -> Passes:
+    """The largest number of watches that share no time, at least `pass_s` each: of those left the first to end.
+
+    Passes of m injections each, with all that overlap, are worth (sum m)^2 / sum m^2 (Kish's effective sample size).
+    """
     length_ns = np.maximum(floats(frame, "watched_s"), pass_s) * NS_PER_S
     begin_ns = times_ns(frame, "t_onset")
     end_ns = begin_ns + length_ns.round().astype(np.int64)
     runs = frame["run_id"].to_list()
     free_ns: dict[str, int] = {}
-    count = 0
+    current: dict[str, int] = {}
+    sizes: list[int] = []
     for row in np.argsort(end_ns, kind="stable").tolist():
-        if begin_ns[row] >= free_ns.get(runs[row], np.iinfo(np.int64).min):
-            free_ns[runs[row]] = int(end_ns[row])
-            count += 1
-    return count
+        run = runs[row]
+        if begin_ns[row] >= free_ns.get(run, np.iinfo(np.int64).min):
+            free_ns[run] = int(end_ns[row])
+            current[run] = len(sizes)
+            sizes.append(0)
+        sizes[current[run]] += 1
+    return Passes(len(sizes), sum(sizes) ** 2 / sum(size**2 for size in sizes) if sizes else 0.0)
 
 
-def bounded_share(name: str, hits: int, trials: int, independent: int) -> Row:
-    """A share of all trials, with the bounds that as many hits among the independent ones alone would have."""
-    if not trials or not independent:
+def bounded_share(name: str, hits: int, trials: int, worth: float) -> Row:
+    """A share of all trials, with the bounds that as many hits among `worth` independent ones alone would have.
+
+    Clopper and Pearson with a number of trials that need not be whole (Korn and Graubard 1998); hits rounded outwards.
+    """
+    if not trials or not worth:
         return columns_of(name, UNKNOWN)
-    expected = hits / trials * independent
-    low = clopper_pearson(int(np.floor(expected + _ROUNDING)), independent).low
-    high = clopper_pearson(int(np.ceil(expected - _ROUNDING)), independent).high
+    tail = (1.0 - CONFIDENCE) / 2.0
+    expected = hits / trials * worth
+    least = float(np.floor(expected + _ROUNDING))
+    most = float(np.ceil(expected - _ROUNDING))
+    low = float(betaincinv(least, worth - least + 1.0, tail)) if least > 0.0 else 0.0
+    high = float(betaincinv(most + 1.0, worth - most, 1.0 - tail)) if most < worth else 1.0
     return {name: hits / trials, f"{name}_low": low, f"{name}_high": high}
 
 
@@ -93,13 +115,13 @@ def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, pl
         "not_possible": lost.height,
         "reason": "; ".join([*lost["reason"].unique().sort().to_list(), *([reason] if reason else [])]) or None,
         "watched_s": cell.watch_s,
-        "passes": independent,
+        "passes": independent.number,
         "noticed": noticed,
-        **bounded_share("noticed_share", noticed, frame.height, independent),
-        **_time_to_detect(frame, independent),
+        **bounded_share("noticed_share", noticed, frame.height, independent.worth),
+        **_time_to_detect(frame, int(independent.worth)),
         "failures": failed.height,
         "missed_at_failure": missed,
-        **bounded_share("pmd_at_failure", missed, failed.height, passes(failed, plan.pass_s)),
+        **bounded_share("pmd_at_failure", missed, failed.height, passes(failed, plan.pass_s).worth),
         "stopped": int(frame["stopped"].sum()),
         "noticed_not_stopped": int((~frame["stopped"].drop_nulls()).sum()),
         "accepted_wrong": int(frame["accepted_wrong"].sum()),
@@ -178,9 +200,9 @@ def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPla
             **_names(cell, bank),
             "time_since_failure_s": time_s,
             "trials": failed.height,
-            "passes": independent,
+            "passes": independent.number,
             "missed": missed,
-            **bounded_share("pmd", missed, failed.height, independent),
+            **bounded_share("pmd", missed, failed.height, independent.worth),
             "missed_certain": _missed(failed.drop_nulls("time_to_failure_s"), time_s, "time_since_failure_s"),
         }
 
@@ -251,11 +273,11 @@ def _bank_row(frame: pl.DataFrame, quiet: Quiet, cells: pl.DataFrame, plan: Reco
         **columns_of("alarm_rate", poisson_rate(quiet.alarms, quiet.hours), "_per_h"),
         "tvb_share": quiet.tvb_s / quiet.recorded_s if quiet.recorded_s else None,
         "injections": frame.height,
-        "passes": independent,
+        "passes": independent.number,
         "noticed": int(frame["noticed"].sum()),
         "failures": failed.height,
         "missed_at_failure": missed,
-        **bounded_share("pmd_at_failure", missed, failed.height, independent),
+        **bounded_share("pmd_at_failure", missed, failed.height, independent.worth),
         "slowest_cell": slowest["cell"].first() if slowest.height else None,
         "noticed_not_stopped": int((~frame["stopped"].drop_nulls()).sum()),
         "accepted_wrong": int(frame["accepted_wrong"].sum()),

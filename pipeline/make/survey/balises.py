@@ -89,7 +89,7 @@ def balises_of_list(
     Raises `SiteError` for a balise that no track, or more than one, can be meant for.
     """
     place = str(path)
-    table = placed_table(place, content_of_survey(path), epsg, config.site)
+    table = placed_table(place, content_of_survey(path, config.survey), epsg, config.site)
     track = track_of(network.track)
     table = _with_names_and_kinds(table, survey)
     placer = _Placer(place, network, track, survey, config.survey)
