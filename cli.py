@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from pipeline.campaign import CampaignSummary, Interrupted, Plan
     from pipeline.project.trial import Wanted
-    from schemas.config import Configuration, Vehicle
+    from schemas.config import Configuration, StreamCorrection, Vehicle
     from schemas.run import RunLog
     from schemas.run import Site as Ground
 
@@ -272,12 +272,13 @@ def _spacing(raws: list[Path], balises: str | None) -> tuple[list[Path], str | N
 def _write_project(wanted: Wanted, folder: Path, accept: bool, force: bool, as_json: bool) -> None:
     from datasets.recordings import recordings
     from pipeline.project.init import answer_of, refuse_existing, words_of, write_project
-    from pipeline.project.trial import draft_project
+    from pipeline.project.trial import correction_lines, draft_project
 
-    def asked(run_id: str, found: Sequence[str], lines: Sequence[str]) -> bool:
+    def asked(run_id: str, found: Sequence[str], corrections: Sequence[StreamCorrection]) -> bool:
         if accept or as_json or not sys.stdin.isatty():
-            return accept
-        _say("\n".join([f"\n{run_id} does not fit as recorded:", *found, *lines]))
+            # Moved positions could hide what the program is to find: only a person takes that.
+            return accept and not any(correction.moves for correction in corrections)
+        _say("\n".join([f"\n{run_id} does not fit as recorded:", *found, *correction_lines(corrections)]))
         return confirm("Accept these corrections?", err=True)
 
     refuse_existing(folder, force)

@@ -75,6 +75,11 @@ class StreamCorrection(Settings):
     shift_up_m: Shift = 0.0
 
     @property
+    def moves(self) -> bool:
+        """It moves positions: a constant error of the receiver could be meant as well as another datum."""
+        return bool(self.shift_east_m or self.shift_north_m or self.shift_up_m)
+
+    @property
     def changes(self) -> str:
         """What it changes, in the words of the configuration."""
         changed = self.model_dump(exclude_defaults=True, exclude={"stream"})

@@ -71,8 +71,8 @@ class Drafted:
     remarks: list[str] = field(default_factory=list)
 
 
-Accept = Callable[[str, Sequence[str], Sequence[str]], bool]
-"""Asked once per run: its id, what does not fit, and the lines that would mend it."""
+Accept = Callable[[str, Sequence[str], Sequence[StreamCorrection]], bool]
+"""Asked once per run: its id, what does not fit, and the corrections that would mend it."""
 
 
 def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: Accept) -> Drafted:
@@ -264,7 +264,7 @@ def _checked(
         run = corrected_further(run, fresh)
     if not corrections:
         return None, entry
-    accepted = accept(ride.run_id, found, correction_lines(corrections))
+    accepted = accept(ride.run_id, found, corrections)
     proposal = Proposal(ride.run_id, tuple(found), tuple(corrections), accepted)
     return proposal, entry.model_copy(update={"correct": tuple(corrections)}) if accepted else entry
 

@@ -11,7 +11,7 @@ import pytest
 import cli
 from pipeline.project.looking import SeenLog, StreamSpan, look_at_dates
 from pipeline.project.rides import rides_of
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, StreamCorrection
 from schemas.project import Project, load_project
 from tests.conftest import SmallTrial
 from tests.project.test_run import nmea
@@ -149,6 +149,19 @@ def test_corrections_are_proposed_and_accepted(raw: Path, capsys: pytest.Capture
     (correction,) = written(raw / "yes").convert[0].correct
     assert (correction.stream, correction.factors) == ("odometer", {"distance_m": 1000.0})
     assert call("run", "--project", "yes") == 0
+
+
+def test_nobody_but_a_person_accepts_that_positions_are_moved(
+    raw: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another datum, or a receiver that is wrong by as much: the survey alone cannot tell."""
+    moved = StreamCorrection(stream="gnss", shift_east_m=40.0)
+    monkeypatch.setattr("pipeline.project.trial._by_recorder", lambda *_: ([moved], None))
+    monkeypatch.setattr("pipeline.project.trial._corrections_of", lambda _: [moved])
+    assert call("trial", "raw", "--track", "line.gpx", "--json", "--to", "week12", "--accept-corrections") == 0
+    (proposed,) = json.loads(capsys.readouterr().out)["corrections"]
+    assert proposed["accepted"] is False
+    assert written(raw / "week12").convert[0].correct == ()
 
 
 @pytest.mark.parametrize("answer", [True, False])
