@@ -106,10 +106,24 @@ class Record:
                     remedy="To keep the change, delete the table that makes it from balise.toml and name the result "
                     "(`site`, or `runs` under [replay]); to make it again, use --force.",
                 )
+            added = [name for name in _names(product) if name not in known.files]
+            if added:
+                raise UsageError(
+                    "was added since this project made what is beside it",
+                    place=str(product.above / added[0]),
+                    remedy="Name the log that it comes from in balise.toml, with its `stream`, and move the file away; "
+                    "--force removes it.",
+                )
 
 
 def _is_there(place: Path) -> bool:
     return place.is_file() or (place.is_dir() and any(place.iterdir()))
+
+
+def _names(product: Product) -> list[str]:
+    """Files in the folder of a product, as they are noted."""
+    inside = (file for file in sorted(product.place.rglob("*")) if file.is_file())
+    return [file.relative_to(product.above).as_posix() for file in inside]
 
 
 def _state(place: Path) -> str:

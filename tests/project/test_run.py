@@ -187,6 +187,22 @@ def test_killed_before_it_is_noted_a_product_is_made_again(tmp_path: Path, known
     assert made.read_bytes() == b"by hand"
 
 
+def test_a_file_that_was_added_to_a_run_is_not_removed(tmp_path: Path) -> None:
+    run = tmp_path / "runs/a"
+
+    def make() -> list[Path]:
+        run.mkdir(parents=True, exist_ok=True)
+        (run / "gnss.parquet").write_bytes(b"made")
+        return [run / "gnss.parquet"]
+
+    Record(tmp_path).bring(Product("run a", run, "old"), make)
+    (run / "reference.parquet").write_bytes(b"added")
+    assert not Record(tmp_path).bring(Product("run a", run, "old"), make)
+    with pytest.raises(UsageError, match="was added"):
+        Record(tmp_path).bring(Product("run a", run, "new"), make)
+    assert Record(tmp_path, force=True).bring(Product("run a", run, "new"), make)
+
+
 def test_unknown_keys_are_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (project / "balise.toml").write_text('[replay]\nrun = ["runs"]\n')
     assert call("run") == 2
