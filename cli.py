@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import shlex
 import signal
 import sys
 import traceback
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from pipeline.campaign import CampaignSummary, Interrupted, Plan
     from pipeline.project.trial import Wanted
-    from schemas.config import Configuration, Vehicle
+    from schemas.config import Configuration, StreamCorrection, Vehicle
     from schemas.run import RunLog
     from schemas.run import Site as Ground
 
@@ -54,8 +55,9 @@ class _OfProject(TyperCommand):
 
             named = given.pop("project", None)
             missing = [option.name for option in self.params if given.get(option.name or "") in (None, [], ())]
-            # A single word is the query, though the result comes first.
-            shifted = self.name == "sql" and "query" in missing and "out" not in missing
+            # A single word is the query or the run, though the result comes first.
+            second = {"sql": "query", "export": "run"}.get(self.name or "")
+            shifted = second in missing and "out" not in missing
             missing = ["out"] if shifted else missing
             say = None if given.get("quiet") else _say
             ctx.default_map = taken_from_project(named, self.name or "", missing, say)
@@ -165,15 +167,16 @@ def replay(
     plan = make_plan(runs, site, out, settings, _vehicle(vehicle), route, write_route, given)
     plan = _calibrated(plan, calibrate, jobs, quiet) if calibrate else plan
     shown = watches(quiet, as_json)
-    options = "".join(f" --{name} {file}" for name, file in (("vehicle", vehicle), ("config", config)) if file)
-    places = {"site": site, "options": options}
+    settings_given = (("vehicle", vehicle), ("config", config))
+    options = "".join(f" --{name} {shlex.quote(str(file))}" for name, file in settings_given if file)
+    places: dict[str, str] = {"site": site, "options": options}
     try:
         summary = run_campaign(
             plan, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit, watches=shown
         )
     except Interrupted as interrupted:
         raise _stopped(interrupted, out, quiet, as_json, places) from None
-    show_summary(summary, out, quiet, as_json, **places)
+    show_summary(summary, out, quiet, as_json, has_pages=False, **places)
     raise Exit(_status_of(summary, fail_on))
 
 
@@ -194,7 +197,7 @@ def _stopped(interrupted: Interrupted, out: str, quiet: bool, as_json: bool, pla
     # A terminal that was closed takes no more words.
     with contextlib.suppress(OSError):
         if interrupted.summary is not None:
-            show_summary(interrupted.summary, out, quiet, as_json, **places)
+            show_summary(interrupted.summary, out, quiet, as_json, has_pages=False, **places)
         print("balise: interrupted; repeat the command to continue", file=sys.stderr)
     return Exit(128 + interrupted.signum)
 
@@ -269,12 +272,13 @@ def _spacing(raws: list[Path], balises: str | None) -> tuple[list[Path], str | N
 def _write_project(wanted: Wanted, folder: Path, accept: bool, force: bool, as_json: bool) -> None:
     from datasets.recordings import recordings
     from pipeline.project.init import answer_of, refuse_existing, words_of, write_project
-    from pipeline.project.trial import draft_project
+    from pipeline.project.trial import correction_lines, draft_project
 
-    def asked(run_id: str, found: Sequence[str], lines: Sequence[str]) -> bool:
+    def asked(run_id: str, found: Sequence[str], corrections: Sequence[StreamCorrection]) -> bool:
         if accept or as_json or not sys.stdin.isatty():
-            return accept
-        _say("\n".join([f"\n{run_id} does not fit as recorded:", *found, *lines]))
+            # Moved positions could hide what the program is to find: only a person takes that.
+            return accept and not any(correction.moves for correction in corrections)
+        _say("\n".join([f"\n{run_id} does not fit as recorded:", *found, *correction_lines(corrections)]))
         return confirm("Accept these corrections?", err=True)
 
     refuse_existing(folder, force)
@@ -304,8 +308,8 @@ def run(
     options = opened.project.replay
     out = opened.place(opened.project.out)
     files = (("vehicle", opened.vehicle_file), ("config", opened.config_file))
-    named = "".join(f" --{name} {file}" for name, file in files if file)
-    places = {"site": opened.place(opened.project.site), "options": named}
+    named = "".join(f" --{name} {shlex.quote(str(file))}" for name, file in files if file)
+    places = {"site": opened.place(opened.project.site), "options": named, **opened.words}
     pages = None if quiet or as_json else how_far("pages")
     at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
     call = Call(_steps(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)
@@ -316,7 +320,7 @@ def run(
     if as_json:
         _print_json({**summary_answer(ended.summary, out), "page": ended.page, "changed": ended.changed})
     else:
-        show_summary(ended.summary, out, quiet, False, **places)
+        show_summary(ended.summary, out, quiet, False, has_pages=ended.page is not None, **places)
     if not (quiet or as_json):
         print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
     raise Exit(_status_of(ended.summary, options.fail_on))
@@ -790,6 +794,7 @@ def line(
 @_command(
     "balise export week12 monday --out monday.mcap --site line9",
     "balise export week12 monday --out monday.gpkg --site line9",
+    of_project=True,
 )
 def export(
     out: ResultFolder,
@@ -803,6 +808,7 @@ def export(
     ros: Annotated[bool, Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
     as_json: Json = False,
+    project: OfProject = None,
 ) -> None:
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or for maps."""
     from pipeline.show.export import export_run

@@ -30,8 +30,8 @@ def measure(folder: Path) -> list[Figure]:
     hour, ten = folder / "one-hour", folder / "ten-hours"
     log, site = write_cdr_trial(hour, 1.0, balises=20), hour / "site"
     with stopwatch() as command:
-        peak_mb = _command_peak_mb(log, site, hour / "command")
-    ten_mb = _command_peak_mb(write_cdr_trial(ten, 10.0, balises=200), ten / "site", ten / "out")
+        peak_mb = command_peak_mb(log, site, hour / "command")
+    ten_mb = command_peak_mb(write_cdr_trial(ten, 10.0, balises=200), ten / "site", ten / "out")
     return [
         *_log_to_tables(log, site, hour / "out", "speed alone"),
         *_log_to_tables(filled(log), site, hour / "out-filled", "all fields"),
@@ -64,7 +64,7 @@ def _log_to_tables(log: Path, site: Path, out: Path, what: str) -> list[Figure]:
     ]
 
 
-def _command_peak_mb(log: Path, site: Path, out: Path) -> float:
+def command_peak_mb(log: Path, site: Path, out: Path) -> float:
     """Peak memory of the command on one run [MB]; it replays in its own process."""
     code = (
         "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL); "

@@ -1,6 +1,7 @@
-"""How the time of the LDS grows with what is on the line: ratios within one run, so that the machine does not matter.
+"""How time and memory grow: ratios within one run, so that the machine does not matter.
 
-The same journey of an hour is walked along with a few balises, or reads, and with four times as many.
+Time of the LDS: the same journey of an hour is walked along with a few balises, or reads, and with four times as many.
+Memory: `balise replay` of journeys of five solutions at 10 Hz, one twice as long as the other.
 """
 
 from __future__ import annotations
@@ -11,8 +12,11 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from benchmarks.end_to_end import command_peak_mb
 from benchmarks.relink import SCALE_SIGMA, SPEED_MPS, journey
 from benchmarks.results import Figure
+from benchmarks.trials import line_scenario
+from datasets.trial import build_run, build_site, write_run_log, write_site
 from pipeline.stages.alignment.align import align, odometer_at
 from pipeline.stages.lds import run_lds
 from pipeline.stages.matching import match
@@ -25,6 +29,9 @@ DURATION_S = 3_600.0
 FEW, TIMES = 2_500, 4
 # Four times as much work may take four times as long, and what the machine adds; sixteen would be quadratic.
 MOST = 6.0
+SOLUTIONS = 5
+HOURS = 4.0, 8.0
+DAY_MB = 6_000.0
 
 
 def measure(out: Path) -> list[Figure]:
@@ -37,7 +44,30 @@ def measure(out: Path) -> list[Figure]:
         name = f"{TIMES * FEW} {kind.value} balises"
         figures.append(Figure(f"LDS, {name}", seconds[1], "s"))
         figures.append(Figure(f"LDS, {name} over {FEW}", seconds[1] / seconds[0], "times", MOST))
-    return figures
+    return figures + _memory(out)
+
+
+def _memory(out: Path) -> list[Figure]:
+    """Peak memory by hours, and what a day comes to by the two."""
+    few_mb, many_mb = (_peak_mb(out / f"hours-{hours:g}", hours) for hours in HOURS)
+    an_hour_mb = (many_mb - few_mb) / (HOURS[1] - HOURS[0])
+    return [
+        Figure(f"peak memory, {HOURS[1]:g} h of {SOLUTIONS} solutions", many_mb, "MB"),
+        Figure("memory of one hour of one solution", an_hour_mb / SOLUTIONS, "MB"),
+        Figure(f"peak memory, a day of {SOLUTIONS} solutions", many_mb + (24.0 - HOURS[1]) * an_hour_mb, "MB", DAY_MB),
+    ]
+
+
+def _peak_mb(folder: Path, hours: float) -> float:
+    """Peak memory of replaying one journey; the solutions differ by nothing but their names."""
+    if not folder.exists():
+        scenario = line_scenario(hours, balises=int(20 * hours), seed=11)
+        run = build_run(scenario, scenario.runs[0])
+        named = [run.gnss.with_columns(solution=pl.lit(f"receiver{number}")) for number in range(SOLUTIONS)]
+        gnss = pl.concat(named).sort("t", "solution")
+        write_site(build_site(scenario), folder / "site")
+        write_run_log(run.with_streams(gnss=gnss, faults=None), folder / "runs")
+    return command_peak_mb(folder / "runs", folder / "site", folder / "out")
 
 
 def _aligned(config: Configuration) -> tuple[pl.DataFrame, Odometry]:

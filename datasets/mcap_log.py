@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Literal
 
 import polars as pl
 
 from datasets.mcap_messages import json_topic, odometry_topic, twist_topic
+from pipeline.read.ingest.correct import recorded_corrections
 from pipeline.read.ingest.recipes import OWN_SCHEMAS
 from pipeline.show.export.mcap_file import Compression, write_topics
 from pipeline.show.export.messages import Topic, rows_topic
@@ -36,7 +38,11 @@ def write_mcap(
     the rest as JSON. `chunk_size` none writes an unchunked file. The same run gives the same bytes.
     """
     losses: list[str] = []
-    topics = [topic for stream in STREAMS for topic in _topics(run, stream, encoding, odometer_message, losses)]
+    topics = [
+        replace(topic, notes=recorded_corrections(run, stream))
+        for stream in STREAMS
+        for topic in _topics(run, stream, encoding, odometer_message, losses)
+    ]
     write_topics(topics, path, "ros2" if encoding == "cdr" else "", compression, chunk_size, checksums)
     return tuple(losses)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -13,7 +13,6 @@ from datasets.trial import write_run_as
 from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
-from pipeline.read.ingest.correct import corrected
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import visible
@@ -21,21 +20,24 @@ from schemas.errors import visible
 
 @dataclass(frozen=True)
 class Conversion:
-    """What was written, how often which kind of record was not used, and what does not fit."""
+    """What was written, how often which kind of record was not used, what was corrected, and what does not fit."""
 
     run: Path
     epochs: int
     not_used: Mapping[str, int]
+    corrected: Sequence[str]
     fit: FitReport
 
     def lines(self) -> list[str]:
         """For people."""
         unused = [f"not used: {count} x {visible(reason)}" for reason, count in self.not_used.items()]
-        return [f"{self.epochs} epochs in {self.run}", *unused, *self.fit.lines()]
+        made = [f"corrected: {visible(text)}" for text in self.corrected]
+        return [f"{self.epochs} epochs in {self.run}", *unused, *made, *self.fit.lines()]
 
     def as_dict(self) -> dict[str, object]:
         """For programs."""
-        return {"run": self.run, "epochs": self.epochs, "not_used": self.not_used, **self.fit.as_dict()}
+        head = {"run": self.run, "epochs": self.epochs, "not_used": self.not_used, "corrected": self.corrected}
+        return {**head, **self.fit.as_dict()}
 
 
 def convert_logs(
@@ -50,13 +52,13 @@ def convert_logs(
     found = gather(logs, settings.ingest, day) if recording is None else recording.gathered()
     if to.is_file() or (to / "gnss.parquet").is_file():
         run = read_run(to, IngestConfig(), with_digest=False)
-        converted = extended(run, to, found, purpose, settings.fix_sigma, force)
+        converted = extended(run, to, found, purpose, settings.fix_sigma, force, settings.ingest.correct)
     else:
-        converted = as_run(found, to.name.removesuffix(".mcap"), purpose, settings.fix_sigma)
+        name = to.name.removesuffix(".mcap")
+        converted = as_run(found, name, purpose, settings.fix_sigma, settings.ingest.correct)
     write_run_as(converted.run, to)
-    # Written as recorded: a replay with the same configuration corrects it, once.
-    as_replayed = corrected(converted.run, settings.ingest.correct)
-    return Conversion(to, converted.run.gnss.height, converted.dropped, fit_report(as_replayed, settings))
+    made = tuple(f"{correction.stream}: {correction.changes}" for correction in converted.run.notes.corrections)
+    return Conversion(to, converted.run.gnss.height, converted.dropped, made, fit_report(converted.run, settings))
 
 
 def known_recording(path: Path) -> Converted | None:

@@ -21,6 +21,7 @@ from datasets.motion import Motion, build_motion
 from datasets.odometer import odometer_stream
 from datasets.receiver import TrainOnLine, gnss_streams, reference_stream
 from datasets.scenario import LogKind, RunSpec, Scenario
+from pipeline.read.ingest.correct import recorded_corrections
 from pipeline.storage import replace_files
 from pipeline.storage.described import table_bytes
 from schemas.config import Vehicle, settings_from, to_toml
@@ -117,14 +118,15 @@ def write_run_as(run: RunLog, path: Path, log: LogKind | None = None) -> None:
         write_mcap(run, path, encoding=log)
         return
     # No stream that an earlier run left here may be taken for one of this run, and without GNSS none is a run.
-    contents = {f"{name}.parquet": _stream_bytes(name, run.stream(name), path.name) for name in STREAMS}
+    contents = {f"{name}.parquet": _stream_bytes(name, run, path.name) for name in STREAMS}
     replace_files(path, contents, marker="gnss.parquet")
 
 
-def _stream_bytes(name: Stream, stream: pl.DataFrame | None, run_id: str) -> bytes | None:
+def _stream_bytes(name: Stream, run: RunLog, run_id: str) -> bytes | None:
+    stream = run.stream(name)
     if stream is None:
         return None
-    return table_bytes(stream, name, STREAM_SCHEMAS[name], {"run_id": run_id})
+    return table_bytes(stream, name, STREAM_SCHEMAS[name], {"run_id": run_id, **recorded_corrections(run, name)})
 
 
 def _start_ns(scenario: Scenario, spec: RunSpec) -> int:

@@ -37,14 +37,15 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
     """
     prepared = prepare(run, site, vehicle or Vehicle(), config or Configuration(), clock_advice)
     evidence = prepared.evidence()
-    placed = _place_solutions(prepared)
-    tables = [
-        _failed(prepared, name, placed.errors[name])
-        if name in placed.errors
-        else _replay_solution(prepared, name, placed, evidence)
-        for name in prepared.run.solutions()
-    ]
-    return _joined(run.run_id, tables)
+    beside = _compared_with(prepared)
+    # A solution at a time: of those done only the tables are kept.
+    parts = {name: _of_solution(prepared, name, beside, evidence) for name in prepared.run.solutions()}
+    errors = [part for part in parts.values() if isinstance(part, InputError)]
+    if len(errors) == len(parts):
+        raise errors[0]
+    return _joined(
+        run.run_id, [part if isinstance(part, dict) else _failed(prepared, name, part) for name, part in parts.items()]
+    )
 
 
 def ride_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> Ride:
@@ -52,47 +53,64 @@ def ride_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration,
     if solution not in run.solutions():
         raise InputError("has no such solution", place=run.run_id, found=solution, expected=", ".join(run.solutions()))
     prepared = prepare(run, site, vehicle, config, clock_advice)
-    placed = _place_solutions(prepared)
-    if solution in placed.errors:
-        raise placed.errors[solution]
-    return ride_of(prepared, solution, placed.matches, prepared.evidence())
+    placed = _place(prepared, solution)
+    if isinstance(placed, InputError):
+        raise placed
+    return ride_of(prepared, solution, _matches(solution, placed, _compared_with(prepared)), prepared.evidence())
 
 
 @dataclass(frozen=True)
 class _Placed:
-    """Solutions that fit their run and lie on the track, by name, and why the others do not."""
+    """A solution that fits its run and lies on the track."""
 
-    fits: Mapping[str, Fit]
-    matches: Mapping[str, Match]
-    errors: Mapping[str, InputError]
-
-
-def _place_solutions(prepared: PreparedRun) -> _Placed:
-    """Does each solution fit the run, and where is it on the track network?"""
-    fits: dict[str, Fit] = {}
-    matches: dict[str, Match] = {}
-    errors: dict[str, InputError] = {}
-    for name in prepared.run.solutions():
-        try:
-            fits[name] = required_fit(prepared, name, prepared.vehicle)
-            matches[name] = prepared.match(name)
-        except InputError as error:
-            # A receiver that never had a fix must not take the run's other solutions with it.
-            errors[name] = error
-    if not matches:
-        raise next(iter(errors.values()))
-    return _Placed(fits, matches, errors)
+    fit: Fit
+    match: Match
 
 
-def _replay_solution(prepared: PreparedRun, solution: str, placed: _Placed, evidence: TrainEvidence) -> Tables:
+Beside = Mapping[str, "_Placed | InputError"]
+"""By name: the one solution, if any, that the channel monitor compares the others with."""
+
+
+def _compared_with(prepared: PreparedRun) -> Beside:
+    """Placed once, and the only match that is kept over all solutions."""
+    channel = prepared.config.monitors.channel_reference
+    return {channel: _place(prepared, channel)} if channel in prepared.run.solutions() else {}
+
+
+def _place(prepared: PreparedRun, solution: str) -> _Placed | InputError:
+    """Does the solution fit the run, and where is it on the track network? Else why not."""
+    try:
+        return _Placed(required_fit(prepared, solution, prepared.vehicle), prepared.match(solution))
+    except InputError as error:
+        # A receiver that never had a fix must not take the run's other solutions with it.
+        return error
+
+
+def _matches(solution: str, placed: _Placed, beside: Beside) -> dict[str, Match]:
+    """The matches that a ride looks at."""
+    others = {name: other.match for name, other in beside.items() if isinstance(other, _Placed)}
+    return {**others, solution: placed.match}
+
+
+def _of_solution(prepared: PreparedRun, solution: str, beside: Beside, evidence: TrainEvidence) -> Tables | InputError:
     """What the train made of one solution, what nobody would have noticed, and what the judge says of it."""
-    ride = ride_of(prepared, solution, placed.matches, evidence)
+    placed = beside.get(solution) or _place(prepared, solution)
+    if isinstance(placed, InputError):
+        return placed
+    ride = ride_of(prepared, solution, _matches(solution, placed, beside), evidence)
     unnoticed = unnoticed_of(ride)
     judged = judge(_case(ride, unnoticed, evidence))
     epochs = pl.concat([judged.epochs, ride.solution.fixes.select("satellites")], how="horizontal")
-    results = _results(ride, judged, epochs, unnoticed, placed.fits[solution], evidence)
-    tables = {"hazards": judged.hazards, "passages": judged.passages, "alarms": judged.alarms, "epochs": epochs}
-    return {**tables, "runs": summarise(results, prepared.config, prepared.provenance)}
+    results = _results(ride, judged, epochs, unnoticed, placed.fit, evidence)
+    tables = {
+        "hazards": judged.hazards,
+        "passages": judged.passages,
+        "alarms": judged.alarms,
+        "epochs": epochs,
+        "runs": summarise(results, prepared.config, prepared.provenance),
+    }
+    # Judged epochs have more columns than the contract: those end here.
+    return {name: shaped(table, TABLES[name]) for name, table in tables.items()}
 
 
 def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence) -> Case:
@@ -157,7 +175,5 @@ def _failed(prepared: PreparedRun, solution: str, error: InputError) -> Tables:
 
 def _joined(run_id: str, parts: list[Tables]) -> RunTables:
     """Rows of all solutions, by the contract."""
-    whole = {
-        name: conform(pl.concat([shaped(part[name], table) for part in parts]), table) for name, table in TABLES.items()
-    }
+    whole = {name: conform(pl.concat([part[name] for part in parts]), table) for name, table in TABLES.items()}
     return RunTables(run_id=run_id, **whole)

@@ -74,6 +74,17 @@ class StreamCorrection(Settings):
     shift_north_m: Shift = 0.0
     shift_up_m: Shift = 0.0
 
+    @property
+    def moves(self) -> bool:
+        """It moves positions: a constant error of the receiver could be meant as well as another datum."""
+        return bool(self.shift_east_m or self.shift_north_m or self.shift_up_m)
+
+    @property
+    def changes(self) -> str:
+        """What it changes, in the words of the configuration."""
+        changed = self.model_dump(exclude_defaults=True, exclude={"stream"})
+        return ", ".join(f"{name} {value}" for name, value in changed.items())
+
 
 class IngestConfig(Settings):
     """Which topics feed which stream (empty: recognised by schema name), and limits of plausible values."""
@@ -262,8 +273,8 @@ class AlignConfig(Settings):
     fastest_mps: Positive = 200.0
     bunched_stamps_m: NonNegative = 20.0
     reset_back_m: NonNegative = 5.0
-    # Over a reset between two rows the speed about it counts where no braking changes the way by more than this, as at
-    # 1 Hz: a tenth of the odometer's fixed error.
+    # Over a reset between two rows the speed about it counts where braking x dt^2 / 4 is no more than this, as at 1 Hz:
+    # a tenth of the odometer's fixed error.
     reset_doubt_m: NonNegative = 0.5
     # Speeds give the distance over such a jump if, over the whole run, they differ from it by a smaller share:
     # another unit or sign differs by more than a half, slip and scale by some percent.
@@ -566,6 +577,8 @@ class SiteConfig(Settings):
 class SurveyConfig(Settings):
     """A site from a survey of the line (`balise site`)."""
 
+    # 100 MB hold some two million points: more is no line that a person checks.
+    size_limit_mb: Annotated[Number, Field(gt=0, le=100_000)] = 100.0
     # Two places that are nearer are one; maps write seven decimals of a degree, 1 cm.
     same_place_m: Positive = 0.05
     # Tracks lie 3.5 m and more apart, RTK scatters by centimetres: lines that are nearer are one track.

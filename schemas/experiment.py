@@ -58,7 +58,7 @@ def _injections_schema() -> type[dy.Schema]:
         "monitors": texts("those that failed first"),
         "time_to_detect_s": real("s", "T_D, from the onset to the first fail; null where none came", min=0),
         "time_to_failure_s": real("s", "from the onset to where the position is certainly wrong", min=0),
-        "time_to_failure_may_s": real("s", "from the onset to where it may be wrong; null where never certain", min=0),
+        "time_to_failure_may_s": real("s", "from the onset to where the fault may have made it wrong", min=0),
         "time_since_failure_s": real("s", "T_dsf, the least that the evidence leaves"),
         "time_since_failure_may_s": real("s", "T_dsf, the largest that it leaves"),
         "stopped": flag("no wrong position in use after the reaction to the first fail; null unnoticed", nullable=True),
@@ -87,15 +87,15 @@ def _cells_schema() -> type[dy.Schema]:
         "not_possible": count("instants drawn at which the recording could not take the fault"),
         "reason": text("why there are fewer than wanted", nullable=True),
         "watched_s": real("s", "how long each was watched", min=0),
-        "passes": count("independent passes: injections whose watches neither overlap nor lie within `pass_s`"),
+        "passes": count("independent passes: watches that share no time, each counted as `pass_s` long at least"),
         "noticed": count("injections noticed"),
         **_with_bounds("noticed_share", "share noticed during the watch"),
         "time_to_detect_median_s": real("s", "median of T_D; null where half were not noticed", min=0),
-        "time_to_detect_median_low_s": real("s", "lower 95 % bound of the median, over passes", min=0),
-        "time_to_detect_median_high_s": real("s", "its upper bound; null where not reached in the watch", min=0),
+        "time_to_detect_median_low_s": real("s", "its lower 95 % bound, over passes; null of fewer than six", min=0),
+        "time_to_detect_median_high_s": real("s", "its upper bound; null also where not reached in the watch", min=0),
         "time_to_detect_p95_s": real("s", "95 % of T_D; null where fewer were noticed", min=0),
         "time_to_detect_max_s": real("s", "largest T_D; null where one was not noticed", min=0),
-        "failures": count("injections whose position certainly failed during the watch"),
+        "failures": count("injections whose position failed, or may have before it was noticed"),
         "missed_at_failure": count("of these not noticed when the position may have failed"),
         **_with_bounds("pmd_at_failure", "share of the failures not noticed by then (DIAG: Pmd at T_dsf = 0)"),
         "stopped": count("noticed and no wrong position in use after it"),
@@ -117,7 +117,7 @@ def _pmd_schema() -> type[dy.Schema]:
     columns: dict[str, dy.Column] = {
         **_CELL,
         "time_since_failure_s": real("s", "time after the failure, negative before it", nullable=False),
-        "trials": count("injections whose position certainly failed during the watch"),
+        "trials": count("injections whose position failed, or may have before it was noticed"),
         "passes": count("independent passes among them"),
         "missed": count("not noticed by then, counted from where the position may have failed"),
         **_with_bounds("pmd", "share not noticed by then"),
@@ -155,7 +155,7 @@ class ExperimentBanks(dy.Schema):
 
     bank = text("bank")
     runs = count("runs replayed")
-    hours = real("h", "time without a fault at which a monitor could have failed", min=0)
+    hours = real("h", "time without a fault at which an alarm could have begun", min=0)
     alarms = count("alarm episodes in it; false ones, where the recording holds no fault")
     alarm_rate_per_h = real("1/h", "rate of these alarms", min=0)
     alarm_rate_low_per_h = real("1/h", "lower 95 % bound", min=0)
@@ -164,7 +164,7 @@ class ExperimentBanks(dy.Schema):
     injections = count("faults put in")
     passes = count("independent passes among those that failed")
     noticed = count("of the injections noticed")
-    failures = count("injections whose position certainly failed during the watch")
+    failures = count("injections whose position failed, or may have before it was noticed")
     missed_at_failure = count("of these not noticed when the position may have failed")
     pmd_at_failure = real("1", "share of the failures not noticed by then, over the plan's own mixture", min=0, max=1)
     pmd_at_failure_low = real("1", "lower 95 % bound, over passes", min=0, max=1)

@@ -5,6 +5,7 @@ Tables are named after the command whose options they hold. Paths are relative t
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from datetime import date as day
 from pathlib import Path
@@ -175,7 +176,9 @@ def load_configuration(file: Path | None) -> Configuration:
 
 def configuration_of(project: Project, file: Path) -> Configuration:
     """The configuration that a project at this file stands for."""
-    config = load_settings(None if project.config is None else file.parent / project.config, Configuration)
+    # By name: the project's folder may not exist yet.
+    named = None if project.config is None else Path(os.path.normpath(file.parent / project.config))
+    config = load_settings(named, Configuration)
     return _at_level(config, project.service_level, file)
 
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     import polars as pl
 
+    from schemas.config import StreamCorrection
+
 Stream = Literal["gnss", "odometer", "satellites", "reference", "balise_reads", "faults"]
 STREAMS: tuple[Stream, ...] = (
     "gnss",
@@ -23,8 +25,8 @@ STREAMS: tuple[Stream, ...] = (
 class IngestNotes:
     """What reading found out about the log beside its data.
 
-    `partial_until_ns` is set when the log is damaged at its end and read up to there; `corrections`: what the
-    configuration changed in it.
+    `partial_until_ns` is set when the log is damaged at its end and read up to there; `corrections`: those that
+    its streams hold already, made when it was read or when it was written.
     """
 
     partial_until_ns: int | None = None
@@ -33,7 +35,7 @@ class IngestNotes:
     chunks_without_crc: int = 0
     files_without_crc: tuple[str, ...] = ()
     skipped_topics: tuple[str, ...] = ()
-    corrections: tuple[str, ...] = ()
+    corrections: tuple[StreamCorrection, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ a column or a verdict changing (`tests/replay/test_rewording.py`).
 
 from __future__ import annotations
 
+import shlex
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -44,6 +45,7 @@ MISFIT_PLACES = _sentences(MisfitPlace, "misfit_places")
 LOST = _sentences(LostTo, "lost")
 NOT_SHOWN = _sentences(NotShown, "not_shown")
 REMEDIES = _sentences(Remedy, "remedies")
+REMEDIES_OF_PROJECT = REMEDIES | {Remedy(code): text for code, text in WORDS["remedies_of_project"].items()}
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def beside_words(run: Mapping[str, Any]) -> str:
     """What stands beside every verdict: balises accepted of those on the path, availability, proof margin."""
     share, margin_m = run["availability"], run["proof_margin_m"]
     accepted = say("verdicts", "accepted", run["balises_accepted"], run["balises_on_path"])
-    available = say("verdicts", "stood") if share is None else say("verdicts", "available", share)
+    available = say("verdicts", "no_motion") if share is None else say("verdicts", "available", share)
     return ", ".join([accepted, available, *([] if margin_m is None else [say("verdicts", "margin", margin_m)])])
 
 
@@ -150,5 +152,10 @@ PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options":
 
 
 def remedy_words(remedy: Remedy | str, **places: str) -> str:
-    """What would mend it, with the command that does; `places`: paths known where it is shown."""
-    return REMEDIES[Remedy(remedy)].format(**PLACES | places)
+    """What would mend it, with the command that does; `places`: paths known where it is shown, with `project` the keys
+    of that file in place of options.
+    """
+    plain = ("options", "of_project", "again")
+    quoted = {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
+    words = REMEDIES_OF_PROJECT if "project" in places else REMEDIES
+    return words[Remedy(remedy)].format(**PLACES | quoted)

@@ -24,8 +24,9 @@ from pipeline.results.figures.head import word_of
 from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest
 from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
+from pipeline.results.packing import not_as_marked
 from pipeline.results.software import software_digest
-from pipeline.results.workers import tell
+from pipeline.results.workers import tell, told
 from pipeline.storage.address import Address, join, redacted
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.enums import RunStatus
@@ -51,11 +52,15 @@ class NotCompared(StrEnum):
     """Tables that this build cannot read, or that do not agree themselves."""
     CAMPAIGN_TABLES = "campaign_tables"
     """The same, or runs made by another build of the program."""
+    PACKS = "packs"
+    """Rows of packed runs of which this build makes other files than the build that wrote them."""
 
 
+_COPIES = (NotCompared.CATALOGUE, NotCompared.CAMPAIGN_TABLES)
 _NOT_COMPARED = {
     NotCompared.CATALOGUE: "the copies in .catalogue",
     NotCompared.CAMPAIGN_TABLES: "the tables in campaign/, which the build that made them can make again",
+    NotCompared.PACKS: "rows of packed runs with their markers, which the build that made them can compare",
 }
 
 
@@ -99,9 +104,12 @@ def verify(out: Address) -> Verification:
         tell(min(first + _RUNS_AT_ONCE, len(runs)), len(runs))
     known = {*manifest["files"], *again["files"], *_OWN_FILES}
     problems += [(name, "there", "not in the manifest") for name in _other_files(out, {*there, *named}, known)]
-    not_compared = tuple(NotCompared)
+    not_compared = _COPIES + ((NotCompared.PACKS,) if packs.listed(out) else ())
     if not problems:
         problems, not_compared = _made_again(out, {run["software_digest"] for run in there.values()})
+        of_packs, unlike = _unpacked(out, there)
+        problems += of_packs
+        not_compared += unlike
     files = len(manifest["files"]) + len(manifest.get("pages", {})) + len(TABLES) * len(runs)
     return Verification(f"{files} files of {len(runs)} runs against {NAME}", tuple(problems), not_compared)
 
@@ -199,6 +207,22 @@ def _packs(out: Address) -> Iterator[Problem]:
         yield from _differences("", {name: sha256(storage.content_of(join(out, name))) for name in expected}, expected)
 
 
+def _unpacked(out: Address, there: Mapping[str, Any]) -> tuple[list[Problem], tuple[NotCompared, ...]]:
+    """The files that each packed run had against its marker: a pack could have been changed together with the list.
+
+    The build that made a run makes the same bytes again; another one may.
+    """
+    problems: list[Problem] = []
+    unlike: tuple[NotCompared, ...] = ()
+    for pack in told(packs.listed(out)):
+        for run, table in not_as_marked(out, pack):
+            if there[run]["software_digest"] == software_digest():
+                problems.append((f"run {run}, {table} in its pack", "other rows", "those of its marker"))
+            else:
+                unlike = (NotCompared.PACKS,)
+    return problems, unlike
+
+
 def _only_in_one(run: str, is_there: bool) -> Problem:
     """A run that only one of the two has; a call that was ended leaves some that the manifest does not name yet."""
     if is_there:
@@ -220,7 +244,9 @@ def _pages(out: Address) -> dict[str, str]:
 
 def _other_files(out: Address, runs: set[str], known: set[str]) -> Iterator[str]:
     """Files that are neither known, nor of a run, nor of `balise line`; pages and catalogue are looked at elsewhere."""
-    of_runs = {f"{table}/{store.folder_name(run)}/{table}.parquet" for table in TABLES for run in runs}
+    # Beside the rows of a packed run its own files are read by nobody but those who read all files.
+    own = runs - store.packed(out, runs).keys()
+    of_runs = {f"{table}/{store.folder_name(run)}/{table}.parquet" for table in TABLES for run in own}
     expected = of_runs | known | {name for pack in packs.listed(out) for name in packs.file_digests(pack)}
     for name in storage.files_below(out):
         if name not in expected and not name.startswith((f"{catalogue.FOLDER}/", "report/", "line/")):
@@ -241,7 +267,7 @@ def _made_again(out: Address, software: set[str]) -> tuple[list[Problem], tuple[
     stale = [t for t, copy in copies.items() if copy is not None and not (t in tables and copy.equals(tables[t]))]
     problems = [(f"{catalogue.FOLDER}/{table}", "other rows", "those of the runs' tables") for table in stale]
     if len(tables) < len(catalogue.CATALOGUED):
-        return problems, tuple(NotCompared)
+        return problems, _COPIES
     problems += _outcomes(out, tables)
     config = store.read_config(out)
     if config is None or software != {software_digest()}:

@@ -13,7 +13,7 @@ from pathlib import Path
 from pipeline.make.receivers import Converted, Gatherings, Purpose, as_run, extended, gather
 from pipeline.project.opened import Opened
 from pipeline.read.ingest import read_run
-from pipeline.read.ingest.correct import corrected
+from pipeline.read.ingest.correct import corrected, corrected_further
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import UsageError
 from schemas.project import ConvertEntry, LogEntry
@@ -46,12 +46,16 @@ def run_of_logs(opened: Opened, entry: ConvertEntry, config: Configuration, reco
     parts = _parts(opened, entry, config.ingest, recordings)
     parts.sort(key=lambda part: part.purpose.stream != "gnss" or "gnss" not in part.found.streams)
     first = parts[0]
-    made = as_run(first.found, entry.run_id, first.purpose, config.fix_sigma)
+    common = config.ingest.correct
+    made = as_run(first.found, entry.run_id, first.purpose, config.fix_sigma, common)
     dropped = Counter(made.dropped)
     for part in parts[1:]:
-        made = extended(made.run, Path(entry.to), part.found, part.purpose, config.fix_sigma, False)
+        made = extended(made.run, Path(entry.to), part.found, part.purpose, config.fix_sigma, False, common)
         dropped.update(made.dropped)
-    return Converted(corrected(made.run, entry.correct), dict(dropped))
+    run = corrected(made.run, common)
+    # A log that is a run of this program may have been corrected so when it was written.
+    own = [correction for correction in entry.correct if correction not in run.notes.corrections]
+    return Converted(corrected_further(run, own), dict(dropped))
 
 
 def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: Recordings) -> list[_Part]:
@@ -88,7 +92,7 @@ def _call_key(log: LogEntry) -> tuple[str, str, str]:
 
 
 def _with_mappings(base: IngestConfig, logs: tuple[LogEntry, ...]) -> IngestConfig:
-    """The mappings of all logs before those of the configuration; its corrections are made by the replay."""
+    """The mappings of all logs before those of the configuration; corrections are made of the whole run."""
     own: list[Mapping[str, object]] = [log.mappings() for log in logs]
     names = dict.fromkeys(name for mappings in own for name in mappings)
     joined = {name: sum((tuple(of[name]) for of in own if name in of), ()) + getattr(base, name) for name in names}  # type: ignore[arg-type]

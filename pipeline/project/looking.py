@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import date, datetime
+from datetime import date, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,10 @@ from pipeline.read.ingest.csv_draft import draft_mapping
 from pipeline.storage import files
 from schemas.config import IngestConfig, settings_from, toml_of
 from schemas.enums import Fix
-from schemas.errors import InputError
+from schemas.errors import BaliseError, InputError
 from schemas.run import STREAMS, Stream
+
+_A_DAY = timedelta(days=1)  # clocks of one ride may be local and UTC
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,22 @@ class SeenLog:
 
     def _spans(self) -> list[StreamSpan]:
         return [self.spans["gnss"]] if self.has_positions else list(self.spans.values())
+
+
+def look_at_dates(path: Path, config: IngestConfig, others: Sequence[SeenLog]) -> SeenLog | None:
+    """A table whose dates may be day first or month first: in the one order that puts it within a day of other logs."""
+    if path.suffix.lower() not in TABLES or names_file(config, path):
+        return None
+    fitting: list[SeenLog] = []
+    for order in ("day_first", "month_first"):
+        try:
+            log = _table(path, config, order)
+        except BaliseError:
+            continue
+        if any(log.start < other.end + _A_DAY and other.start < log.end + _A_DAY for other in others):
+            fitting.append(log)
+    # 03.03.2025 is the same day either way.
+    return fitting[0] if fitting and all(log.spans == fitting[0].spans for log in fitting) else None
 
 
 def look_at(path: Path, config: IngestConfig, day: date | None, recordings: Recordings) -> SeenLog:
@@ -105,7 +123,7 @@ def _seen(
     return SeenLog(path, spans, mapping or {}, is_run, mostly_fixed=gnss is not None and 2 * fixed > gnss.height)
 
 
-def _table(path: Path, config: IngestConfig) -> SeenLog:
+def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> SeenLog:
     """A table by the mapping that its header suggests."""
     drafted = toml_of(draft_mapping(path).encode(), f"mapping of {path}").get("ingest")
     mapping: dict[str, Any] = drafted if isinstance(drafted, dict) else {}
@@ -115,6 +133,8 @@ def _table(path: Path, config: IngestConfig) -> SeenLog:
     for entries in mapping.values():
         for entry in entries:
             entry["topic"] = path.name
+            if date_order is not None:
+                entry["date_order"] = date_order
     ingest = settings_from({**config.model_dump(exclude_defaults=True), **mapping}, IngestConfig, str(path))
     try:
         streams = gather([path], ingest).streams

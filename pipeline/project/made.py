@@ -19,10 +19,11 @@ _NAME = "made.json"
 
 
 class _Made(BaseModel):
-    """SHA-256 of what a product was made of, and of each of its files."""
+    """SHA-256 of what a product was made of, and of each of its files. `begun`: nobody knows whether it is whole."""
 
     of: str
     files: dict[str, str]
+    begun: bool = False
 
 
 _RECORD = TypeAdapter(dict[str, _Made])
@@ -62,16 +63,31 @@ class Record:
         if not self._force:
             if (
                 known is not None
+                and not known.begun
                 and known.of == product.made_of
                 and _digests(product.above, known.files) == known.files
             ):
                 return False
             self._refuse_foreign(product, known)
-        files = make()
+        before = _state(product.place)
+        # Whoever is killed now leaves files that the next call must not take for somebody else's.
+        self._note(product, _Made(of=product.made_of, files={} if known is None else known.files, begun=True))
+        try:
+            files = make()
+        except Exception:
+            if _state(product.place) == before:
+                self._note(product, known)
+            raise
         names = [file.relative_to(product.above).as_posix() for file in files]
-        self._made[product.name] = _Made(of=product.made_of, files=_digests(product.above, names))
-        storage.write_bytes(self._file, _RECORD.dump_json(dict(sorted(self._made.items())), indent=1))
+        self._note(product, _Made(of=product.made_of, files=_digests(product.above, names)))
         return True
+
+    def _note(self, product: Product, made: _Made | None) -> None:
+        self._made.pop(product.name, None)
+        if made is not None:
+            self._made[product.name] = made
+        content = _RECORD.dump_json(dict(sorted(self._made.items())), indent=1, exclude_defaults=True)
+        storage.write_bytes(self._file, content)
 
     def _refuse_foreign(self, product: Product, known: _Made | None) -> None:
         if known is None and _is_there(product.place):
@@ -80,7 +96,7 @@ class Record:
                 place=str(product.place),
                 remedy="Name another place in balise.toml, move it away, or replace it with --force.",
             )
-        if known is not None:
+        if known is not None and not known.begun:
             there = {name: digest for name, digest in _digests(product.above, known.files).items() if digest}
             changed = [name for name, digest in there.items() if digest != known.files[name]]
             if changed:
@@ -94,6 +110,10 @@ class Record:
 
 def _is_there(place: Path) -> bool:
     return place.is_file() or (place.is_dir() and any(place.iterdir()))
+
+
+def _state(place: Path) -> str:
+    return storage.digest_of_files(_all_files(place))
 
 
 def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:

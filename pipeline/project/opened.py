@@ -38,6 +38,12 @@ class Opened:
         return None if named is None else Path(self.place(named))
 
     @property
+    def words(self) -> dict[str, str]:
+        """What sentences on a project name: its file, the option where it is not that of the working directory."""
+        option = "" if self.file == Path(FILE_NAME) else f" --project {self.folder}"
+        return {"project": str(self.file), "of_project": option, "again": f"balise run{option}"}
+
+    @property
     def config_file(self) -> Path | None:
         """What stands for `--config`: the project itself where it changes the configuration."""
         if self.project.calibrate is not None and self.project.calibrate.monitors:
@@ -103,6 +109,7 @@ def values_for(command: str, opened: Opened) -> dict[str, Any]:
         "replay": {"runs": opened.runs(), "site": site, "out": out, **settings, **_replay_values(opened)},
         "report": {"out": out, "site": site},
         "sql": {"out": out},
+        "export": {"out": out, "site": site, "config": opened.config_file},
         "verify": {"out": out, "site": site, "route": route, **settings},
         "safety": {"out": out, "site": site, "vehicle": opened.vehicle_file},
         "line": {"out": out, "site": site, **_line_values(opened)},

@@ -15,20 +15,22 @@ import tomli_w
 from pipeline.make.survey.make import make_site
 from pipeline.project.convert import Recordings, run_of_logs
 from pipeline.project.found import is_one_log, is_site, logs_below
-from pipeline.project.looking import SeenLog, look_at
+from pipeline.project.looking import SeenLog, look_at, look_at_dates
 from pipeline.project.opened import Opened, named_from
 from pipeline.project.rides import Ride, rides_of, stem_of
 from pipeline.project.run import wish_for
 from pipeline.read.ingest import read_run
-from pipeline.read.ingest.correct import corrected
+from pipeline.read.ingest.correct import corrected_further
 from pipeline.read.site.read import read_site
 from pipeline.studies.plausibility.check import CONFIGURATION, FitState
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import IngestConfig, StreamCorrection, settings_from, toml_of
 from schemas.errors import BaliseError, InputError, UsageError
 from schemas.project import FILE_NAME, ConvertEntry, Project, ReplayEntry, TrackEntry
-from schemas.run import Site
+from schemas.run import Site, Stream
+from schemas.words import say
 
+_ZONES_S = 900.0  # time zones are whole quarters of an hour apart
 _ROUNDS = 4  # a clock shows when the unit is right, an axis when the clock is
 
 
@@ -69,8 +71,8 @@ class Drafted:
     remarks: list[str] = field(default_factory=list)
 
 
-Accept = Callable[[str, Sequence[str], Sequence[str]], bool]
-"""Asked once per run: its id, what does not fit, and the lines that would mend it."""
+Accept = Callable[[str, Sequence[str], Sequence[StreamCorrection]], bool]
+"""Asked once per run: its id, what does not fit, and the corrections that would mend it."""
 
 
 def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: Accept) -> Drafted:
@@ -139,20 +141,31 @@ def _base(wanted: Wanted, folder: Path) -> Opened:
 def _looked_at(wanted: Wanted, config: IngestConfig, recordings: Recordings, remarks: list[str]) -> list[SeenLog]:
     """Every log that was named; of folders those that are logs, the others are told."""
     seen: dict[Path, SeenLog] = {}
+    unread: dict[Path, tuple[BaliseError, bool]] = {}
+    named_places: list[Path] = []
     surveys = {path.absolute() for path in wanted.track} | {Path(wanted.balises or "").absolute()}
     for raw in [*_expanded(wanted.raws), *wanted.references]:
         whole = is_one_log(raw)
         for path in [raw] if whole else logs_below(raw):
             place = path.absolute()
-            if place in seen or place in surveys:
+            if place in seen or place in unread or place in surveys:
                 continue
+            named_places.append(place)
             try:
                 seen[place] = replace(look_at(path, config, wanted.day, recordings), path=place)
             except BaliseError as error:
-                if whole and wanted.strict:
-                    raise
-                remarks.append(f"not used: {error}")
-    return list(seen.values())
+                unread[place] = error, whole and wanted.strict
+    sure = list(seen.values())
+    for place, (reason, is_needed) in unread.items():
+        log = look_at_dates(place, config, sure)
+        if log is not None:
+            seen[place] = log
+            remarks.append(f"{place.name}: days and months of its dates in the order that fits the other logs")
+        elif is_needed:
+            raise reason
+        else:
+            remarks.append(f"not used: {reason}")
+    return sorted(seen.values(), key=lambda log: named_places.index(log.path))
 
 
 def _expanded(raws: Sequence[Path]) -> list[Path]:
@@ -238,15 +251,20 @@ def _checked(
     found: list[str] = []
     for _ in range(_ROUNDS):
         report = fit_report(run, config, site, vehicle)
-        fresh = _corrections_of(report)
-        if not fresh:
+        proposed = _corrections_of(report)
+        if not proposed:
             break
-        found += [sentence for sentence in _sentences(report) if sentence not in found]
+        fresh, log = _by_recorder(proposed, ride, report)
+        sentences = _sentences(report)
+        if log is not None:
+            mine = say("misfit_places", "rather_in_stream", log.path.name, "GNSS")
+            sentences = [text.replace(say("misfit_places", "in_stream", "GNSS"), mine) for text in sentences]
+        found += [sentence for sentence in sentences if sentence not in found]
         corrections += fresh
-        run = corrected(run, fresh)
+        run = corrected_further(run, fresh)
     if not corrections:
         return None, entry
-    accepted = accept(ride.run_id, found, correction_lines(corrections))
+    accepted = accept(ride.run_id, found, corrections)
     proposal = Proposal(ride.run_id, tuple(found), tuple(corrections), accepted)
     return proposal, entry.model_copy(update={"correct": tuple(corrections)}) if accepted else entry
 
@@ -261,6 +279,42 @@ def _corrections_of(report: FitReport) -> list[StreamCorrection]:
     lines = report.mending.get(CONFIGURATION, "")
     ingest = toml_of(lines.encode(), "lines that mend it").get("ingest")
     return list(settings_from(ingest, IngestConfig, "lines that mend it").correct) if isinstance(ingest, dict) else []
+
+
+def _by_recorder(
+    proposed: list[StreamCorrection], ride: Ride, report: FitReport
+) -> tuple[list[StreamCorrection], SeenLog | None]:
+    """The same for all streams of one log, which have one clock; and that log, where its clock and not the GNSS's is
+    corrected: what a receiver sends is never a time zone off.
+    """
+    shared = [log for log in ride.others if len(log.spans) > 1]
+    if len(shared) != 1:
+        return proposed, None
+    log = shared[0]
+    shift_s = next((one.shift_s for one in proposed if one.stream == "gnss"), 0.0)
+    of_receivers = not any(other.mapping or other.is_run for files in ride.receivers for other in files)
+    if shift_s and shift_s % _ZONES_S == 0.0 and of_receivers and len(ride.others) == 1 and not ride.references:
+        kept = [one for one in proposed if one.stream not in ("gnss", "satellites")]
+        return [*kept, *(_shifted(name, -shift_s) for name in log.spans)], log
+    shifts = [one for one in proposed if one.shift_s and one.stream in log.spans]
+    unchecked = [
+        name
+        for name in log.spans
+        if name not in [one.stream for one in proposed] and _clock_state(report, name) != FitState.FITS.value
+    ]
+    return [
+        *proposed,
+        *(_shifted(name, one.shift_s) for one in shifts for name in unchecked),
+    ], None
+
+
+def _shifted(stream: str, shift_s: float) -> StreamCorrection:
+    return StreamCorrection.model_validate({"stream": stream, "shift_s": shift_s})
+
+
+def _clock_state(report: FitReport, stream: Stream) -> str | None:
+    what = f"clock of the {stream.replace('_', ' ')} against the GNSS"
+    return next(iter(report.tables["Fit"].filter(pl.col("check") == what)["state"]), None)
 
 
 def _sentences(report: FitReport) -> list[str]:

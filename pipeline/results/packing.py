@@ -90,6 +90,7 @@ def _planned(out: Address, own: frozenset[str], runs_per_pack: int) -> Iterator[
         stale = len(rest) < pack.runs
         small = pack.runs < runs_per_pack / 2 and pack.bytes < _LARGEST_PACK / 2
         if stale or (small and pack.software_digest in by_build.values()):
+            packs.require_whole(out, pack)
             by_build |= dict.fromkeys(rest, pack.software_digest)
             size_of |= dict.fromkeys(rest, pack.bytes // pack.runs)
     for build in sorted(set(by_build.values())):
@@ -253,6 +254,18 @@ def _files(marker: Marker, tables: Mapping[str, pa.Table]) -> Iterator[tuple[str
         yield name, store.file_bytes(table, name, metadata)
 
 
+def not_as_marked(out: Address, pack: Pack) -> Iterator[tuple[str, str]]:
+    """Runs that are read from a pack, with each table of which this build makes another file than the marker names."""
+    here = _read_from(out, pack)
+    for marker, tables in _runs_in(str(out), pack):
+        if marker.run_id not in here:
+            continue
+        digests = _digests(marker)
+        for name, content in _files(marker, tables):
+            if sha256(content) != digests.get(name):
+                yield marker.run_id, name
+
+
 def remove_runs(out: Address, runs: Sequence[str]) -> None:
     """Remove the results of these runs; the others of their packs have files of their own then."""
     for _ in unpack(out, [pack for pack in packs.listed(out) if set(packs.index_of(out, pack).run_ids) & set(runs)]):
@@ -266,7 +279,7 @@ def unpack(out: Address, asked: Sequence[Pack]) -> Iterator[int]:
     Raises `UsageError` where this build of the program cannot make the same bytes: the pack stays.
     """
     for pack in asked:
-        here = {run for run, place in packs.find(out).items() if place.pack == pack}.difference(store.own_runs(out))
+        here = _read_from(out, pack)
         for marker, tables in _runs_in(str(out), pack):
             if marker.run_id in here:
                 files = dict(_files(marker, tables))
@@ -275,6 +288,11 @@ def unpack(out: Address, asked: Sequence[Pack]) -> Iterator[int]:
         packs.write_list(out, [other for other in packs.listed(out) if other != pack])
         packs.sweep(out)
         yield pack.runs
+
+
+def _read_from(out: Address, pack: Pack) -> set[str]:
+    """The runs of a pack that neither a later pack nor files of their own replace."""
+    return {run for run, place in packs.find(out).items() if place.pack == pack}.difference(store.own_runs(out))
 
 
 def _check_unpacked(out: Address, pack: Pack, marker: Marker, files: Mapping[str, bytes]) -> None:

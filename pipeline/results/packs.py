@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from pipeline import storage
 from pipeline.results.marker import Marker, sha256
@@ -45,11 +45,18 @@ class Pack(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    name: str
-    runs: int
-    bytes: int
+    name: str = Field(pattern=r"^[0-9a-f]+$")
+    runs: int = Field(gt=0)
+    bytes: int = Field(gt=0)
     software_digest: str
     sha256: dict[str, str]
+
+    @field_validator("sha256")
+    @classmethod
+    def _of_all(cls, digests: dict[str, str]) -> dict[str, str]:
+        if digests.keys() != {INDEX, *TABLES}:
+            raise ValueError("not the digests of all files of a pack")
+        return digests
 
 
 class _List(BaseModel):
@@ -111,6 +118,19 @@ def file_digests(pack: Pack) -> dict[str, str]:
     return {file_name(part, pack.name): digest for part, digest in pack.sha256.items()}
 
 
+def require_whole(out: Address, pack: Pack) -> None:
+    """Refuse a pack with a file that is not what was written: a new pack of its rows would hide that."""
+    for file, digest in file_digests(pack).items():
+        _whole(out, file, digest)
+
+
+def _whole(out: Address, file: str, digest: str) -> bytes:
+    content = storage.content_of(join(out, file))
+    if content is None or sha256(content) != digest:
+        raise unusable(out, file, "is missing" if content is None else "is damaged")
+    return content
+
+
 def find(out: Address, among: Iterable[str] | None = None) -> dict[str, PackedRun]:
     """Those of these runs that are packed; of all runs in the order of their ids."""
     packs = listed(out)
@@ -153,11 +173,7 @@ def _index(out: str, name: str, digest: str) -> Index:
 
 @lru_cache(maxsize=2)
 def _read_index(out: str, name: str, digest: str, columns: tuple[str, ...]) -> pl.DataFrame:
-    file = file_name(INDEX, name)
-    content = storage.content_of(join(out, file))
-    if content is None or sha256(content) != digest:
-        raise unusable(out, file, "is missing" if content is None else "is damaged")
-    return parquet.read_parquet(content, lambda _: columns)
+    return parquet.read_parquet(_whole(out, file_name(INDEX, name), digest), lambda _: columns)
 
 
 def markers(out: Address, runs: Mapping[str, PackedRun]) -> Iterator[Marker]:

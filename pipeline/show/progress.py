@@ -238,7 +238,9 @@ def progress_watch() -> CampaignWatch:
     return BarWatch() if sys.stderr.isatty() else LineWatch()
 
 
-def show_summary(summary: CampaignSummary, out: str, quiet: bool, as_json: bool, **places: str) -> None:
+def show_summary(
+    summary: CampaignSummary, out: str, quiet: bool, as_json: bool, *, has_pages: bool, **places: str
+) -> None:
     """How it ended: as JSON, as messages of what failed alone, or for people; `places`: as in `remedy_lines`."""
     if as_json:
         print(to_json(summary_answer(summary, out)))
@@ -248,6 +250,8 @@ def show_summary(summary: CampaignSummary, out: str, quiet: bool, as_json: bool,
                 print(f"balise: {outcome_line(outcome)}", file=sys.stderr)
     else:
         _show_ending(summary, out)
+        pages = "" if has_pages else f"; `balise report {out}` writes pages of them"
+        print(f"Tables are in {out}{pages}.")
         for line in remedy_lines(summary, out=out, **places):
             print(f"To mend {line}")
 
@@ -269,4 +273,3 @@ def _show_ending(summary: CampaignSummary, out: str, most: int = 25) -> None:
         show_table(shown)
     if (more := remarkable.height - shown.height) > 0:
         print(f'{more} more are not safe: `balise sql {out} "SELECT verdict, run_id, error FROM runs"` lists all.')
-    print(f"Tables are in {out}; `balise report {out}` writes pages of them.")

@@ -36,7 +36,8 @@ class PreparedRun:
     counts: CleanCounts
     odometers: tuple[Odometry, ...]
     odometry: Odometry | None
-    _fixes: dict[str, pl.DataFrame] = field(default_factory=dict)
+    # Made anew with every run, so that `replace` cannot hand on those of another.
+    _fixes: dict[str, pl.DataFrame] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def fixes(self, solution: str) -> pl.DataFrame:
         """The positions of one solution, checked once; `InputError` unless they are those of one journey."""
@@ -44,6 +45,8 @@ class PreparedRun:
             fixes = self.run.gnss.filter(pl.col("solution") == solution)
             require_two_times(fixes, "gnss", f" of solution {solution!r}")
             require_one_journey(fixes, f"gnss of solution {solution!r}", self.config.ingest)
+            # Solutions come one after the other: the last one alone is kept.
+            self._fixes.clear()
             self._fixes[solution] = fixes
         return self._fixes[solution]
 

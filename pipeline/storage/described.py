@@ -29,6 +29,16 @@ def noted_bytes(frame: pl.DataFrame, notes: Mapping[str, str], schema: type[dy.S
     return parquet_bytes(frame, named, None if schema is None else meanings(schema))
 
 
+def notes_of(content: bytes) -> dict[str, str]:
+    """What `noted_bytes` noted. Raises `ParquetError`."""
+    return noted(metadata_of(content))
+
+
+def noted(metadata: Mapping[str, str]) -> dict[str, str]:
+    """This program's entries among those of a file."""
+    return {key.removeprefix(PREFIX): value for key, value in metadata.items() if key.startswith(PREFIX)}
+
+
 @dataclass(frozen=True)
 class FileDescription:
     """What a file says of itself: rows, key-value metadata, and `column, dtype, unit, meaning` of its columns."""

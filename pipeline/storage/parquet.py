@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 # Part of "the same bytes": none of these may follow a library's default.
 _COMPRESSION_LEVEL = 3
 _ROWS_PER_GROUP = 262_144
+_BYTES_OF_A_VALUE = 8
 
 
 class ParquetError(ValueError):
@@ -35,11 +36,14 @@ def parquet_bytes(
 
     `columns`: what stands in the fields beside what polars notes of its own types (enums).
     """
-    table = frame.rechunk().to_arrow()
     notes = columns or {}
-    fields = [field.with_metadata({**(field.metadata or {}), **notes.get(field.name, {})}) for field in table.schema]
-    schema = pa.schema(fields, metadata=dict(sorted((metadata or {}).items())) or None)
-    return encoded(table.cast(schema))
+    plain = frame.clear().to_arrow().schema
+    fields = [field.with_metadata({**(field.metadata or {}), **notes.get(field.name, {})}) for field in plain]
+    writer = GroupedWriter(pa.schema(fields, metadata=dict(sorted((metadata or {}).items())) or None), _ROWS_PER_GROUP)
+    # A row group at a time: the table is never there twice.
+    for first in range(0, max(frame.height, 1), _ROWS_PER_GROUP):
+        writer.add(frame.slice(first, _ROWS_PER_GROUP).rechunk().to_arrow().cast(writer.schema))
+    return writer.content()
 
 
 def encoded(table: pa.Table) -> bytes:
@@ -56,6 +60,7 @@ class GroupedWriter:
     """
 
     def __init__(self, schema: pa.Schema, rows_per_group: int) -> None:
+        self.schema = schema
         self._rows_per_group = rows_per_group
         self._buffer = io.BytesIO()
         self._waiting: list[pa.Table] = []
@@ -193,6 +198,18 @@ def rows_of(content: bytes) -> int:
         metadata = pq.read_metadata(pa.BufferReader(content))
         groups = (metadata.row_group(number).num_rows for number in range(metadata.num_row_groups))
         return int(max(metadata.num_rows, sum(groups)))
+
+
+def unpacked_size(content: bytes) -> int:
+    """What the table takes in memory at least, by the numbers of values that it declares [bytes].
+
+    Values that are the same in every row take hardly anything in the file. Raises `ParquetError`.
+    """
+    with _reading():
+        metadata = pq.read_metadata(pa.BufferReader(content))
+        groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+        values: int = sum(group.column(number).num_values for group in groups for number in range(metadata.num_columns))
+    return max(values, rows_of(content)) * _BYTES_OF_A_VALUE
 
 
 def without_checksums(content: bytes) -> bool:

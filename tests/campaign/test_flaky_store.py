@@ -12,6 +12,7 @@ import pytest
 from pipeline import storage
 from pipeline.campaign import make_plan, run_campaign
 from pipeline.results import store
+from pipeline.results.marker import metadata_of
 from pipeline.storage import files, object_store
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, UsageError
@@ -114,7 +115,7 @@ def test_every_write_of_a_result_fails_in_turn(undisturbed: Path) -> None:
                 store.write_run(new, out, {"of": "new"})
                 assert not lasting or number > Flaky.count
             Flaky.well()
-            made = {store.metadata_of(_content(out, name)).get("of") for name in TABLES if store.run_ids(out)}
+            made = {metadata_of(_content(out, name)).get("of") for name in TABLES if store.run_ids(out)}
             assert len(made) <= 1 or not files.exists(str(store.table_address(out, "runs", "r"))), (number, lasting)
             assert lasting or made == {"new"}
 

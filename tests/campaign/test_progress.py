@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import rich.console
 from rich.console import Console
 
 import cli
@@ -88,7 +89,7 @@ def test_lines_in_a_pipe(clock: Clock, plan: Plan) -> None:
 
 def test_bar_on_a_terminal(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     screen = Console(file=io.StringIO(), force_terminal=True, width=160, color_system=None)
-    monkeypatch.setattr(progress, "Console", lambda **_: screen)
+    monkeypatch.setattr(rich.console, "Console", lambda **_: screen)
     watch = BarWatch()
     watch.begin(len(plan.jobs), plan.out)
     watch.finished(OK)

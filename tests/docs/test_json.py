@@ -28,6 +28,7 @@ SLOW = {"demo"}
 # What the recordings at hand do not show.
 UNSEEN = {
     "init": {"corrections[]." + name for name in ("run_id", "found", "toml", "accepted")},
+    "trial": {"corrections[]." + name for name in ("run_id", "found", "toml", "accepted")},
     "inspect": {"Problems", "Problems[].problem", "Lines that mend it", "Lines that mend it[].toml"},
     "diff": {"runs[].hazards[].differences[]." + name for name in ("table", "kind", "column", "message", "rows")},
 }

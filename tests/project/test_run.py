@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
 
 import cli
+from pipeline.project.convert import run_of_logs
+from pipeline.project.made import Product, Record
+from pipeline.project.opened import Opened
+from schemas.enums import Remedy
+from schemas.errors import InputError, UsageError
+from schemas.project import Project
+from schemas.words import remedy_words
 from tests.conftest import SmallTrial
 
 
@@ -130,6 +141,52 @@ def test_a_run_taken_out_is_no_part_of_the_figures(project: Path, small_trial: S
     assert call("verify", "-q") == 0
 
 
+def test_runs_taken_out_are_removed_from_compact_files(project: Path, small_trial: SmallTrial) -> None:
+    shutil.copytree(small_trial.paths[1], project / "runs" / "run1")
+    (project / "balise.toml").write_text('[replay]\nruns = ["runs"]\n')
+    assert call("run", "-q") == 0
+    assert call("compact", "-q", "result") == 0
+    (project / "balise.toml").write_text('[replay]\nruns = ["runs/run1"]\n')
+    assert call("run", "-q") == 2
+    assert call("run", "-q", "--prune") == 0
+    assert pl.read_parquet(project / "result/campaign/runs.parquet")["run_id"].unique().to_list() == ["run1"]
+    assert call("verify", "-q") == 0
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_killed_before_it_is_noted_a_product_is_made_again(tmp_path: Path, known: bool) -> None:
+    """Files that the killed call left are nobody else's; a file that a failing call did not touch may be."""
+    made = tmp_path / "runs/a.parquet"
+    made.parent.mkdir()
+
+    def make(content: bytes, error: BaseException | None = None) -> Callable[[], list[Path]]:
+        def making() -> list[Path]:
+            if content:
+                made.write_bytes(content)
+            if error is not None:
+                raise error
+            return [made]
+
+        return making
+
+    if known:
+        Record(tmp_path).bring(Product("run a", made, "old"), make(b"old"))
+    with pytest.raises(Killed):
+        Record(tmp_path).bring(Product("run a", made, "new"), make(b"ha", Killed()))
+    assert Record(tmp_path).bring(Product("run a", made, "new"), make(b"half"))
+    assert not Record(tmp_path).bring(Product("run a", made, "new"), make(b"no"))
+    with pytest.raises(InputError):
+        Record(tmp_path).bring(Product("run a", made, "third"), make(b"", InputError("damaged", place="log")))
+    made.write_bytes(b"by hand")
+    with pytest.raises(UsageError, match="was changed"):
+        Record(tmp_path).bring(Product("run a", made, "third"), make(b"no"))
+    assert made.read_bytes() == b"by hand"
+
+
 def test_unknown_keys_are_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (project / "balise.toml").write_text('[replay]\nrun = ["runs"]\n')
     assert call("run") == 2
@@ -140,3 +197,64 @@ def test_a_configuration_of_that_name_is_no_project(project: Path, capsys: pytes
     (project / "balise.toml").write_text("[hazards]\nfailure_limit_m = 12.0\n")
     assert call("inspect", "runs/run0", "--config", "balise.toml") == 0
     assert "from balise.toml" not in capsys.readouterr().err
+
+
+def test_a_vehicle_is_measured_once_and_used(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = '[calibrate]\nruns = ["runs/run0"]\n[replay]\nruns = ["runs/run0"]\n'
+    (project / "balise.toml").write_text(text)
+    assert call("replay") == 2
+    assert "is not calibrated yet" in capsys.readouterr().err
+    assert call("run") == 0
+    assert "calibrate on 1 runs" in " ".join(capsys.readouterr().err.split())
+    measured = (project / ".balise/vehicle_measured.toml").read_text()
+    assert (project / "result/vehicle.toml").read_text() == measured
+    assert call("run") == 0
+    assert "calibrate up to date" in " ".join(capsys.readouterr().err.split())
+
+
+def test_each_run_is_calibrated_on_the_others(project: Path, small_trial: SmallTrial) -> None:
+    for number in (1, 2):
+        shutil.copytree(small_trial.paths[number], project / "runs" / f"run{number}")
+    (project / "balise.toml").write_text('[replay]\nruns = ["runs"]\ncalibrate = ["runs"]\n')
+    assert call("run", "-q") == 0
+    rows = pl.read_parquet(project / "result/campaign/runs.parquet").select("run_id", "calibrated_by").rows()
+    assert dict(rows)["run1"] == ["run0", "run2"]
+
+
+def test_an_interrupted_conversion_goes_on(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("one", "two"):
+        (project / f"{name}.nmea").write_text(nmea())
+    tables = [
+        f'[[convert]]\nto = "made/{name}"\n[[convert.logs]]\nfiles = ["{name}.nmea"]\n' for name in ("one", "two")
+    ]
+    (project / "balise.toml").write_text("".join(tables))
+    converted: list[str] = []
+
+    def interrupted(opened: Any, entry: Any, *others: Any) -> Any:
+        converted.append(entry.run_id)
+        if converted == ["one", "two"]:
+            os.kill(os.getpid(), signal.SIGINT)
+        return run_of_logs(opened, entry, *others)
+
+    monkeypatch.setattr("pipeline.project.run.run_of_logs", interrupted)
+    assert call("run", "-q") == 128 + signal.SIGINT
+    assert not (project / "made/two/gnss.parquet").exists()
+    assert not (project / "result").exists()
+    assert call("run", "-q") in (0, 1)
+    assert converted == ["one", "two", "two"]
+
+
+def test_a_run_is_exported_and_remedies_name_the_file(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("run") == 0
+    said = capsys.readouterr().out
+    assert "balise replay" not in said
+    assert call("export", "run0", "--out", "run0.geojson") == 0
+    assert (project / "run0.geojson").exists()
+
+
+def test_remedies_of_a_project_name_its_keys() -> None:
+    places = Opened(Path("week12/balise.toml"), Project()).words
+    words = remedy_words(Remedy.CALIBRATE, **places)
+    assert "week12/balise.toml" in words
+    assert words.endswith("`balise run --project week12`")
+    assert "balise replay" not in "".join(remedy_words(remedy, **places) for remedy in Remedy)

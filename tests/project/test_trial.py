@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 import cli
-from pipeline.project.looking import SeenLog, StreamSpan
+from pipeline.project.looking import SeenLog, StreamSpan, look_at_dates
 from pipeline.project.rides import rides_of
+from schemas.config import IngestConfig, StreamCorrection
 from schemas.project import Project, load_project
 from tests.conftest import SmallTrial
 from tests.project.test_run import nmea
@@ -136,7 +137,7 @@ def test_wrong_calls(raw: Path, arguments: list[str], message: str, capsys: pyte
 def test_corrections_are_proposed_and_accepted(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (raw / "raw" / "still.nmea").write_text(nmea(100, acceleration_mps2=0.2))
     rows = (f"2025-03-03T10:{12 + s // 60:02d}:{s % 60:02d}Z;{1e-4 * s**2:.5f}" for s in range(100))
-    (raw / "raw" / "plc.csv").write_text("time;km\n" + "\n".join(rows) + "\n")
+    (raw / "raw" / "plc.csv").write_text("time;dist\n" + "\n".join(rows) + "\n")
     base = ("trial", "raw", "--track", "line.gpx", "--json")
     assert call(*base, "--to", "asked") == 0
     (proposed,) = json.loads(capsys.readouterr().out)["corrections"]
@@ -148,3 +149,88 @@ def test_corrections_are_proposed_and_accepted(raw: Path, capsys: pytest.Capture
     (correction,) = written(raw / "yes").convert[0].correct
     assert (correction.stream, correction.factors) == ("odometer", {"distance_m": 1000.0})
     assert call("run", "--project", "yes") == 0
+
+
+def test_nobody_but_a_person_accepts_that_positions_are_moved(
+    raw: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another datum, or a receiver that is wrong by as much: the survey alone cannot tell."""
+    moved = StreamCorrection(stream="gnss", shift_east_m=40.0)
+    monkeypatch.setattr("pipeline.project.trial._by_recorder", lambda *_: ([moved], None))
+    monkeypatch.setattr("pipeline.project.trial._corrections_of", lambda _: [moved])
+    assert call("trial", "raw", "--track", "line.gpx", "--json", "--to", "week12", "--accept-corrections") == 0
+    (proposed,) = json.loads(capsys.readouterr().out)["corrections"]
+    assert proposed["accepted"] is False
+    assert written(raw / "week12").convert[0].correct == ()
+
+
+@pytest.mark.parametrize("answer", [True, False])
+def test_corrections_are_asked_for_on_a_terminal(
+    raw: Path, answer: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (raw / "raw" / "still.nmea").write_text(nmea(100, acceleration_mps2=0.2))
+    rows = (f"2025-03-03T10:{12 + s // 60:02d}:{s % 60:02d}Z;{1e-4 * s**2:.5f}" for s in range(100))
+    (raw / "raw" / "plc.csv").write_text("time;dist\n" + "\n".join(rows) + "\n")
+    asked: list[str] = []
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr(cli, "confirm", lambda question, **_: asked.append(question) or answer)
+    assert call("trial", "raw", "--track", "line.gpx", "--to", "week12") == 0
+    assert asked == ["Accept these corrections?"]
+    assert "still does not fit as recorded:" in capsys.readouterr().err
+    assert bool(written(raw / "week12").convert[0].correct) is answer
+
+
+def test_a_drive_recorded_with_rtk_is_the_line(raw: Path) -> None:
+    rows = (f"2025/03/03 10:12:{s:02d}.000 {50.01 + s * 1e-4:.9f} 14.000000000 250.0 1 8\n" for s in range(40))
+    head = "%  UTC                  latitude(deg) longitude(deg)  height(m)   Q  ns\n"
+    (raw / "drive.pos").write_text(head + "".join(rows))
+    assert call("trial", "raw", "--track", "drive.pos", "--to", "week12") == 0
+    assert written(raw / "week12").track.survey == ("../drive.pos",)  # type: ignore[union-attr]
+    assert call("run", "--project", "week12") in (0, 1)
+    assert (raw / "week12/site/track.parquet").exists()
+
+
+def test_a_column_called_by_its_unit_counts_in_it(raw: Path) -> None:
+    (raw / "raw" / "plc.csv").write_text("time;km\n2025-03-03T10:12:00Z;0.0\n2025-03-03T10:12:39Z;0.0\n")
+    assert call("trial", "raw", "--track", "line.gpx", "--to", "week12") == 0
+    assert written(raw / "week12").convert[0].logs[1].odometer[0].factors == {"distance_m": 1000.0}
+
+
+def test_a_logger_of_local_time_is_corrected_in_all_its_streams_and_the_receiver_is_not(raw: Path) -> None:
+    (raw / "raw" / "still.nmea").write_text(nmea(100, acceleration_mps2=0.2))
+    # Winter in Berlin is an hour ahead of UTC. At 0.1 m per s squared the reads are at 40, 160, 360, 640 m.
+    reads = {20: "B20", 40: "B40", 60: "B60", 80: "B80"}
+    lines = ["Zeit;Weg [m];Balise"]
+    for s in range(100):
+        way = f"{0.1 * s**2:.2f}".replace(".", ",")
+        lines.append(f"03.03.2025 11:{12 + s // 60:02d}:{s % 60:02d};{way};{reads.get(s, '')}")
+    (raw / "raw" / "plc.csv").write_text("\n".join(lines) + "\n")
+    # A degree of the meridian is 111,229 m here; the ride begins at 50.02 degrees.
+    places = (f"B{s};{50.02 + 0.1 * s**2 / 111229:.7f};14.0;physisch" for s in (20, 40, 60, 80))
+    (raw / "balisen.csv").write_text("\n".join(["Name;Breite;Länge;Art", *places]) + "\n")
+    (raw / "line.gpx").write_text(
+        '<gpx version="1.1"><trk><trkseg><trkpt lat="50.01" lon="14.0"/><trkpt lat="50.04" lon="14.0"/>'
+        "</trkseg></trk></gpx>"
+    )
+    (raw / "settings.toml").write_text("[hazards]\n")
+    base = ("trial", "raw", "--track", "line.gpx", "--balises", "balisen.csv", "--config", "settings.toml")
+    assert call(*base, "--to", "new/week12", "--accept-corrections") == 0
+    (entry,) = written(raw / "new/week12").convert
+    shifts = {correction.stream: correction.shift_s for correction in entry.correct}
+    assert shifts == {"odometer": -3600.0, "balise_reads": -3600.0}
+
+
+def test_dates_are_in_the_order_that_fits_other_logs(tmp_path: Path) -> None:
+    (tmp_path / "plc.csv").write_text("Zeit;Weg\n12.06.2025 11:30:00;1,0\n12.06.2025 11:30:01;2,0\n")
+
+    def on(month: int, day: int) -> SeenLog:
+        times = (datetime(2025, month, day, 9, 30, tzinfo=UTC), datetime(2025, month, day, 9, 40, tzinfo=UTC))
+        return SeenLog(Path("a.ubx"), {"gnss": StreamSpan(10, *times)})
+
+    def start(*others: SeenLog) -> datetime | None:
+        seen = look_at_dates(tmp_path / "plc.csv", IngestConfig(), others)
+        return seen and seen.start
+
+    assert start(on(6, 12)) == datetime(2025, 6, 12, 11, 30, tzinfo=UTC)
+    assert start(on(12, 6)) == datetime(2025, 12, 6, 11, 30, tzinfo=UTC)
+    assert start() is start(on(3, 3)) is start(on(6, 12), on(12, 6)) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -10,11 +11,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from pipeline.campaign.compact import compact, undo
+from pipeline.campaign.verify import NotCompared, verify
 from pipeline.results import catalogue, packing, packs, store
 from pipeline.results.diff import diff_results
+from pipeline.results.manifest import write_manifest
 from pipeline.results.query import run_sql
 from pipeline.storage.parquet import GroupedFile
 from schemas.errors import UsageError
@@ -225,6 +230,73 @@ def test_damage_is_an_error(out: Path, place: str) -> None:
     (out / file[place]).write_bytes(bytes(data))
     with pytest.raises(UsageError, match="cannot be read"):
         store.read_table(out, "runs").collect()
+
+
+def with_other_values(out: Path) -> Path:
+    """The table `runs` of the first pack with a value changed by somebody who can write Parquet."""
+    file = out / f"runs/compact/{packs.listed(out)[0].name}.parquet"
+    table = pq.read_table(file)
+    at = table.column_names.index("availability")
+    field = table.schema.field(at)
+    other = table.set_column(at, field, pa.array([0.99] * table.num_rows, field.type))
+    pq.write_table(other, file, compression="zstd", write_page_checksum=True)
+    return file
+
+
+def list_anew(out: Path, digests: dict[str, str]) -> None:
+    listed = json.loads((out / packs.LIST).read_text())
+    listed["packs"][0]["sha256"] = digests
+    (out / packs.LIST).write_text(json.dumps(listed))
+
+
+def test_a_changed_pack_is_not_packed_again(out: Path) -> None:
+    """The new pack would be whole, and hide the change."""
+    compact(out)
+    with_other_values(out)
+    store.write_run(with_alarms("g", 1), out, METADATA)
+    with pytest.raises(UsageError, match=r"runs/compact/.*is damaged"):
+        compact(out)
+
+
+@pytest.mark.parametrize("by_this_build", [True, False])
+def test_verify_holds_rows_of_packs_against_markers(
+    out: Path, monkeypatch: pytest.MonkeyPatch, by_this_build: bool
+) -> None:
+    """Pack, list and manifest changed together: the markers still say what the runs' tables were."""
+    with_build = {**METADATA, "software_digest": "this"}
+    for run_id, count in RUNS.items():
+        store.write_run(with_alarms(run_id, count), out, with_build)
+    build = "this" if by_this_build else "another"
+    monkeypatch.setattr("pipeline.campaign.verify.software_digest", lambda: build)
+    compact(out)
+    write_manifest(out)
+    assert verify(out).problems == ()
+    out = shutil.copytree(out, out.with_name("copy"))
+    file = with_other_values(out)
+    list_anew(out, packs.listed(out)[0].sha256 | {"runs": hashlib.sha256(file.read_bytes()).hexdigest()})
+    write_manifest(out)
+    catalogue.gather(out)
+    found = verify(out)
+    assert {what for what, *_ in found.problems} == (
+        {f"run {run}, runs in its pack" for run in RUNS} if by_this_build else set()
+    )
+    assert (NotCompared.PACKS in found.not_compared) is not by_this_build
+
+
+def test_verify_sees_own_files_of_a_packed_run(out: Path) -> None:
+    """Without their marker nobody but `**/*.parquet` reads them."""
+    shutil.copytree(out / "alarms/run_id=e", out.with_name("e"))
+    compact(out)
+    assert verify(out).problems == ()
+    shutil.copytree(out.with_name("e"), out / "alarms/run_id=e")
+    assert [what for what, *_ in verify(out).problems] == ["alarms/run_id=e/alarms.parquet"]
+
+
+def test_a_list_that_names_no_table_cannot_be_read(out: Path) -> None:
+    compact(out)
+    list_anew(out, {"index": packs.listed(out)[0].sha256["index"]})
+    with pytest.raises(UsageError, match="not the digests of all files"):
+        store.run_ids(out)
 
 
 def test_in_an_object_store(out: Path) -> None:

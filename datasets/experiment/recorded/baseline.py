@@ -79,8 +79,8 @@ class Baseline:
         return Clock.of(self.epochs, self.config)
 
     def hours(self) -> float:
-        """Time held by epochs at which a monitor could have failed [h]."""
-        return float(self.clock.held_s[self.watched].sum()) / 3600.0
+        """Time held by epochs at which an alarm could have begun [h]: none can while one stands."""
+        return float(self.clock.held_s[self.watched & ~self.alarming].sum()) / 3600.0
 
     @cached_property
     def watched(self) -> Bools:

@@ -134,7 +134,7 @@ def recorded_experiment(
     inputs = _inputs(runs, site, vehicle, config, solution, plan, banks_of(plan, plan_file, config))
     # An earlier call may have found other runs at these addresses.
     _KEPT.clear()
-    surveyed = mapped(_survey, [(inputs, run) for run in inputs.runs], jobs)
+    surveyed = _each_once(mapped(_survey, [(inputs, run) for run in inputs.runs], jobs))
     rooms = [one.room for one in surveyed if one.room is not None]
     if not rooms:
         raise next(one.error for one in surveyed if one.error is not None)
@@ -168,16 +168,14 @@ def _inputs(
 
 def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
     inputs, (run_id, address) = task
-    nothing = dict.fromkeys(ExperimentRuns.column_names())
     try:
         baselines = [_baseline(inputs, address, bank) for bank in inputs.banks]
     except InputError as error:
-        row = {**nothing, "run_id": run_id, "status": RunStatus.FAILED.value, "error": str(error), "injections": 0}
-        return _Surveyed(run_id, row, error=error)
+        return _unusable(run_id, error)
     first = baselines[0]
     room = replace(room_of(baselines, inputs.quiet_s), run_id=run_id)
     row = {
-        **nothing,
+        **dict.fromkeys(ExperimentRuns.column_names()),
         "run_id": run_id,
         "status": RunStatus.OK.value,
         "own_error": first.own_error.value,
@@ -188,6 +186,23 @@ def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
         "has_ranges": room.has_ranges,
     }
     return _Surveyed(run_id, row, room, tuple(map(_quiet, baselines)), first.run.input_digest)
+
+
+def _unusable(run_id: str, error: InputError) -> _Surveyed:
+    nothing = dict.fromkeys(ExperimentRuns.column_names())
+    row = {**nothing, "run_id": run_id, "status": RunStatus.FAILED.value, "error": str(error), "injections": 0}
+    return _Surveyed(run_id, row, error=error)
+
+
+def _each_once(surveyed: Sequence[_Surveyed]) -> list[_Surveyed]:
+    """A copy of a run is no further pass, and no further hour."""
+    first: dict[str, str] = {}
+    kept = []
+    for one in surveyed:
+        original = first.setdefault(one.run_digest, one.run_id) if one.room is not None else one.run_id
+        copy = InputError("is a copy of another run", place=one.run_id, found=f"the same bytes as {original}")
+        kept.append(one if original == one.run_id else _unusable(one.run_id, copy))
+    return kept
 
 
 def _quiet(base: Baseline) -> Quiet:

@@ -8,7 +8,7 @@ import polars as pl
 
 from datasets.experiment.recorded.baseline import Baseline
 from datasets.experiment.recorded.draw import Onset
-from datasets.faults import FaultSpec
+from datasets.faults import FaultKind, FaultSpec
 from datasets.inject import inject
 from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.stages.ride import Ride, ride_of
@@ -50,12 +50,12 @@ def _satellite(base: Baseline, onset: Onset) -> str:
 def _gnss_hit(base: Baseline, fault: FaultSpec, begin_ns: int, end_ns: int) -> PreparedRun:
     """Positions and ranges as cleaned, the fault added from its first epoch on; odometer and reads as they were."""
     run = base.ride.prepared.run
-    tail = run.with_streams(
-        gnss=_between(run.gnss, begin_ns, end_ns), satellites=_cut(run.satellites, begin_ns, end_ns)
-    )
+    # A late position is one of before the fault.
+    from_ns = base.recording.first_ns if fault.kind is FaultKind.LATENCY else begin_ns
+    tail = run.with_streams(gnss=_between(run.gnss, from_ns, end_ns), satellites=_cut(run.satellites, begin_ns, end_ns))
     hit = inject(tail, fault, base.site, base.recording)
     streams = {
-        "gnss": pl.concat([_before(run.gnss, begin_ns), hit.gnss]),
+        "gnss": pl.concat([_before(run.gnss, begin_ns), _between(hit.gnss, begin_ns, end_ns)]),
         "satellites": None if run.satellites is None else _joined(run.satellites, hit.satellites, begin_ns),
     }
     return replace(base.ride.prepared, run=run.with_streams(**streams))

@@ -29,7 +29,8 @@ class Watch:
     """The epochs of an injected run from a little before the onset on, beside those of the fault-free run.
 
     `moved_m`: by what the fault has moved the position in the direction of travel, NaN where not known; `low_m`,
-    `high_m`: the error; `code`: the judgement; `begin`: the first epoch of the fault.
+    `high_m`: the error; `code`: the judgement; `doubtful`: it may be wrong, and by the fault; `begin`: the first epoch
+    of the fault.
     """
 
     epochs: pl.DataFrame
@@ -38,6 +39,7 @@ class Watch:
     low_m: Floats
     high_m: Floats
     code: Ints
+    doubtful: Bools
     begin: int
 
 
@@ -94,7 +96,9 @@ def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
         code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
         code[(low_m > limit_m) | (high_m < -limit_m)] = WRONG
     code[astray & met(epochs, unambiguous(base.config))] = WRONG
-    return Watch(epochs, t_ns, moved_m, low_m, high_m, code, int(np.searchsorted(t_ns, onset.t_ns)))
+    was_right = (own_low_m >= -limit_m) & (own_high_m <= limit_m)
+    doubtful = (code == UNKNOWN) & np.isfinite(moved_m) & (was_right | (np.abs(moved_m) > limit_m))
+    return Watch(epochs, t_ns, moved_m, low_m, high_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))
 
 
 def _moved_m(base: Baseline, found: Injected, epochs: pl.DataFrame, row: Ints) -> tuple[Floats, Bools]:
@@ -116,13 +120,15 @@ def _moved_m(base: Baseline, found: Injected, epochs: pl.DataFrame, row: Ints) -
 def _failure(watch: Watch) -> tuple[int | None, int | None]:
     """The first wrong epoch of a second of them, else the first (DOMAIN section 5.3); and the first that may be.
 
-    The latter: the first of the unbroken unknown or wrong epochs that lead there.
+    The latter: the first of the unbroken unknown or wrong epochs that lead there; where none is certainly wrong, the
+    first doubtful one.
     """
     wrong = watch.code == WRONG
     wrong[: watch.begin] = False
     firsts, lasts = runs_of(wrong)
     if not firsts.size:
-        return None, None
+        doubtful = np.flatnonzero(watch.doubtful[watch.begin :])
+        return None, int(watch.t_ns[watch.begin + doubtful[0]]) if doubtful.size else None
     lasting = watch.t_ns[lasts] - watch.t_ns[firsts] >= _LASTING_S * NS_PER_S
     first = int(firsts[lasting.argmax()])
     before = np.flatnonzero(watch.code[watch.begin : first] == RIGHT)
@@ -159,14 +165,14 @@ def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
     t_ns = times_ns(accepted)
     row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
     train_m, sense = _train_at(base, t_ns, row)
-    at_m, _ = _moved_m(base, found, accepted, row)
+    at_m, astray = _moved_m(base, found, accepted, row)
     at_m = at_m * sense + floats(base.epochs, "path_m")[row]
     own_low_m, own_high_m = (values[row] for values in base.own_m)
     moved_m = (at_m - train_m) * sense
     limit_m = base.config.hazards.failure_limit_m
     low_m = own_low_m + moved_m
     high_m = own_high_m + moved_m
-    wrong = (low_m > limit_m) | (high_m < -limit_m)
+    wrong = (low_m > limit_m) | (high_m < -limit_m) | astray
     right = (low_m >= -limit_m) & (high_m <= limit_m)
     ids = accepted["balise_id"]
     return {

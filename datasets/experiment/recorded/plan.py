@@ -122,8 +122,8 @@ class RecordedPlan(Settings):
     quiet_s: NonNegative = 60.0
     # Instants of one cell in one run are at least so far apart.
     apart_s: Positive = 10.0
-    # Injections whose watches overlap, or lie within this time (3 x 100 s, the correlation of the receiver's own error,
-    # DIAG Table 1), are one pass.
+    # Injections whose watches overlap are one pass; no watch counts as shorter than this (3 x 100 s, the correlation of
+    # the receiver's own error, DIAG Table 1).
     pass_s: Positive = 300.0
     # Length of a piece of line in `places`.
     place_m: Positive = 500.0

@@ -10,19 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
+from scipy.special import betaincinv
 from scipy.stats import binom
 
 from datasets.experiment.recorded.plan import Cell, RecordedPlan
 from datasets.experiment.tables import Row
-from pipeline.stages.run_row.bounds import CONFIDENCE, UNKNOWN, clopper_pearson, columns_of, poisson_rate
+from pipeline.stages.run_row.bounds import CONFIDENCE, UNKNOWN, columns_of, poisson_rate
 from schemas.arrays import NS_PER_S, Floats, floats, times_ns
 from schemas.conform import conform
 from schemas.experiment import ExperimentBanks, ExperimentCells, ExperimentPlaces, ExperimentPmd
 
 _PMD_STEPS = 40
+_QUANTILES = {"median": 0.5, "p95": 0.95, "max": 1.0}
 # Shares of few passes are whole numbers of them but for rounding.
 _ROUNDING = 1e-9
 
@@ -39,28 +42,48 @@ class Quiet:
     recorded_s: float
 
 
-def passes(frame: pl.DataFrame, pass_s: float) -> int:
-    """The largest number of watches that share no time, at least `pass_s` each: of those left the first to end."""
+class Passes(NamedTuple):
+    """Independent passes: their number, and the number of passes of equal size that they are worth."""
+
+    number: int
+    worth: float
+
+
+def passes(frame: pl.DataFrame, pass_s: float) -> Passes:
+    """The largest number of watches that share no time, at least `pass_s` each: of those left the first to end.
+
+    Passes of m injections each, with all that overlap, are worth (sum m)^2 / sum m^2 (Kish's effective sample size).
+    """
     length_ns = np.maximum(floats(frame, "watched_s"), pass_s) * NS_PER_S
     begin_ns = times_ns(frame, "t_onset")
     end_ns = begin_ns + length_ns.round().astype(np.int64)
     runs = frame["run_id"].to_list()
     free_ns: dict[str, int] = {}
-    count = 0
+    current: dict[str, int] = {}
+    sizes: list[int] = []
     for row in np.argsort(end_ns, kind="stable").tolist():
-        if begin_ns[row] >= free_ns.get(runs[row], np.iinfo(np.int64).min):
-            free_ns[runs[row]] = int(end_ns[row])
-            count += 1
-    return count
+        run = runs[row]
+        if begin_ns[row] >= free_ns.get(run, np.iinfo(np.int64).min):
+            free_ns[run] = int(end_ns[row])
+            current[run] = len(sizes)
+            sizes.append(0)
+        sizes[current[run]] += 1
+    return Passes(len(sizes), sum(sizes) ** 2 / sum(size**2 for size in sizes) if sizes else 0.0)
 
 
-def bounded_share(name: str, hits: int, trials: int, independent: int) -> Row:
-    """A share of all trials, with the bounds that as many hits among the independent ones alone would have."""
-    if not trials or not independent:
+def bounded_share(name: str, hits: int, trials: int, worth: float) -> Row:
+    """A share of all trials, with the bounds that as many hits among `worth` independent ones alone would have.
+
+    Clopper and Pearson with a number of trials that need not be whole (Korn and Graubard 1998); hits rounded outwards.
+    """
+    if not trials or not worth:
         return columns_of(name, UNKNOWN)
-    expected = hits / trials * independent
-    low = clopper_pearson(int(np.floor(expected + _ROUNDING)), independent).low
-    high = clopper_pearson(int(np.ceil(expected - _ROUNDING)), independent).high
+    tail = (1.0 - CONFIDENCE) / 2.0
+    expected = hits / trials * worth
+    least = float(np.floor(expected + _ROUNDING))
+    most = float(np.ceil(expected - _ROUNDING))
+    low = float(betaincinv(least, worth - least + 1.0, tail)) if least > 0.0 else 0.0
+    high = float(betaincinv(most + 1.0, worth - most, 1.0 - tail)) if most < worth else 1.0
     return {name: hits / trials, f"{name}_low": low, f"{name}_high": high}
 
 
@@ -81,7 +104,7 @@ def cells_table(
 def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, plan: RecordedPlan) -> Row:
     noticed = int(frame["noticed"].sum())
     independent = passes(frame, plan.pass_s)
-    failed = frame.drop_nulls("time_to_failure_s")
+    failed = _failed(frame)
     missed = _missed(failed, 0.0, "time_since_failure_may_s")
     short = cell.count - frame.height - lost.height
     reason = f"{short} found no room in the runs" if short else None
@@ -92,13 +115,13 @@ def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, pl
         "not_possible": lost.height,
         "reason": "; ".join([*lost["reason"].unique().sort().to_list(), *([reason] if reason else [])]) or None,
         "watched_s": cell.watch_s,
-        "passes": independent,
+        "passes": independent.number,
         "noticed": noticed,
-        **bounded_share("noticed_share", noticed, frame.height, independent),
-        **_time_to_detect(frame, independent),
+        **bounded_share("noticed_share", noticed, frame.height, independent.worth),
+        **_time_to_detect(frame, int(independent.worth)),
         "failures": failed.height,
         "missed_at_failure": missed,
-        **bounded_share("pmd_at_failure", missed, failed.height, passes(failed, plan.pass_s)),
+        **bounded_share("pmd_at_failure", missed, failed.height, passes(failed, plan.pass_s).worth),
         "stopped": int(frame["stopped"].sum()),
         "noticed_not_stopped": int((~frame["stopped"].drop_nulls()).sum()),
         "accepted_wrong": int(frame["accepted_wrong"].sum()),
@@ -124,11 +147,19 @@ def _names(cell: Cell, bank: str) -> Row:
 def _time_to_detect(frame: pl.DataFrame, independent: int) -> Row:
     """Quantiles of T_D; the median's bounds by order statistics of the passes."""
     times_s = np.sort(frame["time_to_detect_s"].fill_null(np.inf).to_numpy())
+    bounds = _median_bounds(times_s, independent)
+    quantiles = {f"time_to_detect_{name}_s": _quantile(times_s, share) for name, share in _QUANTILES.items()}
+    return {**quantiles, "time_to_detect_median_low_s": bounds[0], "time_to_detect_median_high_s": bounds[1]}
+
+
+def _median_bounds(times_s: Floats, independent: int) -> tuple[float | None, float | None]:
+    """None of fewer than six passes: the least and the largest of five enclose the median with 93.75 % only."""
     tail = (1.0 - CONFIDENCE) / 2.0
-    below = max(int(binom.ppf(tail, independent, 0.5)) - 1, 0) / independent if independent else 0.0
-    names = ("median", "median_low", "median_high", "p95", "max")
-    shares = (0.5, below, 1.0 - below, 0.95, 1.0)
-    return {f"time_to_detect_{name}_s": _quantile(times_s, share) for name, share in zip(names, shares, strict=True)}
+    order = int(binom.ppf(tail, independent, 0.5)) if independent else 0
+    if order < 1:
+        return None, None
+    below = (order - 1) / independent
+    return _quantile(times_s, below), _quantile(times_s, 1.0 - below)
 
 
 def _quantile(ordered: Floats, share: float) -> float | None:
@@ -137,6 +168,13 @@ def _quantile(ordered: Floats, share: float) -> float | None:
         return None
     value = float(ordered[max(int(np.ceil(share * ordered.size - _ROUNDING)) - 1, 0)])
     return value if np.isfinite(value) else None
+
+
+def _failed(frame: pl.DataFrame) -> pl.DataFrame:
+    """Positions that certainly failed, and those that may have and were not noticed by then: none of these vanishes."""
+    late = pl.col("time_since_failure_may_s").fill_null(np.inf) > 0.0
+    certain = pl.col("time_to_failure_s").is_not_null()
+    return frame.filter(certain | (pl.col("time_to_failure_may_s").is_not_null() & late))
 
 
 def _missed(failed: pl.DataFrame, time_s: float, since: str) -> int:
@@ -152,7 +190,7 @@ def pmd_table(
 
 
 def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPlan) -> Iterator[Row]:
-    failed = injections.filter(bank=bank, cell=cell.name).drop_nulls("time_to_failure_s")
+    failed = _failed(injections.filter(bank=bank, cell=cell.name))
     if failed.is_empty():
         return
     independent = passes(failed, plan.pass_s)
@@ -162,17 +200,18 @@ def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPla
             **_names(cell, bank),
             "time_since_failure_s": time_s,
             "trials": failed.height,
-            "passes": independent,
+            "passes": independent.number,
             "missed": missed,
-            **bounded_share("pmd", missed, failed.height, independent),
-            "missed_certain": _missed(failed, time_s, "time_since_failure_s"),
+            **bounded_share("pmd", missed, failed.height, independent.worth),
+            "missed_certain": _missed(failed.drop_nulls("time_to_failure_s"), time_s, "time_since_failure_s"),
         }
 
 
 def _times_since_failure_s(failed: pl.DataFrame) -> Floats:
     """From the onset, as far before the failure as it lies in the median, to where the first watch ends."""
-    before_s = float(np.median(floats(failed, "time_to_failure_s")))
-    after_s = float((failed["watched_s"] - failed["time_to_failure_s"]).min())  # type: ignore[arg-type]
+    failure_s = failed["time_to_failure_s"].fill_null(failed["time_to_failure_may_s"])
+    before_s = float(np.median(failure_s.to_numpy()))
+    after_s = float((failed["watched_s"] - failure_s).min())  # type: ignore[arg-type]
     times = np.concatenate(
         [np.linspace(-before_s, 0.0, _PMD_STEPS + 1), np.linspace(0.0, after_s, _PMD_STEPS // 2 + 1)]
     )
@@ -220,7 +259,7 @@ def banks_table(
 
 
 def _bank_row(frame: pl.DataFrame, quiet: Quiet, cells: pl.DataFrame, plan: RecordedPlan) -> Row:
-    failed = frame.drop_nulls("time_to_failure_s")
+    failed = _failed(frame)
     independent = passes(failed, plan.pass_s)
     missed = _missed(failed, 0.0, "time_since_failure_may_s")
     slowest = cells.filter(pl.col("injections") > 0).sort(
@@ -234,11 +273,11 @@ def _bank_row(frame: pl.DataFrame, quiet: Quiet, cells: pl.DataFrame, plan: Reco
         **columns_of("alarm_rate", poisson_rate(quiet.alarms, quiet.hours), "_per_h"),
         "tvb_share": quiet.tvb_s / quiet.recorded_s if quiet.recorded_s else None,
         "injections": frame.height,
-        "passes": independent,
+        "passes": independent.number,
         "noticed": int(frame["noticed"].sum()),
         "failures": failed.height,
         "missed_at_failure": missed,
-        **bounded_share("pmd_at_failure", missed, failed.height, independent),
+        **bounded_share("pmd_at_failure", missed, failed.height, independent.worth),
         "slowest_cell": slowest["cell"].first() if slowest.height else None,
         "noticed_not_stopped": int((~frame["stopped"].drop_nulls()).sum()),
         "accepted_wrong": int(frame["accepted_wrong"].sum()),

@@ -14,7 +14,7 @@ from schemas.errors import InputError, UsageError
 from schemas.run import STREAMS, RunLog, Stream
 
 Streams = dict[Stream, pl.DataFrame]
-_BY_SOLUTION: tuple[Stream, ...] = ("gnss", "satellites")
+BY_SOLUTION: tuple[Stream, ...] = ("gnss", "satellites")
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ def assigned(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
     if purpose.solution is not None and not purpose.solution.strip():
         raise UsageError("is empty", place="--solution", expected="a name for the receiver")
     if purpose.stream == "reference":
-        return {name: frame for name, frame in streams.items() if name not in _BY_SOLUTION} | _reference(
+        return {name: frame for name, frame in streams.items() if name not in BY_SOLUTION} | _reference(
             streams, purpose, sigmas
         )
     if purpose.solution is None or "gnss" not in streams:
@@ -47,7 +47,7 @@ def assigned(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
     named = {
         name: frame.with_columns(solution=pl.lit(purpose.solution))
         for name, frame in streams.items()
-        if name in _BY_SOLUTION
+        if name in BY_SOLUTION
     }
     return streams | named
 
@@ -93,7 +93,7 @@ def added(run: RunLog, streams: Streams, force: bool, place: Path) -> RunLog:
 
 
 def _beside(name: Stream, old: pl.DataFrame, new: pl.DataFrame, force: bool, place: Path) -> pl.DataFrame:
-    by_solution = name in _BY_SOLUTION
+    by_solution = name in BY_SOLUTION
     shared = sorted(set(old["solution"]) & set(new["solution"])) if by_solution else [name]
     if shared and not force:
         raise UsageError(

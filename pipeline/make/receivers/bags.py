@@ -7,14 +7,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import polars as pl
-
 from pipeline.make.receivers.bag_budget import Unpack, budget_of_bag, unpacker_of
 from pipeline.read.ingest.run import read_run
 from pipeline.storage.budget import Budget
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
-from schemas.run import STREAMS, RunLog, Stream
+from schemas.run import RunLog
 
 _HEADER = "std_msgs/msg/Header"
 _ENDINGS = (".bag", ".db3")
@@ -25,26 +23,25 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in (*_ENDINGS, ".mcap") or (path / "metadata.yaml").is_file()
 
 
-def read_bag(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
+def read_bag(path: Path, config: IngestConfig) -> tuple[RunLog, dict[str, int]]:
     """All streams of a bag, by schema name or as `[ingest]` maps its topics; what was left over."""
     if path.suffix.lower() == ".mcap":
-        return _streams(read_run(path, config, with_digest=False), {})
+        return _with_rest(read_run(path, config, with_digest=False), {})
     with TemporaryDirectory() as folder:
         log = Path(folder) / "bag.mcap"
         left = _transcribe(path, log, config)
         try:
-            return _streams(read_run(log, config, with_digest=False), left)
+            return _with_rest(read_run(log, config, with_digest=False), left)
         except BaliseError as error:
             error.place = None if error.place is None else error.place.replace(str(log), str(path))
             error.message = error.message.replace(str(log), str(path))
             raise
 
 
-def _streams(run: RunLog, left: dict[str, int]) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
-    streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
+def _with_rest(run: RunLog, left: dict[str, int]) -> tuple[RunLog, dict[str, int]]:
     if run.notes.damage is not None:
         left = left | {f"end of the log, {run.notes.damage}": 1}
-    return streams, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
+    return run, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
 
 
 def _transcribe(path: Path, to: Path, config: IngestConfig) -> dict[str, int]:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import date
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import polars as pl
 
 from pipeline.make.receivers import nmea, novatel, sbf, ubx
-from pipeline.make.receivers.adding import Purpose, Streams, added, assigned
+from pipeline.make.receivers.adding import BY_SOLUTION, Purpose, Streams, added, assigned
 from pipeline.make.receivers.bags import is_bag, read_bag
 from pipeline.make.receivers.csv import TABLES, names_file, read_csv
 from pipeline.make.receivers.epochs import Epochs, Gathered
@@ -22,11 +22,12 @@ from pipeline.make.receivers.frames import Frame, Protocol, frames, name_of
 from pipeline.make.receivers.rtklib import is_solution, read_solution
 from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked
 from pipeline.read.ingest.conform import conform, refuse
+from pipeline.read.ingest.correct import corrected, corrections_of
 from pipeline.read.ingest.mapping import mappings_of
 from pipeline.storage import files
-from schemas.config import FixSigma, IngestConfig
+from schemas.config import FixSigma, IngestConfig, StreamCorrection
 from schemas.errors import InputError
-from schemas.run import STREAMS, RunLog, Stream
+from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,11 @@ class Converted:
     """The run, and what could not be used: reason to number."""
 
     run: RunLog
-    dropped: dict[str, int]
+    dropped: Mapping[str, int]
 
     def gathered(self) -> Gatherings:
-        """The streams alone."""
-        frames = {name: self.run.stream(name) for name in STREAMS}
-        return Gatherings({name: frame for name, frame in frames.items() if frame is not None}, self.dropped)
+        """The streams, and the corrections that they hold."""
+        return gathered_of(self.run, self.dropped)
 
 
 def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -> Converted:
@@ -47,11 +47,16 @@ def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -
     return as_run(gather(logs, config), run_id)
 
 
-def as_run(logs: Gatherings, run_id: str, purpose: Purpose | None = None, sigmas: FixSigma | None = None) -> Converted:
-    """A new run of what logs hold, the positions as `purpose` says; raises `InputError` where they hold none."""
+def as_run(
+    logs: Gatherings,
+    run_id: str,
+    purpose: Purpose | None = None,
+    sigmas: FixSigma | None = None,
+    correct: Sequence[StreamCorrection] = (),
+) -> Converted:
+    """A new run of what logs hold, positions as `purpose` says, corrected; raises `InputError` without positions."""
     streams = assigned(logs.streams, purpose or Purpose(), sigmas or FixSigma())
-    gnss = streams.pop("gnss", None)
-    if gnss is None:
+    if "gnss" not in streams:
         raise InputError(
             "no epoch with a time and a position",
             place=run_id,
@@ -59,20 +64,69 @@ def as_run(logs: Gatherings, run_id: str, purpose: Purpose | None = None, sigmas
             expected="GNSS positions, which a new run needs",
             remedy="Convert the log of the receiver first or in the same call." + _reasons(logs.dropped),
         )
-    return Converted(RunLog(run_id, gnss).with_streams(**streams), logs.dropped)
+    held = logs.corrections_as(purpose or Purpose())
+    run = RunLog(run_id, streams["gnss"], notes=IngestNotes(corrections=held)).with_streams(**streams)
+    return Converted(corrected(run, correct, later=True), logs.dropped)
 
 
-def extended(run: RunLog, place: Path, logs: Gatherings, purpose: Purpose, sigmas: FixSigma, force: bool) -> Converted:
-    """A run that stands at a place, with what logs hold added to it."""
-    return Converted(added(run, assigned(logs.streams, purpose, sigmas), force, place), logs.dropped)
+def extended(
+    run: RunLog,
+    place: Path,
+    logs: Gatherings,
+    purpose: Purpose,
+    sigmas: FixSigma,
+    force: bool,
+    correct: Sequence[StreamCorrection] = (),
+) -> Converted:
+    """A run that stands at a place, with what logs hold added to it; both are corrected first."""
+    streams = assigned(logs.streams, purpose, sigmas)
+    notes = IngestNotes(corrections=logs.corrections_as(purpose))
+    bare = RunLog(run.run_id, run.gnss.clear(), notes=notes).with_streams(**streams)
+    new = corrected(bare, [made for made in correct if made.stream in streams], later=True)
+    old = corrected(run, correct, later=True)
+    for name in streams.keys() & set(BY_SOLUTION):
+        if old.stream(name) is not None:
+            _refuse_unlike(corrections_of(old, name), corrections_of(new, name), name, place)
+    whole = added(old, {name: frame for name in streams if (frame := new.stream(name)) is not None}, force, place)
+    held = [made for name in STREAMS for made in corrections_of(new if name in streams else old, name)]
+    return Converted(replace(whole, notes=replace(old.notes, corrections=tuple(held))), logs.dropped)
+
+
+def _refuse_unlike(
+    one: Sequence[StreamCorrection], other: Sequence[StreamCorrection], stream: Stream, place: Path
+) -> None:
+    """Rows of one stream that were corrected in different ways could not be told apart."""
+    if one != other:
+        ways = [", ".join(made.changes for made in held) or "none" for held in (one, other)]
+        raise InputError(
+            f"receivers of one {stream} with different corrections",
+            place=str(place),
+            found=" and ".join(ways),
+            remedy="Convert them with one configuration; `solution` in [[ingest.correct]] names which it is for.",
+        )
 
 
 @dataclass(frozen=True)
 class Gatherings:
-    """The streams of all logs, as the contract has them, and what could not be used: reason to number."""
+    """The streams of all logs, as the contract has them, and what could not be used: reason to number.
+
+    `corrections`: those that the streams hold already, of logs that are runs of this program.
+    """
 
     streams: Streams
-    dropped: dict[str, int]
+    dropped: Mapping[str, int]
+    corrections: tuple[StreamCorrection, ...] = ()
+
+    def corrections_as(self, purpose: Purpose) -> tuple[StreamCorrection, ...]:
+        """Those of the streams as they are meant: positions that become the reference are no stream `gnss` any more."""
+        lost = BY_SOLUTION if purpose.stream == "reference" else ()
+        return tuple(made for made in self.corrections if made.stream not in lost)
+
+
+def gathered_of(run: RunLog, dropped: Mapping[str, int]) -> Gatherings:
+    """The streams of a run, and the corrections that they hold."""
+    streams: Streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
+    return Gatherings(streams, dropped, run.notes.corrections)
 
 
 def gather(logs: list[Path], config: IngestConfig | None = None, date: date | None = None) -> Gatherings:
@@ -83,6 +137,7 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
     """
     dropped: Counter[str] = Counter()
     parts: list[tuple[Path, Streams]] = []
+    held: list[tuple[StreamCorrection, ...]] = []
     failures: list[NoEpochError] = []
     strangers: list[UnknownError] = []
     for log in logs:
@@ -90,16 +145,17 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
         with unpacked(log, config or IngestConfig()) as inner:
             for plain in inner:
                 try:
-                    streams, counts = _convert_one(plain, config or IngestConfig(), date)
+                    found = _convert_one(plain, config or IngestConfig(), date)
                 except UnknownError as error:
                     if plain == log:
                         raise
-                    strangers.append(error)
+                    strangers.append(_in_archive(error, plain, log))
                 except NoEpochError as error:
-                    failures.append(error)
+                    failures.append(error if plain == log else _in_archive(error, plain, log))
                 else:
-                    parts.append((log if plain == log else log / plain.name, streams))
-                    dropped.update(counts)
+                    parts.append((log if plain == log else log / plain.name, found.streams))
+                    held.append(found.corrections)
+                    dropped.update(found.dropped)
     if failures and not any("gnss" in streams for _, streams in parts):
         raise failures[0]
     if strangers and not parts:
@@ -107,7 +163,28 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
     counts = {"log without an epoch": len(failures), "file of an archive that is no log": len(strangers)}
     dropped.update({reason: count for reason, count in counts.items() if count})
     _refuse_overlaps(parts)
-    return Gatherings(_joined(parts), dict(dropped))
+    return Gatherings(_joined(parts), dict(dropped), _common(parts, held))
+
+
+def _common(
+    parts: list[tuple[Path, Streams]], held: list[tuple[StreamCorrection, ...]]
+) -> tuple[StreamCorrection, ...]:
+    """What the logs hold of corrections; logs of one stream hold the same."""
+    common: dict[Stream, list[StreamCorrection]] = {}
+    for (log, streams), made in zip(parts, held, strict=True):
+        for name in streams:
+            own = [correction for correction in made if correction.stream == name]
+            _refuse_unlike(common.setdefault(name, own), own, name, log)
+    return tuple(correction for own in common.values() for correction in own)
+
+
+E = TypeVar("E", bound=InputError)
+
+
+def _in_archive(error: E, plain: Path, log: Path) -> E:
+    """An error that is told when the folder where an archive was unpacked is gone."""
+    error.place = str(error.place).replace(str(plain), str(log / plain.name))
+    return error
 
 
 class NoEpochError(InputError):
@@ -182,17 +259,18 @@ def _spans(log: Path, streams: Streams) -> Iterator[_Span]:
                 yield _Span(log, stream, (key, str(name), column), rows["t"].min(), rows["t"].max())
 
 
-def _convert_one(log: Path, config: IngestConfig, date: date | None) -> tuple[Streams, Mapping[str, int]]:
+def _convert_one(log: Path, config: IngestConfig, date: date | None) -> Gatherings:
     if is_bag(log):
-        return read_bag(log, _of_topics(config))
+        # Corrections are made of the whole, once.
+        return gathered_of(*read_bag(log, _of_topics(config).model_copy(update={"correct": ()})))
     if log.suffix.lower() == ".csv" or names_file(config, log):
-        return read_csv(log, config)
+        return Gatherings(*read_csv(log, config))
     if log.is_dir():
         expected = f"a file, or the folder of a bag with its {BAG_FOLDER}"
         raise InputError("cannot be read: it is a folder", place=str(log), expected=expected)
     content = files.read_bytes(log)
     if is_solution(content):
-        return read_solution(content, log)
+        return Gatherings(*read_solution(content, log))
     return _read(content, log, date)
 
 
@@ -206,7 +284,7 @@ def _of_topics(config: IngestConfig) -> IngestConfig:
     return config.model_copy(update=kept)
 
 
-def _read(content: bytes, log: Path, date: date | None) -> tuple[Streams, Mapping[str, int]]:
+def _read(content: bytes, log: Path, date: date | None) -> Gatherings:
     """The epochs of the protocol that says most; what is damaged or said twice is counted."""
     dropped: Counter[str] = Counter()
     gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
@@ -224,14 +302,15 @@ def _read(content: bytes, log: Path, date: date | None) -> tuple[Streams, Mappin
             dropped[f"{protocol} position beside those of {best}"] += epochs.positions
     if not settled[best].epochs:
         raise _no_epoch(content, log, dropped)
-    return settled[best].streams(), dropped
+    return Gatherings(settled[best].streams(), dropped)
 
 
 def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
     """What there is in place of positions tells what to change at the receiver."""
     met = Counter(name_of(frame) for frame in frames(content, lambda: None))
     if not met:
-        hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, content)), _OTHER)
+        head = content[:_HEAD]
+        hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, head)), _OTHER)
         return UnknownError(
             "holds no message of a known receiver" if content else "is empty",
             place=str(log),
@@ -285,6 +364,8 @@ _ALMOST = {
     rb"\A\s*\d{4}(/\d\d/\d\d|\s+\d+\.\d+\s)": "If it is of RTKLIB, let it write its header (out-outhead = on).",
 }
 _MOST_NAMES = 20
+# Where a hint is looked for: what begins with gigabytes of something else is no such file.
+_HEAD = 1024 * 1024
 _UNFIT = "message that does not fit its definition"
 
 

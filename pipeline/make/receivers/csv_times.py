@@ -10,6 +10,7 @@ import polars as pl
 from pipeline.read.ingest.stamps import (
     LEAST_DAY,
     MOST_DAY,
+    day_is_unclear,
     gps_ns_of_weeks,
     orders_of_day,
     time_source,
@@ -168,11 +169,12 @@ def _day_first(first: pl.Series, second: pl.Series, asked: str, place: str) -> b
             expected="day or month first in all rows" if asked == "auto" else asked,
             remedy="Correct date_order." if fitting else "Correct the file.",
         )
-    if asked == "auto" and len(fitting) > 1 and len(first.drop_nulls()):
+    if asked == "auto" and day_is_unclear(first, second):
+        unlike = pl.DataFrame({"first": first, "second": second}).filter(pl.col("first") != pl.col("second"))
         raise InputError(
             "holds dates that fit day first and month first",
             place=place,
-            found=f"{first.drop_nulls()[0]} and {second.drop_nulls()[0]} of a year",
+            found="{} and {} of a year".format(*unlike.row(0)),
             expected="a day over 12 in some row",
             remedy='Give date_order = "day_first" or "month_first" in the mapping.',
         )

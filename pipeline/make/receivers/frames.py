@@ -31,9 +31,12 @@ class Frame(NamedTuple):
     content: bytes
 
 
+# What a message begins with; a search for these bytes passes over what lies between messages, which may be gigabytes.
+_FIRST = b"\xb5$\xaa#%\xd3"
 _START = re.compile(
+    rb"(?=[" + _FIRST + rb"])(?:"
     rb"(?P<UBX>\xb5\x62)|(?P<SBF>\$@)|(?P<NOVATEL>\xaaD[\x12\x13]|[#%][A-Z][A-Z0-9_]+A,)"
-    rb"|(?P<NMEA>\$(?:[A-Z]{2}[A-Z0-9]{3}|P[A-Z0-9]{3,6}),)|(?P<RTCM>\xd3[\x00-\x03])"
+    rb"|(?P<NMEA>\$(?:[A-Z]{2}[A-Z0-9]{3}|P[A-Z0-9]{3,6}),)|(?P<RTCM>\xd3[\x00-\x03]))"
 )
 _SENTENCE = re.compile(rb"\$([ -#%-)+-~]+)\*([0-9A-Fa-f]{2})\r?\n?")
 _NOVATEL_LINE = re.compile(rb"[#%]([ -)+-~]+)\*([0-9A-Fa-f]{8})\r?\n?")
@@ -50,6 +53,8 @@ _RTCM_OVERHEAD = 6
 
 def frames(content: bytes, on_damage: Callable[[], None]) -> Iterator[Frame]:
     """All whole messages in order; `on_damage` is called once for each that is damaged or cut off."""
+    if not any(first in content for first in _FIRST):
+        return
     at = 0
     while start := _START.search(content, at):
         protocol = Protocol[str(start.lastgroup)]

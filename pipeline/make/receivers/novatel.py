@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.make.receivers.epochs import Epoch, Gathered, covariance, velocity
 from pipeline.make.receivers.frames import NOVATEL_NAMES
-from pipeline.read.ingest.novatel import FIX_BY_CODE
+from pipeline.read.ingest.novatel import FIX_BY_CODE, SOLVED
 from pipeline.read.ingest.timescale import utc_of_week
 from schemas.enums import Fix
 
@@ -22,8 +22,6 @@ _RANKS = {"INSPVAS": 0, "INSPVA": 0, "INSPVAX": 1, "PSRPOS": 2, "BESTGNSSPOS": 3
 _INERTIAL = ("INSPVAS", "INSPVA", "INSPVAX")
 _COARSE = 100  # "GPS reference time status": below it the time is approximate or not known
 _WGS84 = 61
-# "Inertial solution status": high variance, good, free, alignment complete. The others are no solution.
-_SOLVED = (2, 3, 6, 7)
 _VELOCITY = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
 # Of the format: BESTVEL comes at 1 Hz at least, one of two may be late; over more there is no velocity of an epoch.
 _LONGEST_BETWEEN_NS = 1_500_000_000
@@ -92,7 +90,7 @@ def settle_source(gathered: Gathered) -> None:
 
 def _inertial(epoch: Epoch, m: Any, rank: int) -> None:
     """INSPVAX tells what its position rests on, INSPVA does not."""
-    solved = int(m.ins_solution_status) in _SOLVED
+    solved = int(m.ins_solution_status) in SOLVED
     kind = FIX_BY_CODE.get(int(m.position_type), Fix.NONE) if hasattr(m, "position_type") else Fix.ESTIMATED
     _place(epoch, m, rank, kind if solved else Fix.NONE)
     epoch.put("velocity", rank, velocity(m.east_vel, m.north_vel, m.up_vel))

@@ -14,6 +14,7 @@ from pipeline.make.survey.network import SurveyNetwork
 from pipeline.make.survey.pieces import Survey, measures_at
 from pipeline.make.survey.sources import content_of_survey
 from pipeline.make.survey.tables import placed_table
+from pipeline.read.ingest.guesses import BALISE_KINDS, BALISE_LIST, first, word_of
 from pipeline.read.site.tables import RawTable, typed_table
 from pipeline.stages.matching.candidates import candidates_of, segments_of
 from pipeline.stages.track.geodesy import points_of
@@ -88,17 +89,33 @@ def balises_of_list(
     Raises `SiteError` for a balise that no track, or more than one, can be meant for.
     """
     place = str(path)
-    table = placed_table(place, content_of_survey(path), epsg, config.site)
+    table = placed_table(place, content_of_survey(path, config.survey), epsg, config.site)
     track = track_of(network.track)
-    if "balise_id" not in table.columns:
-        table = table.with_columns(balise_id=pl.Series([f"B{row}" for row in range(1, table.height + 1)]))
-    kind = pl.col("kind").fill_null("virtual") if "kind" in table.columns else pl.lit("virtual")
-    table = table.with_columns(kind=kind)
+    table = _with_names_and_kinds(table, survey)
     placer = _Placer(place, network, track, survey, config.survey)
     places = [placer.placed(row) for row in table.iter_rows(named=True)]
     columns = {"netelement_id": pl.String, "measure_m": pl.Float64}
     placed = pl.DataFrame(places, schema=columns, orient="row")
     return _typed(place, table.with_columns(placed))
+
+
+def _with_names_and_kinds(table: pl.DataFrame, survey: Survey) -> pl.DataFrame:
+    """Under the names of the contract; what the list does not say is reported: reads of a balise need its name."""
+    words = {name: word_of(name) for name in table.columns}
+    columns = f"columns {', '.join(table.columns)}"
+    for key, patterns in BALISE_LIST.items():
+        found = (first(words, pattern) for pattern in patterns)
+        fitting = next((name for name in found if name and table[name].null_count() == 0), None)
+        if key not in table.columns and fitting and (key != "balise_id" or table[fitting].is_unique().all()):
+            table = table.rename({fitting: key})
+    if "balise_id" not in table.columns:
+        table = table.with_columns(balise_id=pl.Series([f"B{row}" for row in range(1, table.height + 1)]))
+        survey.report("note", "balises", f"none of the {columns} names them: numbered B1 to B{table.height}")
+    if "kind" not in table.columns:
+        survey.report("note", "balises", f"none of the {columns} is their kind: all are taken as virtual")
+        return table.with_columns(kind=pl.lit("virtual"))
+    kind = pl.col("kind").cast(pl.String).str.strip_chars().str.to_lowercase().replace(dict(BALISE_KINDS))
+    return table.with_columns(kind=kind.fill_null("virtual"))
 
 
 class _Placer:

@@ -14,8 +14,16 @@ from schemas.config import SurveyConfig
 from schemas.errors import SiteError
 from schemas.run import Finding
 
-# A survey of 100 MB holds some two million points: more is no line that a person checks.
-MOST_BYTES = 100_000_000
+
+def refuse_large(size: int, place: str, config: SurveyConfig) -> None:
+    """A survey of more bytes than the configuration lets pass."""
+    if size > config.size_limit_mb * 1e6:
+        raise SiteError(
+            "is too large",
+            place=place,
+            expected=f"at most {config.size_limit_mb:g} MB",
+            remedy="Cut it to the line, or write a larger `size_limit_mb` under [survey] in the configuration file.",
+        )
 
 
 @dataclass(frozen=True)

@@ -7,21 +7,25 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from pipeline.make.receivers import as_run, gather
+from pipeline.make.receivers.convert import UnknownError
 from pipeline.make.survey.geojson_lines import read_geojson
 from pipeline.make.survey.map_files import MAP_SUFFIXES, read_map
-from pipeline.make.survey.pieces import MOST_BYTES, Survey, piece_of, with_own_names
+from pipeline.make.survey.pieces import Survey, piece_of, refuse_large, with_own_names
 from pipeline.make.survey.tables import read_points
 from pipeline.make.survey.xml_lines import read_kmz, read_xml
 from pipeline.read.ingest.run import read_run
 from pipeline.stages.matching.fixes import fixes_of
 from pipeline.stages.matching.steps import believable, travelled
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, SurveyConfig, Vehicle
 from schemas.enums import Fix
 from schemas.errors import SiteError
+from schemas.run import RunLog
 
 # A variance of zero means "not known" in a `gnss` stream.
 _LEAST_SIGMA_M = 1e-3
-_KINDS = "GPX, KML, KMZ, GeoJSON, GeoPackage, Shapefile, FlatGeobuf, CSV, Parquet, or a run with a reference"
+_RECORDED = "Of a recorded drive: `balise convert LOG --out DRIVE`, then the same with --stream reference."
+_KINDS = "GPX, KML, KMZ, GeoJSON, GeoPackage, Shapefile, FlatGeobuf, CSV, Parquet, a run, or a log of RTK"
 
 
 def read_surveys(paths: list[Path], epsg: int | None, vehicle: Vehicle, config: Configuration) -> Survey:
@@ -40,28 +44,39 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
     if path.is_dir() or suffix == ".mcap":
         return read_recorded(path, vehicle, config)
     place = str(path)
-    data = content_of_survey(path)
+    data = content_of_survey(path, config.survey)
     match suffix:
         case ".gpx" | ".kml":
             return read_xml(place, path.stem, data)
         case ".kmz":
-            return read_kmz(place, path.stem, data)
+            return read_kmz(place, path.stem, data, config.survey)
         case ".geojson" | ".json":
             return read_geojson(place, path.stem, data, config.site)
         case ".csv" | ".txt" | ".parquet":
             return read_points(place, path.stem, data, epsg, config.site)
         case _ if suffix in MAP_SUFFIXES:
             return read_map(path, data)
-    raise SiteError("is no survey that is known", place=place, found=suffix or "no suffix", expected=_KINDS)
+    return _of_receiver(path, vehicle, config)
 
 
-def content_of_survey(path: Path) -> bytes:
+def _of_receiver(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
+    """The line of a drive as a receiver recorded it."""
+    try:
+        run = as_run(gather([path], config.ingest), path.stem, correct=config.ingest.correct).run
+    except UnknownError:
+        found = path.suffix.lower() or "no suffix"
+        raise SiteError(
+            "is no survey that is known", place=str(path), found=found, expected=_KINDS, remedy=_RECORDED
+        ) from None
+    return _of_run(run, path, vehicle, config)
+
+
+def content_of_survey(path: Path, config: SurveyConfig) -> bytes:
     """The file, unless it is too large to be one."""
     try:
         if not path.is_file():
             raise SiteError("is no regular file", place=str(path))
-        if path.stat().st_size > MOST_BYTES:
-            raise SiteError("is too large", place=str(path), expected=f"at most {MOST_BYTES // 1_000_000} MB")
+        refuse_large(path.stat().st_size, str(path), config)
         return path.read_bytes()
     except OSError as error:
         raise SiteError(f"cannot be read: {error.strerror}", place=str(path)) from None
@@ -72,7 +87,10 @@ def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey
 
     Raises `InputError` where the run cannot be read, `SiteError` where it has no position better than GNSS alone.
     """
-    run = read_run(str(path), config.ingest, with_digest=False)
+    return _of_run(read_run(str(path), config.ingest, with_digest=False), path, vehicle, config)
+
+
+def _of_run(run: RunLog, path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
     points = run.reference
     if points is None:
         fixed = run.gnss.filter(pl.col("fix").cast(pl.String) == Fix.RTK_FIXED.value)

@@ -10,9 +10,10 @@ import io
 import zipfile
 from xml.parsers import expat
 
-from pipeline.make.survey.pieces import MOST_BYTES, Survey, piece_of
+from pipeline.make.survey.pieces import Survey, piece_of, refuse_large
 from pipeline.read.site.geojson import number_of
 from pipeline.storage.budget import UNPACKING
+from schemas.config import SurveyConfig
 from schemas.errors import SiteError
 
 _ENDS_OF_LINE = ("trkseg", "rte", "LineString", "Track")
@@ -36,7 +37,7 @@ def read_xml(place: str, stem: str, data: bytes) -> Survey:
     return reader.survey
 
 
-def read_kmz(place: str, stem: str, data: bytes) -> Survey:
+def read_kmz(place: str, stem: str, data: bytes, config: SurveyConfig) -> Survey:
     """The first KML of a KMZ, which is a zip file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as packed:
@@ -44,11 +45,10 @@ def read_kmz(place: str, stem: str, data: bytes) -> Survey:
             if name is None:
                 raise SiteError("holds no KML", place=place, expected="a KMZ with doc.kml")
             with packed.open(name) as file:
-                content = file.read(MOST_BYTES + 1)
+                content = file.read(int(config.size_limit_mb * 1e6) + 1)
     except UNPACKING as error:
         raise SiteError(f"cannot be unpacked ({error})", place=place, expected="a KMZ, which is a zip file") from None
-    if len(content) > MOST_BYTES:
-        raise SiteError("unpacks to too much", place=place, expected=f"at most {MOST_BYTES // 1_000_000} MB of KML")
+    refuse_large(len(content), f"{place}: {name}", config)
     return read_xml(f"{place}: {name}", stem, content)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,20 +12,32 @@ import polars as pl
 from pipeline.read.ingest.conform import conform, refuse
 from pipeline.stages.track.geodesy import moved_deg
 from schemas.arrays import NS_PER_S, floats
-from schemas.config import StreamCorrection
-from schemas.errors import ConfigError, InputError
+from schemas.config import IngestConfig, StreamCorrection, settings_from
+from schemas.errors import BaliseError, ConfigError, InputError
 from schemas.inputs import STREAM_SCHEMAS
-from schemas.run import RunLog
+from schemas.run import STREAMS, RunLog, Stream
+
+RECORDED = "corrections"
+"""In the metadata of a stream that was written: the corrections that it holds already."""
 
 _PLACE = ("latitude_deg", "longitude_deg")
 
 
-def corrected(run: RunLog, corrections: Sequence[StreamCorrection]) -> RunLog:
-    """The run with these corrections applied in order; `notes` lists them.
+def corrected(run: RunLog, corrections: Sequence[StreamCorrection], later: bool = False) -> RunLog:
+    """The run as the configuration corrects it, each correction once; `notes` lists them.
+
+    A stream that was written with corrections holds them already: what the configuration begins with is left out.
+    `later`: streams that the run does not have yet are corrected when they are added.
 
     Raises `ConfigError` for a stream or column that the run does not have, `InputError` for values that the contract
-    does not allow afterwards.
+    does not allow afterwards, and for a stream that holds other corrections than these.
     """
+    missing = [made for stream in STREAMS for made in _missing(run, stream, corrections)]
+    return corrected_further(run, [made for made in missing if not later or run.stream(made.stream) is not None])
+
+
+def corrected_further(run: RunLog, corrections: Sequence[StreamCorrection]) -> RunLog:
+    """The run with these corrections in order, on top of those that it holds. Raises as `corrected`."""
     for correction in corrections:
         frame = run.stream(correction.stream)
         if frame is None:
@@ -34,9 +47,54 @@ def corrected(run: RunLog, corrections: Sequence[StreamCorrection]) -> RunLog:
                 remedy="Remove this correction, or replay this run with another configuration.",
             )
         run = run.with_streams(**{correction.stream: _corrected(frame, correction, run.run_id)})
-        applied = (*run.notes.corrections, _note_of(correction))
-        run = replace(run, notes=replace(run.notes, corrections=applied))
+        run = replace(run, notes=replace(run.notes, corrections=(*run.notes.corrections, correction)))
     return run
+
+
+def _missing(run: RunLog, stream: Stream, corrections: Sequence[StreamCorrection]) -> Sequence[StreamCorrection]:
+    """Those of a stream that it does not hold yet; where it holds others, nobody knows what would be made twice."""
+    held = corrections_of(run, stream)
+    wanted = [correction for correction in corrections if correction.stream == stream]
+    both = min(len(held), len(wanted))
+    if held[:both] != wanted[:both]:
+        raise InputError(
+            f"the {stream} was written with other corrections than these",
+            place=f"{run.run_id}: {stream}",
+            found="; ".join(correction.changes for correction in held),
+            expected="; ".join(correction.changes for correction in wanted),
+            remedy="Convert its logs again with this configuration, or take the one that they were converted with.",
+        )
+    return wanted[both:]
+
+
+def corrections_of(run: RunLog, stream: Stream) -> list[StreamCorrection]:
+    """The corrections that a stream holds already."""
+    return [correction for correction in run.notes.corrections if correction.stream == stream]
+
+
+def recorded_corrections(run: RunLog, stream: Stream) -> dict[str, str]:
+    """What a written stream says of its corrections, for its metadata."""
+    held = [correction.model_dump(mode="json", exclude_defaults=True) for correction in corrections_of(run, stream)]
+    return {RECORDED: json.dumps(held)} if held else {}
+
+
+def read_corrections(metadata: Mapping[str, str], stream: Stream, place: str) -> tuple[StreamCorrection, ...]:
+    """The corrections that a stream says it holds. Raises `InputError` where that cannot be understood."""
+    text = metadata.get(RECORDED)
+    if text is None:
+        return ()
+    try:
+        held = settings_from({"correct": json.loads(text)}, IngestConfig, place).correct
+    except (ValueError, RecursionError, BaliseError):
+        held = ()
+    if not held or any(correction.stream != stream for correction in held):
+        raise InputError(
+            f"does not say clearly how its {stream} was corrected",
+            place=place,
+            found=text[:80],
+            remedy="Convert its logs again.",
+        )
+    return held
 
 
 def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -> pl.DataFrame:
@@ -92,11 +150,3 @@ def _refuse_unknown(correction: StreamCorrection) -> None:
             found=", ".join(unknown),
             expected="some of " + ", ".join(numbers),
         )
-
-
-def _note_of(correction: StreamCorrection) -> str:
-    changed = correction.model_dump(exclude_defaults=True)
-    changed.pop("stream")
-    return f"{correction.stream} corrected by configuration: " + ", ".join(
-        f"{name} {value}" for name, value in changed.items()
-    )

@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.read.ingest.csv_text import read_log_table, with_points
 from pipeline.read.ingest.guesses import COLUMNS, WORDS, columns_in, first, mapping_lines, one_line, unit_in, word_of
-from pipeline.read.ingest.stamps import LEAST_DAY, MOST_DAY, orders_of_day
+from pipeline.read.ingest.stamps import LEAST_DAY, MOST_DAY, day_is_unclear
 from schemas.run import Stream
 
 _EMPTY = """
@@ -101,7 +101,7 @@ def _order(column: pl.Series) -> list[str]:
         return []
     parts = column.str.extract_groups(r"^([0-9]{1,2})[-/.]([0-9]{1,2})[-/.][0-9]").struct.unnest().cast(pl.Int64)
     day_or_month = parts.to_series(0)
-    if day_or_month.null_count() == len(column) or len(orders_of_day(day_or_month, parts.to_series(1))) < 2:
+    if not day_is_unclear(day_or_month, parts.to_series(1)):
         return []
     return ['# date_order = "day_first"  # or "month_first": all dates of the file fit both, so you must say it']
 

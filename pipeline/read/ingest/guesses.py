@@ -16,6 +16,8 @@ COLUMNS: Mapping[Stream, Mapping[str, str]] = _FILE["columns"]
 SURVEY: Mapping[str, str] = _FILE["survey"] | {
     name: COLUMNS["gnss"][name] for name in ("latitude_deg", "longitude_deg")
 }
+BALISE_LIST: Mapping[str, list[str]] = _FILE["balise_list"]
+BALISE_KINDS: Mapping[str, str] = _FILE["balise_kinds"]
 WORDS: Mapping[str, str] = _FILE["words"]
 UNITS: Mapping[str, float] = _FILE["units"]
 _POSITION = {"latitude_deg", "longitude_deg"}
@@ -45,7 +47,9 @@ def columns_in(stream: Stream, words: Mapping[str, str]) -> dict[str, str]:
 def unit_in(name: str) -> str | None:
     """The unit in brackets, or at the end of a name."""
     patterns = (r"[\[(<]\s*([^\])>]+?)\s*[\])>]", r"_(kmh|kph|mps|mph|km|mm|cm|m|ms|s|ft|kn|knots)$")
-    return next((match[1] for pattern in patterns if (match := re.search(pattern, name.lower()))), None)
+    found = next((match[1] for pattern in patterns if (match := re.search(pattern, name.lower()))), None)
+    # A column that is called by its unit alone: kilometres.
+    return "km" if found is None and word_of(name) == "km" else found
 
 
 def mapping_lines(

@@ -36,13 +36,14 @@ class Schema:
 
 @dataclass(frozen=True)
 class Channel:
-    """A channel with its schema; `file` serves error messages."""
+    """A channel with its schema; `file` serves error messages, `notes` are this program's in the channel's metadata."""
 
     id: int
     topic: str
     encoding: str
     schema: Schema | None
     file: str
+    notes: tuple[tuple[str, str], ...] = ()
 
     @property
     def place(self) -> str:

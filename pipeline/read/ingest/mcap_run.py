@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -12,17 +12,18 @@ import polars as pl
 
 from pipeline.read.ingest.assemble import DecodedRows, stream_frames
 from pipeline.read.ingest.conform import refuse
+from pipeline.read.ingest.correct import read_corrections
 from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of, undecodable
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel, DamageError
 from pipeline.read.ingest.mcap_walk import McapWalk
-from pipeline.read.ingest.plan import Sample, is_candidate, settle, solution_of, sources_of
+from pipeline.read.ingest.plan import Sample, Source, is_candidate, settle, solution_of, sources_of
 from pipeline.read.ingest.reader import SourceReader
 from pipeline.storage import files
 from pipeline.storage.address import Address, stem_of
 from pipeline.storage.budget import most_unpacked
 from schemas.arrays import times_ns
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, StreamCorrection
 from schemas.errors import InputError
 from schemas.run import IngestNotes, RunLog
 
@@ -95,7 +96,7 @@ def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> 
     """All streams of a log, read strictly from front to back in pieces."""
     streams = McapStreams(config)
     walk, digest = walk_log(path, config, streams, with_digest)
-    frames, slow_messages, left_over = _frames(path, config, walk, streams)
+    frames, held, slow_messages, left_over = _frames(path, config, walk, streams)
     return RunLog(
         run_id=stem_of(path),
         notes=IngestNotes(
@@ -104,6 +105,7 @@ def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> 
             slow_path_messages=slow_messages,
             chunks_without_crc=walk.without_crc,
             skipped_topics=left_over,
+            corrections=held,
         ),
         input_digest=digest,
         gnss=frames["gnss"],
@@ -140,8 +142,8 @@ def walk_log(
 
 def _frames(
     path: Address, config: IngestConfig, walk: McapWalk, streams: McapStreams
-) -> tuple[dict[str, pl.DataFrame], int, tuple[str, ...]]:
-    """Frames of all streams, messages decoded one by one, and the topics that fed none."""
+) -> tuple[dict[str, pl.DataFrame], tuple[StreamCorrection, ...], int, tuple[str, ...]]:
+    """Frames of all streams, corrections that they hold, messages decoded one by one, and the topics that fed none."""
     readers = [reader for of_channel in streams.readers.values() for reader in of_channel]
     met = [walk.channels[channel_id] for channel_id in streams.readers]
     settled = settle([reader.source for reader in readers], [c.topic for c in met], config, str(path))
@@ -156,7 +158,20 @@ def _frames(
     if "gnss" not in frames:
         breaches.append(_no_gnss(path, walk, left_over))
     refuse(breaches)
-    return frames, sum(reader.slow_messages for reader in chosen), (*left_over, *remarks)
+    slow_messages = sum(reader.slow_messages for reader in chosen)
+    return frames, _held([*settled], str(path)), slow_messages, (*left_over, *remarks)
+
+
+def _held(sources: Sequence[Source], place: str) -> tuple[StreamCorrection, ...]:
+    """What the topics of each stream say of its corrections, all the same."""
+    held: list[StreamCorrection] = []
+    for stream in dict.fromkeys(source.recipe.stream for source in sources):
+        said = {source.channel.notes: source.channel for source in sources if source.recipe.stream == stream}
+        if len(said) > 1:
+            topics = ", ".join(channel.topic for channel in said.values())
+            raise InputError(f"topics of {stream} were corrected in different ways", place=place, found=topics)
+        held += [found for notes in said for found in read_corrections(dict(notes), stream, place)]
+    return tuple(held)
 
 
 def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> InputError:

@@ -28,6 +28,7 @@ from pipeline.read.ingest.mcap_records import (
     unpacked,
 )
 from pipeline.read.ingest.mcap_summary import Summary, WalkCounts
+from pipeline.storage.described import noted
 
 _AFTER_THE_DATA = (
     Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.FOOTER, Opcode.SUMMARY_OFFSET,
@@ -186,7 +187,8 @@ class McapWalk:
     def _channel(self, body: bytes, position: int) -> None:
         record = parse(records.Channel, body, position)
         schema = self._schemas.get(record.schema_id)
-        channel = Channel(record.id, record.topic, record.message_encoding, schema, self._file)
+        notes = tuple(noted(record.metadata).items())
+        channel = Channel(record.id, record.topic, record.message_encoding, schema, self._file, notes)
         if self.channels.get(record.id, channel) != channel:
             raise DamageError(position, f"channel {record.id} ({record.topic}) is defined twice with different content")
         if record.schema_id and schema is None:

@@ -8,10 +8,12 @@ from collections.abc import Iterable
 import polars as pl
 
 from pipeline.read.ingest.conform import conform, refuse, refuse_too_many
+from pipeline.read.ingest.correct import read_corrections
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
+from pipeline.storage.described import notes_of
 from pipeline.storage.parquet import ColumnTypes, ParquetError, read_parquet, rows_of, without_checksums
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, StreamCorrection
 from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -27,6 +29,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
     frames: dict[str, pl.DataFrame] = {}
     skipped: list[str] = []
     unproved: list[str] = []
+    held: list[StreamCorrection] = []
     for stream in STREAMS:
         if f"{stream}.parquet" not in present:
             continue
@@ -38,13 +41,14 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
         recorded = _read(content, stream, str(file), config, breaches)
         if recorded is not None:
             frames[stream] = conform(recorded, stream, str(file), breaches)
+            held += read_corrections(notes_of(content), stream, str(file))
             unproved += [f"{stream}.parquet"] if without_checksums(content) else []
             skipped += [f"{stream}.parquet: column {name}" for name in _others(recorded.columns, stream)]
     refuse(breaches)
     skipped += sorted(present - {f"{stream}.parquet" for stream in STREAMS})
     return RunLog(
         run_id=stem_of(path),
-        notes=IngestNotes(skipped_topics=tuple(skipped), files_without_crc=tuple(unproved)),
+        notes=IngestNotes(skipped_topics=tuple(skipped), files_without_crc=tuple(unproved), corrections=tuple(held)),
         input_digest=digest.hexdigest() if with_digest else "",
         gnss=frames["gnss"],
     ).with_streams(**frames)

@@ -219,7 +219,16 @@ def _preferred(sources: Sequence[Source]) -> list[Source]:
     if of_project:
         return of_project
     whole = [source for source in sources if not source.recipe.supplement]
-    return list(sources) if whole else []
+    return [source for source in sources if not _is_outranked(source, sources)] if whole else []
+
+
+def _is_outranked(source: Source, sources: Sequence[Source]) -> bool:
+    """Whether a receiver, whose topics stand side by side, has a message of higher rank; a mapped one always counts."""
+    home = source.channel.topic.rpartition("/")[0]
+    return source.mapping is None and any(
+        0 < source.recipe.rank < other.recipe.rank and other.channel.topic.rpartition("/")[0] == home
+        for other in sources
+    )
 
 
 def _refuse_shared_solutions(sources: Sequence[Source]) -> None:

@@ -92,6 +92,11 @@ def orders_of_day(first: pl.Series, second: pl.Series) -> list[str]:
     return [order for order, month in months.items() if (month.drop_nulls() <= 12).all()]
 
 
+def day_is_unclear(first: pl.Series, second: pl.Series) -> bool:
+    """Whether the dates do not tell which is the day, and it matters: 03/03 is one day in both orders."""
+    return len(orders_of_day(first, second)) > 1 and bool((first != second).any())
+
+
 def within(counts: pl.Series, unit_ns: int) -> pl.Series:
     """The counts of a unit since an epoch, null before it and after `LATEST_NS`: nothing then overflows 64 bits."""
     return counts.set(~counts.is_between(0, LATEST_NS // max(unit_ns, 1)), None)

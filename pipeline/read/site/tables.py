@@ -9,7 +9,9 @@ import polars as pl
 
 from pipeline.read.ingest.conform import Defaults, conform_to, line_of, rows_text, type_name
 from pipeline.read.ingest.csv_text import comments_of, epsg_in, read_table
-from pipeline.storage.parquet import metadata_of, read_parquet, rows_of
+from pipeline.storage.budget import most_unpacked
+from pipeline.storage.parquet import metadata_of, read_parquet, unpacked_size
+from schemas.config import IngestConfig
 from schemas.enums import BaliseDirection, Reaction
 from schemas.errors import InputError
 from schemas.inputs import SITE_SCHEMAS
@@ -52,8 +54,8 @@ def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:
         if not file.endswith(".parquet"):
             return _with_epsg(file, read_table(data, infer=False), epsg_in(comments_of(data)))
         named = {name.lower(): value for name, value in metadata_of(data).items()}.get("epsg")
-        if (rows := rows_of(data)) > len(data):  # each has numbers of its own
-            raise ValueError(f"{rows} rows in {len(data)} bytes")
+        if (size := unpacked_size(data)) > most_unpacked(len(data), IngestConfig()):
+            raise ValueError(f"{len(data)} bytes unpack to {size // 2**20} MiB")
         return _with_epsg(file, read_parquet(data), named)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         kind = "Parquet" if file.endswith(".parquet") else "CSV"

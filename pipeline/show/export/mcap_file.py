@@ -18,6 +18,7 @@ from pipeline.show.export.messages import Encoding, Topic, geojson_topic, log_to
 from pipeline.show.export.position_messages import location_fix_topic, navsatfix_topic
 from pipeline.show.export.positions import as_gnss, positions_of
 from pipeline.storage import whole_file
+from pipeline.storage.described import PREFIX
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import MONITORS
 
@@ -83,6 +84,7 @@ def write_topics(
                 topic.topic,
                 topic.encoding,
                 writer.register_schema(topic.schema_name, topic.schema_encoding, topic.schema),
+                {f"{PREFIX}{key}": value for key, value in topic.notes.items()},
             )
             for topic in topics
         ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -42,7 +43,7 @@ _ENUMS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True)
 class Topic:
-    """One channel to write: its schema, and one payload per time [ns since 1970]."""
+    """One channel to write: its schema, one payload per time [ns since 1970], and notes for its metadata."""
 
     topic: str
     encoding: str
@@ -51,6 +52,7 @@ class Topic:
     schema: bytes
     times_ns: list[int]
     messages: Iterator[bytes]
+    notes: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def rows_topic(topic: str, name: str, frame: pl.DataFrame, encoding: Encoding) -> Topic:

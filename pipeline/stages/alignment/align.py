@@ -117,7 +117,7 @@ def _columns(
         pl.Series("odometer_counter", odometry.counter_at_s(at)),
         pl.Series("slip_doubt_m", odometry.slip_doubt_at_s(at)),
         pl.Series("stamp_jitter_s", np.full(known.size, jitter_s)),
-        pl.Series("odometer_white_m2_per_s", np.full(known.size, odometry.noise.white_m2_per_s)),
+        pl.Series("odometer_white_m2_per_s", odometry.white_m2_per_s_at(at)),
         pl.Series("odometer_rows_m", rows_m),
         pl.Series("odometer_period_s", np.full(known.size, odometry.period_s)),
         pl.Series("speed_mps", speed, nan_to_null=True),

@@ -221,7 +221,7 @@ class _Learner:
             jitter_s=self._jitter_s,
             scale_sigma=in_use.scale_sigma,
             latency_sigma_s=in_use.latency_sigma_s,
-            white_m2_per_s=self._odometry.noise.white_m2_per_s,
+            white_m2_per_s=self._odometry.white_m2_per_s_at(at_s),
             rows_m=self._rows_m(at_s),
             period_s=self._odometry.period_s,
         )

@@ -149,7 +149,8 @@ class ScaleLatencyFilter:
         rows = self._rows(sigma_m)
         steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
         unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / self.config.settling_tau_s)
-        settled_m2 = (-np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
+        bridged_m2 = np.diff(self.odometry.bridged_m2_at(np.concatenate([[state.t_s], t_s])))
+        settled_m2 = (bridged_m2 - np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
         white_m2 = (self.config.white_share * sigma_m**2).tolist()
         before = state.joint
         epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, steps_ns, settled_m2, strict=True)

@@ -167,11 +167,12 @@ def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame
         return gnss, {}
     counts: dict[str, int] = {}
     marked: list[pl.DataFrame] = []
-    for part in gnss.with_row_index("_row").partition_by("solution", maintain_order=True):
+    narrow = gnss.select("solution", "t", "fix", *_PLACE).with_row_index("_row")
+    for part in narrow.partition_by("solution", maintain_order=True):
         part, count = without_placeholders(part, config.ingest, config.align.fastest_mps)
-        marked.append(part)
+        marked.append(part.select("_row", "fix"))
         counts[part["solution"][0]] = count
-    return (pl.concat(marked).sort("_row").drop("_row") if any(counts.values()) else gnss), counts
+    return (gnss.with_columns(pl.concat(marked).sort("_row")["fix"]) if any(counts.values()) else gnss), counts
 
 
 def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
@@ -244,7 +245,9 @@ def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, Strea
     sources = [key for key in keys if key in _SOURCES]
     late = frame.select((pl.col("t") < (latest.over(sources) if sources else latest)).sum()).item()
     ordered = frame if late == 0 and frame["t"].is_sorted() else frame.sort("t", maintain_order=True)
-    unique = ordered.unique(subset=keys, keep="first", maintain_order=True)
+    first = ordered.select(pl.struct(keys).is_first_distinct()).to_series()
+    # Where each key stands once the rows are not copied: of a day of several solutions they are most of the log.
+    unique = ordered if first.all() else ordered.filter(first)
     return unique, StreamCounts(frame.height - unique.height, late)
 
 

@@ -165,8 +165,8 @@ def mission_epochs(journey: Journey, config: LdsConfig) -> frozenset[int]:
 def unwatched_epochs(journey: Journey, watched: Ints, gap_reset_s: float) -> frozenset[int]:
     """The first watched epochs after time over which no monitor can say what became of the position.
 
-    Longer than the bank bridges; or longer than a crossing is interpolated over, and the odometer lost its distance.
+    Longer than the bank bridges; or however short, where the odometer lost its distance: no increment leads over it.
     """
     waited_ns = np.diff(journey.t_ns[watched])
-    lost = (np.diff(journey.counter[watched]) != 0) & (waited_ns > journey.gap_ns)
+    lost = np.diff(journey.counter[watched]) != 0
     return frozenset(watched[1:][lost | (waited_ns > gap_reset_s * NS_PER_S)].tolist())

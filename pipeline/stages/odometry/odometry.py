@@ -48,7 +48,8 @@ class Odometry:
     `oriented`. `segment`: how often the distance was lost before a sample; `counter`: the same, over slip and pauses
     between speeds, where the way is known roughly; `slip_doubt_m`: by how much that may be off so far. `pause[i]`:
     between samples i and i+1 nothing is interpolated. `scale`: true over recorded distance, None without its sigma.
-    `leaps_ns`: rows to which the counter leaps (`rows.leaps`).
+    `leaps_ns`: rows to which the counter leaps (`rows.leaps`); `bridged_m2`: variance of the distance over those that
+    are bridged, a sum.
     """
 
     epoch_ns: int
@@ -66,6 +67,7 @@ class Odometry:
     scale: float | None = None
     scale_sigma: float | None = None
     leaps_ns: tuple[int, ...] = ()
+    bridged_m2: Floats | None = None
 
     @property
     def begin_ns(self) -> int:
@@ -153,6 +155,17 @@ class Odometry:
         now = t_s - latency_s
         return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
 
+    def white_m2_per_s_at(self, t_s: Floats) -> Floats:
+        """White noise of the steps to these instants from the ones before, with that of bridged resets [m^2/s]."""
+        white = np.full(t_s.size, self.noise.white_m2_per_s)
+        dt_s = np.diff(t_s)
+        white[1:] += np.where(dt_s > 0.0, np.diff(self.bridged_m2_at(t_s)) / np.maximum(dt_s, 1e-9), 0.0)
+        return white
+
+    def bridged_m2_at(self, t_s: Floats) -> Floats:
+        """Variance of the distance over bridged resets so far [m^2]."""
+        return np.zeros(t_s.size) if self.bridged_m2 is None else np.interp(t_s, self.t_s, self.bridged_m2)
+
     def known_at_s(self, t_s: Floats) -> Bools:
         """Whether the distance is known: between two samples without a pause, none of which reports slip."""
         before, after = self._around(t_s)
@@ -234,7 +247,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     dt_s = np.diff(t_s)
     period_s = float(np.median(dt_s))
     limit_s = max(align.odometer_gap_s, align.odometer_gap_periods * period_s)
-    way_m, counted = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
+    way_m, counted, bridged_m = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
     unknown = np.isnan(way_m)
     pause = unknown | (dt_s > limit_s)
     slip = _slips(stream, align)
@@ -251,8 +264,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
     noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, config) if counted.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
+    row_s = t_s
     if apart.size:
-        row_s = t_s
         t_s, distance_m, row = filled_in(t_s, distance_m, speed, apart, align)
         segment = segment[row]
         pause = pause[row[:-1]]
@@ -275,6 +288,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
         leaps_ns=_leaps_ns(stream, align),
+        # Bounds of the way count as three sigmas.
+        bridged_m2=np.interp(t_s, row_s, _sums((bridged_m / 3.0) ** 2)) if bridged_m.any() else None,
         config=align,
     )
 

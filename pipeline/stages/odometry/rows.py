@@ -15,10 +15,14 @@ from schemas.config import AlignConfig
 
 
 class Ways(NamedTuple):
-    """Per step from a row to the next: way [m], NaN where not known, and whether it is of the recorded distance."""
+    """Per step from a row to the next: way [m], NaN where not known, and whether it is of the recorded distance.
+
+    `doubt_m`: by how much the way over a bridged reset may be off, 0 elsewhere.
+    """
 
     way_m: Floats
     counted: Bools
+    doubt_m: Floats
 
 
 def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: float, config: AlignConfig) -> Ways:
@@ -34,21 +38,32 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
     way_m = np.where(np.isnan(recorded), driven, recorded)
     unknown = np.isnan(way_m)
     if not unknown.any():
-        return Ways(way_m, ~np.isnan(recorded))
+        return Ways(way_m, ~np.isnan(recorded), np.zeros(way_m.size))
     # Rows by turns: fill the gaps of either column between its own rows, then decide again.
     carried_m = _carried(t_s, distance_m, limit_s)
     leap = leaps(t_s, carried_m, config) | _resets(t_s, distance_m, config)
     recorded = np.where(unknown & ~leap, np.diff(carried_m), recorded)
     driven = _trusted(_driven(t_s, _carried(t_s, speed_mps, limit_s)), recorded, leap, config)
     counted = ~np.isnan(recorded)
-    return Ways(_over_resets(t_s, np.where(counted, recorded, driven), leap, config), counted)
+    way_m = np.where(counted, recorded, driven)
+    bridged_m = _over_resets(t_s, way_m, leap, config)
+    bridged = np.isnan(way_m) & np.isfinite(bridged_m)
+    return Ways(bridged_m, counted, np.where(bridged, _bridge_doubt_m(np.diff(t_s), config), 0.0))
+
+
+def _bridge_doubt_m(dt_s: Floats, config: AlignConfig) -> Floats:
+    """B dt^2 / 4, and b dt w / 2 where the acceleration changes from +b to -b just there (`_over_resets`)."""
+    about_s = config.speed_window_s + 0.5 * dt_s
+    doubt_m: Floats = 0.25 * config.braking_mps2 * dt_s**2 + 0.5 * config.braking_mps2 * dt_s * about_s
+    return doubt_m
 
 
 def _over_resets(t_s: Floats, way_m: Floats, leap: Bools, config: AlignConfig) -> Floats:
     """The ways, at leaps of the counter between rows close together by the mean speed about them.
 
-    With acceleration and braking up to b that is off by at most b dt^2 / 4. Where this is more than `reset_doubt_m`,
-    the distance is lost.
+    Where the train brakes or accelerates at up to b, two speeds at the rows would be off by at most b dt^2 / 4. Where
+    this is more than `reset_doubt_m`, the distance is lost. The mean over w on either side is off by b dt w / 2 more
+    where the acceleration changes from +b to -b just there: 1.35 m in all at 1 Hz.
     """
     dt_s = np.diff(t_s)
     lost = np.flatnonzero(leap & np.isnan(way_m) & (0.25 * config.braking_mps2 * dt_s**2 <= config.reset_doubt_m))

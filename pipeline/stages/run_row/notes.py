@@ -33,7 +33,7 @@ _WITHOUT_ODOMETER = (NotEvaluated.NO_ODOMETER, NotEvaluated.BEYOND_SPAN, NotEval
 
 def ingest_notes(ingest: IngestNotes) -> list[Remark]:
     """What reading the log showed of it."""
-    corrected = [Remark(Note.CORRECTED, (text,)) for text in ingest.corrections]
+    corrected = [Remark(Note.CORRECTED, (made.stream, made.changes)) for made in ingest.corrections]
     return corrected + remarks(
         {
             Note.CHUNKS_WITHOUT_CRC: ingest.chunks_without_crc,

@@ -171,6 +171,6 @@ def _heights(base: str, up_m: Floats, height_m: Floats, of: Recording) -> list[C
             return [Check(what, FitState.MISFIT, words, (cause,), advice=f"Write heights of the {stream} in metres.")]
     if abs(apart_m) > _GEOID_M:
         return [misfit(what, words, MisfitCause.HEIGHT_UNKNOWN)]
-    # The judge believes the reference: where it has the other zero, somebody has to say which is right.
-    lines = correction("gnss", shift_m={"up": round(apart_m, 1)}) if base == "survey" else ""
-    return [misfit(what, words, MisfitCause.HEIGHT_ZERO, lines=lines)]
+    # No lines: survey or reference alone cannot tell that it is right, and the other may be.
+    advice = "Find out which of the two has the other zero, and mend that one."
+    return [misfit(what, words, MisfitCause.HEIGHT_ZERO, advice=advice)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import polars as pl
@@ -111,3 +112,17 @@ def test_runs_that_cannot_be_used(bench: Bench, journey: Journey) -> None:
     slips = '[[faults]]\nkind = "slip"\nrates_mps = [0.5]\nduration_s = 20.0\n'
     with pytest.raises(BaliseError, match="no run has an odometer"):
         bench.run("per_cell = 1\n" + slips + RAMPS, run=journey.run.with_streams(odometer=None))
+
+
+def test_a_copy_of_a_run_is_no_further_pass(bench: Bench) -> None:
+    whole = bench.run("per_cell = 2\n" + RAMPS, "whole")
+    (folder,) = (bench.folder / "runs").iterdir()
+    shutil.copytree(folder, folder.with_name("zz_copy"))
+    try:
+        made = bench.run("per_cell = 2\n" + RAMPS, "copied")
+    finally:
+        shutil.rmtree(folder.with_name("zz_copy"))
+    assert list(made.failed) == ["zz_copy"]
+    assert "the same bytes as" in made.failed["zz_copy"]
+    assert made.tables["cells"].equals(whole.tables["cells"])
+    assert made.tables["banks"].equals(whole.tables["banks"])

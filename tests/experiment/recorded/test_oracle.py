@@ -58,6 +58,8 @@ def _first_alarm_s(tables: RunTables, onset: Onset, watched_s: float) -> float |
         PlannedFault(kind=FaultKind.STEP, sizes_m=(3.0,)),
         PlannedFault(kind=FaultKind.SLIP, rates_mps=(0.5,), duration_s=20.0),
         PlannedFault(kind=FaultKind.OUTAGE, durations_s=(20.0,)),
+        # Its first epochs hold positions of before the fault.
+        PlannedFault(kind=FaultKind.LATENCY, latencies_s=(0.7,)),
     ],
     ids=lambda fault: fault.kind.value,
 )
@@ -89,6 +91,15 @@ def test_a_ramp_in_one_range_follows_the_sky_as_in_a_replay_from_the_start() -> 
     assert row["target"] in base.satellites_at(onset.t_ns)
     assert row["time_to_detect_s"] == _first_alarm_s(_brute_force(sky, Configuration(), found), onset, 245.0)
     assert row["time_to_detect_s"] is not None
+
+
+def test_hours_of_a_standing_alarm_do_not_dilute_its_rate(journey: Journey) -> None:
+    base = _baseline(journey, Configuration.model_validate({"monitors": {"false_alarm_probability": 0.02}}))
+    stands = base.epochs["alarm"].to_numpy() | base.epochs["negated"].to_numpy()
+    standing_s = float(base.clock.held_s[stands].sum())
+    assert base.alarms.height > 0
+    assert standing_s > 30.0
+    assert base.hours() * 3600.0 <= base.clock.duration_s - standing_s + 1.0
 
 
 @pytest.fixture(scope="module")

@@ -61,6 +61,15 @@ def refused(path: Path, config: IngestConfig, key: str, scratch: Path) -> None:
     assert list(scratch.iterdir()) == []
 
 
+def test_what_is_no_log_is_named_in_its_archive(tmp_path: Path, scratch: Path) -> None:
+    log = tmp_path / "a.zip"
+    log.write_bytes(zipped(**{"day/notes.bin": b"nothing of a receiver"}))
+    with pytest.raises(InputError, match="no message of a known receiver") as caught:
+        convert([log], "r")
+    assert str(caught.value).startswith(f"{log / 'notes.bin'}: ")
+    assert list(scratch.iterdir()) == []
+
+
 @pytest.mark.parametrize("suffix", PACKED)
 def test_each_kind_of_archive_is_read_and_has_a_limit(tmp_path: Path, scratch: Path, suffix: str) -> None:
     log = tmp_path / f"a.gps{suffix}"

@@ -15,6 +15,7 @@ from tests.make.survey.test_site_of_survey import degrees, recorded, site_of, to
 
 # Another value for each key.
 OTHERS = {
+    "size_limit_mb": 0.0001,
     "same_place_m": 2.0,
     "same_track_m": 0.3,
     "shape_m": 5.0,

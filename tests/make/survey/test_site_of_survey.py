@@ -155,6 +155,20 @@ def test_surveys_have_the_headers_of_logs(tmp_path: Path) -> None:
     assert site.track["latitude_deg"].to_list() == pytest.approx(latitude.tolist())
 
 
+def test_a_list_of_balises_has_names_and_kinds_in_german_and_says_what_it_lacks(tmp_path: Path) -> None:
+    line = tmp_path / "line.csv"
+    line.write_text("Breite;Länge\n50,00;14,0\n50,02;14,0\n")
+    listed = tmp_path / "balisen.csv"
+    listed.write_text("Balise;Breite;Länge;Art\nPB7;50,005;14,0;physisch\nV8;50,01;14,0;virtuell\n")
+    made = site_of(line, balises=str(listed)).balises
+    assert made.sort("measure_m").select("balise_id", "kind").rows() == [("PB7", "physical"), ("V8", "virtual")]
+    listed.write_text("Breite;Länge\n50,005;14,0\n")
+    site = site_of(line, balises=str(listed))
+    assert site.balises.select("balise_id", "kind").rows() == [("B1", "virtual")]
+    assert "names them: numbered B1 to B1" in told(site)
+    assert "is their kind: all are taken as virtual" in told(site)
+
+
 def track_csv(path: Path, east_m: np.ndarray, **columns: Any) -> Path:
     latitude, longitude = degrees(east_m, 0.0 * east_m)
     pl.DataFrame({"lat": latitude, "lon": longitude, **columns}).write_csv(path)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pyproj
 import pytest
 
 from pipeline.read.site.read import read_site
+from pipeline.read.site.tables import load_table
 from pipeline.stages.track.geodesy import moved_deg
 from schemas.config import SiteConfig
 from schemas.errors import SiteError
@@ -17,6 +21,27 @@ from tests.read.site import builders
 
 Line = list[tuple[float, float]]
 ARC = [(300.0 * float(np.sin(angle)), 300.0 * float(1.0 - np.cos(angle))) for angle in np.arange(0.0, 1.2, 0.2)]
+
+
+def linked(count: int) -> bytes:
+    """Links that differ in nothing: hardly a byte for each."""
+    same = {"netelement_a": "a", "position_a": 0, "netelement_b": "b", "position_b": 0, "navigability": "Both"}
+    table = pa.table({name: pa.repeat(pa.scalar(value), count) for name, value in same.items()})
+    file = io.BytesIO()
+    pq.write_table(table, file, compression="zstd")
+    return file.getvalue()
+
+
+def test_a_table_of_equal_rows_is_read_unless_it_takes_all_memory() -> None:
+    """1,000,000 x 5 values are 40 MB, and 20,000,000 x 5 are 763 MiB, beyond the 64 MiB that are always allowed."""
+    regular, bomb = linked(1_000_000), linked(20_000_000)
+    assert len(regular) < 1_000_000
+    breaches: list[str] = []
+    table = load_table("links.parquet", regular, breaches)
+    assert table is not None
+    assert table.frame.height == 1_000_000
+    assert load_table("links.parquet", bomb, breaches) is None
+    assert breaches == [f"links.parquet: cannot be read as Parquet ({len(bomb)} bytes unpack to 762 MiB)"]
 
 
 def written(folder: Path, lines: dict[str, Line], links: str = "", measure_m: tuple[float, ...] = ()) -> Path:

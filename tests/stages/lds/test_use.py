@@ -68,6 +68,16 @@ def test_use(given: dict[str, Any], expected: list[tuple[int, str]]) -> None:
     assert changes(walk(**given)) == [(1, IN_USE), *expected]
 
 
+@pytest.mark.parametrize("offset_m", [0.0, 30.0])
+def test_distance_lost_between_two_consecutive_positions_is_watched_by_nobody(offset_m: float) -> None:
+    """The counter is lost between 29 and 30 s, both of which have a position and a row."""
+    lost = [int(k >= 30) for k in range(COUNT)]
+    true_m = steps(0.0, 20.0, COUNT)
+    place_m = [x + offset_m * after for x, after in zip(true_m, lost, strict=True)]
+    epochs = epochs_of(place_m, true_m, odometer_segment=lost, odometer_counter=lost)
+    assert changes(run(epochs, balises_at({"V1": 110.0}), ScriptedBank(begins=[30]))) == [(1, IN_USE), (30, NEGATED)]
+
+
 def test_a_start_of_mission_ends_every_wait() -> None:
     start = datetime(1970, 1, 1, 0, 1, tzinfo=UTC)
     negated = changes(walk({"fails": [25]}, 30.0, starts_of_mission=(start,)))

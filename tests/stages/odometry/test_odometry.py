@@ -164,6 +164,14 @@ def test_a_counter_that_is_reset_by_little_turns_no_train_round(reset_m, step_s,
     assert len(odometry.leaps_ns) == 1
 
 
+def test_a_bridged_reset_has_its_own_noise() -> None:
+    """At 1 Hz: 1.8 / 4 + 1.8 x 1.5 / 2 = 1.8 m at most, 0.6 m one sigma, beside 0.05 m a second."""
+    t = np.arange(20.0)
+    odometry = odometry_from(odometer_of(t, distance_m=500.0 + 20.0 * t - np.where(t >= 10.0, 600.0, 0.0)))
+    expected = np.where(t == 10.0, 0.05**2 + 0.6**2, 0.05**2)
+    np.testing.assert_allclose(odometry.white_m2_per_s_at(t), expected)
+
+
 def test_reversing_noise_and_single_rows_are_no_reset():
     """At 1 Hz: a train that runs to and fro in 4 s, a counter of whole 5 m at an edge, a row 30 m ahead or behind."""
     to_and_fro = np.abs(np.arange(20.0) % 8.0 - 4.0) * 3.0
