@@ -32,9 +32,9 @@ from schemas.run import RunLog
 # Largest ratio to reading and decompressing, smallest to `mcap` with its decoder package.
 TARGETS: dict[Case, tuple[float, float]] = {
     "cdr Odometry": (2.6, 70.0),
-    "cdr TwistStamped": (2.6, 50.0),
-    "protobuf": (4.0, 14.0),
-    "json": (9.0, 5.0),
+    "cdr TwistStamped": (2.2, 50.0),
+    "protobuf": (2.5, 14.0),
+    "json": (6.7, 5.0),
 }
 _CRC_NS_PER_BYTE = 0.25
 _LONG_HOURS = 10.0

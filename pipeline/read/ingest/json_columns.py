@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import polars as pl
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.json
 
 from pipeline.read.ingest.generic import parse_path
-from pipeline.read.ingest.layout import Columns
+from pipeline.read.ingest.layout import Columns, Values
 from pipeline.read.ingest.mcap_block import Bytes, Messages
 from schemas.arrays import Ints
 
@@ -37,6 +36,8 @@ class JsonDecoder:
                 node = node.setdefault("[]" if isinstance(step, int) else step, {})
             node["[]" if isinstance(last, int) else last] = _ARROW[type(dtype)]
         self._schema = pa.schema(list(_struct(tree)))
+        self._met: pa.Schema | None = None  # what of it the first messages held, while no other has held more
+        self._narrow = True
 
     def decode(self, messages: Messages) -> tuple[list[tuple[Messages, Columns]], list[Messages]]:
         """All messages as columns, or all of them left over."""
@@ -44,18 +45,41 @@ class JsonDecoder:
         if content is None:
             return [], [messages]
         try:
-            table = pa.json.read_json(
-                pa.BufferReader(content),
-                read_options=pa.json.ReadOptions(use_threads=False, block_size=len(content) + 1),
-                parse_options=pa.json.ParseOptions(explicit_schema=self._schema, unexpected_field_behavior="ignore"),
-            )
+            table = self._parsed(content)
         except pa.ArrowInvalid:
             return [], [messages]
         # Every payload starts and ends as an object does: so many objects as messages are one each.
         if table.num_rows != len(messages):
             return [], [messages]
         frame = pl.DataFrame(pl.from_arrow(table))
-        return [(messages, frame.select(_value(path).alias(path) for path in self._types).to_dict())], []
+        met = {path: dtype for path, dtype in self._types.items() if parse_path(path)[0] in frame.columns}
+        columns: dict[str, Values] = {**frame.select(_value(path).alias(path) for path in met).to_dict()}
+        for path, dtype in self._types.items():
+            if path not in met:
+                columns[path] = pl.Series([None], dtype=dtype).new_from_index(0, len(messages))
+        return [(messages, columns)], []
+
+    def _parsed(self, content: bytearray) -> pa.Table:
+        """Without the columns that the first messages lacked, as long as none has more: each costs a message time."""
+        if self._met is not None:
+            try:
+                return _read(content, self._met, "error")
+            except pa.ArrowInvalid:
+                self._met = None
+        table = _read(content, self._schema, "ignore")
+        if self._narrow:
+            self._narrow = False
+            filled = [field for field in self._schema if table[field.name].null_count < len(table)]
+            self._met = pa.schema(filled) if filled else None
+        return table
+
+
+def _read(content: bytearray, schema: pa.Schema, unexpected: Literal["error", "ignore"]) -> pa.Table:
+    return pa.json.read_json(
+        pa.BufferReader(content),
+        read_options=pa.json.ReadOptions(use_threads=False, block_size=len(content) + 1),
+        parse_options=pa.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior=unexpected),
+    )
 
 
 def _struct(tree: Mapping[str, Any]) -> list[pa.Field]:
@@ -76,9 +100,11 @@ def _value(path: str) -> pl.Expr:
     return value
 
 
-def _joined(messages: Messages) -> bytes | None:
+def _joined(messages: Messages) -> bytearray | None:
     """The payloads, one after the other; none if any is not the UTF-8 text of something between braces."""
-    content = b"\n".join(_payloads(*part) for part in messages.by_piece())
+    content = bytearray().join(_with_byte_before(*part) for part in messages.by_piece())
+    ends = np.cumsum(messages.length + 1)
+    np.frombuffer(content, dtype=np.uint8)[ends - messages.length - 1] = ord("\n")
     # A letter is found ten times as fast as a word.
     strange = any(word[:1] in content and word in content for word in _LITERALS) and _AS_VALUE.search(content)
     if strange or (b"null" in content and _NULL_AFTER.search(content)) or not _is_utf8(content):
@@ -86,16 +112,13 @@ def _joined(messages: Messages) -> bytes | None:
     return content if _all_between_braces(messages) else None
 
 
-def _payloads(piece: Bytes, starts: Ints, ends: Ints) -> memoryview:
-    """Those of one piece, joined."""
-    if len(starts) == 1:
-        return piece[starts[0] : ends[0]].data
-    bounds = np.column_stack([starts, ends]).reshape(-1)
+def _with_byte_before(piece: Bytes, starts: Ints, ends: Ints) -> memoryview:
+    """The payloads of one piece side by side, each with the last byte of the head before it: room for a new line."""
+    bounds = np.column_stack([starts - 1, ends]).reshape(-1)
     buffers = [None, pa.py_buffer(np.append(bounds, bounds[-1])), pa.py_buffer(piece)]
     parts = pa.LargeBinaryArray.from_buffers(pa.large_binary(), len(bounds), buffers)
-    payloads = parts.take(pa.array(np.arange(0, len(bounds), 2)))  # between them are the heads of records
-    whole = pa.LargeListArray.from_arrays(pa.array([0, len(payloads)], pa.int64()), payloads)
-    return memoryview(pc.binary_join(whole, pa.scalar(b"\n", pa.large_binary()))[0].as_buffer())
+    taken = parts.take(pa.array(np.arange(0, len(bounds), 2)))  # between them are the heads of records
+    return memoryview(taken.buffers()[2])[: int((ends - starts).sum()) + len(starts)]
 
 
 def _all_between_braces(messages: Messages) -> bool:
@@ -107,7 +130,7 @@ def _all_between_braces(messages: Messages) -> bool:
     return all(text[:1] == b"{" and text[-1:] == b"}" for text in texts)
 
 
-def _is_utf8(content: bytes) -> bool:
+def _is_utf8(content: bytearray) -> bool:
     if content.isascii():
         return True
     try:

@@ -46,9 +46,10 @@ payloads = st.lists(st.tuples(documents, styles, damage), min_size=1, max_size=1
 
 
 def messages_of(contents: list[bytes]) -> Messages:
+    """In a log, the head of its record stands before each payload."""
     lengths = np.array([len(content) for content in contents], dtype=np.int64)
-    starts = np.concatenate([[0], np.cumsum(lengths[:-1])]).astype(np.int64)
-    data = np.frombuffer(b"".join(contents) + b" ", dtype=np.uint8)
+    starts = np.cumsum(lengths + 1) - lengths
+    data = np.frombuffer(b"".join(b"#" + content for content in contents) + b" ", dtype=np.uint8)
     return Messages([data], np.zeros(1, dtype=np.int64), starts, lengths, starts)
 
 
@@ -81,6 +82,29 @@ def test_good_messages_are_taken_at_once():
     assert (len(parts), left) == (1, [])
     assert parts[0][1]["a"].to_list() == [number / 7 for number in range(50)]
     assert parts[0][1]["t.sec"].to_list() == list(range(50))
+
+
+def test_fields_that_only_later_messages_have_are_read():
+    blocks = [
+        [b'{"a": 1.5, "name": "x"}', b'{"a": 2.5}'],  # these say which fields a message has
+        [b'{"a": 3.5}', b'{"name": null}'],
+        [b'{"a": 4.5}', b'{"a": 5.5, "ok": true}'],
+        [b'{"a": 6.5, "other": 1, "t": {"sec": 7}, "c": [0, 8.5]}'],
+    ]
+    decoder = JsonDecoder(TYPES)
+    decoded = [decoder.decode(messages_of(block)) for block in blocks]
+    assert [left for _, left in decoded] == [[]] * 4
+    columns = [parts[0][1] for parts, _ in decoded]
+    read = {path: [value for block in columns for value in block[path].to_list()] for path in TYPES}
+    assert read == {
+        "a": [1.5, 2.5, 3.5, None, 4.5, 5.5, 6.5],
+        "t.sec": [None] * 6 + [7],
+        "name": ["x"] + [None] * 6,
+        "ok": [None] * 5 + [True, None],
+        "c[1]": [None] * 6 + [8.5],
+    }
+    assert decoder.decode(messages_of([b'{"a": 1, "a": 2}']))[0] == []
+    assert {path: values.dtype for path, values in columns[1].items()} == TYPES
 
 
 @pytest.mark.parametrize(
