@@ -318,12 +318,15 @@ def run(
     except Interrupted as interrupted:
         raise _stopped(interrupted, out, quiet, as_json, places) from None
     if as_json:
-        _print_json({**summary_answer(ended.summary, out), "page": ended.page, "changed": ended.changed})
+        made = {"page": ended.page, "changed": ended.changed, "unread": ended.unread}
+        _print_json({**summary_answer(ended.summary, out), **made})
     else:
         show_summary(ended.summary, out, quiet, False, has_pages=ended.page is not None, **places)
+        for line in ended.lost(opened.file):
+            print(line, file=sys.stderr if quiet else sys.stdout)
     if not (quiet or as_json):
         print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
-    raise Exit(_status_of(ended.summary, options.fail_on))
+    raise Exit(_status_of(ended.summary, options.fail_on) or (RUNS_NOT_OK if ended.unread else OK))
 
 
 def _steps(quiet: bool, as_json: bool) -> Callable[[str, str], None]:
