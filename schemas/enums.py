@@ -158,17 +158,11 @@ class MisfitCause(StrEnum):
     LATENCY_OF_FILE = "latency_of_file"
     IMPOSSIBLE_SCALE = "impossible_scale"
     COUNTS_BACKWARDS = "counts_backwards"
-    SPEED_WITHOUT_SIGN = "speed_without_sign"
     COUNTER_WITHOUT_SIGN = "counter_without_sign"
     OFFSET_OF_REFERENCE = "offset_of_reference"
     WHOLE_SECONDS = "whole_seconds"
-    DATUM = "datum"
-    DATUM_LIKELY = "datum_likely"
     MAP_SHIFT = "map_shift"
-    MAP_SHIFT_BY_REFERENCE = "map_shift_by_reference"
-    HEIGHT_UNIT = "height_unit"
     HEIGHT_ZERO = "height_zero"
-    HEIGHT_UNKNOWN = "height_unknown"
     COPY = "copy"
     OTHER_PLACE = "other_place"
     VELOCITY_EXCHANGED = "velocity_exchanged"
@@ -181,8 +175,6 @@ class MisfitCause(StrEnum):
     WRONG_DAY = "wrong_day"
     CONSTANT_LAG = "constant_lag"
     LATENCY = "latency"
-    STAMPED_LATE = "stamped_late"
-    STAMPED_EARLY = "stamped_early"
     AXES_EXCHANGED = "axes_exchanged"
     LONGITUDE_SIGN = "longitude_sign"
     LATITUDE_SIGN = "latitude_sign"
@@ -196,8 +188,6 @@ class MisfitPlace(StrEnum):
 
     IN_STREAM = "in_stream"
     RATHER_IN_STREAM = "rather_in_stream"
-    IN_SURVEY = "in_survey"
-    IN_REFERENCE = "in_reference"
 
 
 class NotShown(StrEnum):
