@@ -153,7 +153,7 @@ def test_a_noticed_fault_that_returns_stays_within_the_bound(step_m: float) -> N
 
 
 def test_a_fault_before_the_first_tvb_goes_on_in_use_without_a_figure() -> None:
-    """A step of 60 m at 40 s, found at once and forgotten: in use 60 m off, where 12.5 m go unnoticed in the clean run."""
+    """A step of 60 m at 40 s, found at once and forgotten: in use 60 m off; of the clean run 12.5 m go unnoticed."""
     t_s = np.arange(400.0)
     computed = Configuration.model_validate({"monitors": NO_NOISE, "undetected": {"compute": True}})
     clean = _replayed(np.zeros(t_s.size), t_s, computed)
