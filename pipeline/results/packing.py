@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -188,6 +189,7 @@ class _PackWriter:
             bytes=sum(map(len, contents.values())),
             software_digest=step.software_digest,
             sha256={part: sha256(content) for part, content in contents.items()},
+            ends={table: sha256(parquet.end_of(io.BytesIO(contents[table]))) for table in TABLES},
         )
 
 
