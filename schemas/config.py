@@ -606,10 +606,6 @@ class SurveyConfig(Settings):
     doubled_m: Positive = 100.0
     # A corner is a kink too if it turns by so much on a curve that no track has; less is how dense surveys scatter.
     corner_deg: Positive = 8.0
-    # Scatter is judged where points are about evenly spaced: no step is so many times another.
-    uneven_steps: Positive = 3.0
-    # Scatter makes a line longer: told from this share of its length on, that of the best odometer scale.
-    longer_share: Probability = 1e-4
     # Kilometres are posts, not lengths: so far they stray from the track between two points, in metres or by share.
     kilometre_m: Positive = 20.0
     kilometre_share: Probability = 0.05
