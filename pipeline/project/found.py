@@ -43,6 +43,14 @@ def is_one_log(path: Path) -> bool:
     return path.is_file() or is_run(path) or is_bag(path) or (path / "processed_log").is_dir()
 
 
+def is_prose(path: Path) -> bool:
+    """A text without columns, as notes are."""
+    try:
+        return path.suffix.lower() == ".txt" and read_log_table(path, infer=True).table.width < 2
+    except BaliseError:
+        return False
+
+
 def logs_below(folder: Path) -> list[Path]:
     """What may be a log in a folder and those below it."""
     return look_around(folder).logs

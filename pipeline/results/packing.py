@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -188,13 +189,14 @@ class _PackWriter:
             bytes=sum(map(len, contents.values())),
             software_digest=step.software_digest,
             sha256={part: sha256(content) for part, content in contents.items()},
+            ends={table: sha256(parquet.end_of(io.BytesIO(contents[table]))) for table in TABLES},
         )
 
 
 def _named(run_id: str, table: pa.Table) -> pa.Table:
     """With the id of the run in the first column."""
     field = pa.field("run_id", pa.large_string())
-    return table.add_column(0, field, pa.array([run_id] * table.num_rows, field.type))
+    return table.add_column(0, field, pa.repeat(pa.scalar(run_id, field.type), table.num_rows))
 
 
 def _own(out: str, run_id: str) -> _Recorded:
