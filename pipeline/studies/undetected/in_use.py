@@ -53,8 +53,14 @@ class Returns:
         return cls(path_m - odometer_m, sigma_m, travelled_m, doubt_m, counter, scale_sigma)
 
     def within(self, part: slice) -> Returns:
-        arrays = (self.offset_m, self.sigma_m, self.travelled_m, self.doubt_m)
-        return Returns(*(values[part] for values in arrays), self.counter[part], self.scale_sigma)
+        return Returns(
+            self.offset_m[part],
+            self.sigma_m[part],
+            self.travelled_m[part],
+            self.doubt_m[part],
+            self.counter[part],
+            self.scale_sigma,
+        )
 
 
 def in_use_errors(
