@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import re
@@ -726,7 +727,7 @@ def sql(
     allow_files: Annotated[bool, Option("--allow-files", help="Let the query read other files (`read_csv`).")] = False,
     project: OfProject = None,
 ) -> None:
-    """Ask the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
+    """Query the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
     from pipeline.results.answer_files import write_answer
     from pipeline.results.query import named_results, run_sql
 
@@ -777,7 +778,7 @@ def line(
     as_json: Json = False,
     project: OfProject = None,
 ) -> None:
-    """Say of each piece of track whether virtual balises may be placed there, and propose some."""
+    """Classify each piece of track: may virtual balises be placed there? Propose places for them."""
     from pipeline.show.line import write_line
     from pipeline.studies.line import read_points, study_line
     from schemas.config import read_toml, settings_from
@@ -900,8 +901,12 @@ def diff(
 
 def main() -> None:
     """Entry point of the program: turns whatever happens into one message and an exit status."""
+    # By default the collector goes through all modules time and again while they are loaded, and twice at the end.
+    gc.set_threshold(50_000)
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
-    sys.exit(_guarded(arguments, debug="--debug" in sys.argv[1:]))
+    status = _guarded(arguments, debug="--debug" in sys.argv[1:])
+    gc.freeze()
+    sys.exit(status)
 
 
 @cache

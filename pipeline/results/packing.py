@@ -181,7 +181,7 @@ class _PackWriter:
 def _named(run_id: str, table: pa.Table) -> pa.Table:
     """With the id of the run in the first column."""
     field = pa.field("run_id", pa.large_string())
-    return table.add_column(0, field, pa.array([run_id] * table.num_rows, field.type))
+    return table.add_column(0, field, pa.repeat(pa.scalar(run_id, field.type), table.num_rows))
 
 
 def _recorded(out: str, run_id: str) -> tuple[Marker, dict[str, pa.Table]]:
