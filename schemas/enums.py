@@ -255,6 +255,7 @@ class Note(StrEnum):
     ODOMETER_CONTRADICTED = "odometer_contradicted"
     LEARNED = "learned"
     UNDIAGNOSED = "undiagnosed"
+    IN_USE_UNBOUNDED = "in_use_unbounded"
     MOVING_UNKNOWN = "moving_unknown"
     AVAILABLE = "available"
     REMEDY = "remedy"

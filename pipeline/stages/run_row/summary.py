@@ -77,6 +77,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         *results.notes,
         *notes.judged_notes(row),
         *notes.undiagnosed_notes(epochs, judged.passages),
+        *notes.in_use_notes(epochs),
         *notes.time_notes(epochs, clock, lost, config),
         *(Remark(Note.REMEDY, (remedy_words(cure),)) for cure in cures),
     )
