@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import re
@@ -318,12 +319,15 @@ def run(
     except Interrupted as interrupted:
         raise _stopped(interrupted, out, quiet, as_json, places) from None
     if as_json:
-        _print_json({**summary_answer(ended.summary, out), "page": ended.page, "changed": ended.changed})
+        made = {"page": ended.page, "changed": ended.changed, "unread": ended.unread}
+        _print_json({**summary_answer(ended.summary, out), **made})
     else:
         show_summary(ended.summary, out, quiet, False, has_pages=ended.page is not None, **places)
+        for line in ended.lost(opened.file):
+            print(line, file=sys.stderr if quiet else sys.stdout)
     if not (quiet or as_json):
         print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
-    raise Exit(_status_of(ended.summary, options.fail_on))
+    raise Exit(_status_of(ended.summary, options.fail_on) or (RUNS_NOT_OK if ended.unread else OK))
 
 
 def _steps(quiet: bool, as_json: bool) -> Callable[[str, str], None]:
@@ -723,7 +727,7 @@ def sql(
     allow_files: Annotated[bool, Option("--allow-files", help="Let the query read other files (`read_csv`).")] = False,
     project: OfProject = None,
 ) -> None:
-    """Ask the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
+    """Query the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
     from pipeline.results.answer_files import write_answer
     from pipeline.results.query import named_results, run_sql
 
@@ -774,7 +778,7 @@ def line(
     as_json: Json = False,
     project: OfProject = None,
 ) -> None:
-    """Say of each piece of track whether virtual balises may be placed there, and propose some."""
+    """Classify each piece of track: may virtual balises be placed there? Propose places for them."""
     from pipeline.show.line import write_line
     from pipeline.studies.line import read_points, study_line
     from schemas.config import read_toml, settings_from
@@ -897,8 +901,12 @@ def diff(
 
 def main() -> None:
     """Entry point of the program: turns whatever happens into one message and an exit status."""
+    # By default the collector goes through all modules time and again while they are loaded, and twice at the end.
+    gc.set_threshold(50_000)
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
-    sys.exit(_guarded(arguments, debug="--debug" in sys.argv[1:]))
+    status = _guarded(arguments, debug="--debug" in sys.argv[1:])
+    gc.freeze()
+    sys.exit(status)
 
 
 @cache

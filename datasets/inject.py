@@ -92,7 +92,7 @@ def inject(run: RunLog, fault: FaultSpec, site: Site | None = None, whole: Recor
 
     Times count from the run's first GNSS epoch. Position faults keep the recorded noise: they are added to it.
     Along and across the track follow the site where one is given, else the run's own way. Range faults need
-    the `satellites` stream. Recorded velocities stay as they are. Random noise hangs on run and fault alone.
+    the `satellites` stream. Recorded velocities stay as they are. Random noise depends on run and fault alone.
     """
     whole = whole or Recording(run, site)
     first_ns = whole.first_ns

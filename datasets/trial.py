@@ -1,6 +1,6 @@
 """A scenario becomes a trial: a site and runs, in memory or on disk.
 
-Every random number hangs on the scenario's seed, the run's name and what is drawn, never on the order of work:
+Every random number depends on the scenario's seed, the run's name and what is drawn, never on the order of work:
 one run written alone has the bytes that it has in the whole trial.
 """
 

@@ -129,7 +129,7 @@ class LineEntry(Settings):
 
 
 class Project(Settings):
-    """The whole of a project file."""
+    """The whole of a project file. `unread`: logs that could not be read when it was written; no run has them."""
 
     site: str = "site"
     out: str = "result"
@@ -137,6 +137,7 @@ class Project(Settings):
     vehicles: dict[str, str] = Field(default={})
     config: str | None = None
     service_level: str | None = None
+    unread: tuple[str, ...] = ()
     track: TrackEntry | None = None
     convert: tuple[ConvertEntry, ...] = ()
     calibrate: CalibrateEntry | None = None

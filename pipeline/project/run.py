@@ -45,11 +45,23 @@ class Call:
 
 @dataclass(frozen=True)
 class Ended:
-    """How the replay ended, and the first page of the report; `changed`: whether anything had to be done."""
+    """How the replay ended, and the first page of the report; `changed`: whether anything had to be done.
+
+    `unread`: logs of the trial that no run was made of, since they could not be read.
+    """
 
     summary: CampaignSummary
     page: Path | None
     changed: bool
+    unread: Sequence[str] = ()
+
+    def lost(self, file: Path) -> list[str]:
+        """These logs in words, for whoever reads the verdict."""
+        return [
+            f"NOT REPLAYED: {log} could not be read, and no figure knows of it. Mend it and name it in a [[convert]] "
+            f"table; then, or where it is no log, take it out of `unread` in {file}."
+            for log in self.unread
+        ]
 
 
 @dataclass
@@ -91,7 +103,7 @@ def run_project(opened: Opened, recordings: Recordings, call: Call) -> Ended:
         watches=call.watches,
     )
     changed = bool(steps.changed) or not all(outcome.skipped for outcome in summary.outcomes)
-    return Ended(summary, _report(steps, plan), changed)
+    return Ended(summary, _report(steps, plan), changed, [*map(opened.place, opened.project.unread)])
 
 
 def plan_of(opened: Opened) -> Plan:

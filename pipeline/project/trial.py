@@ -14,7 +14,7 @@ import tomli_w
 
 from pipeline.make.survey.make import make_site
 from pipeline.project.convert import Recordings, run_of_logs
-from pipeline.project.found import is_one_log, is_site, logs_below
+from pipeline.project.found import is_one_log, is_prose, is_site, logs_below
 from pipeline.project.looking import SeenLog, look_at, look_at_dates
 from pipeline.project.opened import Opened, named_from
 from pipeline.project.rides import Ride, rides_of, stem_of
@@ -83,7 +83,7 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     folder = folder.absolute()
     base = _base(wanted, folder)
     remarks: list[str] = []
-    logs = _looked_at(wanted, base.given_config().ingest, recordings, remarks)
+    logs, unread = _looked_at(wanted, base.given_config().ingest, recordings, remarks)
     rides, alone = rides_of(logs, [path.absolute() for path in wanted.references])
     if not rides and logs:
         raise InputError("no log holds positions", place=", ".join(str(log.path) for log in logs), expected="GNSS")
@@ -101,8 +101,9 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
             ready.append(named_from(ride.logs[0].path, folder))
         else:
             entries.append(entry)
-    replay = ReplayEntry(runs=tuple(ready))
-    drafted.opened = Opened(base.file, base.project.model_copy(update={"convert": tuple(entries), "replay": replay}))
+    own = {"convert": tuple(entries), "replay": ReplayEntry(runs=tuple(ready))}
+    own["unread"] = tuple(named_from(path, folder) for path in unread)
+    drafted.opened = Opened(base.file, base.project.model_copy(update=own))
     return drafted
 
 
@@ -138,8 +139,10 @@ def _base(wanted: Wanted, folder: Path) -> Opened:
     return Opened(folder / FILE_NAME, Project(**{name: value for name, value in given.items() if value is not None}))
 
 
-def _looked_at(wanted: Wanted, config: IngestConfig, recordings: Recordings, remarks: list[str]) -> list[SeenLog]:
-    """Every log that was named; of folders those that are logs, the others are told."""
+def _looked_at(
+    wanted: Wanted, config: IngestConfig, recordings: Recordings, remarks: list[str]
+) -> tuple[list[SeenLog], list[Path]]:
+    """Every log that was named, and of folders those that can be read; then files of folders that may be logs."""
     seen: dict[Path, SeenLog] = {}
     unread: dict[Path, tuple[BaliseError, bool]] = {}
     named_places: list[Path] = []
@@ -155,6 +158,7 @@ def _looked_at(wanted: Wanted, config: IngestConfig, recordings: Recordings, rem
                 seen[place] = replace(look_at(path, config, wanted.day, recordings), path=place)
             except BaliseError as error:
                 unread[place] = error, whole and wanted.strict
+    lost: list[Path] = []
     sure = list(seen.values())
     for place, (reason, is_needed) in unread.items():
         log = look_at_dates(place, config, sure)
@@ -163,9 +167,12 @@ def _looked_at(wanted: Wanted, config: IngestConfig, recordings: Recordings, rem
             remarks.append(f"{place.name}: days and months of its dates in the order that fits the other logs")
         elif is_needed:
             raise reason
-        else:
+        elif is_prose(place):
             remarks.append(f"not used: {reason}")
-    return sorted(seen.values(), key=lambda log: named_places.index(log.path))
+        else:
+            lost.append(place)
+            remarks.append(f"NOT READ, `balise run` will say so: {reason}")
+    return sorted(seen.values(), key=lambda log: named_places.index(log.path)), lost
 
 
 def _expanded(raws: Sequence[Path]) -> list[Path]:

@@ -11,20 +11,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.results import packs
+from pipeline.results.marker import sha256
 from pipeline.results.packs import Pack, PackedRun
-from pipeline.storage import files
+from pipeline.storage import files, parquet
 from pipeline.storage.address import Address, join
 from pipeline.storage.parquet import ColumnTypes, GroupedFile, ParquetError, Span, written_schema
 from schemas.errors import InputError
 
 
 class _File(NamedTuple):
-    """One table of a pack; a pack never changes, and its name follows from its content."""
+    """One table of a pack, and the digest of the end of its file; a pack never changes."""
 
     out: str
     table: str
     name: str
-    sha256: str
+    end: str
 
 
 def read_rows(
@@ -67,7 +68,7 @@ def as_written(out: Address, table: str, pack: Pack, rows: Sequence[int]) -> Ite
 
 
 def _file_of(out: Address, table: str, pack: Pack) -> _File:
-    return _File(str(out), table, pack.name, pack.sha256[table])
+    return _File(str(out), table, pack.name, pack.ends[table])
 
 
 def _read(file: _File, spans: Sequence[Span], columns: Sequence[str] | None) -> pa.Table:
@@ -83,14 +84,18 @@ def _read(file: _File, spans: Sequence[Span], columns: Sequence[str] | None) -> 
         raise packs.unusable(file.out, packs.file_name(file.table, file.name), str(error)) from None
 
 
-def _opened(file: _File, footer: pq.FileMetaData | None = None) -> GroupedFile:
+def _opened(file: _File, footer: pq.FileMetaData) -> GroupedFile:
     return GroupedFile(files.in_parts(join(file.out, packs.file_name(file.table, file.name))), footer)
 
 
 @lru_cache(maxsize=32)
 def _footer(file: _File) -> pq.FileMetaData:
+    """What the end of the file says. Refuses the file of another result under the name of this one."""
     try:
-        return _opened(file).metadata
+        end = parquet.end_of(files.in_parts(join(file.out, packs.file_name(file.table, file.name))))
+        if sha256(end) != file.end:
+            raise ParquetError("it is not the one that was packed")
+        return parquet.metadata_in(end)
     except (ParquetError, InputError) as error:
         raise packs.unusable(file.out, packs.file_name(file.table, file.name), str(error)) from None
 

@@ -14,12 +14,12 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import groupby
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipeline import storage
 from pipeline.results.marker import Marker, sha256
@@ -41,7 +41,11 @@ INDEX_COLUMNS: dict[str, pl.DataType] = {
 
 
 class Pack(BaseModel):
-    """One pack as it is listed. `sha256`: of its index and of each table; `software_digest`: who made all its runs."""
+    """One pack as it is listed. `software_digest`: who made all its runs.
+
+    `sha256`: of its index and of each table; `ends`: of the end of each table's file, so that whoever opens one sees at
+    once that it is the one that was packed.
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -50,13 +54,13 @@ class Pack(BaseModel):
     bytes: int = Field(gt=0)
     software_digest: str
     sha256: dict[str, str]
+    ends: dict[str, str]
 
-    @field_validator("sha256")
-    @classmethod
-    def _of_all(cls, digests: dict[str, str]) -> dict[str, str]:
-        if digests.keys() != {INDEX, *TABLES}:
+    @model_validator(mode="after")
+    def _of_all(self) -> Self:
+        if self.sha256.keys() != {INDEX, *TABLES} or self.ends.keys() != set(TABLES):
             raise ValueError("not the digests of all files of a pack")
-        return digests
+        return self
 
 
 class _List(BaseModel):
@@ -116,12 +120,6 @@ def file_name(part: str, name: str) -> str:
 def file_digests(pack: Pack) -> dict[str, str]:
     """The SHA-256 of each file of a pack, by its name."""
     return {file_name(part, pack.name): digest for part, digest in pack.sha256.items()}
-
-
-def require_whole(out: Address, pack: Pack) -> None:
-    """Refuse a pack with a file that is not what was written: a new pack of its rows would hide that."""
-    for file, digest in file_digests(pack).items():
-        _whole(out, file, digest)
 
 
 def _whole(out: Address, file: str, digest: str) -> bytes:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import base64
 import io
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import IO
 
@@ -21,6 +22,8 @@ import pyarrow.parquet as pq
 _COMPRESSION_LEVEL = 3
 _ROWS_PER_GROUP = 262_144
 _BYTES_OF_A_VALUE = 8
+# The length of the footer, and the four letters.
+_TAIL = 8
 
 
 class ParquetError(ValueError):
@@ -210,6 +213,25 @@ def unpacked_size(content: bytes) -> int:
         groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
         values: int = sum(group.column(number).num_values for group in groups for number in range(metadata.num_columns))
     return max(values, rows_of(content)) * _BYTES_OF_A_VALUE
+
+
+def end_of(source: Path | IO[bytes]) -> bytes:
+    """The end of a file, which says where all else is and between which values it lies. Raises `ParquetError`."""
+    with _reading(), source.open("rb") if isinstance(source, Path) else nullcontext(source) as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - _TAIL, 0))
+        tail = file.read()
+        length = int.from_bytes(tail[:4], "little") + _TAIL
+        if size < length or tail[4:] != b"PAR1":
+            raise ValueError("it is cut short")
+        file.seek(size - length)
+        return file.read()
+
+
+def metadata_in(end: bytes) -> pq.FileMetaData:
+    """What the end of a file says. Raises `ParquetError`."""
+    with _reading():
+        return pq.read_metadata(pa.BufferReader(end))
 
 
 def without_checksums(content: bytes) -> bool:

@@ -99,6 +99,24 @@ def test_two_commands_from_logs_to_report(raw: Path, capsys: pytest.CaptureFixtu
     assert (raw / "week12/result/report/index.html").exists()
 
 
+@pytest.mark.parametrize("way", [("trial", "raw", "--track", "line.gpx", "--to", "."), ("init", ".")])
+def test_a_log_that_was_lost_stands_beside_the_verdict(
+    raw: Path, way: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (raw / "raw" / "lost.ubx").write_bytes(bytes(1000))
+    assert call(*way) == 0
+    assert written(raw).unread == ("raw/lost.ubx",)
+    capsys.readouterr()
+    assert call("run") == 1
+    ending = capsys.readouterr().out
+    assert ending.index("unproven") < ending.index("NOT REPLAYED: raw/lost.ubx")
+    assert call("run", "--json") == 1
+    assert json.loads(capsys.readouterr().out)["unread"] == ["raw/lost.ubx"]
+    text = (raw / "balise.toml").read_text()
+    (raw / "balise.toml").write_text(text.replace('"raw/lost.ubx",', "", 1))
+    assert call("run") == 0
+
+
 def test_a_folder_is_a_project_by_one_word(raw: Path) -> None:
     assert call("init", ".") == 0
     project = written(raw)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -21,7 +22,7 @@ from pipeline.results import catalogue, packing, packs, store
 from pipeline.results.diff import diff_results
 from pipeline.results.manifest import write_manifest
 from pipeline.results.query import run_sql
-from pipeline.storage.parquet import GroupedFile
+from pipeline.storage.parquet import GroupedFile, end_of
 from schemas.errors import UsageError
 from schemas.run import RunTables
 from schemas.tables import TABLES
@@ -244,17 +245,49 @@ def with_other_values(out: Path) -> Path:
 
 
 def list_anew(out: Path, digests: dict[str, str]) -> None:
+    """The list as somebody writes it who knows the program; of each file the end is that of the file there."""
     listed = json.loads((out / packs.LIST).read_text())
-    listed["packs"][0]["sha256"] = digests
+    first = listed["packs"][0]
+    first["sha256"] = digests
+    first["ends"] = {
+        name: hashlib.sha256(end_of(out / name / f"compact/{first['name']}.parquet")).hexdigest() for name in TABLES
+    }
     (out / packs.LIST).write_text(json.dumps(listed))
+
+
+def test_the_file_of_another_result_is_refused_when_it_is_read(out: Path, tmp_path: Path) -> None:
+    """Without `verify`; whole in itself, and under the same name."""
+    compact(out)
+    out = shutil.copytree(out, tmp_path / "copy")
+    with_other_values(out)
+    with pytest.raises(UsageError, match=r"runs/compact/.*many runs are in it: it is not the one that was packed"):
+        run_sql(out, "SELECT availability FROM runs WHERE run_id = 'e'")
+    assert {what.split("/")[0] for what, *_ in verify(out).problems} == {"runs"}
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
+def test_what_was_cut_short_is_never_taken_for_whole(out: Path, tmp_path: Path, share: float) -> None:
+    compact(out)
+    for number, name in enumerate(sorted(name for name in files_in(out) if "compact/" in name)):
+        trial = shutil.copytree(out, tmp_path / f"cut{number}")
+        whole = (trial / name).read_bytes()
+        (trial / name).write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(UsageError, match="cannot be read"):
+            content(trial)
+        with contextlib.suppress(UsageError):
+            assert verify(trial).problems, name
 
 
 def test_a_changed_pack_is_not_packed_again(out: Path) -> None:
     """The new pack would be whole, and hide the change."""
     compact(out)
+    out = shutil.copytree(out, out.with_name("copy"))
     with_other_values(out)
     store.write_run(with_alarms("g", 1), out, METADATA)
-    with pytest.raises(UsageError, match=r"runs/compact/.*is damaged"):
+    with pytest.raises(UsageError, match=r"runs/compact/.*not the one that was packed"):
+        compact(out)
+    list_anew(out, packs.listed(out)[0].sha256)
+    with pytest.raises(UsageError, match="cannot be made again byte for byte"):
         compact(out)
 
 

@@ -142,7 +142,9 @@ def _with_byte_before(messages: Messages) -> memoryview:
     bounds = np.column_stack([messages.start - 1, messages.start + messages.length]).reshape(-1)
     buffers = [None, pa.py_buffer(np.append(bounds, bounds[-1])), pa.py_buffer(messages.data)]
     parts = pa.LargeBinaryArray.from_buffers(pa.large_binary(), len(bounds), buffers)
-    taken = parts.take(pa.array(np.arange(0, len(bounds), 2)))  # between them are the heads of records
+    # Between them are the heads of records. Not `pa.array`: it imports pandas, where that is installed.
+    every_other = pl.int_range(0, len(bounds), 2, eager=True)
+    taken = parts.take(every_other.to_arrow())
     return memoryview(taken.buffers()[2])[: int(messages.length.sum()) + len(messages)]
 
 

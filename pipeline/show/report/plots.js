@@ -1,6 +1,6 @@
 "use strict";
 // Drawings in SVG. Colours are classes of the style sheet, so that both schemes and paper follow by themselves;
-// no meaning hangs on colour alone: every tone has its shape, its hatching or its dashes.
+// no meaning depends on colour alone: every tone has its shape, its hatching or its dashes.
 const Plots = (() => {
   const SPACE = "http://www.w3.org/2000/svg";
   const EDGE = { left: 78, time: 128, names: 128, right: 14, top: 10, bottom: 40 };

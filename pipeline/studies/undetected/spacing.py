@@ -91,6 +91,6 @@ def _first_beyond(
 
 
 def splits_anywhere(rows: Watched) -> list[Floats]:
-    """Best splits of a long stretch, for any start: what is best hangs on thresholds, and these change little."""
+    """Best splits of a long stretch, for any start: the best split depends on thresholds, and these change little."""
     first, last = rows.longest
     return list(splits_of(stretch_after(rows, first + (last - first) // 8, last, known=True)))
