@@ -25,7 +25,6 @@ BETWEEN = "; "
 # How many losses a sentence names; from which share on.
 _NAMED = 3
 _LEAST_SHARE = 0.005
-_CENTIMETRE_M = 0.01
 
 WORDS: dict[str, Any] = tomllib.loads((files("schemas") / "words.toml").read_text(encoding="utf-8"))
 """Sections of `words.toml` by name."""
@@ -151,18 +150,6 @@ def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) 
     return say("verdicts", "unnoticed", largest_m) + (
         say("verdicts", "unnoticed_beyond", beyond_share) if beyond_share else ""
     )
-
-
-def noise_words(widened: Mapping[str, tuple[float, float]]) -> str:
-    """What measured noise does to the thresholds: by axis, raw threshold over the model's, and the white noise [m]."""
-    return ", ".join(
-        say("noise_axes", "widened", say("noise_axes", axis), ratio, _short(noise_m))
-        for axis, (ratio, noise_m) in widened.items()
-    )
-
-
-def _short(length_m: float) -> str:
-    return f"{1000.0 * length_m:.0f} mm" if length_m < _CENTIMETRE_M else f"{100.0 * length_m:.0f} cm"
 
 
 PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options": ""}
