@@ -273,6 +273,8 @@ class AlignConfig(Settings):
     fastest_mps: Positive = 200.0
     bunched_stamps_m: NonNegative = 20.0
     reset_back_m: NonNegative = 5.0
+    # A recorder that restarts may set it back at several rows one after the other.
+    reset_moves: Annotated[int, Field(strict=True, gt=0)] = 4
     # Over a reset between two rows the speed about it counts where braking x dt^2 / 4 is no more than this, as at 1 Hz:
     # a tenth of the odometer's fixed error.
     reset_doubt_m: NonNegative = 0.5
@@ -604,10 +606,6 @@ class SurveyConfig(Settings):
     doubled_m: Positive = 100.0
     # A corner is a kink too if it turns by so much on a curve that no track has; less is how dense surveys scatter.
     corner_deg: Positive = 8.0
-    # Scatter is judged where points are about evenly spaced: no step is so many times another.
-    uneven_steps: Positive = 3.0
-    # Scatter makes a line longer: told from this share of its length on, that of the best odometer scale.
-    longer_share: Probability = 1e-4
     # Kilometres are posts, not lengths: so far they stray from the track between two points, in metres or by share.
     kilometre_m: Positive = 20.0
     kilometre_share: Probability = 0.05

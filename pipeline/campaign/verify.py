@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -20,7 +19,6 @@ from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
 from pipeline.campaign.watch import Follower
 from pipeline.results import catalogue, packs, store
-from pipeline.results.figures.head import word_of
 from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest
 from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
@@ -35,11 +33,6 @@ from schemas.tables import TABLES
 
 Problem = tuple[str, str, str]
 _RUNS_AT_ONCE = 50
-# Of the outcome of a run, what its tables say.
-_OF_TABLES = (
-    *("status", "error", "verdict", "hazards", "missed_detections", "why", "faults", "balises_accepted"),
-    *("balises_on_path", "availability", "proof_margin_m", "held_s", "remedies", "lost"),
-)
 _COLUMNS = ("what", "found", "expected")
 # What a campaign leaves beside the files that the manifest names.
 _OWN_FILES = (NAME, lock.NAME, lock.HELD, "replay.log")
@@ -86,8 +79,8 @@ class Verification:
 def verify(out: Address) -> Verification:
     """Hold every file of a result against `OUT/manifest.json`, and the manifest against the runs' own metadata.
 
-    Provenance is read from the markers again, the catalogue and the campaign's tables are made again from the runs'
-    tables, and files that the manifest does not name are listed. Raises `UsageError` where there is no manifest.
+    Provenance is read from the markers again. What is kept of runs and the campaign's tables are made again from the
+    runs' tables. Files that the manifest does not name are listed. Raises `UsageError` where there is no manifest.
     """
     manifest = _manifest(out)
     again = gathered(out, manifest)
@@ -254,21 +247,16 @@ def _other_files(out: Address, runs: set[str], known: set[str]) -> Iterator[str]
 
 
 def _made_again(out: Address, software: set[str]) -> tuple[list[Problem], tuple[NotCompared, ...]]:
-    """The catalogue and the campaign's tables against the runs' own tables, which agree with the manifest.
+    """What is kept of runs and the campaign's tables against the runs' own tables, which agree with the manifest.
 
     The campaign's tables can be made again by the build that made them, with the configuration that lies there.
     """
-    tables: dict[str, pl.DataFrame] = {}
-    for table in catalogue.CATALOGUED:
-        # What another build of the program wrote only that build can read; it has no copy here.
-        with contextlib.suppress(UsageError):
-            tables[table] = store.read_table(out, table).collect()
-    copies = {table: catalogue.fresh(out, table) for table in catalogue.CATALOGUED}
-    stale = [t for t, copy in copies.items() if copy is not None and not (t in tables and copy.equals(tables[t]))]
-    problems = [(f"{catalogue.FOLDER}/{table}", "other rows", "those of the runs' tables") for table in stale]
-    if len(tables) < len(catalogue.CATALOGUED):
-        return problems, _COPIES
-    problems += _outcomes(out, tables)
+    try:
+        tables = store.small_tables(out)
+    except UsageError:
+        # What another build of the program wrote only that build can read.
+        return [], _COPIES
+    problems = list(_outcomes(out, tables))
     config = store.read_config(out)
     if config is None or software != {software_digest()}:
         return problems, (NotCompared.CAMPAIGN_TABLES,)
@@ -279,26 +267,20 @@ def _made_again(out: Address, software: set[str]) -> tuple[list[Problem], tuple[
 
 def _outcomes(out: Address, tables: Mapping[str, pl.DataFrame]) -> Iterator[Problem]:
     """The outcomes that are kept, with the verdicts and figures that `replay` repeats, against the runs' own tables."""
-    kept = resume.kept(str(out))
     parts = {name: tables[name].partition_by("run_id", as_dict=True) for name in ("runs", "hazards", "passages")}
-    for run, outcome in kept.items():
+    for run, kept in resume.kept(str(out)).items():
         own = {name: of_runs.get((run,), tables[name].clear()) for name, of_runs in parts.items()}
-        if own["runs"].is_empty():
-            continue
-        # Which availability was low is said by the configuration of that call, which need not be the last one.
-        again = outcome_of(run, outcome.log, math.inf, **own)
-        for name, found, expected in _unequal(outcome, again):
-            yield f"{catalogue.FOLDER}/complete, {run}, {name}", found, expected
+        if not own["runs"].is_empty() and not _is_outcome_of(kept, own):
+            yield f"{catalogue.FOLDER}/complete, {run}", "other values", "those of the run's tables"
 
 
-def _unequal(kept: RunOutcome, again: RunOutcome) -> Iterator[Problem]:
-    failed = again.status is RunStatus.FAILED
-    for name in ("status", "verdict") if failed else _OF_TABLES:
-        found = getattr(kept, name)
-        expected = getattr(again, name)
-        if found != expected and not (name == "lost" and not found):
-            words = word_of if name == "verdict" else str
-            yield name, words(found), words(expected)
+def _is_outcome_of(kept: RunOutcome, tables: Mapping[str, pl.DataFrame]) -> bool:
+    # Which availability was low is said by the configuration of that call, which need not be the last one.
+    again = outcome_of(kept.run_id, kept.log, math.inf, **tables)
+    if again.status is RunStatus.FAILED:
+        return (kept.status, kept.verdict) == (again.status, again.verdict)
+    of_call = ("skipped", "seconds", "attempts", "proof", "trace", *(() if kept.lost else ("lost",)))
+    return asdict(again) | {name: getattr(kept, name) for name in of_call} == asdict(kept)
 
 
 def _settings(config_digest: str, manifest: Manifest) -> str:

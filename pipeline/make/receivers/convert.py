@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from itertools import combinations
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import polars as pl
 
@@ -136,55 +136,44 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
     holds an epoch, or where two logs tell of the same time under one solution.
     """
     dropped: Counter[str] = Counter()
-    parts: list[tuple[Path, Streams]] = []
-    held: list[tuple[StreamCorrection, ...]] = []
-    failures: list[NoEpochError] = []
-    strangers: list[UnknownError] = []
+    parts: list[tuple[Path, Gatherings]] = []
+    unread: list[NoEpochError | UnknownError] = []
     for log in logs:
         files.require_regular(log)
         with unpacked(log, config or IngestConfig()) as inner:
             for plain in inner:
+                place = log if plain == log else log / plain.name
                 try:
-                    found = _convert_one(plain, config or IngestConfig(), date)
-                except UnknownError as error:
-                    if plain == log:
+                    parts.append((place, _convert_one(plain, config or IngestConfig(), date)))
+                    dropped.update(parts[-1][1].dropped)
+                except (NoEpochError, UnknownError) as error:
+                    if plain == log and isinstance(error, UnknownError):
                         raise
-                    strangers.append(_in_archive(error, plain, log))
-                except NoEpochError as error:
-                    failures.append(error if plain == log else _in_archive(error, plain, log))
-                else:
-                    parts.append((log if plain == log else log / plain.name, found.streams))
-                    held.append(found.corrections)
-                    dropped.update(found.dropped)
-    if failures and not any("gnss" in streams for _, streams in parts):
-        raise failures[0]
-    if strangers and not parts:
-        raise strangers[0]
-    counts = {"log without an epoch": len(failures), "file of an archive that is no log": len(strangers)}
-    dropped.update({reason: count for reason, count in counts.items() if count})
+                    error.place = str(error.place).replace(str(plain), str(place))
+                    unread.append(error)
+    _refuse_unread(unread, parts)
+    names = {NoEpochError: "log without an epoch", UnknownError: "file of an archive that is no log"}
+    dropped.update(names[type(error)] for error in unread)
     _refuse_overlaps(parts)
-    return Gatherings(_joined(parts), dict(dropped), _common(parts, held))
+    return Gatherings(_joined(parts), dict(dropped), _common(parts))
 
 
-def _common(
-    parts: list[tuple[Path, Streams]], held: list[tuple[StreamCorrection, ...]]
-) -> tuple[StreamCorrection, ...]:
+def _refuse_unread(unread: list[NoEpochError | UnknownError], parts: list[tuple[Path, Gatherings]]) -> None:
+    """Without any position a log of a receiver that holds none is the error; without any log, a file that is none."""
+    found = any("gnss" in gathered.streams for _, gathered in parts)
+    for error in unread:
+        if not parts or (isinstance(error, NoEpochError) and not found):
+            raise error
+
+
+def _common(parts: list[tuple[Path, Gatherings]]) -> tuple[StreamCorrection, ...]:
     """What the logs hold of corrections; logs of one stream hold the same."""
     common: dict[Stream, list[StreamCorrection]] = {}
-    for (log, streams), made in zip(parts, held, strict=True):
-        for name in streams:
-            own = [correction for correction in made if correction.stream == name]
-            _refuse_unlike(common.setdefault(name, own), own, name, log)
-    return tuple(correction for own in common.values() for correction in own)
-
-
-E = TypeVar("E", bound=InputError)
-
-
-def _in_archive(error: E, plain: Path, log: Path) -> E:
-    """An error that is told when the folder where an archive was unpacked is gone."""
-    error.place = str(error.place).replace(str(plain), str(log / plain.name))
-    return error
+    for log, gathered in parts:
+        for name in gathered.streams:
+            made = [correction for correction in gathered.corrections if correction.stream == name]
+            _refuse_unlike(common.setdefault(name, made), made, name, log)
+    return tuple(correction for made in common.values() for correction in made)
 
 
 class NoEpochError(InputError):
@@ -199,64 +188,63 @@ def _reasons(dropped: Mapping[str, int]) -> str:
     return "".join(f" Not used: {reason} ({count})." for reason, count in sorted(dropped.items()))
 
 
-def _joined(parts: list[tuple[Path, Streams]]) -> Streams:
+def _joined(parts: list[tuple[Path, Gatherings]]) -> Streams:
     """The streams of all logs, one after the other, as the contract has them."""
     breaches: list[InputError] = []
     collected: dict[Stream, list[pl.DataFrame]] = {}
-    for log, streams in parts:
-        for name, frame in streams.items():
+    for log, gathered in parts:
+        for name, frame in gathered.streams.items():
             if frame.height:
                 collected.setdefault(name, []).append(conform(frame, name, str(log), breaches))
     refuse(breaches)
     return {name: pl.concat(frames) for name, frames in collected.items()}
 
 
-def _refuse_overlaps(parts: list[tuple[Path, Streams]]) -> None:
-    """Two recorders under one name would be read as one that jumps between their values."""
-    spans = [span for log, streams in parts for span in _spans(log, streams)]
-    for one, two in combinations(spans, 2):
-        if one.name == two.name and one.log != two.log and one.start < two.end and two.start < one.end:
-            raise InputError(
-                f"two logs hold {_VALUES[one.stream][1]} of the same time under one {one.name[0]}",
-                place=f"{one.log}, {two.log}",
-                found=f"{' '.join(one.name[:2])} in both, from {max(one.start, two.start)} on",
-                expected="one recorder per call" if one.stream == "gnss" else "one recorder",
-                remedy=_VALUES[one.stream][2],
-            )
-
-
-class _Span(NamedTuple):
-    """From when to when a log holds values under a name."""
-
-    log: Path
-    stream: Stream
-    name: tuple[str, str, str]
-    start: Any
-    end: Any
-
-
-# By stream: the column that tells recorders apart, what they would be mixed of, and what to do.
-_VALUES: dict[Stream, tuple[str, str, str]] = {
+# By stream: the column that tells recorders apart, those of which one log may hold one and another the other, what two
+# logs would be mixed of, and what to do.
+_RECORDERS: dict[Stream, tuple[str, tuple[str, ...], str, str]] = {
     "gnss": (
         "solution",
+        (),
         "positions",
         "Convert the second log into the same run with --solution NAME, or --stream reference.",
     ),
-    "odometer": ("sensor", "odometer values", "Leave one of them out, or name its `sensor` in the mapping."),
+    "odometer": (
+        "sensor",
+        ("distance_m", "speed_mps"),
+        "odometer values",
+        "Leave one of them out, or name its `sensor` in the mapping.",
+    ),
 }
 
 
-def _spans(log: Path, streams: Streams) -> Iterator[_Span]:
-    """Of GNSS by solution, of odometers by sensor and column: one log may hold the distance, another the speed."""
-    for stream, (key, _, _) in _VALUES.items():
-        if stream not in streams:
+def _refuse_overlaps(parts: list[tuple[Path, Gatherings]]) -> None:
+    """Two recorders under one name would be read as one that jumps between their values."""
+    for stream, (key, columns, values, remedy) in _RECORDERS.items():
+        logs = [(log, gathered.streams[stream]) for log, gathered in parts if stream in gathered.streams]
+        spans = [span for log, frame in logs for span in _spans(log, frame, key, columns)]
+        if len(spans) < 2:
             continue
-        frame = streams[stream].drop_nulls("t")
-        frame = frame if key in frame.columns else frame.with_columns(pl.lit("primary").alias(key))
-        columns = ["t"] if stream == "gnss" else [name for name in ("distance_m", "speed_mps") if name in frame.columns]
-        for column in columns:
-            for (name,), rows in frame.drop_nulls(column).group_by(key, maintain_order=True):
-                yield _Span(log, stream, (key, str(name), column), rows["t"].min(), rows["t"].max())
+        for (name, _), rows in pl.concat(spans).group_by(key, "column", maintain_order=True):
+            for one, two in pairwise(rows.sort("start", "end").iter_rows(named=True)):
+                if one["log"] != two["log"] and two["start"] < one["end"]:
+                    raise InputError(
+                        f"two logs hold {values} of the same time under one {key}",
+                        place=f"{one['log']}, {two['log']}",
+                        found=f"{key} {name} in both, from {two['start']} on",
+                        expected="one recorder",
+                        remedy=remedy,
+                    )
+
+
+def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -> Iterator[pl.DataFrame]:
+    """From when to when a log holds values, by recorder; a frame for each of the columns."""
+    named = frame if key in frame.columns else frame.with_columns(pl.lit("primary").alias(key))
+    for column in columns or ("t",):
+        if column in named.columns:
+            of_column = named.drop_nulls(["t", column]).group_by(pl.col(key).cast(pl.String), maintain_order=True)
+            spans = of_column.agg(start=pl.col("t").min(), end=pl.col("t").max())
+            yield spans.with_columns(log=pl.lit(str(log)), column=pl.lit(column))
 
 
 def _convert_one(log: Path, config: IngestConfig, date: date | None) -> Gatherings:
@@ -321,7 +309,7 @@ def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputErr
         "no epoch with a time and a position",
         place=str(log),
         found=", ".join(f"{name} ({count})" for name, count in met.most_common(_MOST_NAMES)),
-        expected="UBX NAV-PVT or NAV-SOL, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
+        expected="UBX NAV-PVT, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
         "NovAtel BESTPOS or INSPVA",
         remedy="Let the receiver record one of these messages, or give the day of NMEA without one by --date."
         + _reasons(dropped),
@@ -360,8 +348,6 @@ _ALMOST = {
     rb"\A.{20,60}C?RINEX VER": "RINEX holds ranges, no positions: compute them first, "
     "for example with rnx2rtkp of RTKLIB, and convert the .pos file that it writes.",
     rb"\$[A-Z]{2}(GGA|GNS|RMC),[^*\r\n]*\r?\n": "NMEA without checksums cannot be checked: let the logger keep them.",
-    rb"(?m)^<(BEST|PSR|INS)": "Abbreviated ASCII of NovAtel has no checksums: log BESTPOSA or BESTPOSB.",
-    rb"\A\s*\d{4}(/\d\d/\d\d|\s+\d+\.\d+\s)": "If it is of RTKLIB, let it write its header (out-outhead = on).",
 }
 _MOST_NAMES = 20
 # Where a hint is looked for: what begins with gigabytes of something else is no such file.

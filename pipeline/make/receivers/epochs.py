@@ -18,9 +18,8 @@ from schemas.enums import Fix
 from schemas.inputs import Gnss, Satellites
 from schemas.run import Stream
 
-# Numerics of the reading, which has no configuration: a message may come so many epochs after its own, as many as a
-# receiver at 20 Hz makes in over a second. With a later one an epoch of
-# the same key begins.
+# A message may come so many epochs after its own, as many as a receiver at 20 Hz makes in over a second; with a later
+# one another epoch of the same key begins. Numerics of the reading, which has no configuration.
 _LATEST_MESSAGE = 32
 
 
@@ -47,12 +46,6 @@ class Epoch:
             self._ranks[what] = rank
             self.gnss |= columns
 
-    def put_time(self, rank: int, t_ns: int) -> None:
-        """As `put`, the time [ns since 1970]."""
-        if rank >= self._ranks.get("time", rank):
-            self._ranks["time"] = rank
-            self.t_ns = t_ns
-
 
 @dataclass
 class Gathered:
@@ -75,15 +68,10 @@ class Gathered:
             or epoch.positions.get(position, content) != content
             or len(self.epochs) - epoch.number > _LATEST_MESSAGE
         ):
-            return self.begin(key, position, content)
+            epoch = self._latest[key] = Epoch(key, len(self.epochs))
+            self.epochs.append(epoch)
         if position:
             epoch.positions[position] = content
-        return epoch
-
-    def begin(self, key: Hashable, position: str = "", content: bytes = b"") -> Epoch:
-        """A new epoch of this key, whatever came before."""
-        epoch = self._latest[key] = Epoch(key, len(self.epochs), positions={position: content} if position else {})
-        self.epochs.append(epoch)
         return epoch
 
     def drop(self, reason: str, count: int = 1) -> None:

@@ -1,4 +1,4 @@
-"""Whole messages of a receiver log: UBX, SBF, NMEA, NovAtel and RTCM 3, by their start, length and checksum.
+"""Whole messages of a receiver log: UBX, SBF, NMEA and NovAtel, by their start, length and checksum.
 
 A start whose message does not prove whole counts as damaged, and the search goes on right behind that start: a
 damaged length hides nothing of what follows it.
@@ -20,7 +20,6 @@ class Protocol(StrEnum):
     UBX = "UBX"
     SBF = "SBF"
     NMEA = "NMEA"
-    RTCM = "RTCM"
     NOVATEL = "NovAtel"
 
 
@@ -32,11 +31,11 @@ class Frame(NamedTuple):
 
 
 # What a message begins with; a search for these bytes passes over what lies between messages, which may be gigabytes.
-_FIRST = b"\xb5$\xaa#%\xd3"
+_FIRST = b"\xb5$\xaa#%"
 _START = re.compile(
     rb"(?=[" + _FIRST + rb"])(?:"
     rb"(?P<UBX>\xb5\x62)|(?P<SBF>\$@)|(?P<NOVATEL>\xaaD[\x12\x13]|[#%][A-Z][A-Z0-9_]+A,)"
-    rb"|(?P<NMEA>\$(?:[A-Z]{2}[A-Z0-9]{3}|P[A-Z0-9]{3,6}),)|(?P<RTCM>\xd3[\x00-\x03]))"
+    rb"|(?P<NMEA>\$(?:[A-Z]{2}[A-Z0-9]{3}|P[A-Z0-9]{3,6}),))"
 )
 _SENTENCE = re.compile(rb"\$([ -#%-)+-~]+)\*([0-9A-Fa-f]{2})\r?\n?")
 _NOVATEL_LINE = re.compile(rb"[#%]([ -)+-~]+)\*([0-9A-Fa-f]{8})\r?\n?")
@@ -48,7 +47,6 @@ NOVATEL_NAMES = {
 }  # fmt: skip
 _UBX_OVERHEAD = 8
 _SBF_HEAD = 8
-_RTCM_OVERHEAD = 6
 
 
 def frames(content: bytes, on_damage: Callable[[], None]) -> Iterator[Frame]:
@@ -63,8 +61,7 @@ def frames(content: bytes, on_damage: Callable[[], None]) -> Iterator[Frame]:
             yield Frame(protocol, content[start.start() : end])
             at = end
             continue
-        if protocol is not Protocol.RTCM:  # its start is too short to mean anything by itself
-            on_damage()
+        on_damage()
         at = start.start() + 1
 
 
@@ -95,14 +92,6 @@ def _nmea_end(content: bytes, start: int) -> int | None:
     return sentence.end()
 
 
-def _rtcm_end(content: bytes, start: int) -> int | None:
-    """RTCM 10403, transport layer: length in ten bits, CRC-24Q at the end."""
-    end = start + _RTCM_OVERHEAD + int.from_bytes(content[start + 1 : start + 3], "big")
-    if end > len(content):
-        return None
-    return end if _crc24q(content[start : end - 3]) == int.from_bytes(content[end - 3 : end], "big") else None
-
-
 def _novatel_end(content: bytes, start: int) -> int | None:
     """OEM7 commands and logs reference manual, "32-bit CRC": over all from the start, of ASCII without its sign."""
     if content[start : start + 1] in (b"#", b"%"):
@@ -125,31 +114,10 @@ def _crc32(content: bytes) -> int:
     return crc32(content, 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
-def _crc24q_table() -> list[int]:
-    table = []
-    for value in range(256):
-        crc = value << 16
-        for _ in range(8):
-            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)
-        table.append(crc & 0xFFFFFF)
-    return table
-
-
-_CRC24Q = _crc24q_table()
-
-
-def _crc24q(content: bytes) -> int:
-    crc = 0
-    for byte in content:
-        crc = (crc << 8) & 0xFFFFFF ^ _CRC24Q[crc >> 16 ^ byte]
-    return crc
-
-
 _ENDS: dict[Protocol, Callable[[bytes, int], int | None]] = {
     Protocol.UBX: _ubx_end,
     Protocol.SBF: _sbf_end,
     Protocol.NMEA: _nmea_end,
-    Protocol.RTCM: _rtcm_end,
     Protocol.NOVATEL: _novatel_end,
 }
 
@@ -168,8 +136,6 @@ def name_of(frame: Frame) -> str:
 
         number = int.from_bytes(content[4:6], "little") & 0x1FFF
         name = str(SBF_MSGIDS.get(number, (f"block {number}",))[0])
-    elif protocol is Protocol.RTCM:
-        name = str(int.from_bytes(content[3:5], "big") >> 4)
     else:
         number = int.from_bytes(content[4:6], "little")
         name = NOVATEL_NAMES.get(number, f"message {number}")

@@ -1,8 +1,6 @@
-"""u-blox UBX, gathered by iTOW: NAV-PVT or NAV-PVAT with NAV-COV, NAV-PL, NAV-SBAS, NAV-SAT and NAV-HPPOSLLH.
+"""u-blox UBX, gathered by iTOW: NAV-PVT or NAV-PVAT with NAV-COV, NAV-PL, NAV-SBAS, NAV-HPPOSLLH.
 
-Receivers without NAV-PVT (generations 4 to 6) tell an epoch by NAV-SOL in earth-fixed coordinates to the centimetre.
-NAV-POSLLH and NAV-VELNED tell place and velocity better, NAV-STATUS the kind of fix, NAV-TIMEUTC and NAV-TIMEGPS the
-time, NAV-SVINFO the satellites. Later ones still send them.
+Satellites: NAV-SAT or NAV-SVINFO. Receivers before generation 7 send no NAV-PVT and are not read.
 """
 
 from __future__ import annotations
@@ -11,10 +9,8 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
-from pipeline.make.receivers.earth_fixed import geodetic, local_velocity
-from pipeline.make.receivers.epochs import Epoch, Gathered, covariance, satellite_name, velocity
+from pipeline.make.receivers.epochs import Gathered, covariance, satellite_name, velocity
 from pipeline.read.ingest.recipes_drivers import UBX_SYSTEMS
-from pipeline.read.ingest.timescale import utc_of_week
 from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
 
@@ -26,8 +22,6 @@ _SVIDS = (
     (1, 32, "G", 1), (33, 64, "C", 6), (65, 96, "R", 1), (120, 158, "S", 20), (159, 163, "C", 1), (193, 202, "J", 1),
     (211, 246, "E", 1),
 )  # fmt: skip
-# Messages of one epoch may round its time, and know another number of leap seconds before they have been received.
-_SAME_MOMENT_NS = 60 * NS_PER_S
 
 
 def parse(raw: bytes) -> Any:
@@ -38,62 +32,48 @@ def parse(raw: bytes) -> Any:
 
 
 def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
-    """Add what this message says to its epoch, whose key is the time of the week; most tell no more of the time."""
-    rank, time_of = _TIMES.get(message.identity, (0, _no_time))
-    t_ns = time_of(message)
-    position = message.identity if message.identity in _POSITIONS else ""
-    epoch = gathered.at(message.iTOW, position, raw)
-    if epoch.t_ns is not None and t_ns is not None and abs(t_ns - epoch.t_ns) > _SAME_MOMENT_NS:
-        # The same moment of another week: the log was interrupted, or several were joined.
-        epoch = gathered.begin(message.iTOW, position, raw)
-    if t_ns is not None:
-        epoch.put_time(rank, t_ns)
+    """Add what this message says to its epoch, whose key is the time of the week."""
+    is_position = message.identity in _POSITIONS
+    epoch = gathered.at(message.iTOW, message.identity if is_position else "", raw)
+    if is_position:
+        epoch.t_ns = _time_ns(message)
     for what, rank, columns_of in _CONTENTS.get(message.identity, ()):
         if columns := columns_of(message):
             epoch.put(what, rank, columns)
     if message.identity == "NAV-PL" and not message.plPosValid:
         gathered.drop("protection level not valid")
-    _see_satellites(epoch, message)
+    if message.identity == "NAV-SAT":
+        epoch.satellites = _satellites(message, message.numSvs, 1.0)
+    elif message.identity == "NAV-SVINFO" and not epoch.satellites:
+        epoch.satellites = _satellites(message, message.numCh, 1e-2)
 
 
-def _no_time(_: Any) -> int | None:
-    return None
-
-
-def _calendar_ns(m: Any, second: int) -> int | None:
-    """UTC of a message's calendar and `nano`, none where there is no such day [ns since 1970]."""
+def _time_ns(m: Any) -> int | None:
+    """UTC of the calendar and `nano`, none where it is not valid or no day [ns since 1970]."""
+    if not (m.validDate and m.validTime):
+        return None
     try:
         minute = datetime(m.year, m.month, m.day, m.hour, m.min, tzinfo=UTC)
     except ValueError:
         return None
+    second = int(m.second if hasattr(m, "second") else m.sec)
     return (int(minute.timestamp()) + second) * NS_PER_S + int(m.nano)
 
 
-def _pvt_time(m: Any) -> int | None:
-    if not (m.validDate and m.validTime):
-        return None
-    return _calendar_ns(m, int(m.second if hasattr(m, "second") else m.sec))
+def _fix(m: Any) -> Columns:
+    return {"fix": _kind(m).value, "satellites": m.numSV}
 
 
-def _week_time(m: Any, known: bool) -> int | None:
-    return utc_of_week(m.week, m.iTOW * 1_000_000 + m.fTOW) if known else None
-
-
-def _fix(fix_type: int, good: bool, differential: bool, carrier: int = 0) -> Fix:
-    """Kind of fix from `fixType` (or `gpsFix`), the flag that it is within its limits, `diffSoln` and `carrSoln`."""
-    if not good or fix_type in (0, 5):  # none, time only
-        return Fix.NONE
-    if fix_type == 1:
-        return Fix.ESTIMATED
-    if carrier in (1, 2):
-        return Fix.RTK_FIXED if carrier == 2 else Fix.RTK_FLOAT
-    return Fix.DIFFERENTIAL if differential else Fix.AUTONOMOUS
-
-
-def _pvt_fix(m: Any) -> Columns:
+def _kind(m: Any) -> Fix:
+    """Kind of fix from `fixType`, the flag that it is within its limits, `diffSoln` and `carrSoln`."""
     good = m.gnssFixOk if hasattr(m, "gnssFixOk") else m.gnssFixOK
-    fix = Fix.NONE if getattr(m, "invalidLlh", False) else _fix(m.fixType, good, m.diffSoln, m.carrSoln)
-    return {"fix": fix.value, "satellites": m.numSV}
+    if not good or getattr(m, "invalidLlh", False) or m.fixType in (0, 5):  # none, time only
+        return Fix.NONE
+    if m.fixType == 1:
+        return Fix.ESTIMATED
+    if m.carrSoln in (1, 2):
+        return Fix.RTK_FIXED if m.carrSoln == 2 else Fix.RTK_FLOAT
+    return Fix.DIFFERENTIAL if m.diffSoln else Fix.AUTONOMOUS
 
 
 def _place(m: Any) -> Columns:
@@ -104,11 +84,6 @@ def _place(m: Any) -> Columns:
 def _velocity(m: Any) -> Columns:
     """Velocity [mm/s]."""
     return velocity(m.velE / 1e3, m.velN / 1e3, -(m.velD / 1e3))
-
-
-def _early_velocity(m: Any) -> Columns:
-    """Velocity [cm/s]."""
-    return velocity(m.velE * 1e-2, m.velN * 1e-2, -(m.velD * 1e-2))
 
 
 def _accuracy(m: Any) -> Columns:
@@ -127,28 +102,8 @@ def _protection(m: Any) -> Columns:
     return {"hpl_m": max(m.plPos1, m.plPos2) / 1e3, "vpl_m": m.plPos3 / 1e3} if m.plPosValid else {}
 
 
-def _earth_fixed_place(m: Any) -> Columns:
-    """Of NAV-SOL [cm]; its accuracy is of all three axes together and not used."""
-    known = m.ecefX or m.ecefY or m.ecefZ
-    return geodetic(m.ecefX * 1e-2, m.ecefY * 1e-2, m.ecefZ * 1e-2) if known else {}
-
-
-def _earth_fixed_velocity(m: Any) -> Columns:
-    place = _earth_fixed_place(m)
-    speeds_mps = (m.ecefVX * 1e-2, m.ecefVY * 1e-2, m.ecefVZ * 1e-2)
-    return local_velocity(place["latitude_deg"], place["longitude_deg"], speeds_mps) if place else {}
-
-
-def _see_satellites(epoch: Epoch, m: Any) -> None:
-    """NAV-SAT, or NAV-SVINFO, which tells the same of the epoch [deg; residual in m or cm]."""
-    if m.identity == "NAV-SAT":
-        epoch.satellites = _satellites(m, m.numSvs, 1.0)
-    elif m.identity == "NAV-SVINFO" and not epoch.satellites:
-        epoch.satellites = _satellites(m, m.numCh, 1e-2)
-
-
 def _satellites(m: Any, count: int, residual_m: float) -> list[Columns]:
-    """Those that are known and above or below a horizon; `residual_m`: the unit of the residual."""
+    """Those that are known and above or below a horizon [deg]; `residual_m`: the unit of the residual."""
     rows: list[Columns] = []
     for index in range(1, count + 1):
         azimuth, elevation, residual, used = (
@@ -180,33 +135,15 @@ def _name(m: Any, index: int) -> str | None:
 
 
 # What messages say of an epoch, and with which rank: it gives way to a higher one.
-_PVT = (("fix", 3, _pvt_fix), ("place", 3, _place), ("velocity", 3, _velocity), ("accuracy", 3, _accuracy))
+_PVT = (("fix", 0, _fix), ("place", 0, _place), ("velocity", 0, _velocity), ("accuracy", 0, _accuracy))
 _CONTENTS: dict[str, tuple[tuple[str, int, Callable[[Any], Columns]], ...]] = {
     "NAV-PVT": _PVT,
     "NAV-PVAT": _PVT,
-    "NAV-HPPOSLLH": (("place", 4, lambda m: {} if m.invalidLlh else _place(m)),),
-    "NAV-COV": (("accuracy", 4, _stated_covariance),),
+    "NAV-HPPOSLLH": (("place", 1, lambda m: {} if m.invalidLlh else _place(m)),),
+    "NAV-COV": (("accuracy", 1, _stated_covariance),),
     "NAV-PL": (("protection", 0, _protection),),
     "NAV-SBAS": (("sbas", 0, lambda m: {"sbas_prn": m.geo} if m.geo and m.mode else {}),),
-    "NAV-SOL": (
-        ("fix", 1, lambda m: {"fix": _fix(m.gpsFix, m.gpsfixOK, m.diffSoln).value, "satellites": m.numSV}),
-        ("place", 1, _earth_fixed_place),
-        ("velocity", 1, _earth_fixed_velocity),
-    ),
-    "NAV-STATUS": (("fix", 0, lambda m: {"fix": _fix(m.gpsFix, m.gpsFixOk, m.diffSoln).value}),),
-    "NAV-POSLLH": (("place", 2, _place), ("accuracy", 2, _accuracy)),
-    "NAV-VELNED": (("velocity", 2, _early_velocity),),
 }
-_TIMES: dict[str, tuple[int, Callable[[Any], int | None]]] = {
-    "NAV-PVT": (3, _pvt_time),
-    "NAV-PVAT": (3, _pvt_time),
-    "NAV-TIMEUTC": (2, lambda m: _calendar_ns(m, m.sec) if m.validUTC else None),
-    "NAV-SOL": (1, lambda m: _week_time(m, m.wknSet and m.towSet)),
-    "NAV-TIMEGPS": (1, lambda m: _week_time(m, m.towValid and m.weekValid)),
-}
-_POSITIONS = ("NAV-PVT", "NAV-PVAT", "NAV-SOL", "NAV-POSLLH")
+_POSITIONS = ("NAV-PVT", "NAV-PVAT")
 # Class and id of the messages above, of NAV-SAT and of NAV-SVINFO.
-_WANTED = frozenset(
-    b"\x01" + bytes([number])
-    for number in (0x02, 0x03, 0x06, 0x07, 0x12, 0x14, 0x17, 0x20, 0x21, 0x30, 0x32, 0x35, 0x36, 0x62)
-)
+_WANTED = frozenset(b"\x01" + bytes([number]) for number in (0x07, 0x14, 0x17, 0x30, 0x32, 0x35, 0x36, 0x62))

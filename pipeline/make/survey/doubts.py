@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
-import polars as pl
 
-from pipeline.make.survey.network import SurveyNetwork, arms_of
+from pipeline.make.survey.network import SurveyNetwork
 from pipeline.make.survey.pieces import LinePiece, kilometre_spans
 from pipeline.stages.matching.candidates import candidates_of, segments_of
 from pipeline.stages.track.geodesy import points_of, way_m
 from pipeline.stages.track.network import Network, network_of
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import in_pieces, places_along, track_of
-from schemas.arrays import Floats
 from schemas.config import SiteConfig, SurveyConfig
-from schemas.enums import Navigability
 from schemas.run import Finding
 
 
@@ -28,8 +24,8 @@ def doubts(network: SurveyNetwork, config: SurveyConfig, site: SiteConfig) -> li
     findings = [*_heights(network.elements), *_doubled(in_parts, config)]
     findings += _open_ends(network_of(track, network.links), config.same_track_m, site.near_ends_m)
     for element in network.elements:
-        findings += [*_kinks(element, config), *_kilometres(element, config), *_scattered(element, config)]
-    return [*findings, *_corners(network, config)]
+        findings += [*_kinks(element, config), *_kilometres(element, config)]
+    return findings
 
 
 def _heights(elements: list[LinePiece]) -> Iterator[Finding]:
@@ -64,23 +60,6 @@ def _kinks(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
         yield Finding("warning", f"track: {element.name}", text, "Look whether a point is wrong or out of order.")
 
 
-def _corners(network: SurveyNetwork, config: SurveyConfig) -> Iterator[Finding]:
-    """Kinks where two elements meet that a train runs over."""
-    used = network.links.filter(pl.col("navigability").cast(pl.String) != Navigability.NONE.value)
-    passed = set(used.select("netelement_a", "position_a").iter_rows())
-    for meeting in arms_of(network.ends).values():
-        first = network.elements[meeting[0][0]].name, meeting[0][1]
-        if len(meeting) == 2 and meeting[0][0] != meeting[1][0] and first in passed:
-            inward, onward = (_last_step(network.elements[element], position) for element, position in meeting)
-            corner = replace(inward.followed_by(onward.take([0])), name=f"{inward.name}, {onward.name}")
-            yield from _kinks(corner, config)
-
-
-def _last_step(element: LinePiece, position: int) -> LinePiece:
-    """The last two points before an end, the end last."""
-    return element.take([1, 0] if position == 0 else [-2, -1])
-
-
 def _kilometres(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
     way = way_m(element.surface)
     known, off_m, jumps = kilometre_spans(element.line_km, way, config)
@@ -93,45 +72,6 @@ def _kilometres(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
             f"over {way[last] - way[first]:.0f} m of track ({jumps.sum()} such places)"
         )
         yield Finding("warning", f"track: {element.name}", text, "A jump of the kilometres, or points out of order.")
-
-
-def _scattered(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
-    """Points that lie aside of a smooth line through their neighbours make the element longer than the track is."""
-    flat = replace(element, height_m=np.zeros(len(element))).solid
-    solid = element.solid
-    way = way_m(flat)
-    by_plan = _longer_m(flat, way, config.uneven_steps)
-    by_height = max(0.0, min(_longer_m(solid, way, config.uneven_steps) - by_plan, float(way_m(solid)[-1] - way[-1])))
-    if by_plan + by_height > max(config.shape_m, config.longer_share * way[-1]):
-        what = "positions"
-        longer_m = by_plan
-        remedy = "Export all decimals; do not draw by hand."
-        if by_height > by_plan:
-            what = "heights"
-            longer_m = by_height
-            remedy = "Mend them, or leave them out with --flat."
-        text = f"{what} scatter: they make the element about {longer_m:.1f} m longer than the track is"
-        yield Finding("warning", f"track: {element.name}", text, remedy)
-
-
-def _longer_m(places: Floats, way: Floats, uneven_steps: float) -> float:
-    """By how much scatter lengthens a line: each point's variance over its spacing.
-
-    The variance is that of its distance from the cubic through two neighbours on either side, which curves and
-    transitions follow; points with neighbours at uneven distances cannot be judged.
-    """
-    if len(way) < 5:
-        return 0.0
-    at = np.stack([way[shift : len(way) - 4 + shift] for shift in range(5)])
-    step = np.diff(at, axis=0)
-    even = step.max(axis=0) < uneven_steps * step.min(axis=0)
-    sides = (0, 1, 3, 4)
-    factors = ([(at[2] - at[k]) / (at[own] - at[k]) for k in sides if k != own] for own in sides)
-    weights = np.stack([np.prod(own, axis=0) for own in factors])
-    beside = np.stack([places[shift : len(way) - 4 + shift] for shift in sides])
-    miss = places[2:-2] - np.einsum("kn,knj->nj", weights, beside)
-    variance_m2 = (miss**2).sum(axis=1) / (1.0 + (weights**2).sum(axis=0))
-    return float((variance_m2 / step.mean(axis=0))[even].sum())
 
 
 def _doubled(ground: Network, config: SurveyConfig) -> Iterator[Finding]:

@@ -54,26 +54,22 @@ def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> 
     if not pieces:
         return _NOTHING
     nodes = _nodes(pieces, config.same_place_m if join_m is None else join_m, survey.relations)
+    if pieces[0].whole:
+        ends = np.array([piece_nodes[[0, -1]] for piece_nodes in nodes])
+        return _linked(pieces, ends, set(), set(), survey, config)
     pieces, nodes = _without_doubles(pieces, nodes, survey)
     if not pieces:
         return _NOTHING
     switches = _nodes_at(pieces, nodes, survey.switches_deg, config)
     crossings = _crossings(pieces, nodes, switches, survey, config)
-    elements, ends = _cut(pieces, nodes, crossings)
+    return _linked(*_cut(pieces, nodes, crossings), crossings, switches, survey, config)
+
+
+def _linked(
+    elements: list[LinePiece], ends: Ints, crossings: set[int], switches: set[int], survey: Survey, config: SurveyConfig
+) -> SurveyNetwork:
     track = _track_table(elements)
-    relations = _of_parts(survey.relations, elements)
-    return SurveyNetwork(elements, ends, _links(track, ends, relations, crossings, switches, survey, config), track)
-
-
-def _of_parts(relations: list[Relation], elements: list[LinePiece]) -> list[Relation]:
-    """The relations given, between the parts of net elements that other surveys cut."""
-    parts = Counter(element.name.rpartition(".")[0] for element in elements if element.whole)
-    names = {element.name for element in elements}
-
-    def part(name: str, end: int) -> str:
-        return name if name in names or not parts[name] else f"{name}.{parts[name] if end else 1}"
-
-    return [(part(a, a_end), a_end, part(b, b_end), b_end, way) for a, a_end, b, b_end, way in relations]
+    return SurveyNetwork(elements, ends, _links(track, ends, crossings, switches, survey, config), track)
 
 
 def _track_table(elements: list[LinePiece]) -> pl.DataFrame:
@@ -128,8 +124,7 @@ def _without_doubles(pieces: list[LinePiece], nodes: list[Ints], survey: Survey)
     for piece, piece_nodes in zip(pieces, nodes, strict=True):
         edges = [(min(ends), max(ends)) for ends in itertools.pairwise(piece_nodes.tolist())]
         new = np.array([edge not in seen and edge[0] != edge[1] for edge in edges])
-        new |= piece.whole
-        doubled = 0 if piece.whole else sum(edge in seen for edge in edges)
+        doubled = sum(edge in seen for edge in edges)
         seen.update(edges)
         if doubled:
             text = f"{doubled} of its {len(edges)} segments stand in the survey already and are left out"
@@ -146,15 +141,12 @@ def _crossings(
     """Nodes where tracks cross without a switch: those named so, and those where two lines just run through.
 
     Nobody can take such a node of two lines for a slip by its geometry; a survey that names it a switch is believed.
-    A net element that is whole branches at its ends only.
     """
     inner = np.concatenate([piece_nodes[1:-1] for piece_nodes in nodes])
     at_ends = np.unique(np.concatenate([piece_nodes[[0, -1]] for piece_nodes in nodes]))
     through, count = np.unique(inner, return_counts=True)
     named = _nodes_at(pieces, nodes, survey.crossings_deg, config)
-    lines = [piece_nodes[1:-1] for piece, piece_nodes in zip(pieces, nodes, strict=True) if not piece.whole]
-    unnamed = np.intersect1d(through[count == 2], np.concatenate([np.zeros(0, dtype=np.int64), *lines]))
-    by_form = set(np.setdiff1d(unnamed, at_ends).tolist()) - switches
+    by_form = set(np.setdiff1d(through[count == 2], at_ends).tolist()) - switches
     _report_crossings(pieces, nodes, by_form - named, survey)
     return named | by_form
 
@@ -185,37 +177,23 @@ def _nodes_at(
 
 
 def _cut(pieces: list[LinePiece], nodes: list[Ints], crossings: set[int]) -> tuple[list[LinePiece], Ints]:
-    """Elements from node to node; the parts of a piece are named `id.1`, `id.2` along it.
-
-    A net element that is whole is cut by lines of other surveys only, not by net elements.
-    """
-    passing = _occurrences(nodes, nodes)
-    lines = [piece_nodes for piece, piece_nodes in zip(pieces, nodes, strict=True) if not piece.whole]
-    of_lines = _occurrences(lines, nodes)
-    number: dict[str, int] = {}
-    count: dict[str, int] = {}
-    parts: list[tuple[LinePiece, int, int]] = []
-    for piece, piece_nodes in zip(pieces, nodes, strict=True):
-        meets = of_lines[piece_nodes] > 0 if piece.whole else passing[piece_nodes] > 1
-        inner = [row for row in range(1, len(piece_nodes) - 1) if meets[row] and int(piece_nodes[row]) not in crossings]
-        cuts = [0, *inner, len(piece_nodes) - 1]
-        count[piece.name] = count.get(piece.name, 0) + len(cuts) - 1
-        for first, last in itertools.pairwise(cuts):
-            parts.append((piece.take(np.arange(first, last + 1)), int(piece_nodes[first]), int(piece_nodes[last])))
-    elements = []
+    """Elements from node to node; the parts of a piece are named `id.1`, `id.2` along it."""
+    passing = np.bincount(np.concatenate(nodes))
+    parts: list[LinePiece] = []
     ends = []
-    for piece, first, last in parts:
-        number[piece.name] = number.get(piece.name, 0) + 1
-        name = piece.name if count[piece.name] == 1 else f"{piece.name}.{number[piece.name]}"
-        elements.append(replace(piece, name=name))
-        ends.append((first, last))
+    for piece, piece_nodes in zip(pieces, nodes, strict=True):
+        is_cut = [passing[node] > 1 and node not in crossings for node in piece_nodes.tolist()]
+        inner = [row for row in range(1, len(piece_nodes) - 1) if is_cut[row]]
+        for first, last in itertools.pairwise([0, *inner, len(piece_nodes) - 1]):
+            parts.append(piece.take(np.arange(first, last + 1)))
+            ends.append(piece_nodes[[first, last]])
+    count = Counter(part.name for part in parts)
+    number: Counter[str] = Counter()
+    elements = []
+    for part in parts:
+        number[part.name] += 1
+        elements.append(part if count[part.name] == 1 else replace(part, name=f"{part.name}.{number[part.name]}"))
     return elements, np.array(ends, dtype=np.int64).reshape(-1, 2)
-
-
-def _occurrences(some: list[Ints], nodes: list[Ints]) -> Ints:
-    """How often each node occurs in some of the pieces."""
-    count = 1 + max(int(piece_nodes.max()) for piece_nodes in nodes)
-    return np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *some]), minlength=count)
 
 
 def arms_of(ends: Ints) -> dict[int, list[tuple[int, int]]]:
@@ -227,19 +205,14 @@ def arms_of(ends: Ints) -> dict[int, list[tuple[int, int]]]:
 
 
 def _links(
-    table: pl.DataFrame,
-    ends: Ints,
-    relations: list[Relation],
-    crossings: set[int],
-    switches: set[int],
-    survey: Survey,
-    config: SurveyConfig,
+    table: pl.DataFrame, ends: Ints, crossings: set[int], switches: set[int], survey: Survey, config: SurveyConfig
 ) -> pl.DataFrame:
     """The relations given, as they are; of ends that none of them names every pair at a node, by its angle.
 
     By angle a pair is navigable in both directions where a train can go that way, else not at all.
     """
     track = track_of(table)
+    relations = survey.relations
     directions = outward(track)
     names = track.ids
     named = {end for a, a_end, b, b_end, _ in relations for end in ((a, a_end), (b, b_end))}

@@ -134,14 +134,13 @@ def piece_of(
 
 
 def with_own_names(pieces: list[LinePiece]) -> list[LinePiece]:
-    """Each name once: the second of a name gets `#2`, in the order of the files; relations name net elements."""
-    reserved = {piece.name for piece in pieces if piece.whole}
+    """Each name once: the second of a name gets `#2`, in the order of the files."""
     used: set[str] = set()
     named = []
     for piece in pieces:
         name = piece.name
         number = 1
-        while name in used or (name in reserved and not piece.whole):
+        while name in used:
             number += 1
             name = f"{piece.name}#{number}"
         used.add(name)

@@ -35,6 +35,13 @@ def read_surveys(paths: list[Path], epsg: int | None, vehicle: Vehicle, config: 
         survey.add(_read(path, epsg, vehicle, config))
     if not any(len(piece) > 1 for piece in survey.pieces):
         raise SiteError("holds no line", place=", ".join(map(str, paths)), expected="a line of two points or more")
+    if 0 < sum(piece.whole for piece in survey.pieces) < len(survey.pieces):
+        raise SiteError(
+            "holds net relations and stands beside lines without them",
+            place=", ".join(map(str, paths)),
+            expected="a network with its relations alone, or lines alone",
+            remedy="Add the other lines and their relations to the network.",
+        )
     survey.pieces = with_own_names(survey.pieces)
     return survey
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import correlate
 
 from pipeline.stages.odometry.scale_lag import ScaleLag, scale_and_lag
 from pipeline.studies.plausibility.records import MOVING_MPS, SPEED_S, Places, Record
@@ -239,6 +238,8 @@ def _possible_lags(gnss: Places, other: Record) -> tuple[list[float], str]:
 
 def _correlations(first: Floats, second: Floats) -> Floats:
     """Correlation at every shift over what both know; 0 where that is too little (Padfield 2012, masked FFT)."""
+    from scipy.signal import correlate  # takes long to load, and hardly any run needs it
+
     known = [np.isfinite(values).astype(np.float64) for values in (first, second)]
     apart = [np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0) for values in (first, second)]
     spread = correlate(apart[0] ** 2, known[1], method="fft") * correlate(known[0], apart[1] ** 2, method="fft")

@@ -30,8 +30,6 @@ OTHERS = {
     "kink_aside_m": 2.0,
     "doubled_m": 300.0,
     "corner_deg": 15.0,
-    "uneven_steps": 1.5,
-    "longer_share": 0.5,
     "kilometre_m": 1000.0,
     "kilometre_share": 0.9,
     "balise_beside_m": 2.0,
@@ -50,12 +48,6 @@ def drawn(folder: Path, **keys: float) -> tuple[str, ...]:
             way("near", (201, 200), (300, 200)),
         ),
     ]
-    east = np.cumsum(np.tile([10.0, 20.0], 60))
-    scattered = np.random.default_rng(1).normal(0.0, 0.5, len(east))
-    latitude, longitude = degrees(east, scattered)
-    rows = "\n".join(f"{y},{x}" for y, x in zip(latitude, longitude, strict=True))
-    table = folder / "scattered.csv"
-    table.write_text(f"lat,lon\n{rows}\n")
     # A jump of 500 m, and posts that are 1,100 m apart by their numbers, 1,000 m by the track.
     even = np.arange(0.0, 2001.0, 10.0)
     posts = track_csv(folder / "km.csv", even, km=even / 1000 + np.where(even > 1000, 0.5, 0.0))
@@ -65,7 +57,7 @@ def drawn(folder: Path, **keys: float) -> tuple[str, ...]:
     wanted.write_text("lat,lon\n{},{}\n".format(*(axis[0] for axis in degrees([100.0], [5.0]))))
     made = []
     for survey, balises in (
-        *((written(folder, "lines.geojson", *lines), None), (table, None), (posts, None), (sparse, None)),
+        *((written(folder, "lines.geojson", *lines), None), (posts, None), (sparse, None)),
         (track_csv(folder / "line.csv", even), str(wanted)),
     ):
         try:

@@ -144,24 +144,11 @@ def test_a_missing_element_and_two_words_for_one_pair_are_told(tmp_path: Path) -
     ]
 
 
-def test_a_line_of_another_survey_cuts_an_element_and_its_relations_follow(tmp_path: Path) -> None:
-    given = network(
-        tmp_path, [("a", 0, "c", 1, "none"), ("a", 1, "b", 0, "BA"), ("a", 1, "d", 0, "AB"), ("b", 1, "c", 0, "AB")]
-    )
-    middle = builders.POINTS["a"][1]
-    branch = {"type": "LineString", "coordinates": [middle, (middle[0] + 0.001, middle[1] + 0.0001)]}
-    siding = written(tmp_path, "siding.geojson", {"type": "Feature", "properties": {"id": "a"}, "geometry": branch})
-    site = site_of(siding, given)
-    names = site.track["netelement_id"].unique(maintain_order=True).to_list()
-    assert names == ["a#2", "a.1", "a.2", "b", "c", "d"]
-    assert {
-        ("a.1", 0, "c", 1, "none"),
-        ("a.2", 1, "b", 0, "BA"),
-        ("a.2", 1, "d", 0, "AB"),
-        ("b", 1, "c", 0, "AB"),
-    } < set(rows(site))
-    joined = {frozenset([row[:2], row[2:4]]): row[4] for row in rows(site)}
-    assert joined[frozenset([("a.1", 1), ("a.2", 0)])] == "both"
+def test_a_network_with_relations_beside_other_lines_is_refused(tmp_path: Path) -> None:
+    given = network(tmp_path, [("a", 1, "b", 0, "BA")])
+    siding = written(tmp_path, "siding.geojson", way("x", (0, 0), (100, 0)))
+    with pytest.raises(SiteError, match="holds net relations and stands beside lines without them"):
+        site_of(siding, given)
 
 
 @pytest.mark.parametrize(

@@ -175,21 +175,6 @@ def track_csv(path: Path, east_m: np.ndarray, **columns: Any) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("scatter_m", "digits", "cause"), [(0.0, 9, None), (0.0, 5, "positions"), (2.0, 9, "heights"), (0.05, 9, None)]
-)
-def test_a_line_that_scatter_makes_longer_is_told_with_its_cause(
-    tmp_path: Path, scatter_m: float, digits: int, cause: str | None
-) -> None:
-    east = np.arange(0.0, 2001.0, 10.0)
-    latitude, longitude = degrees(east, 0.3 * east)
-    height = 400.0 + 0.02 * east + np.random.default_rng(1).normal(0.0, scatter_m, len(east))
-    survey = tmp_path / "line.csv"
-    pl.DataFrame({"lat": latitude.round(digits), "lon": longitude.round(digits), "height": height}).write_csv(survey)
-    said = [word for word in ("positions", "heights") if f"{word} scatter: they make" in told(site_of(survey))]
-    assert said == ([] if cause is None else [cause])
-
-
 def test_a_piece_that_is_missing_is_told_and_two_tracks_side_by_side_are_no_gap(tmp_path: Path) -> None:
     one, other = way("a", (0, 0), (500, 0)), way("b", (560, 0), (900, 0))
     beside = way("c", (0, 4.5), (500, 4.5))
@@ -202,9 +187,7 @@ def test_a_piece_that_is_missing_is_told_and_two_tracks_side_by_side_are_no_gap(
     assert "end 1 of a and end 0 of b are 60.00 m apart and not linked" in gaps[0]
 
 
-def test_a_corner_between_two_lines_and_a_line_over_itself_are_told(tmp_path: Path) -> None:
-    bent = written(tmp_path, "b.geojson", way("a", (0, 0), (500, 0)), way("b", (500, 0), (600, 80)))
-    assert "track: a, b: 1 kinks; the sharpest turns by 39 degrees" in told(site_of(bent))
+def test_a_line_over_itself_is_told(tmp_path: Path) -> None:
     again = written(tmp_path, "a.geojson", way("a", (0, 0), (500, 0), (500.5, 0.4), (0, 0.4)))
     assert "track: a: lies within 1.5 m of itself" in told(site_of(again))
 
