@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import re
@@ -900,8 +901,12 @@ def diff(
 
 def main() -> None:
     """Entry point of the program: turns whatever happens into one message and an exit status."""
+    # By default the collector goes through all modules time and again while they are loaded, and twice at the end.
+    gc.set_threshold(50_000)
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
-    sys.exit(_guarded(arguments, debug="--debug" in sys.argv[1:]))
+    status = _guarded(arguments, debug="--debug" in sys.argv[1:])
+    gc.freeze()
+    sys.exit(status)
 
 
 @cache

@@ -273,6 +273,8 @@ class AlignConfig(Settings):
     fastest_mps: Positive = 200.0
     bunched_stamps_m: NonNegative = 20.0
     reset_back_m: NonNegative = 5.0
+    # A recorder that restarts may set it back at several rows one after the other.
+    reset_moves: Annotated[int, Field(strict=True, gt=0)] = 4
     # Over a reset between two rows the speed about it counts where braking x dt^2 / 4 is no more than this, as at 1 Hz:
     # a tenth of the odometer's fixed error.
     reset_doubt_m: NonNegative = 0.5

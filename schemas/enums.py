@@ -262,6 +262,7 @@ class Note(StrEnum):
     ODOMETER_CONTRADICTED = "odometer_contradicted"
     LEARNED = "learned"
     UNDIAGNOSED = "undiagnosed"
+    IN_USE_UNBOUNDED = "in_use_unbounded"
     MOVING_UNKNOWN = "moving_unknown"
     AVAILABLE = "available"
     POOR_POSITIONS = "poor_positions"

@@ -208,7 +208,7 @@ def test_windows_stand_after_a_pause_of_an_odometer_of_speed_alone():
     """The way of the pause is guessed from the speeds around it; taken as none, the next balise would come early."""
     run, site = journey()
     at_s = (pl.col("t") - run.odometer["t"][0]).dt.total_microseconds() / 1e6
-    paused = run.odometer.with_columns(distance_m=pl.lit(None, pl.Float64)).filter(~at_s.is_between(120.0, 128.0))
+    paused = run.odometer.with_columns(distance_m=pl.lit(None, pl.Float64)).filter(~at_s.is_between(120.0, 124.0))
     passages = replay(run.with_streams(odometer=paused), site, VEHICLE).passages
     whole = replay(run, site, VEHICLE).passages
     assert passages["linking_error"].cast(str).to_list() == ["none"] * whole.height

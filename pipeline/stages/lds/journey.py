@@ -165,8 +165,11 @@ def mission_epochs(journey: Journey, config: LdsConfig) -> frozenset[int]:
 def unwatched_epochs(journey: Journey, watched: Ints, gap_reset_s: float) -> frozenset[int]:
     """The first watched epochs after time over which no monitor can say what became of the position.
 
-    Longer than the bank bridges; or however short, where the odometer lost its distance: no increment leads over it.
+    Longer than the bank bridges; or however short, where the odometer lost its distance or guessed it over a pause: no
+    increment leads over it. Slip has a test of its own.
     """
     waited_ns = np.diff(journey.t_ns[watched])
-    lost = np.diff(journey.counter[watched]) != 0
+    slipped = np.diff(np.cumsum(journey.slips)[watched]) > 0
+    paused = (np.diff(journey.segment[watched]) != 0) & ~slipped
+    lost = paused | (np.diff(journey.counter[watched]) != 0)
     return frozenset(watched[1:][lost | (waited_ns > gap_reset_s * NS_PER_S)].tolist())

@@ -140,7 +140,7 @@ class Relink:
         if self._journey.scale_sigma is None and not (anchor.is_read and anchor.epoch == epoch):
             return Comparison(reason=NotEvaluated.RELINK_NO_VEHICLE)
         doubt_m = float(self._journey.slip_doubt_m[epoch] - self._journey.slip_doubt_m[anchor.epoch])
-        if doubt_m > 0.5 * self._config.hazards.failure_limit_m:
+        if doubt_m > self._rule.most_m:
             # Slip at each start counts too much each time, and would soon explain any fault.
             return Comparison(reason=NotEvaluated.RELINK_SLIPPED)
         moved_m, bound_m = (float(values[0]) for values in self.moved_m(anchor, epoch, epoch + 1))
@@ -161,10 +161,9 @@ class Relink:
         way_m = journey.travelled_m[at] - anchor.travelled_m
         positions_m2 = anchor.sigma_m**2 + journey.sigma_m[at] ** 2
         bound_m = self._rule.bound_m(self._rule.variance_m2(positions_m2, waited_s, way_m, journey.scale_sigma or 0.0))
-        most_m = 0.5 * self._config.hazards.failure_limit_m
         doubt_m = journey.slip_doubt_m[at] - journey.slip_doubt_m[anchor.epoch]
-        known = (journey.counter[at] == journey.counter[anchor.epoch]) & (doubt_m <= most_m)
-        return np.where(known, moved_m, np.nan), np.minimum(most_m, bound_m + doubt_m)
+        known = (journey.counter[at] == journey.counter[anchor.epoch]) & (doubt_m <= self._rule.most_m)
+        return np.where(known, moved_m, np.nan), np.minimum(self._rule.most_m, bound_m + doubt_m)
 
 
 class Recovery:

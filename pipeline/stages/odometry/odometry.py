@@ -15,6 +15,10 @@ from pipeline.stages.odometry.rows import filled_in, leaps, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 
+# The bound of a bridged way holds for an emergency brake right after as hard acceleration: a Gaussian error comes as
+# far in 3 of 1000 cases.
+_BOUND_SIGMAS = 3.0
+
 
 class OdometerWay(NamedTuple):
     """True distance between two instants, signed [m], and its variance [m^2]; NaN where it is not known."""
@@ -288,8 +292,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
         leaps_ns=_leaps_ns(stream, align),
-        # Bounds of the way count as three sigmas.
-        bridged_m2=np.interp(t_s, row_s, _sums((bridged_m / 3.0) ** 2)) if bridged_m.any() else None,
+        bridged_m2=np.interp(t_s, row_s, _sums((bridged_m / _BOUND_SIGMAS) ** 2)) if bridged_m.any() else None,
         config=align,
     )
 

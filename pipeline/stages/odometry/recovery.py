@@ -22,6 +22,11 @@ class RecoveryRule:
 
     config: Configuration
 
+    @property
+    def most_m(self) -> float:
+        """Half of the failure limit [m]: no bound is wider, and no more may be in doubt."""
+        return 0.5 * self.config.hazards.failure_limit_m
+
     def is_quiet(self, quiet_s: float | Floats) -> Bools:
         """Nothing has failed fast for long enough."""
         return np.asarray(quiet_s) >= self.config.lds.recovery_s
@@ -36,5 +41,4 @@ class RecoveryRule:
     def bound_m(self, variance_m2: float | Floats) -> Floats:
         """min(failure limit / 2, k_T sqrt(variance)) [m]."""
         factor = self.config.monitors.threshold_factor
-        most_m = 0.5 * self.config.hazards.failure_limit_m
-        return np.minimum(most_m, factor * np.sqrt(variance_m2))
+        return np.minimum(self.most_m, factor * np.sqrt(variance_m2))

@@ -52,29 +52,38 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
 
 
 def _bridge_doubt_m(dt_s: Floats, config: AlignConfig) -> Floats:
-    """B dt^2 / 4, and b dt w / 2 where the acceleration changes from +b to -b just there (`_over_resets`)."""
-    about_s = config.speed_window_s + 0.5 * dt_s
-    doubt_m: Floats = 0.25 * config.braking_mps2 * dt_s**2 + 0.5 * config.braking_mps2 * dt_s * about_s
+    """By how much the way over a bridged reset may be off (`_over_resets`).
+
+    At most b dt^2 / 4 by speeds at the two rows; and b dt w / 2 more, as the mean over w on either side stands for
+    them, where the acceleration changes from +b to -b just there: 1.8 m in all at 1 Hz, where w is 1.5 s.
+    """
+    braking_mps2 = config.braking_mps2
+    doubt_m: Floats = 0.25 * braking_mps2 * dt_s**2 + 0.5 * braking_mps2 * dt_s * _about_s(dt_s, config)
     return doubt_m
+
+
+def _about_s(dt_s: Floats, config: AlignConfig) -> Floats:
+    """Over how long the speed on either side of a reset is taken: rounded stamps take in the row at its edge."""
+    about_s: Floats = config.speed_window_s + 0.5 * dt_s
+    return about_s
 
 
 def _over_resets(t_s: Floats, way_m: Floats, leap: Bools, config: AlignConfig) -> Floats:
     """The ways, at leaps of the counter between rows close together by the mean speed about them.
 
-    Where the train brakes or accelerates at up to b, two speeds at the rows would be off by at most b dt^2 / 4. Where
-    this is more than `reset_doubt_m`, the distance is lost. The mean over w on either side is off by b dt w / 2 more
-    where the acceleration changes from +b to -b just there: 1.35 m in all at 1 Hz.
+    Where speeds at the two rows could be off by more than `reset_doubt_m` (b dt^2 / 4), the distance is lost.
     """
     dt_s = np.diff(t_s)
     lost = np.flatnonzero(leap & np.isnan(way_m) & (0.25 * config.braking_mps2 * dt_s**2 <= config.reset_doubt_m))
     filled_m = way_m.copy()
-    for step in lost.tolist():
-        about_s = config.speed_window_s + 0.5 * dt_s[step]  # so that rounded stamps take in the row at its edge
-        begin, end = np.searchsorted(t_s, (t_s[step] - about_s, t_s[step + 1] + about_s)).tolist()
-        about = slice(begin, end - 1)
-        known = np.isfinite(way_m[about])
-        if known[: step - about.start].any() and known[step + 1 - about.start :].any():
-            filled_m[step] = way_m[about][known].sum() / dt_s[about][known].sum() * dt_s[step]
+    begins_s = t_s[lost] - _about_s(dt_s[lost], config)
+    ends_s = t_s[lost + 1] + _about_s(dt_s[lost], config)
+    begins = np.searchsorted(t_s, begins_s).tolist()
+    ends = (np.searchsorted(t_s, ends_s) - 1).tolist()
+    for step, begin, end in zip(lost.tolist(), begins, ends, strict=True):
+        known = np.isfinite(way_m[begin:end])
+        if known[: step - begin].any() and known[step + 1 - begin :].any():
+            filled_m[step] = way_m[begin:end][known].sum() / dt_s[begin:end][known].sum() * dt_s[step]
     return filled_m
 
 
@@ -91,27 +100,38 @@ def _too_far(way_m: Floats, dt_s: Floats, config: AlignConfig) -> Bools:
 
 
 def _resets(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
-    """Steps back between two moves forward, longer than a train can brake, turn, brake and turn again.
+    """Moves from one back, longer than a train can brake, turn, brake and turn again, to the next like the one before.
 
-    Within dt a train from rest to rest gets braking dt^2 / 4 far. A single wrong row is no reset: it makes the move
-    before or after it longer by the same amount, so these two differ.
+    Where these differ a single row was wrong, which makes one of them longer; where the moves between make up for the
+    way, a few were.
     """
     resets = np.zeros(t_s.size - 1, dtype=np.bool_)
     rows = np.flatnonzero(np.isfinite(distance_m))
     moves = np.flatnonzero(np.diff(distance_m[rows]))
-    if moves.size < 3:
-        return resets
     first = rows[moves]
     last = rows[moves + 1]
     way_m = distance_m[last] - distance_m[first]
-    before_m = way_m[:-2]
-    back_m = way_m[1:-1]
-    after_m = way_m[2:]
-    most_m = config.reset_back_m + 0.25 * config.braking_mps2 * (t_s[last] - t_s[first])[1:-1] ** 2
-    against = (back_m * before_m < 0.0) & (back_m * after_m < 0.0) & (np.abs(back_m) > most_m)
-    for move in (np.flatnonzero(against & (np.abs(after_m - before_m) <= most_m)) + 1).tolist():
-        resets[first[move] : last[move]] = True
+    time_s = t_s[last] - t_s[first]
+    back = (way_m[1:] * way_m[:-1] < 0.0) & (np.abs(way_m[1:]) > _turned_m(time_s[1:], config))
+    for move in (np.flatnonzero(back) + 1).tolist():
+        before_m = way_m[move - 1]
+        after = slice(move + 1, move + 1 + config.reset_moves)
+        since_s = t_s[last[move : after.stop - 1]] - t_s[first[move]]
+        most_m = _turned_m(since_s[: way_m[after].size], config)
+        alike = np.flatnonzero((way_m[after] * before_m > 0.0) & (np.abs(way_m[after] - before_m) <= most_m))
+        if not alike.size:
+            continue
+        end = int(last[move + alike[0]])
+        expected_m = before_m / time_s[move - 1] * since_s[alike[0]]
+        if np.abs(distance_m[end] - distance_m[first[move]] - expected_m) > most_m[alike[0]]:
+            resets[first[move] : end] = True
     return resets
+
+
+def _turned_m(dt_s: Floats, config: AlignConfig) -> Floats:
+    """The farthest that a distance falls without a reset: by the fixed error, and from rest to rest."""
+    way_m: Floats = config.reset_back_m + 0.25 * config.braking_mps2 * dt_s**2
+    return way_m
 
 
 def _without_spikes(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Floats:

@@ -161,6 +161,13 @@ def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> list[Rema
     return [Remark(Note.UNDIAGNOSED, (count, reason.value)) for reason, count in counts.items() if count]
 
 
+def in_use_notes(epochs: pl.DataFrame) -> list[Remark]:
+    """Epochs in use at which no figure bounds a fault still in use; nothing where none was computed."""
+    used = epochs.filter(pl.col("in_use") & pl.col("undetected_ahead_m").is_not_null())
+    unbounded = used["undetected_ahead_in_use_m"].null_count()
+    return remarks({Note.IN_USE_UNBOUNDED: (unbounded, used.height) if unbounded else None})
+
+
 def noise_notes(epochs: pl.DataFrame, white_noise: Mapping[str, float | None], config: Configuration) -> list[Remark]:
     """By how much measured noise widens the thresholds, where that is worth a word."""
     widened = widened_by_noise(epochs, white_noise, config)

@@ -16,7 +16,14 @@ from pipeline.stages.judge.judge import Judged
 from pipeline.stages.provenance import Provenance
 from pipeline.stages.run_row import run_figures as figures
 from pipeline.stages.run_row.lost_time import LostTime, lost_time
-from pipeline.stages.run_row.notes import ingest_notes, judged_notes, noise_notes, time_notes, undiagnosed_notes
+from pipeline.stages.run_row.notes import (
+    in_use_notes,
+    ingest_notes,
+    judged_notes,
+    noise_notes,
+    time_notes,
+    undiagnosed_notes,
+)
 from pipeline.stages.run_row.remedies import remedies, unknown_parts
 from pipeline.stages.run_row.verdict import reasons_of, verdict_of
 from schemas.arrays import NS_PER_S
@@ -179,6 +186,7 @@ def _notes(
         *results.notes,
         *judged_notes(results.judged.evidence, unknown, results.vehicle, results.odometer_contradicted),
         *undiagnosed_notes(results.epochs, results.judged.passages),
+        *in_use_notes(results.epochs),
         *noise_notes(results.epochs, results.white_noise, config),
         *time_notes(results.epochs, clock, lost, config),
         *(Remark(Note.REMEDY, (remedy_words(cure),)) for cure in cures),

@@ -17,7 +17,7 @@ from pipeline.studies.undetected.in_use import Returns, in_use_errors
 from pipeline.studies.undetected.position_tests import bounded, range_bounds, with_channel
 from pipeline.studies.undetected.spacing import largest_spacing
 from pipeline.studies.undetected.watched import FaultWindow, Watched, watched, windows
-from schemas.arrays import Bools, Floats, Ints, floats, ints, times_ns
+from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import Configuration, UndetectedConfig, Vehicle
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind
@@ -96,7 +96,8 @@ def undetected_of(
         low_m, high_m = range_bounds(epochs, ranges, config)
         of_range = _both(bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts, config.undetected)
     spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
-    in_use = in_use_errors(rows, parts, errors.error_m, _returns(rows, epochs, vehicle, config), config)
+    validated = flags(epochs, "tvb")[rows.epoch]
+    in_use = in_use_errors(rows, parts, errors.error_m, validated, _returns(rows, epochs, vehicle, config), config)
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
     facing = ints(epochs["direction"], unknown=1)
     names = _names(diagnosis.bank, config)

@@ -106,6 +106,23 @@ def test_without_a_vehicle_file_only_a_telegram_links_again() -> None:
     assert accepted(replayed(Slip(0.02), vehicle=Vehicle(), read=True)) != []
 
 
+@pytest.mark.parametrize("size_m", [0.0, 25.0])
+def test_a_fault_in_a_pause_of_speeds_does_not_get_through(size_m: float) -> None:
+    """No row for 3 s, 60 s after the second start; from the middle of the pause to the end the position is ahead."""
+    begin_s = SECOND_START_S + 60.0
+    whole = ride(fault=Fault(begin_s + 1.5, size_m))
+    assert whole.odometer is not None
+    at_s = (pl.col("t") - whole.odometer["t"][0]).dt.total_nanoseconds() * 1e-9
+    speeds = whole.odometer.with_columns(distance_m=pl.lit(None, pl.Float64))
+    paused = whole.with_streams(odometer=speeds.filter(~at_s.is_between(begin_s, begin_s + 3.0, closed="none")))
+    tables = replay(paused, SITE, VEHICLE, KNOWN)
+    after = [name for name, at_m in BALISES.items() if at_m > way_m(np.array([begin_s]))[0]]
+    assert (set(after) <= set(accepted(tables))) == (size_m == 0.0)
+    assert tables.runs["unsafe_accepted"].item() == 0
+    # Until the odometer is back nothing along the track can see it.
+    assert tables.runs["hazardous_s"].item() <= 1.6
+
+
 def test_the_world_is_as_described() -> None:
     t_s = times()
     true_m = way_m(t_s)

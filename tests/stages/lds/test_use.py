@@ -78,6 +78,35 @@ def test_distance_lost_between_two_consecutive_positions_is_watched_by_nobody(of
     assert changes(run(epochs, balises_at({"V1": 110.0}), ScriptedBank(begins=[30]))) == [(1, IN_USE), (30, NEGATED)]
 
 
+@pytest.mark.parametrize(
+    ("offset_m", "doubt_m", "scale_sigma", "expected"),
+    [
+        # k_T sqrt(2) x 1 m = 7.5 m and the pause's doubt, at most 10 m.
+        (0.0, 4.05, 1e-4, "relink"),
+        (30.0, 4.05, 1e-4, NEGATED),
+        (9.5, 4.05, 1e-4, "relink"),
+        (9.5, 0.0, 1e-4, NEGATED),
+        # A pause of 5 s: more in doubt than half the failure limit; or no vehicle file.
+        (0.0, 11.25, 1e-4, NEGATED),
+        (0.0, 4.05, None, NEGATED),
+    ],
+)
+def test_a_way_guessed_over_a_pause_asks_for_a_re_link(
+    offset_m: float, doubt_m: float, scale_sigma: float | None, expected: str
+) -> None:
+    """Speeds alone pause from 27 to 30 s; there is no row, hence no watched epoch, at 28 and 29 s."""
+    true_m = steps(0.0, 20.0, COUNT)
+    epochs = epochs_of(
+        [x + offset_m * (k >= 29) for k, x in enumerate(true_m)],
+        [None if k in (28, 29) else x for k, x in enumerate(true_m)],
+        odometer_segment=[int(k >= 30) for k in range(COUNT)],
+        odometer_counter=[0] * COUNT,
+        slip_doubt_m=[doubt_m * (k >= 30) for k in range(COUNT)],
+    )
+    result = run(epochs, balises_at({"V1": 110.0}), ScriptedBank(begins=[30]), scale_sigma=scale_sigma)
+    assert changes(result)[1] == (30, expected)
+
+
 def test_a_start_of_mission_ends_every_wait() -> None:
     start = datetime(1970, 1, 1, 0, 1, tzinfo=UTC)
     negated = changes(walk({"fails": [25]}, 30.0, starts_of_mission=(start,)))

@@ -164,6 +164,22 @@ def test_a_counter_that_is_reset_by_little_turns_no_train_round(reset_m, step_s,
     assert len(odometry.leaps_ns) == 1
 
 
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+def test_resets_one_after_the_other_count_nothing(turned: float) -> None:
+    """15 m a row at 10 m/s: the counter begins anew in the 4th, 5th and 6th step, and shows 6, 4 and 9 m after each."""
+    t = 1.5 * np.arange(10.0)
+    reads = np.array([955.0, 970.0, 985.0, 1000.0, 6.0, 4.0, 9.0, 24.0, 39.0, 54.0])
+    odometry = odometry_from(odometer_of(t, distance_m=turned * reads))
+    assert odometry.segment.tolist() == [0, 0, 0, 0, 1, 2, 3, 3, 3, 3]
+    np.testing.assert_allclose(np.diff(odometry.distance_m)[[0, 1, 2, 6, 7, 8]], turned * 15.0)
+
+
+def test_two_wrong_rows_are_no_resets() -> None:
+    """The rows at 4 and 5 s are 60 and 30 m short: the ways over them sum up to what the train drives."""
+    reads = 20.0 * np.arange(12.0) - 60.0 * (np.arange(12) == 4) - 30.0 * (np.arange(12) == 5)
+    assert odometry_from(odometer_of(np.arange(12.0), distance_m=reads)).leaps_ns == ()
+
+
 def test_a_bridged_reset_has_its_own_noise() -> None:
     """At 1 Hz: 1.8 / 4 + 1.8 x 1.5 / 2 = 1.8 m at most, 0.6 m one sigma, beside 0.05 m a second."""
     t = np.arange(20.0)
