@@ -151,23 +151,6 @@ def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) 
     )
 
 
-<<<<<<< HEAD
-def noise_words(widened: Mapping[str, tuple[float, float]]) -> str:
-    """What measured noise does to the thresholds: by axis, raw threshold over the model's, and the white noise [m]."""
-    return ", ".join(
-        say("noise_axes", "widened", say("noise_axes", axis), ratio, _short(noise_m))
-        for axis, (ratio, noise_m) in widened.items()
-    )
-
-
-def _short(length_m: float) -> str:
-    return f"{1000.0 * length_m:.0f} mm" if length_m < _CENTIMETRE_M else f"{100.0 * length_m:.0f} cm"
-=======
-PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options": ""}
-"""What a command names where nobody knows the paths."""
->>>>>>> main
-
-
 def remedy_words(remedy: Remedy | str, **places: str) -> str:
     """What would mend it, and how; `places`: paths known where it is shown, with `project` the keys of that file in
     place of a command. Without any, in words for readers inside and outside a project.
