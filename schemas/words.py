@@ -158,6 +158,6 @@ def remedy_words(remedy: Remedy | str, **places: str) -> str:
     section = "remedies_of_project" if "project" in places else "remedies_by_command" if places else "remedies_anywhere"
     how = WORDS[section].get(Remedy(remedy).value, "")
     plain = ("options", "of_project", "again")
-    named = {"site": "the site", "options": ""}
+    named = {"run": "RUN", "site": "the site", "out": "OUT", "options": ""}
     named |= {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
     return REMEDIES[Remedy(remedy)].format(how=how.format(**named), **named)
