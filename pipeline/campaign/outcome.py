@@ -14,7 +14,7 @@ from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.hazard_words import hazard_words
 from pipeline.results.figures.head import worst_verdict
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.results.outcome import RunOutcome
+from pipeline.results.outcome import BESIDE, RunOutcome
 from pipeline.stages.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
@@ -130,8 +130,7 @@ def _beside(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[
     if verdict is None:
         return {}
     row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
-    names = ("balises_accepted", "balises_on_path", "availability", "proof_margin_m", "held_s")
-    figures = {name: row[name] for name in names} | {"remedies": tuple(row["remedies"] or ())}
+    figures = {name: row[name] for name in BESIDE} | {"remedies": tuple(row["remedies"] or ())}
     available = row["availability"]
     if available is None or available >= low:
         return figures
