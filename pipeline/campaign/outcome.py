@@ -43,17 +43,14 @@ class ChangedError(InputError):
 
 
 def changed(address: Address) -> ChangedError:
-    """The error of a log that somebody writes to."""
     return ChangedError("changed while it was read", place=str(address), remedy="Replay it again when it is complete.")
 
 
 def overdue(limit_s: float) -> str:
-    """The reason of a run that was given up."""
     return f"took longer than the time limit of {limit_s:g} s"
 
 
 def lost(attempts: int) -> str:
-    """The reason of a run whose workers died over it."""
     return (
         f"its worker died {attempts} times (killed, or out of memory). "
         "Give it more memory or fewer --jobs; the next call tries it again."
@@ -61,7 +58,6 @@ def lost(attempts: int) -> str:
 
 
 def never_begun(workers: int) -> str:
-    """The reason of a run whose workers died before they could begin it."""
     return f"{workers} workers died before they started this run. See the logs of the workers."
 
 

@@ -63,8 +63,6 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class CampaignSummary:
-    """A campaign in figures."""
-
     planned: int
     outcomes: tuple[RunOutcome, ...]
     seconds: float
@@ -96,5 +94,4 @@ class CampaignSummary:
 
     @property
     def left(self) -> int:
-        """Runs that were not reached."""
         return self.planned - len(self.outcomes)
