@@ -39,7 +39,7 @@ class LineEvidence:
 
 
 _WAY = {"piece": pl.Int64, "at_m": pl.Float64, "growing": pl.Boolean}
-"""A way: pieces in the order in which a train runs over them, the middles from its begin; `growing`: with the measure."""
+"""A way: pieces in the order of a train, their middles from its begin; `growing`: with their measure."""
 _PLACED: dict[str, pl.DataType | type[pl.DataType]] = {
     "piece": pl.Int64,
     "growing": pl.Boolean,
