@@ -169,11 +169,19 @@ const Plots = (() => {
     place.prepend(list);
   }
 
+  // While a page is printed all is as wide as a sheet, whatever the window.
+  const SHEET_PX = 1300;
+  let printing = false;
+  const widthOf = (id) => {
+    const { clientWidth } = document.getElementById(id);
+    return clientWidth && printing ? SHEET_PX : clientWidth;
+  };
+
   function draw(id, spec) {
     const place = document.getElementById(id);
     drawn.set(id, spec);
     place.closest("figure").classList.remove("nothing");
-    const width = place.clientWidth;
+    const width = widthOf(id);
     if (!width) return;
     const left = spec.compass !== undefined ? EDGE.right : spec.x.kind === "time" ? EDGE.time : spec.y.kind === "names" ? EDGE.names : EDGE.left;
     const frame = { x0: left, x1: width - EDGE.right, y0: EDGE.top, y1: spec.height - (spec.x.title ? EDGE.bottom : spec.compass !== undefined ? EDGE.right : 24) };
@@ -315,12 +323,12 @@ const Plots = (() => {
     place.closest("figure").classList.add("nothing");
   }
 
-  // With another width all is drawn again; paper scales what is there.
+  const drawAll = () => { for (const [id, spec] of drawn) draw(id, spec); };
   let width = window.innerWidth;
   window.addEventListener("resize", () => {
     if (window.innerWidth === width) return;
     width = window.innerWidth;
-    for (const [id, spec] of drawn) draw(id, spec);
+    drawAll();
   });
 
   // Ranges that hold all values with a little room.
@@ -338,7 +346,15 @@ const Plots = (() => {
   }
 
   // Paper shows what a click would open.
-  window.addEventListener("beforeprint", () => { for (const one of document.querySelectorAll("details")) one.open = true; });
+  window.addEventListener("beforeprint", () => {
+    printing = true;
+    for (const one of document.querySelectorAll("details")) one.open = true;
+    drawAll();
+  });
+  window.addEventListener("afterprint", () => {
+    printing = false;
+    drawAll();
+  });
 
   // A page is used without a mouse too.
   function keys(actions) {
@@ -353,5 +369,5 @@ const Plots = (() => {
 
   const follow = (go) => { document.querySelector(`a[data-go="${go}"]`)?.click(); };
 
-  return { data, draw, empty, follow, keys, range, unpack };
+  return { data, draw, empty, follow, keys, range, unpack, widthOf };
 })();
