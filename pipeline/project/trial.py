@@ -53,8 +53,6 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Corrections of one run, why, and whether they were accepted."""
-
     run_id: str
     found: tuple[str, ...]
     corrections: tuple[StreamCorrection, ...]
@@ -220,7 +218,6 @@ def _solution(ride: Ride, files: Sequence[SeenLog]) -> str:
 
 
 def _entry(ride: Ride, folder: Path, day: date | None) -> ConvertEntry:
-    """The ride as a `[[convert]]` table."""
     logs: list[dict[str, Any]] = []
     for files in ride.receivers:
         name = _solution(ride, files)
@@ -272,7 +269,6 @@ def _checked(
 
 
 def correction_lines(corrections: Sequence[StreamCorrection]) -> list[str]:
-    """Corrections as they stand in a project."""
     tables = [tomli_w.dumps(correction.model_dump(exclude_defaults=True)) for correction in corrections]
     return [line for table in tables for line in ("[[convert.correct]]", *table.splitlines())]
 
