@@ -3,9 +3,9 @@
     way of the other = scale * way counted - scale * lag * change of speed
 
 with ways and speeds counted at the stamps less an assumed lag, and `lag` what is left of it. That is linear in scale
-and scale * lag. The causal filter (`alignment.odometer_filter`) follows it from epoch to epoch; the fit of a run
-(`plausibility.pairs`) solves it the other way round, by windows and without outliers. Calibration weighs observations
-of whole runs and solves them here:
+and scale * lag. The causal filter (`alignment.odometer_filter`) follows it from epoch to epoch, beside errors of the
+positions. Calibration weighs observations of whole runs by their covariance, the fit of a run (`plausibility.pairs`)
+weighs windows by what is left of them, and both solve it here:
 
     estimate = scale_and_lag(columns.T @ (weight * columns), columns.T @ (weight * way), spread, assumed_s)
 
