@@ -10,6 +10,11 @@ const Plots = (() => {
     right: ["circle", 5], read: ["square", 4.5], lost: ["diamond", 6.5], unknown: ["ring", 5], wrong: ["cross", 6.5],
     hazard: ["cross", 6],
   };
+  // What became of a passage, from harmless to bad: its tone, and what it is called.
+  const OUTCOMES = [
+    ["read", "balise read"], ["right", "accepted, right"], ["lost", "lost"],
+    ["unknown", "accepted, could not be checked"], ["wrong", "accepted at a wrong place"],
+  ];
   const ARRAYS = { f4: Float32Array, u4: Uint32Array, u1: Uint8Array };
   const data = JSON.parse(document.getElementById("data").textContent);
   const drawn = new Map();
@@ -369,5 +374,5 @@ const Plots = (() => {
 
   const follow = (go) => { document.querySelector(`a[data-go="${go}"]`)?.click(); };
 
-  return { data, draw, empty, follow, keys, range, unpack, widthOf };
+  return { OUTCOMES, data, draw, empty, follow, keys, range, unpack, widthOf };
 })();
