@@ -1,7 +1,6 @@
-"""The way from each recorded row of an odometer to the next: by its distance where that tells it, else by its speeds.
+"""The way from each row of an odometer to the next: by its distance where that says it, else by its speeds.
 
-Where rows hold the one or the other by turns (two sensors in one stream), each is carried between its own rows. Between
-rows far apart distances lie on curves that a train can drive.
+Rows may hold the one or the other by turns. Between rows far apart distances lie on curves that a train can drive.
 """
 
 from __future__ import annotations
@@ -15,10 +14,7 @@ from schemas.config import AlignConfig
 
 
 class Ways(NamedTuple):
-    """Per step from a row to the next: way [m], NaN where not known, and whether it is of the recorded distance.
-
-    `doubt_m`: by how much the way over a bridged reset may be off, 0 elsewhere.
-    """
+    """Per step: way [m], NaN where not known; whether it is of the recorded distance; doubt over a bridged reset."""
 
     way_m: Floats
     counted: Bools
@@ -28,8 +24,8 @@ class Ways(NamedTuple):
 def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: float, config: AlignConfig) -> Ways:
     """Ways between rows at these times [s]; `distance_m` and `speed_mps` as recorded, NaN where not.
 
-    Over a leap of the distance the speeds count, if they agree with the distance elsewhere. Where rows hold distance
-    and speed by turns, nothing is interpolated over more than `limit_s`.
+    Over a leap of the distance the speeds count, if they agree with the distance elsewhere. By turns, nothing is
+    interpolated over more than `limit_s`.
     """
     distance_m = _without_spikes(t_s, distance_m, config)
     leap = leaps(t_s, distance_m, config)
@@ -146,7 +142,7 @@ def _without_spikes(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Flo
 
 
 def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignConfig) -> Floats:
-    """Ways by the speeds; none over leaps if speeds and counter disagree elsewhere (a wrong unit, sign or sensor)."""
+    """None over leaps if speeds and counter disagree elsewhere (a wrong unit, sign or sensor)."""
     both = np.isfinite(recorded_m) & np.isfinite(driven_m)
     if not leap.any() or not both.any():
         return driven_m
@@ -158,13 +154,13 @@ def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignCon
 
 
 def _driven(t_s: Floats, speed_mps: Floats) -> Floats:
-    """The way of each step by its two speeds (trapezoids) [m]."""
+    """By trapezoids [m]."""
     steps: Floats = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(t_s)
     return steps
 
 
 def _carried(t_s: Floats, values: Floats, limit_s: float) -> Floats:
-    """Values interpolated between known rows no farther apart than the limit; NaN elsewhere."""
+    """Interpolated between known rows no farther apart than the limit; NaN elsewhere."""
     known = np.flatnonzero(np.isfinite(values))
     if known.size < 2:
         return values
@@ -181,8 +177,8 @@ def filled_in(
 ) -> tuple[Floats, Floats, Ints]:
     """Samples with finer ones between the given rows and the next, on cubic curves: times, distances, row of each.
 
-    Slopes at the rows are the speeds where these agree with the way between, else those of a monotone curve (PCHIP),
-    and at most three times the mean slope, so that the cubic does not turn back (Fritsch and Carlson).
+    Slopes at the rows are the speeds where these agree with the way between, else of a monotone curve (PCHIP), and at
+    most three times the mean slope, so that the cubic does not turn back (Fritsch and Carlson).
     """
     from scipy.interpolate import PchipInterpolator  # hardly a log needs it, and it takes long to load
 
