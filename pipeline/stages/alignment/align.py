@@ -16,7 +16,6 @@ from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
 from schemas.enums import NotEvaluated
 
 BEYOND_SPAN = NotEvaluated.BEYOND_SPAN
-INTERRUPTED = NotEvaluated.INTERRUPTED
 _OF_ODOMETER = (
     *("along_m", "odometer_m", "travelled_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m"),
     *("odometer_period_s", "odometer_scale", "scale_sigma"),
@@ -102,7 +101,7 @@ def _columns(
         held = with_hysteresis(total, hysteresis_m(rows_m, config.align))
         turning = speed_of_positions(at, held, config.align.speed_window_s)
     inside = (at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])
-    reason = first_reason((~known & inside, INTERRUPTED), (~known, BEYOND_SPAN))
+    reason = first_reason((~known & inside, NotEvaluated.INTERRUPTED), (~known, BEYOND_SPAN))
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
         pl.Series("travelled_m", travelled, nan_to_null=True),

@@ -34,10 +34,6 @@ class Estimates(NamedTuple):
     latency_s: Floats
     latency_sigma_s: Floats
 
-    @classmethod
-    def of(cls, scale: float, scale_sigma: float, latency_s: float, latency_sigma_s: float) -> Estimates:
-        return cls(*(np.asarray(value) for value in (scale, scale_sigma, latency_s, latency_sigma_s)))
-
     def over(self, epochs: int) -> Estimates:
         return Estimates(*(np.full(epochs, value) for value in self))
 
@@ -237,11 +233,10 @@ def _nanoseconds(seconds: float) -> int:
 
 def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimates:
     """By the vehicle file, else the configured prior around 1 and 0."""
-    scale_known = vehicle.odometer_scale is not None
-    latency_known = vehicle.gnss_latency_s is not None
-    return Estimates.of(
-        scale=vehicle.odometer_scale if vehicle.odometer_scale is not None else 1.0,
-        scale_sigma=(vehicle.odometer_scale_sigma or 0.0) if scale_known else config.scale_prior_sigma,
-        latency_s=vehicle.gnss_latency_s if vehicle.gnss_latency_s is not None else 0.0,
-        latency_sigma_s=(vehicle.gnss_latency_sigma_s or 0.0) if latency_known else config.latency_prior_sigma_s,
-    )
+    scale = 1.0, config.scale_prior_sigma
+    latency_s = 0.0, config.latency_prior_sigma_s
+    if vehicle.odometer_scale is not None:
+        scale = vehicle.odometer_scale, vehicle.odometer_scale_sigma or 0.0
+    if vehicle.gnss_latency_s is not None:
+        latency_s = vehicle.gnss_latency_s, vehicle.gnss_latency_sigma_s or 0.0
+    return Estimates(*(np.asarray(value) for value in (*scale, *latency_s)))

@@ -27,11 +27,6 @@ from schemas.enums import NotEvaluated
 ORDER_THRESHOLD = 0.5
 _BLOCK = 4096  # epochs evaluated at once
 
-AMBIGUOUS = NotEvaluated.AMBIGUOUS_OR_OFF
-FIRST_EPOCH = NotEvaluated.NO_EPOCH_BEFORE
-NEVER = NotEvaluated.NEVER_VALIDATED
-LOST = NotEvaluated.DISTANCE_LOST
-
 
 def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:
     """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards).
@@ -137,7 +132,7 @@ class LinkDistance:
         moved_m, bound_m = self._since_return[:, ahead]
         held = known & np.isfinite(moved_m)
         self._reason[ahead][self._possible[ahead]] = None
-        self._reason[ahead][lost] = LOST
+        self._reason[ahead][lost] = NotEvaluated.DISTANCE_LOST
         since_m = np.where(held, moved_m, self._offset_m[ahead] - anchor.offset_m)
         self._value[ahead] = np.where(known, since_m, np.nan)
         self._threshold[ahead] = np.where(known, np.where(held, bound_m, threshold_m), np.nan)
@@ -161,7 +156,7 @@ class LinkDistance:
     def columns(self) -> list[pl.Series]:
         reasons = pl.Series(self._reason.tolist(), dtype=pl.String)
         unknown = reasons.is_null() & pl.Series(np.isnan(self._value))
-        reasons = first_reason((reasons.is_not_null(), reasons), (unknown, NEVER))
+        reasons = first_reason((reasons.is_not_null(), reasons), (unknown, NotEvaluated.NEVER_VALIDATED))
         return of_monitor("link_distance", verdicts(self._value, self._threshold, reasons))
 
 
@@ -176,9 +171,9 @@ def _order_reasons(journey: Journey, disabled: bool) -> pl.Series:
         (np.full(before.size, disabled), DISABLED),
         (~odometer, NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
-        (before < 0, FIRST_EPOCH),
+        (before < 0, NotEvaluated.NO_EPOCH_BEFORE),
         (~odometer[before], NO_ODOMETER),
-        (journey.ambiguous | journey.ambiguous[before], AMBIGUOUS),
+        (journey.ambiguous | journey.ambiguous[before], NotEvaluated.AMBIGUOUS_OR_OFF),
         (~(sigma & sigma[before]), NO_SIGMA),
     )
 
@@ -188,6 +183,6 @@ def _distance_reasons(journey: Journey, disabled: bool) -> pl.Series:
         (np.full(journey.t_ns.size, disabled), DISABLED),
         (~np.isfinite(journey.odometer_m), NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
-        (journey.ambiguous, AMBIGUOUS),
+        (journey.ambiguous, NotEvaluated.AMBIGUOUS_OR_OFF),
         (~np.isfinite(journey.sigma_m), NO_SIGMA),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -32,25 +32,12 @@ WHITE_PART = float(np.sqrt(OF_WALK / OF_WHITE_NOISE))
 """White noise over what is measured, which is taken for a random walk."""
 
 
-@dataclass(frozen=True)
-class AxisRecord:
-    """What one axis of the bank saw over a whole run, restarts included.
-
-    `value`, `threshold`: per epoch and monitor (raw, then the EWMAs) [m/s]; NaN where there is none. `enabled`:
-    monitors.
-    """
-
-    series: AxisSeries
-    value: Floats
-    threshold: Floats
-    enabled: Bools
-
-
-class _AxisBank:
+class AxisBank:
     """One axis of the bank over all epochs of a solution; rows are evaluated up to `_done`.
 
-    `noise_m`: fast noise in the thresholds; NaN where not known. `noise_known`: no failure can hide in it; true where
-    the axis has no row.
+    `series`: its increments, `fresh` where a restart was too. `value`, `threshold`, `noise_m` (fast noise in the
+    thresholds): per epoch and monitor (raw, then the EWMAs), NaN where there is none. `noise_known`: no failure can
+    hide in it; true where the axis has no row. `enabled`: which of the monitors are.
     """
 
     def __init__(self, axis: Axis, epochs: int, config: Configuration) -> None:
@@ -58,7 +45,7 @@ class _AxisBank:
         self.series = axis.series
         self._config = config
         self._alphas = np.array(config.monitors.ewma_alphas)
-        self._enabled = np.array([f"{axis.name}_{scale}" not in config.monitors.disabled for scale in SCALES])
+        self.enabled = np.array([f"{axis.name}_{scale}" not in config.monitors.disabled for scale in SCALES])
         shape = epochs, len(SCALES)
         self.value, self.threshold, self.noise_m = (np.full(shape, np.nan, order="F") for _ in range(3))
         self.state = np.full(shape, NOT_EVALUATED, dtype=np.int8, order="F")
@@ -88,9 +75,9 @@ class _AxisBank:
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats, noise_m: Floats) -> None:
-        present = ~part.fresh[:, None] & self._enabled[None, :]
+        present = ~part.fresh[:, None] & self.enabled[None, :]
         # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
-        known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self._enabled.any(), axis=1)
+        known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self.enabled.any(), axis=1)
         judged = present & known[:, None]
         self.state[part.epoch] = states_of(value, threshold, judged)
         self.value[part.epoch] = np.where(present, value, np.nan)
@@ -117,9 +104,6 @@ class _AxisBank:
         self._meter.restart(row)
         self._begin_at(row, None, FIRST_BLOCK)
 
-    def record(self) -> AxisRecord:
-        return AxisRecord(self.series, self.value, self.threshold, self._enabled)
-
     def white_noise_m(self) -> float | None:
         """sqrt(4 M / 6) of one epoch at the end; None where never known (DOMAIN section 3)."""
         known = self.noise_m[:, 0][np.isfinite(self.noise_m[:, 0])]
@@ -138,7 +122,7 @@ class _AxisBank:
         reasons = self.axis.reasons.fill_null(of_noise).fill_null(FIRST_EPOCH)
         columns: list[pl.Series] = []
         for index, scale in enumerate(SCALES):
-            why = reasons if self._enabled[index] else self.axis.reasons.fill_null(DISABLED)
+            why = reasons if self.enabled[index] else self.axis.reasons.fill_null(DISABLED)
             frame = verdicts(self.value[:, index], self.threshold[:, index], why, self.state[:, index])
             columns += of_monitor(f"{self.axis.name}_{scale}", frame)
         return columns
@@ -156,7 +140,7 @@ class MonitorBank:
         self._count = epochs.height
         disabled = config.monitors.disabled
         self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in config.monitors.ewma_alphas)])
-        self._axes = tuple(_AxisBank(axis, self._count, config) for axis in axes_of(epochs, config))
+        self._axes = tuple(AxisBank(axis, self._count, config) for axis in axes_of(epochs, config))
         along, across, _ = self._axes
         # In a run without an odometer the axis across the track has to say where the bank begins.
         self._begins = (along if along.series.epoch.size else across).begins
@@ -241,10 +225,10 @@ class MonitorBank:
             axis.restart(epoch)
         self._known_to = epoch - 1
 
-    def along(self) -> AxisRecord:
+    def along(self) -> AxisBank:
         """What the monitors along the track saw, after the walk."""
         self._look_to_the_end()
-        return self._axes[0].record()
+        return self._axes[0]
 
     def white_noise(self) -> dict[str, float | None]:
         """`white_noise_*_m` of the run [m]."""

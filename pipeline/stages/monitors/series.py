@@ -110,8 +110,8 @@ def _across(
 
 def _without_reason(epochs: pl.DataFrame, reasons: pl.Series) -> tuple[Ints, pl.DataFrame]:
     """The epochs without a reason against them: their rows, and what stands there."""
-    rows = np.flatnonzero(reasons.is_null().to_numpy())
-    return rows, epochs[rows]
+    used = reasons.is_null()
+    return np.flatnonzero(used.to_numpy()), epochs.filter(used)
 
 
 def _turned_mps(used: pl.DataFrame) -> Floats:

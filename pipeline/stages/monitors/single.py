@@ -22,7 +22,6 @@ from schemas.enums import NotEvaluated
 
 NO_VELOCITY = NotEvaluated.NO_VELOCITY
 NO_OTHER_SOLUTION = NotEvaluated.NO_OTHER_SOLUTION
-NO_OTHER_EPOCH = NotEvaluated.NO_OTHER_EPOCH
 
 
 def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
@@ -76,7 +75,7 @@ def channel_monitor(
     both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
     placed = epochs["fix_valid"] & epochs["on_track"] & epochs["sigma_along_m"].is_not_null()
     reasons = first_reason(
-        (~placed, NO_POSITION), (met["path_m"].is_null() | met["sigma_along_m"].is_null(), NO_OTHER_EPOCH)
+        (~placed, NO_POSITION), (met["path_m"].is_null() | met["sigma_along_m"].is_null(), NotEvaluated.NO_OTHER_EPOCH)
     )
     return verdicts(value, config.monitors.threshold_factor * both_m, reasons)
 

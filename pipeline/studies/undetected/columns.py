@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gap_ns
 from pipeline.stages.lds.relink import Held
-from pipeline.stages.monitors.bank import AxisRecord
+from pipeline.stages.monitors.bank import AxisBank
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
 from pipeline.studies.undetected.in_use import Returns, in_use_errors
@@ -37,7 +37,7 @@ class Diagnosis:
     """
 
     epochs: pl.DataFrame
-    bank: AxisRecord
+    bank: AxisBank
     held: tuple[Held, ...]
     channel: pl.DataFrame
     other: pl.DataFrame | None
@@ -149,7 +149,7 @@ def _way_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
     return way
 
 
-def _names(bank: AxisRecord, config: Configuration) -> list[str]:
+def _names(bank: AxisBank, config: Configuration) -> list[str]:
     """The monitors along the track in use (raw stands for the largest rate of a fault too), and who holds outright."""
     along = [f"along_{name}" for index, name in enumerate(SCALES) if bank.enabled[index] or index == 0]
     return [*along, "channel" if config.undetected.solutions_at_fault == "one" else "link_distance"]
