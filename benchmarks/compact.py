@@ -90,15 +90,14 @@ def _many(folder: Path, log: Path, count: int) -> Plan:
     """The result of so many runs in packs, with what a campaign keeps of them; and its plan."""
     out = folder / "many"
     names = [f"r{number:05}" for number in range(count)]
-    recorded = packing._own(str(folder / "few"), "one")
-    metadata = recorded.marker.metadata
+    recorded, tables = packing._recorded(str(folder / "few"), "one")
+    metadata = recorded.metadata
     listed = []
     for first in range(0, count, packing.RUNS_PER_PACK):
         writer = packing._PackWriter()
         for name in names[first : first + packing.RUNS_PER_PACK]:
-            marker = Marker(name, recorded.marker.sha256, json.dumps(metadata | {"run_id": name}))
-            writer.add(replace(recorded, marker=marker))
-        listed.append(writer.write(packing._Step(str(out), software_digest(), (), frozenset())))
+            writer.add(Marker(name, recorded.sha256, json.dumps(metadata | {"run_id": name})), tables)
+        listed.append(writer.write(packing._Step(str(out), software_digest(), ())))
     packs.write_list(out, listed)
     for name in names:
         (folder / "logs" / name).mkdir(parents=True)

@@ -6,7 +6,7 @@ import contextlib
 import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -20,7 +20,6 @@ from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
 from pipeline.campaign.watch import Follower
 from pipeline.results import catalogue, packs, store
-from pipeline.results.figures.head import word_of
 from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest
 from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
@@ -35,11 +34,6 @@ from schemas.tables import TABLES
 
 Problem = tuple[str, str, str]
 _RUNS_AT_ONCE = 50
-# Of the outcome of a run, what its tables say.
-_OF_TABLES = (
-    *("status", "error", "verdict", "hazards", "missed_detections", "why", "faults", "balises_accepted"),
-    *("balises_on_path", "availability", "proof_margin_m", "held_s", "remedies", "lost"),
-)
 _COLUMNS = ("what", "found", "expected")
 # What a campaign leaves beside the files that the manifest names.
 _OWN_FILES = (NAME, lock.NAME, lock.HELD, "replay.log")
@@ -279,26 +273,20 @@ def _made_again(out: Address, software: set[str]) -> tuple[list[Problem], tuple[
 
 def _outcomes(out: Address, tables: Mapping[str, pl.DataFrame]) -> Iterator[Problem]:
     """The outcomes that are kept, with the verdicts and figures that `replay` repeats, against the runs' own tables."""
-    kept = resume.kept(str(out))
     parts = {name: tables[name].partition_by("run_id", as_dict=True) for name in ("runs", "hazards", "passages")}
-    for run, outcome in kept.items():
+    for run, kept in resume.kept(str(out)).items():
         own = {name: of_runs.get((run,), tables[name].clear()) for name, of_runs in parts.items()}
-        if own["runs"].is_empty():
-            continue
-        # Which availability was low is said by the configuration of that call, which need not be the last one.
-        again = outcome_of(run, outcome.log, math.inf, **own)
-        for name, found, expected in _unequal(outcome, again):
-            yield f"{catalogue.FOLDER}/complete, {run}, {name}", found, expected
+        if not own["runs"].is_empty() and not _is_outcome_of(kept, own):
+            yield f"{catalogue.FOLDER}/complete, {run}", "other values", "those of the run's tables"
 
 
-def _unequal(kept: RunOutcome, again: RunOutcome) -> Iterator[Problem]:
-    failed = again.status is RunStatus.FAILED
-    for name in ("status", "verdict") if failed else _OF_TABLES:
-        found = getattr(kept, name)
-        expected = getattr(again, name)
-        if found != expected and not (name == "lost" and not found):
-            words = word_of if name == "verdict" else str
-            yield name, words(found), words(expected)
+def _is_outcome_of(kept: RunOutcome, tables: Mapping[str, pl.DataFrame]) -> bool:
+    # Which availability was low is said by the configuration of that call, which need not be the last one.
+    again = outcome_of(kept.run_id, kept.log, math.inf, **tables)
+    if again.status is RunStatus.FAILED:
+        return (kept.status, kept.verdict) == (again.status, again.verdict)
+    of_call = ("skipped", "seconds", "attempts", "proof", "trace", *(() if kept.lost else ("lost",)))
+    return asdict(again) | {name: getattr(kept, name) for name in of_call} == asdict(kept)
 
 
 def _settings(config_digest: str, manifest: Manifest) -> str:

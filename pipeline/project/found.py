@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, get_args
 
 from pipeline.make.receivers.bags import is_bag
 from pipeline.make.survey.map_files import MAP_SUFFIXES
 from pipeline.project.looking import is_run
 from pipeline.read.ingest.csv_text import read_log_table
 from pipeline.read.ingest.guesses import WORDS, columns_in, first, word_of
-from schemas.config import Configuration, Vehicle, read_toml, settings_from
+from schemas.config import Configuration, Settings, Vehicle, read_toml, settings_from
 from schemas.errors import BaliseError
 from schemas.project import FILE_NAME
 
@@ -21,16 +22,9 @@ _LINES = (".gpx", ".kml", ".kmz", ".geojson", ".json", *MAP_SUFFIXES)
 _BESIDE = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".ini", ".db", ".md", ".html", ".pdf")
 
 
-@dataclass
-class Found:
-    """Paths by what they are for."""
-
-    logs: list[Path] = field(default_factory=list)
-    surveys: list[Path] = field(default_factory=list)
-    sites: list[Path] = field(default_factory=list)
-    balises: list[Path] = field(default_factory=list)
-    vehicles: list[Path] = field(default_factory=list)
-    configs: list[Path] = field(default_factory=list)
+Kind = Literal["logs", "surveys", "sites", "balises", "vehicles", "configs"]
+Found = dict[Kind, list[Path]]
+"""Paths by what they are for."""
 
 
 def is_site(path: Path) -> bool:
@@ -53,14 +47,15 @@ def is_prose(path: Path) -> bool:
 
 def logs_below(folder: Path) -> list[Path]:
     """What may be a log in a folder and those below it."""
-    return look_around(folder).logs
+    return look_around(folder)["logs"]
 
 
 def look_around(folder: Path) -> Found:
     """Sort what lies in a folder and those below it, by names and headers; results and hidden files are passed over."""
-    found = Found()
+    found: Found = {kind: [] for kind in get_args(Kind)}
     for path in _walk(folder):
-        _sort(path, found)
+        if (kind := _kind_of(path)) is not None:
+            found[kind].append(path)
     return found
 
 
@@ -74,44 +69,36 @@ def _walk(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def _sort(path: Path, found: Found) -> None:
+def _kind_of(path: Path) -> Kind | None:
     suffix = path.suffix.lower()
     if is_site(path):
-        found.sites.append(path)
-    elif suffix == ".toml":
-        _sort_settings(path, found)
-    elif suffix in _LINES:
-        found.surveys.append(path)
-    elif suffix == ".csv" and path.is_file():
-        _sort_table(path, found)
-    else:
-        found.logs.append(path)
+        return "sites"
+    if suffix == ".toml":
+        return _kind_of_settings(path)
+    if suffix in _LINES:
+        return "surveys"
+    return _kind_of_table(path) if suffix == ".csv" and path.is_file() else "logs"
 
 
-def _sort_settings(path: Path, found: Found) -> None:
+def _kind_of_settings(path: Path) -> Kind | None:
     """A vehicle or a configuration file: what it can be read as."""
-    for kind, into in ((Vehicle, found.vehicles), (Configuration, found.configs)):
-        try:
-            settings_from(read_toml(path), kind, str(path))
-        except BaliseError:
-            continue
-        into.append(path)
-        return
+    kinds: dict[Kind, type[Settings]] = {"vehicles": Vehicle, "configs": Configuration}
+    for kind, settings in kinds.items():
+        with contextlib.suppress(BaliseError):
+            settings_from(read_toml(path), settings, str(path))
+            return kind
+    return None
 
 
-def _sort_table(path: Path, found: Found) -> None:
+def _kind_of_table(path: Path) -> Kind:
     """A table without a time is no log: it lists balises, or points of a line."""
     try:
         table = read_log_table(path, infer=True).table
     except BaliseError:
-        found.logs.append(path)
-        return
+        return "logs"
     words = {name: word_of(name) for name in table.columns if name.strip()}
     if any(first(words, WORDS[kind]) for kind in ("time", "date", "clock", "week")):
-        found.logs.append(path)
-    elif first(words, WORDS["balise"]):
-        found.balises.append(path)
-    elif columns_in("reference", words):
-        found.surveys.append(path)
-    else:
-        found.logs.append(path)
+        return "logs"
+    if first(words, WORDS["balise"]):
+        return "balises"
+    return "surveys" if columns_in("reference", words) else "logs"

@@ -7,10 +7,17 @@ from typing import Any
 
 from pipeline import storage
 from pipeline.project.draft import project_text
-from pipeline.project.found import look_around
+from pipeline.project.found import Kind, look_around
 from pipeline.project.trial import Drafted, Wanted, correction_lines
 from schemas.errors import UsageError
 from schemas.project import FILE_NAME
+
+_ONE_OF: dict[Kind, str] = {
+    "sites": "sites",
+    "balises": "tables of balises",
+    "vehicles": "vehicle files",
+    "configs": "configuration files",
+}
 
 
 def wanted_in(folder: Path) -> Wanted:
@@ -18,20 +25,18 @@ def wanted_in(folder: Path) -> Wanted:
     if not folder.exists():
         return Wanted(())
     found = look_around(folder)
-    several = {"sites": found.sites, "tables of balises": found.balises}
-    several |= {"vehicle files": found.vehicles, "configuration files": found.configs}
-    for what, paths in several.items():
-        if len(paths) > 1:
+    for kind, what in _ONE_OF.items():
+        if len(found[kind]) > 1:
             raise UsageError(
                 f"holds several {what}",
                 place=str(folder),
-                found=", ".join(map(str, paths)),
+                found=", ".join(map(str, found[kind])),
                 remedy="Move away what is not meant, or name what is: balise trial RAW... --track LINE --to FOLDER.",
             )
-    vehicle = next(iter(found.vehicles), None)
-    config = next(iter(found.configs), None)
-    balises = None if found.sites or not found.balises else str(found.balises[0])
-    return Wanted(found.logs, found.sites or found.surveys, balises, vehicle=vehicle, config=config, strict=False)
+    sites, balises, vehicle, config = (next(iter(found[kind]), None) for kind in _ONE_OF)
+    listed = None if sites or balises is None else str(balises)
+    track = found["sites"] or found["surveys"]
+    return Wanted(found["logs"], track, listed, vehicle=vehicle, config=config, strict=False)
 
 
 def refuse_existing(folder: Path, force: bool) -> None:
@@ -58,32 +63,22 @@ def words_of(drafted: Drafted, file: Path) -> list[str]:
     for proposal in drafted.proposals:
         words += [f"{proposal.run_id} does not fit as recorded:", *(f"  {sentence}" for sentence in proposal.found)]
         words += [f"  {line}" for line in correction_lines(proposal.corrections)]
-        fate = "accepted" if proposal.accepted else "NOT accepted: they stand in the file as comments"
-        words.append(
-            f"  These corrections are {fate}."
-            if proposal.accepted
-            else f"  These corrections are {fate}; remove the # or add --accept-corrections."
-        )
-    words += drafted.remarks
-    words.append(f"Wrote {file}. Look at it, then")
-    return [*words, f"now: {next_command(file)}"]
+        how = "accepted." if proposal.accepted else f"NOT accepted: {_UNACCEPTED}"
+        words.append(f"  These corrections are {how}")
+    return [*words, *drafted.remarks, f"Wrote {file}. Look at it, then", f"now: {next_command(file)}"]
+
+
+_UNACCEPTED = "they stand in the file as comments; remove the # or add --accept-corrections."
 
 
 def answer_of(drafted: Drafted, file: Path) -> dict[str, Any]:
     """The same for programs."""
-    proposals = [
-        {
-            "run_id": proposal.run_id,
-            "found": list(proposal.found),
-            "toml": correction_lines(proposal.corrections),
-            "accepted": proposal.accepted,
-        }
-        for proposal in drafted.proposals
-    ]
+    proposals = [vars(proposal) | {"toml": correction_lines(proposal.corrections)} for proposal in drafted.proposals]
+    fields = ("run_id", "found", "toml", "accepted")
     return {
         "file": file,
         "logs": drafted.logs,
-        "corrections": proposals,
+        "corrections": [{name: proposal[name] for name in fields} for proposal in proposals],
         "remarks": drafted.remarks,
         "next": next_command(file),
     }

@@ -61,21 +61,17 @@ class Record:
         """
         known = self._made.get(product.name)
         if not self._force:
-            if (
-                known is not None
-                and not known.begun
-                and known.of == product.made_of
-                and _digests(product.above, known.files) == known.files
-            ):
+            if known is not None and known == _Made(of=product.made_of, files=_digests(product.above, known.files)):
                 return False
-            self._refuse_foreign(product, known)
-        before = _state(product.place)
+            if known is None or not known.begun:
+                _refuse_foreign(product, known)
+        before = _digests(product.above, _names(product))
         # Whoever is killed now leaves files that the next call must not take for somebody else's.
         self._note(product, _Made(of=product.made_of, files={} if known is None else known.files, begun=True))
         try:
             files = make()
         except Exception:
-            if _state(product.place) == before:
+            if _digests(product.above, _names(product)) == before:
                 self._note(product, known)
             raise
         names = [file.relative_to(product.above).as_posix() for file in files]
@@ -89,55 +85,46 @@ class Record:
         content = _RECORD.dump_json(dict(sorted(self._made.items())), indent=1, exclude_defaults=True)
         storage.write_bytes(self._file, content)
 
-    def _refuse_foreign(self, product: Product, known: _Made | None) -> None:
-        if known is None and _is_there(product.place):
+
+def _refuse_foreign(product: Product, known: _Made | None) -> None:
+    """Refuse what somebody else made, changed or added. What is gone is made again."""
+    there = _digests(product.above, _names(product))
+    if known is None:
+        if there:
             raise UsageError(
                 "is there, and this project did not make it",
                 place=str(product.place),
                 remedy="Name another place in balise.toml, move it away, or replace it with --force.",
             )
-        if known is not None and not known.begun:
-            there = {name: digest for name, digest in _digests(product.above, known.files).items() if digest}
-            changed = [name for name, digest in there.items() if digest != known.files[name]]
-            if changed:
-                raise UsageError(
-                    "was changed since this project made it",
-                    place=str(product.above / changed[0]),
-                    remedy="To keep the change, delete the table that makes it from balise.toml and name the result "
-                    "(`site`, or `runs` under [replay]); to make it again, use --force.",
-                )
-            added = [name for name in _names(product) if name not in known.files]
-            if added:
-                raise UsageError(
-                    "was added since this project made what is beside it",
-                    place=str(product.above / added[0]),
-                    remedy="Name the log that it comes from in balise.toml, with its `stream`, and move the file away; "
-                    "--force removes it.",
-                )
-
-
-def _is_there(place: Path) -> bool:
-    return place.is_file() or (place.is_dir() and any(place.iterdir()))
+        return
+    for name, digest in there.items():
+        if name in known.files and digest != known.files[name]:
+            raise UsageError(
+                "was changed since this project made it",
+                place=str(product.above / name),
+                remedy="To keep the change, delete the table that makes it from balise.toml and name the result "
+                "(`site`, or `runs` under [replay]); to make it again, use --force.",
+            )
+    for name in there.keys() - known.files.keys():
+        raise UsageError(
+            "was added since this project made what is beside it",
+            place=str(product.above / name),
+            remedy="Name the log that it comes from in balise.toml, with its `stream`, and move the file away; "
+            "--force removes it.",
+        )
 
 
 def _names(product: Product) -> list[str]:
-    """Files in the folder of a product, as they are noted."""
-    inside = (file for file in sorted(product.place.rglob("*")) if file.is_file())
-    return [file.relative_to(product.above).as_posix() for file in inside]
-
-
-def _state(place: Path) -> str:
-    return storage.digest_of_files(_all_files(place))
+    """The file of a product, or those in its folder, as they are noted."""
+    place = product.place
+    files = [place] if place.is_file() else [file for file in sorted(place.rglob("*")) if file.is_file()]
+    return [file.relative_to(product.above).as_posix() for file in files]
 
 
 def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
-    """The SHA-256 of files below a folder (`.`: itself a file); empty where a file is gone."""
-    contents = {name: folder / name for name in sorted(names)}
-    return {name: _digest(path) if path.is_file() else "" for name, path in contents.items()}
-
-
-def _digest(path: Path) -> str:
-    return storage.file_digests(path)[0].sha256
+    """The SHA-256 of files below a folder; empty where a file is gone."""
+    places = {name: folder / name for name in sorted(names)}
+    return {name: storage.file_digests(path)[0].sha256 if path.is_file() else "" for name, path in places.items()}
 
 
 def digest_over(settings: object, files: Iterable[Path]) -> str:

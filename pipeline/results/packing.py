@@ -38,21 +38,12 @@ class _UnfitError(Exception):
 
 
 @dataclass(frozen=True)
-class _Recorded:
-    """A run as it lies there: its marker, and its tables as they were written, without metadata."""
-
-    marker: Marker
-    tables: Mapping[str, pa.Table]
-
-
-@dataclass(frozen=True)
 class _Step:
-    """What one pack is made of: runs of one build of the program. `own`: those among them with files of their own."""
+    """What one pack is made of: runs of one build of the program."""
 
     out: str
     software_digest: str
     runs: tuple[str, ...]
-    own: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -67,43 +58,49 @@ class Packed:
 def pack_runs(out: Address, runs_per_pack: int, jobs: int) -> Iterator[tuple[Packed, int]]:
     """Pack all runs that have files of their own: each pack as soon as it counts, and how many runs there are to do.
 
-    A pack with runs that were replayed since, and one that is less than half full, is made anew.
+    A pack with runs that were replayed since, and one that is less than half full, is taken apart first.
     """
-    own = frozenset(store.own_runs(out))
-    steps = list(_planned(out, own, runs_per_pack))
+    _take_apart(out, runs_per_pack)
+    steps = list(_planned(out, runs_per_pack))
     total = sum(len(step.runs) for step in steps)
-    made: list[Pack] = []
     for packed in each(_write_pack, steps, jobs):
-        made += [] if packed.pack is None else [packed.pack]
-        _count(out, made, own)
-        store.remove_own(out, [run for run in packed.runs if run in own])
+        if packed.pack is not None:
+            packs.write_list(out, [*packs.listed(out), packed.pack])
+            store.remove_own(out, packed.runs)
         yield packed, total
     packs.sweep(out)
 
 
-def _planned(out: Address, own: frozenset[str], runs_per_pack: int) -> Iterator[_Step]:
-    """By the build that made them, as only runs of one build are sure to have the same columns."""
-    by_build = {marker.run_id: marker.metadata.get("software_digest", "") for marker in store.markers(out, sorted(own))}
-    size_of = _sizes(out, own)
-    packed = packs.find(out)
+def _take_apart(out: Address, runs_per_pack: int) -> None:
+    builds = set(_builds(out).values())
     for pack in packs.listed(out):
-        rest = [run for run in packs.index_of(out, pack).run_ids if packed[run].pack == pack and run not in by_build]
-        stale = len(rest) < pack.runs
+        stale = len(_read_from(out, pack)) < pack.runs
         small = pack.runs < runs_per_pack / 2 and pack.bytes < _LARGEST_PACK / 2
-        if stale or (small and pack.software_digest in by_build.values()):
-            packs.require_whole(out, pack)
-            by_build |= dict.fromkeys(rest, pack.software_digest)
-            size_of |= dict.fromkeys(rest, pack.bytes // pack.runs)
+        if stale or (small and pack.software_digest in builds):
+            for _ in unpack(out, [pack]):
+                pass
+
+
+def _builds(out: Address) -> dict[str, str]:
+    """By which build of the program each run was made that has files of its own."""
+    own = store.own_runs(out)
+    return {marker.run_id: marker.metadata.get("software_digest", "") for marker in store.markers(out, own)}
+
+
+def _planned(out: Address, runs_per_pack: int) -> Iterator[_Step]:
+    """Only runs of one build are sure to have the same columns."""
+    by_build = _builds(out)
+    size_of = _sizes(out, by_build)
     for build in sorted(set(by_build.values())):
         of_build = sorted(run for run, made_by in by_build.items() if made_by == build)
         for runs in _portions(of_build, size_of, runs_per_pack):
-            yield _Step(str(out), build, runs, own.intersection(runs))
+            yield _Step(str(out), build, runs)
 
 
-def _sizes(out: Address, own: Iterable[str]) -> dict[str, int]:
+def _sizes(out: Address, runs: Iterable[str]) -> dict[str, int]:
     """Size of all tables of each run [bytes]."""
     of_tables = [storage.sizes(join(out, table), f"{table}.parquet") for table in TABLES]
-    return {run: sum(sizes.get(store.folder_name(run), 0) for sizes in of_tables) for run in own}
+    return {run: sum(sizes.get(store.folder_name(run), 0) for sizes in of_tables) for run in runs}
 
 
 def _portions(runs: Sequence[str], size_of: Mapping[str, int], most: int) -> Iterator[tuple[str, ...]]:
@@ -120,15 +117,6 @@ def _portions(runs: Sequence[str], size_of: Mapping[str, int], most: int) -> Ite
         yield tuple(portion)
 
 
-def _count(out: Address, made: Sequence[Pack], own: frozenset[str]) -> None:
-    """List the packs made so far, after those that hold a run that is found nowhere else."""
-    names = {pack.name for pack in made}
-    elsewhere = own.union(*(packs.index_of(out, pack).run_ids for pack in made))
-    before = [pack for pack in packs.listed(out) if pack.name not in names]
-    needed = [pack for pack in before if not elsewhere.issuperset(packs.index_of(out, pack).run_ids)]
-    packs.write_list(out, [*needed, *made])
-
-
 def _write_pack(step: _Step) -> Packed:
     """Write the files of one pack, read them again, and hold each run against what it was."""
     left_out: dict[str, str] = {}
@@ -137,13 +125,13 @@ def _write_pack(step: _Step) -> Packed:
         for run in step.runs:
             if run not in left_out:
                 try:
-                    writer.add(_own(step.out, run) if run in step.own else _of_pack(step.out, run))
+                    writer.add(*_recorded(step.out, run))
                 except (_UnfitError, parquet.ParquetError) as error:
                     left_out[run] = str(error)
         if not writer.run_ids:
             return Packed(None, (), left_out)
         pack = writer.write(step)
-        wrong = list(_not_the_same(step, pack))
+        wrong = [marker.run_id for marker, files in _made_again(step.out, pack) if _unlike(marker, files)]
         if not wrong:
             return Packed(pack, tuple(writer.run_ids), left_out)
         left_out |= dict.fromkeys(wrong, "its files cannot be made again byte for byte by this build of the program")
@@ -154,26 +142,23 @@ class _PackWriter:
 
     def __init__(self) -> None:
         self._rows: list[tuple[str | int, ...]] = []
-        self._schemas: dict[str, pa.Schema] = {}
         self._writers: dict[str, parquet.GroupedWriter] = {}
 
     @property
     def run_ids(self) -> list[str]:
         return [str(row[0]) for row in self._rows]
 
-    def add(self, run: _Recorded) -> None:
-        """Raises `_UnfitError` where its columns are not those of the others."""
-        tables = {name: _named(run.marker.run_id, table) for name, table in run.tables.items()}
-        for name, table in tables.items():
-            if not table.schema.equals(self._schemas.setdefault(name, table.schema), check_metadata=True):
-                raise _UnfitError("it has other columns than runs of the same build of the program")
-        for name, table in tables.items():
-            if name not in self._writers:
-                self._writers[name] = parquet.GroupedWriter(table.schema, _ROWS_PER_GROUP)
+    def add(self, marker: Marker, tables: Mapping[str, pa.Table]) -> None:
+        """`tables`: without metadata. Raises `_UnfitError` where their columns are not those of the other runs."""
+        named = {name: _named(marker.run_id, table) for name, table in tables.items()}
+        if not self._writers:
+            self._writers = {name: parquet.GroupedWriter(of.schema, _ROWS_PER_GROUP) for name, of in named.items()}
+        if any(not of.schema.equals(self._writers[name].schema, check_metadata=True) for name, of in named.items()):
+            raise _UnfitError("it has other columns than runs of the same build of the program")
+        for name, table in named.items():
             self._writers[name].add(table)
-        metadata = json.dumps(run.marker.metadata, ensure_ascii=False)
-        heights = [tables[name].num_rows for name in TABLES]
-        self._rows.append((run.marker.run_id, run.marker.sha256, metadata, *heights))
+        metadata = json.dumps(marker.metadata, ensure_ascii=False)
+        self._rows.append((marker.run_id, marker.sha256, metadata, *(named[name].num_rows for name in TABLES)))
 
     def write(self, step: _Step) -> Pack:
         """Put the files in their places, where nobody looks before they are listed."""
@@ -199,73 +184,43 @@ def _named(run_id: str, table: pa.Table) -> pa.Table:
     return table.add_column(0, field, pa.repeat(pa.scalar(run_id, field.type), table.num_rows))
 
 
-def _own(out: str, run_id: str) -> _Recorded:
+def _recorded(out: str, run_id: str) -> tuple[Marker, dict[str, pa.Table]]:
     """A run from its own files. Raises `_UnfitError` where they are not what its marker says."""
     places = {name: str(store.table_address(out, name, run_id)) for name in TABLES}
     contents = storage.read_many(list(places.values()))
-    marker = Marker.of_file(run_id, contents.get(places[MARKER], b""))
-    noted = _digests(marker)
-    for name, place in places.items():
-        if sha256(contents.get(place)) != noted.get(name):
-            raise _UnfitError(f"its table `{name}` is not the one that its marker names")
-    tables = {name: parquet.as_written(contents[place]).replace_schema_metadata(None) for name, place in places.items()}
-    return _Recorded(marker, tables)
+    files = {name: contents.get(place, b"") for name, place in places.items()}
+    marker = Marker.of_file(run_id, files[MARKER])
+    for name in _unlike(marker, files):
+        raise _UnfitError(f"its table `{name}` is not the one that its marker names")
+    tables = {name: parquet.as_written(content) for name, content in files.items()}
+    return marker, {name: table.replace_schema_metadata(None) for name, table in tables.items()}
 
 
-def _of_pack(out: str, run_id: str) -> _Recorded:
-    """A run from the pack where it is now."""
-    places = packs.find(out, [run_id])
-    (marker,) = packs.markers(out, places)
-    return _Recorded(marker, {name: packed_tables.of_run(out, name, places[run_id]) for name in TABLES})
+def _unlike(marker: Marker, files: Mapping[str, bytes]) -> list[str]:
+    """The tables whose files are not those that the run has, or had before it was packed."""
+    noted = {**tables_noted(marker.metadata), MARKER: marker.sha256}
+    return [name for name in TABLES if sha256(files[name]) != noted.get(name)]
 
 
-def _digests(marker: Marker) -> dict[str, str]:
-    """The digests of the files that a run has, or had before it was packed."""
-    return {**tables_noted(marker.metadata), MARKER: marker.sha256}
-
-
-def _not_the_same(step: _Step, pack: Pack) -> Iterator[str]:
-    """Runs of a new pack whose own files do not follow from it, or that are not what they were in the pack before."""
-    for marker, tables in _runs_in(step.out, pack):
-        if marker.run_id in step.own:
-            same = _digests(marker) == {name: sha256(content) for name, content in _files(marker, tables)}
-        else:
-            before = _of_pack(step.out, marker.run_id)
-            same = marker == before.marker and all(
-                table.equals(before.tables[name], check_metadata=True) for name, table in tables.items()
-            )
-        if not same:
-            yield marker.run_id
-
-
-def _runs_in(out: str, pack: Pack) -> Iterator[tuple[Marker, dict[str, pa.Table]]]:
-    """Every run of a pack: its marker and its tables, some runs at a time in memory."""
+def _made_again(out: Address, pack: Pack) -> Iterator[tuple[Marker, dict[str, bytes]]]:
+    """Every run of a pack: its marker and its own files, some runs at a time in memory."""
     run_ids = packs.index_of(out, pack).run_ids
     markers = packs.markers(out, {run: PackedRun(pack, row) for row, run in enumerate(run_ids)})
     for first in range(0, len(run_ids), _RUNS_AT_ONCE):
         rows = range(first, min(first + _RUNS_AT_ONCE, len(run_ids)))
         parts = {name: packed_tables.as_written(out, name, pack, rows) for name in TABLES}
         for _ in rows:
-            yield next(markers), {name: next(tables) for name, tables in parts.items()}
-
-
-def _files(marker: Marker, tables: Mapping[str, pa.Table]) -> Iterator[tuple[str, bytes]]:
-    """The run's own files."""
-    metadata = marker.metadata
-    for name, table in tables.items():
-        yield name, store.file_bytes(table, name, metadata)
+            marker = next(markers)
+            metadata = marker.metadata
+            yield marker, {name: store.file_bytes(next(of), name, metadata) for name, of in parts.items()}
 
 
 def not_as_marked(out: Address, pack: Pack) -> Iterator[tuple[str, str]]:
     """Runs that are read from a pack, with each table of which this build makes another file than the marker names."""
     here = _read_from(out, pack)
-    for marker, tables in _runs_in(str(out), pack):
-        if marker.run_id not in here:
-            continue
-        digests = _digests(marker)
-        for name, content in _files(marker, tables):
-            if sha256(content) != digests.get(name):
-                yield marker.run_id, name
+    for marker, files in _made_again(out, pack):
+        if marker.run_id in here:
+            yield from ((marker.run_id, name) for name in _unlike(marker, files))
 
 
 def remove_runs(out: Address, runs: Sequence[str]) -> None:
@@ -282,10 +237,10 @@ def unpack(out: Address, asked: Sequence[Pack]) -> Iterator[int]:
     """
     for pack in asked:
         here = _read_from(out, pack)
-        for marker, tables in _runs_in(str(out), pack):
+        for marker, files in _made_again(out, pack) if here else []:
             if marker.run_id in here:
-                files = dict(_files(marker, tables))
-                _check_unpacked(out, pack, marker, files)
+                if _unlike(marker, files):
+                    raise _unlike_error(pack, marker.run_id)
                 store.write_files(out, marker.run_id, files)
         packs.write_list(out, [other for other in packs.listed(out) if other != pack])
         packs.sweep(out)
@@ -297,10 +252,11 @@ def _read_from(out: Address, pack: Pack) -> set[str]:
     return {run for run, place in packs.find(out).items() if place.pack == pack}.difference(store.own_runs(out))
 
 
-def _check_unpacked(out: Address, pack: Pack, marker: Marker, files: Mapping[str, bytes]) -> None:
-    if {name: sha256(content) for name, content in files.items()} != _digests(marker):
-        raise UsageError(
-            "cannot be made again byte for byte by this build of the program",
-            place=f"files of run {marker.run_id}",
-            remedy="Use the build that packed it: it can still be read from its pack by this one.",
-        )
+def _unlike_error(pack: Pack, run_id: str) -> UsageError:
+    """Also of a pack that was changed: as a new one its rows would pass for whole."""
+    return UsageError(
+        "cannot be made again byte for byte by this build of the program",
+        place=f"files of run {run_id}",
+        found=f"pack {pack.name}",
+        remedy="`balise verify` says whether a file was changed. Else use the build that packed it, or replay the run.",
+    )

@@ -122,12 +122,6 @@ def file_digests(pack: Pack) -> dict[str, str]:
     return {file_name(part, pack.name): digest for part, digest in pack.sha256.items()}
 
 
-def require_whole(out: Address, pack: Pack) -> None:
-    """Refuse a pack with a file that is not what was written: a new pack of its rows would hide that."""
-    for file, digest in file_digests(pack).items():
-        _whole(out, file, digest)
-
-
 def _whole(out: Address, file: str, digest: str) -> bytes:
     content = storage.content_of(join(out, file))
     if content is None or sha256(content) != digest:

@@ -32,11 +32,6 @@ _FILES = re.compile(r"\bread_(csv|parquet|ipc|json|ndjson)\b", re.IGNORECASE)
 
 _SHOW = re.compile(r"\s*show\s+tables\s*;?\s*", re.IGNORECASE)
 _DESCRIBE = re.compile(r"\s*(?:describe|desc)\s+(?:table\s+)?[\"`]?(\w+)[\"`]?\s*;?\s*", re.IGNORECASE)
-# What polars says of a name that it does not know.
-_NO_COLUMN = re.compile(r"(?:unable to find column|no column named) [\"'](\w+)[\"']")
-_NO_TABLE = re.compile(r"relation '(\w+)' was not found")
-_NO_VALUE = re.compile(r"to `enum` failed for value \"([^\"]*)\"")
-
 _NAMED = re.compile(r"[A-Za-z]\w*=.+")
 
 _EXPECTED = "a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES])
@@ -66,7 +61,7 @@ def run_sql(
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, RecursionError) as error:
         message = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UsageError(
-            f"cannot be answered: {_in_our_words(message, tables, others or {})}",
+            f"cannot be answered: {message}",
             place="SQL",
             expected=_EXPECTED,
             remedy=_REMEDY,
@@ -143,22 +138,6 @@ def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
         return columns
     run_id = {"column": "run_id", "dtype": "String", "unit": "", "nullable": False, "meaning": "id of the run"}
     return pl.concat([pl.DataFrame([run_id], schema=columns.schema), columns])
-
-
-def _in_our_words(message: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
-    """What polars says, of a name or a value that it does not know in our words, with the nearest that there is."""
-    contracts = _contracts(others)
-    columns = {"run_id": None} | {
-        name: kind for table in tables for name, kind in contracts[table][1].columns().items()
-    }
-    if column := _NO_COLUMN.search(message):
-        return f"no column is called `{column[1]}`{did_you_mean(column[1], columns)}"
-    if missing := _NO_TABLE.search(message):
-        return f"no table is called `{missing[1]}`{did_you_mean(missing[1], contracts)}"
-    if value := _NO_VALUE.search(message):
-        values = {word for kind in columns.values() if isinstance(kind, dy.Enum) for word in kind.categories}
-        return f"no column has the value `{value[1]}`{did_you_mean(value[1], values)}"
-    return message
 
 
 def _campaign_tables(out: Address, names: Iterable[str]) -> dict[str, pl.LazyFrame]:

@@ -23,10 +23,10 @@ from pipeline.results.marker import Marker, sha256
 from pipeline.results.source import conjuncts, source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join, redacted, shown
-from pipeline.storage.described import PREFIX
+from pipeline.storage.described import PREFIX, table_bytes
 from pipeline.storage.files import exists, read_bytes
 from schemas.config import Configuration, Settings, Vehicle, settings_from, to_toml, toml_of
-from schemas.conform import conform, dtypes, meanings
+from schemas.conform import conform, dtypes
 from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES
@@ -56,10 +56,12 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
     run or one without marker, which does not count.
     """
     noted = {"run_id": tables.run_id, **metadata}
-    others = {name: table_bytes(getattr(tables, name), name, noted) for name in TABLES if name != _MARKER}
-    digests = json.dumps({name: sha256(content) for name, content in others.items()})
-    last = table_bytes(tables.runs, _MARKER, {**noted, "tables": digests})
-    write_files(out, tables.run_id, {**others, _MARKER: last})
+    contents: dict[str, bytes] = {}
+    for name in (*(name for name in TABLES if name != _MARKER), _MARKER):
+        if name == _MARKER:
+            noted["tables"] = json.dumps({table: sha256(content) for table, content in contents.items()})
+        contents[name] = table_bytes(conform(getattr(tables, name), TABLES[name]), name, TABLES[name], noted)
+    write_files(out, tables.run_id, contents)
 
 
 def write_files(out: Address, run_id: str, contents: Mapping[str, bytes]) -> None:
@@ -78,20 +80,6 @@ def write_files(out: Address, run_id: str, contents: Mapping[str, bytes]) -> Non
     except BaseException:
         storage.discard(staged)
         raise
-
-
-def table_bytes(frame: pl.DataFrame, table: str, metadata: Mapping[str, str]) -> bytes:
-    """A table as Parquet, held to its contract, with unit and meaning in the field of each column."""
-    checked = conform(frame, TABLES[table])
-    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata}, meanings(TABLES[table]))
-
-
-def parquet_bytes(
-    frame: pl.DataFrame, metadata: Mapping[str, str], columns: Mapping[str, Mapping[str, str]] | None = None
-) -> bytes:
-    """A frame as Parquet with its metadata; the same content always gives the same bytes."""
-    named = {f"{PREFIX}{key}": value for key, value in metadata.items()}
-    return parquet.parquet_bytes(frame, named, columns)
 
 
 def read_run(out: Address, run_id: str) -> RunTables:
@@ -172,36 +160,31 @@ def _read_own(
     contents = storage.read_many(places) if is_url(out) else {}
     reader = parquet.TableReader(checked)
     try:
-        for run, place in zip(runs, places, strict=True):
+        for run, place in zip(runs, places, strict=True):  # noqa: B007 - `checked` and the error name the run
             if is_url(out) and place not in contents:
-                raise _unreadable(table, run, "no such object")
+                raise parquet.ParquetError("no such object")
             reader.add(contents[place] if is_url(out) else Path(place))
         if runs:
             yield dict(zip(runs, reader.heights, strict=True)), reader.frame()
     except parquet.ParquetError as error:
-        raise _unreadable(table, run, str(error)) from None
-
-
-def _unreadable(table: str, run_id: str, reason: str) -> UsageError:
-    return UsageError(
-        f"cannot be read: {reason}",
-        place=f"run {run_id}, table `{table}`",
-        remedy="Replay this run again with --force.",
-    )
+        where = f"run {run}, table `{table}`"
+        raise UsageError(
+            f"cannot be read: {error}", place=where, remedy="Replay this run again with --force."
+        ) from None
 
 
 def _check_columns(table: str, run_id: str, recorded: Mapping[str, pl.DataType]) -> None:
     expected = dtypes(TABLES[table])
     lost = [name for name in expected if name not in recorded]
-    retyped = [
+    unlike = [f"no {', '.join(lost)}"] if lost else []
+    unlike += [
         f"{name} as {recorded[name]}, not {kind}" for name, kind in expected.items() if recorded.get(name, kind) != kind
     ]
-    if lost or retyped:
-        parts = ([f"no {', '.join(lost)}"] if lost else []) + retyped
+    if unlike:
         raise UsageError(
             "was written by another build of the program",
             place=f"run {run_id}, table `{table}`",
-            found="; ".join(parts),
+            found="; ".join(unlike),
             expected=f"the columns of contract {CONTRACT_VERSION} as of this build",
             remedy="Repeat `balise replay` with the same --out: it replays this run again.",
         )
@@ -266,11 +249,6 @@ def markers(out: Address, among: Sequence[str] | None = None) -> Iterator[Marker
         found = {marker.run_id: marker for marker in packs.markers(out, in_packs)}
         found |= {run: Marker.of_file(run, contents[place]) for run, place in places.items() if place in contents}
         yield from (found[run] for run in some if run in found)
-
-
-def marker_of(out: Address, run_id: str) -> Marker | None:
-    """The marker of one run; none where it is not complete."""
-    return next(markers(out, [run_id]), None)
 
 
 def packed_frame(out: Address, table: str, run_id: str) -> pl.DataFrame | None:

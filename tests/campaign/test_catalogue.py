@@ -107,7 +107,7 @@ def test_verify_sees_a_false_outcome(small_trial: SmallTrial, tmp_path: Path, na
         kept = {**whole, "proof": "kept", **lies}
         catalogue.keep(tmp_path, "complete", software_digest(), json.dumps([kept]).encode())
         found = [what for what, _, _ in verify(tmp_path).problems]
-        assert found == [f".catalogue/complete, {job.run_id}, {told}" for told in lies]
+        assert found == [f".catalogue/complete, {job.run_id}" for _ in lies]
 
 
 def test_a_copy_of_tables_that_cannot_be_read_is_no_answer(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

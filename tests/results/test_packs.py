@@ -281,9 +281,13 @@ def test_what_was_cut_short_is_never_taken_for_whole(out: Path, tmp_path: Path, 
 def test_a_changed_pack_is_not_packed_again(out: Path) -> None:
     """The new pack would be whole, and hide the change."""
     compact(out)
+    out = shutil.copytree(out, out.with_name("copy"))
     with_other_values(out)
     store.write_run(with_alarms("g", 1), out, METADATA)
-    with pytest.raises(UsageError, match=r"runs/compact/.*is damaged"):
+    with pytest.raises(UsageError, match=r"runs/compact/.*not the one that was packed"):
+        compact(out)
+    list_anew(out, packs.listed(out)[0].sha256)
+    with pytest.raises(UsageError, match="cannot be made again byte for byte"):
         compact(out)
 
 

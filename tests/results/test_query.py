@@ -89,24 +89,6 @@ def test_what_cannot_be_answered_says_what_can(out: Path, sql: str, said: str) -
     assert "expected a SELECT over hazards, passages, alarms, epochs, runs" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("sql", "meant"),
-    [
-        ("SELECT speed FROM hazards", "no column is called `speed` (did you mean `speed_mps`?)"),
-        ("SELECT h.hazrd FROM hazards h", "no column is called `hazrd` (did you mean `hazard`"),
-        ("SELECT * FROM hazard", "no table is called `hazard` (did you mean `hazards`?)"),
-        (
-            "SELECT * FROM hazards WHERE hazard = 'VB_SHFT'",
-            "no column has the value `VB_SHFT` (did you mean `VB_SHIFT`?)",
-        ),
-    ],
-)
-def test_the_nearest_name_is_told(out: Path, sql: str, meant: str) -> None:
-    with pytest.raises(UsageError) as caught:
-        run_sql(out, sql)
-    assert meant in str(caught.value)
-
-
 def test_tables_and_columns_are_listed(out: Path) -> None:
     tables = run_sql(out, "show tables;")
     assert {"hazards", "epochs", "campaign_figures"} <= set(tables["table"])

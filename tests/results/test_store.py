@@ -22,6 +22,7 @@ from pipeline.results.query import run_sql
 from pipeline.show.terminal import table_lines, to_json
 from pipeline.storage import files
 from pipeline.storage.address import Address, redacted, stem_of
+from pipeline.storage.parquet import parquet_bytes
 from schemas.config import Configuration
 from schemas.errors import InputError, OutputError, UsageError
 from schemas.run import RunTables
@@ -280,7 +281,7 @@ def as_of_another_build(out: object, run_id: str) -> None:
     place = store.table_address(out, "runs", run_id)  # type: ignore[arg-type]
     content = storage.read_many([str(place)])[str(place)] if str(out).startswith("memory") else Path(place).read_bytes()
     frame = pl.read_parquet(content).drop("notes").cast({"outages": pl.Int32})
-    storage.write_bytes(place, store.parquet_bytes(frame, {}))
+    storage.write_bytes(place, parquet_bytes(frame, {}))
 
 
 @pytest.mark.parametrize("remote", [False, True])

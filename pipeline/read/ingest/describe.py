@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of
+from pipeline.read.ingest.fields import fields_of
 from pipeline.read.ingest.guesses import COLUMNS, columns_in, mapping_lines, word_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel
@@ -166,8 +166,8 @@ def _fields(channel: Channel, messages: Messages) -> Mapping[str, str]:
     if messages.length[0] > LARGEST_MESSAGE:
         return {}
     try:
-        return fields_of(decoder_for(channel)(messages.payload(0)))
-    except (UndecodableError, InputError):
+        return fields_of(channel, messages)
+    except InputError:
         return {}
 
 

@@ -1,9 +1,13 @@
-"""Columnar decoding of JSON messages by pyarrow, whose parser holds every value against the type asked for."""
+"""JSON messages to columns by pyarrow, whose parser holds every value against the type asked for.
+
+What pyarrow refuses or may misread (a text over several lines, 9.0 for a whole number) is parsed message by message.
+"""
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -11,10 +15,9 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.json
 
-from pipeline.read.ingest.generic import parse_path
-from pipeline.read.ingest.layout import Columns, Values
-from pipeline.read.ingest.mcap_block import Bytes, Messages
-from schemas.arrays import Ints
+from pipeline.read.ingest.layout import Columns, Decoded, UndecodableError, Values, parse_path, undecodable
+from pipeline.read.ingest.mcap_block import Messages
+from pipeline.read.ingest.mcap_records import Channel
 
 _ARROW = {pl.Float64: pa.float64(), pl.Int64: pa.int64(), pl.Boolean: pa.bool_(), pl.String: pa.string()}
 # Literals that pyarrow takes and JSON does not know, and `null` after an object, which pyarrow does not survive.
@@ -24,9 +27,14 @@ _NULL_AFTER = re.compile(rb"\}\s*null")
 
 
 class JsonDecoder:
-    """Decodes the messages of a channel; whatever pyarrow refuses is left to the ordinary parser."""
+    """Decodes the messages of a channel; `slow_messages`: those parsed one by one.
 
-    def __init__(self, types: Mapping[str, pl.DataType]) -> None:
+    Raises `InputError` for a message that cannot be decoded.
+    """
+
+    def __init__(self, channel: Channel, types: Mapping[str, pl.DataType]) -> None:
+        self.slow_messages = 0
+        self._channel = channel
         self._types = types
         tree: dict[str, Any] = {}
         for path, dtype in types.items():
@@ -39,25 +47,28 @@ class JsonDecoder:
         self._met: pa.Schema | None = None  # what of it the first messages held, while no other has held more
         self._narrow = True
 
-    def decode(self, messages: Messages) -> tuple[list[tuple[Messages, Columns]], list[Messages]]:
-        """All messages as columns, or all of them left over."""
+    def decode(self, messages: Messages) -> Iterator[Decoded]:
+        """The fields of all messages."""
         content = _joined(messages)
-        if content is None:
-            return [], [messages]
         try:
-            table = self._parsed(content)
+            table = None if content is None else self._parsed(content)
         except pa.ArrowInvalid:
-            return [], [messages]
+            table = None
         # Every payload starts and ends as an object does: so many objects as messages are one each.
-        if table.num_rows != len(messages):
-            return [], [messages]
+        if table is not None and table.num_rows == len(messages):
+            yield messages, self._columns(table)
+        else:
+            self.slow_messages += len(messages)
+            yield messages, one_by_one(self._channel, messages, self._types)
+
+    def _columns(self, table: pa.Table) -> Columns:
         frame = pl.DataFrame(pl.from_arrow(table))
         met = {path: dtype for path, dtype in self._types.items() if parse_path(path)[0] in frame.columns}
         columns: dict[str, Values] = {**frame.select(_value(path).alias(path) for path in met).to_dict()}
         for path, dtype in self._types.items():
             if path not in met:
-                columns[path] = pl.Series([None], dtype=dtype).new_from_index(0, len(messages))
-        return [(messages, columns)], []
+                columns[path] = pl.Series([None], dtype=dtype).new_from_index(0, len(table))
+        return columns
 
     def _parsed(self, content: bytearray) -> pa.Table:
         """Without the columns that the first messages lacked, as long as none has more: each costs a message time."""
@@ -72,6 +83,20 @@ class JsonDecoder:
             filled = [field for field in self._schema if table[field.name].null_count < len(table)]
             self._met = pa.schema(filled) if filled else None
         return table
+
+
+def one_by_one(channel: Channel, messages: Messages, types: Mapping[str, pl.DataType]) -> Columns:
+    """The fields by Python's own parser. Raises `InputError` for the first message that cannot be decoded."""
+    steps = {path: parse_path(path) for path in types}
+    values: dict[str, list[Any]] = {path: [] for path in types}
+    for row in range(len(messages)):
+        try:
+            document = parse_json(messages.payload(row))
+            for path, dtype in types.items():
+                values[path].append(_fitting(_at(document, steps[path]), dtype))
+        except UndecodableError as error:
+            raise undecodable(channel, messages.log_time[row], error) from None
+    return {path: pl.Series(path, column, dtype=types[path]) for path, column in values.items()}
 
 
 def _read(content: bytearray, schema: pa.Schema, unexpected: Literal["error", "ignore"]) -> pa.Table:
@@ -102,7 +127,7 @@ def _value(path: str) -> pl.Expr:
 
 def _joined(messages: Messages) -> bytearray | None:
     """The payloads, one after the other; none if any is not the UTF-8 text of something between braces."""
-    content = bytearray().join(_with_byte_before(*part) for part in messages.by_piece())
+    content = bytearray(_with_byte_before(messages))
     ends = np.cumsum(messages.length + 1)
     np.frombuffer(content, dtype=np.uint8)[ends - messages.length - 1] = ord("\n")
     # A letter is found ten times as fast as a word.
@@ -112,23 +137,25 @@ def _joined(messages: Messages) -> bytearray | None:
     return content if _all_between_braces(messages) else None
 
 
-def _with_byte_before(piece: Bytes, starts: Ints, ends: Ints) -> memoryview:
-    """The payloads of one piece side by side, each with the last byte of the head before it: room for a new line."""
-    bounds = np.column_stack([starts - 1, ends]).reshape(-1)
-    buffers = [None, pa.py_buffer(np.append(bounds, bounds[-1])), pa.py_buffer(piece)]
+def _with_byte_before(messages: Messages) -> memoryview:
+    """The payloads side by side, each with the last byte of the head before it: room for a new line."""
+    bounds = np.column_stack([messages.start - 1, messages.start + messages.length]).reshape(-1)
+    buffers = [None, pa.py_buffer(np.append(bounds, bounds[-1])), pa.py_buffer(messages.data)]
     parts = pa.LargeBinaryArray.from_buffers(pa.large_binary(), len(bounds), buffers)
     # Between them are the heads of records. Not `pa.array`: it imports pandas, where that is installed.
     every_other = pl.int_range(0, len(bounds), 2, eager=True)
     taken = parts.take(every_other.to_arrow())
-    return memoryview(taken.buffers()[2])[: int((ends - starts).sum()) + len(starts)]
+    return memoryview(taken.buffers()[2])[: int(messages.length.sum()) + len(messages)]
 
 
 def _all_between_braces(messages: Messages) -> bool:
     """Whether the text of every message is something between braces, but for white space around it."""
     if not messages.length.all():
         return False
-    ends = [(piece[starts] == ord("{")) & (piece[ends - 1] == ord("}")) for piece, starts, ends in messages.by_piece()]
-    texts = (messages.payload(row).strip(b" \t\r\n") for row in np.flatnonzero(~np.concatenate(ends)).tolist())
+    first = messages.data[messages.start]
+    last = messages.data[messages.start + messages.length - 1]
+    others = np.flatnonzero((first != ord("{")) | (last != ord("}")))
+    texts = (messages.payload(row).strip(b" \t\r\n") for row in others.tolist())
     return all(text[:1] == b"{" and text[-1:] == b"}" for text in texts)
 
 
@@ -140,3 +167,59 @@ def _is_utf8(content: bytearray) -> bool:
     except UnicodeDecodeError:
         return False
     return True
+
+
+def parse_json(payload: bytes) -> Any:
+    """One JSON document; literals that are not JSON (NaN, Infinity) and doubled names are refused."""
+    try:
+        return json.loads(payload, parse_constant=_refuse_literal, object_pairs_hook=_object)
+    except (ValueError, RecursionError) as error:
+        raise UndecodableError(f"not JSON: {error}") from None
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object; of two values under one name, nobody can say which is meant."""
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        raise ValueError("a name occurs twice in one object")
+    return members
+
+
+def _refuse_literal(literal: str) -> Any:
+    raise ValueError(f"the literal {literal}")
+
+
+def _at(document: Any, steps: list[str | int]) -> Any:
+    """The value at a path, none where there is none."""
+    value = document
+    for step in steps:
+        if isinstance(step, str):
+            value = value.get(step) if isinstance(value, dict) else None
+        else:
+            value = value[step] if isinstance(value, list) and step < len(value) else None
+    return value
+
+
+# What values of a type may be, and how the type is called.
+_KINDS: dict[type[pl.DataType], tuple[type, str]] = {
+    pl.Float64: (float, "a number"),
+    pl.Int64: (int, "a 64-bit integer"),
+    pl.String: (str, "text"),
+    pl.Boolean: (bool, "true or false"),
+}
+
+
+def _fitting(value: Any, dtype: pl.DataType) -> Any:
+    """The value in the type asked for: whole numbers also serve as floats, and floats that are whole as integers."""
+    kind, name = _KINDS[type(dtype)]
+    fits = value is None or type(value) is kind
+    if fits and (kind is not int or value is None or -(2**63) <= value < 2**63):
+        return value
+    if kind is float and type(value) is int and abs(value) < 2**1023:
+        return float(value)
+    if kind is int and type(value) is float and value.is_integer() and abs(value) < 2**53:
+        return int(value)
+    # Python does not even write integers of 4,300 digits.
+    long = isinstance(value, int) and value.bit_length() > 1024
+    shown = f"an integer of {value.bit_length()} bits" if long else repr(value)[:80]
+    raise UndecodableError(f"{shown} is not {name}")

@@ -2,6 +2,7 @@
 
 A layout is made by walking one message. It holds for another message of the same length if all bytes
 that shaped the walk (length prefixes, tags) are the same there; that is checked on every message.
+There is no other way to decode: a message like no other is walked for itself.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,20 +19,42 @@ import polars as pl
 import pyarrow as pa
 
 from pipeline.read.ingest.mcap_block import Bytes, Messages
+from pipeline.read.ingest.mcap_records import Channel
 from schemas.arrays import Bools, Ints
+from schemas.errors import InputError
 
-_MOST_LAYOUTS = 256  # of one channel; beyond, messages are decoded one by one
-_MOST_ASIDE = 8  # messages without layout that may come before one that has a layout
-_LARGEST_LEARNT = 1 << 16  # bytes of a message that is walked to learn its layout
+_MOST_LAYOUTS = 256  # of one channel that are kept
+_LARGEST_KEPT = 1 << 16  # bytes of a message whose layout is kept
 _NEAR = 32  # bytes; what lies nearer is taken together
+_EXACT_INTEGER = 2.0**53
 
 
-class UnfitError(Exception):
-    """A message or field that has no fixed layout, or not the type asked for."""
+class UndecodableError(Exception):
+    """A message that its own schema does not fit, or a field that has not the type asked for; `str` says why."""
+
+
+def undecodable(channel: Channel, log_time_ns: int, error: UndecodableError) -> InputError:
+    """The error for one message, named by the time at which it was recorded."""
+    return InputError(
+        f"the message recorded at log time {log_time_ns} ns cannot be decoded: {error}",
+        place=channel.place,
+        remedy="Record the log again, or map other fields.",
+    )
+
+
+def parse_path(path: str) -> list[str | int]:
+    """`a.b[3].c` as `["a", "b", 3, "c"]`."""
+    steps: list[str | int] = []
+    for part in path.split("."):
+        name, *indices = part.split("[")
+        steps.append(name)
+        steps += [int(index.rstrip("]")) for index in indices]
+    return steps
 
 
 Values = npt.NDArray[Any] | pl.Series
 Columns = Mapping[str, Values]
+Decoded = tuple[Messages, Columns]
 
 
 @dataclass(frozen=True)
@@ -43,23 +67,25 @@ class Field:
     take: Callable[[Bytes], Values]
 
     def as_type(self, dtype: pl.DataType) -> Field:
-        """The field, if its values are of the kind asked for (whole numbers also serve as floats)."""
+        """The field, if its values are of the kind asked for, or numbers that may be."""
         if isinstance(dtype, self.kind):
             return self
-        if self.kind is pl.Int64 and isinstance(dtype, pl.Float64):
-            return replace(self, kind=pl.Float64)
-        raise UnfitError(f"not of type {dtype}")
+        if self.kind in (pl.Int64, pl.Float64) and isinstance(dtype, pl.Int64 | pl.Float64):
+            return replace(self, kind=type(dtype))
+        raise UndecodableError(f"a field holds {self.kind.__name__}, not {dtype}")
 
     def values(self, rows: Bytes) -> Values:
-        """As numbers of 64 bits; other values as they are taken."""
+        """As numbers of 64 bits, which must hold what was recorded; other values as they are taken."""
         values = self.take(rows)
-        if self.kind is pl.Float64 and isinstance(values, np.ndarray):
+        if self.kind not in (pl.Int64, pl.Float64) or not isinstance(values, np.ndarray):
+            return values
+        if self.kind is pl.Float64:
             return values.astype(np.float64)
-        if self.kind is pl.Int64 and isinstance(values, np.ndarray):
-            if values.dtype == np.uint64 and (values >> np.uint64(63)).any():
-                raise UnfitError("a number is larger than 64 bits with a sign hold")
-            return values.astype(np.int64)
-        return values
+        if values.dtype == np.uint64 and (values >> np.uint64(63)).any():
+            raise UndecodableError("a number is larger than a 64-bit integer with a sign")
+        if values.dtype.kind == "f" and not ((np.abs(values) < _EXACT_INTEGER) & (np.rint(values) == values)).all():
+            raise UndecodableError("a number is not a 64-bit integer")
+        return values.astype(np.int64)
 
 
 def fixed(offset: int, dtype: str) -> Field:
@@ -83,7 +109,7 @@ def text(offset: int, length: int) -> Field:
         try:
             texts.validate(full=True)  # refuses what is not UTF-8
         except pa.ArrowInvalid:
-            raise UnfitError("a text is not UTF-8") from None
+            raise UndecodableError("a text is not UTF-8") from None
         return pl.Series(pl.from_arrow(texts))
 
     return Field(pl.String, offset, offset + length, take)
@@ -108,9 +134,11 @@ class ByteStretch:
 
 @dataclass(frozen=True)
 class Layout:
-    """Of messages of one length: the fields, and the stretches that hold them and all that shapes the layout."""
+    """Of messages of one length: where they hold the fields, in the order of the rows that they make (mostly one),
+    and the stretches that hold these and all that shapes the layout.
+    """
 
-    fields: Mapping[str, Field]
+    fields: Mapping[str, Sequence[Field]]
     stretches: Sequence[ByteStretch]
 
     def rows(self, messages: Messages) -> list[Bytes]:
@@ -125,22 +153,34 @@ class Layout:
         return agree
 
     def values(self, stretches: Sequence[Bytes]) -> Columns:
-        """The fields of messages that have this layout."""
+        """The fields of messages that have this layout, for each row that they make."""
         starts = [stretch.start for stretch in self.stretches]
-        values = {}
-        for path, field in self.fields.items():
+
+        def values(field: Field) -> Values:
             number = bisect_right(starts, field.start) - 1
-            extent = slice(field.start - starts[number], field.end - starts[number])
-            values[path] = field.values(stretches[number][:, extent])
-        return values
+            return field.values(stretches[number][:, field.start - starts[number] : field.end - starts[number]])
+
+        return {path: _in_turn([*map(values, fields)]) for path, fields in self.fields.items()}
+
+    def rows_of(self, messages: Messages) -> Messages:
+        """The message of each row."""
+        count = max(map(len, self.fields.values()), default=1)
+        return messages if count == 1 else messages.chosen(np.repeat(np.arange(len(messages)), count))
 
 
-def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) -> Layout:
+def _in_turn(columns: Sequence[Values]) -> Values:
+    """The first value of each, then the second of each, and so on."""
+    if len(columns) == 1:
+        return columns[0]
+    return np.column_stack([*map(np.asarray, columns)]).ravel() if columns else np.empty(0)
+
+
+def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Sequence[Field]]) -> Layout:
     """From one message; `static` masks the bits that shape the layout."""
     mask = np.frombuffer(static, dtype=np.uint8)
     content = np.frombuffer(payload, dtype=np.uint8)
     used = mask != 0
-    for field in fields.values():
+    for field in chain.from_iterable(fields.values()):
         used[field.start : field.end] = True
     places = np.flatnonzero(used)
     stretches = []
@@ -165,56 +205,66 @@ def _by_length(messages: Messages) -> Iterator[tuple[int, Messages]]:
 
 
 class LayoutDecoder:
-    """Decodes the messages of a channel by their layouts, which it learns as they come."""
+    """Decodes the messages of a channel by their layouts, which it learns as they come.
 
-    def __init__(self, walk: Callable[[bytes], Layout]) -> None:
+    `slow_messages`: those whose layout was not kept. Raises `InputError` for a message that cannot be decoded.
+    """
+
+    def __init__(self, channel: Channel, walk: Callable[[bytes], Layout]) -> None:
+        self.slow_messages = 0
+        self._channel = channel
         self._walk = walk
         self._layouts: dict[int, list[Layout]] = {}
-        self._count = 0
+        self._kept = 0
 
-    def decode(self, messages: Messages) -> tuple[list[tuple[Messages, Columns]], list[Messages]]:
-        """Messages whose layout is known with their fields, and those that no layout fits."""
-        parts: list[tuple[Messages, Columns]] = []
-        left: list[Messages] = []
+    def decode(self, messages: Messages) -> Iterator[Decoded]:
+        """The fields of all messages, of those of one layout together."""
         for length, alike in _by_length(messages):
-            for layout, group, rows in self._by_layout(length, alike, left):
-                try:
-                    parts.append((group, layout.values(rows)))
-                except UnfitError:  # the ordinary decoder says why
-                    left.append(group)
-        return parts, left
+            yield from self._by_layout(alike, self._layouts.setdefault(length, []))
 
-    def _by_layout(
-        self, length: int, messages: Messages, aside: list[Messages]
-    ) -> Iterator[tuple[Layout, Messages, list[Bytes]]]:
-        """Messages of one length by their layouts, with the stretches of these; those without one into `aside`."""
-        known = self._layouts.setdefault(length, [])
+    def _by_layout(self, left: Messages, known: list[Layout]) -> Iterator[Decoded]:
         tried = 0
-        while len(messages):
-            if tried == len(known) and not self._learn(messages.payload(0), known):
-                if len(aside) >= _MOST_ASIDE:
-                    aside.append(messages)
-                    return
-                aside.append(messages.chosen(slice(1)))
-                messages = messages.chosen(slice(1, None))
+        while len(left):
+            if tried == len(known) and not self._learn(left, known):
+                yield self._alone(left.chosen(slice(1)))
+                left = left.chosen(slice(1, None))
                 continue
             layout = known[tried]
             tried += 1
-            rows = layout.rows(messages)
+            rows = layout.rows(left)
             agree = layout.of(rows)
             if agree.all():
-                yield layout, messages, rows
+                yield self._decoded(layout, left, rows)
                 return
             if agree.any():
-                yield layout, messages.chosen(agree), [stretch[agree] for stretch in rows]
-            messages = messages.chosen(~agree)
+                yield self._decoded(layout, left.chosen(agree), [stretch[agree] for stretch in rows])
+            left = left.chosen(~agree)
 
-    def _learn(self, payload: bytes, known: list[Layout]) -> bool:
-        if self._count >= _MOST_LAYOUTS or len(payload) > _LARGEST_LEARNT:
+    def _learn(self, messages: Messages, known: list[Layout]) -> bool:
+        """Whether the layout of the first message is known from now on."""
+        if self._kept >= _MOST_LAYOUTS or messages.length[0] > _LARGEST_KEPT:
             return False
-        try:
-            known.append(self._walk(payload))
-        except UnfitError:
-            return False
-        self._count += 1
+        known.append(self._layout_of_first(messages))
+        self._kept += 1
         return True
+
+    def _alone(self, message: Messages) -> Decoded:
+        self.slow_messages += 1
+        layout = self._layout_of_first(message)
+        return self._decoded(layout, message, layout.rows(message))
+
+    def _layout_of_first(self, messages: Messages) -> Layout:
+        try:
+            return self._walk(messages.payload(0))
+        except UndecodableError as error:
+            raise undecodable(self._channel, messages.log_time[0], error) from None
+
+    def _decoded(self, layout: Layout, messages: Messages, rows: Sequence[Bytes]) -> Decoded:
+        try:
+            return layout.rows_of(messages), layout.values(rows)
+        except UndecodableError as error:
+            if len(messages) == 1:
+                raise undecodable(self._channel, messages.log_time[0], error) from None
+        for row in range(len(messages)):  # one of them cannot be decoded
+            self._decoded(layout, messages.chosen(slice(row, row + 1)), [stretch[row : row + 1] for stretch in rows])
+        raise AssertionError("messages that can be decoded one by one cannot be decoded together")

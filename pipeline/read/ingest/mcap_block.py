@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -32,14 +31,12 @@ _FIXED_FIELDS = MESSAGE_HEAD.itemsize - HEAD_SIZE
 
 @dataclass(frozen=True)
 class Messages:
-    """Messages of one channel in a block, in order of the file.
+    """Messages of one channel in a block, in order of the file: where their payloads lie in the records of the block.
 
-    `start` says where payloads lie in `pieces`, counted as if these followed each other; `bases` is where each begins.
     Times are in nanoseconds; `before` is the size of all blocks before this one.
     """
 
-    pieces: Sequence[Bytes]
-    bases: Ints
+    data: Bytes
     start: Ints
     length: Ints
     log_time: Ints
@@ -58,22 +55,12 @@ class Messages:
         """The last field of the heads that stand before the payloads."""
         return self.stretches(-8, 0).view("<i8")[:, 0]
 
-    def by_piece(self) -> Iterator[tuple[Bytes, Ints, Ints]]:
-        """Each piece that holds some, with the offsets in it from which and to which each payload goes."""
-        bounds = [*np.searchsorted(self.start, self.bases).tolist(), len(self)]
-        for piece, base, (first, end) in zip(self.pieces, self.bases, pairwise(bounds), strict=True):
-            if first < end:
-                starts = self.start[first:end] - base
-                yield piece, starts, starts + self.length[first:end]
-
     def stretches(self, start: int, end: int) -> Bytes:
         """From one byte to another of each payload, one row each; the payloads must be that long."""
-        parts = [stretches_of(piece, starts + start, end - start) for piece, starts, _ in self.by_piece()]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return stretches_of(self.data, self.start + start, end - start)
 
     def payload(self, row: int) -> bytes:
-        ((piece, (start,), (end,)),) = self.chosen(slice(row, row + 1)).by_piece()
-        return piece[start:end].tobytes()
+        return self.data[self.start[row] :][: self.length[row]].tobytes()
 
     def chosen(self, rows: Ints | Bools | slice) -> Messages:
         """Some of them."""
@@ -229,18 +216,26 @@ def _walked(content: Any, starts: array[int], offset: int) -> Piece:
 
 def block_of(pieces: list[Piece], before: int) -> Block:
     """The messages of neighbouring pieces, by channel; `before` is the size of the pieces before these."""
-    data = [piece.data for piece in pieces]
-    bases = np.cumsum([0, *map(len, data[:-1])])
-    starts = np.concatenate([piece.starts + base for piece, base in zip(pieces, bases, strict=True)])
-    channels, lengths, log_times = (
-        np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("channels", "lengths", "log_times")
-    )
-    order = np.argsort(channels, kind="stable")
-    ordered = channels[order]
+    whole = pieces[0] if len(pieces) == 1 else _together(pieces)
+    order = np.argsort(whole.channels, kind="stable")
+    channels = whole.channels[order]
+    starts = whole.starts + MESSAGE_HEAD.itemsize
+    lengths = whole.lengths - _FIXED_FIELDS
     return {
-        int(channels[rows[0]]): Messages(
-            data, bases, starts[rows] + MESSAGE_HEAD.itemsize, lengths[rows] - _FIXED_FIELDS, log_times[rows], before
-        )
-        for rows in np.split(order, np.flatnonzero(ordered[1:] != ordered[:-1]) + 1)
+        int(whole.channels[rows[0]]): Messages(whole.data, starts[rows], lengths[rows], whole.log_times[rows], before)
+        for rows in np.split(order, np.flatnonzero(channels[1:] != channels[:-1]) + 1)
         if len(rows)
     }
+
+
+def _together(pieces: list[Piece]) -> Piece:
+    bases = np.cumsum([0, *(len(piece.data) for piece in pieces[:-1])])
+    return Piece(
+        data=np.concatenate([piece.data for piece in pieces]),
+        starts=np.concatenate([piece.starts + base for piece, base in zip(pieces, bases, strict=True)]),
+        opcodes=np.concatenate([piece.opcodes for piece in pieces]),
+        channels=np.concatenate([piece.channels for piece in pieces]),
+        lengths=np.concatenate([piece.lengths for piece in pieces]),
+        log_times=np.concatenate([piece.log_times for piece in pieces]),
+        offset=pieces[0].offset,
+    )

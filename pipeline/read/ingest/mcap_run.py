@@ -13,7 +13,7 @@ import polars as pl
 from pipeline.read.ingest.assemble import DecodedRows, stream_frames
 from pipeline.read.ingest.conform import refuse
 from pipeline.read.ingest.correct import read_corrections
-from pipeline.read.ingest.generic import UndecodableError, decoder_for, fields_of, undecodable
+from pipeline.read.ingest.fields import fields_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel, DamageError
 from pipeline.read.ingest.mcap_walk import McapWalk
@@ -62,7 +62,9 @@ class McapStreams:
                 remedy="Select topics with [ingest] in the configuration, or remove the others from the log.",
             )
         _check_sizes(messages, channel)
-        return [SourceReader(source) for source in sources_of(_sample_of(messages, channel), self._config)]
+        return [
+            SourceReader(source) for source in sources_of(Sample(channel, fields_of(channel, messages)), self._config)
+        ]
 
 
 def _check_sizes(messages: Messages, channel: Channel) -> None:
@@ -82,14 +84,6 @@ def _pieces(messages: Messages) -> Iterator[Messages]:
         return
     cuts = np.flatnonzero(np.diff(messages.length.cumsum() // _DECODED_TOGETHER)) + 1
     yield from (messages.chosen(rows) for rows in np.split(np.arange(len(messages)), cuts))
-
-
-def _sample_of(messages: Messages, channel: Channel) -> Sample:
-    """The fields of the channel's first message."""
-    try:
-        return Sample(channel, fields_of(decoder_for(channel)(messages.payload(0))))
-    except UndecodableError as error:
-        raise undecodable(channel, messages, 0, error) from None
 
 
 def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> RunLog:

@@ -12,5 +12,4 @@ _TYPES = [*csv.DictReader(line for line in _LINES if not line.startswith("#"))]
 FIX_BY_CODE = {int(row["number"]): Fix(row["fix"]) for row in _TYPES if row["fix"] != Fix.NONE}
 # "Inertial solution status": high variance, good, free, alignment complete. The others are no solution.
 SOLVED = (2, 3, 6, 7)
-SOLVED_WORDS = ("INS_HIGH_VARIANCE", "INS_SOLUTION_GOOD", "INS_SOLUTION_FREE", "INS_ALIGNMENT_COMPLETE")
 FIX_BY_WORD = {word: Fix(row["fix"]) for row in _TYPES for word in row["words"].split()}

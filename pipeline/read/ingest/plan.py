@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.read.ingest.conform import DEFAULTS, refuse
-from pipeline.read.ingest.generic import definition_of
+from pipeline.read.ingest.fields import definition_of
 from pipeline.read.ingest.mapping import mapped_recipe, mappings_of
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.recipe import Recipe
@@ -113,6 +113,8 @@ def _source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None
                 doubtful[name] = absent[0]
         elif wanted or not (contract[name].nullable or name in DEFAULTS):
             breaches.append(missing_field(sample.channel, sample.fields, name, absent))
+    if recipe.rows and sample.channel.encoding != "cdr":
+        breaches.append(InputError("holds arrays, which are read of cdr only", place=sample.channel.place))
     times = _times(sample, recipe, mapping, breaches)
     paths = dict.fromkeys([*recipe.key, *(path for name in columns for path in recipe.fields_of(name))])
     types = {path: recipe.type_of(path) for path in paths}
@@ -218,17 +220,7 @@ def _preferred(sources: Sequence[Source]) -> list[Source]:
     of_project = [source for source in sources if source.recipe.own]
     if of_project:
         return of_project
-    whole = [source for source in sources if not source.recipe.supplement]
-    return [source for source in sources if not _is_outranked(source, sources)] if whole else []
-
-
-def _is_outranked(source: Source, sources: Sequence[Source]) -> bool:
-    """Whether a receiver, whose topics stand side by side, has a message of higher rank; a mapped one always counts."""
-    home = source.channel.topic.rpartition("/")[0]
-    return source.mapping is None and any(
-        0 < source.recipe.rank < other.recipe.rank and other.channel.topic.rpartition("/")[0] == home
-        for other in sources
-    )
+    return list(sources) if any(not source.recipe.supplement for source in sources) else []
 
 
 def _refuse_shared_solutions(sources: Sequence[Source]) -> None:

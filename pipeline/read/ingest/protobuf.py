@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.generic import parse_path
-from pipeline.read.ingest.layout import Field, Layout, UnfitError, Values, constant, fixed, flag, layout_of, text
+from pipeline.read.ingest.layout import (
+    Field,
+    Layout,
+    UndecodableError,
+    Values,
+    constant,
+    fixed,
+    flag,
+    layout_of,
+    parse_path,
+    text,
+)
 from pipeline.read.ingest.mcap_block import Bytes
 
 # Wire types (protobuf encoding guide).
@@ -20,8 +30,9 @@ _LEN = 2
 _I32 = 5
 _LONGEST_TAG = 5  # bytes: tags and lengths are numbers of 32 bits
 # descriptor.proto: FieldDescriptorProto.Type
-_BOOL, _STRING, _MESSAGE = 8, 9, 11
+_BOOL, _STRING, _MESSAGE, _BYTES = 8, 9, 11, 12
 _FIXED_WIDTH = {1: "<f8", 6: "<u8", 16: "<i8", 2: "<f4", 7: "<u4", 15: "<i4"}
+_WIRE_OF_WIDTH = {"8": _I64, "4": _I32, "": _VARINT}
 # What remains of the 64 bits: an int32 below zero is written with all 64 bits of its sign.
 _VARINTS = {3: np.int64, 4: np.uint64, 5: np.int32, 13: np.uint32, 14: np.int32}
 _ZIGZAG = (17, 18)  # sint32, sint64
@@ -50,7 +61,7 @@ class _Walk:
     """The walk through one message; what is not wanted only shapes the layout."""
 
     def __init__(self, payload: bytes, types: Mapping[str, pl.DataType]) -> None:
-        self.fields: dict[str, Field] = {}
+        self.fields: dict[str, list[Field]] = {}
         self.static = bytearray(len(payload))
         self._payload = payload
         self._types = types
@@ -61,18 +72,24 @@ class _Walk:
         for step, subtree in tree.items():
             field = descriptor.fields_by_name.get(step) if isinstance(step, str) else None
             if field is None:
-                raise UnfitError(f"no field {step}")
+                raise UndecodableError(f"no field {step}")
             places = met.get(field.number, [])
-            if len(places) > 1:
-                raise UnfitError("a field occurs twice")
-            if not places:
-                self._absent(field, subtree)
-            elif field.is_repeated:
-                self._packed(field, subtree, *places[0])
-            elif field.type == _MESSAGE and places[0][0] == _LEN:
-                self.message(field.message_type, subtree, *places[0][1:])
+            if field.is_repeated:
+                self._elements(field, subtree, self._unpacked(field.type, places))
+            elif len(places) > 1:
+                raise UndecodableError(f"the field {step} occurs twice")
+            elif places:
+                self._value(field, subtree, places[0])
             else:
-                self._keep(subtree, _value(field.type, *places[0]))
+                self._absent(field, subtree)
+
+    def _value(self, field: Any, tree: Mapping[Any, Any], place: Raw) -> None:
+        if field.type == _MESSAGE and place[0] == _LEN:
+            self.message(field.message_type, tree, *place[1:])
+        elif (path := tree.get("")) is None or len(tree) > 1:
+            raise UndecodableError(f"the field {field.name} is no message")
+        else:
+            self.fields[path] = [_field(field.type, *place).as_type(self._types[path])]
 
     def _scan(self, at: int, end: int) -> dict[int, list[Raw]]:
         """All fields of one message by number; tags, lengths and widths of varints are marked as static."""
@@ -89,9 +106,9 @@ class _Walk:
             elif wire in (_I64, _I32):
                 at = start + (8 if wire == _I64 else 4)
             else:
-                raise UnfitError("a group or unknown wire type")
+                raise UndecodableError("a group or unknown wire type")
             if at > end or number == 0 or tag >> 32:
-                raise UnfitError("a field runs past its message")
+                raise UndecodableError("a field runs past its message")
             met.setdefault(number, []).append((wire, start, at))
         return met
 
@@ -107,44 +124,54 @@ class _Walk:
             at += 1
             if byte < 0x80:
                 return value, at
-        raise UnfitError("a number runs past its message, or is too long")
+        raise UndecodableError("a number runs past its message, or is too long")
 
-    def _packed(self, field: Any, tree: Mapping[Any, Any], wire: int, start: int, end: int) -> None:
-        """Elements of a packed array of fixed width."""
-        dtype = _FIXED_WIDTH.get(field.type)
-        if dtype is None or wire != _LEN or (end - start) % int(dtype[2]):
-            raise UnfitError("an array without fixed width")
+    def _unpacked(self, kind: int, places: list[Raw]) -> list[Raw]:
+        """The elements of an array; numbers may be packed side by side."""
+        elements: list[Raw] = []
+        for wire, start, end in places:
+            if wire == _LEN and kind not in (_STRING, _MESSAGE, _BYTES):
+                elements += self._packed(kind, start, end)
+            else:
+                elements.append((wire, start, end))
+        return elements
+
+    def _packed(self, kind: int, at: int, end: int) -> Iterator[Raw]:
+        dtype = _FIXED_WIDTH.get(kind, "")
+        while at < end:
+            start = at
+            at = at + int(dtype[2]) if dtype else self._varint(at, end, 0x80)[1]
+            if at > end:
+                raise UndecodableError("an array ends inside a number")
+            yield _WIRE_OF_WIDTH[dtype[2:]], start, at
+
+    def _elements(self, field: Any, tree: Mapping[Any, Any], elements: list[Raw]) -> None:
         for index, subtree in tree.items():
-            offset = start + int(dtype[2]) * index if isinstance(index, int) else end
-            if offset < end:
-                self._keep(subtree, fixed(offset, dtype))
+            if not isinstance(index, int):
+                raise UndecodableError(f"the field {field.name} is an array")
+            if index < len(elements):
+                self._value(field, subtree, elements[index])
             else:
                 self._null(subtree)
 
     def _absent(self, field: Any, tree: Mapping[Any, Any]) -> None:
-        """A field that is left out: null where presence is known or it is an array, else the default."""
-        if field.is_repeated or field.has_presence:
+        """A field that is left out: null where presence is known, else the default."""
+        if field.has_presence:
             self._null(tree)
         elif (path := tree.get("")) is not None:
-            self.fields[path] = constant(field.default_value, self._types[path])
+            self.fields[path] = [constant(field.default_value, self._types[path])]
 
     def _null(self, tree: Mapping[Any, Any]) -> None:
         """Every field below an absent message is null."""
         for step, node in tree.items():
             if step == "":
-                self.fields[node] = constant(None, self._types[node])
+                self.fields[node] = [constant(None, self._types[node])]
             else:
                 self._null(node)
 
-    def _keep(self, tree: Mapping[Any, Any], field: Field) -> None:
-        path = tree.get("")
-        if path is None or len(tree) > 1:
-            raise UnfitError("a field is used as a message")
-        self.fields[path] = field.as_type(self._types[path])
 
-
-def _value(kind: int, wire: int, start: int, end: int) -> Field:
-    if kind in _FIXED_WIDTH and wire == (_I64 if _FIXED_WIDTH[kind].endswith("8") else _I32):
+def _field(kind: int, wire: int, start: int, end: int) -> Field:
+    if kind in _FIXED_WIDTH and wire == _WIRE_OF_WIDTH[_FIXED_WIDTH[kind][2:]]:
         return fixed(start, _FIXED_WIDTH[kind])
     if kind == _STRING and wire == _LEN:
         return text(start, end - start)
@@ -152,7 +179,7 @@ def _value(kind: int, wire: int, start: int, end: int) -> Field:
         return flag(start)
     if wire == _VARINT and (kind in _VARINTS or kind in _ZIGZAG):
         return Field(pl.Int64, start, end, lambda rows: _numbers(rows, kind))
-    raise UnfitError("wire type")
+    raise UndecodableError("a field is written as another type than its schema says")
 
 
 def _numbers(septets: Bytes, kind: int) -> Values:

@@ -1,19 +1,16 @@
-"""Messages of a channel to columns: the columnar decoder of its encoding, and the ordinary one for the rest."""
+"""Messages of a channel to columns, by the decoder of their encoding."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 import polars as pl
 
-from pipeline.read.ingest.generic import decode_columns, definition_of
+from pipeline.read.ingest.fields import definition_of
 from pipeline.read.ingest.json_columns import JsonDecoder
-from pipeline.read.ingest.layout import Columns, LayoutDecoder, Values
+from pipeline.read.ingest.layout import LayoutDecoder, Values
 from pipeline.read.ingest.mcap_block import Messages
-from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.plan import Source
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import layout_of_cdr
@@ -23,19 +20,14 @@ from schemas.arrays import Ints
 ORDINAL = "(ordinal)"  # place of a message in the file
 
 
-class Decoder(Protocol):
-    def decode(self, messages: Messages) -> tuple[list[tuple[Messages, Columns]], list[Messages]]:
-        """Messages with their fields, and those that are left to the ordinary decoder."""
-
-
-def decoder_of(channel: Channel, types: Mapping[str, pl.DataType]) -> Decoder:
-    """The columnar decoder of the channel's encoding."""
+def _decoder_of(source: Source) -> JsonDecoder | LayoutDecoder:
+    channel = source.channel
     if channel.encoding == "json":
-        return JsonDecoder(types)
+        return JsonDecoder(channel, source.types)
+    definition = definition_of(channel)
     if channel.encoding == "cdr":
-        definitions, name = definition_of(channel)
-        return LayoutDecoder(partial(layout_of_cdr, definitions, name, types))
-    return LayoutDecoder(layout_by(definition_of(channel).DESCRIPTOR, types))
+        return LayoutDecoder(channel, partial(layout_of_cdr, definition, source.types, source.recipe.rows))
+    return LayoutDecoder(channel, layout_by(definition.DESCRIPTOR, source.types))
 
 
 class SourceReader:
@@ -43,29 +35,26 @@ class SourceReader:
 
     def __init__(self, source: Source) -> None:
         self.source = source
-        self.slow_messages = 0
-        self._decoder = None if source.recipe.rows else decoder_of(source.channel, source.types)
+        self._decoder = _decoder_of(source)
         used = {name for time in source.times.values() for name in time.fields}
         self._times = [name for name in (LOG_TIME, PUBLISH_TIME) if name in used]
         self._types = {name: pl.Int64() for name in (ORDINAL, *self._times)} | dict(source.types)
         self._parts: dict[str, list[Values]] = {name: [] for name in self._types}
 
+    @property
+    def slow_messages(self) -> int:
+        return self._decoder.slow_messages
+
     def add(self, messages: Messages) -> None:
         """Decode these messages."""
-        parts, left = self._decoder.decode(messages) if self._decoder else ([], [messages])
-        for decoded, columns in parts:
-            self._keep(decoded, columns)
-        for rest in left:
-            self.slow_messages += len(rest)
-            columns, numbers = decode_columns(self.source.channel, rest, self.source.types, self.source.recipe.rows)
-            self._keep(rest.chosen(np.array(numbers, dtype=np.int64)), columns)
-
-    def _keep(self, messages: Messages, columns: Columns) -> None:
-        values: dict[str, Values] = {ORDINAL: messages.ordinal, **columns}
-        values |= {LOG_TIME: messages.log_time} if LOG_TIME in self._times else {}
-        values |= {PUBLISH_TIME: messages.publish_time} if PUBLISH_TIME in self._times else {}
-        for name, parts in self._parts.items():
-            parts.append(values[name])
+        for decoded, columns in self._decoder.decode(messages):
+            if not len(decoded):  # messages of empty arrays
+                continue
+            values: dict[str, Values] = {ORDINAL: decoded.ordinal, **columns}
+            values |= {LOG_TIME: decoded.log_time} if LOG_TIME in self._times else {}
+            values |= {PUBLISH_TIME: decoded.publish_time} if PUBLISH_TIME in self._times else {}
+            for name, parts in self._parts.items():
+                parts.append(values[name])
 
     def frame(self) -> pl.DataFrame:
         """One row per message in order of the file; what was collected is given up."""

@@ -26,7 +26,6 @@ class Recipe:
     the types of others that are no floats. `key` names the fields by which a `supplement` (a message that holds
     further columns of the same epochs, such as a covariance) finds its epoch. `time` is set where the time is a
     calendar. `rows` names an array whose elements become one row each; paths are then looked up in the element first.
-    `rank`: of messages of one receiver only those of the highest one count.
     """
 
     stream: Stream
@@ -40,7 +39,6 @@ class Recipe:
     remark: str = ""
     time: CivilTime | None = None
     rows: str = ""
-    rank: int = 0
 
     def fields_of(self, column: str) -> list[str]:
         """The recorded fields that a column is made of."""
@@ -50,7 +48,7 @@ class Recipe:
         return self.types.get(path, pl.Int64() if path in self.whole else pl.Float64())
 
 
-def fix_from(codes: pl.Expr, kinds: Mapping[int, Fix] | Mapping[str, Fix], known: pl.Expr | None = None) -> pl.Expr:
+def fix_from(codes: pl.Expr, kinds: Mapping[int, Fix], known: pl.Expr | None = None) -> pl.Expr:
     """The kind of fix from a receiver's code; none of a code that is not listed, and where it is not `known`."""
     names = {code: kind.value for code, kind in kinds.items()}
     fix = codes.replace_strict(names, default=Fix.NONE.value, return_dtype=FIX_TYPE)

@@ -10,8 +10,8 @@ import math
 
 import polars as pl
 
-from pipeline.read.ingest import recipes_novatel
-from pipeline.read.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, fix_from, places_of, unless
+from pipeline.read.ingest import novatel
+from pipeline.read.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, deviations, fix_from, places_of, unless
 from pipeline.read.ingest.stamps import CivilTime
 from schemas.enums import Fix
 
@@ -146,6 +146,22 @@ def _nav_sat(stamps: dict[str, str], rows: str, used: pl.Expr, types: dict[str, 
     )
 
 
+def _bestpos() -> Recipe:
+    """novatel_oem7_msgs/msg/BESTPOS: its height is over mean sea level, so the undulation is added."""
+    return Recipe(
+        stream="gnss",
+        columns={
+            "latitude_deg": pl.col("lat"),
+            "longitude_deg": pl.col("lon"),
+            "height_m": pl.col("hgt") + pl.col("undulation"),
+            **deviations("lon_stdev", "lat_stdev", "hgt_stdev"),
+            "fix": fix_from(pl.col("pos_type.type"), novatel.FIX_BY_CODE, known=pl.col("sol_status.status") == 0),
+            "satellites": pl.col("num_sol_svs"),
+        },
+        whole=("sol_status.status", "pos_type.type", "num_sol_svs"),
+    )
+
+
 # gps_msgs/GPSStatus: status.
 _GPS_STATUS = {
     0: Fix.AUTONOMOUS, 1: Fix.SBAS, 2: Fix.DIFFERENTIAL, 18: Fix.DIFFERENTIAL, 19: Fix.RTK_FIXED, 20: Fix.RTK_FLOAT,
@@ -185,6 +201,6 @@ BY_SCHEMA: dict[str, tuple[Recipe, ...]] = {
         _nav_sat({"t": "header.stamp"}, "sv_info", pl.col("flags.sv_used"), {"flags.sv_used": pl.Boolean()}),
     ),
     "ublox_msgs/msg/NavSAT": (_nav_sat({}, "sv", (pl.col("flags") & 8) == 8, {}),),
-    **recipes_novatel.BY_SCHEMA,
+    "novatel_oem7_msgs/msg/BESTPOS": (_bestpos(),),
     "gps_msgs/msg/GPSFix": (_gps_fix(),),
 }

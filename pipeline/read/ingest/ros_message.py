@@ -1,18 +1,17 @@
-"""ROS 2 messages: the `ros2msg` text that a log carries, one message of CDR by it, and the layout of such messages."""
+"""ROS 2 messages: the `ros2msg` text that a log carries, and the layout of a message of CDR by it."""
 
 from __future__ import annotations
 
 import re
-import sys
-from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from itertools import chain
+from typing import NamedTuple
 
 import polars as pl
 
-from pipeline.read.ingest.layout import Field, Layout, UnfitError, fixed, flag, layout_of, text
+from pipeline.read.ingest.layout import Field, Layout, UndecodableError, constant, fixed, flag, layout_of, text
 
 PRIMITIVES = {
     "bool": "u1", "byte": "u1", "char": "i1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
@@ -20,7 +19,7 @@ PRIMITIVES = {
 }  # fmt: skip
 HEADER_SIZE = 4  # encapsulation: representation, options
 DEEPEST = 32  # messages inside each other
-_CODES = {"u1": "B", "i1": "b", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q", "f4": "f", "f8": "d"}
+_MOST_SHOWN = 64  # elements of an array that are named one by one
 # One line at a time, and no two parts of the pattern that could take the same characters: the time is linear.
 _LINE = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?:<=)?\d{0,9}\])?\s+(?P<name>[A-Za-z]\w*)(?P<rest>(?:[\s=].*)?)",
@@ -29,7 +28,7 @@ _LINE = re.compile(
 
 
 class DefinitionError(ValueError):
-    """A definition that is not understood, or a message that does not follow it."""
+    """A definition that is not understood."""
 
 
 @dataclass(frozen=True)
@@ -105,69 +104,78 @@ class FieldPlace(NamedTuple):
 
 
 class RosWalk:
-    """One message of CDR, front to back, as a dict; numbers are aligned to their size, counted from behind the header.
+    """The walk through one message of CDR; numbers are aligned to their size, counted from behind the header.
 
-    `places` and `lengths` tell where its fields and the lengths that shape it were met. Raises `DefinitionError` where
-    the message does not follow its definition.
+    `places` tells where its fields were met, `counts` how many messages its arrays of them hold, `lengths` where what
+    shapes it stands. Raises `UndecodableError` where the message does not follow its definition.
     """
 
-    def __init__(self, payload: bytes, definitions: Mapping[str, Definition]) -> None:
+    def __init__(self, payload: bytes, definitions: Mapping[str, Definition], name: str) -> None:
         if len(payload) < HEADER_SIZE or payload[0] != 0 or payload[1] not in (0, 1):
-            raise DefinitionError(f"encapsulation 0x{payload[:2].hex()} is not plain CDR")
+            raise UndecodableError(f"encapsulation 0x{payload[:2].hex()} is not plain CDR")
         self.little = bool(payload[1])
         self.places: dict[str, FieldPlace] = {}
+        self.counts: dict[str, int] = {}
         self.lengths: list[int] = []
         self._payload = payload
         self._definitions = definitions
         self._at = HEADER_SIZE
+        self._message(name, "", 0)
 
-    def message(self, name: str, path: str = "", depth: int = 0) -> dict[str, Any]:
+    def kinds(self) -> Iterator[tuple[str, str]]:
+        """The fields with their kind: `int`, `float`, `text`, `flag`."""
+        for path, place in self.places.items():
+            code = PRIMITIVES.get(place.kind)
+            kind = "text" if code is None else "flag" if place.kind == "bool" else "float" if code[0] == "f" else "int"
+            if code is None or place.size is None:
+                yield path, kind
+            else:
+                yield from ((f"{path}[{index}]", kind) for index in range(min(place.size, _MOST_SHOWN)))
+
+    def _message(self, name: str, path: str, depth: int) -> None:
         if name not in self._definitions or depth > DEEPEST:
-            raise DefinitionError(f"no definition of {name}")
+            raise UndecodableError(f"no definition of {name}")
         members = self._definitions[name]
         if not members:
             self._take(1, 1)  # IDL knows no empty structure: ROS 2 puts one byte there
-        return {m.name: self._member(m, f"{path}.{m.name}" if path else m.name, depth) for m in members}
+        for member in members:
+            self._member(member, f"{path}.{member.name}" if path else member.name, depth)
 
-    def _member(self, member: Member, path: str, depth: int) -> Any:
+    def _member(self, member: Member, path: str, depth: int) -> None:
         if member.count is None:
-            return self._value(member.type, path, depth)
+            self._value(member.type, path, depth)
+            return
         count = member.count or self._length()
         if member.type in PRIMITIVES:
-            return self._numbers(member.type, path, count) if count else []
-        return [self._value(member.type, f"{path}[{index}]", depth) for index in range(count)]
+            if count:
+                self._numbers(member.type, path, count)
+            return
+        self.counts[path] = count
+        for index in range(count):
+            self._value(member.type, f"{path}[{index}]", depth)
 
-    def _value(self, kind: str, path: str, depth: int) -> Any:
+    def _value(self, kind: str, path: str, depth: int) -> None:
         if kind in PRIMITIVES:
-            return self._numbers(kind, path, None)[0]
-        if kind == "string":
-            return self._text(path)
-        if kind == "wstring":
-            raise DefinitionError("wide text is not read")
-        return self.message(kind, path, depth + 1)
+            self._numbers(kind, path, None)
+        elif kind == "string":
+            self._text(path)
+        elif kind == "wstring":
+            raise UndecodableError("wide text is not read")
+        else:
+            self._message(kind, path, depth + 1)
 
-    def _numbers(self, kind: str, path: str, count: int | None) -> Sequence[Any]:
-        code = PRIMITIVES[kind]
-        size = int(code[1])
+    def _numbers(self, kind: str, path: str, count: int | None) -> None:
+        size = int(PRIMITIVES[kind][1])
         offset = self._take(size * (1 if count is None else count), size)
         self.places[path] = FieldPlace(kind, offset, count)
-        values = array(_CODES[code], self._payload[offset : self._at])
-        if self.little != (sys.byteorder == "little"):
-            values.byteswap()
-        return [bool(value) for value in values] if kind == "bool" else values
 
-    def _text(self, path: str) -> str:
+    def _text(self, path: str) -> None:
         """A text with its closing zero, which programs leave out where there is no text."""
         length = self._length()
         offset = self._take(length, 1)
+        if length and self._payload[self._at - 1]:
+            raise UndecodableError("a text has no closing zero")
         self.places[path] = FieldPlace("string", offset, length)
-        content = self._payload[offset : self._at]
-        if content and content[-1]:
-            raise DefinitionError("a text has no closing zero")
-        try:
-            return content[:-1].decode()
-        except UnicodeDecodeError:
-            raise DefinitionError("a text is not UTF-8") from None
 
     def _length(self) -> int:
         offset = self._take(4, 4)
@@ -177,45 +185,50 @@ class RosWalk:
     def _take(self, size: int, alignment: int) -> int:
         start = self._at + -(self._at - HEADER_SIZE) % alignment
         if start + size > len(self._payload):
-            raise DefinitionError("the message ends too early")
+            raise UndecodableError("the message ends too early")
         self._at = start + size
         return start
 
 
 def layout_of_cdr(
-    definitions: Mapping[str, Definition], name: str, types: Mapping[str, pl.DataType], payload: bytes
+    definition: tuple[Mapping[str, Definition], str], types: Mapping[str, pl.DataType], rows: str, payload: bytes
 ) -> Layout:
-    """Where the wanted fields lie, and which bytes shape the message."""
-    try:
-        walk = RosWalk(payload, definitions)
-        walk.message(name)
-    except DefinitionError as error:
-        raise UnfitError(str(error)) from None
+    """Where the wanted fields lie, and which bytes shape the message.
+
+    `rows`: an array of which each element makes a row; fields that it does not hold are those of the message.
+    """
+    walk = RosWalk(payload, *definition)
+    elements = [f"{rows}[{index}]." for index in range(walk.counts.get(rows, 0))] if rows else [""]
+    fields = {
+        path: [_field(walk, f"{element}{path}", path, dtype) for element in elements] for path, dtype in types.items()
+    }
     static = bytearray(len(payload))
     static[0:2] = b"\xff\xff"
     for offset in walk.lengths:
         static[offset : offset + 4] = b"\xff" * 4
-    fields: dict[str, Field] = {}
-    for path, dtype in types.items():
-        array = re.fullmatch(r"(.*)\[([0-9]+)\]", path)
-        place = walk.places.get(path)
-        index = 0
-        if place is None and array and (whole := walk.places.get(array[1])) and int(array[2]) < (whole.size or 0):
-            place = whole
-            index = int(array[2])
-        elif place is None or (place.size is not None and place.kind != "string"):
-            raise UnfitError(f"no field {path}")
-        fields[path] = _field(place, index, walk.little).as_type(dtype)
-        if place.kind == "string":
-            static[fields[path].end] = 0xFF  # the closing zero
+    for field in chain.from_iterable(fields.values()):
+        if field.kind is pl.String and field.end > field.start:
+            static[field.end] = 0xFF  # the closing zero
     return layout_of(payload, static, fields)
 
 
-def _field(place: FieldPlace, index: int, little: bool) -> Field:
+def _field(walk: RosWalk, path: str, outside: str, dtype: pl.DataType) -> Field:
+    """The field of this path in an element or, by the path `outside` of it, in the message."""
+    place = walk.places.get(path) or walk.places.get(outside)
+    if place is not None and (place.size is None or place.kind == "string"):
+        return _field_at(place, 0, walk.little).as_type(dtype)
+    array = re.fullmatch(r"(.*)\[([0-9]+)\]", path)
+    place = walk.places.get(array[1]) if array else None
+    if array and place and int(array[2]) < (place.size or 0):
+        return _field_at(place, int(array[2]), walk.little).as_type(dtype)
+    if "[" not in path:
+        raise UndecodableError(f"no field {path}")
+    return constant(None, dtype)  # beyond the end of a sequence
+
+
+def _field_at(place: FieldPlace, index: int, little: bool) -> Field:
     if place.kind == "string":
-        if not place.size:
-            raise UnfitError("a text without its closing zero")
-        return text(place.offset, place.size - 1)
+        return text(place.offset, place.size - 1) if place.size else constant("", pl.String())
     code = PRIMITIVES[place.kind]
     offset = place.offset + index * int(code[1])
     return flag(offset) if place.kind == "bool" else fixed(offset, ("<" if little else ">") + code)

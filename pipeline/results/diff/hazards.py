@@ -18,32 +18,39 @@ _DECIDING = {
     *("balise_ids", "accepted_ids"),
 }
 
+Change = Literal["appeared", "vanished", "changed"]
+
 
 @dataclass(frozen=True)
 class HazardChange:
     """A hazard that stands in one result only, or in both with other values."""
 
-    change: Literal["appeared", "vanished", "changed"]
+    change: Change
     solution: str
     hazard: str
     t_hazard: str
     differences: tuple[Difference, ...] = ()
 
     @property
+    def _deciding(self) -> list[str]:
+        return [item.column for item in self.differences if item.column in _DECIDING]
+
+    @property
     def matters(self) -> bool:
         """Whether it is more than other figures of the same hazard."""
-        return self.change != "changed" or bool({item.column for item in self.differences} & _DECIDING)
+        return self.change != "changed" or bool(self._deciding)
+
+    @property
+    def _head(self) -> str:
+        return f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
 
     @property
     def short(self) -> str:
         """The change in one line; of changed values the columns alone."""
-        columns = ", ".join(item.column for item in self.differences if item.column in _DECIDING)
-        head = f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
-        return f"{head}: {columns}" if columns else head
+        return ": ".join(filter(None, [self._head, ", ".join(self._deciding)]))
 
     def __str__(self) -> str:
-        text = f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
-        return text + "".join(f"\n    {item.column}: {item.message}" for item in self.differences)
+        return self._head + "".join(f"\n    {item.column}: {item.message}" for item in self.differences)
 
 
 def compare_hazards(a: pl.DataFrame, b: pl.DataFrame) -> tuple[list[Difference], list[HazardChange]]:
@@ -55,16 +62,14 @@ def compare_hazards(a: pl.DataFrame, b: pl.DataFrame) -> tuple[list[Difference],
     if any(item.column in {"solution", "hazard", "t_hazard"} for item in schema):
         return schema, []
     pairs = _matched(a, b)
-    gone = [row for row in range(a.height) if row not in pairs]
-    come = [row for row in range(b.height) if row not in set(pairs.values())]
-    ids = ["hazard_id", "caused_by"] if gone or come else []
-    changes = [(_stamp(a, row), _change("vanished", a, row)) for row in gone]
-    changes += [(_stamp(b, row), _change("appeared", b, row)) for row in come]
+    changes = [_change("vanished", a, row) for row in range(a.height) if row not in pairs]
+    changes += [_change("appeared", b, row) for row in range(b.height) if row not in pairs.values()]
+    ids = ["hazard_id", "caused_by"] if changes else []
     for row_a, row_b in pairs.items():
-        row_of_a, row_of_b = (frame.drop(ids, strict=False)[row : row + 1] for frame, row in ((a, row_a), (b, row_b)))
-        differing = [item for item in compare_tables(row_of_a, row_of_b, Hazards) if item.kind == "values"]
+        rows = (a.drop(ids, strict=False)[row_a : row_a + 1], b.drop(ids, strict=False)[row_b : row_b + 1])
+        differing = tuple(item for item in compare_tables(*rows, Hazards) if item.kind == "values")
         if differing:
-            changes.append((_stamp(a, row_a), _change("changed", a, row_a, tuple(differing))))
+            changes.append(_change("changed", a, row_a, differing))
     return schema, [change for _, change in sorted(changes, key=lambda item: item[0])]
 
 
@@ -83,24 +88,16 @@ def _matched(a: pl.DataFrame, b: pl.DataFrame) -> dict[int, int]:
         and (apart_ns := 0 if t_a == t_b else window_ns + 1 if None in (t_a, t_b) else abs(t_a - t_b)) <= window_ns
     )
     pairs: dict[int, int] = {}
-    matched_b: set[int] = set()
     for _, row_a, row_b in near:
-        if row_a not in pairs and row_b not in matched_b:
+        if row_a not in pairs and row_b not in pairs.values():
             pairs[row_a] = row_b
-            matched_b.add(row_b)
     return dict(sorted(pairs.items()))
 
 
-def _stamp(frame: pl.DataFrame, row: int) -> int:
-    """The hazard's time [ns]; those without one come first."""
-    return int(frame["t_hazard"].to_physical()[row] or 0)
-
-
 def _change(
-    change: Literal["appeared", "vanished", "changed"],
-    frame: pl.DataFrame,
-    row: int,
-    differences: tuple[Difference, ...] = (),
-) -> HazardChange:
+    change: Change, frame: pl.DataFrame, row: int, differences: tuple[Difference, ...] = ()
+) -> tuple[int, HazardChange]:
+    """The change behind its time [ns]; hazards without one come first."""
     t_text = frame["t_hazard"].dt.to_string("%Y-%m-%dT%H:%M:%S%.3fZ")[row] or "an unknown time"
-    return HazardChange(change, frame["solution"][row], str(frame["hazard"][row]), t_text, differences)
+    found = HazardChange(change, frame["solution"][row], str(frame["hazard"][row]), t_text, differences)
+    return int(frame["t_hazard"].to_physical()[row] or 0), found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 import polars as pl
@@ -10,7 +11,6 @@ import polars as pl
 from pipeline import storage
 from pipeline.results import store
 from pipeline.results.diff.hazards import HazardChange, compare_hazards
-from pipeline.results.diff.leading import BALISE_COUNTS, balise_counts, passage_changes, verdict_changes
 from pipeline.results.diff.tables import Difference, compare_tables
 from pipeline.results.workers import told
 from pipeline.storage.address import Address, redacted
@@ -26,6 +26,15 @@ _KEYS: dict[str, tuple[str, ...]] = {
 }
 # How a result was made is shown, but is no change of the result.
 _PROVENANCE = ("config_digest", "input_digest", "software", "contract")
+BALISE_COUNTS = {
+    "balises_on_path": "on the path",
+    "balises_accepted": "accepted",
+    "balises_rejected": "rejected",
+    "balises_missed": "not found",
+    "balises_not_available": "without a position",
+    "unsafe_accepted": "accepted despite a wrong position",
+    "unproven_accepted": "accepted that nothing can check",
+}
 _LINES_SHOWN = 20
 _COLUMNS_SHOWN = 8
 
@@ -147,41 +156,89 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str) -> RunDiff:
     verdicts: tuple[str, ...] = ()
     balises: tuple[str, ...] = ()
     for table, contract in TABLES.items():
-        a, b = (_recorded(out, table, run_id) for out in (out_a, out_b))
-        if isinstance(a, bytes) and isinstance(b, bytes) and a == b:
+        content_a, content_b = (_recorded(out, table, run_id) for out in (out_a, out_b))
+        if isinstance(content_a, bytes) and isinstance(content_b, bytes) and content_a == content_b:
             continue
-        frame_a, frame_b = (_frame(out, table, run_id, content) for out, content in ((out_a, a), (out_b, b)))
-        if frame_a.equals(frame_b):
+        a = _frame(out_a, table, run_id, content_a)
+        b = _frame(out_b, table, run_id, content_b)
+        if a.equals(b):
             continue
         if table == "hazards":
-            differing, hazards = compare_hazards(frame_a, frame_b)
+            differing, hazards = compare_hazards(a, b)
         else:
-            differing = compare_tables(frame_a, frame_b, contract, _KEYS[table])
+            differing = compare_tables(a, b, contract, _KEYS[table])
         if table == "runs":
-            verdicts = verdict_changes(frame_a, frame_b)
-            balises = balise_counts(frame_a, frame_b) + balises
+            verdicts = _changed_words(a, b, {"verdict": ""}, unknown="failed")
+            balises = _changed_words(a, b, BALISE_COUNTS, unknown="unknown") + balises
         elif table == "passages":
-            balises = passage_changes(frame_a, frame_b)
+            balises = _passage_changes(a, b)
         differences += differing
     made = [item for item in differences if item.kind == "values" and item.column in _PROVENANCE]
-    changed = [item for item in differences if item not in made]
-    return RunDiff(run_id, verdicts, balises, tuple(hazards), tuple(changed), tuple(item.column for item in made))
+    changed = tuple(item for item in differences if item not in made)
+    return RunDiff(run_id, verdicts, balises, tuple(hazards), changed, tuple(item.column for item in made))
 
 
-def _frame(out: Address, table: str, run_id: str, recorded: bytes | pl.DataFrame) -> pl.DataFrame:
-    try:
-        return read_parquet(recorded) if isinstance(recorded, bytes) else recorded
-    except ParquetError as error:
-        place = redacted(str(store.table_address(out, table, run_id)))
-        raise UsageError(f"cannot be read: {error}", place=place, remedy="Replay the run again with --force.") from None
+def _changed_words(a: pl.DataFrame, b: pl.DataFrame, columns: Mapping[str, str], unknown: str) -> tuple[str, ...]:
+    """`accepted 15 became 3`: values that changed, of the solutions that stand in both `runs` tables of one run."""
+    changed = []
+    for column, words in columns.items():
+        if column not in a.columns or column not in b.columns:
+            continue
+        before, after = (dict(frame.select("solution", column).iter_rows()) for frame in (a, b))
+        for solution in [name for name in before if name in after]:
+            was, became = (unknown if of[solution] is None else of[solution] for of in (before, after))
+            if before[solution] != after[solution]:
+                changed.append(_of(solution, a, b) + f"{words} {was} became {became}".strip())
+    return tuple(changed)
+
+
+def _passage_changes(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
+    """`VB04 VB05: accepted became rejected_monitor`, from two `passages` tables of one run."""
+    moved: dict[tuple[str, str, str], list[str]] = {}
+    before = _statuses(a)
+    after = _statuses(b)
+    for solution, balise in dict.fromkeys([*before, *after]):
+        was = before.get((solution, balise), "no passage")
+        became = after.get((solution, balise), "no passage")
+        if was != became:
+            moved.setdefault((solution, was, became), []).append(balise)
+    return tuple(
+        f"{_of(solution, a, b)}{' '.join(balises)}: {was} became {became}"
+        for (solution, was, became), balises in moved.items()
+    )
+
+
+def _statuses(passages: pl.DataFrame) -> dict[tuple[str, str], str]:
+    """What became of each balise of each solution, turn by turn."""
+    if not {"solution", "balise_id", "status"} <= set(passages.columns):
+        return {}
+    listed = passages.group_by("solution", "balise_id", maintain_order=True).agg(pl.col("status").cast(pl.String))
+    return {(solution, balise): ", ".join(statuses) for solution, balise, statuses in listed.iter_rows()}
+
+
+def _of(solution: str, a: pl.DataFrame, b: pl.DataFrame) -> str:
+    """The solution in front, where there is more than one."""
+    several = pl.concat([a["solution"], b["solution"]]).n_unique() > 1
+    return f"{solution}: " if several else ""
 
 
 def _recorded(out: Address, table: str, run_id: str) -> bytes | pl.DataFrame:
     """The run's own file, or its rows in a pack."""
     if (packed := store.packed_frame(out, table, run_id)) is not None:
         return packed
-    address = store.table_address(out, table, run_id)
-    if (content := storage.content_of(address)) is None:
-        place = redacted(str(address))
-        raise UsageError("is missing from a complete run", place=place, remedy="Replay the run again with --force.")
+    content = storage.content_of(store.table_address(out, table, run_id))
+    if content is None:
+        raise _unreadable(out, table, run_id, "is missing from a complete run")
     return content
+
+
+def _frame(out: Address, table: str, run_id: str, recorded: bytes | pl.DataFrame) -> pl.DataFrame:
+    try:
+        return read_parquet(recorded) if isinstance(recorded, bytes) else recorded
+    except ParquetError as error:
+        raise _unreadable(out, table, run_id, f"cannot be read: {error}") from None
+
+
+def _unreadable(out: Address, table: str, run_id: str, reason: str) -> UsageError:
+    place = redacted(str(store.table_address(out, table, run_id)))
+    return UsageError(reason, place=place, remedy="Replay the run again with --force.")

@@ -1,4 +1,4 @@
-"""What changed between two results: schemas and whole numbers exactly, floats by their column's tolerance.
+"""What changed between two tables: schemas and whole numbers exactly, floats by their column's tolerance.
 
 The tolerance is absolute and stands in the contract (`metadata["tolerance"]`); there is no relative
 one, which would call positions tens of metres apart the same.
@@ -6,13 +6,12 @@ one, which would call positions tens of metres apart the same.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import dataframely as dy
 import polars as pl
-
-DifferenceKind = Literal["schema", "rows", "values"]
 
 
 @dataclass(frozen=True)
@@ -20,14 +19,13 @@ class Difference:
     """One difference between two tables; `rows` counts the rows concerned."""
 
     table: str
-    kind: DifferenceKind
+    kind: Literal["schema", "rows", "values"]
     column: str
     message: str
     rows: int = 0
 
     @property
     def place(self) -> str:
-        """Table and column."""
         return f"{self.table}.{self.column}" if self.column else self.table
 
     def __str__(self) -> str:
@@ -44,7 +42,7 @@ def compare_tables(
     table may hold, is always a difference.
     """
     name = contract.__name__.lower()
-    differences = _schema_differences(name, a, b)
+    differences = [Difference(name, "schema", *what) for what in _schema_differences(a, b)]
     common = [column for column in a.columns if b.schema.get(column) == a.schema[column]]
     if not set(keys) <= set(common):
         return differences
@@ -56,33 +54,26 @@ def compare_tables(
         return [*differences, Difference(name, "rows", "", f"{a.height} rows became {b.height}", rows)]
     columns = contract.columns()
     for column in common:
-        differing = _values_differ(a[column], b[column], tolerance_of(columns.get(column)))
-        if differing is not None:
-            message, rows = differing
-            differences.append(Difference(name, "values", column, message, rows))
+        if (differing := _values_differ(a[column], b[column], tolerance_of(columns.get(column)))) is not None:
+            differences.append(Difference(name, "values", column, *differing))
     return differences
 
 
 def tolerance_of(column: dy.Column | None) -> float:
     """Absolute tolerance of a column [its unit]; zero where the contract names none."""
-    tolerance = (column.metadata or {}).get("tolerance", 0.0) if column is not None else 0.0
-    return float(tolerance)
+    return float((column.metadata or {}).get("tolerance", 0.0)) if column is not None else 0.0
 
 
-def _schema_differences(table: str, a: pl.DataFrame, b: pl.DataFrame) -> list[Difference]:
-    differences = [
-        Difference(table, "schema", column, "column is lost") for column in a.columns if column not in b.columns
-    ]
-    differences += [
-        Difference(table, "schema", column, "column is new") for column in b.columns if column not in a.columns
-    ]
+def _schema_differences(a: pl.DataFrame, b: pl.DataFrame) -> Iterator[tuple[str, str]]:
+    """Column, or none where it is about all of them, and what became of it."""
     both = [column for column in a.columns if column in b.columns]
-    if both != [column for column in b.columns if column in a.columns]:
-        differences.append(Difference(table, "schema", "", "columns stand in another order"))
+    yield from ((column, "column is lost") for column in a.columns if column not in both)
+    yield from ((column, "column is new") for column in b.columns if column not in both)
+    if both != [column for column in b.columns if column in both]:
+        yield "", "columns stand in another order"
     for column in both:
         if a.schema[column] != b.schema[column]:
-            differences.append(Difference(table, "schema", column, f"{a.schema[column]} became {b.schema[column]}"))
-    return differences
+            yield column, f"{a.schema[column]} became {b.schema[column]}"
 
 
 def _paired(
@@ -91,10 +82,8 @@ def _paired(
     """The rows that stand in both, in the order of `a`; a key that stands twice counts by its turn."""
     by = [*keys, "_turn"]
     a, b = (frame.with_columns(_turn=pl.int_range(pl.len()).over(list(keys))) for frame in (a, b))
-    lost = _joined(a, b, by, "anti")
-    new = _joined(b, a, by, "anti")
     differences = []
-    for word, rows in (("lost", lost), ("new", new)):
+    for word, rows in (("lost", _joined(a, b, by, "anti")), ("new", _joined(b, a, by, "anti"))):
         if rows.height:
             first = ", ".join(f"{key} {_text(rows[key][0])}" for key in keys)
             differences.append(Difference(table, "rows", "", f"{rows.height} rows {word}, first: {first}", rows.height))

@@ -95,39 +95,54 @@ def _too_far(way_m: Floats, dt_s: Floats, config: AlignConfig) -> Bools:
     return far
 
 
-def _resets(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
-    """Moves from one back, longer than a train can brake, turn, brake and turn again, to the next like the one before.
+class _Moves(NamedTuple):
+    """Steps between known rows in which the distance changes: first and last row, way [m], time [s]."""
 
-    Where these differ a single row was wrong, which makes one of them longer; where the moves between make up for the
-    way, a few were.
-    """
-    resets = np.zeros(t_s.size - 1, dtype=np.bool_)
+    first: Ints
+    last: Ints
+    way_m: Floats
+    time_s: Floats
+
+
+def _moves(t_s: Floats, distance_m: Floats) -> _Moves:
     rows = np.flatnonzero(np.isfinite(distance_m))
     moves = np.flatnonzero(np.diff(distance_m[rows]))
     first = rows[moves]
     last = rows[moves + 1]
-    way_m = distance_m[last] - distance_m[first]
-    time_s = t_s[last] - t_s[first]
-    back = (way_m[1:] * way_m[:-1] < 0.0) & (np.abs(way_m[1:]) > _turned_m(time_s[1:], config))
+    return _Moves(first, last, distance_m[last] - distance_m[first], t_s[last] - t_s[first])
+
+
+def _resets(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
+    """Steps from a move back, longer than a train can brake, turn, brake and turn again, to where it counts on."""
+    resets = np.zeros(t_s.size - 1, dtype=np.bool_)
+    moves = _moves(t_s, distance_m)
+    way_m = moves.way_m
+    back = (way_m[1:] * way_m[:-1] < 0.0) & (np.abs(way_m[1:]) > _turned_m(moves.time_s[1:], config))
     for move in (np.flatnonzero(back) + 1).tolist():
-        before_m = way_m[move - 1]
-        after = slice(move + 1, move + 1 + config.reset_moves)
-        since_s = t_s[last[move : after.stop - 1]] - t_s[first[move]]
-        most_m = _turned_m(since_s[: way_m[after].size], config)
-        alike = np.flatnonzero((way_m[after] * before_m > 0.0) & (np.abs(way_m[after] - before_m) <= most_m))
-        if not alike.size:
-            continue
-        end = int(last[move + alike[0]])
-        expected_m = before_m / time_s[move - 1] * since_s[alike[0]]
-        if np.abs(distance_m[end] - distance_m[first[move]] - expected_m) > most_m[alike[0]]:
-            resets[first[move] : end] = True
+        resets[moves.first[move] : _counts_on(moves, move, t_s, distance_m, config)] = True
     return resets
+
+
+def _counts_on(moves: _Moves, back: int, t_s: Floats, distance_m: Floats, config: AlignConfig) -> int:
+    """The row from which a counter counts on that was reset in the move `back`; the first row of that if it was not.
+
+    The next move is like the one before: a single wrong row makes one of them longer by as much as it is off.
+    """
+    begin = int(moves.first[back])
+    before_m = moves.way_m[back - 1]
+    for after in range(back + 1, min(back + 1 + config.reset_moves, moves.way_m.size)):
+        end = int(moves.last[after - 1])
+        most_m = _turned_m(t_s[end] - t_s[begin], config)
+        if moves.way_m[after] * before_m > 0.0 and abs(moves.way_m[after] - before_m) <= most_m:
+            # Where the train has just driven on over these moves, they are of a few wrong rows.
+            driven_m = before_m / moves.time_s[back - 1] * (t_s[end] - t_s[begin])
+            return end if abs(distance_m[end] - distance_m[begin] - driven_m) > most_m else begin
+    return begin
 
 
 def _turned_m(dt_s: Floats, config: AlignConfig) -> Floats:
     """The farthest that a distance falls without a reset: by the fixed error, and from rest to rest."""
-    way_m: Floats = config.reset_back_m + 0.25 * config.braking_mps2 * dt_s**2
-    return way_m
+    return config.reset_back_m + 0.25 * config.braking_mps2 * dt_s**2
 
 
 def _without_spikes(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Floats:

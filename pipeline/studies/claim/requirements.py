@@ -17,13 +17,13 @@ from pipeline.studies.claim.tally import (
     ALWAYS,
     BROKEN,
     NOT_KNOWN,
-    S_PER_H,
     Demand,
     Kind,
     Tally,
     codes,
     counted,
 )
+from pipeline.studies.tally import S_PER_H
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags
 from schemas.enums import AreaType, BaliseKind, PassageStatus
 

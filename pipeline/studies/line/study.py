@@ -16,7 +16,7 @@ from pipeline.studies.line.pieces import Pieces, middles, pieces_of
 from pipeline.studies.line.proposals import LineEvidence, proposals
 from pipeline.studies.line.remarks import remarks
 from pipeline.studies.line.spans import EPOCH_COLUMNS, SpanState
-from pipeline.studies.trials import distinct
+from pipeline.studies.tally import distinct
 from schemas.arrays import floats
 from schemas.config import Configuration
 from schemas.enums import Evidence

@@ -8,9 +8,9 @@ held to the anchor; from there on it grows by what the restarted bank lets pass,
     held to anchor A     f(k) <= U(A) + b(A, k) - (x(k) - x(A))          x: GNSS minus odometer as recorded
     after, since h       f(k) <= f(h) + sum over (h, k] of way_s (y - u), |averages| <= thresholds
 
-The anchor is the first TVB, or one `anchor_lag_s` before the alarm; which one, and when the alarm came, is open: the
-largest counts. A fault before the first TVB is no fault of these: noticed or not, it is a start of mission at a wrong
-place, and nothing bounds it.
+The anchor is the fix, or a TVB `anchor_lag_s` before the alarm; which one, and when the alarm came, is open: the
+largest counts. Before anything was validated there is no anchor: the LDS forgets a fault that is noticed there and
+initialises anew with it. So nothing is bounded from a start of mission to the first fix after the first TVB.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import polars as pl
 
 from pipeline.stages.odometry.recovery import RecoveryRule
 from pipeline.studies.undetected.watched import FaultWindow, Watched
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
 from schemas.config import Configuration
 
 # The hold ends after the memory of the slowest average; growth counts from a row in its last tenth, where there is one.
@@ -33,7 +33,7 @@ _LAST_TENTH = 0.9
 class Returns:
     """What decides whether a negated position returns, at the rows of `Watched`.
 
-    `offset_m`: GNSS minus odometer. `validated`: TVBs. The others as in the aligned epochs.
+    `offset_m`: GNSS minus odometer. The others as in the aligned epochs.
     """
 
     offset_m: Floats
@@ -41,125 +41,123 @@ class Returns:
     travelled_m: Floats
     doubt_m: Floats
     counter: Ints
-    validated: Bools
     scale_sigma: float
 
     @classmethod
     def of(cls, rows: Watched, epochs: pl.DataFrame, scale_sigma: float) -> Returns:
-        """From aligned epochs with `tvb`."""
         path_m, odometer_m, sigma_m, travelled_m, doubt_m = (
             floats(epochs, name)[rows.epoch]
             for name in ("path_m", "odometer_m", "position_sigma_m", "travelled_m", "slip_doubt_m")
         )
         counter = epochs["odometer_counter"].to_numpy().astype(np.int64)[rows.epoch]
-        tvb = flags(epochs, "tvb")[rows.epoch]
-        return cls(path_m - odometer_m, sigma_m, travelled_m, doubt_m, counter, tvb, scale_sigma)
+        return cls(path_m - odometer_m, sigma_m, travelled_m, doubt_m, counter, scale_sigma)
 
-    def between(self, low: int, high: int) -> Returns:
-        """Rows [low, high)."""
-        part = slice(low, high)
+    def within(self, part: slice) -> Returns:
         return Returns(
             self.offset_m[part],
             self.sigma_m[part],
             self.travelled_m[part],
             self.doubt_m[part],
             self.counter[part],
-            self.validated[part],
             self.scale_sigma,
         )
 
 
 def in_use_errors(
-    rows: Watched, windows: list[FaultWindow], unnoticed_m: Floats, returns: Returns | None, config: Configuration
+    rows: Watched,
+    windows: list[FaultWindow],
+    unnoticed_m: Floats,
+    validated: Bools,
+    returns: Returns | None,
+    config: Configuration,
 ) -> Floats:
     """The largest error along growing path and against it [m], shape (2, rows); NaN where nothing bounds it.
 
-    `unnoticed_m`: the same of errors that no monitor noticed. Without `returns` no alarm is ever taken back.
+    `unnoticed_m`: the same of errors that no monitor noticed; `validated`: TVBs. Without `returns` no alarm is ever
+    taken back once a position was validated.
     """
-    if returns is None:
-        return unnoticed_m
     errors = np.full_like(unnoticed_m, np.nan)
-    missions = {round(start.timestamp() * NS_PER_S) for start in config.lds.starts_of_mission}
     for window in windows:
         part = slice(window.start, window.end + 1)
-        begun = bool(returns.validated[: window.start].any()) and window.since_ns not in missions
-        here = returns.between(window.start, window.end + 1)
-        first = 0 if begun else _first(here.validated)
-        if first is None:
+        grown = slice(window.start + 1, window.end + 1)
+        if not validated[_of_mission(rows, window, config) & (np.arange(rows.rows) < window.start)].any():
             continue
-        seen = rows.between(window.start, window.end + 1)
+        if returns is None:
+            errors[:, grown] = unnoticed_m[:, grown]
+            continue
+        seen = rows.between(part.start, part.stop)
         for way, sign, travel in ((0, 1.0, seen), (1, -1.0, seen.mirrored())):
-            largest_m = np.concatenate([[0.0], unnoticed_m[way, window.start + 1 : window.end + 1]])
-            found = _Window(travel, here, sign, first, begun, config).largest_m(largest_m)
-            errors[way, part][1:] = found[1:]
+            largest_m = np.concatenate([[0.0], unnoticed_m[way, grown]])
+            found = _Window(travel, returns.within(part), validated[part], sign, config)
+            errors[way, grown] = found.largest_m(largest_m)[1:]
     return errors
 
 
-def _first(true: Bools) -> int | None:
-    return int(true.argmax()) if true.any() else None
+def _of_mission(rows: Watched, window: FaultWindow, config: Configuration) -> Bools:
+    """The rows since the last start of mission up to the fix of a window: what was validated before is forgotten."""
+    missions_ns = [round(start.timestamp() * NS_PER_S) for start in config.lds.starts_of_mission]
+    since_s = [window.since_s - (window.since_ns - t_ns) / NS_PER_S for t_ns in missions_ns if t_ns <= window.since_ns]
+    return rows.t_s >= max(since_s, default=-np.inf)
 
 
 @dataclass(frozen=True)
 class _Window:
-    """One window and direction; `first`: the row from which positions count as validated, by a fix if `by_fix`."""
+    """One window, which begins with a fix, in one direction."""
 
     seen: Watched
     returns: Returns
+    validated: Bools
     sign: float
-    first: int
-    by_fix: bool
     config: Configuration
 
     def largest_m(self, unnoticed_m: Floats) -> Floats:
-        """The largest error at each row; NaN before the first validated row, and once the distance was lost."""
-        lds = self.config.lds
-        held_m = self._held_m(self._anchors_m(unnoticed_m, lds.recovery_s))
+        """The largest error at each row; NaN once the distance was lost."""
+        recovery_s = self.config.lds.recovery_s
+        held_m = self._held_m(unnoticed_m, recovery_s)
         hold_s = _LAST_TENTH / min(self.config.monitors.ewma_alphas)
         if "link_distance" in self.config.monitors.disabled:
             hold_s = 0.0
-        ended_m = self._held_m(self._anchors_m(unnoticed_m, lds.recovery_s + hold_s))
+        ended_m = self._held_m(unnoticed_m, recovery_s + hold_s)
         most_m = np.maximum(unnoticed_m, np.maximum(held_m, self._after_m(ended_m)))
-        counter = self.returns.counter
-        unknown = (np.arange(counter.size) < self.first) | (counter != counter[self.first])
+        unknown = self.returns.counter != self.returns.counter[0]
         return np.where(unknown | np.isinf(most_m), np.nan, most_m)
 
-    def _anchors_m(self, unnoticed_m: Floats, delay_s: float) -> Floats:
-        """The largest U(A) + x(A) of an anchor whose alarm may have been over for so long at each row."""
-        t_s = self.seen.t_s
+    def _held_m(self, unnoticed_m: Floats, delay_s: float) -> Floats:
+        """The largest error at each row while it is held to an anchor whose alarm may be over for so long."""
         reach_m = unnoticed_m + self.sign * self.returns.offset_m + self.seen.learned_late_m
-        of_tvb = np.where(self.returns.validated & (np.arange(t_s.size) >= self.first), reach_m, -np.inf)
-        old = np.searchsorted(t_s, t_s - self.config.lds.anchor_lag_s - delay_s, side="right") - 1
-        lagged_m = np.where(old >= 0, np.fmax.accumulate(of_tvb)[old], -np.inf)
-        first_m = float(reach_m[self.first])
-        if self.by_fix:
-            # The position's own error at the fix is not known.
-            read_m = self.config.hazards.balise_read_sigma_m
-            first_m += self.config.monitors.threshold_factor * float(np.hypot(self.returns.sigma_m[self.first], read_m))
-        return np.maximum(lagged_m, np.where(t_s - t_s[self.first] >= delay_s, first_m, -np.inf))
-
-    def _held_m(self, anchors_m: Floats) -> Floats:
-        """The largest error at each row while it is held to one of these anchors."""
+        anchors_m = self._anchors_m(reach_m, delay_s)
         held_m: Floats = anchors_m + self._bound_m() - self.sign * self.returns.offset_m + self.seen.learned_late_m
         return held_m
+
+    def _anchors_m(self, reach_m: Floats, delay_s: float) -> Floats:
+        """The largest U(A) + x(A) of these anchors at each row."""
+        t_s = self.seen.t_s
+        of_tvb = np.where(self.validated, reach_m, -np.inf)
+        old = np.searchsorted(t_s, t_s - self.config.lds.anchor_lag_s - delay_s, side="right") - 1
+        lagged_m = np.where(old >= 0, np.fmax.accumulate(of_tvb)[old], -np.inf)
+        # The position's own error at the fix is not known.
+        read_m = self.config.hazards.balise_read_sigma_m
+        spread_m = self.config.monitors.threshold_factor * float(np.hypot(self.returns.sigma_m[0], read_m))
+        fix_m = float(reach_m[0]) + spread_m
+        return np.maximum(lagged_m, np.where(t_s - t_s[0] >= delay_s, fix_m, -np.inf))
 
     def _bound_m(self) -> Floats:
         """The widest bound of a re-link at each row: with the anchor at the first row, and the largest sigma since."""
         returns = self.returns
         rule = RecoveryRule(self.config)
         sigma_m2 = np.fmax.accumulate(returns.sigma_m) ** 2 + returns.sigma_m**2
-        waited_s = np.maximum(self.seen.t_s - self.seen.t_s[self.first], 0.0)
-        way_m = returns.travelled_m - returns.travelled_m[self.first]
+        waited_s = np.maximum(self.seen.t_s - self.seen.t_s[0], 0.0)
+        way_m = returns.travelled_m - returns.travelled_m[0]
         bound_m = rule.bound_m(rule.variance_m2(sigma_m2, waited_s, way_m, returns.scale_sigma))
-        doubt_m = returns.doubt_m - returns.doubt_m[self.first]
-        widest_m: Floats = np.minimum(0.5 * self.config.hazards.failure_limit_m, bound_m + np.maximum(doubt_m, 0.0))
+        doubt_m = np.maximum(returns.doubt_m - returns.doubt_m[0], 0.0)
+        widest_m: Floats = np.minimum(0.5 * self.config.hazards.failure_limit_m, bound_m + doubt_m)
         return widest_m
 
     def _after_m(self, ended_m: Floats) -> Floats:
         """The error at each row after a hold that ended at some row before with at most `ended_m`."""
-        best = np.full(ended_m.size, np.inf)
-        for average in range(self.seen.weight.shape[1]):
-            best = np.minimum(best, self._grown_m(ended_m, average))
-        return best
+        averages = range(self.seen.weight.shape[1])
+        least: Floats = np.min([self._grown_m(ended_m, average) for average in averages], axis=0, initial=np.inf)
+        return least
 
     def _grown_m(self, ended_m: Floats, average: int) -> Floats:
         """By one average alone: way_s y = way_s / w (A_i - (1 - w) A_(i-1)), and each |A| within its threshold."""

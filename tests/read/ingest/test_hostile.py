@@ -21,7 +21,8 @@ from pipeline.make.receivers import gather
 from pipeline.read.ingest import mcap_block, read_run
 from pipeline.read.ingest.correct import corrected
 from pipeline.read.ingest.describe import describe_log
-from pipeline.read.ingest.layout import LayoutDecoder, UnfitError, constant, fixed, layout_of
+from pipeline.read.ingest.layout import LayoutDecoder, UndecodableError, constant, fixed, layout_of
+from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
 from pipeline.stages.clean.clean import clean, of_the_journey
@@ -30,6 +31,7 @@ from schemas.config import IngestConfig, StreamCorrection
 from schemas.errors import InputError
 from tests.read.ingest import samples
 from tests.read.ingest.samples import (
+    START_NS,
     channel,
     chunk,
     definitions,
@@ -173,32 +175,40 @@ def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
 
 def test_a_message_without_bytes_at_the_end_of_a_block_is_decoded() -> None:
     """A protobuf message is empty where all its fields have their defaults."""
-    numbers = [np.array([number]) for number in (0, 3, 0, 0)]
-    message = mcap_block.Messages([np.frombuffer(b"abc", dtype=np.uint8)], *numbers)
-    fields = {"x": constant(0.0, pl.Float64())}
-    decoder = LayoutDecoder(lambda payload: layout_of(payload, bytearray(payload), fields))
-    ((_, columns),), left = decoder.decode(message)
+    start, length, log_time = (np.array([number]) for number in (3, 0, 0))
+    message = mcap_block.Messages(np.frombuffer(b"abc", dtype=np.uint8), start, length, log_time)
+    fields = {"x": [constant(0.0, pl.Float64())]}
+    channel = Channel(1, "/x", "protobuf", None, "x.mcap")
+    decoder = LayoutDecoder(channel, lambda payload: layout_of(payload, bytearray(payload), fields))
+    ((_, columns),) = decoder.decode(message)
     assert columns["x"].to_list() == [0.0]
-    assert left == []
 
 
-def test_payloads_are_taken_from_the_piece_that_they_lie_in() -> None:
-    pieces = [np.frombuffer(content, dtype=np.uint8) for content in (b"-ab-cd", b"", b"--ef")]
-    start, length = np.array([1, 4, 8]), np.array([2, 2, 2])
-    messages = mcap_block.Messages(pieces, np.array([0, 6, 6]), start, length, start, before=100)
-    assert [messages.payload(row) for row in range(3)] == [b"ab", b"cd", b"ef"]
-    assert messages.stretches(0, 2).tobytes() == b"abcdef"
-    assert messages.chosen(np.array([False, False, True])).stretches(-1, 1).tobytes() == b"-e"
-    assert messages.ordinal.tolist() == [101, 104, 108]
+def test_pieces_of_a_block_are_one_after_the_other() -> None:
+    """Two chunks with a message each, and one without."""
+    chunks = [definitions() + some_messages(1), definitions(), message(position(1), START_NS + 1)]
+    pieces = [mcap_block.piece_of_chunk(chunk, 0, lambda *_: None, mcap_block.Allowance(9)) for chunk in chunks]
+    ((channel_id, messages),) = mcap_block.block_of(pieces, before=100).items()
+    assert channel_id == 1
+    assert [messages.payload(row) for row in range(2)] == [position(0), position(1)]
+    assert messages.stretches(0, 2).tobytes() == position(0)[:2] * 2
+    assert messages.chosen(np.array([False, True])).log_time.tolist() == [START_NS + 1]
+    second = len(chunks[0]) + len(chunks[1]) + 31
+    assert messages.ordinal.tolist() == [100 + len(definitions()) + 31, 100 + second]
 
 
-def test_a_number_beyond_64_bits_with_a_sign_is_left_to_the_ordinary_decoder() -> None:
+def test_a_number_that_64_bits_with_a_sign_do_not_hold_is_refused() -> None:
     rows = np.array([1, 2**63], dtype="<u8").view(np.uint8).reshape(2, 8)
     whole, real = (fixed(0, "<u8").as_type(dtype) for dtype in (pl.Int64(), pl.Float64()))
     assert list(whole.values(rows[:1])) == [1]
     assert list(real.values(rows)) == [1.0, 2.0**63]
-    with pytest.raises(UnfitError):
+    with pytest.raises(UndecodableError, match="larger"):
         whole.values(rows)
+    written = np.array([9.0, 9.5]).view(np.uint8).reshape(2, 8)
+    count = fixed(0, "<f8").as_type(pl.Int64())
+    assert list(count.values(written[:1])) == [9]
+    with pytest.raises(UndecodableError, match="is not a 64-bit integer"):
+        count.values(written)
 
 
 LETTERS = "A" * 26
@@ -232,10 +242,10 @@ def test_definitions_that_contradict_themselves_are_refused(text: str, reason: s
 @pytest.mark.parametrize("tag", [b"\x88\x80\x80\x80\x80\x00", b"\x88\x80\x80\x80\x10"], ids=["6 bytes", "bit 32"])
 def test_a_protobuf_tag_has_32_bits(tag: bytes) -> None:
     layout = layout_by(Timestamp.DESCRIPTOR, {"seconds": pl.Int64()})
-    assert layout(b"\x08\x05").fields["seconds"].start == 1
+    assert layout(b"\x08\x05").fields["seconds"][0].start == 1
     with pytest.raises(DecodeError):
         Timestamp.FromString(tag + b"\x05")
-    with pytest.raises(UnfitError):
+    with pytest.raises(UndecodableError):
         layout(tag + b"\x05")
 
 
@@ -257,8 +267,8 @@ def test_a_shift_that_64_bits_do_not_hold_is_refused() -> None:
 def test_a_message_does_not_make_more_than_it_holds() -> None:
     definitions = parse_definitions("a/msg/B", "C[] c\nuint8[100000000] d\n===\nMSG: a/C\nC c\n")
     for payload in (b"\0\1\0\0" + b"\xff" * 4, b"\0\1\0\0" + bytes(4)):
-        with pytest.raises(DefinitionError, match=r"too early|no definition"):
-            RosWalk(payload, definitions).message("a/B")
+        with pytest.raises(UndecodableError, match=r"too early|no definition"):
+            RosWalk(payload, definitions, "a/B")
 
 
 def log_of(tmp_path: Path, stamps: list[object], name: str = "t") -> Path:

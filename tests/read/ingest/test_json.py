@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.read.ingest.generic import UndecodableError, decode_columns, parse_json
-from pipeline.read.ingest.json_columns import JsonDecoder
+from pipeline.read.ingest.json_columns import JsonDecoder, one_by_one, parse_json
+from pipeline.read.ingest.layout import Columns, UndecodableError
 from pipeline.read.ingest.mcap_block import Messages
 from pipeline.read.ingest.mcap_records import Channel
 from schemas.errors import InputError
@@ -50,7 +50,7 @@ def messages_of(contents: list[bytes]) -> Messages:
     lengths = np.array([len(content) for content in contents], dtype=np.int64)
     starts = np.cumsum(lengths + 1) - lengths
     data = np.frombuffer(b"".join(b"#" + content for content in contents) + b" ", dtype=np.uint8)
-    return Messages([data], np.zeros(1, dtype=np.int64), starts, lengths, starts)
+    return Messages(data, starts, lengths, starts)
 
 
 def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:
@@ -61,27 +61,38 @@ def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:
     return content.encode("utf-8", "surrogatepass")
 
 
+def at_once(contents: list[bytes], decoder: JsonDecoder | None = None) -> tuple[Columns, int]:
+    """The columns, and how many messages were parsed one by one."""
+    decoder = decoder or JsonDecoder(CHANNEL, TYPES)
+    ((found, columns),) = decoder.decode(messages_of(contents))
+    assert len(found) == len(contents)
+    return columns, decoder.slow_messages
+
+
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(payloads)
 def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
-    contents = [written(*one) for one in drawn]
-    for some in ([content] for content in contents):
-        parts, left = JsonDecoder(TYPES).decode(messages_of(some))
-        assert sum(len(found) for found, _ in parts) + sum(map(len, left)) == len(some)
-        for found, columns in parts:
-            expected, _ = decode_columns(CHANNEL, found, TYPES)
-            for path, values in columns.items():
-                assert values.to_list() == expected[path].to_list()
+    for content in (written(*one) for one in drawn):
+        try:
+            expected = one_by_one(CHANNEL, messages_of([content]), TYPES)
+        except InputError:
+            with pytest.raises(InputError):
+                at_once([content])
+            continue
+        columns, _ = at_once([content])
+        assert {path: values.to_list() for path, values in columns.items()} == {
+            path: values.to_list() for path, values in expected.items()
+        }
 
 
 def test_good_messages_are_taken_at_once():
     contents = [
         json.dumps({"a": number / 7, "name": "Info NaN null", "t": {"sec": number}}).encode() for number in range(50)
     ]
-    parts, left = JsonDecoder(TYPES).decode(messages_of(contents))
-    assert (len(parts), left) == (1, [])
-    assert parts[0][1]["a"].to_list() == [number / 7 for number in range(50)]
-    assert parts[0][1]["t.sec"].to_list() == list(range(50))
+    columns, slow = at_once(contents)
+    assert slow == 0
+    assert columns["a"].to_list() == [number / 7 for number in range(50)]
+    assert columns["t.sec"].to_list() == list(range(50))
 
 
 def test_fields_that_only_later_messages_have_are_read():
@@ -91,10 +102,9 @@ def test_fields_that_only_later_messages_have_are_read():
         [b'{"a": 4.5}', b'{"a": 5.5, "ok": true}'],
         [b'{"a": 6.5, "other": 1, "t": {"sec": 7}, "c": [0, 8.5]}'],
     ]
-    decoder = JsonDecoder(TYPES)
-    decoded = [decoder.decode(messages_of(block)) for block in blocks]
-    assert [left for _, left in decoded] == [[]] * 4
-    columns = [parts[0][1] for parts, _ in decoded]
+    decoder = JsonDecoder(CHANNEL, TYPES)
+    columns = [at_once(block, decoder)[0] for block in blocks]
+    assert decoder.slow_messages == 0
     read = {path: [value for block in columns for value in block[path].to_list()] for path in TYPES}
     assert read == {
         "a": [1.5, 2.5, 3.5, None, 4.5, 5.5, 6.5],
@@ -103,7 +113,8 @@ def test_fields_that_only_later_messages_have_are_read():
         "ok": [None] * 5 + [True, None],
         "c[1]": [None] * 6 + [8.5],
     }
-    assert decoder.decode(messages_of([b'{"a": 1, "a": 2}']))[0] == []
+    with pytest.raises(InputError, match="a name occurs twice"):
+        at_once([b'{"a": 1, "a": 2}'], decoder)
     assert {path: values.dtype for path, values in columns[1].items()} == TYPES
 
 
@@ -118,13 +129,11 @@ def test_what_is_no_json_is_refused(content):
     with pytest.raises(UndecodableError):
         parse_json(content)
     with pytest.raises(InputError):
-        decode_columns(CHANNEL, messages_of([content]), TYPES)
-    several = [b'{"a": 1.5}', content, b'{"a": 2.5}']
-    parts, left = JsonDecoder(TYPES).decode(messages_of(several))
-    assert (parts, [len(rest) for rest in left]) == ([], [len(several)])
+        at_once([b'{"a": 1.5}', content, b'{"a": 2.5}'])
 
 
 def test_two_halves_of_a_document_are_not_one():
     halves = [b'{"a": 1.5}{"a": 2.5}', b'{"a": 3.5, "c": {}', b"}", b"{}"]
     for several in (halves[1:3], halves[:3], [*halves, b'{"a": 1}null{}']):
-        assert JsonDecoder(TYPES).decode(messages_of(several))[0] == []
+        with pytest.raises(InputError):
+            at_once(several)
