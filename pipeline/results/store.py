@@ -99,6 +99,11 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
     return scan_runs(out, table, runs)
 
 
+def small_tables(out: Address) -> dict[str, pl.DataFrame]:
+    """All tables of all complete runs but `epochs`, which is large."""
+    return {name: read_table(out, name).collect() for name in TABLES if name != "epochs"}
+
+
 def scan_runs(out: Address, table: str, runs: Sequence[str]) -> pl.LazyFrame:
     """One table of these runs, read and checked when a query asks; a condition on `run_id` reads those runs only.
 
@@ -288,32 +293,11 @@ def sweep(out: Address) -> None:
                 storage.remove_folder(join(join(out, table), folder))
     packs.sweep(out)
     if not is_url(out):
-        for folder in _folders(Path(out)):
-            _remove_unfinished(folder)
-
-
-def _folders(out: Path) -> Iterator[str]:
-    """The folders of a result, runs and all."""
-    yield str(out)
-    for table in storage.folders_in(out):
-        yield f"{out}/{table}"
-        yield from (f"{out}/{table}/{run}" for run in storage.folders_in(out / table))
-
-
-def sweep_run(out: Path, run_id: str) -> None:
-    """`sweep` for one run of a local result, whose worker is known to have ended."""
-    complete = Path(table_address(out, _MARKER, run_id)).exists()
-    for table in TABLES:
-        folder = Path(table_address(out, table, run_id)).parent
-        if complete:
-            _remove_unfinished(folder)
-        else:
-            storage.remove_folder(folder)
-
-
-def _remove_unfinished(folder: Path | str) -> None:
-    for name in storage.unfinished_in(folder):
-        Path(folder, name).unlink(missing_ok=True)
+        inside = [f"{out}/{name}" for name in storage.folders_in(out)]
+        runs = [f"{folder}/{run}" for folder in inside for run in storage.folders_in(folder)]
+        for folder in (str(out), *inside, *runs):
+            for name in storage.unfinished_in(folder):
+                Path(folder, name).unlink(missing_ok=True)
 
 
 def read_config(out: Address) -> Configuration | None:
