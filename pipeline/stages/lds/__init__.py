@@ -1,7 +1,7 @@
 """Location determination system: virtual balises, ETCS linking, travelling virtual balise.
 
 In: aligned epochs of one solution, a monitor bank, balises of the path, telegrams with the odometer at each. Out: LDS
-columns of the epochs, crossings, passages. Knows of no truth.
+columns of the epochs, crossings, passages. Touches no file, and knows of no truth.
 
 `run` is the stage, `journey` the columns of the epochs, `machine` the walk along them with one state of the position
 (`Use`). `crossings`: where a balise is passed or read; `detection` offers them to the two chains of `linking`
