@@ -275,7 +275,8 @@ def _outcomes(out: Address, tables: Mapping[str, pl.DataFrame]) -> Iterator[Prob
 
 
 def _is_outcome_of(kept: RunOutcome, tables: Mapping[str, pl.DataFrame]) -> bool:
-    # Which availability was low is said by the configuration of that call, which need not be the last one.
+    """Whether all that tables say of a run is what they say now; of a failed run status and verdict alone."""
+    # Only of low availability it says what was lost, and which is low was said by the configuration of that call.
     again = outcome_of(kept.run_id, kept.log, math.inf, **tables)
     if again.status is RunStatus.FAILED:
         return (kept.status, kept.verdict) == (again.status, again.verdict)

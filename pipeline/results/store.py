@@ -83,7 +83,6 @@ def write_files(out: Address, run_id: str, contents: Mapping[str, bytes]) -> Non
 
 
 def read_run(out: Address, run_id: str) -> RunTables:
-    """The five tables of one complete run."""
     frames = {name: read_table(out, name, run_id).drop("run_id").collect() for name in TABLES}
     return RunTables(run_id, **frames)
 
@@ -201,7 +200,6 @@ def run_ids(out: Address) -> list[str]:
 
 
 def own_runs(out: Address) -> list[str]:
-    """The complete runs that have files of their own, sorted."""
     folders = [name for name in storage.folders_in(join(out, _MARKER)) if name.startswith("run_id=")]
     runs = sorted(unquote(name.removeprefix("run_id=")) for name in folders)
     return runs if is_url(out) else _own(out, runs)
@@ -330,5 +328,4 @@ def write_vehicle(out: Address, vehicle: Vehicle) -> None:
 
 
 def folder_name(run_id: str) -> str:
-    """The folder of a run in that of a table."""
     return f"run_id={file_name(run_id)}"

@@ -32,8 +32,6 @@ def version(address: Address) -> str | None:
 
 
 class FileDigest(NamedTuple):
-    """A file by its name and content."""
-
     name: str
     size_bytes: int
     sha256: str
