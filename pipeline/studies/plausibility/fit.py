@@ -130,4 +130,5 @@ def _inline(into: str, lines: str) -> str:
     if not tables:
         return f"{into[0].upper()}{into[1:]}: {'; '.join(filter(None, head.splitlines()))}"
     entries = [f"{{ {', '.join(filter(None, table.splitlines()))} }}" for table in tables]
-    return f"First line of the configuration file: ingest.correct = [{', '.join(entries)}]"
+    file = "the configuration file (in a project, [[convert.correct]] of this run in balise.toml)"
+    return f"First line of {file}: ingest.correct = [{', '.join(entries)}]"
