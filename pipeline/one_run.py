@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import polars as pl
 
@@ -16,8 +15,7 @@ from pipeline.stages.ride import Ride, ride_of
 from pipeline.stages.run_row.notes import ride_notes
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
 from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit
-from pipeline.studies.undetected.columns import Undetected
-from pipeline.studies.undetected.ride import unnoticed_of
+from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
 from schemas.enums import Reason
@@ -27,6 +25,8 @@ from schemas.tables import TABLES
 
 Tables = dict[str, pl.DataFrame]
 """Those of one solution, by name."""
+Matches = dict[str, Match]
+"""By solution: the one that is replayed, and the one, if any, that the channel monitor compares with it."""
 
 
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
@@ -38,14 +38,20 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
     prepared = prepare(run, site, vehicle or Vehicle(), config or Configuration(), clock_advice)
     evidence = prepared.evidence()
     beside = _compared_with(prepared)
+    errors: list[InputError] = []
+    parts: list[Tables] = []
     # A solution at a time: of those done only the tables are kept.
-    parts = {name: _of_solution(prepared, name, beside, evidence) for name in prepared.run.solutions()}
-    errors = [part for part in parts.values() if isinstance(part, InputError)]
+    for solution in prepared.run.solutions():
+        try:
+            parts.append(_of_solution(prepared, solution, beside, evidence))
+        except InputError as error:
+            # A receiver that never had a fix must not take the run's other solutions with it.
+            errors.append(error)
+            parts.append(_failed(prepared, solution, error))
     if len(errors) == len(parts):
         raise errors[0]
-    return _joined(
-        run.run_id, [part if isinstance(part, dict) else _failed(prepared, name, part) for name, part in parts.items()]
-    )
+    whole = {name: conform(pl.concat([part[name] for part in parts]), table) for name, table in TABLES.items()}
+    return RunTables(run_id=run.run_id, **whole)
 
 
 def ride_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> Ride:
@@ -53,55 +59,41 @@ def ride_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration,
     if solution not in run.solutions():
         raise InputError("has no such solution", place=run.run_id, found=solution, expected=", ".join(run.solutions()))
     prepared = prepare(run, site, vehicle, config, clock_advice)
-    placed = _place(prepared, solution)
-    if isinstance(placed, InputError):
-        raise placed
-    return ride_of(prepared, solution, _matches(solution, placed, _compared_with(prepared)), prepared.evidence())
+    required_fit(prepared, solution, vehicle)
+    matches = _with_match(_compared_with(prepared), prepared, solution)
+    return ride_of(prepared, solution, matches, prepared.evidence())
 
 
-@dataclass(frozen=True)
-class _Placed:
-    """A solution that fits its run and lies on the track."""
+def _compared_with(prepared: PreparedRun) -> Matches:
+    """The match of the solution that the channel monitor compares with, the only one that is kept over all solutions.
 
-    fit: Fit
-    match: Match
-
-
-Beside = Mapping[str, "_Placed | InputError"]
-"""By name: the one solution, if any, that the channel monitor compares the others with."""
-
-
-def _compared_with(prepared: PreparedRun) -> Beside:
-    """Placed once, and the only match that is kept over all solutions."""
+    None where that solution does not fit the run or lies on no track: then it has a failed row of its own.
+    """
     channel = prepared.config.monitors.channel_reference
-    return {channel: _place(prepared, channel)} if channel in prepared.run.solutions() else {}
-
-
-def _place(prepared: PreparedRun, solution: str) -> _Placed | InputError:
-    """Does the solution fit the run, and where is it on the track network? Else why not."""
+    if channel not in prepared.run.solutions():
+        return {}
     try:
-        return _Placed(required_fit(prepared, solution, prepared.vehicle), prepared.match(solution))
-    except InputError as error:
-        # A receiver that never had a fix must not take the run's other solutions with it.
-        return error
+        required_fit(prepared, channel, prepared.vehicle)
+        return {channel: prepared.match(channel)}
+    except InputError:
+        return {}
 
 
-def _matches(solution: str, placed: _Placed, beside: Beside) -> dict[str, Match]:
-    """The matches that a ride looks at."""
-    others = {name: other.match for name, other in beside.items() if isinstance(other, _Placed)}
-    return {**others, solution: placed.match}
+def _with_match(beside: Matches, prepared: PreparedRun, solution: str) -> Matches:
+    return beside if solution in beside else {**beside, solution: prepared.match(solution)}
 
 
-def _of_solution(prepared: PreparedRun, solution: str, beside: Beside, evidence: TrainEvidence) -> Tables | InputError:
-    """What the train made of one solution, what nobody would have noticed, and what the judge says of it."""
-    placed = beside.get(solution) or _place(prepared, solution)
-    if isinstance(placed, InputError):
-        return placed
-    ride = ride_of(prepared, solution, _matches(solution, placed, beside), evidence)
+def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence: TrainEvidence) -> Tables:
+    """What the train made of one solution, what nobody would have noticed, and what the judge says of it.
+
+    Raises `InputError` where the solution does not fit the run or lies on no track.
+    """
+    fit = required_fit(prepared, solution, prepared.vehicle)
+    ride = ride_of(prepared, solution, _with_match(beside, prepared, solution), evidence)
     unnoticed = unnoticed_of(ride)
     judged = judge(_case(ride, unnoticed, evidence))
     epochs = pl.concat([judged.epochs, ride.solution.fixes.select("satellites")], how="horizontal")
-    results = _results(ride, judged, epochs, unnoticed, placed.fit, evidence)
+    results = _results(ride, judged, epochs, unnoticed, fit, evidence)
     tables = {
         "hazards": judged.hazards,
         "passages": judged.passages,
@@ -134,46 +126,39 @@ def _results(
 ) -> SolutionResults:
     """All that the `runs` row is made of."""
     prepared = ride.prepared
-    name = ride.solution.name
     run = prepared.run
-    counts = prepared.counts.solutions[name]
-    return SolutionResults(
-        solution=name,
-        epochs=epochs,
-        judged=judged,
-        vehicle=prepared.figures_from,
-        odometer_contradicted=evidence.contradicted,
-        alignment=ride.at_the_end(),
-        white_noise=ride.bank.white_noise(),
-        counts=counts,
-        ingest=run.notes,
-        ambiguous_stretches=ride.match.ambiguous.height,
-        notes=[*fit.notes, *ride_notes(ride, evidence)],
-        misfits=fit.codes,
-        faults_injected=run.faults is not None and run.faults.height > 0,
-        undetected=unnoticed.figures(epochs, prepared.config),
-        reasons=_reasons(evidence, bool(fit.unproving or counts.contradicting)),
-        anchored_ns=evidence.anchored_ns,
-    )
-
-
-def _reasons(evidence: TrainEvidence, doubtful: bool) -> list[Reason]:
-    """What stands against a verdict whatever was judged (DOMAIN section 5.4)."""
-    applies = {
+    counts = prepared.counts.solutions[ride.solution.name]
+    columns = {
+        "vehicle": prepared.figures_from,
+        "faults_injected": run.faults is not None and run.faults.height > 0,
+        "misfits": fit.codes,
+        "duplicates": counts.duplicates,
+        "out_of_order": counts.out_of_order,
+        "odometer_contradicted": evidence.contradicted,
+        "ambiguous_stretches": ride.match.ambiguous.height,
+        **ride.at_the_end(),
+        **ride.bank.white_noise(),
+        **unnoticed.figures(epochs, prepared.config),
+    }
+    # What stands against a verdict whatever was judged (DOMAIN section 5.4).
+    against = {
         Reason.EVIDENCE_DISPUTED: evidence.disputed > 0,
-        Reason.INPUT_DOUBTFUL: doubtful,
+        Reason.INPUT_DOUBTFUL: bool(fit.unproving or counts.contradicting),
         Reason.CLOCK_ASSUMED: evidence.clock_assumed,
     }
-    return [reason for reason, applied in applies.items() if applied]
+    return SolutionResults(
+        solution=ride.solution.name,
+        epochs=epochs,
+        judged=judged,
+        columns=columns,
+        ingest=run.notes,
+        notes=[*fit.notes, *ride_notes(ride, evidence)],
+        reasons=[reason for reason, applies in against.items() if applies],
+        anchored_ns=evidence.anchored_ns,
+    )
 
 
 def _failed(prepared: PreparedRun, solution: str, error: InputError) -> Tables:
     """A solution without content but for the row that says why."""
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
     return nothing | {"runs": failed_row(str(error), prepared.provenance, solution)}
-
-
-def _joined(run_id: str, parts: list[Tables]) -> RunTables:
-    """Rows of all solutions, by the contract."""
-    whole = {name: conform(pl.concat([part[name] for part in parts]), table) for name, table in TABLES.items()}
-    return RunTables(run_id=run_id, **whole)

@@ -6,12 +6,14 @@ a column or a verdict changing (`tests/replay/test_rewording.py`).
 
 from __future__ import annotations
 
+import re
 import shlex
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib.resources import files
+from string import Formatter
 from typing import Any, TypeVar
 
 from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, NotShown, Reason, Remedy
@@ -23,7 +25,6 @@ BETWEEN = "; "
 # How many losses a sentence names; from which share on.
 _NAMED = 3
 _LEAST_SHARE = 0.005
-_CENTIMETRE_M = 0.01
 
 WORDS: dict[str, Any] = tomllib.loads((files("schemas") / "words.toml").read_text(encoding="utf-8"))
 """Sections of `words.toml` by name."""
@@ -32,6 +33,22 @@ WORDS: dict[str, Any] = tomllib.loads((files("schemas") / "words.toml").read_tex
 def say(section: str, name: str, /, *figures: object, **named: object) -> str:
     """The words of a section under a name, with their figures: `say("hazards", "in_use", 3.0, 0.5)`."""
     return str(WORDS[section][name]).format(*figures, **named)
+
+
+_OPTIONAL = re.compile(r"\[([^\[\]]*)\]")
+
+
+def say_of(section: str, name: str, figures: Mapping[str, object]) -> str:
+    """The words of a section with figures by name; a part in [brackets] stands only where its first figure does.
+
+    A figure stands where it is neither null nor zero.
+    """
+
+    def part(match: re.Match[str]) -> str:
+        first = next(field for _, field, _, _ in Formatter().parse(match[1]) if field)
+        return match[1] if figures[first] else ""
+
+    return _OPTIONAL.sub(part, str(WORDS[section][name])).format_map(figures)
 
 
 def _sentences(kind: type[Code], section: str) -> dict[Code, str]:
@@ -45,7 +62,6 @@ MISFIT_PLACES = _sentences(MisfitPlace, "misfit_places")
 LOST = _sentences(LostTo, "lost")
 NOT_SHOWN = _sentences(NotShown, "not_shown")
 REMEDIES = _sentences(Remedy, "remedies")
-REMEDIES_OF_PROJECT = REMEDIES | {Remedy(code): text for code, text in WORDS["remedies_of_project"].items()}
 
 
 @dataclass(frozen=True)
@@ -135,27 +151,13 @@ def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) 
     )
 
 
-def noise_words(widened: Mapping[str, tuple[float, float]]) -> str:
-    """What measured noise does to the thresholds: by axis, raw threshold over the model's, and the white noise [m]."""
-    return ", ".join(
-        say("noise_axes", "widened", say("noise_axes", axis), ratio, _short(noise_m))
-        for axis, (ratio, noise_m) in widened.items()
-    )
-
-
-def _short(length_m: float) -> str:
-    return f"{1000.0 * length_m:.0f} mm" if length_m < _CENTIMETRE_M else f"{100.0 * length_m:.0f} cm"
-
-
-PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options": ""}
-"""What a command names where nobody knows the paths."""
-
-
 def remedy_words(remedy: Remedy | str, **places: str) -> str:
-    """What would mend it, with the command that does; `places`: paths known where it is shown, with `project` the keys
-    of that file in place of options.
+    """What would mend it, and how; `places`: paths known where it is shown, with `project` the keys of that file in
+    place of a command. Without any, in words for readers inside and outside a project.
     """
+    section = "remedies_of_project" if "project" in places else "remedies_by_command" if places else "remedies_anywhere"
+    how = WORDS[section].get(Remedy(remedy).value, "")
     plain = ("options", "of_project", "again")
-    quoted = {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
-    words = REMEDIES_OF_PROJECT if "project" in places else REMEDIES
-    return words[Remedy(remedy)].format(**PLACES | quoted)
+    named = {"run": "RUN", "site": "the site", "out": "OUT", "options": ""}
+    named |= {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
+    return REMEDIES[Remedy(remedy)].format(how=how.format(**named), **named)

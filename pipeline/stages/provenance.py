@@ -21,9 +21,12 @@ class Provenance:
 
 
 def provenance(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> Provenance:
-    """Digests of the settings and of log and site, and this program."""
-    inputs = input_digest(run, site.digest)
-    return Provenance(digest_of(config, vehicle), inputs, SOFTWARE, config.calibration.runs)
+    return Provenance(
+        config_digest=digest_of(config, vehicle),
+        input_digest=input_digest(run, site.digest),
+        software=SOFTWARE,
+        calibrated_by=config.calibration.runs,
+    )
 
 
 def input_digest(run: RunLog, site_digest: str) -> str:

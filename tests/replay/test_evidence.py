@@ -87,7 +87,7 @@ def test_balises_accepted_while_no_odometer_could_contradict_are_told():
     assert inside.height > 0
     assert f"{inside.height} {undiagnosed} (odometer interrupted or slipping): a jump" in paused.runs["notes"].item()
     middle = begin + timedelta(seconds=100)
-    for kept, word in ((pl.col("t") < middle, "ends before"), (pl.col("t") > middle, "begins after")):
+    for kept, word in ((pl.col("t") < middle, "begins +0 s and ends -"), (pl.col("t") > middle, "begins +100 s")):
         part = replay(run.with_streams(odometer=run.odometer.filter(kept)), site, VEHICLE)
         unseen = part.passages.filter(
             (pl.col("kind") == "virtual") & (pl.col("status") == "accepted"),
@@ -96,7 +96,7 @@ def test_balises_accepted_while_no_odometer_could_contradict_are_told():
         assert unseen.height > 0
         notes = part.runs["notes"].item()
         assert f"{unseen.height} {undiagnosed} (outside the odometer's time span): a jump" in notes
-        assert f"the odometer {word} the GNSS" in notes
+        assert f"the odometer {word}" in notes
 
 
 def test_positions_left_out_for_their_time_are_told():

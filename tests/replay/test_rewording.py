@@ -73,7 +73,7 @@ def tables_of(out: Path) -> dict[str, pl.DataFrame]:
 
 def dictionaries() -> Iterator[dict[Any, str]]:
     """Every dictionary of words for an enum in `schemas/words.py`, and every section of phrases in its file."""
-    yield from (words.WORDS[section] for section in ("hazards", "verdicts", "noise_axes", "studies", "safety", "line"))
+    yield from (words.WORDS[section] for section in ("hazards", "verdicts", "studies", "safety", "line"))
     yield from of_enums()
 
 

@@ -7,12 +7,15 @@ nanoseconds in order.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import polars as pl
 
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
 from schemas.config import Configuration, LdsConfig
+
+Time = TypeVar("Time", float, pl.Expr)
 
 # CONTRACT section 3, `outages`: what is longer lacks an epoch.
 GAP_PERIODS = 1.5
@@ -77,19 +80,6 @@ def trusted(config: Configuration) -> pl.Expr:
     return usable() & confident(config) & unambiguous(config)
 
 
-@dataclass(frozen=True)
-class Uptime:
-    """How long a condition held, and how often it was lost after it had held."""
-
-    up_s: float
-    losses: int
-
-    @property
-    def mean_time_between_losses_h(self) -> float | None:
-        """None without a loss: that only says that it is longer than the time observed."""
-        return self.up_s / self.losses / 3600.0 if self.losses and self.up_s > 0 else None
-
-
 def nominal_period_s(t_ns: Ints) -> float | None:
     """Median distance of consecutive epochs [s]; None for fewer than two."""
     return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else None
@@ -98,6 +88,11 @@ def nominal_period_s(t_ns: Ints) -> float | None:
 def position_ns(epochs: pl.DataFrame) -> Ints:
     """Times of the epochs with a position: a logger may write others between them, which say nothing."""
     return times_ns(epochs.filter(pl.col("path_m").is_not_null()))
+
+
+def reaction_of(period_s: Time, config: Configuration) -> Time | float:
+    """Time from detection to negation [s]: as configured, else one period of the positions."""
+    return period_s if config.hazards.reaction_s is None else config.hazards.reaction_s
 
 
 def crossing_gap_ns(t_ns: Ints, lds: LdsConfig) -> int:
@@ -111,19 +106,24 @@ def gap_limit_s(period_s: float | None, gap_reset_s: float) -> float:
 
 
 def outages_s(t_ns: Ints, usable: Bools, limit_s: float) -> Floats:
-    """Lengths [s] of the stretches over `limit_s` without a usable epoch, in order of time.
+    """Lengths [s] of the stretches over `limit_s` from one usable epoch to the next, in order of time.
 
-    From one usable epoch to the next; at the ends from the first and to the last epoch.
+    At the ends from the first and to the last epoch.
     """
-    bounds = np.concatenate([t_ns[:1], t_ns[usable], t_ns[-1:]])
-    stretches = np.diff(bounds) / NS_PER_S
+    stretches = np.diff(np.concatenate([t_ns[:1], t_ns[usable], t_ns[-1:]])) / NS_PER_S
     return stretches[stretches > limit_s]
 
 
+class Uptime(NamedTuple):
+    """How long a condition held [s], and how often it was lost after it had held."""
+
+    up_s: float
+    losses: int
+
+
 def uptime(t_ns: Ints, good: Bools, limit_s: float) -> Uptime:
-    """Time during which `good` held [s], and its losses: outages that followed upon a good epoch."""
-    held = t_ns[good]
-    stretches = np.diff(np.concatenate([held, t_ns[-1:]])) / NS_PER_S
+    """A loss is an outage that follows upon a good epoch."""
+    stretches = np.diff(np.concatenate([t_ns[good], t_ns[-1:]])) / NS_PER_S
     lost = stretches > limit_s
     return Uptime(float(stretches[~lost].sum()), int(lost.sum()))
 
@@ -143,11 +143,10 @@ def share_of_time(held: Floats, where: Bools) -> float | None:
 def availability(t_ns: Ints, valid: Bools, moving: Bools, limit_s: float) -> float | None:
     """Share of moving time, gaps included, during which `valid` held; None if it never moved.
 
-    `moving[k]` says whether the train moved from epoch k to the next. A gap is time without validity.
+    `moving[k]`: from epoch k to the next. A gap is time without validity.
     """
     if len(t_ns) < 2:
         return None
-    steps = np.diff(t_ns) / NS_PER_S
-    total = steps[moving[:-1]].sum()
+    total = (np.diff(t_ns) / NS_PER_S)[moving[:-1]].sum()
     held = held_s(t_ns, limit_s)[:-1]
     return min(1.0, float(held[moving[:-1] & valid[:-1]].sum() / total)) if total > 0 else None

@@ -44,14 +44,10 @@ class FailureLog:
 
     def standing_at(self, instant_ns: int) -> str | None:
         """First monitor of the alarm that stands just before the instant, by its fails or by negation."""
-        spanning = [alarm for alarm in self.alarms if alarm.start_ns < instant_ns <= alarm.end_ns]
-        if spanning:
-            return spanning[0].monitors[0]
+        begun = [alarm for alarm in self.alarms if alarm.start_ns < instant_ns]
         before = int(np.searchsorted(self.t_ns, instant_ns)) - 1
-        earlier = [alarm for alarm in self.alarms if alarm.end_ns < instant_ns]
-        if before >= 0 and self.negated[before] and earlier:
-            return earlier[-1].monitors[0]
-        return None
+        stands = begun and (instant_ns <= begun[-1].end_ns or (before >= 0 and self.negated[before]))
+        return begun[-1].monitors[0] if stands else None
 
     def start_within(self, begin_ns: int, end_ns: int) -> int | None:
         """Start of the first alarm that came in `begin <= t < end`."""
@@ -65,43 +61,36 @@ def failure_log(epochs: pl.DataFrame, recovery_s: float) -> FailureLog:
     columns = [truths(epochs[f"{name}_state"] == MonitorState.FAIL.value) for name in monitors]
     failed = np.column_stack(columns) if columns else np.zeros((t_ns.size, 0), np.bool_)
     rows = np.flatnonzero(failed.any(axis=1))
-    matrix = failed[rows]
-    first = tuple(monitors[index] for index in matrix.argmax(axis=1).tolist()) if rows.size else ()
-    alarms = _alarms(epochs, t_ns, rows, matrix, monitors, recovery_s)
-    return FailureLog(t_ns, flags(epochs, "negated"), rows, first, alarms)
-
-
-def _alarms(
-    epochs: pl.DataFrame, t_ns: Ints, rows: Ints, matrix: Bools, monitors: list[str], recovery_s: float
-) -> tuple[AlarmEpisode, ...]:
-    if rows.size == 0:
-        return ()
     breaks = np.flatnonzero(np.diff(t_ns[rows]) >= recovery_s * NS_PER_S) + 1
-    alarms = []
-    for part in np.split(np.arange(rows.size), breaks):
-        first = int(rows[part[0]])
-        last = int(rows[part[-1]])
-        names = _in_order(matrix[part], monitors)
-        peak = _peak(epochs[first : last + 1], names)
-        alarms.append(AlarmEpisode(first, last, int(t_ns[first]), int(t_ns[last]), names, peak))
-    return tuple(alarms)
+    parts = [part for part in np.split(rows, breaks) if part.size]
+    return FailureLog(
+        t_ns=t_ns,
+        negated=flags(epochs, "negated"),
+        failing=rows,
+        first_monitor=tuple(monitors[failed[row].argmax()] for row in rows.tolist()),
+        alarms=tuple(_alarm(epochs, t_ns, part, failed[part], monitors) for part in parts),
+    )
 
 
-def _in_order(matrix: Bools, monitors: list[str]) -> tuple[str, ...]:
-    """Monitors that failed, by their first fail; those of one epoch in the order of the contract."""
-    failed = np.flatnonzero(matrix.any(axis=0))
-    by_time = sorted(failed.tolist(), key=lambda column: (int(matrix[:, column].argmax()), column))
-    return tuple(monitors[column] for column in by_time)
+def _alarm(epochs: pl.DataFrame, t_ns: Ints, rows: Ints, failed: Bools, monitors: list[str]) -> AlarmEpisode:
+    """One alarm of the failing epochs `rows`; `failed`: at each which monitors."""
+    first = int(rows[0])
+    last = int(rows[-1])
+    # By their first fail; those of one epoch in the order of the contract.
+    columns = sorted(np.flatnonzero(failed.any(axis=0)).tolist(), key=lambda column: failed[:, column].argmax())
+    names = tuple(monitors[column] for column in columns)
+    peak = _peak(epochs[first : last + 1], names)
+    return AlarmEpisode(first, last, int(t_ns[first]), int(t_ns[last]), names, peak)
 
 
 def _peak(epochs: pl.DataFrame, monitors: tuple[str, ...]) -> float:
     """Largest |value| / threshold where one of the monitors fails; 0 where neither is recorded."""
-    ratios = [
-        epochs.select(
-            (pl.col(f"{name}_value").abs() / pl.col(f"{name}_threshold"))
-            .filter((pl.col(f"{name}_state") == MonitorState.FAIL.value) & (pl.col(f"{name}_threshold") > 0))
-            .max()
-        ).item()
+    failing = {
+        name: (pl.col(f"{name}_state") == MonitorState.FAIL.value) & (pl.col(f"{name}_threshold") > 0)
         for name in monitors
-    ]
-    return max((float(ratio) for ratio in ratios if ratio is not None), default=0.0)
+    }
+    ratios = epochs.select(
+        (pl.col(f"{name}_value").abs() / pl.col(f"{name}_threshold")).filter(condition).max().alias(name)
+        for name, condition in failing.items()
+    )
+    return max((float(ratio) for ratio in ratios.row(0) if ratio is not None), default=0.0)

@@ -30,11 +30,10 @@ class Solution:
     @cached_property
     def offers(self) -> pl.DataFrame:
         """Crossings and telegrams, with `virtual` and `accepted`; also crossings before the balise was re-armed."""
-        status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
-        virtual = kind == BaliseKind.VIRTUAL.value
-        accepted = (virtual & (status == PassageStatus.ACCEPTED.value)).fill_null(value=False)
+        virtual = pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value
+        accepted = virtual & (pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value)
         crossings = self.crossings.filter(pl.col("offered") | pl.col("status").is_null())
-        return crossings.with_columns(virtual=virtual, accepted=accepted)
+        return crossings.with_columns(virtual=virtual, accepted=accepted.fill_null(value=False))
 
     @cached_property
     def accepted(self) -> pl.DataFrame:

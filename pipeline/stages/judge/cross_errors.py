@@ -16,11 +16,9 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
     Null where the reference is silent, and where the position is farther ahead or behind than the failure limit: over
     such a distance a curve alone is metres aside, and a slope metres up.
     """
-    fixes = case.solution.fixes
-    reference = case.reference
     at_ns = case.instants_of_epochs()
-    across = np.full(at_ns.size, np.nan)
-    up = np.full(at_ns.size, np.nan)
+    errors_m = np.full((2, at_ns.size), np.nan)
+    reference = case.reference
     if reference is not None and reference.height >= 2:
         stamps = times_ns(reference)
         since_s = (stamps - stamps[0]) / NS_PER_S
@@ -28,12 +26,12 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
         after = np.searchsorted(since_s, at_s).clip(1, since_s.size - 1)
         covered = (at_s >= since_s[0]) & (at_s <= since_s[-1])
         covered &= since_s[after] - since_s[after - 1] <= case.config.hazards.reference_gap_s
-        latitude, longitude, height = (
-            np.interp(at_s, since_s, floats(reference, name)) for name in ("latitude_deg", "longitude_deg", "height_m")
-        )
-        rows = np.flatnonzero(covered & np.isfinite(floats(fixes, "latitude_deg")))
-        points = points_of(floats(fixes, "latitude_deg")[rows], floats(fixes, "longitude_deg")[rows])
-        away = points.surface - points_of(latitude[rows], longitude[rows]).surface
+        columns = ("latitude_deg", "longitude_deg", "height_m")
+        latitude, longitude, height_m = (floats(case.solution.fixes, name) for name in columns)
+        rows = np.flatnonzero(covered & np.isfinite(latitude))
+        there = [np.interp(at_s[rows], since_s, floats(reference, name)) for name in columns]
+        points = points_of(latitude[rows], longitude[rows])
+        away = points.surface - points_of(there[0], there[1]).surface
         east = np.einsum("ij,ij->i", away, points.east)
         north = np.einsum("ij,ij->i", away, points.north)
         heading = np.radians(heading_deg[rows])
@@ -41,7 +39,6 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
         along_m = east * np.sin(heading) + north * np.cos(heading)
         left_m = north * np.sin(heading) - east * np.cos(heading)
         near = np.abs(along_m) <= case.config.hazards.failure_limit_m
-        across[rows] = np.where(near, left_m, np.nan)
-        up[rows] = np.where(near, (floats(fixes, "height_m") - height)[rows], np.nan)
+        errors_m[:, rows] = np.where(near, [left_m, height_m[rows] - there[2]], np.nan)
     names = ("error_cross_m", "error_up_m")
-    return [pl.Series(name, values, nan_to_null=True) for name, values in zip(names, (across, up), strict=True)]
+    return [pl.Series(name, error_m, nan_to_null=True) for name, error_m in zip(names, errors_m, strict=True)]

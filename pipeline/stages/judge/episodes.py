@@ -11,10 +11,9 @@ import polars as pl
 from pipeline.stages.epochs.failure_log import FailureLog
 from pipeline.stages.evidence.evidence import NOTHING
 from pipeline.stages.judge.failures import Course, Failure, failure_at
-from pipeline.stages.judge.judgement import WRONG, Judgements
+from pipeline.stages.judge.judgement import WRONG
 from pipeline.stages.judge.jumps import Jump
 from schemas.arrays import NS_PER_S, Bools, spans_of
-from schemas.config import Configuration, HazardConfig
 
 _ODOMETER = "odometer"
 
@@ -29,21 +28,29 @@ class Detection:
 
 
 @dataclass(frozen=True)
-class Episode:
-    """A fault from its onset until the position is right again; numbers are of `Course`, `end` is the first after it.
+class Extent:
+    """Positions of an episode, numbered as in `Course`, from the onset on; `end` is the first after it.
 
-    `mark`: the first position that is wrong or completes a wrong offer; `step`, `jump_back`: the jumps at its ends;
-    `failed`: begin of the position failure, possibly since `may_ns`; `failure`: the time wrong in use around it.
+    `mark`: the first that is wrong or completes a wrong offer; `step`, `jump_back`: the jumps at its ends.
     """
 
     mark: int
     onset: int
     end: int
+    step: Jump | None
+    jump_back: Jump | None
+
+
+@dataclass(frozen=True)
+class Episode(Extent):
+    """A fault from its onset until the position is right again; `begin_ns`: that of a step included.
+
+    `failed`: begin of the position failure, possibly since `may_ns`; `failure`: the time wrong in use around it.
+    """
+
     begin_ns: int
     onset_ns: int
     end_ns: int
-    step: Jump | None
-    jump_back: Jump | None
     failed: int | None
     may_ns: int | None
     detection: Detection
@@ -51,23 +58,21 @@ class Episode:
 
     @property
     def undetected_ns(self) -> tuple[int, int]:
-        """From the begin, that of a step included, to detection or to the end."""
-        detected_ns = self.detection.t_ns
-        return self.begin_ns, self.end_ns if detected_ns is None else detected_ns
+        """From the begin to detection or to the end."""
+        return self.begin_ns, self.end_ns if self.detection.t_ns is None else self.detection.t_ns
 
 
 def find_episodes(
-    course: Course, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None, config: Configuration
+    course: Course, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None
 ) -> list[Episode]:
     """One episode for each time that positions left the evidence, or offered a VB wrong."""
     episodes: list[Episode] = []
     floor = 0
     for mark in np.flatnonzero(course.judged.is_wrong | _offered_wrong(course)).tolist():
         if mark >= floor:
-            episode = _episode(course, mark, floor, failures, log, faults, config)
-            back = episode.jump_back
-            episodes.append(episode)
-            floor = max(episode.end, mark + 1, 0 if back is None else back.last + 1)
+            extent = _extent(course, mark, floor)
+            episodes.append(_episode(course, extent, failures, log, faults))
+            floor = max(extent.end, mark + 1, 0 if extent.jump_back is None else extent.jump_back.last + 1)
     return episodes
 
 
@@ -80,79 +85,72 @@ def _offered_wrong(course: Course) -> Bools:
     return marked
 
 
-def _episode(
-    course: Course,
-    mark: int,
-    floor: int,
-    failures: Sequence[Failure],
-    log: FailureLog,
-    faults: pl.DataFrame | None,
-    config: Configuration,
-) -> Episode:
-    hazards = config.hazards
-    after_quiet = course.after_quiet(floor, mark)
-    step = next(iter(course.jumps_in(after_quiet, mark + 1)), None)
-    onset = after_quiet if step is None else max(floor, step.first)
-    jump_back, end = _end(course, mark, step, hazards)
-    end_ns = int(course.t_ns[end]) if end < course.size else int(course.t_ns[-1]) + 1
-    onset_ns, detection = _detected(course, onset, mark, end_ns, step, log, faults, hazards)
-    failed = _failed(course, onset, end, step, hazards)
-    in_use = (failure for failure in failures if failure.first < end and failure.last >= onset)
-    return Episode(
+def _extent(course: Course, mark: int, floor: int) -> Extent:
+    """Since and until when positions are off around a mark; no earlier than `floor`."""
+    onset = course.after_quiet(floor, mark)
+    step = next(iter(course.jumps_in(onset, mark + 1)), None)
+    calm = int(course.calm_from[mark])
+    after_step = mark if step is None else max(mark, step.last)
+    later = course.jumps_in(mark + 1, calm + 1)
+    back = next((jump for jump in later if jump.first > after_step and _is_back(course, jump)), None)
+    return Extent(
         mark=mark,
-        onset=onset,
-        end=end,
-        begin_ns=onset_ns if step is None else min(onset_ns, int(course.t_ns[step.first - 1]) + 1),
-        onset_ns=onset_ns,
-        end_ns=end_ns,
+        onset=onset if step is None else max(floor, step.first),
+        end=calm if back is None else back.first,
         step=step,
-        jump_back=jump_back,
-        failed=failed,
-        may_ns=None if failed is None else _failed_may_ns(course, failed, hazards),
-        detection=detection,
-        failure=next(in_use, None) or failure_at(course, onset, end, np.zeros(0, dtype=np.int64), config),
+        jump_back=back,
     )
 
 
-def _end(course: Course, mark: int, step: Jump | None, config: HazardConfig) -> tuple[Jump | None, int]:
-    """The jump back that ends the episode, and the first position after it."""
-    calm = int(course.calm_from[mark])
-    for jump in course.jumps_in(mark + 1, calm + 1):
-        after_step = jump.first > mark and (step is None or jump.first > step.last)
-        if after_step and _is_back(course.judged, jump, config):
-            return jump, jump.first
-    return None, calm
-
-
-def _is_back(judged: Judgements, jump: Jump, config: HazardConfig) -> bool:
+def _is_back(course: Course, jump: Jump) -> bool:
     """The jump goes against the error before it, and the error after it is within the limit."""
-    ends = judged.take(np.array([jump.first - 1, jump.last]))
-    back = float(ends.middle_m[0]) * jump.step_m < 0.0
-    return back and float(ends.least_m[1]) <= config.failure_limit_m and ends.code[1] != WRONG
+    judged = course.judged
+    back = float(judged.middle_m[jump.first - 1]) * jump.step_m < 0.0
+    within = float(judged.least_m[jump.last]) <= course.config.hazards.failure_limit_m
+    return back and within and judged.code[jump.last] != WRONG
+
+
+def _episode(
+    course: Course, extent: Extent, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None
+) -> Episode:
+    step = extent.step
+    end_ns = int(course.t_ns[extent.end]) if extent.end < course.size else int(course.t_ns[-1]) + 1
+    onset_ns, detection = _detected(course, extent, end_ns, log, faults)
+    failed = _failed(course, extent)
+    in_use = (failure for failure in failures if failure.first < extent.end and failure.last >= extent.onset)
+    no_use = np.zeros(0, dtype=np.int64)
+    return Episode(
+        **vars(extent),
+        begin_ns=onset_ns if step is None else min(onset_ns, int(course.t_ns[step.first - 1]) + 1),
+        onset_ns=onset_ns,
+        end_ns=end_ns,
+        failed=failed,
+        may_ns=None if failed is None else _failed_may_ns(course, failed),
+        detection=detection,
+        failure=next(in_use, None) or failure_at(course, extent.onset, extent.end, no_use),
+    )
 
 
 def _detected(
-    course: Course,
-    onset: int,
-    mark: int,
-    end_ns: int,
-    step: Jump | None,
-    log: FailureLog,
-    faults: pl.DataFrame | None,
-    config: HazardConfig,
+    course: Course, extent: Extent, end_ns: int, log: FailureLog, faults: pl.DataFrame | None
 ) -> tuple[int, Detection]:
     """Onset, as a `faults` stream names it, else the first epoch of the step or drift; and detection.
 
-    A drift is visible late: an alarm up to `alarm_lead_s` before its onset becomes the onset, with T_D 0.
+    A drift is visible late: an alarm up to `alarm_lead_s` before its onset becomes the onset, with T_D 0. Detection is
+    the first fail of any monitor from the onset on; at once where an alarm was standing.
     """
-    onset_ns = int(course.t_ns[onset])
+    onset_ns = int(course.t_ns[extent.onset])
+    named_ns = named_onset_ns(faults, onset_ns, int(course.t_ns[extent.mark]))
     alarm_ns = None
-    named_ns = named_onset_ns(faults, onset_ns, int(course.t_ns[mark]))
-    if named_ns is None and step is None:
-        alarm_ns = log.start_within(onset_ns - round(config.alarm_lead_s * NS_PER_S), onset_ns)
+    if named_ns is None and extent.step is None:
+        lead_ns = round(course.config.hazards.alarm_lead_s * NS_PER_S)
+        alarm_ns = log.start_within(onset_ns - lead_ns, onset_ns)
     begin_ns = next((t_ns for t_ns in (named_ns, alarm_ns) if t_ns is not None), onset_ns)
-    detection = _detection(log, begin_ns, end_ns)
-    return begin_ns, detection if alarm_ns is None else replace(detection, standing=True)
+    standing = log.standing_at(begin_ns)
+    if standing is not None:
+        return begin_ns, Detection(begin_ns, standing, standing=True)
+    detection = Detection(*(log.first_in(begin_ns, end_ns) or ()))
+    return begin_ns, replace(detection, standing=alarm_ns is not None)
 
 
 def named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> int | None:
@@ -167,19 +165,12 @@ def named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> 
     return before[-1] if before else next(iter(begins), None)
 
 
-def _detection(log: FailureLog, onset_ns: int, end_ns: int) -> Detection:
-    """First fail of any monitor in the episode; at once where an alarm was standing."""
-    standing = log.standing_at(onset_ns)
-    if standing is not None:
-        return Detection(onset_ns, standing, standing=True)
-    first = log.first_in(onset_ns, end_ns)
-    return Detection() if first is None else Detection(*first)
-
-
-def _failed(course: Course, onset: int, end: int, step: Jump | None, config: HazardConfig) -> int | None:
+def _failed(course: Course, extent: Extent) -> int | None:
     """First position that stays wrong for `failure_hold_s`, a step at once; else the first wrong one of the episode."""
-    spans = [(onset + first, onset + last) for first, last in spans_of(course.judged.is_wrong[onset:end])]
-    hold_ns = round(config.failure_hold_s * NS_PER_S)
+    onset = extent.onset
+    step = extent.step
+    spans = [(onset + first, onset + last) for first, last in spans_of(course.judged.is_wrong[onset : extent.end])]
+    hold_ns = round(course.config.hazards.failure_hold_s * NS_PER_S)
     for first, last in spans:
         at_once = step is not None and step.first <= first <= step.last
         if at_once or course.t_ns[last] - course.t_ns[first] >= hold_ns:
@@ -187,16 +178,16 @@ def _failed(course: Course, onset: int, end: int, step: Jump | None, config: Haz
     return spans[0][0] if spans else None
 
 
-def _failed_may_ns(course: Course, failed: int, config: HazardConfig) -> int | None:
+def _failed_may_ns(course: Course, failed: int) -> int | None:
     """When the failure may have begun: the first position not proved right whose interval reaches beyond the limit.
 
     Looked for since the last right position. None where the evidence is silent for some of that time.
     """
-    right = np.flatnonzero(course.judged.is_right[:failed])
-    run = np.arange(int(right[-1]) + 1 if right.size else 0, failed + 1)
-    judged = course.judged.take(run)
-    if (judged.kind == NOTHING).any():
+    judged = course.judged
+    right = np.flatnonzero(judged.is_right[:failed])
+    since = slice(int(right[-1]) + 1 if right.size else 0, failed + 1)
+    if (judged.kind[since] == NOTHING).any():
         return None
     # Where no place along the track can be compared (NaN), any error may be.
-    may = ~(judged.largest_m <= config.failure_limit_m) | judged.is_wrong
-    return int(course.t_ns[run[may]][0])
+    may = ~(judged.largest_m <= course.config.hazards.failure_limit_m) | judged.is_wrong
+    return int(course.t_ns[since][may[since]][0])

@@ -1,4 +1,4 @@
-"""Everything that is judged of each epoch, as columns of one frame (`schemas.stages.JudgedEpochs`)."""
+"""Everything that is judged of each epoch, and of each offer, as columns of one frame each (`schemas.stages`)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.cross_errors import cross_errors
 from pipeline.stages.judge.in_use import lds_states, time_in_use
 from pipeline.stages.judge.judgement import REFERENCE, Judgements, MatchedPositions, judge_positions, judgements_of
-from pipeline.stages.judge.travel import OdometerSteps, moving, odometer_wrong, travel_direction
-from schemas.arrays import Ints, flags, floats, ints
+from pipeline.stages.judge.travel import OdometerSteps, beyond_confidence, moving, travel_direction
+from schemas.arrays import Ints, flags, floats, ints, times_ns
 
 
 def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
@@ -29,7 +29,9 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
     train_m = positions.path_m - along.known_m(config.hazards.known_error_m)
     reference_m = np.where(along.kind == REFERENCE, train_m, np.nan)
     stood = within_spans(at_ns, case.evidence.stood)
-    wrong_count = odometer_wrong(case, train_m, along.half_m)
+    accepted_ns = times_ns(case.solution.accepted)
+    odometer_m = floats(epochs, "odometer_m")
+    wrong_count = beyond_confidence(times_ns(epochs), odometer_m, train_m, along.half_m, accepted_ns, config.lds)
     undiagnosed = flags(epochs, "diagnosis_faulty") | wrong_count
     use = time_in_use(epochs, along.code, config)
     return epochs.drop("direction").with_columns(
@@ -65,3 +67,30 @@ def direction_by_evidence(case: Case) -> pl.Series:
     positions = MatchedPositions.of(case, case.solution.epochs, met(case.solution.epochs, unambiguous(case.config)))
     along = judge_positions(positions, case.evidence.at(at_ns), case.legs(), case.config.hazards)
     return _direction(case, positions, at_ns, along)
+
+
+def judged_offers(case: Case, epochs: pl.DataFrame) -> pl.DataFrame:
+    """The offers of the LDS, every telegram among them, as `schemas.stages.JudgedOffers`; `epochs`: judged.
+
+    Judged is the place of the balise: at the time of the telegram, or of the crossing less the GNSS latency.
+    """
+    offers = case.solution.offers
+    limits = case.config.hazards
+    t_ns = times_ns(offers)
+    before = ints(offers["before"])
+    sure = flags(epochs, "unambiguous")
+    positions = MatchedPositions.of(case, offers, sure[before] & sure[ints(offers["epoch"])])
+    at_ns = np.where(flags(offers, "virtual"), case.instants(t_ns), t_ns)
+    along = judgements_of(case, positions, at_ns, case.evidence.at(at_ns))
+    judged = along.turned(ints(epochs["direction"])[before])
+    margin_m = np.where(judged.is_right, limits.failure_limit_m - judged.largest_m, np.nan)
+    late = case.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
+    return offers.select(
+        *("crossing_id", "balise_id", "t", "epoch", "path_m", "virtual", "accepted"),
+        offered=pl.col("virtual") & pl.col("offered"),
+        beyond_window=pl.col("crossing_id").is_in(late.drop_nulls().implode()),
+    ).with_columns(
+        *judged.columns(),
+        pl.Series("location_error_m", judged.known_m(limits.known_error_m), nan_to_null=True),
+        pl.Series("proof_margin_m", margin_m, nan_to_null=True),
+    )

@@ -9,14 +9,49 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.stages.judge.judgement import Judgements
+from pipeline.stages.judge.judgement import JUDGEMENTS, UNKNOWN, WRONG, Judgements
 from pipeline.stages.judge.jumps import Jump
-from pipeline.stages.judge.offers import Offers
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, spans_of, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, spans_of, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.conform import dtypes
 from schemas.enums import Judgement
 from schemas.stages import Failures
+
+
+@dataclass(frozen=True)
+class Offers:
+    """Judged offers in arrays; `number`: the position, by its row, that completes each."""
+
+    balise_id: list[str]
+    number: Ints
+    t_ns: Ints
+    path_m: Floats
+    judged: Judgements
+    virtual: Bools
+    offered: Bools
+    accepted: Bools
+    beyond_window: Bools
+
+    @classmethod
+    def of(cls, offers: pl.DataFrame, positions: pl.DataFrame) -> Offers:
+        number = np.searchsorted(ints(positions["epoch"]), ints(offers["epoch"]))
+        return cls(
+            balise_id=offers["balise_id"].to_list(),
+            number=number.clip(0, max(positions.height - 1, 0)),
+            t_ns=times_ns(offers),
+            path_m=floats(offers, "path_m"),
+            judged=Judgements.of(offers),
+            **{name: flags(offers, name) for name in ("virtual", "offered", "accepted", "beyond_window")},
+        )
+
+    def between(self, begin: int, end: int) -> Bools:
+        """Those that positions `begin` to `end` complete."""
+        return np.logical_and(self.number >= begin, self.number < end)
+
+    def worst_accepted(self, begin: int, end: int) -> Judgement:
+        """The worst judgement of the VBs accepted at positions `begin` to `end`; right where none was."""
+        codes = self.judged.code[self.accepted & self.between(begin, end)]
+        return next((JUDGEMENTS[code] for code in (WRONG, UNKNOWN) if code in codes), Judgement.RIGHT)
 
 
 @dataclass(frozen=True)
@@ -30,12 +65,11 @@ class Course:
     positions: pl.DataFrame
     t_ns: Ints
     judged: Judgements
-    used_s: Floats
-    wrong_s: Floats
     calm_from: Ints
     quiet: Bools
     jumps: Sequence[Jump]
     offers: Offers
+    config: Configuration
 
     @property
     def size(self) -> int:
@@ -64,19 +98,18 @@ _POSITION_COLUMNS = (
 )
 
 
-def course_of(positions: pl.DataFrame, offers: pl.DataFrame, jumps: Sequence[Jump], config: HazardConfig) -> Course:
+def course_of(positions: pl.DataFrame, offers: pl.DataFrame, jumps: Sequence[Jump], config: Configuration) -> Course:
     t_ns = times_ns(positions)
     judged = Judgements.of(positions)
     return Course(
         positions=positions,
         t_ns=t_ns,
         judged=judged,
-        used_s=floats(positions, "used_s"),
-        wrong_s=floats(positions, "wrong_s"),
-        calm_from=_calm_from(t_ns, judged, config),
-        quiet=_quiet(judged, floats(positions, "sigma_along_m"), config),
+        calm_from=_calm_from(t_ns, judged, config.hazards),
+        quiet=_quiet(judged, floats(positions, "sigma_along_m"), config.hazards),
         jumps=jumps,
         offers=Offers.of(offers, positions),
+        config=config,
     )
 
 
@@ -84,22 +117,20 @@ def _calm_from(t_ns: Ints, judged: Judgements, config: HazardConfig) -> Ints:
     """`Course.calm_from`: from each position on, the first that begins `episode_end_s` within half the limit."""
     calm = (judged.largest_m <= 0.5 * config.failure_limit_m) & ~judged.is_wrong
     hold_ns = round(config.episode_end_s * NS_PER_S)
-    begins: Ints = np.full(t_ns.size + 1, t_ns.size, dtype=np.int64)
+    begins = np.full(t_ns.size, t_ns.size)
     for first, last in spans_of(calm):
         # The positions of a calm span up to here have `hold_ns` of it ahead of them.
         after_last = int(np.searchsorted(t_ns, t_ns[last] - hold_ns, side="right"))
         begins[first:after_last] = np.arange(first, max(first, after_last))
-    calm_from: Ints = np.minimum.accumulate(begins[::-1])[::-1][: t_ns.size]
-    return calm_from
+    return np.asarray(np.minimum.accumulate(begins[::-1])[::-1])
 
 
 def _quiet(judged: Judgements, sigma_m: Floats, config: HazardConfig) -> Bools:
     """|e| at most min(3 sqrt(sigma_x^2 + sigma_ref^2), half the limit)."""
     sigma_ref_m = np.nan_to_num(judged.half_m) / config.evidence_factor
     noise_m = config.evidence_factor * np.hypot(np.nan_to_num(sigma_m), sigma_ref_m)
-    with np.errstate(invalid="ignore"):
-        quiet: Bools = np.abs(judged.middle_m) <= np.minimum(noise_m, 0.5 * config.failure_limit_m)
-    return np.logical_and(quiet, ~judged.is_wrong)
+    within = np.less_equal(np.abs(judged.middle_m), np.minimum(noise_m, 0.5 * config.failure_limit_m))
+    return np.logical_and(within, ~judged.is_wrong)
 
 
 @dataclass(frozen=True)
@@ -116,38 +147,38 @@ class Failure:
     within_budget: bool | None
 
 
-def find_failures(course: Course, config: Configuration) -> list[Failure]:
+def find_failures(course: Course) -> list[Failure]:
     """Wrong positions in use, in order of time.
 
     Two belong to one failure where less than `recovery_s` lies between them, or no calm position does.
     """
-    wrong = np.flatnonzero(course.wrong_s > 0.0)
+    wrong = np.flatnonzero(floats(course.positions, "wrong_s") > 0.0)
     if wrong.size == 0:
         return []
-    apart = np.diff(course.t_ns[wrong]) >= config.lds.recovery_s * NS_PER_S
+    apart = np.diff(course.t_ns[wrong]) >= course.config.lds.recovery_s * NS_PER_S
     calm_between = course.calm_from[wrong[:-1]] < wrong[1:]
     failures: list[Failure] = []
     for part in np.split(wrong, np.flatnonzero(apart & calm_between) + 1):
         begin = course.after_quiet(failures[-1].end if failures else 0, int(part[0]))
-        failures.append(failure_at(course, begin, int(course.calm_from[part[-1]]), part, config))
+        failures.append(failure_at(course, begin, int(course.calm_from[part[-1]]), part))
     return failures
 
 
-def failure_at(course: Course, begin: int, end: int, wrong: Ints, config: Configuration) -> Failure:
+def failure_at(course: Course, begin: int, end: int, wrong: Ints) -> Failure:
     """Positions `begin` to `end` as a failure; `wrong`: those judged wrong in use, maybe none."""
-    hazardous_s = float(course.wrong_s[wrong].sum())
+    hazardous_s = float(floats(course.positions, "wrong_s")[wrong].sum())
     may_be_wrong = ~course.judged.is_right[begin:end]
-    may_s = float(course.used_s[begin:end][may_be_wrong].sum())
+    may_s = float(floats(course.positions, "used_s")[begin:end][may_be_wrong].sum())
     accepted = course.offers.worst_accepted(begin, end)
-    within = within_budget(hazardous_s, may_s, accepted, config.budget_s)
+    within = within_budget(hazardous_s, may_s, accepted, course.config.budget_s)
     first, last = (int(wrong[0]), int(wrong[-1])) if wrong.size else (begin, end)
     return Failure(begin, first, last, end, hazardous_s, may_s, accepted, within)
 
 
 def failures_within(epochs: pl.DataFrame, offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """The failures of a part of the epochs judged, as if it were all."""
-    course = course_of(positions_of(epochs), offers, (), config.hazards)
-    return failures_table(find_failures(course, config), course)
+    course = course_of(positions_of(epochs), offers, (), config)
+    return failures_table(find_failures(course), course)
 
 
 def within_budget(hazardous_s: float, hazardous_may_s: float, accepted: Judgement, budget_s: float) -> bool | None:
@@ -160,14 +191,13 @@ def within_budget(hazardous_s: float, hazardous_may_s: float, accepted: Judgemen
 def failures_table(failures: Sequence[Failure], course: Course) -> pl.DataFrame:
     """One row per failure: frame as `schemas.stages.Failures`."""
     rows = [
-        {
+        vars(failure)
+        | {
             "t_start": int(course.t_ns[failure.begin]),
             "t_end": int(course.t_ns[min(failure.end, course.size - 1)]),
-            "hazardous_s": failure.hazardous_s,
-            "hazardous_may_s": failure.hazardous_may_s,
             "accepted": failure.accepted.value,
-            "within_budget": failure.within_budget,
         }
         for failure in failures
     ]
-    return pl.DataFrame(rows, schema=dtypes(Failures))
+    schema = dtypes(Failures)
+    return pl.DataFrame([[row[name] for name in schema] for row in rows], schema=schema, orient="row")

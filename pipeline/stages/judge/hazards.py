@@ -9,22 +9,21 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from pipeline.stages.epochs.clock import nominal_period_s, reaction_of
 from pipeline.stages.evidence.evidence import KINDS
-from pipeline.stages.judge.attribution import suspect_of
+from pipeline.stages.judge.alarms import suspect_of
 from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.episodes import Episode
-from pipeline.stages.judge.failures import Course
-from pipeline.stages.judge.in_use import reaction_s
+from pipeline.stages.judge.failures import Course, Offers
 from pipeline.stages.judge.jumps import Jump
-from pipeline.stages.judge.offers import Offers
 from pipeline.stages.judge.travel import speed_at
 from schemas.arrays import NS_PER_S
-from schemas.config import Configuration, HazardConfig
 from schemas.conform import dtypes
 from schemas.enums import Evidence, FailureMode, Hazard, Timing
 from schemas.tables import Hazards
 
 Row = dict[str, Any]
+_JUMPS = {Hazard.VB_JUMP_1A, Hazard.VB_JUMP_1B}
 
 
 @dataclass
@@ -39,30 +38,26 @@ class HazardRow:
     caused_by: HazardRow | None = None
 
 
-def hazard_rows(episodes: Iterable[Episode], course: Course, config: HazardConfig) -> list[HazardRow]:
+def hazard_rows(episodes: Iterable[Episode], course: Course) -> list[HazardRow]:
     """At most one row per episode and class, and one for VBs that the jump back crosses; in order of time."""
-    return [row for episode in episodes for row in _of_episode(episode, course, config)]
+    return [row for episode in episodes for row in _of_episode(episode, course)]
 
 
-def _of_episode(episode: Episode, course: Course, config: HazardConfig) -> list[HazardRow]:
+def _of_episode(episode: Episode, course: Course) -> list[HazardRow]:
     by_class = _jumps(episode, course)
     crossed = {hit for row in by_class.values() for hit in row.crossed}
-    for hit in _hits(episode, course.offers, config):
+    for hit in _hits(episode, course):
         if hit not in crossed:
             astray = course.offers.judged.wrong_track[hit]
-            hazard = Hazard.VB_WRONG_TRACK if astray else next(iter(sorted(by_class.keys() & _JUMPS)), Hazard.VB_SHIFT)
+            hazard = Hazard.VB_WRONG_TRACK if astray else min(by_class.keys() & _JUMPS, default=Hazard.VB_SHIFT)
             by_class.setdefault(hazard, HazardRow(hazard, episode)).hits.append(hit)
     rows = sorted(by_class.values(), key=lambda row: t_hazard_ns(row, course))
     back = episode.jump_back
     crossed_back = [] if back is None else crossed_by(back, course)
     if crossed_back:
         hazard = _class_of(crossed_back, course.offers)
-        cause = next(iter(rows), None)
-        rows.append(HazardRow(hazard, episode, back, crossed_back, crossed_back, cause))
+        rows.append(HazardRow(hazard, episode, back, crossed_back, crossed_back, next(iter(rows), None)))
     return rows
-
-
-_JUMPS = {Hazard.VB_JUMP_1A, Hazard.VB_JUMP_1B}
 
 
 def _jumps(episode: Episode, course: Course) -> dict[Hazard, HazardRow]:
@@ -78,9 +73,10 @@ def _jumps(episode: Episode, course: Course) -> dict[Hazard, HazardRow]:
     return rows
 
 
-def _hits(episode: Episode, offers: Offers, config: HazardConfig) -> list[int]:
+def _hits(episode: Episode, course: Course) -> list[int]:
     """Offers judged wrong during the episode, beyond the shift limit or on another track."""
-    beyond = (offers.judged.least_m > config.shift_limit_m) | offers.judged.wrong_track
+    offers = course.offers
+    beyond = (offers.judged.least_m > course.config.hazards.shift_limit_m) | offers.judged.wrong_track
     wrong = offers.offered & offers.judged.is_wrong & offers.between(episode.onset, episode.end)
     return np.flatnonzero(beyond & wrong).tolist()
 
@@ -96,13 +92,15 @@ def crossed_by(jump: Jump, course: Course) -> list[int]:
     # Where the train was is better known by the evidence than by the position before the jump.
     start_m = before["path_m"] if before["train_m"] is None else before["train_m"]
     low_m, high_m = sorted((start_m, start_m + (after["path_m"] - before["path_m"]) - step_m))
-    by_train = (offers.path_m[on_the_way] >= low_m) & (offers.path_m[on_the_way] <= high_m)
-    return on_the_way[~by_train].tolist()  # type: ignore[no-any-return]
+    return [hit for hit in on_the_way.tolist() if not low_m <= offers.path_m[hit] <= high_m]
 
 
 def _class_of(crossed: list[int], offers: Offers) -> Hazard:
-    distinct = {offers.balise_id[number] for number in crossed}
-    return Hazard.VB_JUMP_1A if len(distinct) > 1 else Hazard.VB_JUMP_1B
+    return Hazard.VB_JUMP_1A if len(_names(crossed, offers)) > 1 else Hazard.VB_JUMP_1B
+
+
+def _names(hits: list[int], offers: Offers) -> list[str]:
+    return list(dict.fromkeys(offers.balise_id[hit] for hit in hits))
 
 
 def t_hazard_ns(row: HazardRow, course: Course) -> int:
@@ -117,14 +115,12 @@ def size_m(row: HazardRow, course: Course) -> float | None:
     """
     episode = row.episode
     jump = row.jump
-    if jump is not None and jump is episode.jump_back:
-        return jump.step_m
     of_positions = course.judged.middle_m[episode.onset : episode.end]
     error_m = np.concatenate([of_positions, course.offers.judged.middle_m[row.hits]])
     error_m = error_m[np.isfinite(error_m)]
-    if error_m.size == 0:
-        return None if jump is None else jump.step_m
-    return float(error_m[np.argmax(np.abs(error_m))])
+    if jump is not None and (jump is episode.jump_back or error_m.size == 0):
+        return jump.step_m
+    return float(error_m[np.argmax(np.abs(error_m))]) if error_m.size else None
 
 
 def rate_mps(row: HazardRow, course: Course) -> float | None:
@@ -139,29 +135,27 @@ def rate_mps(row: HazardRow, course: Course) -> float | None:
     known = np.isfinite(error_m)
     if known.sum() < 2 or np.ptp(t_s[known]) == 0.0:
         return None
-    slope, _ = np.polyfit(t_s[known], error_m[known], 1)
-    return float(slope)
+    return float(np.polyfit(t_s[known], error_m[known], 1)[0])
 
 
 def hazards_table(rows: Sequence[HazardRow], case: Case, epochs: pl.DataFrame, course: Course) -> pl.DataFrame:
     """Rows in order of time; `hazard_id` is the place in `rows`; `epochs`: judged."""
     ids = {id(row): number for number, row in enumerate(rows)}
-    config = case.config
     values = [
         {
             "solution": case.solution.name,
             "hazard_id": number,
-            "caused_by": None if row.caused_by is None else ids[id(row.caused_by)],
-            "suspect": suspect_of(epochs, row.episode.onset_ns, row.episode.end_ns, config).value,
+            "caused_by": ids.get(id(row.caused_by)),
+            "suspect": suspect_of(epochs, row.episode.onset_ns, row.episode.end_ns, case.config).value,
             "size_m": size_m(row, course),
             "rate_mps": rate_mps(row, course),
             "evidence": _evidence(row, course).value,
             "hazardous_s": row.episode.failure.hazardous_s,
             "hazardous_may_s": row.episode.failure.hazardous_may_s,
-            "budget_s": config.budget_s,
+            "budget_s": case.config.budget_s,
             "within_budget": row.episode.failure.within_budget,
             **_kind(row, course.offers),
-            **instants(row, course, config),
+            **instants(row, course),
             **_place(row, case, epochs, course),
         }
         for number, row in enumerate(rows)
@@ -176,18 +170,15 @@ def _kind(row: HazardRow, offers: Offers) -> Row:
     mode = FailureMode.INSERTION
     if row.hazard is Hazard.VB_SHIFT and timing is not Timing.EARLY:
         mode = FailureMode.DELETION if offers.beyond_window[row.hits].any() else FailureMode.NONE
-    accepted = [hit for hit in row.hits if offers.accepted[hit]]
+    names = _names(row.hits, offers)
+    accepted = {offers.balise_id[hit] for hit in row.hits if offers.accepted[hit]}
     return {
         "hazard": row.hazard.value,
         "failure_mode": mode.value,
         "timing": timing.value,
-        "balise_ids": _names(row.hits, offers),
-        "accepted_ids": [name for name in _names(row.hits, offers) if name in _names(accepted, offers)],
+        "balise_ids": names,
+        "accepted_ids": [name for name in names if name in accepted],
     }
-
-
-def _names(hits: list[int], offers: Offers) -> list[str]:
-    return list(dict.fromkeys(offers.balise_id[hit] for hit in hits))
 
 
 def _evidence(row: HazardRow, course: Course) -> Evidence:
@@ -196,12 +187,12 @@ def _evidence(row: HazardRow, course: Course) -> Evidence:
     return next((KINDS[kind] for kind in kinds if kind >= 0), Evidence.ODOMETER)
 
 
-def instants(row: HazardRow, course: Course, config: Configuration) -> Row:
+def instants(row: HazardRow, course: Course) -> Row:
     """When it began, hit, failed, was detected and ended, and the times between (DIAG, T_D and T_dsf)."""
     episode = row.episode
-    detected_ns = row.episode.detection.t_ns
+    detected_ns = episode.detection.t_ns
     failed_ns = None if episode.failed is None else int(course.t_ns[episode.failed])
-    reaction_ns = round(reaction_s(course.t_ns, config) * NS_PER_S)
+    reaction_ns = round(reaction_of(nominal_period_s(course.t_ns) or 0.0, course.config) * NS_PER_S)
     return {
         "t_onset": episode.onset_ns,
         "t_hazard": t_hazard_ns(row, course),

@@ -7,22 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gap_ns, met, nominal_period_s, trusted
+from pipeline.stages.epochs.clock import crossing_gap_ns, met, nominal_period_s, reaction_of, trusted
 from pipeline.stages.judge.judgement import RIGHT, WRONG
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, runs_of, times_ns
 from schemas.config import Configuration
 from schemas.enums import LdsState
 
-_STATES = tuple(LdsState)
 # Numerics: times shorter than half a nanosecond are rounding.
 _LEAST_S = 0.5 / NS_PER_S
-
-
-def reaction_s(position_ns: Ints, config: Configuration) -> float:
-    """From detection to negation [s]: as configured, else from one position to the next."""
-    if config.hazards.reaction_s is not None:
-        return config.hazards.reaction_s
-    return nominal_period_s(position_ns) or 0.0
 
 
 def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.DataFrame:
@@ -37,16 +29,14 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
     steps = _StepTimes.of(epochs, known, config)
     usable = met(epochs.filter(known), trusted(config) & ~pl.col("withheld"))
     in_use = usable & (steps.left_s(steps.alone_s) > _LEAST_S)
-    judged = code[known]
-    wrong_s = steps.lasting_s(in_use & (judged == WRONG))
-    doubtful_s = steps.lasting_s(in_use & (judged != RIGHT))
-    used_s = np.where(in_use & (judged == RIGHT), steps.left_s(steps.near_s), doubtful_s)
-    columns = {"in_use": in_use, "used_s": used_s, "wrong_s": wrong_s}
-    whole = {name: np.zeros(known.size, dtype=values.dtype) for name, values in columns.items()}
-    for name, values in columns.items():
-        whole[name][known] = values
-    counted_s = np.where(whole["wrong_s"] > 0.0, whole["wrong_s"], _counted_s(times_ns(epochs), known, steps))
-    return pl.DataFrame({**whole, "counted_s": counted_s})
+    right = code[known] == RIGHT
+    wrong_s, used_s = np.zeros((2, known.size))
+    wrong_s[known] = steps.lasting_s(in_use & (code[known] == WRONG))
+    used_s[known] = np.where(in_use & right, steps.left_s(steps.near_s), steps.lasting_s(in_use & ~right))
+    in_use_of_all = known.copy()
+    in_use_of_all[known] = in_use
+    counted_s = np.where(wrong_s > 0.0, wrong_s, _counted_s(times_ns(epochs), known, steps))
+    return pl.DataFrame({"in_use": in_use_of_all, "used_s": used_s, "wrong_s": wrong_s, "counted_s": counted_s})
 
 
 @dataclass(frozen=True)
@@ -76,7 +66,8 @@ class _StepTimes:
         step_s = np.diff(all_s[known], prepend=all_s[known][:1] - period_s)
         alone_s = np.minimum(step_s, period_s)
         near_s = np.where(step_s <= gap_s, step_s, alone_s)
-        negated = negated_spans(all_s, flags(epochs, "negated"), flags(epochs, "withheld"), reaction_s(t_ns, config))
+        delay_s = reaction_of(period_s, config)
+        negated = _negated_spans(all_s, flags(epochs, "negated"), flags(epochs, "withheld"), delay_s)
         blocked_s = np.cumsum(np.diff(negated, axis=1, prepend=negated[:, :1]).ravel())
         return cls(all_s[known], step_s, near_s, alone_s, period_s, gap_s, negated.ravel(), blocked_s)
 
@@ -94,7 +85,7 @@ class _StepTimes:
         return np.where(member, self.left_s(np.where(member_before, self.step_s, self.alone_s)), 0.0)
 
 
-def negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) -> Floats:
+def _negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) -> Floats:
     """Begin and end of each negation [s]: from `delay_s` after it, or at once where already withheld, to the return."""
     firsts, lasts = runs_of(negated)
     until_s = np.append(t_s, t_s[-1:])[lasts + 1]
@@ -122,10 +113,11 @@ def lds_states(epochs: pl.DataFrame, code: Ints, in_use: Bools, undiagnosed: Boo
 
     Null where the evidence cannot say, and where a wrong position was not in use.
     """
-    state = np.full(epochs.height, len(_STATES))
-    state[code == RIGHT] = _STATES.index(LdsState.P0)
-    state[undiagnosed] = _STATES.index(LdsState.P3)
-    state[flags(epochs, "negated")] = _STATES.index(LdsState.P2)
-    state[(code == WRONG) & in_use] = _STATES.index(LdsState.P1)
-    words = pl.Series("lds_state", [*(state.value for state in _STATES), None], dtype=pl.Enum(LdsState))
-    return words.gather(state)
+    applies = {
+        LdsState.P1: (code == WRONG) & in_use,
+        LdsState.P2: flags(epochs, "negated"),
+        LdsState.P3: undiagnosed,
+        LdsState.P0: code == RIGHT,
+    }
+    states = [pl.when(pl.Series(held)).then(pl.lit(state.value)) for state, held in applies.items()]
+    return pl.select(lds_state=pl.coalesce(states).cast(pl.Enum(LdsState))).to_series()

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gap_ns
 from pipeline.stages.epochs.failure_log import failure_log
-from pipeline.stages.evidence.evidence import KINDS, NOTHING, within_spans
+from pipeline.stages.evidence.evidence import within_spans
 from pipeline.stages.judge.alarms import alarms_table
 from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.episodes import find_episodes
-from pipeline.stages.judge.epochs import judged_epochs
+from pipeline.stages.judge.epochs import judged_epochs, judged_offers
 from pipeline.stages.judge.failures import course_of, failures_table, find_failures, positions_of
 from pipeline.stages.judge.hazards import hazard_rows, hazards_table
-from pipeline.stages.judge.judgement import Judgements
 from pipeline.stages.judge.jumps import jumps_of
-from pipeline.stages.judge.offers import judged_offers
 from pipeline.stages.judge.passages import passages_table
-from pipeline.stages.judge.travel import Span, odometer_steps
+from pipeline.stages.judge.travel import odometer_steps
 from schemas.arrays import flags, times_ns
 from schemas.enums import Evidence
 
@@ -52,29 +48,24 @@ def judge(case: Case) -> Judged:
     offers = judged_offers(case, epochs)
     positions = positions_of(epochs)
     gap_ns = crossing_gap_ns(times_ns(positions), config.lds)
-    jumps = jumps_of(positions, case.odometry, gap_ns, config.hazards)
-    course = course_of(positions, offers, jumps, config.hazards)
-    failures = find_failures(course, config)
+    course = course_of(positions, offers, jumps_of(positions, case.odometry, gap_ns, config.hazards), config)
+    failures = find_failures(course)
     log = failure_log(case.solution.epochs, config.lds.recovery_s)
-    episodes = find_episodes(course, failures, log, case.faults, config)
-    rows = hazard_rows(episodes, course, config.hazards)
+    episodes = find_episodes(course, failures, log, case.faults)
+    rows = hazard_rows(episodes, course)
+    # From a fault's onset to its detection.
     undetected = [episode.undetected_ns for episode in episodes]
+    suspect_after = within_spans(times_ns(epochs), undetected) & flags(epochs, "tvb")
     return Judged(
         hazards=hazards_table(rows, case, epochs, course),
         alarms=alarms_table(case.solution.name, epochs, log, [row.episode for row in rows], config),
         passages=passages_table(case, epochs, offers, rows, undetected),
         failures=failures_table(failures, course),
-        epochs=epochs.with_columns(_suspect_after(epochs, undetected)),
+        epochs=epochs.with_columns(pl.Series("suspect_after_the_fact", suspect_after)),
         offers=offers,
         distance_m=_distance_m(case, epochs),
-        evidence=_evidence(epochs),
+        evidence=_evidence(epochs["evidence"]),
     )
-
-
-def _suspect_after(epochs: pl.DataFrame, undetected: Sequence[Span]) -> pl.Series:
-    """TVBs between a fault's onset and its detection."""
-    after = within_spans(times_ns(epochs), undetected) & flags(epochs, "tvb")
-    return pl.Series("suspect_after_the_fact", after)
 
 
 def _distance_m(case: Case, epochs: pl.DataFrame) -> float | None:
@@ -87,8 +78,8 @@ def _distance_m(case: Case, epochs: pl.DataFrame) -> float | None:
     return float(place.diff().abs().sum()) if place.len() > 1 else None
 
 
-def _evidence(epochs: pl.DataFrame) -> Evidence | None:
-    """What most epochs rest on."""
-    kinds = Judgements.of(epochs).kind
-    kinds = kinds[kinds != NOTHING]
-    return KINDS[int(np.bincount(kinds).argmax())] if kinds.size else None
+def _evidence(kinds: pl.Series) -> Evidence | None:
+    """What most epochs rest on; of equally many the first in the order of the enum."""
+    counts = {kind: (kinds == kind.value).sum() for kind in Evidence}
+    most = max(counts, key=lambda kind: counts[kind])
+    return most if counts[most] else None

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.evidence.carrying import carried_forward
+from pipeline.stages.evidence.carrying import Interval, carried_forward
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.stages.judge.case import Case
 from pipeline.stages.track.path import RoutePath
@@ -42,8 +43,7 @@ class MatchedPositions:
 
     @property
     def known(self) -> Bools:
-        known: Bools = (self.element >= 0) & np.isfinite(self.path_m)
-        return known
+        return np.isfinite(self.path_m) & np.greater_equal(self.element, 0)
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,6 @@ class Judgements:
             wrong_track=flags(frame, "wrong_track"),
         )
 
-    def take(self, rows: Ints) -> Judgements:
-        return Judgements(self.code[rows], self.low_m[rows], self.high_m[rows], self.kind[rows], self.wrong_track[rows])
-
     def columns(self) -> list[pl.Series]:
         words = [word.value for word in JUDGEMENTS]
         kinds = pl.Series("evidence", [*(kind.value for kind in KINDS), None], dtype=pl.Enum(Evidence))
@@ -90,40 +87,36 @@ class Judgements:
         low_m = np.where(forward, self.low_m, -self.high_m)
         return replace(self, low_m=low_m, high_m=np.where(forward, self.high_m, -self.low_m))
 
-    @property
+    @cached_property
     def is_right(self) -> Bools:
-        right: Bools = self.code == RIGHT
-        return right
+        return np.isin(self.code, RIGHT)
 
-    @property
+    @cached_property
     def is_wrong(self) -> Bools:
-        wrong: Bools = self.code == WRONG
-        return wrong
+        return np.isin(self.code, WRONG)
 
-    @property
-    def middle_m(self) -> Floats:
-        return 0.5 * (self.low_m + self.high_m)
-
-    @property
-    def half_m(self) -> Floats:
-        return 0.5 * (self.high_m - self.low_m)
-
-    @property
-    def least_m(self) -> Floats:
-        """The smallest size that the error may have."""
-        least: Floats = np.maximum(np.maximum(self.low_m, -self.high_m), 0.0)
-        return least
-
-    @property
-    def largest_m(self) -> Floats:
-        """The largest size that the error may have."""
-        largest: Floats = np.maximum(-self.low_m, self.high_m)
-        return largest
-
-    @property
+    @cached_property
     def by_truth(self) -> Bools:
         """By reference or balise reads, which alone can call a position right."""
         return np.isin(self.kind, [REFERENCE, BALISE])
+
+    @cached_property
+    def middle_m(self) -> Floats:
+        return 0.5 * (self.low_m + self.high_m)
+
+    @cached_property
+    def half_m(self) -> Floats:
+        return 0.5 * (self.high_m - self.low_m)
+
+    @cached_property
+    def least_m(self) -> Floats:
+        """The smallest size that the error may have."""
+        return np.asarray(np.maximum(np.maximum(self.low_m, -self.high_m), 0.0))
+
+    @cached_property
+    def largest_m(self) -> Floats:
+        """The largest size that the error may have."""
+        return np.asarray(np.maximum(-self.low_m, self.high_m))
 
     def known_m(self, known_to_m: float) -> Floats:
         """The error where reference or balise reads give it to plus or minus so much, else NaN [m]."""
@@ -161,7 +154,7 @@ def judge_positions(
     low_m = np.full(size, np.inf)
     high_m = np.full(size, -np.inf)
     # True as long as it holds for every alternative seen so far.
-    right, ahead, behind, elsewhere = (np.ones(size, dtype=np.bool_) for _ in range(4))
+    right, ahead, behind, elsewhere = np.ones((4, size), dtype=np.bool_)
     judged = np.zeros(size, dtype=np.bool_)
     sense = _path_sense(positions, legs)
     for alternative in evidence.alternatives:
@@ -211,9 +204,10 @@ def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs
     low_m = np.where(forward, at_m - there.high_m, there.low_m - at_m)
     high_m = np.where(forward, at_m - there.low_m, there.high_m - at_m)
     off_track = ~np.isfinite(at_m)
-    away = np.flatnonzero(off_track)
-    if away.size:
-        low_m[away], high_m[away], off_track[away] = _by_own_path(positions, there.where(off_track), legs)
+    if off_track.any():
+        low_m[off_track], high_m[off_track], off_track[off_track] = _by_own_path(
+            positions, there.where(off_track), legs
+        )
     return low_m, high_m, off_track
 
 
@@ -244,7 +238,7 @@ def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence
 
 
 def with_own_anchors(
-    judged: Judgements, positions: MatchedPositions, train_m: tuple[Floats, Floats], config: HazardConfig
+    judged: Judgements, positions: MatchedPositions, train_m: Interval, config: HazardConfig
 ) -> Judgements:
     """Where there is no other evidence, by the odometer since an accepted VB: wrong, or unknown, never right.
 

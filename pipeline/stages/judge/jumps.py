@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -12,8 +12,7 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, spans_of
 from schemas.config import HazardConfig
 
 
-@dataclass(frozen=True)
-class PositionChanges:
+class PositionChanges(NamedTuple):
     """Per position: sum of the changes of position minus evidence up to it [m], along growing path.
 
     `linked`: the change since the position before is known, and no gap lies between.
@@ -24,8 +23,7 @@ class PositionChanges:
     linked: Bools
 
 
-@dataclass(frozen=True)
-class Jump:
+class Jump(NamedTuple):
     """A jump from position `first - 1` to `last`; `step_m` in the direction of travel."""
 
     first: int
@@ -36,11 +34,11 @@ class Jump:
 def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: int, config: HazardConfig) -> list[Jump]:
     """All jumps of the positions, in order of time; numbers are rows of `positions`."""
     at_ns = times_ns(positions, "at")
-    path_m = floats(positions, "path_m")
     counted_m = np.full(max(at_ns.size - 1, 0), np.nan)
     if odometry is not None:
         counted_m = odometry.between(at_ns[:-1], at_ns[1:]).distance_m
-    steps = steps_of(times_ns(positions), path_m, floats(positions, "reference_m"), counted_m, gap_ns)
+    places = floats(positions, "path_m"), floats(positions, "reference_m")
+    steps = steps_of(times_ns(positions), *places, counted_m, gap_ns)
     return find_jumps(steps, ints(positions["direction"]), config)
 
 
@@ -62,7 +60,7 @@ def find_jumps(steps: PositionChanges, direction: Ints, config: HazardConfig) ->
             first, last = _extent(steps, begin, end, sign, config)
             step_m = float(steps.excess_m[last] - steps.excess_m[first - 1]) * float(direction[last])
             jumps.append(Jump(first, last, step_m))
-    return sorted(jumps, key=lambda jump: (jump.first, jump.last))
+    return sorted(jumps, key=lambda jump: jump[:2])
 
 
 def _largest_step(steps: PositionChanges, config: HazardConfig) -> Floats:
@@ -71,13 +69,12 @@ def _largest_step(steps: PositionChanges, config: HazardConfig) -> Floats:
     Lag by lag: as soon as no pair of positions so far apart is in the window, no longer lag has one.
     """
     excess_m = steps.excess_m
-    size = steps.t_ns.size
-    largest_m = np.zeros(size)
-    if size < 2 or np.ptp(excess_m) <= config.jump_limit_m:
+    largest_m = np.zeros(excess_m.size)
+    if excess_m.size < 2 or np.ptp(excess_m) <= config.jump_limit_m:
         return largest_m
     window_ns = round(config.jump_window_s * NS_PER_S)
     chain = np.cumsum(~steps.linked)
-    for lag in range(1, size):
+    for lag in range(1, excess_m.size):
         near = chain[lag:] == chain[:-lag]
         if lag > 1:
             near &= steps.t_ns[lag:] - steps.t_ns[:-lag] <= window_ns

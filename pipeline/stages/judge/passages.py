@@ -8,18 +8,16 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gap_ns
-from pipeline.stages.evidence.evidence import NOTHING, within_spans
+from pipeline.stages.epochs.clock import crossing_gap_ns, met
+from pipeline.stages.evidence.evidence import NOTHING, Span, within_spans
 from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.hazards import HazardRow
 from pipeline.stages.judge.judgement import Judgements
-from pipeline.stages.judge.travel import Span, speed_at
-from pipeline.stages.judge.true_crossings import TrueCrossing, crossings_of
+from pipeline.stages.judge.travel import speed_at
+from pipeline.stages.judge.true_crossings import Crossings, TrueCrossing, crossings_of
 from schemas.arrays import Bools, Ints, ints, times_ns
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
 from schemas.tables import Passages
-
-Crossings = dict[str, list[TrueCrossing]]
 
 
 def passages_table(
@@ -35,13 +33,14 @@ def passages_table(
     known = case.solution.passages.with_columns(_true_times(case.solution.passages, crossings))
     passages = _with_unoffered(known, case, crossings, stamps, gap_ns)
     t_true = passages["t_true"]
-    positioned = _within_gap(stamps, ints(t_true), gap_ns) & t_true.is_not_null().to_numpy()
+    accepted = (pl.col("status") == PassageStatus.ACCEPTED.value) & (pl.col("kind") == BaliseKind.VIRTUAL.value)
+    offered_ns = ints(passages["t_offered"].dt.timestamp("ns"))
     frame = passages.with_columns(
         pl.col("t_true").cast(pl.Datetime("ns", "UTC")),
         *_of_offers(passages, offers, rows),
-        pl.Series("_positioned", positioned),
-        pl.Series("suspect_after_the_fact", _accepted_within(passages, undetected)),
         _speeds(passages, t_true, epochs, gap_ns),
+        _positioned=pl.Series(_within_gap(stamps, ints(t_true), gap_ns)) & t_true.is_not_null(),
+        suspect_after_the_fact=pl.Series(met(passages, accepted) & within_spans(offered_ns, undetected)),
     )
     return _with_failures(frame).select(Passages.column_names())
 
@@ -53,23 +52,18 @@ def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[Haza
     """
     judged = Judgements.of(offers)
     hazard = np.full(offers.height, NOTHING)
-    jumped = np.zeros(offers.height, dtype=np.bool_)
+    inserted = judged.is_wrong & ((judged.low_m > 0.0) | judged.wrong_track)
     for number, row in reversed(list(enumerate(rows))):
         hazard[row.hits] = number
-        jumped[row.crossed] = True
-    early = judged.is_wrong & ((judged.low_m > 0.0) | judged.wrong_track)
+        inserted[row.crossed] = True
     of_virtual = ("judgement", "error_low_m", "error_high_m", "evidence", "proof_margin_m")
-    joined = passages.select("crossing_id").join(
-        offers.select(
-            *("crossing_id", "location_error_m"),
-            *(pl.when("virtual").then(pl.col(name)).alias(name) for name in of_virtual),
-            hazard_id=pl.Series(hazard).replace(NOTHING, None),
-            _inserted=pl.Series(jumped | early),
-        ),
-        on="crossing_id",
-        how="left",
-        maintain_order="left",
+    columns = offers.select(
+        *("crossing_id", "location_error_m"),
+        *(pl.when("virtual").then(pl.col(name)).alias(name) for name in of_virtual),
+        hazard_id=pl.Series(hazard).replace(NOTHING, None),
+        _inserted=pl.Series(inserted),
     )
+    joined = passages.select("crossing_id").join(columns, on="crossing_id", how="left", maintain_order="left")
     return joined.drop("crossing_id").with_columns(pl.col("_inserted").fill_null(value=False))
 
 
@@ -106,13 +100,6 @@ def _within_gap(stamps: Ints, t_ns: Ints, gap_ns: int) -> Bools:
     return np.asarray(inside & (stamps[after] - stamps[after - 1] <= gap_ns))
 
 
-def _accepted_within(passages: pl.DataFrame, spans: Sequence[Span]) -> Bools:
-    """Virtual balises accepted in some spans of time."""
-    accepted = (passages["status"].cast(pl.String) == PassageStatus.ACCEPTED.value).to_numpy()
-    virtual = (passages["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy()
-    return np.asarray(accepted & virtual & within_spans(ints(passages["t_offered"].dt.timestamp("ns")), spans))
-
-
 def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, gap_ns: int) -> pl.Series:
     """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
     at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
@@ -131,16 +118,15 @@ def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:
     deletion = absent | ~offered | beyond_window
     by_position = insertion | (beyond_window & wrong) | (~offered & ~absent & pl.col("_positioned"))
     without = absent | (~offered & ~pl.col("_positioned"))
-    return frame.with_columns(
-        failure_mode=_word(frame, "failure_mode", (insertion, FailureMode.INSERTION), (deletion, FailureMode.DELETION)),
-        cause=_word(frame, "cause", (by_position, Cause.POSITION), (without, Cause.NO_POSITION)),
-    )
+    mode = _first_of(insertion, FailureMode.INSERTION, deletion, FailureMode.DELETION)
+    cause = _first_of(by_position, Cause.POSITION, without, Cause.NO_POSITION)
+    kinds = frame.schema
+    return frame.with_columns(failure_mode=mode.cast(kinds["failure_mode"]), cause=cause.cast(kinds["cause"]))
 
 
-def _word(frame: pl.DataFrame, column: str, *rows: tuple[pl.Expr, FailureMode | Cause]) -> pl.Expr:
-    """The word of the first condition that holds, `none` where none does."""
-    applying = [pl.when(condition).then(pl.lit(word.value)) for condition, word in rows]
-    return pl.coalesce(*applying, pl.lit("none")).cast(frame.schema[column])
+def _first_of(first: pl.Expr, word: FailureMode | Cause, second: pl.Expr, other: FailureMode | Cause) -> pl.Expr:
+    """The word of the first condition that holds, `none` where neither does."""
+    return pl.when(first).then(pl.lit(word.value)).when(second).then(pl.lit(other.value)).otherwise(pl.lit("none"))
 
 
 def _with_unoffered(
@@ -160,19 +146,19 @@ def _with_unoffered(
     if not missed:
         return passages
     positioned = _within_gap(stamps, np.array([crossing.t_ns for _, crossing in missed]), gap_ns).tolist()
-    rows = [_unoffered(*pair, case, seen) for pair, seen in zip(missed, positioned, strict=True)]
+    rows = [_unoffered(*pair, case.solution.name, seen) for pair, seen in zip(missed, positioned, strict=True)]
     added = pl.DataFrame(rows, schema=passages.schema)
     when = pl.coalesce("t_offered", "t_reckoned")
     ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
     return pl.concat([ordered, added.with_columns(_when=when)]).sort("_when", maintain_order=True).drop("_when")
 
 
-def _unoffered(balise: dict[str, Any], crossing: TrueCrossing, case: Case, positioned: bool) -> dict[str, Any]:
+def _unoffered(balise: dict[str, Any], crossing: TrueCrossing, solution: str, positioned: bool) -> dict[str, Any]:
     """The row of such a passage; `sense` of crossing and balise are along the measure, `direction` along the path."""
     names = ("balise_id", "kind", "netelement_id", "measure_m", "path_m", "location_accuracy_m")
     growing = crossing.sense * balise["sense"] > 0
     return {name: balise[name] for name in names} | {
-        "solution": case.solution.name,
+        "solution": solution,
         "direction": (Direction.GROWING if growing else Direction.FALLING).value,
         "status": (PassageStatus.MISSED if positioned else PassageStatus.NOT_AVAILABLE).value,
         "linking_error": LinkingError.NONE.value,

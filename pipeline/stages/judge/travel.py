@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
+from pipeline.stages.evidence.evidence import Span
 from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.judgement import REFERENCE, Judgements
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, spans_of, times_ns
 from schemas.config import Configuration, HazardConfig, LdsConfig
-
-Span = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -32,17 +31,15 @@ def odometer_steps(case: Case) -> OdometerSteps:
     at_ns = case.instants_of_epochs()
     odometry = case.odometry
     if odometry is None:
-        nothing = np.zeros(at_ns.size, dtype=np.bool_)
-        return OdometerSteps(nothing, nothing)
+        return OdometerSteps(*np.zeros((2, at_ns.size), dtype=np.bool_))
     moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
     counts = _to_the_next(np.isfinite(odometry.between(at_ns[:-1], at_ns[1:]).distance_m), at_ns.size)
     path_m = floats(case.solution.epochs, "path_m")
-    limit_m = case.config.hazards.failure_limit_m
     stood: list[Span] = []
     for first, last in spans_of(counts & ~moves):
         rows = slice(first, min(last + 2, at_ns.size))
         places_m = path_m[rows][np.isfinite(path_m[rows])]
-        if places_m.size and float(np.abs(places_m - places_m[0]).max()) > limit_m:
+        if np.abs(places_m - places_m[:1]).max(initial=0.0) > case.config.hazards.failure_limit_m:
             stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
     return OdometerSteps(moves, counts, tuple(stood))
 
@@ -57,8 +54,7 @@ def travel_direction(
     """
     train_m = path_m - along.known_m(config.known_error_m)
     moved_m, noise_m, _ = _moved_m(at_ns, train_m, along.half_m, config.turn_s)
-    with np.errstate(invalid="ignore"):
-        sure = np.abs(moved_m) > noise_m
+    sure = np.abs(moved_m) > noise_m
     by_reference = along.kind == REFERENCE
     if has_odometer:
         # Not over a turn: the odometer knows best when that was.
@@ -83,8 +79,7 @@ def moving(
     By the reference (`reference_m` +- `half_m`) it does where its way over a second exceeds dead band and noise.
     """
     moved_m, noise_m, elapsed_s = _moved_m(at_ns, reference_m, half_m, config.align.speed_window_s)
-    with np.errstate(invalid="ignore"):
-        by_reference = np.abs(moved_m) > config.matching.deadband_mps * elapsed_s + noise_m
+    by_reference = np.abs(moved_m) > config.matching.deadband_mps * elapsed_s + noise_m
     moves = by_reference | (steps.moves & steps.counts)
     sure = np.isfinite(moved_m) | (steps.counts & ~stood)
     frame = pl.DataFrame({"moving": _to_the_next(moves[:-1], at_ns.size), "sure": _to_the_next(sure[:-1], at_ns.size)})
@@ -103,14 +98,6 @@ def _to_the_next(steps: Bools, size: int) -> Bools:
     return np.concatenate([steps, last])[:size]
 
 
-def odometer_wrong(case: Case, train_m: Floats, half_m: Floats) -> Bools:
-    """Epochs at which the distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""
-    epochs = case.solution.epochs
-    odometer_m = floats(epochs, "odometer_m")
-    accepted_ns = times_ns(case.solution.accepted)
-    return beyond_confidence(times_ns(epochs), odometer_m, train_m, half_m, accepted_ns, case.config.lds)
-
-
 def beyond_confidence(
     t_ns: Ints, odometer_m: Floats, train_m: Floats, half_m: Floats, accepted_ns: Ints, lds: LdsConfig
 ) -> Bools:
@@ -123,13 +110,12 @@ def beyond_confidence(
     rows = np.flatnonzero(np.isfinite(odometer_m) & np.isfinite(train_m))
     last = np.searchsorted(accepted_ns, t_ns[rows], side="right") - 1
     rows = rows[last >= 0]
-    last = last[last >= 0]
     if rows.size == 0:
         return beyond
-    since = (t_ns[rows] - t_ns[rows[0]]).astype(np.float64)
-    accepted = (accepted_ns[last] - t_ns[rows[0]]).astype(np.float64)
+    since_ns = (t_ns[rows] - t_ns[rows[0]]).astype(np.float64)
+    accepted = (accepted_ns[last[last >= 0]] - t_ns[rows[0]]).astype(np.float64)
     odometer_then_m, train_then_m, half_then_m = (
-        np.interp(accepted, since, values[rows]) for values in (odometer_m, train_m, half_m)
+        np.interp(accepted, since_ns, values[rows]) for values in (odometer_m, train_m, half_m)
     )
     counted_m = odometer_m[rows] - odometer_then_m
     driven_m = train_m[rows] - train_then_m
@@ -140,10 +126,9 @@ def beyond_confidence(
 
 def speed_at(epochs: pl.DataFrame, t_ns: Ints) -> Floats:
     """Speed [m/s] by the epochs around each instant; NaN where no epoch knows it."""
-    speed_mps = np.abs(floats(epochs, "speed_mps"))
-    stamps_ns = times_ns(epochs)
-    known = np.isfinite(speed_mps)
-    if not known.any():
+    known = epochs.filter(pl.col("speed_mps").is_not_null())
+    if known.is_empty():
         return np.full(t_ns.size, np.nan)
-    at_s, stamps_s = ((values - stamps_ns[0]) / NS_PER_S for values in (t_ns, stamps_ns[known]))
-    return np.asarray(np.interp(at_s, stamps_s, speed_mps[known]))
+    begin_ns = times_ns(epochs)[0]
+    at_s, stamps_s = ((values - begin_ns) / NS_PER_S for values in (t_ns, times_ns(known)))
+    return np.asarray(np.interp(at_s, stamps_s, np.abs(floats(known, "speed_mps"))))

@@ -28,7 +28,11 @@ class TrueCrossing(NamedTuple):
     clear: bool
 
 
-def crossings_of(case: Case) -> dict[str, list[TrueCrossing]]:
+Crossings = dict[str, list[TrueCrossing]]
+"""Of each balise, in order of time."""
+
+
+def crossings_of(case: Case) -> Crossings:
     """Crossings of each balise of the path by the train, in a direction in which the balise is valid."""
     balises = case.solution.balises.unique("balise_id", keep="first")
     elements = case.element_numbers(balises["netelement_id"]).tolist()
@@ -53,40 +57,6 @@ def between_far_epochs(at_ns: Ints, step_s: float) -> Ints:
     return np.unique(np.concatenate([at_ns, *between]))
 
 
-def true_crossings(
-    t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], config: Configuration
-) -> dict[str, list[TrueCrossing]]:
-    """Crossings of each balise in order of time, where the evidence leaves one track; `t_ns`: of the evidence.
-
-    Where the half interval is at most `known_error_m`, its middle counts; else the whole interval has to pass from one
-    side of the balise to the other.
-    """
-    alone = _alone(evidence, t_ns.size)
-    tracks = [track.where(alone[track.rows]) for track in evidence.alternatives]
-    train = _Train(t_ns, *np.full((3, t_ns.size), np.nan))
-    for track in tracks:
-        train.element[track.rows], train.measure_m[track.rows], _ = track.route.locate(track.middle_m)
-        train.half_m[track.rows] = 0.5 * (track.high_m - track.low_m)
-    names = list(places)
-    elements = np.array([place.element for place in places.values()])
-    measures_m = np.array([place.measure_m for place in places.values()])
-    crossings: dict[str, list[TrueCrossing]] = {name: [] for name in names}
-    for track in tracks:
-        if track.rows.size == 0:
-            continue
-        rows, at_m = _with_beside(track, train)
-        on_track = np.isin(rows, track.rows)
-        least_m = at_m.min()
-        most_m = at_m.max()
-        for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
-            if least_m <= visit_m <= most_m:
-                crossed = _crossed(train, rows, on_track, at_m - visit_m, config)
-                crossings[names[balise]] += [
-                    crossing._replace(sense=int(crossing.sense * sense)) for crossing in crossed
-                ]
-    return {name: sorted(crossed) for name, crossed in crossings.items()}
-
-
 class _Train(NamedTuple):
     """Where the train was at each instant, NaN where not known: net element, measure, half the interval."""
 
@@ -96,13 +66,35 @@ class _Train(NamedTuple):
     half_m: Floats
 
 
-def _alone(evidence: EvidenceSet, size: int) -> Bools:
-    """Instants at which the train was on one track for sure."""
-    count = np.zeros(size, dtype=np.int64)
-    for alternative in evidence.alternatives:
-        count[alternative.rows] += 1
-    alone: Bools = count == 1
-    return alone
+def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], config: Configuration) -> Crossings:
+    """Crossings where the evidence leaves one track; `t_ns`: of the evidence.
+
+    Where the half interval is at most `known_error_m`, its middle counts; else the whole interval has to pass from one
+    side of the balise to the other.
+    """
+    alternatives = np.bincount(
+        np.concatenate([track.rows for track in evidence.alternatives] or [np.zeros(0, np.int64)]), minlength=t_ns.size
+    )
+    tracks = [track.where(alternatives[track.rows] == 1) for track in evidence.alternatives]
+    train = _Train(t_ns, *np.full((3, t_ns.size), np.nan))
+    for track in tracks:
+        train.element[track.rows], train.measure_m[track.rows], _ = track.route.locate(track.middle_m)
+        train.half_m[track.rows] = 0.5 * (track.high_m - track.low_m)
+    names = list(places)
+    elements = np.array([place.element for place in places.values()])
+    measures_m = np.array([place.measure_m for place in places.values()])
+    crossings: Crossings = {name: [] for name in names}
+    for track in tracks:
+        if track.rows.size == 0:
+            continue
+        rows, at_m = _with_beside(track, train)
+        on_track = np.isin(rows, track.rows)
+        for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
+            if at_m.min() <= visit_m <= at_m.max():
+                crossed = _crossed(train, rows, on_track, at_m - visit_m, config)
+                turned = [crossing._replace(sense=int(crossing.sense * sense)) for crossing in crossed]
+                crossings[names[balise]] += turned
+    return {name: sorted(crossed) for name, crossed in crossings.items()}
 
 
 def _with_beside(track: Alternative, train: _Train) -> tuple[Ints, Floats]:

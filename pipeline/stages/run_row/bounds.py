@@ -1,8 +1,8 @@
 """How certain a figure from few events is: exact bounds on rates and shares, and both as columns of tables.
 
-Rates are of a Poisson process; shares are of independent trials (events, passages, runs), never of
-epochs, whose errors are correlated. The bounds are exact in the sense of Garwood and of Clopper and
-Pearson: they hold at least as often as they claim, because events are whole numbers.
+Rates are of a Poisson process; shares are of independent trials (events, passages, runs), never of epochs, whose errors
+are correlated. The bounds are exact in the sense of Garwood and of Clopper and Pearson: they hold at least as often as
+they claim, because events are whole numbers.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from dataclasses import dataclass
 
 import polars as pl
 
-# The incomplete gamma and beta functions give what chi-square and beta quantiles of scipy.stats
-# give, without the second that importing scipy.stats costs every worker.
+# The incomplete gamma and beta functions give what chi-square and beta quantiles of scipy.stats give, without the
+# second that importing scipy.stats costs every worker.
 from scipy.special import betaincinv, gammaincinv
 
 CONFIDENCE = 0.95
+CONTINUITY_S = 15.0
+"""Most critical phase of an APV-I/LPV-200 operation (LOC section VI); part of the column names `continuity_15s`."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +48,10 @@ def poisson_rate(events: int, exposure_h: float, confidence: float = CONFIDENCE)
     return Estimate(events / exposure_h, low / exposure_h, high / exposure_h)
 
 
-def poisson_rate_upper(events: int, exposure_h: float, confidence: float = CONFIDENCE) -> float | None:
+def poisson_rate_upper(events: int, exposure_h: float) -> float | None:
     """One-sided upper bound of a rate [1/h], the one a THR claim needs: zero events give 3.00/T."""
-    _check(events, confidence)
-    if not exposure_h > 0:
-        return None
-    return float(gammaincinv(events + 1, confidence)) / exposure_h
+    _check(events)
+    return float(gammaincinv(events + 1, CONFIDENCE)) / exposure_h if exposure_h > 0 else None
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> Estimate:
@@ -68,32 +68,28 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
     return Estimate(successes / trials, low, high)
 
 
-def hours_to_substantiate(rate_per_h: float, events: int = 0, confidence: float = CONFIDENCE) -> float:
+def hours_to_substantiate(rate_per_h: float, events: int = 0) -> float:
     """Total hours [h] with no more than `events` events that show a rate below `rate_per_h`.
 
     One-sided: 0.67e-9/h needs 4.47e9 h without any event.
     """
-    _check(events, confidence)
+    _check(events)
     if not rate_per_h > 0:
         raise ValueError(f"a rate of {rate_per_h} 1/h cannot be substantiated")
-    return float(gammaincinv(events + 1, confidence)) / rate_per_h
+    return float(gammaincinv(events + 1, CONFIDENCE)) / rate_per_h
 
 
-def hours_still_needed(rate_per_h: float, events: int, exposure_h: float, confidence: float = CONFIDENCE) -> float:
+def hours_still_needed(rate_per_h: float, events: int, exposure_h: float) -> float:
     """Hours [h] still to be run without a further event, after `events` in `exposure_h`."""
-    return max(0.0, hours_to_substantiate(rate_per_h, events, confidence) - exposure_h)
+    return max(0.0, hours_to_substantiate(rate_per_h, events) - exposure_h)
 
 
-def _check(events: int, confidence: float) -> None:
+def _check(events: int, confidence: float = CONFIDENCE) -> None:
     if events < 0:
         raise ValueError(f"{events} events")
-    if not 0.0 < confidence < 1.0 or math.isnan(confidence):
+    if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence {confidence} is no probability between 0 and 1")
 
-
-# The usual time of continuity of GNSS approaches, and part of the column names `continuity_15s`.
-CONTINUITY_S = 15.0
-"""Most critical phase of an APV-I/LPV-200 operation (LOC section VI)."""
 
 Estimator = tuple[str, str, Callable[[int, float], Estimate] | Callable[[int, int], Estimate], str, str]
 """Name, ending with the unit, what estimates, and the columns of its events and of what they are held against."""
@@ -101,11 +97,8 @@ Estimator = tuple[str, str, Callable[[int, float], Estimate] | Callable[[int, in
 
 def columns_of(name: str, estimate: Estimate, unit: str = "") -> dict[str, object]:
     """An estimate as three columns `name`, `name_low`, `name_high`, with their unit at the end."""
-    return {
-        f"{name}{unit}": estimate.value,
-        f"{name}_low{unit}": estimate.low,
-        f"{name}_high{unit}": estimate.high,
-    }
+    parts = {"": estimate.value, "_low": estimate.low, "_high": estimate.high}
+    return {f"{name}{part}{unit}": value for part, value in parts.items()}
 
 
 def with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:

@@ -25,15 +25,14 @@ def missed_detection() -> pl.Expr:
 
     Missed for certain counts from `t_failure`, found for certain from `t_failure_may`; between them null.
     """
-    failed = pl.col("t_failure")
-    may = pl.col("t_failure_may")
-    return pl.when(failed.is_not_null() & _late(failed)).then(True).when(may.is_not_null() & ~_late(may)).then(False)
-
-
-def _late(since: pl.Expr) -> pl.Expr:
-    """Not found by then plus the budget."""
     budget = (pl.col("budget_s") * 1e9).round().cast(pl.Int64).cast(pl.Duration("ns"))
-    return pl.col("t_detected").is_null() | (pl.col("t_detected") > since + budget)
+
+    def late(since: str) -> pl.Expr:
+        undetected = pl.col("t_detected").is_null() | (pl.col("t_detected") > pl.col(since) + budget)
+        return pl.col(since).is_not_null() & undetected
+
+    in_time = pl.col("t_failure_may").is_not_null() & ~late("t_failure_may")
+    return pl.when(late("t_failure")).then(True).when(in_time).then(False)
 
 
 def since_when_at_most() -> pl.Expr:
@@ -53,20 +52,17 @@ def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
     failed = pl.col("t_failure").is_not_null()
     t_end = pl.col("t_end")
     keys = [*(name for name in ("run_id", "solution") if name in hazards.columns), "begin"]
-    return (
-        hazards.filter(pl.col("caused_by").is_null())
-        .with_columns(begin=pl.coalesce("t_onset", "t_hazard"), missed=missed_detection())
-        .group_by(keys)
-        .agg(
-            t_failure=pl.col("t_failure").min(),
-            t_failure_may=since_when_at_most(),
-            t_end=pl.when(t_end.null_count() == 0).then(t_end.max()),
-            budget_s=pl.col("budget_s").first(),
-            failed=failed.any(),
-            missed=pl.when(failed.any()).then(pl.col("missed").filter(failed).any(ignore_nulls=False)),
-            with_truth=pl.col("evidence").is_in(TRUTH).all(),
-            detected=pl.col("detected").any(),
-            **{name: pl.col(name).max() for name in DETECTION_TIMES},
-        )
-        .sort(keys)
+    rows = hazards.filter(pl.col("caused_by").is_null())
+    rows = rows.with_columns(begin=pl.coalesce("t_onset", "t_hazard"), missed=missed_detection())
+    episodes = rows.group_by(keys).agg(
+        t_failure=pl.col("t_failure").min(),
+        t_failure_may=since_when_at_most(),
+        t_end=pl.when(t_end.null_count() == 0).then(t_end.max()),
+        budget_s=pl.col("budget_s").first(),
+        failed=failed.any(),
+        missed=pl.when(failed.any()).then(pl.col("missed").filter(failed).any(ignore_nulls=False)),
+        with_truth=pl.col("evidence").is_in(TRUTH).all(),
+        detected=pl.col("detected").any(),
+        **{name: pl.col(name).max() for name in DETECTION_TIMES},
     )
+    return episodes.sort(keys)

@@ -35,18 +35,14 @@ class LostTime:
 
     def columns(self) -> dict[str, object]:
         """As they stand in `runs`."""
-        return {
-            "lost_to": list(self.causes),
-            "lost_to_share": list(self.causes.values()),
-            "lost_to_monitor": self.monitor,
-        }
+        causes = {"lost_to": list(self.causes), "lost_to_share": list(self.causes.values())}
+        return {**causes, "lost_to_monitor": self.monitor}
 
 
 def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, clock: Clock, config: Configuration) -> LostTime:
-    """Shares of the moving time, gaps included; each epoch counts for the first cause that applies.
+    """Shares of the moving time; each judged epoch counts for the first cause that applies.
 
-    `epochs`: monitored and judged, in order of time; `alarms`: of the same solution. A gap is
-    time without a position, as for `availability`.
+    A gap is time without a position, as for `availability`.
     """
     moving = met(epochs, may_move())
     steps_s = np.diff(clock.t_ns, append=clock.t_ns[-1:]) / NS_PER_S
@@ -55,56 +51,59 @@ def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, clock: Clock, config: 
         return LostTime()
     gap = clock.held_s < steps_s
     lost = moving & (gap | ~met(epochs, pl.col("tvb") & pl.col("moving").is_not_null()))
-    share = float(steps_s[lost].sum()) / whole_s
     left = lost
-    by_cause: dict[LostTo, Bools] = {}
+    parts: dict[LostTo, float] = {}
+    alarmed = lost
     for cause, applies in _causes(epochs, gap, clock.t_ns, config).items():
-        by_cause[cause] = left & applies
+        parts[cause] = float(steps_s[left & applies].sum()) / whole_s
+        if cause is LostTo.ALARM:
+            alarmed = left & applies
         left = left & ~applies
-    parts = {cause: float(steps_s[rows].sum()) / whole_s for cause, rows in by_cause.items()}
     ranked = sorted((cause for cause, part in parts.items() if part > 0.0), key=lambda cause: -parts[cause])
-    alarmed = by_cause[LostTo.ALARM]
     unexplained = alarmed & ~_explained(alarms, clock.t_ns, config.lds.recovery_s)
-    unfounded = bool(2.0 * steps_s[unexplained].sum() > steps_s[alarmed].sum())
-    return LostTime(share, {cause: parts[cause] for cause in ranked}, _loudest(epochs.filter(alarmed)), unfounded)
+    return LostTime(
+        share=float(steps_s[lost].sum()) / whole_s,
+        causes={cause: parts[cause] for cause in ranked},
+        monitor=_loudest(epochs.filter(alarmed)),
+        unfounded=bool(2.0 * steps_s[unexplained].sum() > steps_s[alarmed].sum()),
+    )
 
 
 def _causes(epochs: pl.DataFrame, gap: Bools, t_ns: Ints, config: Configuration) -> dict[LostTo, Bools]:
     """Conditions in the order in which they apply."""
     negated = met(epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.FAIL_SAFE.value)
-    withheld = pl.col("withheld_for").cast(pl.String)
-    waiting = met(epochs, withheld == LostTo.RELINK.value)
+    alarm_ns = np.where(met(epochs, pl.col("alarm")), t_ns, np.iinfo(np.int64).min)
+    # A monitor fails, or has failed less than `recovery_s` ago (DOMAIN section 4).
+    alarmed = np.maximum.accumulate(alarm_ns) >= t_ns - round(config.lds.recovery_s * NS_PER_S)
+    noise, slip, relink = (
+        met(epochs, pl.col("withheld_for").cast(pl.String) == cause.value)
+        for cause in (LostTo.NOISE, LostTo.SLIP, LostTo.RELINK)
+    )
     return {
         LostTo.NO_POSITION: gap | ~met(epochs, usable()),
         LostTo.CONFIDENCE: ~met(epochs, confident(config)),
         LostTo.TRACK_AMBIGUOUS: ~met(epochs, unambiguous(config)),
-        LostTo.NOISE: met(epochs, withheld == LostTo.NOISE.value),
-        LostTo.SLIP: met(epochs, withheld == LostTo.SLIP.value),
-        LostTo.RELINK: waiting | (negated & ~_alarmed(epochs, t_ns, config.lds.recovery_s)),
+        LostTo.NOISE: noise,
+        LostTo.SLIP: slip,
+        LostTo.RELINK: relink | (negated & ~alarmed),
         LostTo.ALARM: negated,
         LostTo.NO_ODOMETER: met(epochs, pl.col("odometer_reason").is_not_null()),
     }
-
-
-def _alarmed(epochs: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
-    """A monitor fails, or has failed less than `recovery_s` ago (DOMAIN section 4)."""
-    alarm = met(epochs, pl.col("alarm"))
-    last_ns = np.maximum.accumulate(np.where(alarm, t_ns, np.iinfo(np.int64).min))
-    return np.asarray(last_ns >= t_ns - round(recovery_s * NS_PER_S))
 
 
 def _explained(alarms: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
     """Epochs of alarm episodes that were due, or that belong to a hazard, and of the recovery after them."""
     due = alarms.filter((pl.col("verdict") == Verdict.TRUE.value) | pl.col("hazard_id").is_not_null())
     ends_ns = times_ns(due, "t_end") + round(recovery_s * NS_PER_S)
-    spans = zip(times_ns(due, "t_start"), ends_ns, strict=True)
-    inside = [(t_ns >= start_ns) & (t_ns <= end_ns) for start_ns, end_ns in spans]
-    return np.logical_or.reduce(inside) if inside else np.zeros(t_ns.size, dtype=np.bool_)
+    inside = np.zeros(t_ns.size, dtype=np.bool_)
+    for start_ns, end_ns in zip(times_ns(due, "t_start"), ends_ns, strict=True):
+        inside |= (t_ns >= start_ns) & (t_ns <= end_ns)
+    return inside
 
 
 def _loudest(epochs: pl.DataFrame) -> str | None:
     """The monitor that failed in most of these epochs."""
-    failing = (pl.col(f"{name}_state").cast(pl.String) == MonitorState.FAIL.value for name in MONITORS)
-    counts = epochs.select(condition.sum().alias(name) for name, condition in zip(MONITORS, failing, strict=True))
-    name, count = max(counts.row(0, named=True).items(), key=lambda item: item[1])
-    return str(name) if count else None
+    failing = {name: pl.col(f"{name}_state").cast(pl.String) == MonitorState.FAIL.value for name in MONITORS}
+    counts = epochs.select(**{name: condition.sum() for name, condition in failing.items()}).row(0, named=True)
+    loudest = max(counts, key=lambda name: int(counts[name]))
+    return loudest if counts[loudest] else None

@@ -9,15 +9,12 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import may_move, met
+from pipeline.stages.epochs.clock import may_move, met, reaction_of
 from pipeline.stages.run_row.lost_time import LostTime
-from pipeline.stages.run_row.verdict import reaction_of
-from schemas.arrays import Bools, floats
+from schemas.arrays import floats
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, LostTo, Reason, Remedy, RunVerdict, VehicleFigures
 from schemas.tables import BANK_MONITORS
-
-Row = Mapping[str, Any]
 
 FAST = tuple(name for name in BANK_MONITORS if name.endswith(("_raw", "_ewma_0p1")))
 """Monitors that the receiver's fast noise fails where the model states it too small."""
@@ -31,26 +28,25 @@ _STAMPS_S = 1e-3
 
 @dataclass(frozen=True)
 class Unknown:
-    """Where the moving time in use lies that the evidence leaves unknown."""
+    """Whether more moving time in use than the budget is unknown before the first and after the last epoch that is
+    judged, and between them.
+    """
 
     at_ends: bool
     between: bool
 
 
 def unknown_parts(epochs: pl.DataFrame, config: Configuration) -> Unknown:
-    """Before the first and after the last epoch that is judged, or between them."""
-    used = met(epochs, pl.col("in_use") & may_move())
     known = met(epochs, pl.col("judgement") != Judgement.UNKNOWN.value)
-    judged = np.flatnonzero(known)
-    inside: Bools = np.zeros(epochs.height, dtype=np.bool_)
-    if judged.size:
-        inside[judged[0] : judged[-1] + 1] = True
-    used_s = floats(epochs, "used_s")
-    at_ends_s, between_s = (float(used_s[used & ~known & part].sum()) for part in (~inside, inside))
+    inside = np.logical_or.accumulate(known) & np.logical_or.accumulate(known[::-1])[::-1]
+    unknown_s = floats(epochs, "used_s") * (met(epochs, pl.col("in_use") & may_move()) & ~known)
+    at_ends_s, between_s = (float(unknown_s[part].sum()) for part in (~inside, inside))
     return Unknown(at_ends_s > config.budget_s, between_s > config.budget_s)
 
 
-def remedies(run: Row, lost: LostTime, unknown: Unknown, survey_stated: bool, config: Configuration) -> list[Remedy]:
+def remedies(
+    run: Mapping[str, Any], lost: LostTime, unknown: Unknown, survey_stated: bool, config: Configuration
+) -> list[Remedy]:
     """What would mend this run, in the order of the enum; `survey_stated`: the survey states its sigma."""
     unproven = run["verdict"] == RunVerdict.UNPROVEN
     reasons = frozenset(run.get("reasons") or ())
@@ -84,7 +80,7 @@ def remedies(run: Row, lost: LostTime, unknown: Unknown, survey_stated: bool, co
     return [remedy for remedy in Remedy if table[remedy]]
 
 
-def _too_slow(run: Row, config: Configuration) -> bool:
+def _too_slow(run: Mapping[str, Any], config: Configuration) -> bool:
     """A failure beyond the budget that was negated as soon as an epoch of this log allows, and hurt no balise."""
     if not run["gnss_rate_hz"]:
         return False

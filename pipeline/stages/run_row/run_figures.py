@@ -8,33 +8,15 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import (
-    Clock,
-    availability,
-    may_move,
-    met,
-    outages_s,
-    share_of_time,
-    trusted,
-    uptime,
-    usable,
-)
-from pipeline.stages.run_row.bounds import CONTINUITY_S, UNKNOWN, Estimate, columns_of, continuity, poisson_rate
+from pipeline.stages.epochs import clock as along_time
+from pipeline.stages.epochs.clock import Clock, may_move, met, share_of_time
+from pipeline.stages.run_row.bounds import CONTINUITY_S, UNKNOWN, columns_of, continuity, poisson_rate
 from pipeline.stages.run_row.independent import missed_detection
 from pipeline.stages.run_row.verdict import LEVEL_LISTS, level_rows
+from schemas import enums
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
-from schemas.enums import (
-    TRUTH,
-    BaliseKind,
-    Evidence,
-    Hazard,
-    Judgement,
-    LdsState,
-    MonitorState,
-    PassageStatus,
-    Verdict,
-)
+from schemas.enums import TRUTH, Judgement, PassageStatus
 from schemas.tables import SCALES
 
 Row = dict[str, Any]
@@ -45,15 +27,15 @@ def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
 
     Time of which nobody knows whether the train moved counts as moving, and a TVB in it does not (DOMAIN section 5.5).
     """
-    lost = outages_s(clock.t_ns, met(epochs, usable()), clock.limit_s)
+    lost_s = along_time.outages_s(clock.t_ns, met(epochs, along_time.usable()), clock.limit_s)
     valid = met(epochs, pl.col("tvb") & pl.col("moving").is_not_null())
-    share = availability(clock.t_ns, valid, met(epochs, may_move()), clock.limit_s)
-    trust = uptime(clock.t_ns, met(epochs, trusted(config)), clock.limit_s)
-    mtbf_h = trust.mean_time_between_losses_h
+    share = along_time.availability(clock.t_ns, valid, met(epochs, may_move()), clock.limit_s)
+    trust = along_time.uptime(clock.t_ns, met(epochs, along_time.trusted(config)), clock.limit_s)
+    mtbf_h = trust.up_s / trust.losses / 3600.0 if trust.losses and trust.up_s > 0 else None
     return {
         "availability": share if met(epochs, pl.col("moving"))[:-1].any() else None,
-        "outages": len(lost),
-        "longest_outage_s": float(lost.max()) if len(lost) else 0.0 if epochs.height else None,
+        "outages": lost_s.size,
+        "longest_outage_s": float(lost_s.max(initial=0.0)) if epochs.height else None,
         "cross_bias_m": epochs["cross_track_m"].filter(epochs["on_track"]).median(),
         "mtbf_h": mtbf_h,
         "continuity_15s": continuity(CONTINUITY_S, mtbf_h) if mtbf_h else None,
@@ -68,32 +50,30 @@ def judged() -> pl.Expr:
 
 
 def time_in_use(epochs: pl.DataFrame, recovery_s: float) -> Row:
-    """Time in use, and what of it nobody can judge or nothing diagnoses (DOMAIN section 5.4).
+    """Time in use, and what of it nobody can judge or nothing diagnoses (DOMAIN section 5.4); all null without epochs.
 
-    `epochs`: with the columns of `JudgedEpochs`. Shares are of the moving time in use, null without any.
+    Shares are of the moving time in use, null without any.
     """
     used_s = floats(epochs, "used_s")
     moves = met(epochs, may_move())
     seen = met(epochs, judged())
-    moving_s = used_s[moves]
-    unknown = ~seen & moves & (used_s > 0.0)
-    return {
-        "in_use_s": float(used_s.sum()) if epochs.height else None,
-        "in_use_judged_s": float(used_s[seen].sum()) if epochs.height else None,
-        "negated_s": float(floats(epochs, "counted_s")[met(epochs, pl.col("negated"))].sum())
-        if epochs.height
-        else None,
-        "share_unknown": share_of_time(moving_s, ~seen[moves]),
-        "share_undiagnosed": share_of_time(moving_s, met(epochs, pl.col("undiagnosed"))[moves]),
-        "unknown_in_use_s": _longest_s(times_ns(epochs), used_s, unknown, recovery_s) if epochs.height else None,
+    negated_s = floats(epochs, "counted_s")[met(epochs, pl.col("negated"))]
+    figures = {
+        "in_use_s": float(used_s.sum()),
+        "in_use_judged_s": float(used_s[seen].sum()),
+        "negated_s": float(negated_s.sum()),
+        "share_unknown": share_of_time(used_s[moves], ~seen[moves]),
+        "share_undiagnosed": share_of_time(used_s[moves], met(epochs, pl.col("undiagnosed"))[moves]),
+        "unknown_in_use_s": _longest_s(times_ns(epochs), used_s, ~seen & moves & (used_s > 0.0), recovery_s),
     }
+    return figures if epochs.height else dict.fromkeys(figures)
 
 
 def _longest_s(t_ns: Ints, used_s: Floats, where: Bools, apart_s: float) -> float:
     """Longest time that epochs less than `apart_s` from each other stand for [s]."""
     rows = np.flatnonzero(where)
     breaks = np.flatnonzero(np.diff(t_ns[rows]) >= apart_s * NS_PER_S) + 1
-    return max((float(used_s[part].sum()) for part in np.split(rows, breaks)), default=0.0)
+    return max(float(used_s[part].sum()) for part in np.split(rows, breaks))
 
 
 def proof_margin_m(epochs: pl.DataFrame, passages: pl.DataFrame, limit_m: float) -> float | None:
@@ -144,15 +124,19 @@ def acceptances() -> dict[str, pl.Expr]:
     known = judged().fill_null(value=False)
     return {
         "accepted_judged": accepted() & known,
-        "unsafe_accepted": accepted() & (pl.col("judgement") == Judgement.WRONG).fill_null(value=False),
+        "unsafe_accepted": accepted() & _wrong(),
         "unproven_accepted": accepted() & ~known,
         "initialising_accepted": pl.col("initialising"),
     }
 
 
+def _wrong() -> pl.Expr:
+    return (pl.col("judgement") == Judgement.WRONG).fill_null(value=False)
+
+
 def balise_counts(passages: pl.DataFrame) -> Row:
     """What became of the virtual balises, and of those accepted what the judge says of their positions."""
-    virtual = passages.filter(pl.col("kind") == BaliseKind.VIRTUAL)
+    virtual = passages.filter(pl.col("kind") == enums.BaliseKind.VIRTUAL)
     counts = {"balises_on_path": is_passage(), **{f"balises_{name}": met for name, met in outcomes().items()}}
     errors = spread(pl.col("location_error_m").filter(accepted()), "location_error", "count")
     return _counted(virtual, counts | acceptances()) | virtual.select(**errors).row(0, named=True)
@@ -168,22 +152,17 @@ def is_passage() -> pl.Expr:
 
     An offer beyond is one that is judged wrong and for which the evidence knows no true crossing.
     """
-    wrong = (pl.col("judgement") == Judgement.WRONG.value).fill_null(value=False)
-    return ~(pl.col("t_true").is_null() & wrong)
+    return ~(pl.col("t_true").is_null() & _wrong())
 
 
 def hazard_counts(hazards: pl.DataFrame) -> Row:
-    counts = {kind.counted_as: pl.col("hazard") == kind for kind in Hazard} | {
+    counts = {kind.counted_as: pl.col("hazard") == kind for kind in enums.Hazard} | {
         "hazards_detected": pl.col("detected"),
         "hazards_within_budget": pl.col("within_budget"),
         "missed_detections": missed_detection(),
     }
-    return {
-        **_counted(hazards, counts),
-        "time_to_detect_max_s": hazards["time_to_detect_s"].max(),
-        "time_since_failure_max_s": hazards["time_since_failure_s"].max(),
-        "time_since_failure_may_max_s": hazards["time_since_failure_may_s"].max(),
-    }
+    times = ("time_to_detect", "time_since_failure", "time_since_failure_may")
+    return _counted(hazards, counts) | {f"{name}_max_s": hazards[f"{name}_s"].max() for name in times}
 
 
 def failure_counts(failures: pl.DataFrame) -> Row:
@@ -194,9 +173,7 @@ def failure_counts(failures: pl.DataFrame) -> Row:
         **_counted(failures, counts),
         "hazardous_max_s": failures["hazardous_s"].max(),
         "hazardous_s": failures["hazardous_s"].sum(),
-        "failure_hazardous_s": failures["hazardous_s"].to_list(),
-        "failure_hazardous_may_s": failures["hazardous_may_s"].to_list(),
-        "failure_accepted": failures["accepted"].to_list(),
+        **{f"failure_{name}": failures[name].to_list() for name in ("hazardous_s", "hazardous_may_s", "accepted")},
     }
 
 
@@ -206,26 +183,26 @@ def service_levels(row: Row, config: Configuration) -> Row:
     return {name: [level[part] for level in rows] for part, name in LEVEL_LISTS.items()}
 
 
-def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence | None) -> Row:
+def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: enums.Evidence | None) -> Row:
     """Alarms and the rate of false ones, which needs a reference or balise reads and a verdict on every alarm.
 
     The rate counts the time in use in which the along-track bank judged and the position was judged (DOMAIN 6).
     """
-    false = alarms.filter(pl.col("verdict") == Verdict.FALSE).height
-    monitored = met(epochs, _along_evaluated())
+    false = alarms.filter(pl.col("verdict") == enums.Verdict.FALSE).height
+    evaluated = (pl.col(f"along_{scale}_state") != enums.MonitorState.NOT_EVALUATED for scale in SCALES)
+    monitored = met(epochs, pl.any_horizontal(evaluated))
     seen = met(epochs, judged())
-    truth = evidence in TRUTH and bool(seen.any())
-    complete = truth and not (alarms["verdict"] == Verdict.UNKNOWN).any()
     counted_s = floats(epochs, "counted_s")
-    in_use = met(epochs, pl.col("in_use"))
-    judged_s = float(counted_s[monitored & seen & in_use].sum())
-    rate: Estimate = poisson_rate(false, judged_s / 3600.0) if complete else UNKNOWN
+    judged_s = counted_s[monitored & seen & met(epochs, pl.col("in_use"))]
     times = {
         "held_s": counted_s,
         "monitored_s": counted_s[monitored],
         "evidence_s": counted_s[seen],
-        "judged_s": counted_s[monitored & seen & in_use],
+        "judged_s": judged_s,
     }
+    truth = evidence in TRUTH and bool(seen.any())
+    complete = truth and not (alarms["verdict"] == enums.Verdict.UNKNOWN).any()
+    rate = poisson_rate(false, float(judged_s.sum()) / 3600.0) if complete else UNKNOWN
     return {
         **{name: float(held.sum()) if epochs.height else None for name, held in times.items()},
         "alarms": alarms.height,
@@ -234,16 +211,11 @@ def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence 
     }
 
 
-def _along_evaluated() -> pl.Expr:
-    """A monitor of the along-track bank has a verdict."""
-    return pl.any_horizontal(pl.col(f"along_{scale}_state") != MonitorState.NOT_EVALUATED for scale in SCALES)
-
-
 def exposure(epochs: pl.DataFrame) -> Row:
-    exposure = epochs["exposure_s"]
+    exposure_s = epochs["exposure_s"]
     return {
-        "exposure_max_s": exposure.max(),
-        "exposure_p99_s": exposure.quantile(0.99, interpolation="linear"),
+        "exposure_max_s": exposure_s.max(),
+        "exposure_p99_s": exposure_s.quantile(0.99, interpolation="linear"),
     }
 
 
@@ -254,28 +226,28 @@ def state_shares(epochs: pl.DataFrame) -> Row:
     up to less than one. If some state is unknown and no epoch is known to be P0, the share of P0 is null, not 0; so is
     that of P1 unless some epoch is in it.
     """
-    states = {f"share_{state.value.lower()}": pl.col("lds_state") == state for state in LdsState}
-    inside = epochs.select(condition.fill_null(value=False).alias(name) for name, condition in states.items())
     counted_s = floats(epochs, "counted_s")
-    row: Row = {flag.name: share_of_time(counted_s, flag.to_numpy()) for flag in inside}
-    if epochs["lds_state"].null_count() and not inside["share_p0"].any():
-        unknown = ["share_p0"] if inside["share_p1"].any() else ["share_p0", "share_p1"]
-        row |= dict.fromkeys(unknown)
+    inside = {state: met(epochs, pl.col("lds_state") == state) for state in enums.LdsState}
+    row: Row = {f"share_{state.value.lower()}": share_of_time(counted_s, held) for state, held in inside.items()}
+    if epochs["lds_state"].null_count() and not inside[enums.LdsState.P0].any():
+        row["share_p0"] = None
+        if not inside[enums.LdsState.P1].any():
+            row["share_p1"] = None
     return row
 
 
 def stanford_counts(epochs: pl.DataFrame, limit_m: float, bound: str = "confidence_m") -> Row:
     """Epochs whose error is known to 5 m, by error and bound along the track (CONTRACT section 3, `stanford_*`)."""
-    known = epochs.select(error=pl.col("error_along_m").abs(), bound=pl.col(bound)).drop_nulls()
-    error = known["error"].to_numpy()
-    claimed = known["bound"].to_numpy()
-    offered = claimed <= limit_m
-    return {
-        "stanford_nominal": int(np.sum(offered & (error <= claimed))),
-        "stanford_misleading": int(np.sum(offered & (error > claimed) & (error <= limit_m))),
-        "stanford_hazardous": int(np.sum(offered & (error > limit_m))),
-        "stanford_unavailable": int(np.sum(~offered)),
+    error_m = pl.col("error_along_m").abs()
+    offered = pl.col(bound) <= limit_m
+    counts = {
+        "nominal": offered & (error_m <= pl.col(bound)),
+        "misleading": offered & (error_m > pl.col(bound)) & (error_m <= limit_m),
+        "hazardous": offered & (error_m > limit_m),
+        "unavailable": ~offered,
     }
+    known = epochs.drop_nulls(["error_along_m", bound])
+    return _counted(known, {f"stanford_{name}": condition for name, condition in counts.items()})
 
 
 def stanford_of_receiver(epochs: pl.DataFrame, limit_m: float) -> Row:

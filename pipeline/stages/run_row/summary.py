@@ -9,27 +9,19 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.stages.clean.clean import StreamCounts
 from pipeline.stages.epochs.clock import Clock, may_move
 from pipeline.stages.judge.failures import failures_within
 from pipeline.stages.judge.judge import Judged
 from pipeline.stages.provenance import Provenance
+from pipeline.stages.run_row import notes
 from pipeline.stages.run_row import run_figures as figures
-from pipeline.stages.run_row.lost_time import LostTime, lost_time
-from pipeline.stages.run_row.notes import (
-    in_use_notes,
-    ingest_notes,
-    judged_notes,
-    noise_notes,
-    time_notes,
-    undiagnosed_notes,
-)
+from pipeline.stages.run_row.lost_time import lost_time
 from pipeline.stages.run_row.remedies import remedies, unknown_parts
 from pipeline.stages.run_row.verdict import reasons_of, verdict_of
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import MisfitCause, Note, Reason, Remedy, RunStatus, VehicleFigures
+from schemas.enums import Note, Reason, RunStatus
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 from schemas.words import Remark, notes_text, remedy_words
@@ -39,11 +31,8 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class SolutionResults:
-    """What the stages say of one solution; `epochs` as in `schemas.tables`.
+    """What the stages say of one solution; `epochs` as in `schemas.tables`, `columns` of `runs` as they stand there.
 
-    `odometer_contradicted`: gaps between anchors that the odometer does not close (DOMAIN section 5.1). `alignment`:
-    latency and odometer scale at the end of the run. `white_noise`: its columns of `runs`.
-    `undetected`: columns of `runs` on errors that nobody would have noticed, where computed.
     `reasons`: those that no figure holds; `anchored_ns`: first and last instant at which a read or the reference says
     where the train was.
     """
@@ -51,17 +40,9 @@ class SolutionResults:
     solution: str
     epochs: pl.DataFrame
     judged: Judged
-    vehicle: VehicleFigures = VehicleFigures.NONE
-    odometer_contradicted: int = 0
-    alignment: Row = field(default_factory=dict)
-    white_noise: Row = field(default_factory=dict)
-    counts: StreamCounts = field(default_factory=StreamCounts)
+    columns: Mapping[str, object]
     ingest: IngestNotes = field(default_factory=IngestNotes)
-    ambiguous_stretches: int = 0
     notes: Sequence[Remark] = ()
-    faults_injected: bool = False
-    misfits: Sequence[MisfitCause] = ()
-    undetected: Row = field(default_factory=dict)
     reasons: Sequence[Reason] = ()
     anchored_ns: tuple[int, int] | None = None
 
@@ -69,17 +50,15 @@ class SolutionResults:
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
     """One row of the `runs` table (CONTRACT section 3)."""
     epochs = results.epochs
-    clock = Clock.of(results.epochs, config)
+    clock = Clock.of(epochs, config)
     judged = results.judged
     lost = lost_time(epochs, judged.alarms, clock, config)
     row = (
         _identity(results)
-        | results.white_noise
         | _decisive(epochs, judged.passages, judged.failures, config)
         | ({} if judged.evidence else {"hazardous_s": None})
-        | {"duration_s": clock.duration_s, "reasons": results.reasons}
         | lost.columns()
-        | _extent(epochs, clock, judged.distance_m)
+        | _extent(epochs, clock)
         | figures.positions(epochs, clock, config)
         | figures.accuracy(epochs)
         | figures.hazard_counts(judged.hazards)
@@ -88,14 +67,36 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | figures.state_shares(epochs)
         | figures.stanford_counts(epochs, config.lds.ci_limit_m)
         | figures.stanford_of_receiver(epochs, config.lds.ci_limit_m)
-        | results.undetected
         | _provenance(provenance)
     )
     row |= _part(results, row, config) | figures.service_levels(row, config) | _verdict(row, config)
-    unknown = row["share_unknown"] if Reason.UNKNOWN_IN_USE in row["reasons"] else None
     stated = epochs["survey_sigma_m"].is_not_null().any()
     cures = remedies(row, lost, unknown_parts(epochs, config), stated, config)
-    return _frame(row | {"remedies": cures, "notes": _notes(results, unknown, lost, cures, clock, config)})
+    noted = (
+        *notes.ingest_notes(results.ingest),
+        *results.notes,
+        *notes.judged_notes(row),
+        *notes.undiagnosed_notes(epochs, judged.passages),
+        *notes.in_use_notes(epochs),
+        *notes.time_notes(epochs, clock, lost, config),
+        *(Remark(Note.REMEDY, (remedy_words(cure),)) for cure in cures),
+    )
+    return _frame(row | {"remedies": cures, "notes": notes_text(noted)})
+
+
+def _identity(results: SolutionResults) -> Row:
+    ingest = results.ingest
+    damaged = ingest.partial_until_ns is not None or ingest.damage is not None
+    return {
+        **results.columns,
+        "solution": results.solution,
+        "status": RunStatus.PARTIAL if damaged else RunStatus.OK,
+        "error": ingest.damage,
+        "partial_until": ingest.partial_until_ns,
+        "evidence": results.judged.evidence,
+        "distance_m": results.judged.distance_m,
+        "reasons": results.reasons,
+    }
 
 
 def _decisive(epochs: pl.DataFrame, passages: pl.DataFrame, failures: pl.DataFrame, config: Configuration) -> Row:
@@ -124,9 +125,7 @@ def _part(results: SolutionResults, row: Row, config: Configuration) -> Row:
     if share is None or not 0.0 < share < 1.0:
         return {}
     part = results.epochs.filter(inside)
-    begin = part["epoch"].item(0)
-    end = part["epoch"].item(-1)
-    offers = results.judged.offers.filter(pl.col("epoch").is_between(begin, end))
+    offers = results.judged.offers.filter(pl.col("epoch").is_between(part["epoch"][0], part["epoch"][-1]))
     passages = results.judged.passages.join(offers.select("crossing_id"), on="crossing_id", how="semi")
     decisive = _decisive(part, passages, failures_within(part, offers, config), config)
     verdict = _verdict(row | decisive | {"duration_s": (to_ns - from_ns) / NS_PER_S}, config)["verdict"]
@@ -135,81 +134,29 @@ def _part(results: SolutionResults, row: Row, config: Configuration) -> Row:
 
 def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.DataFrame:
     """The `runs` row of a run that could not be replayed: counts are zero, the rest is not known."""
-    zeros: Row = {
-        name: 0 for name, column in Runs.columns().items() if column.dtype == pl.Int64 and not column.nullable
-    }
+    columns = Runs.columns().items()
+    zeros: Row = {name: 0 for name, column in columns if column.dtype == pl.Int64 and not column.nullable}
     return _frame(zeros | {"solution": solution, "status": RunStatus.FAILED, "error": error} | _provenance(provenance))
 
 
 def _frame(row: Mapping[str, object]) -> pl.DataFrame:
+    """The row as a table, where nothing is NaN or infinite."""
     schema = dtypes(Runs)
-    values = {name: [_known(row.get(name))] for name in schema}
+    unknown = {name for name, value in row.items() if isinstance(value, float) and not math.isfinite(value)}
+    values = {name: [None if name in unknown else row.get(name)] for name in schema}
     return conform(pl.DataFrame(values, schema=schema), Runs)
 
 
-def _known(value: object) -> object:
-    """A value as it may stand in a table: never NaN nor infinite."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _identity(results: SolutionResults) -> Row:
-    ingest = results.ingest
-    damaged = ingest.partial_until_ns is not None or ingest.damage is not None
-    return {
-        "solution": results.solution,
-        "status": RunStatus.PARTIAL if damaged else RunStatus.OK,
-        "error": ingest.damage,
-        "partial_until": ingest.partial_until_ns,
-        "duplicates": results.counts.duplicates,
-        "out_of_order": results.counts.out_of_order,
-        "evidence": results.judged.evidence,
-        "vehicle": results.vehicle,
-        "faults_injected": results.faults_injected,
-        "misfits": list(results.misfits),
-        "odometer_contradicted": results.odometer_contradicted,
-        "ambiguous_stretches": results.ambiguous_stretches,
-        **results.alignment,
-    }
-
-
-def _notes(
-    results: SolutionResults,
-    unknown: float | None,
-    lost: LostTime,
-    cures: Sequence[Remedy],
-    clock: Clock,
-    config: Configuration,
-) -> str | None:
-    """What the reader should know beside the figures."""
-    noted = (
-        *ingest_notes(results.ingest),
-        *results.notes,
-        *judged_notes(results.judged.evidence, unknown, results.vehicle, results.odometer_contradicted),
-        *undiagnosed_notes(results.epochs, results.judged.passages),
-        *in_use_notes(results.epochs),
-        *noise_notes(results.epochs, results.white_noise, config),
-        *time_notes(results.epochs, clock, lost, config),
-        *(Remark(Note.REMEDY, (remedy_words(cure),)) for cure in cures),
-    )
-    return notes_text(noted)
-
-
-def _extent(epochs: pl.DataFrame, clock: Clock, distance_m: float | None) -> Row:
+def _extent(epochs: pl.DataFrame, clock: Clock) -> Row:
     return {
         "t_start": epochs["t"].dt.timestamp("ns").first(),
         "t_end": epochs["t"].dt.timestamp("ns").last(),
         "duration_s": clock.duration_s,
-        "distance_m": distance_m,
         "epochs": epochs.height,
         "gnss_rate_hz": 1.0 / clock.period_s if clock.period_s else None,
     }
 
 
 def _provenance(provenance: Provenance) -> Row:
-    return {
-        "config_digest": provenance.config_digest,
-        "input_digest": provenance.input_digest,
-        "software": provenance.software,
-        "calibrated_by": list(provenance.calibrated_by),
-        "contract": CONTRACT_VERSION,
-    }
+    calibrated_by = list(provenance.calibrated_by)
+    return {**vars(provenance), "calibrated_by": calibrated_by, "contract": CONTRACT_VERSION}

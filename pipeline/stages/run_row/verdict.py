@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar
-
-import polars as pl
+from typing import Any
 
 from pipeline.stages.judge.failures import within_budget
 from schemas.config import Configuration
 from schemas.enums import Judgement, Reason, RunVerdict, ThrVerdict
 
 Row = Mapping[str, Any]
-Time = TypeVar("Time", float, pl.Expr)
 Failure = tuple[float, float, str]
 """Hazardous time [s], the same with what is unknown, and the worst judgement of the VBs accepted meanwhile."""
-
 
 _UNSAFE = {Reason.ACCEPTED_WRONG, Reason.FAILURE_BEYOND_BUDGET, Reason.HAZARDOUS_SUM}
 _LASTING = (Reason.EVIDENCE_DISPUTED, Reason.INPUT_DOUBTFUL, Reason.CLOCK_ASSUMED)
 """Reasons that no count of a `runs` row holds: they stand among its `reasons` from the beginning."""
-
 
 DECISIVE = (
     *("unsafe_accepted", "unproven_accepted", "balises_accepted", "unknown_in_use_s", "share_undiagnosed"),
@@ -30,11 +25,22 @@ DECISIVE = (
 )
 """Columns of `runs` that the reasons are read from."""
 
+LEVEL_LISTS = {
+    "service_level": "service_levels",
+    "allowed_s": "level_allowed_s",
+    "within": "level_within",
+    "exceeded": "level_exceeded",
+    "verdict": "level_verdict",
+}
+"""What `level_rows` gives for each service level, and the list of the `runs` table that holds it."""
+
+_OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVerdict.UNKNOWN}
+
 
 def reasons_of(run: Row, allowed_s: float, undiagnosed_share: float) -> list[Reason]:
-    """Why a run has its verdict, from the counts of one `runs` row (DOMAIN section 5.4).
+    """Why a run has its verdict, by the columns `DECISIVE` of its row (DOMAIN section 5.4).
 
-    `allowed_s`: allowed T_D; `undiagnosed_share`: of the configuration. Of `run["reasons"]` stays what no count holds.
+    `allowed_s`: allowed T_D; `undiagnosed_share`: of the configuration.
     """
     failures = failures_in(run)
     within, beyond = level_counts(failures, allowed_s)
@@ -63,19 +69,6 @@ def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
     return RunVerdict.UNPROVEN if against else RunVerdict.SAFE
 
 
-LEVEL_LISTS = {
-    "service_level": "service_levels",
-    "allowed_s": "level_allowed_s",
-    "within": "level_within",
-    "exceeded": "level_exceeded",
-    "verdict": "level_verdict",
-}
-"""What `level_rows` gives for each service level, and the list of the `runs` table that holds it."""
-
-
-_OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVerdict.UNKNOWN}
-
-
 def level_rows(run: Row, config: Configuration) -> list[dict[str, object]]:
     """One `runs` row against the allowed T_D of each service level, by the rules of the run's verdict."""
     failures = failures_in(run)
@@ -88,13 +81,6 @@ def level_rows(run: Row, config: Configuration) -> list[dict[str, object]]:
         values = (level, allowed_s, within, exceeded, _OF_LEVEL.get(verdict, in_time).value)
         rows.append(dict(zip(LEVEL_LISTS, values, strict=True)))
     return rows
-
-
-def reaction_of(period_s: Time, config: Configuration) -> Time | float:
-    """Time from detection to the block [s]: that of the configuration, else one epoch; with the period of the epochs
-    the least time that any fault is in use.
-    """
-    return period_s if config.hazards.reaction_s is None else config.hazards.reaction_s
 
 
 def failures_in(run: Row) -> list[Failure]:

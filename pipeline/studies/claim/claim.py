@@ -14,9 +14,9 @@ from pipeline.storage.address import Address
 from pipeline.studies.claim.front import front_of
 from pipeline.studies.claim.profile import RequirementProfile
 from pipeline.studies.claim.requirements import ALL, ClaimRide, Requirement, Tallies, requirements, tallies
-from pipeline.studies.claim.tally import S_PER_H, Compliance, Kind, Tally, drawn
+from pipeline.studies.claim.tally import Kind, Tally, drawn
 from pipeline.studies.reservations import failed_runs, runs_without_truth, sentences, several_settings
-from pipeline.studies.trials import distinct
+from pipeline.studies.tally import S_PER_H, Compliance, distinct
 from schemas.config import Configuration
 from schemas.enums import NotShown, RunStatus
 from schemas.run import Site
@@ -69,11 +69,13 @@ def claim(
 
 def _once_a_day(of_run: Tallies, day: tuple[object, ...], days: set[tuple[object, ...]]) -> Tallies:
     """Without the trials of requirements that another run of the day was a trial of; time and events stay."""
-    spent = {key for key, counts in of_run.items() if counts.trials and (*day, *key) in days}
-    days.update((*day, *key) for key, counts in of_run.items() if counts.trials)
-    return {
-        key: replace(counts, trials=0, kept=0, broken=0) if key in spent else counts for key, counts in of_run.items()
-    }
+    once = dict(of_run)
+    for key, counts in of_run.items():
+        if counts.trials and (*day, *key) in days:
+            once[key] = replace(counts, trials=0, kept=0, broken=0)
+        elif counts.trials:
+            days.add((*day, *key))
+    return once
 
 
 def _tallies_of(
@@ -125,13 +127,13 @@ def _row(solution: str, requirement: Requirement, counts: Tally) -> dict[str, An
         "trials": counts.trials,
         "kept": counts.kept,
         "broken": counts.broken,
-        "measured": shown.measured.value,
-        "low": shown.measured.low,
-        "high": shown.measured.high,
+        "measured": shown.bounds.value,
+        "low": shown.bounds.low,
+        "high": shown.bounds.high,
         "worst": counts.worst,
         "hours": counts.held_s / S_PER_H,
         "hours_known": counts.known_s / S_PER_H,
-        "hours_needed": shown.needed_h,
+        "hours_needed": shown.needed,
         "clause": requirement.clause,
         "reason": NOT_SHOWN[_reason(requirement, counts)] if shown.finding is Compliance.NOT_SHOWN else None,
     }
@@ -169,10 +171,10 @@ def _notes(
     """What the reader must know before the rows."""
     settings = several_settings(runs, say("claim", "trains"))
     late = runs["latency_sigma_s"].null_count()
-    said: dict[str, Any] = {
+    said = {
         "at_antenna": not settings and not ahead_m,
-        "outside": outside_h if areas is not None else 0.0,
-        "no_latency": (late, runs.height) if late else (),
+        "outside": areas is not None and outside_h,
+        "no_latency": late and (late, runs.height),
         "only_broken": True,
         "rear_end": True,
         "by_day": profile.method.independent == "run",

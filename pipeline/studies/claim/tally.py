@@ -1,43 +1,26 @@
-"""Counts of a requirement that add up over runs, and what they show.
+"""Counts of a requirement that add up over runs, and what is demanded of them.
 
 A run is one trial of a share: of its time one instant is drawn, without a look at its error, because epochs of a run
-err together. A gap of the log is time of which nobody knows. Weaker evidence turns what is kept or broken into what is
-not known; that counts as broken before anything is called `met`, and as kept before anything is called `not met`.
+err together. A gap of the log is time of which nobody knows.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
-from pipeline.stages.run_row.bounds import (
-    UNKNOWN,
-    Estimate,
-    clopper_pearson,
-    hours_still_needed,
-    poisson_rate,
-    poisson_rate_upper,
-)
-from pipeline.studies.trials import Trials
+from pipeline.stages.run_row.bounds import UNKNOWN, Estimate, clopper_pearson, poisson_rate
+from pipeline.studies.tally import S_PER_H, Compliance, Shown, rate_shown, share_shown
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
-S_PER_H = 3600.0
 KEPT = 1
 NOT_KNOWN = 0
 BROKEN = -1
 
 _COUNTS = ("trials", "kept", "broken", "events", "possible", "held_s", "known_s")
-
-
-class Compliance(StrEnum):
-    """What the data say of a requirement."""
-
-    MET = "met"
-    NOT_MET = "not met"
-    NOT_SHOWN = "not shown"
 
 
 @dataclass(frozen=True)
@@ -83,7 +66,7 @@ def counted(
     code: Ints,
     gap_s: float,
     size: Floats | None = None,
-    silent_s: Floats | None = None,
+    silent_s: Floats | float = 0.0,
 ) -> Tally:
     """Of the epochs of one run to which a requirement applies, in order of time; `run` draws its trial.
 
@@ -91,7 +74,7 @@ def counted(
     """
     if code.size == 0:
         return Tally()
-    silent = np.zeros(code.size) if silent_s is None else silent_s
+    silent = np.broadcast_to(silent_s, code.shape)
     trial = _trial(run, held_s, silent, code)
     known = code != NOT_KNOWN
     sizes = size[known & np.isfinite(size)] if size is not None else np.empty(0)
@@ -137,15 +120,6 @@ def drawn(run: str) -> float:
     return int.from_bytes(hashlib.sha256(run.encode()).digest()[:6], "big") / (1 << 48)
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A finding with its bounds; `needed_h`: hours still to be run, without a further event, to show the demand."""
-
-    finding: Compliance
-    measured: Estimate = UNKNOWN
-    needed_h: float | None = None
-
-
 class Kind(StrEnum):
     """What is demanded: a maximum at all times, a share of trials, a rate, a share of time."""
 
@@ -175,66 +149,40 @@ class Demand:
         return f"< {self.limit:g} /h" if self.kind is Kind.RATE else f"p >= {self.limit:g}"
 
     def shown(self, tally: Tally) -> Shown:
+        """`needed` in hours."""
+        hours_known = tally.known_s / S_PER_H
         if self.kind is Kind.RATE:
-            return of_rate(tally, self.limit)
+            return rate_shown(tally.events, tally.possible, tally.held_s / S_PER_H, hours_known, self.limit)
         if self.kind is Kind.AVAILABILITY:
-            return of_availability(tally, self.limit, self.outside_s)
-        if self.kind is Kind.ALWAYS:
-            return of_always(tally)
-        shown = of_share(tally, self.limit)
-        unmet = Compliance.NOT_SHOWN if shown.finding is Compliance.MET else shown.finding
-        return replace(shown, finding=unmet, needed_h=None) if self.by_means else shown
+            return self._available(tally)
+        if self.kind is Kind.SHARE:
+            return self._often(tally)
+        # One event breaks a maximum that is demanded without a probability, and no number of hours shows it.
+        finding = Compliance.NOT_MET if tally.events else Compliance.NOT_SHOWN
+        return Shown(finding, poisson_rate(tally.events, hours_known))
+
+    def _often(self, tally: Tally) -> Shown:
+        """A share of runs; the figure with its bounds is of the runs judged."""
+        if tally.trials == 0:
+            return Shown(Compliance.NOT_SHOWN)
+        judged = tally.kept + tally.broken
+        broken = share_shown(tally.broken, judged, tally.trials - judged, 1.0 - self.limit)
+        kept = clopper_pearson(tally.kept, judged)
+        if broken.finding is Compliance.MET:
+            return Shown(Compliance.NOT_SHOWN, kept) if self.by_means else Shown(Compliance.MET, kept, 0.0)
+        hours = tally.held_s / tally.trials / S_PER_H
+        untold = self.by_means or broken.needed is None or hours <= 0.0
+        return Shown(broken.finding, kept, None if untold else hours * (broken.needed or 0))
+
+    def _available(self, tally: Tally) -> Shown:
+        """Broken runs were unavailable for `outside_s` at least, so for that part of the longest run at least.
+
+        Never `met`: the result does not hold the confidence of speed, nor what stood in gaps of the log.
+        """
+        broken = clopper_pearson(tally.broken, tally.trials) if tally.trials else UNKNOWN
+        lost = (broken.low or 0.0) * self.outside_s / tally.longest_s if tally.longest_s > 0 else 0.0
+        measured = Estimate(tally.known_s / tally.held_s, None, 1.0 - lost) if tally.held_s > 0 else UNKNOWN
+        return Shown(Compliance.NOT_MET if lost > 1.0 - self.limit else Compliance.NOT_SHOWN, measured)
 
 
 ALWAYS = Demand(Kind.ALWAYS)
-
-
-def of_share(tally: Tally, share: float) -> Shown:
-    """At least this share, by exact bounds over runs (Clopper and Pearson)."""
-    if tally.trials == 0:
-        return Shown(Compliance.NOT_SHOWN)
-    judged = tally.kept + tally.broken
-    trials = Trials(judged, tally.broken, tally.trials - judged)
-    broken = trials.share()
-    measured = clopper_pearson(tally.kept, judged)
-    if broken.high is not None and 1.0 - broken.high >= share:
-        return Shown(Compliance.MET, measured, 0.0)
-    finding = Compliance.NOT_MET if broken.low is not None and 1.0 - broken.low < share else Compliance.NOT_SHOWN
-    hours = tally.held_s / tally.trials / S_PER_H
-    needed = trials.needed(1.0 - share)
-    return Shown(finding, measured, needed * hours if hours > 0 and needed is not None else None)
-
-
-def of_rate(tally: Tally, rate_per_h: float) -> Shown:
-    """Below this rate [1/h], by exact Poisson bounds on events; the one-sided bound for `met`, as a THR claim needs."""
-    hours = tally.held_s / S_PER_H
-    measured = poisson_rate(tally.events, tally.known_s / S_PER_H)
-    if hours <= 0.0:
-        return Shown(Compliance.NOT_SHOWN, needed_h=hours_still_needed(rate_per_h, tally.possible, 0.0))
-    low = poisson_rate(tally.events, hours).low
-    high = poisson_rate_upper(tally.possible, hours)
-    needed_h = hours_still_needed(rate_per_h, tally.possible, hours)
-    if high is not None and high <= rate_per_h:
-        return Shown(Compliance.MET, measured, 0.0)
-    return Shown(
-        Compliance.NOT_MET if low is not None and low > rate_per_h else Compliance.NOT_SHOWN,
-        measured,
-        needed_h,
-    )
-
-
-def of_always(tally: Tally) -> Shown:
-    """A maximum without a probability: one event breaks it, no number of hours shows it."""
-    measured = poisson_rate(tally.events, tally.known_s / S_PER_H)
-    return Shown(Compliance.NOT_MET if tally.events else Compliance.NOT_SHOWN, measured)
-
-
-def of_availability(tally: Tally, share: float, outside_s: float) -> Shown:
-    """Broken runs were unavailable for `outside_s` at least, so for that part of the longest run at least.
-
-    Never `met`: the result does not hold the confidence of speed, nor what stood in gaps of the log.
-    """
-    broken = clopper_pearson(tally.broken, tally.trials) if tally.trials else UNKNOWN
-    lost = (broken.low or 0.0) * outside_s / tally.longest_s if tally.longest_s > 0 else 0.0
-    measured = Estimate(tally.known_s / tally.held_s, None, 1.0 - lost) if tally.held_s > 0 else UNKNOWN
-    return Shown(Compliance.NOT_MET if lost > 1.0 - share else Compliance.NOT_SHOWN, measured)

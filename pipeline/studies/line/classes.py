@@ -9,12 +9,17 @@ import polars as pl
 
 from pipeline.studies.line.pieces import Pieces
 from pipeline.studies.line.spans import FIRST_LOSS, SpanState
-from pipeline.studies.trials import Trials
+from pipeline.studies.tally import Compliance, share_shown
 from schemas.conform import conform
 from schemas.line import LOSSES, SHORT_OF_SATELLITES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
 
 KEYS = ["piece", "growing"]
 _TRIALS = ["bad", "passes", "wrong_in_use", "unjudged"]
+_SHOWN = {
+    **dict.fromkeys(("loss_share", "loss_low", "loss_high", "unsafe_high"), pl.Float64),
+    "passes_needed": pl.Int64,
+    "finding": pl.String,
+}
 
 
 def piece_classes(
@@ -64,11 +69,12 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Counts per piece and direction; hours of the day are those of all right passes."""
     state = pl.col("state")
     cause = pl.col("cause")
-    usual = pl.col("satellites").filter(state == int(SpanState.RIGHT)).median().over("run_id")
-    passes = passes.with_columns(few=pl.col("satellites") <= criteria.satellites_share * usual)
     right = state == int(SpanState.RIGHT)
     wrong = state == int(SpanState.WRONG_IN_USE)
     lost = (state >= int(FIRST_LOSS)) & ~wrong
+    # A receiver is compared with itself: what it used on the right passes of the run.
+    usual = pl.col("satellites").filter(right).median().over("run_id")
+    passes = passes.with_columns(few=pl.col("satellites") <= criteria.satellites_share * usual)
     hour = pl.col("t").dt.strftime("%H").unique()
     hours = passes.filter(right).group_by(KEYS).agg(hours=hour.len(), hours_of_day=hour.sort().str.join(" "))
     return (
@@ -101,27 +107,33 @@ def _by_frequency(names: pl.Series) -> str:
 def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """With bounds, class and cause: what was not judged counts against each bound."""
     cases = counted.select(_TRIALS).unique()
-    bounds = [_bounds(bad, number, wrong, lost, criteria) for bad, number, wrong, lost in cases.iter_rows()]
-    schema = dict.fromkeys(("loss_share", "loss_low", "loss_high", "unsafe_high"), pl.Float64)
-    bounded = pl.concat(
-        [cases, pl.DataFrame(bounds, schema=schema | {"passes_needed": pl.Int64}, orient="row")], how="horizontal"
-    )
+    rows = [_shown(bad, number, wrong, unjudged, criteria) for bad, number, wrong, unjudged in cases.iter_rows()]
+    shown = pl.DataFrame(rows, schema=_SHOWN, orient="row")
+    judged = counted.join(pl.concat([cases, shown], how="horizontal"), on=_TRIALS, how="left", maintain_order="left")
     misleading = (pl.col("wrong_in_use") > 0) | (pl.col("claimed_wrongly") > 0)
-    unsuitable = misleading | (pl.col("loss_low") > criteria.loss_limit).fill_null(value=False)
-    shown = (pl.col("loss_high") <= criteria.loss_limit).fill_null(value=False)
+    unsuitable = misleading | (pl.col("finding") == Compliance.NOT_MET.value)
+    met = pl.col("finding") == Compliance.MET.value
     hours = pl.col("hours") >= criteria.hours_least
-    classed = (
+    piece_class = (
         pl.when(unsuitable)
         .then(pl.lit(PieceClass.UNSUITABLE.value))
-        .when(shown & hours)
+        .when(met & hours)
         .then(pl.lit(PieceClass.SUITABLE.value))
         .otherwise(pl.lit(PieceClass.UNKNOWN.value))
     )
-    return counted.join(bounded, on=_TRIALS, how="left", maintain_order="left").with_columns(
-        piece_class=classed,
-        cause=_cause(unsuitable, shown, hours),
+    return judged.with_columns(
+        piece_class=piece_class,
+        cause=_cause(unsuitable, met, hours),
         passes_needed=pl.when(~unsuitable).then("passes_needed"),
     )
+
+
+def _shown(bad: int, number: int, wrong: int, unjudged: int, criteria: LineCriteria) -> tuple[object, ...]:
+    """The columns `_SHOWN` of so many passes."""
+    lost = share_shown(bad, number, unjudged, criteria.loss_limit, criteria.confidence)
+    unsafe = share_shown(wrong, number, unjudged, criteria.loss_limit, criteria.confidence)
+    bounds = lost.bounds
+    return bounds.value, bounds.low, bounds.high, unsafe.bounds.high, lost.needed, lost.finding.value
 
 
 def _cause(unsuitable: pl.Expr, shown: pl.Expr, hours: pl.Expr) -> pl.Expr:
@@ -151,13 +163,3 @@ def _cause(unsuitable: pl.Expr, shown: pl.Expr, hours: pl.Expr) -> pl.Expr:
         *(pl.when(when).then(cause if isinstance(cause, pl.Expr) else pl.lit(cause.value)) for when, cause in order),
         pl.lit(LineCause.NO_PASS.value),
     )
-
-
-def _bounds(
-    bad: int, number: int, wrong: int, unjudged: int, criteria: LineCriteria
-) -> tuple[float | None, float | None, float | None, float | None, int | None]:
-    """Share lost with its bounds, upper bound of the share wrong in use, further right passes needed."""
-    passes = Trials(number, bad, unjudged)
-    lost = passes.share(criteria.confidence)
-    unsafe = Trials(number, wrong, unjudged).share(criteria.confidence)
-    return lost.value, lost.low, lost.high, unsafe.high, passes.needed(criteria.loss_limit, criteria.confidence)

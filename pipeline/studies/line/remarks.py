@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 
 from pipeline.studies.reservations import runs_without_truth, sentences, several_settings
-from pipeline.studies.trials import trials_needed
+from pipeline.studies.tally import trials_needed
 from schemas.line import LineCriteria, LineDirection
 from schemas.words import say
 
@@ -23,7 +23,7 @@ def remarks(
     unserved = figures.height > 0 and figures["points"].max() and (figures["points_served"] < figures["points"]).any()
     never = say("line", "never_enough")
     numbers = {
-        "too_few_passes": (most, needed or never, criteria.loss_limit) if few else (),
+        "too_few_passes": few and (most, needed or never, criteria.loss_limit),
         "by_day": criteria.independent == "pass",
     }
     rest = {

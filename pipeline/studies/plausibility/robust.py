@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,40 +18,23 @@ SIGNIFICANT_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
-class Shift:
-    """How far one record lies from another [m]."""
-
-    east_m: float
-    north_m: float
-
-    @property
-    def shift_m(self) -> float:
-        return float(np.hypot(self.east_m, self.north_m))
-
-    @property
-    def towards(self) -> str:
-        """In words."""
-        east = "east" if self.east_m >= 0 else "west"
-        north = "north" if self.north_m >= 0 else "south"
-        return f"{abs(self.east_m):.0f} m {east}, {abs(self.north_m):.0f} m {north}"
-
-    def off_m(self, other: Shift) -> float:
-        """How far this shift is from another."""
-        return float(np.hypot(self.east_m - other.east_m, self.north_m - other.north_m))
-
-
-@dataclass(frozen=True)
 class Regression:
-    """`estimate` with `sigma` (inf: not known); `halves`: the estimates of the first and second half of the run alone.
+    """`estimate` with `sigma` (inf: not known); `weight` of each observation, `spread` of what is left [m].
 
-    `spread`: of what is left [m]; `whole`: every part of the estimate is known.
+    `halves`: the estimates of the first and the second half of the run alone. `whole`: every part of the estimate is
+    known.
     """
 
     estimate: Floats
     sigma: Floats
+    weight: Floats
     spread: float
+    halves: tuple[Floats, ...]
     whole: bool
-    halves: tuple[Floats, ...] = ()
+
+
+def halves_of(count: int) -> tuple[slice, slice]:
+    return slice(None, count // 2), slice(count // 2, None)
 
 
 def steady(whole: Floats, *halves: Floats) -> bool:
@@ -71,36 +54,31 @@ def regressed(
     `floor`: least spread of what is left. Directions with less than the share `least_known` of the information of the
     best known one stay zero. `start`: an estimate to begin with, else that of least absolute deviations.
     """
-    half = len(target) // 2
-    parts = [(design[:half], target[:half]), (design[half:], target[half:])]
-    alone = tuple(_solved(*part, floor, least_known, start).estimate for part in parts if len(part[1]) >= LEAST)
-    return replace(_solved(design, target, floor, least_known, start), halves=alone)
-
-
-def _solved(
-    design: Floats, target: Floats, floor: float, least_known: float, start: tuple[float, ...] | None
-) -> Regression:
-    """Iteratively reweighted least squares: the weight of an observation falls with what the last round left of it."""
-    count, each = target.shape
-    equations = design.reshape(count * each, -1)
-    goal = target.ravel()
-    weight = np.ones(count)
-    left = np.zeros(count) if start is None else np.linalg.norm(target - design @ np.array(start), axis=1)
+    weight = np.ones(len(target))
+    left = np.zeros(len(target)) if start is None else np.linalg.norm(target - design @ np.array(start), axis=1)
     for number in range(_ROUNDS):
         spread = max(1.4826 * float(np.median(left)), floor)
         if start is None and number < _ROUNDS // 2:
             weight = floor / np.maximum(left, floor)
         else:
             weight = np.clip(1.0 - (left / (_BIWEIGHT * spread)) ** 2, 0.0, None) ** 2
-        weighted = (equations * np.repeat(weight, each)[:, None]).T
-        strengths, axes = np.linalg.eigh(weighted @ equations)
-        known = strengths > least_known * strengths[-1]
-        inverse = (axes[:, known] / strengths[known]) @ axes[:, known].T
-        estimate = inverse @ (weighted @ goal)
-        left = np.linalg.norm((goal - equations @ estimate).reshape(count, each), axis=1)
-    whole = bool(known.all())
-    sigma = spread * np.sqrt(np.diag(inverse)) if whole else np.full(len(estimate), np.inf)
-    return Regression(estimate, sigma, spread, whole)
+        estimate, variance = _solved(design, target, weight, least_known)
+        left = np.linalg.norm(target - design @ estimate, axis=1)
+    alone = (_solved(design[part], target[part], weight[part], least_known)[0] for part in halves_of(len(target)))
+    halves = tuple(alone) if len(target) >= 2 * LEAST else ()
+    whole = bool(np.isfinite(variance).all())
+    return Regression(estimate, spread * np.sqrt(variance), weight, spread, halves, whole)
+
+
+def _solved(design: Floats, target: Floats, weight: Floats, least_known: float) -> tuple[Floats, Floats]:
+    """Weighted least squares, and the variance of each part at a spread of 1 (inf where a direction is not known)."""
+    weighted = design * weight[:, None, None]
+    normal = np.einsum("nmk,nml->kl", weighted, design)
+    strengths, axes = np.linalg.eigh(normal)
+    known = strengths > least_known * max(float(strengths[-1]), 1e-300)
+    inverse = (axes[:, known] / strengths[known]) @ axes[:, known].T
+    variance = np.diag(inverse) if known.all() else np.full(len(inverse), np.inf)
+    return inverse @ np.einsum("nmk,nm->k", weighted, target), variance
 
 
 def explains(share: float, before: float) -> bool:

@@ -10,12 +10,12 @@ import polars as pl
 
 from pipeline.stages.judge.failures import Course, course_of
 from pipeline.stages.judge.jumps import Jump
-from schemas.config import HazardConfig
+from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.stages import JudgedEpochs, JudgedOffers
 
 NS = 1_000_000_000
-CONFIG = HazardConfig()
+CONFIG = Configuration()
 
 
 def positions(t_s: Sequence[float], error_m: Sequence[float] | float = 0.0, half_m: float = 1.0, **columns: Any) -> Any:

@@ -12,21 +12,21 @@ import pytest
 
 from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
-from pipeline.stages.judge.alarms import _belongs, healthy_across, verdict_of, verdict_within
-from pipeline.stages.judge.attribution import suspect_of
+from pipeline.stages.judge.alarms import _belongs, healthy_across, suspect_of, verdict_of, verdict_within
 from pipeline.stages.judge.case import Case, Solution
 from pipeline.stages.judge.cross_errors import cross_errors
 from pipeline.stages.judge.episodes import (
     Detection,
     Episode,
+    Extent,
     _failed,
     _failed_may_ns,
     _is_back,
     find_episodes,
     named_onset_ns,
 )
-from pipeline.stages.judge.failures import Course, Failure, find_failures, within_budget
-from pipeline.stages.judge.hazards import HazardRow, crossed_by, hazard_rows, instants, rate_mps, size_m
+from pipeline.stages.judge.failures import Course, Failure, Offers, find_failures, within_budget
+from pipeline.stages.judge.hazards import HazardRow, _evidence, crossed_by, hazard_rows, instants, rate_mps, size_m
 from pipeline.stages.judge.in_use import lds_states, time_in_use
 from pipeline.stages.judge.judgement import (
     RIGHT,
@@ -39,7 +39,6 @@ from pipeline.stages.judge.judgement import (
     with_own_anchors,
 )
 from pipeline.stages.judge.jumps import Jump, find_jumps, steps_of
-from pipeline.stages.judge.offers import Offers
 from pipeline.stages.judge.passages import _true_times, _with_failures
 from pipeline.stages.judge.travel import OdometerSteps, beyond_confidence, moving, travel_direction
 from pipeline.stages.judge.true_crossings import TrueCrossing, between_far_epochs, true_crossings
@@ -66,7 +65,7 @@ def ns(t_s: float | None) -> int | None:
 def episodes(of: Course) -> list[Episode]:
     """Where no monitor fails and nothing was offered."""
     quiet = FailureLog(of.t_ns, np.zeros(of.size, dtype=bool), np.zeros(0, dtype=np.int64), (), ())
-    return find_episodes(of, find_failures(of, Configuration()), quiet, None, Configuration())
+    return find_episodes(of, find_failures(of), quiet, None)
 
 
 @pytest.mark.parametrize(
@@ -221,7 +220,7 @@ def test_an_alarm_shortly_before_a_drift_is_its_onset_and_was_there_before_it(
     failing = np.array([] if alarm_s is None else [alarm_s], dtype=np.int64)
     alarms = tuple(AlarmEpisode(t, t, t * NS, t * NS, ("along_raw",), 2.0) for t in failing.tolist())
     log = FailureLog(drift.t_ns, np.zeros(drift.size, bool), failing, ("along_raw",) * failing.size, alarms)
-    (episode,) = find_episodes(drift, find_failures(drift, Configuration()), log, None, Configuration())
+    (episode,) = find_episodes(drift, find_failures(drift), log, None)
     assert episode.onset_ns == onset_s * NS
     assert episode.detection.standing is standing
     assert episode.detection.t_ns == ns(alarm_s)
@@ -242,7 +241,7 @@ def test_what_an_episode_hit() -> None:
         offered=[k != 2 for k in range(10)], wrong_track=[number == 7 for number in epoch],
     )  # fmt: skip
     met = course(positions(range(10)), offered=offered)
-    found = hazard_rows([replace(EPISODE, onset=2, end=8)], met, HazardConfig())
+    found = hazard_rows([replace(EPISODE, onset=2, end=8)], met)
     assert [(row.hazard, row.hits) for row in found] == [(Hazard.VB_SHIFT, [1, 9]), (Hazard.VB_WRONG_TRACK, [6])]
 
 
@@ -265,7 +264,8 @@ def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
     low_m = np.where(np.arange(2) == 0, middle_m, size_m)
     kind, track = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=bool)
     judged = Judgements(np.array([WRONG, code]), low_m, low_m, kind, track)
-    assert bool(_is_back(judged, Jump(1, 1, step_m), HazardConfig())) is back
+    judged_course = replace(course(positions(range(2))), judged=judged)
+    assert bool(_is_back(judged_course, Jump(1, 1, step_m))) is back
 
 
 @pytest.mark.parametrize(("may_s", "detected_s"), [(104.5, 107.0), (None, 107.0), (104.5, None)])
@@ -275,7 +275,7 @@ def test_the_times_of_a_hazard(may_s: float | None, detected_s: float | None) ->
     episode = replace(
         EPISODE, onset_ns=103 * NS, end_ns=109 * NS, failed=5, may_ns=ns(may_s), detection=Detection(ns(detected_s))
     )
-    found = instants(HazardRow(Hazard.VB_SHIFT, episode, None, [1]), met, Configuration())
+    found = instants(HazardRow(Hazard.VB_SHIFT, episode, None, [1]), met)
     times = [found[name] for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
     assert times == seconds(103, 104, 105, 109).tolist()
     seen = detected_s is not None
@@ -327,7 +327,7 @@ def test_a_failure_is_a_second_of_wrong_from_the_onset_on(
     """Positions each 0.5 s, the onset is the third."""
     frame = positions(0.5 * np.arange(8), [30.0 if k in wrong else 0.0 for k in range(8)])
     jump = None if step is None else Jump(*step, 30.0)
-    assert _failed(course(frame), 2, 8, jump, HazardConfig()) == failure
+    assert _failed(course(frame), Extent(2, 2, 8, jump, None)) == failure
 
 
 @pytest.mark.parametrize(
@@ -344,7 +344,7 @@ def test_since_when_a_drift_may_have_failed(
 ) -> None:
     """6 m more each second, known to 5 m: beyond 20 m for certain at 5 s, and possibly from 3 s on."""
     frame = positions(range(6), 6.0 * np.arange(6), 5.0, judgement=judgement, evidence=evidence)
-    assert _failed_may_ns(course(frame), 5, HazardConfig()) == ns(may_s)
+    assert _failed_may_ns(course(frame), 5) == ns(may_s)
 
 
 def placed(path_m: list[float], element: int = 0) -> MatchedPositions:
@@ -621,11 +621,20 @@ def test_the_size_and_slope_of_a_hazard(
     assert found == (None if rate is None else pytest.approx(rate))
 
 
+@pytest.mark.parametrize(("first", "kind"), [("reference", Evidence.REFERENCE), (None, Evidence.BALISE)])
+def test_a_hazard_rests_on_what_judged_its_first_balise_else_on_its_first_position(
+    first: str | None, kind: Evidence
+) -> None:
+    offered = offers([2, 3], evidence=[first, "odometer"])
+    met = course(positions(range(5), evidence=["balise", *["odometer"] * 4]), offered=offered)
+    assert _evidence(HazardRow(Hazard.VB_SHIFT, EPISODE, None, [0, 1]), met) is kind
+
+
 def test_pulses_are_one_failure_and_a_calm_half_minute_ends_it() -> None:
     """60 m for 0.3 s in each of ten seconds at 10 Hz, right for 45 s, one pulse more: 3.0 s and 0.3 s wrong in use."""
     t_s = 0.1 * np.arange(600)
     pulse = ((t_s % 1.0) < 0.25) & (t_s < 9.95) | ((t_s > 54.95) & (t_s < 55.25))
-    found = find_failures(course(positions(t_s, np.where(pulse, 60.0, 0.0))), Configuration())
+    found = find_failures(course(positions(t_s, np.where(pulse, 60.0, 0.0))))
     assert [one.hazardous_s for one in found] == pytest.approx([3.0, 0.3])
     assert [one.within_budget for one in found] == [False, True]
 
@@ -636,7 +645,7 @@ def test_a_failure_goes_on_until_it_is_calm_for_long_enough(apart_s: int, betwee
     error_m = np.full(60, 0.0)
     error_m[10 : 10 + apart_s] = between_m
     error_m[[10, 10 + apart_s]] = 60.0
-    assert len(find_failures(course(positions(range(60), error_m)), Configuration())) == failures
+    assert len(find_failures(course(positions(range(60), error_m)))) == failures
 
 
 def test_unknown_time_in_use_counts_to_the_failure_that_it_belongs_to() -> None:
@@ -644,7 +653,7 @@ def test_unknown_time_in_use_counts_to_the_failure_that_it_belongs_to() -> None:
     error_m = np.full(30, 0.0)
     error_m[5:9] = [60.0, np.nan, np.nan, np.nan]
     frame = positions(range(30), error_m, path_m=10.0 * np.arange(30))
-    (found,) = find_failures(course(frame, offered=offers([7], judgement="unknown")), Configuration())
+    (found,) = find_failures(course(frame, offered=offers([7], judgement="unknown")))
     assert (found.hazardous_s, found.hazardous_may_s, found.accepted) == (1.0, 4.0, Judgement.UNKNOWN)
 
 

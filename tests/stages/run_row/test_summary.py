@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.stages.clean.clean import StreamCounts
 from pipeline.stages.judge.judge import Judged
 from pipeline.stages.provenance import Provenance
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
@@ -21,6 +20,11 @@ from schemas.tables import CONTRACT_VERSION, SCALES, Runs
 from schemas.words import Remark
 from tests.tables import NS, alarms, epochs, failures, hazards, passages
 
+COLUMNS: dict[str, Any] = {
+    **dict.fromkeys(("odometer_contradicted", "duplicates", "out_of_order", "ambiguous_stretches"), 0),
+    "vehicle": VehicleFigures.FILE,
+    "faults_injected": False,
+}
 PROVENANCE = Provenance("c" * 64, "i" * 64, "balise 0.1.0")
 CONFIG = Configuration()
 ACCEPTED = {"status": "accepted", "judgement": "right"}
@@ -30,8 +34,8 @@ _TIMES_S = [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]
 def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
     nothing = Judged(hazards(), alarms(), passages(), failures(), frame, pl.DataFrame(), None, Evidence.REFERENCE)
     given = {name: fields.pop(name) for name in vars(nothing) if name in fields}
-    empty = SolutionResults("primary", frame, replace(nothing, **given), vehicle=VehicleFigures.FILE)
-    return replace(empty, **fields)
+    own = {name: fields.pop(name) for name in ("ingest", "notes") if name in fields}
+    return SolutionResults("primary", frame, replace(nothing, **given), COLUMNS | fields, **own)
 
 
 def row(frame: pl.DataFrame, config: Configuration = CONFIG, **fields: Any) -> dict[str, Any]:
@@ -112,13 +116,12 @@ def test_what_the_evidence_cannot_see_is_said() -> None:
 def test_what_cleaning_and_alignment_found() -> None:
     found = row(
         epochs(seconds(3)),
-        counts=StreamCounts(duplicates=4, out_of_order=2),
-        alignment={
-            "latency_s": 0.08,
-            "latency_sigma_s": 0.01,
-            "odometer_scale": 1.004,
-            "odometer_scale_sigma": 2e-4,
-        },
+        duplicates=4,
+        out_of_order=2,
+        latency_s=0.08,
+        latency_sigma_s=0.01,
+        odometer_scale=1.004,
+        odometer_scale_sigma=2e-4,
         ambiguous_stretches=3,
     )
     assert (found["duplicates"], found["out_of_order"], found["ambiguous_stretches"]) == (4, 2, 3)

@@ -20,17 +20,8 @@ from pipeline.studies.claim import claim, load_profile, read_areas
 from pipeline.studies.claim.claim import claim_table
 from pipeline.studies.claim.front import Front, front_of, speed_errors
 from pipeline.studies.claim.requirements import ClaimRide, requirements, tallies
-from pipeline.studies.claim.tally import (
-    Compliance,
-    Tally,
-    clusters_s,
-    counted,
-    of_always,
-    of_availability,
-    of_rate,
-    of_share,
-)
-from pipeline.studies.trials import trials_needed
+from pipeline.studies.claim.tally import ALWAYS, Demand, Kind, Tally, clusters_s, counted
+from pipeline.studies.tally import Compliance, Shown, trials_needed
 from schemas.config import Configuration
 from schemas.errors import ConfigError, SiteError
 from schemas.inputs import Areas, Links, Track
@@ -54,6 +45,18 @@ SITE = Site(
     track=table(Track, 2, netelement_id="A", measure_m=[0.0, 1000.0], latitude_deg=[50.0, 50.01], longitude_deg=14.0),
     links=Links.create_empty(),
 )
+
+
+def of_share(tally: Tally, share: float) -> Shown:
+    return Demand(Kind.SHARE, share).shown(tally)
+
+
+def of_rate(tally: Tally, rate_per_h: float) -> Shown:
+    return Demand(Kind.RATE, rate_per_h).shown(tally)
+
+
+def of_availability(tally: Tally, share: float, outside_s: float) -> Shown:
+    return Demand(Kind.AVAILABILITY, share, outside_s=outside_s).shown(tally)
 
 
 def front(t_s: list[float], areas: pl.DataFrame | None = AREAS, run: dict[str, Any] = RUN, **columns: Any) -> Front:
@@ -178,16 +181,16 @@ def test_what_few_runs_show() -> None:
     assert of_share(Tally(trials=10, broken=10), 0.954).finding is Compliance.NOT_MET
     # Zero events: 2.9957/T one-sided; 1e-10 /h takes 3.0e10 h.
     assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 1e-10).finding is Compliance.NOT_SHOWN
-    assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 1e-10).needed_h == pytest.approx(2.9957e10, rel=1e-4)
+    assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 1e-10).needed == pytest.approx(2.9957e10, rel=1e-4)
     assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 3.0).finding is Compliance.MET
     assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 2.99).finding is Compliance.NOT_SHOWN
     assert of_rate(Tally(events=1, possible=1, held_s=3600.0, known_s=3600.0), 1e-10).finding is Compliance.NOT_MET
-    assert of_always(Tally(held_s=1e12, known_s=1e12)).finding is Compliance.NOT_SHOWN
-    assert of_always(Tally(events=1)).finding is Compliance.NOT_MET
+    assert ALWAYS.shown(Tally(held_s=1e12, known_s=1e12)).finding is Compliance.NOT_SHOWN
+    assert ALWAYS.shown(Tally(events=1)).finding is Compliance.NOT_MET
     # Five of five runs lost 60 s of at most an hour: at least 0.478 of the runs, 0.8 % of the time.
     lost = of_availability(Tally(trials=5, broken=5, held_s=9000.0, known_s=8000.0, longest_s=3600.0), 0.99998, 60.0)
     assert lost.finding is Compliance.NOT_MET
-    assert lost.measured.high == pytest.approx(1 - 0.47818 / 60, abs=1e-6)
+    assert lost.bounds.high == pytest.approx(1 - 0.47818 / 60, abs=1e-6)
     assert of_availability(Tally(trials=999, held_s=1e9, known_s=1e9), 0.99998, 60.0).finding is Compliance.NOT_SHOWN
 
 
@@ -251,7 +254,7 @@ def test_weaker_evidence_never_shows_what_stronger_refutes(runs: list[list[tuple
         strong += counted(str(number), t_ns, held, full, 300.0)
         weak += counted(str(number), t_ns, held, less, 300.0)
     fault_free = Tally(trials=1, kept=1, held_s=3600.0, known_s=3600.0)
-    for shown in (lambda c: of_share(c, 0.6), lambda c: of_rate(c, 8.0), of_always):
+    for shown in (lambda c: of_share(c, 0.6), lambda c: of_rate(c, 8.0), ALWAYS.shown):
         findings = (shown(strong).finding, shown(weak).finding)
         assert findings not in {
             (Compliance.NOT_MET, Compliance.MET),

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.studies.line.classes import piece_classes
 from pipeline.studies.line.spans import SpanState
-from pipeline.studies.trials import distinct, trials_needed
+from pipeline.studies.tally import distinct, trials_needed
 from schemas.line import LineCriteria
 from schemas.run import Site
 from tests.studies.line.tables import (

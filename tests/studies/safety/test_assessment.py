@@ -113,7 +113,7 @@ def test_statements_say_what_the_figures_are_not(found: Assessment) -> None:
     assert said[0].startswith("unsafe: 1 unsafe, 0 unproven, 2 safe, 0 failed; ")
     assert said[1].startswith("Faults were injected into 1 of 3 runs")
     assert any(text.startswith("primary: 1 position failures in use, at a virtual balise or not: 0") for text in said)
-    assert "0 in time for 0.5025 s (lpv200; 95 %: 0.0% to 97.5%)" in said[-1]
+    assert "0 in time for 0.5025 s (lpv200; 1 judged by a truth, 95 %: 0.0% to 97.5%)" in said[-1]
 
 
 def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
