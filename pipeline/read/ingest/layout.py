@@ -151,10 +151,11 @@ class Layout:
             rows[:, stretch.at] & stretch.mask != stretch.expected
             for stretch, rows in zip(self.stretches, stretches, strict=True)
         ]
-        # Mostly none is: then no row of a few bytes has to be looked at for itself.
-        if not any(part.any() for part in wrong):
-            return np.ones(len(stretches[0]), dtype=np.bool_)
-        return ~np.any([part.any(axis=1) for part in wrong], axis=0)
+        agree = np.ones(len(stretches[0]), dtype=np.bool_)
+        for part in wrong:
+            if part.any():  # mostly none is: then no row of a few bytes has to be looked at for itself
+                agree &= ~part.any(axis=1)
+        return agree
 
     def values(self, stretches: Sequence[Bytes]) -> Columns:
         """The fields of messages that have this layout, for each row that they make."""
