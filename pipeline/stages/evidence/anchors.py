@@ -96,7 +96,7 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
     rows = _every(stretch.t_ns, 1.0)
     step_m = np.where(np.diff(path.leg[rows]) == 0, np.diff(path.at_m[rows]), 0.0)
     if counter is not None:
-        counted_m = counter.between(stretch.t_ns[rows[:-1]], stretch.t_ns[rows[1:]]).distance_m
+        counted_m = counter.distance_m(stretch.t_ns[rows[:-1]], stretch.t_ns[rows[1:]])
         step_m = np.sign(step_m) * np.nan_to_num(counted_m)
     moved_m = np.cumsum(step_m)
     first = np.flatnonzero(np.abs(moved_m) >= least_m)

@@ -51,8 +51,15 @@ class Counter:
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> Counted:
         """True distance between instants and its variance; NaN over a break."""
         counted = self.odometer.between(begin_ns, end_ns)
+        return Counted(self._unbroken(begin_ns, end_ns, counted.distance_m), counted.variance_m2)
+
+    def distance_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """The distance of `between` alone, which takes half the time."""
+        return self._unbroken(begin_ns, end_ns, self.odometer.distance_between(begin_ns, end_ns))
+
+    def _unbroken(self, begin_ns: Ints | int, end_ns: Ints, distance_m: Floats) -> Floats:
         breaks = [np.searchsorted(self.breaks_ns, t_ns, side="right") for t_ns in (begin_ns, end_ns)]
-        return Counted(np.where(breaks[0] == breaks[1], counted.distance_m, np.nan), counted.variance_m2)
+        return np.where(breaks[0] == breaks[1], distance_m, np.nan)
 
     def driven_m(self, since_ns: Ints | int, t_ns: Ints) -> Floats:
         """Way driven, turns included [m]."""
@@ -62,7 +69,7 @@ class Counter:
     def speed_mps(self, t_ns: Ints) -> Floats:
         """Speed over a second about each instant [m/s]; NaN where it did not count throughout."""
         half_ns = round(0.5 * self.odometer.config.speed_window_s * NS_PER_S)
-        speed: Floats = self.between(t_ns - half_ns, t_ns + half_ns).distance_m / (2 * half_ns / NS_PER_S)
+        speed: Floats = self.distance_m(t_ns - half_ns, t_ns + half_ns) / (2 * half_ns / NS_PER_S)
         return speed
 
     def best_speed_mps(self, t_ns: Ints) -> Floats:
@@ -92,7 +99,7 @@ def beside_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
 
 def carried(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
     """Least and largest coordinate on one side of an anchor at `at_m`; NaN where the odometer is silent."""
-    centre = at_m + counter.between(anchor.t_ns, t_ns).distance_m
+    centre = at_m + counter.distance_m(anchor.t_ns, t_ns)
     known_m = config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m
     half = beside_m(counter.driven_m(anchor.t_ns, t_ns), known_m, config)
     return centre - half, centre + half
@@ -172,7 +179,7 @@ def carried_forward(
 
 def _since_accepted(counter: Counter, since_ns: Ints, at_m: Floats, t_ns: Ints, config: Configuration) -> Interval:
     """Each balise plus the distance since it, +- (5 m + 5 %) (SUBSET-041 5.3.1.1)."""
-    centre = at_m + counter.between(since_ns, t_ns).distance_m
+    centre = at_m + counter.distance_m(since_ns, t_ns)
     half = beside_m(counter.driven_m(since_ns, t_ns), 0.0, config)
     return centre - half, centre + half
 

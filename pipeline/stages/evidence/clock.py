@@ -89,7 +89,7 @@ def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter)
     lags_s = np.arange(-_FARTHEST_S, _FARTHEST_S + _STEP_S, _STEP_S)
     spreads = []
     for lag_s in lags_s.tolist():
-        counted = counter.between(_shifted(begin_ns, lag_s), _shifted(end_ns, lag_s)).distance_m
+        counted = counter.distance_m(_shifted(begin_ns, lag_s), _shifted(end_ns, lag_s))
         known = np.isfinite(counted)
         enough = known.sum() >= 0.5 * known.size and float(np.abs(counted[known]).sum()) > 0.0
         spreads.append(float(np.median(np.abs(way_m - counted)[known])) if enough else np.inf)
@@ -102,7 +102,7 @@ def _rest_of_lag(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter, 
     """The remaining lag once `lag_s` is taken off, and its sigma [s], infinite where the ways cannot show it."""
     begin_ns = _shifted(begin_ns, lag_s)
     end_ns = _shifted(end_ns, lag_s)
-    counted = counter.between(begin_ns, end_ns).distance_m
+    counted = counter.distance_m(begin_ns, end_ns)
     change = counter.speed_mps(end_ns) - counter.speed_mps(begin_ns)
     # Noise of the odometer would look like a lag. Where its recording begins or ends the speed is NaN, not a change.
     change = np.where(np.abs(change) <= counter.odometer.deadband_mps, 0.0, change)

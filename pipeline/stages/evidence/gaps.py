@@ -94,7 +94,7 @@ def _between(
     if end.t_ns < begin.t_ns:
         return []
     end_ns = np.array([end.t_ns])
-    length_m = float(counter.between(begin.t_ns, end_ns).distance_m[0])
+    length_m = float(counter.distance_m(begin.t_ns, end_ns)[0])
     if np.isnan(length_m):
         return [Gap(begin.t_ns, end.t_ns, begin, None, []), Gap(begin.t_ns, end.t_ns, None, end, [])]
     way_m = float(counter.driven_m(begin.t_ns, end_ns)[0])
@@ -209,7 +209,7 @@ def _turned(gap: Gap, counter: Counter, config: Configuration) -> bool:
     """The train went back in the gap by more than the fixed error of the odometer."""
     t_ns = _looks(gap, counter)
     for anchor in gap.anchors[:1]:
-        distance_m = counter.between(anchor.t_ns, t_ns).distance_m
+        distance_m = counter.distance_m(anchor.t_ns, t_ns)
         distance_m = distance_m[np.isfinite(distance_m)]
         if distance_m.size:
             # The largest fall behind the farthest place so far; a run without a turn has none in one of the two senses.

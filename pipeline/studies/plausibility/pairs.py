@@ -11,7 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.studies.plausibility.records import MOVING_MPS, SPEED_S, Places, Record
-from pipeline.studies.plausibility.robust import LEAST, SIGNIFICANT_SIGMAS, explains, regressed, steady, usual
+from pipeline.studies.plausibility.robust import (
+    LEAST,
+    SIGNIFICANT_SIGMAS,
+    Regression,
+    explains,
+    of_halves,
+    regressed,
+    steady,
+    usual,
+)
 from schemas.arrays import Floats
 
 # Windows overlap by half, which makes sigmas larger by so much; positions a step apart are no better known [m].
@@ -140,7 +149,12 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     # A counter that is reset seems to run so far that it would weigh more than all the rest.
     sane = off < np.log(2.0)
     design = np.column_stack([size, np.sign(counted) * change])[sane, None, :] / unit
-    fit = regressed(design, way[sane, None], _LEAST_SPREAD_M, start=(1.0, 0.0))
+    target = way[sane, None]
+
+    def solved(rows: slice) -> Regression:
+        return regressed(design[rows], target[rows], _LEAST_SPREAD_M, start=(1.0, 0.0))
+
+    fit = solved(slice(None))
     scale, slope = (fit.estimate / unit).tolist()
     sigma, slope_sigma = (_OVERLAP * fit.sigma / unit).tolist()
     return PairFit(
@@ -148,7 +162,7 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
         factor_sigma=sigma / scale**2,
         lag_s=lag_s + slope / scale,
         lag_sigma_s=slope_sigma / scale,
-        halves=tuple((sign * unit / half, lag_s + lag / half) for half, lag in fit.halves),
+        halves=tuple((sign * unit / half, lag_s + lag / half) for half, lag in of_halves(solved, len(target))),
         constant=counts * float(np.mean(off < _WINDOW_AGREES)),
     )
 

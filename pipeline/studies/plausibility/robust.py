@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -42,16 +43,12 @@ class Shift:
 
 @dataclass(frozen=True)
 class Regression:
-    """`estimate` with `sigma` (inf: not known); `halves`: the estimates of the first and second half of the run alone.
-
-    `spread`: of what is left [m]; `whole`: every part of the estimate is known.
-    """
+    """`estimate` with `sigma` (inf: not known); `spread`: of what is left [m]; `whole`: all of it is known."""
 
     estimate: Floats
     sigma: Floats
     spread: float
     whole: bool
-    halves: tuple[Floats, ...] = ()
 
 
 def steady(whole: Floats, *halves: Floats) -> bool:
@@ -69,18 +66,9 @@ def regressed(
     """Robust regression; `design` (n, m, k), `target` (n, m): the m parts of one observation share a weight.
 
     `floor`: least spread of what is left. Directions with less than the share `least_known` of the information of the
-    best known one stay zero. `start`: an estimate to begin with, else that of least absolute deviations.
+    best known one stay zero. `start`: an estimate to begin with, else that of least absolute deviations. Iteratively
+    reweighted least squares: the weight of an observation falls with what the last round left of it.
     """
-    half = len(target) // 2
-    parts = [(design[:half], target[:half]), (design[half:], target[half:])]
-    alone = tuple(_solved(*part, floor, least_known, start).estimate for part in parts if len(part[1]) >= LEAST)
-    return replace(_solved(design, target, floor, least_known, start), halves=alone)
-
-
-def _solved(
-    design: Floats, target: Floats, floor: float, least_known: float, start: tuple[float, ...] | None
-) -> Regression:
-    """Iteratively reweighted least squares: the weight of an observation falls with what the last round left of it."""
     count, each = target.shape
     equations = design.reshape(count * each, -1)
     goal = target.ravel()
@@ -101,6 +89,12 @@ def _solved(
     whole = bool(known.all())
     sigma = spread * np.sqrt(np.diag(inverse)) if whole else np.full(len(estimate), np.inf)
     return Regression(estimate, sigma, spread, whole)
+
+
+def of_halves(fit: Callable[[slice], Regression], count: int) -> list[Floats]:
+    """The estimates of the first and the second half of so many observations alone; none of too few."""
+    halves = (slice(count // 2), slice(count // 2, count))
+    return [fit(half).estimate for half in halves if half.stop - (half.start or 0) >= LEAST]
 
 
 def explains(share: float, before: float) -> bool:

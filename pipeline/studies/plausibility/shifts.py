@@ -11,7 +11,16 @@ from pipeline.stages.track.network import surveyed
 from pipeline.stages.track.once import Once
 from pipeline.stages.track.segments import Polyline, on_segments
 from pipeline.studies.plausibility.records import MOVING_MPS, Places
-from pipeline.studies.plausibility.robust import LEAST, Shift, explains, regressed, sampled, steady
+from pipeline.studies.plausibility.robust import (
+    LEAST,
+    Regression,
+    Shift,
+    explains,
+    of_halves,
+    regressed,
+    sampled,
+    steady,
+)
 from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
 from schemas.run import Site
@@ -116,12 +125,16 @@ def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityCon
     apart = apart[moves]
     # Apart = lag * velocity + shift. Along one heading at constant speed the two look alike: it is taken for a lag.
     design = np.concatenate([velocity[:, :, None], np.broadcast_to(np.eye(2), (len(apart), 2, 2))], axis=2)
-    fit = regressed(design, apart, floor=0.2, least_known=1e-4)
+
+    def solved(rows: slice) -> Regression:
+        return regressed(design[rows], apart[rows], floor=0.2, least_known=1e-4)
+
+    fit = solved(slice(None))
     # What is reported besides is no disagreement, nor what positions scatter beyond it.
     bound = 1.5 * config.shift_told_m + config.lag_told_s * np.linalg.norm(velocity, axis=1)
     rest_s, east_m, north_m = fit.estimate.tolist()
     # The record is ahead by so much way at its stamp: it stamps a place so much too early.
-    of_parts = (fit.estimate, *fit.halves)
+    of_parts = (fit.estimate, *of_halves(solved, len(apart)))
     return PlaceFit(
         east_m=east_m,
         north_m=north_m,
