@@ -109,6 +109,12 @@ Solution = Annotated[str, Option(help="Solution of the runs.")]
 Jobs = Annotated[
     int, Option(min=0, callback=lambda jobs: jobs or os.cpu_count() or 1, help="So many at once; 0: one per core.")
 ]
+Day = Annotated[
+    datetime | None,
+    Option("--date", formats=["%Y-%m-%d"], callback=lambda at: at and at.date(), help="Day (UTC) of NMEA logs."),
+]
+Balises = Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")]
+AcceptAll = Annotated[bool, Option("--accept-corrections", help="Accept what is proposed.")]
 ProjectFile = Annotated[Path | None, _file("--project", help="Project: its folder or file; default: balise.toml here.")]
 OfProject = Annotated[
     Path | None, _file("--project", help="Take what is not given from this project; default: balise.toml here.")
@@ -168,9 +174,7 @@ def replay(
     plan = make_plan(runs, site, out, settings, _vehicle(vehicle), route, write_route, given)
     plan = _calibrated(plan, calibrate, jobs, quiet) if calibrate else plan
     shown = watches(quiet, as_json)
-    settings_given = (("vehicle", vehicle), ("config", config))
-    options = "".join(f" --{name} {shlex.quote(str(file))}" for name, file in settings_given if file)
-    places: dict[str, str] = {"site": site, "options": options}
+    places = {"site": site, "options": _options(vehicle, config)}
     try:
         summary = run_campaign(
             plan, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit, watches=shown
@@ -179,6 +183,12 @@ def replay(
         raise _stopped(interrupted, out, quiet, as_json, places) from None
     show_summary(summary, out, quiet, as_json, has_pages=False, **places)
     raise Exit(_status_of(summary, fail_on))
+
+
+def _options(vehicle: Path | None, config: Path | None) -> str:
+    """The settings files as options of a command."""
+    files = {"vehicle": vehicle, "config": config}
+    return "".join(f" --{name} {shlex.quote(str(file))}" for name, file in files.items() if file)
 
 
 def _check_named(runs: list[str]) -> None:
@@ -224,12 +234,12 @@ def trial(
     raws: Annotated[list[Path], _place(metavar="RAW...", help=_LOGS + " Folders of these.")],
     to: Annotated[Path, _file("--to", "--out", help="Folder of the project.")],
     track: Annotated[list[Path] | None, _file(help="The line: maps (GPX, GeoJSON, ...), points, or a site.")] = None,
-    balises: Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")] = None,
+    balises: Balises = None,
     reference: Annotated[list[Path] | None, _file(help="Of the logs, one whose positions are the truth.")] = None,
-    date: Annotated[datetime | None, Option(formats=["%Y-%m-%d"], help="Day (UTC) of NMEA logs without one.")] = None,
+    date: Day = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
-    accept_corrections: Annotated[bool, Option("--accept-corrections", help="Accept what is proposed.")] = False,
+    accept_corrections: AcceptAll = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -244,15 +254,14 @@ def trial(
         )
         raise UsageError("needs the line that the train ran on", place="--track", remedy=remedy)
     raws, balises = _spacing(raws, balises)
-    day = None if date is None else date.date()
-    wanted = Wanted(raws, track, balises, reference or (), day, vehicle, config)
+    wanted = Wanted(raws, track, balises, reference or (), date, vehicle, config)
     _write_project(wanted, to, accept_corrections, force, as_json)
 
 
 @_command("balise init week12")
 def init(
     folder: Annotated[Path, _place(help="Folder of the project.")] = Path(),
-    accept_corrections: Annotated[bool, Option("--accept-corrections", help="Accept what is proposed.")] = False,
+    accept_corrections: AcceptAll = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -308,8 +317,7 @@ def run(
     opened = open_project(project)
     options = opened.project.replay
     out = opened.place(opened.project.out)
-    files = (("vehicle", opened.vehicle_file), ("config", opened.config_file))
-    named = "".join(f" --{name} {shlex.quote(str(file))}" for name, file in files if file)
+    named = _options(opened.vehicle_file, opened.config_file)
     places = {"site": opened.place(opened.project.site), "options": named, **opened.words}
     pages = None if quiet or as_json else how_far("pages")
     at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
@@ -554,7 +562,7 @@ def convert(
     config: ConfigFile = None,
     solution: Annotated[str | None, Option(help="Name of the receiver in the run, where it has several.")] = None,
     stream: Annotated[Literal["gnss", "reference"], Option(help="What the positions are for.")] = "gnss",
-    date: Annotated[datetime | None, Option(formats=["%Y-%m-%d"], help="Day (UTC) of an NMEA log without one.")] = None,
+    date: Day = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -562,8 +570,8 @@ def convert(
     from datasets.recordings import convert_logs
     from pipeline.make.receivers import Purpose
 
-    given, day = None if config is None else _configuration(config), None if date is None else date.date()
-    done = convert_logs(logs, out, given, Purpose(solution, stream), day, force)
+    given = None if config is None else _configuration(config)
+    done = convert_logs(logs, out, given, Purpose(solution, stream), date, force)
     _tell(as_json, done.as_dict(), {}, *done.lines())
 
 
@@ -577,7 +585,7 @@ def make_a_site(
         list[Path], _place(help="Maps (GPX, KML, GeoJSON, GeoPackage, Shapefile), CSV, or recorded runs.")
     ],
     out: OutFolder,
-    balises: Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")] = None,
+    balises: Balises = None,
     direction: Annotated[
         Literal["both", "ahead", "back"],
         Option(help="Of balises `every` so far: valid for trains away from the survey's start, back to it, or both."),

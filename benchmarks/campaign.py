@@ -12,6 +12,7 @@ from benchmarks.trials import write_campaign
 from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
 from pipeline.campaign import make_plan, run_campaign
+from pipeline.campaign.compact import compact
 from pipeline.campaign.finish import write_campaign as write_tables
 from pipeline.results.query import run_sql
 from schemas.config import Configuration
@@ -98,6 +99,7 @@ def _questions(folder: Path) -> list[Figure]:
     bare_s = best_of(2, lambda: run_sql(many, _HAZARDS))
     with stopwatch() as watch:
         write_tables(many, Configuration())
+    compact(many)
     found = run_sql(many, _HAZARDS)["n"].sum()
     command = [str(Path(sys.executable).parent / "balise"), "sql", str(many), _JOINED]
     return [
@@ -110,8 +112,8 @@ def _questions(folder: Path) -> list[Figure]:
             "s",
             QUERY_S,
         ),
-        Figure("hazard query without the catalogue", bare_s, "s"),
-        Figure("tables over ten thousand runs, nothing catalogued", watch.seconds, "s"),
+        Figure("hazard query before they are compact", bare_s, "s"),
+        Figure("tables over ten thousand runs", watch.seconds, "s"),
     ]
 
 

@@ -19,7 +19,7 @@ from benchmarks.fuzz_files import Case, main, mutated
 from benchmarks.fuzz_ingest import Random
 from datasets.scenario import Scenario
 from datasets.trial import write_trial
-from pipeline.campaign import make_plan, run_campaign
+from pipeline.campaign import make_plan, resume, run_campaign
 from pipeline.campaign.verify import verify
 from pipeline.results.query import run_sql
 
@@ -48,14 +48,14 @@ def small_result(folder: Path) -> Path:
 
 def cache_case(whole: Path) -> Case:
     """A file of `.catalogue` changed."""
-    expected = run_sql(whole, _QUERY)
+    expected = resume.kept(str(whole))
 
     def case(random: Random, folder: Path) -> str:
         out = _copy(whole, folder)
         files = sorted(file for file in (out / ".catalogue").rglob("*") if file.is_file())
         chosen = files[random.integers(len(files))]
         chosen.write_bytes(mutated(chosen.read_bytes(), random))
-        return "whole" if run_sql(out, _QUERY).equals(expected) else "WRONG another answer"
+        return "whole" if resume.kept(str(out)) in ({}, expected) else "WRONG another answer"
 
     return case
 

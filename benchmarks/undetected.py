@@ -26,10 +26,9 @@ from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.one_run import replay, ride_alone
-from pipeline.studies.undetected.columns import Diagnosis, rows_of
+from pipeline.stages.ride import Ride
+from pipeline.studies.undetected.columns import rows_of, windows_of
 from pipeline.studies.undetected.profile import FaultProfile, profile_at
-from pipeline.studies.undetected.ride import diagnosis_of
-from pipeline.studies.undetected.watched import windows
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, Site
@@ -170,11 +169,11 @@ def proof(seed: int, curved: bool, folder: Path) -> Outcome | None:
     """
     trial, config = trial_of(seed, curved), _NOISE_GIVEN
     rng = np.random.default_rng([250, seed])
-    diagnosis = diagnosis_of(ride_alone(trial.run, trial.site, trial.vehicle, config, "primary"))
-    epoch = _some_epoch(diagnosis, trial, config, rng)
+    ride = ride_alone(trial.run, trial.site, trial.vehicle, config, "primary")
+    epoch = _some_epoch(ride, rng)
     if epoch is None:
         return None
-    found = profile_at(diagnosis, epoch, bool(rng.random() < 0.5), trial.vehicle, config)
+    found = profile_at(ride, epoch, bool(rng.random() < 0.5))
     clean = replay(trial.run, trial.site, trial.vehicle, config).epochs
     once = _injected(trial, found, 1.0, folder)
     size_m = found.fault["size_m"][-1] * clean["direction"][epoch]
@@ -193,9 +192,9 @@ def proof(seed: int, curved: bool, folder: Path) -> Outcome | None:
     )
 
 
-def _some_epoch(diagnosis: Diagnosis, trial: Trial, config: Configuration, rng: np.random.Generator) -> int | None:
-    rows = rows_of(diagnosis, trial.vehicle, config)
-    parts = windows(rows, times_ns(diagnosis.epochs), diagnosis.fixes_ns)
+def _some_epoch(ride: Ride, rng: np.random.Generator) -> int | None:
+    rows = rows_of(ride)
+    parts = windows_of(ride, rows)
     if not parts:
         return None
     chosen = parts[int(rng.integers(len(parts)))]

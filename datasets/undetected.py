@@ -8,7 +8,6 @@ import tomli_w
 
 from pipeline.one_run import ride_alone
 from pipeline.studies.undetected.profile import FaultProfile, epoch_of, profile_at
-from pipeline.studies.undetected.ride import diagnosis_of
 from schemas.config import Configuration, Vehicle
 from schemas.errors import OutputError
 from schemas.run import RunLog, Site
@@ -29,9 +28,7 @@ def largest_fault(
 ) -> FaultProfile:
     """The largest fault that no monitor would have noticed, at a balise, a time after the first epoch, or the end."""
     ride = ride_alone(run, site, vehicle, config, solution)
-    diagnosis = diagnosis_of(ride)
-    epoch = epoch_of(diagnosis, ride.lds.passages, ride.lds.crossings, vehicle, config, balise, at_s)
-    return profile_at(diagnosis, epoch, behind, vehicle, config)
+    return profile_at(ride, epoch_of(ride, balise, at_s), behind)
 
 
 def sentence_of(found: FaultProfile) -> str:

@@ -15,8 +15,7 @@ from pipeline.stages.ride import Ride, ride_of
 from pipeline.stages.run_row.notes import ride_notes
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
 from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit
-from pipeline.studies.undetected.columns import Undetected
-from pipeline.studies.undetected.ride import unnoticed_of
+from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
 from schemas.enums import Reason

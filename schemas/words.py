@@ -62,7 +62,6 @@ MISFIT_PLACES = _sentences(MisfitPlace, "misfit_places")
 LOST = _sentences(LostTo, "lost")
 NOT_SHOWN = _sentences(NotShown, "not_shown")
 REMEDIES = _sentences(Remedy, "remedies")
-REMEDIES_OF_PROJECT = REMEDIES | {Remedy(code): text for code, text in WORDS["remedies_of_project"].items()}
 
 
 @dataclass(frozen=True)
@@ -152,15 +151,13 @@ def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) 
     )
 
 
-PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options": ""}
-"""What a command names where nobody knows the paths."""
-
-
 def remedy_words(remedy: Remedy | str, **places: str) -> str:
-    """What would mend it, with the command that does; `places`: paths known where it is shown, with `project` the keys
-    of that file in place of options.
+    """What would mend it, and how; `places`: paths known where it is shown, with `project` the keys of that file in
+    place of a command. Without any, in words for readers inside and outside a project.
     """
+    section = "remedies_of_project" if "project" in places else "remedies_by_command" if places else "remedies_anywhere"
+    how = WORDS[section].get(Remedy(remedy).value, "")
     plain = ("options", "of_project", "again")
-    quoted = {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
-    words = REMEDIES_OF_PROJECT if "project" in places else REMEDIES
-    return words[Remedy(remedy)].format(**PLACES | quoted)
+    named = {"run": "RUN", "site": "the site", "out": "OUT", "options": ""}
+    named |= {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
+    return REMEDIES[Remedy(remedy)].format(how=how.format(**named), **named)

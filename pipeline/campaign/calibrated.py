@@ -19,7 +19,7 @@ from schemas.config import Configuration, digest_of
 from schemas.errors import BaliseError, InputError, UsageError
 
 if TYPE_CHECKING:
-    from pipeline.studies.calibration.calibrate import Calibration, Observed
+    from pipeline.studies.calibration.calibrate import Observed
 
 AUTO = "auto"
 
@@ -43,25 +43,23 @@ def calibrated(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
     """
     automatic = list(runs) == [AUTO]
     sources = mapped(_source, _jobs_of(plan, runs, automatic), jobs)
-    refused = [source for source in sources if source.reason]
+    refused = "; ".join(f"{source.run_id}: {source.reason}" for source in sources if source.reason)
     if refused and not automatic:
-        reasons = "; ".join(f"{source.run_id}: {source.reason}" for source in refused)
-        raise UsageError("cannot calibrate", place="--calibrate", found=reasons, expected="fault-free runs")
+        raise UsageError("cannot calibrate", place="--calibrate", found=refused, expected="fault-free runs")
     good = [source for source in sources if not source.reason]
     _require_one_vehicle(good, plan.config)
     contents = {source.run_id: source.content for source in sources}
     made: dict[tuple[str, ...], RunJob] = {}
     finished = []
     for job in plan.jobs:
-        itself = job.run_id, contents.get(job.run_id)
-        others = [source for source in good if source.run_id != itself[0] and source.content != itself[1]]
+        content = contents.get(job.run_id)
+        others = [source for source in good if source.run_id != job.run_id and source.content != content]
         names = tuple(source.run_id for source in others)
         if names not in made:
-            _require_enough(job, others, refused)
+            _require_enough(job, len(others), refused)
             made[names] = _calibrated(job, others)
-        calibration = made[names]
-        digest = calibration.config_digest
-        finished.append(replace(job, config=calibration.config, vehicle=calibration.vehicle, config_digest=digest))
+        like = made[names]
+        finished.append(replace(job, config=like.config, vehicle=like.vehicle, config_digest=like.config_digest))
     whole = plan if len(made) != 1 else replace(plan, config=finished[0].config, vehicle=finished[0].vehicle)
     return replace(whole, jobs=tuple(finished))
 
@@ -106,30 +104,26 @@ def _calibrated(job: RunJob, sources: Sequence[_CalibrationRun]) -> RunJob:
         calibration = calibration_of(seen, job.vehicle, job.config)
     except BaliseError as error:
         raise UsageError(error.message, place=error.place, found=error.found, remedy=error.remedy) from None
-    config = _with_calibration(job.config, calibration, tuple(source.run_id for source in sources))
-    return replace(
-        job, config=config, vehicle=calibration.vehicle, config_digest=digest_of(config, calibration.vehicle)
-    )
+    names = tuple(source.run_id for source in sources)
+    changes = {
+        "monitors": job.config.monitors.model_copy(update=calibration.monitors),
+        "calibration": job.config.calibration.model_copy(update={"runs": names}),
+    }
+    config = job.config.model_copy(update=changes)
+    digest = digest_of(config, calibration.vehicle)
+    return replace(job, config=config, vehicle=calibration.vehicle, config_digest=digest)
 
 
-def _with_calibration(config: Configuration, measured: Calibration, runs: tuple[str, ...]) -> Configuration:
-    monitors = config.monitors.model_copy(update=measured.monitors)
-    calibration = config.calibration.model_copy(update={"runs": runs})
-    return config.model_copy(update={"monitors": monitors, "calibration": calibration})
-
-
-def _require_enough(job: RunJob, sources: Sequence[_CalibrationRun], refused: Sequence[_CalibrationRun]) -> None:
+def _require_enough(job: RunJob, count: int, refused: str) -> None:
     least = job.config.calibration.least_runs
-    if len(sources) >= least:
-        return
-    without = "; ".join(f"{source.run_id}: {source.reason}" for source in refused)
-    raise UsageError(
-        f"too few other fault-free runs to calibrate {job.run_id}",
-        place="--calibrate",
-        found=f"{len(sources)}" + (f" (left out: {without})" if without else ""),
-        expected=f"{least} at least (calibration.least_runs)",
-        remedy="Give more fault-free runs of this vehicle.",
-    )
+    if count < least:
+        raise UsageError(
+            f"too few other fault-free runs to calibrate {job.run_id}",
+            place="--calibrate",
+            found=f"{count}" + (f" (left out: {refused})" if refused else ""),
+            expected=f"{least} at least (calibration.least_runs)",
+            remedy="Give more fault-free runs of this vehicle.",
+        )
 
 
 def _require_one_vehicle(sources: Sequence[_CalibrationRun], config: Configuration) -> None:
@@ -137,9 +131,8 @@ def _require_one_vehicle(sources: Sequence[_CalibrationRun], config: Configurati
     estimates = {run.observed.estimate: run.run_id for run in sources if run.observed and run.observed.estimate}
     if not estimates:
         return
-    by_scale = sorted(estimates, key=lambda estimate: estimate.scale)
-    least = by_scale[0]
-    most = by_scale[-1]
+    least = min(estimates, key=lambda estimate: estimate.scale)
+    most = max(estimates, key=lambda estimate: estimate.scale)
     noise = config.monitors.threshold_factor * (least.scale_sigma**2 + most.scale_sigma**2) ** 0.5
     if most.scale - least.scale <= config.calibration.same_vehicle_scale + noise:
         return

@@ -33,8 +33,6 @@ class LostWorkerError(Exception):
 
 
 class DaskEngine(Engine):
-    """An existing Dask cluster."""
-
     def __init__(self, scheduler: str, limit_s: float) -> None:
         self._client = _connect(scheduler)
         self._limit_s = limit_s
@@ -174,7 +172,6 @@ def _begin() -> None:
 
 
 def lost_scheduler(scheduler: str) -> UsageError:
-    """The error of a cluster that does not answer."""
     return UsageError(
         "the Dask scheduler does not answer",
         place=redacted(scheduler),

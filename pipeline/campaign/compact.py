@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pipeline.campaign import resume
 from pipeline.campaign.lock import locked
-from pipeline.results import catalogue, packs, store
+from pipeline.results import packs, store
 from pipeline.results.manifest import write_manifest
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.packing import RUNS_PER_PACK, pack_runs, unpack
@@ -65,7 +65,6 @@ def undo(out: Address) -> Compaction:
 def _finished(out: Address, left_out: Mapping[str, str], known: Mapping[str, RunOutcome]) -> Compaction:
     """Write what follows from where runs lie; `known`: outcomes of runs that need not be looked into again."""
     write_manifest(out)
-    catalogue.gather(out)
     if known:
         resume.keep_in_place(str(out), known)
     own = len(store.own_runs(out))

@@ -90,7 +90,6 @@ class _Overdue(StopRun):
 
 @contextlib.contextmanager
 def _alarm(limit_s: float) -> Iterator[None]:
-    """Raise `_Overdue` after a time."""
 
     def ring(signum: int, frame: FrameType | None) -> None:
         raise _Overdue

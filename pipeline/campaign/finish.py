@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping
 import polars as pl
 
 from pipeline import storage
-from pipeline.results import catalogue, manifest, store
+from pipeline.results import manifest, store
 from pipeline.results.figures.campaign_figures import derived_tables
 from pipeline.results.marker import metadata_of, sha256
 from pipeline.results.software import software_digest
@@ -25,7 +25,7 @@ def write_campaign(out: Address, config: Configuration, made: Collection[str] = 
     """Derive the tables of `OUT/campaign/` from all complete runs, write the manifest; `made`: runs replayed now."""
     key = campaign_key(out, config)
     if not _is_current(out, key):
-        for name, content in campaign_files(catalogue.gather(out), config, key):
+        for name, content in campaign_files(store.small_tables(out), config, key):
             storage.write_bytes(join(out, name), content)
     manifest.write_manifest(out, made)
 

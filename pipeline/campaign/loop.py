@@ -64,16 +64,16 @@ class CampaignLoop:
         self._planned = len(jobs) + len(known)
         self._stop: int | None = None
         self._said = False
-        self._disturbed: set[str] = set()
+        self._disturbed = False
 
     def stop(self, signum: int) -> None:
         """End at the next look, because of this signal."""
         self._stop = signum
 
     @property
-    def disturbed(self) -> set[str]:
-        """Ids of the runs whose worker may have left something half written: lost, ended, or under way still."""
-        return self._disturbed | {item.attempt.job.run_id for item in self._under_way.values()}
+    def disturbed(self) -> bool:
+        """Whether a worker may have left something half written: lost, ended, or under way still."""
+        return self._disturbed or bool(self._under_way)
 
     def run(self) -> None:
         """Go on until every run has its outcome. Raises `Interrupted` when asked to stop."""
@@ -134,7 +134,7 @@ class CampaignLoop:
             self._waiting.appendleft(replace(attempt, starts=attempt.starts + 1))
             return None
         if begun and attempt.number < WAITS.attempts:
-            self._disturbed.add(attempt.job.run_id)
+            self._disturbed = True
             for watch in self._watches:
                 watch.lost(attempt.job.run_id, attempt.number)
             self._waiting.appendleft(_Attempt(attempt.job, attempt.number + 1))
@@ -150,7 +150,7 @@ class CampaignLoop:
                 item.since_s = now
             if now - item.since_s > self._limit_s and not item.overdue:
                 item.overdue = True
-                self._disturbed.add(item.attempt.job.run_id)
+                self._disturbed = True
                 self._engine.kill(result)
 
     def _look_for_workers(self) -> None:

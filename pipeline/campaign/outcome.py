@@ -14,7 +14,7 @@ from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.hazard_words import hazard_words
 from pipeline.results.figures.head import worst_verdict
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.results.outcome import RunOutcome
+from pipeline.results.outcome import BESIDE, RunOutcome
 from pipeline.stages.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
@@ -43,17 +43,14 @@ class ChangedError(InputError):
 
 
 def changed(address: Address) -> ChangedError:
-    """The error of a log that somebody writes to."""
     return ChangedError("changed while it was read", place=str(address), remedy="Replay it again when it is complete.")
 
 
 def overdue(limit_s: float) -> str:
-    """The reason of a run that was given up."""
     return f"took longer than the time limit of {limit_s:g} s"
 
 
 def lost(attempts: int) -> str:
-    """The reason of a run whose workers died over it."""
     return (
         f"its worker died {attempts} times (killed, or out of memory). "
         "Give it more memory or fewer --jobs; the next call tries it again."
@@ -61,7 +58,6 @@ def lost(attempts: int) -> str:
 
 
 def never_begun(workers: int) -> str:
-    """The reason of a run whose workers died before they could begin it."""
     return f"{workers} workers died before they started this run. See the logs of the workers."
 
 
@@ -130,8 +126,7 @@ def _beside(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[
     if verdict is None:
         return {}
     row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
-    names = ("balises_accepted", "balises_on_path", "availability", "proof_margin_m", "held_s")
-    figures = {name: row[name] for name in names} | {"remedies": tuple(row["remedies"] or ())}
+    figures = {name: row[name] for name in BESIDE} | {"remedies": tuple(row["remedies"] or ())}
     available = row["availability"]
     if available is None or available >= low:
         return figures

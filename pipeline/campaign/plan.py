@@ -13,7 +13,7 @@ from pipeline.results import store
 from pipeline.results.manifest import SettingsFiles, listing, settings_files, unaltered
 from pipeline.results.software import software_digest
 from pipeline.storage import files
-from pipeline.storage.address import Address, is_url, join, name_of, redacted, stem_of
+from pipeline.storage.address import Address, join, name_of, redacted, stem_of
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.errors import InputError, UsageError
 from schemas.run import STREAMS
@@ -176,38 +176,27 @@ def _check_name(run_id: str, address: Address) -> None:
 
 
 def _expand(name: str) -> list[Address]:
+    """What cannot be told from a run by its name is taken for one: whether it can be read is found out later."""
     matches = storage.require_match(name)
-    return [run for match in matches for run in ([match] if _is_run(match) else _runs_in(match))]
+    return [
+        run for match in matches for run in ([match] if is_run(match) or not files.is_dir(match) else _runs_in(match))
+    ]
 
 
-def _is_run(address: Address) -> bool:
-    """A file, or a folder that holds a stream itself; whether it can be read is found out later."""
-    return name_of(address).endswith(".mcap") or not files.is_dir(address) or _holds_stream(address)
-
-
-def _holds_stream(folder: Address) -> bool:
-    names = files.list_dir(folder)
+def is_run(address: Address) -> bool:
+    """An MCAP log, or a folder with streams as the contract names them."""
+    if name_of(address).lower().endswith(".mcap"):
+        return True
+    names = files.list_dir(address) if files.is_dir(address) else []
     return any(f"{stream}.parquet" in names for stream in STREAMS)
 
 
 def _runs_in(folder: Address) -> list[Address]:
-    inside = [join(folder, name) for name in files.list_dir(folder)]
-    runs = [child for child in inside if _looks_like_run(child)]
+    """Raises `InputError` for a folder inside that cannot be listed: nobody knows what would be left out."""
+    inside = [join(folder, name) for name in files.list_dir(folder) if not name.startswith(".")]
+    runs = [child for child in inside if is_run(child)]
     if not runs:
         raise UsageError(
             "holds no run", place=redacted(str(folder)), expected="RUN.mcap files or folders with gnss.parquet"
         )
     return runs
-
-
-def _looks_like_run(child: Address) -> bool:
-    if name_of(child).startswith("."):
-        return False
-    if name_of(child).endswith(".mcap"):
-        return True
-    try:
-        return files.is_dir(child) and _holds_stream(child)
-    except InputError:
-        if is_url(child):
-            raise  # the store is silent: nobody knows what would be left out
-        return False

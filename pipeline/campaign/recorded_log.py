@@ -43,7 +43,6 @@ class RecordedLog:
         return (catalogue.kept(self._job.out, self._note(), self._key()) or b"").decode()
 
     def _note(self) -> str:
-        """The name under which the digest of this log is kept."""
         return f"inputs/{hashlib.sha256(self._job.run_id.encode()).hexdigest()}.txt"
 
     def _key(self) -> str:
@@ -65,7 +64,6 @@ class RecordedLog:
             self._check_unchanged(path)
 
     def read(self, path: Path) -> RunLog:
-        """Decode the log."""
         try:
             run = read_run(path, self._job.config.ingest)
         except pl.exceptions.PanicException as error:
@@ -90,7 +88,6 @@ class RecordedLog:
         return self.digest
 
     def _stored_version(self) -> str | None:
-        """What a store says of the log."""
         return storage.version(self._job.address) if is_url(self._job.address) else None
 
     def _check_unchanged(self, path: Path) -> None:

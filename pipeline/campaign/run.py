@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from pipeline.campaign.cluster import DaskEngine
 from pipeline.campaign.engines import HAS_ALARM, Engine, LocalEngine, SerialEngine
@@ -55,7 +54,9 @@ def run_campaign(
             summary = _watched(plan, loop, watches, at_once=engine.in_process)
         finally:
             engine.close()
-            _tidy(plan, loop)
+            # Of a cluster's workers one that is still at its run writes it again.
+            if loop.disturbed and not is_url(plan.out):
+                store.sweep(plan.out)
             if left.jobs:
                 keep(plan, loop.outcomes)
         _finish(plan, loop, summary)
@@ -95,13 +96,6 @@ def _watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Follower], at_onc
     if stopped is not None:
         raise Interrupted(stopped.signum, summary)
     return summary
-
-
-def _tidy(plan: Plan, loop: CampaignLoop) -> None:
-    """Remove what ended workers left half done; one of a cluster that is at it still writes its run again."""
-    if not is_url(plan.out):
-        for run_id in loop.disturbed:
-            store.sweep_run(Path(plan.out), run_id)
 
 
 def _finish(plan: Plan, loop: CampaignLoop, summary: CampaignSummary) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -80,8 +79,8 @@ class Verification:
 def verify(out: Address) -> Verification:
     """Hold every file of a result against `OUT/manifest.json`, and the manifest against the runs' own metadata.
 
-    Provenance is read from the markers again, the catalogue and the campaign's tables are made again from the runs'
-    tables, and files that the manifest does not name are listed. Raises `UsageError` where there is no manifest.
+    Provenance is read from the markers again. What is kept of runs and the campaign's tables are made again from the
+    runs' tables. Files that the manifest does not name are listed. Raises `UsageError` where there is no manifest.
     """
     manifest = _manifest(out)
     again = gathered(out, manifest)
@@ -248,21 +247,16 @@ def _other_files(out: Address, runs: set[str], known: set[str]) -> Iterator[str]
 
 
 def _made_again(out: Address, software: set[str]) -> tuple[list[Problem], tuple[NotCompared, ...]]:
-    """The catalogue and the campaign's tables against the runs' own tables, which agree with the manifest.
+    """What is kept of runs and the campaign's tables against the runs' own tables, which agree with the manifest.
 
     The campaign's tables can be made again by the build that made them, with the configuration that lies there.
     """
-    tables: dict[str, pl.DataFrame] = {}
-    for table in catalogue.CATALOGUED:
-        # What another build of the program wrote only that build can read; it has no copy here.
-        with contextlib.suppress(UsageError):
-            tables[table] = store.read_table(out, table).collect()
-    copies = {table: catalogue.fresh(out, table) for table in catalogue.CATALOGUED}
-    stale = [t for t, copy in copies.items() if copy is not None and not (t in tables and copy.equals(tables[t]))]
-    problems = [(f"{catalogue.FOLDER}/{table}", "other rows", "those of the runs' tables") for table in stale]
-    if len(tables) < len(catalogue.CATALOGUED):
-        return problems, _COPIES
-    problems += _outcomes(out, tables)
+    try:
+        tables = store.small_tables(out)
+    except UsageError:
+        # What another build of the program wrote only that build can read.
+        return [], _COPIES
+    problems = list(_outcomes(out, tables))
     config = store.read_config(out)
     if config is None or software != {software_digest()}:
         return problems, (NotCompared.CAMPAIGN_TABLES,)
@@ -281,7 +275,8 @@ def _outcomes(out: Address, tables: Mapping[str, pl.DataFrame]) -> Iterator[Prob
 
 
 def _is_outcome_of(kept: RunOutcome, tables: Mapping[str, pl.DataFrame]) -> bool:
-    # Which availability was low is said by the configuration of that call, which need not be the last one.
+    """Whether all that tables say of a run is what they say now; of a failed run status and verdict alone."""
+    # Only of low availability it says what was lost, and which is low was said by the configuration of that call.
     again = outcome_of(kept.run_id, kept.log, math.inf, **tables)
     if again.status is RunStatus.FAILED:
         return (kept.status, kept.verdict) == (again.status, again.verdict)

@@ -74,7 +74,6 @@ def _one_line(texts: Sequence[str]) -> list[str]:
 
 
 def _plain(settings: Settings) -> dict[str, object]:
-    """What is set, as TOML takes it."""
     return settings.model_dump(exclude_defaults=True)
 
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, get_args
 
+from pipeline.campaign.plan import is_run
 from pipeline.make.receivers.bags import is_bag
 from pipeline.make.survey.map_files import MAP_SUFFIXES
-from pipeline.project.looking import is_run
 from pipeline.read.ingest.csv_text import read_log_table
 from pipeline.read.ingest.guesses import WORDS, columns_in, first, word_of
 from schemas.config import Configuration, Settings, Vehicle, read_toml, settings_from

@@ -72,7 +72,6 @@ _UNACCEPTED = "they stand in the file as comments; remove the # or add --accept-
 
 
 def answer_of(drafted: Drafted, file: Path) -> dict[str, Any]:
-    """The same for programs."""
     proposals = [vars(proposal) | {"toml": correction_lines(proposal.corrections)} for proposal in drafted.proposals]
     fields = ("run_id", "found", "toml", "accepted")
     return {

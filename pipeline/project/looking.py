@@ -10,13 +10,13 @@ from typing import Any
 
 import polars as pl
 
+from pipeline.campaign.plan import is_run
 from pipeline.make.receivers import gather
 from pipeline.make.receivers.convert import UnknownError
 from pipeline.make.receivers.csv import TABLES, names_file
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.csv_draft import draft_mapping
-from pipeline.storage import files
 from schemas.config import IngestConfig, settings_from, toml_of
 from schemas.enums import Fix
 from schemas.errors import BaliseError, InputError
@@ -97,12 +97,6 @@ def look_at(path: Path, config: IngestConfig, day: date | None, recordings: Reco
         if path.suffix.lower() not in TABLES:
             raise
         return _table(path, config)
-
-
-def is_run(path: Path) -> bool:
-    """An MCAP log, or a folder with streams as the contract names them."""
-    names = set(files.list_dir(path)) if path.is_dir() else set()
-    return path.suffix.lower() == ".mcap" or bool(names & {f"{stream}.parquet" for stream in STREAMS})
 
 
 def _seen(

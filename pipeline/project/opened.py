@@ -10,7 +10,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from pipeline.storage.address import is_url
-from schemas.config import Configuration, Vehicle, load_settings, read_toml
+from schemas.config import Configuration, Settings, Vehicle, load_settings, read_toml
 from schemas.errors import UsageError
 from schemas.project import FILE_NAME, NO_VEHICLE, Project, configuration_of, is_project, load_project
 
@@ -103,19 +103,32 @@ def values_for(command: str, opened: Opened) -> dict[str, Any]:
     out = opened.place(project.out)
     site = opened.place(project.site)
     settings = {"vehicle": opened.vehicle_file, "config": opened.config_file}
-    route = opened.path(project.replay.route)
+    replay = _options_of(opened, project.replay, "route", "write_route")
+    replay["runs"] = opened.runs()
+    replay["calibrate"] = [one if one == "auto" else opened.place(one) for one in project.replay.calibrate]
+    replay["time_limit"] = replay.pop("time_limit_s", None)
+    line = _options_of(opened, project.line, "criteria", "points", "out")
+    claim = _options_of(
+        opened, project.claim, *(["profile"] if (project.claim.profile or "").endswith(".toml") else [])
+    )
     values: dict[str, dict[str, Any]] = {
         "inspect": {"path": out if Path(out).exists() else site, "site": site, **settings},
-        "replay": {"runs": opened.runs(), "site": site, "out": out, **settings, **_replay_values(opened)},
+        "replay": {"site": site, "out": out, **settings, **replay},
         "report": {"out": out, "site": site},
         "sql": {"out": out},
         "export": {"out": out, "site": site, "config": opened.config_file},
-        "verify": {"out": out, "site": site, "route": route, **settings},
+        "verify": {"out": out, "site": site, "route": replay.get("route"), **settings},
         "safety": {"out": out, "site": site, "vehicle": opened.vehicle_file},
-        "line": {"out": out, "site": site, **_line_values(opened)},
-        "claim": {"out": out, "site": site, **_claim_values(opened)},
+        "line": {**line, "out": out, "site": site, "to": line.get("out")},
+        "claim": {"out": out, "site": site, "profile": claim.get("profile"), "front_ahead": claim.get("front_ahead_m")},
     }
     return {name: value for name, value in values.get(command, {}).items() if value not in (None, [], False)}
+
+
+def _options_of(opened: Opened, entry: Settings, *paths: str) -> dict[str, Any]:
+    """What a table of the project sets; `paths`: what of it are places."""
+    given = entry.model_dump(exclude_unset=True)
+    return given | {name: opened.path(given[name]) for name in paths if name in given}
 
 
 def taken_from_project(
@@ -144,34 +157,6 @@ def _require_measured(opened: Opened, values: dict[str, Any]) -> None:
 
 def _shown(value: object) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def _replay_values(opened: Opened) -> dict[str, Any]:
-    options = opened.project.replay
-    calibrate = [one if one == "auto" else opened.place(one) for one in options.calibrate]
-    return {
-        "route": opened.path(options.route),
-        "write_route": opened.path(options.write_route),
-        "undetected": options.undetected,
-        "calibrate": calibrate,
-        "jobs": options.jobs or None,
-        "scheduler": options.scheduler,
-        "time_limit": options.time_limit_s if "time_limit_s" in options.model_fields_set else None,
-        "fail_on": options.fail_on,
-    }
-
-
-def _line_values(opened: Opened) -> dict[str, Any]:
-    options = opened.project.line
-    files = {"criteria": options.criteria, "points": options.points, "to": options.out}
-    return {"solution": options.solution, **{name: opened.path(named) for name, named in files.items()}}
-
-
-def _claim_values(opened: Opened) -> dict[str, Any]:
-    options = opened.project.claim
-    is_file = (options.profile or "").endswith(".toml")
-    profile = opened.place(options.profile) if options.profile and is_file else options.profile
-    return {"profile": profile, "front_ahead": options.front_ahead_m}
 
 
 def named_from(path: PurePath, folder: PurePath) -> str:

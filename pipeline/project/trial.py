@@ -53,8 +53,6 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Corrections of one run, why, and whether they were accepted."""
-
     run_id: str
     found: tuple[str, ...]
     corrections: tuple[StreamCorrection, ...]
@@ -110,10 +108,11 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
 def _base(wanted: Wanted, folder: Path) -> Opened:
     """The project without its runs."""
 
-    def named(path: Path | None) -> str | None:
-        return None if path is None else named_from(path.absolute(), folder)
+    def named(path: Path) -> str:
+        return named_from(path.absolute(), folder)
 
-    given: dict[str, Any] = {"vehicle": named(wanted.vehicle), "config": named(wanted.config)}
+    settings = {"vehicle": wanted.vehicle, "config": wanted.config}
+    given: dict[str, Any] = {name: named(path) for name, path in settings.items() if path is not None}
     sites = [path for path in wanted.track if is_site(path)]
     if sites and (len(wanted.track) > 1 or wanted.balises):
         raise UsageError(
@@ -122,21 +121,20 @@ def _base(wanted: Wanted, folder: Path) -> Opened:
             expected="a site alone, or surveys to make one of",
             remedy="Its balises stand in its file balises.csv or balises.parquet; leave --balises out.",
         )
+    for path in wanted.track:
+        if not path.exists():
+            expected = "a map, a table of points, or a site"
+            raise UsageError("does not exist", place=f"--track {path}", expected=expected)
     if sites:
         given["site"] = named(sites[0])
     elif wanted.track:
-        for path in wanted.track:
-            if not path.exists():
-                raise UsageError(
-                    "does not exist", place=f"--track {path}", expected="a map, a table of points, or a site"
-                )
         balises = wanted.balises
         if balises is not None and not balises.startswith("every"):
             if not Path(balises).is_file():
                 raise UsageError("does not exist", place=f"--balises {balises}", expected="a table, or `every 1000`")
             balises = named(Path(balises))
-        given["track"] = TrackEntry(survey=tuple(filter(None, map(named, wanted.track))), balises=balises)
-    return Opened(folder / FILE_NAME, Project(**{name: value for name, value in given.items() if value is not None}))
+        given["track"] = TrackEntry(survey=tuple(map(named, wanted.track)), balises=balises)
+    return Opened(folder / FILE_NAME, Project(**given))
 
 
 def _looked_at(
@@ -200,16 +198,14 @@ def _without_odometer(rides: Sequence[Ride]) -> list[str]:
 
 
 def _notes_of(ride: Ride) -> list[str]:
-    notes: list[str] = []
-    if len(ride.receivers) > 1:
-        names = ", ".join(f"{files[0].path.name} ({_solution(ride, files)})" for files in ride.receivers)
-        notes.append(f"{ride.run_id}: receivers of the same time, each a solution of its own: {names}")
-        notes += [
-            f"{ride.run_id}: {files[0].path.name} is RTK-fixed; if it is the truth, add --reference {files[0].path}"
-            for files in ride.receivers
-            if files[0].mostly_fixed and not ride.references
-        ]
-    return notes
+    if len(ride.receivers) < 2:
+        return []
+    names = ", ".join(f"{files[0].path.name} ({_solution(ride, files)})" for files in ride.receivers)
+    fixed = [files[0].path for files in ride.receivers if files[0].mostly_fixed and not ride.references]
+    return [
+        f"{ride.run_id}: receivers of the same time, each a solution of its own: {names}",
+        *(f"{ride.run_id}: {path.name} is RTK-fixed; if it is the truth, add --reference {path}" for path in fixed),
+    ]
 
 
 def _solution(ride: Ride, files: Sequence[SeenLog]) -> str:
@@ -222,25 +218,21 @@ def _solution(ride: Ride, files: Sequence[SeenLog]) -> str:
 
 
 def _entry(ride: Ride, folder: Path, day: date | None) -> ConvertEntry:
-    """The ride as a `[[convert]]` table."""
     logs: list[dict[str, Any]] = []
     for files in ride.receivers:
         name = _solution(ride, files)
         # A log of several solutions has their names itself.
-        logs.append({"files": [log.path for log in files], "solution": None if name == "primary" else name})
-        logs[-1] |= files[0].mapping
+        own = {} if name == "primary" else {"solution": name}
+        logs.append({"files": [log.path for log in files], **own, **files[0].mapping})
     logs += [{"files": [log.path], "stream": "reference", **log.mapping} for log in ride.references]
     logs += [{"files": [log.path], **log.mapping} for log in ride.others]
     for log in logs:
-        log["date"] = day if any(path.suffix.lower() not in (".csv", ".mcap") for path in log["files"]) else None
+        if day is not None and any(path.suffix.lower() not in (".csv", ".mcap") for path in log["files"]):
+            log["date"] = day
         log["files"] = [named_from(path, folder) for path in log["files"]]
     # A run that lies where converted ones go is not overwritten by its correction.
     home = "converted" if folder / "runs" / ride.run_id in [log.path for log in ride.logs] else "runs"
-    return settings_from(
-        {"to": f"{home}/{ride.run_id}", "logs": [{k: v for k, v in log.items() if v is not None} for log in logs]},
-        ConvertEntry,
-        str(folder / FILE_NAME),
-    )
+    return settings_from({"to": f"{home}/{ride.run_id}", "logs": logs}, ConvertEntry, str(folder / FILE_NAME))
 
 
 def _checked(
@@ -277,7 +269,6 @@ def _checked(
 
 
 def correction_lines(corrections: Sequence[StreamCorrection]) -> list[str]:
-    """Corrections as they stand in a project."""
     tables = [tomli_w.dumps(correction.model_dump(exclude_defaults=True)) for correction in corrections]
     return [line for table in tables for line in ("[[convert.correct]]", *table.splitlines())]
 
@@ -303,25 +294,20 @@ def _by_recorder(
     if shift_s and shift_s % _ZONES_S == 0.0 and of_receivers and len(ride.others) == 1 and not ride.references:
         kept = [one for one in proposed if one.stream not in ("gnss", "satellites")]
         return [*kept, *(_shifted(name, -shift_s) for name in log.spans)], log
-    shifts = [one for one in proposed if one.shift_s and one.stream in log.spans]
-    unchecked = [
-        name
-        for name in log.spans
-        if name not in [one.stream for one in proposed] and _clock_state(report, name) != FitState.FITS.value
-    ]
-    return [
-        *proposed,
-        *(_shifted(name, one.shift_s) for one in shifts for name in unchecked),
-    ], None
+    shifts = [one.shift_s for one in proposed if one.shift_s and one.stream in log.spans]
+    named = [one.stream for one in proposed]
+    unchecked = [name for name in log.spans if name not in named and not _clock_fits(report, name)]
+    return [*proposed, *(_shifted(name, shift_s) for shift_s in shifts for name in unchecked)], None
 
 
 def _shifted(stream: str, shift_s: float) -> StreamCorrection:
     return StreamCorrection.model_validate({"stream": stream, "shift_s": shift_s})
 
 
-def _clock_state(report: FitReport, stream: Stream) -> str | None:
+def _clock_fits(report: FitReport, stream: Stream) -> bool:
     what = f"clock of the {stream.replace('_', ' ')} against the GNSS"
-    return next(iter(report.tables["Fit"].filter(pl.col("check") == what)["state"]), None)
+    states = report.tables["Fit"].filter(pl.col("check") == what)["state"]
+    return states.head(1).to_list() == [FitState.FITS.value]
 
 
 def _sentences(report: FitReport) -> list[str]:

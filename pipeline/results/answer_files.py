@@ -51,7 +51,6 @@ def write_csv(answer: pl.DataFrame, file: Path) -> None:
 
 
 def write_parquet(answer: pl.DataFrame, file: Path) -> None:
-    """Parquet with the types of the tables."""
     write_bytes(file, noted_bytes(answer, {"table": "answer of `balise sql`", "software": SOFTWARE}))
 
 

@@ -62,8 +62,6 @@ class _Run(_Strict):
 
 
 class _Form(_Strict):
-    """What a manifest looks like."""
-
     manifest: Literal[1]
     program: dict[str, Any]
     platform: dict[str, str]
@@ -75,7 +73,6 @@ class _Form(_Strict):
 
 
 def settings_files(configuration: Path | None = None, vehicle: Path | None = None) -> SettingsFiles:
-    """The files as they were given."""
     paths = {"configuration": configuration, "vehicle": vehicle}
     return {name: None if path is None else _file(storage.file_digests(path)[0]) for name, path in paths.items()}
 
@@ -216,7 +213,6 @@ def _frame() -> Manifest:
 
 @cache
 def _packages() -> Mapping[str, str]:
-    """Versions of the libraries that this program needs."""
     try:
         needed = [re.split(r"[^\w.-]", line)[0] for line in requires("balise") or [] if "extra ==" not in line]
     except PackageNotFoundError:

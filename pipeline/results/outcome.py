@@ -11,13 +11,14 @@ import polars as pl
 from pipeline.results.figures.head import CampaignHead, figures_beside, head_of
 from schemas.enums import RunStatus, RunVerdict
 
-_BESIDE = {
+BESIDE = {
     "balises_accepted": pl.Int64,
     "balises_on_path": pl.Int64,
     "availability": pl.Float64,
     "proof_margin_m": pl.Float64,
     "held_s": pl.Float64,
 }
+"""Figures of a run that stand beside its verdict."""
 UnderWay = Sequence[tuple[str, float]]
 """Ids of the runs under way, and for how long [s]."""
 
@@ -62,8 +63,6 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class CampaignSummary:
-    """A campaign in figures."""
-
     planned: int
     outcomes: tuple[RunOutcome, ...]
     seconds: float
@@ -75,8 +74,8 @@ class CampaignSummary:
 
     def beside(self) -> dict[str, Any]:
         """The figures beside the verdict over all runs that have one; nothing where none has."""
-        rows = [{name: getattr(outcome, name) for name in _BESIDE} for outcome in self.outcomes if outcome.held_s]
-        return dict(figures_beside(pl.DataFrame(rows, schema=_BESIDE))) if rows else {}
+        rows = [{name: getattr(outcome, name) for name in BESIDE} for outcome in self.outcomes if outcome.held_s]
+        return dict(figures_beside(pl.DataFrame(rows, schema=BESIDE))) if rows else {}
 
     def count(self, status: RunStatus) -> int:
         return sum(outcome.status == status for outcome in self.outcomes)
@@ -95,5 +94,4 @@ class CampaignSummary:
 
     @property
     def left(self) -> int:
-        """Runs that were not reached."""
         return self.planned - len(self.outcomes)

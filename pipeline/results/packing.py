@@ -72,8 +72,9 @@ def pack_runs(out: Address, runs_per_pack: int, jobs: int) -> Iterator[tuple[Pac
 
 
 def _take_apart(out: Address, runs_per_pack: int) -> None:
-    builds = set(_builds(out).values())
-    for pack in packs.listed(out):
+    listed = packs.listed(out)
+    builds = set(_builds(out).values()) if listed else set()
+    for pack in listed:
         stale = len(_read_from(out, pack)) < pack.runs
         small = pack.runs < runs_per_pack / 2 and pack.bytes < _LARGEST_PACK / 2
         if stale or (small and pack.software_digest in builds):
@@ -138,8 +139,6 @@ def _write_pack(step: _Step) -> Packed:
 
 
 class _PackWriter:
-    """Gathers runs, and writes them as one pack."""
-
     def __init__(self) -> None:
         self._rows: list[tuple[str | int, ...]] = []
         self._writers: dict[str, parquet.GroupedWriter] = {}

@@ -118,7 +118,6 @@ def file_name(part: str, name: str) -> str:
 
 
 def file_digests(pack: Pack) -> dict[str, str]:
-    """The SHA-256 of each file of a pack, by its name."""
     return {file_name(part, pack.name): digest for part, digest in pack.sha256.items()}
 
 
@@ -175,7 +174,6 @@ def _read_index(out: str, name: str, digest: str, columns: tuple[str, ...]) -> p
 
 
 def markers(out: Address, runs: Mapping[str, PackedRun]) -> Iterator[Marker]:
-    """The markers of these runs, pack by pack."""
     for pack, rows in by_pack(runs):
         index = _read_index(str(out), pack.name, pack.sha256[INDEX], ("run_id", *_OF_MARKER))
         yield from (Marker(*row) for row in index[list(rows.values())].iter_rows())
@@ -195,7 +193,6 @@ def sweep(out: Address) -> None:
 
 
 def unusable(out: Address, file: str, reason: str) -> UsageError:
-    """The error of a file of a pack that cannot be read."""
     return UsageError(
         f"cannot be read, and many runs are in it: {reason}",
         place=redacted(str(join(out, file))),

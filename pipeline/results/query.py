@@ -14,7 +14,7 @@ import dataframely as dy
 import polars as pl
 
 from pipeline import storage
-from pipeline.results import catalogue, store
+from pipeline.results import store
 from pipeline.results.source import source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, join
@@ -106,7 +106,9 @@ def _tables(out: Address, sql: str, prefix: str = "") -> dict[str, pl.LazyFrame]
     def named(names: Iterable[str]) -> list[str]:
         return [name for name in names if re.search(rf"\b{prefix}{name}\b", sql, re.IGNORECASE)]
 
-    tables = {name: catalogue.scan(out, name) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
+    tables = {name: store.read_table(out, name) for name in named(TABLES)} | _campaign_tables(
+        out, named(CAMPAIGN_TABLES)
+    )
     return {f"{prefix}{name}": frame for name, frame in tables.items()}
 
 

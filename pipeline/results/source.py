@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from itertools import product
 
 import polars as pl
 from polars.io.plugins import register_io_source
@@ -46,13 +47,11 @@ def conjuncts(predicate: pl.Expr | None) -> Iterator[pl.Expr]:
 
 
 def _check_words(predicate: pl.Expr | None, schema: Mapping[str, pl.DataType]) -> None:
+    """Each word that a column of words is compared with must be one of its own."""
     for condition in conjuncts(predicate):
         inputs = condition.meta.pop()
-        columns = [item.meta.output_name() for item in inputs if item.meta.is_column()]
+        kinds = [schema.get(item.meta.output_name()) for item in inputs if item.meta.is_column()]
         words = [pl.select(item).item() for item in inputs if item.meta.is_literal()]
-        for kind in (schema.get(name) for name in columns):
-            for word in words:
-                if isinstance(kind, pl.Enum) and isinstance(word, str) and word not in kind.categories:
-                    raise pl.exceptions.InvalidOperationError(
-                        f'conversion from `str` to `enum` failed for value "{word}"'
-                    )
+        for kind, word in product(kinds, words):
+            if isinstance(kind, pl.Enum) and isinstance(word, str) and word not in kind.categories:
+                raise pl.exceptions.InvalidOperationError(f'conversion from `str` to `enum` failed for value "{word}"')

@@ -83,7 +83,6 @@ def write_files(out: Address, run_id: str, contents: Mapping[str, bytes]) -> Non
 
 
 def read_run(out: Address, run_id: str) -> RunTables:
-    """The five tables of one complete run."""
     frames = {name: read_table(out, name, run_id).drop("run_id").collect() for name in TABLES}
     return RunTables(run_id, **frames)
 
@@ -97,6 +96,11 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
         known = ", ".join(run_ids(out)[:10]) or "no complete run"
         raise UsageError(f"has no run {run_id!r}", place=shown(out), found=known)
     return scan_runs(out, table, runs)
+
+
+def small_tables(out: Address) -> dict[str, pl.DataFrame]:
+    """All tables of all complete runs but `epochs`, which is large."""
+    return {name: read_table(out, name).collect() for name in TABLES if name != "epochs"}
 
 
 def scan_runs(out: Address, table: str, runs: Sequence[str]) -> pl.LazyFrame:
@@ -196,7 +200,6 @@ def run_ids(out: Address) -> list[str]:
 
 
 def own_runs(out: Address) -> list[str]:
-    """The complete runs that have files of their own, sorted."""
     folders = [name for name in storage.folders_in(join(out, _MARKER)) if name.startswith("run_id=")]
     runs = sorted(unquote(name.removeprefix("run_id=")) for name in folders)
     return runs if is_url(out) else _own(out, runs)
@@ -288,32 +291,11 @@ def sweep(out: Address) -> None:
                 storage.remove_folder(join(join(out, table), folder))
     packs.sweep(out)
     if not is_url(out):
-        for folder in _folders(Path(out)):
-            _remove_unfinished(folder)
-
-
-def _folders(out: Path) -> Iterator[str]:
-    """The folders of a result, runs and all."""
-    yield str(out)
-    for table in storage.folders_in(out):
-        yield f"{out}/{table}"
-        yield from (f"{out}/{table}/{run}" for run in storage.folders_in(out / table))
-
-
-def sweep_run(out: Path, run_id: str) -> None:
-    """`sweep` for one run of a local result, whose worker is known to have ended."""
-    complete = Path(table_address(out, _MARKER, run_id)).exists()
-    for table in TABLES:
-        folder = Path(table_address(out, table, run_id)).parent
-        if complete:
-            _remove_unfinished(folder)
-        else:
-            storage.remove_folder(folder)
-
-
-def _remove_unfinished(folder: Path | str) -> None:
-    for name in storage.unfinished_in(folder):
-        Path(folder, name).unlink(missing_ok=True)
+        inside = [f"{out}/{name}" for name in storage.folders_in(out)]
+        runs = [f"{folder}/{run}" for folder in inside for run in storage.folders_in(folder)]
+        for folder in (str(out), *inside, *runs):
+            for name in storage.unfinished_in(folder):
+                Path(folder, name).unlink(missing_ok=True)
 
 
 def read_config(out: Address) -> Configuration | None:
@@ -346,5 +328,4 @@ def write_vehicle(out: Address, vehicle: Vehicle) -> None:
 
 
 def folder_name(run_id: str) -> str:
-    """The folder of a run in that of a table."""
     return f"run_id={file_name(run_id)}"

@@ -36,7 +36,6 @@ def told(items: Collection[T]) -> Iterator[T]:
 
 
 def tell(done: int, total: int) -> None:
-    """Tell whoever watches how much is done."""
     if (progress := _PROGRESS.get()) is not None:
         progress(done, total)
 

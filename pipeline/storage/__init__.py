@@ -26,7 +26,6 @@ from pipeline.storage.identity import (
     signature,
     sizes,
     version,
-    versions,
 )
 from pipeline.storage.writing import (
     UNFINISHED,
@@ -73,7 +72,6 @@ __all__ = [
     "stage",
     "unfinished_in",
     "version",
-    "versions",
     "whole_file",
     "write_bytes",
 ]

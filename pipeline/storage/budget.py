@@ -47,13 +47,11 @@ class Budget:
         self._begun_s = time.monotonic()
 
     def take_file(self) -> None:
-        """One more file will be unpacked."""
         self._files += 1
         if self._files > self._config.unpacked_files_limit:
             raise self._spent("holds too many files", "unpacked_files_limit", "files")
 
     def take(self, count: int) -> None:
-        """So many bytes more are unpacked."""
         self._bytes += count
         if self._bytes > self._most:
             raise self._spent("unpacks to too much", "unpacked_limit_mib", "MiB")

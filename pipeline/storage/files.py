@@ -46,7 +46,6 @@ def open_binary(path: Address) -> IO[bytes]:
 
 
 def read_bytes(path: Address) -> bytes:
-    """The whole content."""
     with local_copy(path) as file:
         return _local(file, lambda present: _regular(present).read_bytes())
 
@@ -101,12 +100,10 @@ def _regular(path: Path) -> Path:
 
 
 def size_of(path: Address) -> int:
-    """Size in bytes."""
     return _either(path, lambda file: file.stat().st_size, lambda store, inner: int(store.size(inner)))
 
 
 def _either(path: Address, local: Callable[[Path], T], remote: Callable[[Any, str], T]) -> T:
-    """The operation that suits the place."""
     return on_store(path, remote, kind=InputError) if is_url(path) else _local(path, local)
 
 

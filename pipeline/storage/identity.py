@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 from collections.abc import Iterable
@@ -12,21 +11,8 @@ from typing import NamedTuple
 from pipeline.storage.address import Address, is_url
 from pipeline.storage.fetching import folders_in
 from pipeline.storage.object_store import on_store
-from pipeline.storage.objects import objects_at, version_in, version_of
+from pipeline.storage.objects import objects_at, version_in
 from schemas.errors import InputError
-
-
-def versions(folder: Address, name: str) -> dict[str, str] | None:
-    """What changes with the content of `folder/*/name`, by the folder between.
-
-    None where a store gives its objects no version that could be relied on.
-    """
-    if not is_url(folder):
-        return _local_versions(str(folder), name)
-    listed = on_store(folder, lambda store, path: store.find(path, detail=True))
-    infos = {place.split("/")[-2]: info for place, info in listed.items() if place.endswith(f"/{name}")}
-    of_parts = {part: version_of(info) for part, info in infos.items()}
-    return None if None in of_parts.values() else {part: str(version) for part, version in of_parts.items()}
 
 
 def sizes(folder: Address, name: str) -> dict[str, int]:
@@ -45,19 +31,7 @@ def version(address: Address) -> str | None:
     return version_in(on_store(address, objects_at, kind=InputError))
 
 
-def _local_versions(folder: str, name: str) -> dict[str, str]:
-    of_parts = {}
-    for part in folders_in(folder):
-        # Gone or not complete: no version.
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            stat = os.stat(f"{folder}/{part}/{name}")  # noqa: PTH116 - ten thousand of them
-            of_parts[part] = f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns} {stat.st_ino}"
-    return of_parts
-
-
 class FileDigest(NamedTuple):
-    """A file by its name and content."""
-
     name: str
     size_bytes: int
     sha256: str

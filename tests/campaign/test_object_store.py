@@ -17,7 +17,7 @@ from pipeline.campaign import lock, make_plan, run_campaign
 from pipeline.campaign.lock import locked
 from pipeline.campaign.verify import verify
 from pipeline.campaign.waits import WAITS
-from pipeline.results import catalogue, store
+from pipeline.results import store
 from pipeline.results.manifest import read_manifest
 from pipeline.results.query import run_sql
 from pipeline.storage import files
@@ -128,18 +128,15 @@ def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path, r
 
 
 @pytest.mark.usefixtures("in_process")
-def test_catalogue_in_a_store(bucket: str, small_trial: SmallTrial) -> None:
-    out = f"{bucket}/catalogued"
+def test_questions_to_a_store(bucket: str, small_trial: SmallTrial) -> None:
+    out = f"{bucket}/asked"
     for count in (1, 2):
         run_campaign(make_plan([str(path) for path in small_trial.paths[:count]], small_trial.site, out))
         assert run_sql(out, "SELECT COUNT(*) AS n FROM runs")["n"].to_list() == [count]
         assert run_sql(out, "SELECT COUNT(DISTINCT run_id) AS n FROM campaign_runs")["n"].to_list() == [count]
-        assert catalogue.fresh(out, "passages") is not None
     assert verify(out).problems == ()
     place = str(store.table_address(out, "passages", "run0"))
     storage.write_bytes(place, storage.read_many([place])[place] + b"more")
-    assert catalogue.fresh(out, "passages") is None
-    assert catalogue.fresh(out, "runs") is not None
     assert [what for what, _, _ in verify(out).problems] == ["run run0, passages"]
     storage.remove(store.table_address(out, "runs", "run1"))
     assert [what for what, _, _ in verify(out).problems] == ["run run1", "run run0, passages"]

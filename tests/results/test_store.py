@@ -17,7 +17,7 @@ import pytest
 
 from pipeline import storage
 from pipeline.campaign import find_runs
-from pipeline.results import catalogue, store
+from pipeline.results import store
 from pipeline.results.query import run_sql
 from pipeline.show.terminal import table_lines, to_json
 from pipeline.storage import files
@@ -106,8 +106,7 @@ def test_any_output_folder_is_read(tmp_path: Path, folder: str) -> None:
     for run_id in ("b", "a"):
         store.write_run(tables_of(run_id), out, METADATA)
     assert store.read_table(out, "runs").collect()["run_id"].to_list() == ["a", "b"]
-    for _ in ("gathered anew", "from the catalogue"):
-        assert catalogue.gather(out)["runs"]["run_id"].to_list() == ["a", "b"]
+    assert store.small_tables(out)["runs"]["run_id"].to_list() == ["a", "b"]
     assert run_sql(out, "SELECT run_id FROM hazards").height == 0
     assert run_sql(out, "SELECT run_id FROM runs WHERE run_id = 'b'").rows() == [("b",)]
 
@@ -144,17 +143,6 @@ def test_run_without_marker_does_not_count(tmp_path: Path) -> None:
     assert not any(leftover.exists() for leftover in leftovers)
     of_somebody.unlink()
     assert len(files_in(tmp_path)) == len(TABLES)
-
-
-def test_sweep_of_one_run_leaves_the_others(tmp_path: Path) -> None:
-    for run_id in ("a", "b", "c"):
-        store.write_run(tables_of(run_id), tmp_path, METADATA)
-    whole = {name: data for name, data in files_in(tmp_path).items() if "run_id=a" not in name}
-    (tmp_path / "runs/run_id=a/runs.parquet").unlink()
-    (tmp_path / "runs/run_id=b/.runs.parquet.0123456789ab.tmp").touch()
-    for run_id in ("a", "b"):
-        store.sweep_run(tmp_path, run_id)
-    assert files_in(tmp_path) == whole
 
 
 @pytest.mark.parametrize("failing", range(5))

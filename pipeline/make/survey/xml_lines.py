@@ -117,7 +117,10 @@ class _XmlLines:
 
     def _add_triple(self, parts: list[str]) -> None:
         """Longitude, latitude and, perhaps, height, as KML writes them."""
-        longitude, latitude, *height = [self._number(part) for part in parts[:3]] if len(parts) > 1 else [None, None]
+        if len(parts) < 2:
+            self.points.append([None, None, None])  # no place: refused with its line
+            return
+        longitude, latitude, *height = [self._number(part) for part in parts[:3]]
         self.points.append([latitude, longitude, height[0] if height else None])
 
     def _number(self, text: str | None) -> float:

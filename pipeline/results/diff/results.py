@@ -156,26 +156,31 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str) -> RunDiff:
     verdicts: tuple[str, ...] = ()
     balises: tuple[str, ...] = ()
     for table, contract in TABLES.items():
-        content_a, content_b = (_recorded(out, table, run_id) for out in (out_a, out_b))
-        if isinstance(content_a, bytes) and isinstance(content_b, bytes) and content_a == content_b:
-            continue
-        a = _frame(out_a, table, run_id, content_a)
-        b = _frame(out_b, table, run_id, content_b)
-        if a.equals(b):
+        if (pair := _unlike(out_a, out_b, table, run_id)) is None:
             continue
         if table == "hazards":
-            differing, hazards = compare_hazards(a, b)
+            differing, hazards = compare_hazards(*pair)
         else:
-            differing = compare_tables(a, b, contract, _KEYS[table])
+            differing = compare_tables(*pair, contract, _KEYS[table])
         if table == "runs":
-            verdicts = _changed_words(a, b, {"verdict": ""}, unknown="failed")
-            balises = _changed_words(a, b, BALISE_COUNTS, unknown="unknown") + balises
+            verdicts = _changed_words(*pair, {"verdict": ""}, unknown="failed")
+            balises = _changed_words(*pair, BALISE_COUNTS, unknown="unknown") + balises
         elif table == "passages":
-            balises = _passage_changes(a, b)
+            balises = _passage_changes(*pair)
         differences += differing
     made = [item for item in differences if item.kind == "values" and item.column in _PROVENANCE]
     changed = tuple(item for item in differences if item not in made)
     return RunDiff(run_id, verdicts, balises, tuple(hazards), changed, tuple(item.column for item in made))
+
+
+def _unlike(out_a: Address, out_b: Address, table: str, run_id: str) -> tuple[pl.DataFrame, pl.DataFrame] | None:
+    """One table of a run in both results; none where it is the same. Files of the same bytes are not opened."""
+    content_a, content_b = (_recorded(out, table, run_id) for out in (out_a, out_b))
+    if isinstance(content_a, bytes) and isinstance(content_b, bytes) and content_a == content_b:
+        return None
+    a = _frame(out_a, table, run_id, content_a)
+    b = _frame(out_b, table, run_id, content_b)
+    return None if a.equals(b) else (a, b)
 
 
 def _changed_words(a: pl.DataFrame, b: pl.DataFrame, columns: Mapping[str, str], unknown: str) -> tuple[str, ...]:

@@ -40,7 +40,6 @@ def withstood(hazards: pl.DataFrame) -> str:
 
 
 def _sizes(size_m: pl.Series) -> str:
-    """How large they became, as far as that is known."""
     largest_m = size_m.abs().max()
     if largest_m is None:
         return ""

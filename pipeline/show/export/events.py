@@ -1,4 +1,4 @@
-"""Hazards, alarms and passages as sentences with an instant."""
+"""Hazards and passages as sentences with an instant."""
 
 from __future__ import annotations
 
@@ -38,16 +38,6 @@ def hazard_text(row: Row) -> str:
     accepted = f", accepted despite the fault: {', '.join(row['accepted_ids'])}" if row["accepted_ids"] else ""
     detected = "detected" if row["detected"] else "not detected"
     return f"{row['hazard']} {size}, {row['failure_mode']}, {detected}, hits {hit}{accepted}, suspect: {row['suspect']}"
-
-
-def alarm_entries(alarms: pl.DataFrame) -> list[Entry]:
-    """Begin and end of each alarm."""
-    entries: list[Entry] = []
-    for row in _plain(alarms):
-        name = f"alarm {row['alarm_id']}"
-        text = f"{', '.join(row['monitors'])}; verdict {row['verdict']}, suspect {row['suspect']}"
-        entries += [(row["t_start"], Level.WARNING, name, text), (row["t_end"], Level.INFO, name, "last fail")]
-    return entries
 
 
 def passage_entries(passages: pl.DataFrame) -> list[Entry]:

@@ -12,7 +12,7 @@ from typing import IO, Literal
 
 import polars as pl
 
-from pipeline.show.export.events import alarm_entries, hazard_entries, passage_entries
+from pipeline.show.export.events import hazard_entries, passage_entries
 from pipeline.show.export.gis import balises_geojson, track_geojson
 from pipeline.show.export.messages import Encoding, Topic, geojson_topic, log_topic, rows_topic
 from pipeline.show.export.position_messages import location_fix_topic, navsatfix_topic
@@ -116,15 +116,13 @@ def _position_topics(
 
 
 def _result_topics(solution: str, tables: RunTables, encoding: Encoding) -> list[Topic]:
-    epochs, hazards, alarms, passages = (
-        frame.filter(pl.col("solution") == solution)
-        for frame in (tables.epochs, tables.hazards, tables.alarms, tables.passages)
+    epochs, hazards, passages = (
+        frame.filter(pl.col("solution") == solution) for frame in (tables.epochs, tables.hazards, tables.passages)
     )
     return [
         rows_topic(f"/{solution}/lds", "balise.Lds", epochs.select(_LDS), encoding),
         rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitors(epochs), encoding),
         log_topic(f"/{solution}/hazards", hazard_entries(hazards), encoding),
-        log_topic(f"/{solution}/alarms", alarm_entries(alarms), encoding),
         log_topic(f"/{solution}/passages", passage_entries(passages), encoding),
     ]
 

@@ -29,8 +29,8 @@ def export_run(
 ) -> tuple[list[Path], list[str]]:
     """Write a run of the result `out`; returns the files, and what they lack for want of site or log.
 
-    `.mcap` holds raw (from the log), GNSS, matched and true positions, track, balises, monitors, LDS, hazards,
-    alarms and passages; beside it goes `NAME.layout.json` for Foxglove. `positions` chooses foxglove.LocationFix or
+    `.mcap` holds raw (from the log), GNSS, matched and true positions, track, balises, monitors, LDS, hazards
+    and passages; beside it goes `NAME.layout.json` for Foxglove. `positions` chooses foxglove.LocationFix or
     ROS 2 NavSatFix. The others need the site. `.geojson` and `.gpx` hold matched positions and hazards, `.gpkg` and
     `.parquet` epochs, passages and hazards with all their columns; GeoParquet has a file for each table.
     """

@@ -1,9 +1,8 @@
 "use strict";
 // The page of a campaign: distributions, and where on the network positions could be had.
 (() => {
-  const { data, draw, empty } = Plots;
-  const OUTCOMES = [["in time", "right"], ["too late", "wrong"], ["could not be checked", "unknown"]];
-  const OFFERS = [["right", "accepted, right"], ["read", "balise reads"], ["lost", "lost"], ["unknown", "accepted, could not be checked"], ["wrong", "accepted at a wrong place"]];
+  const { OUTCOMES, data, draw, empty } = Plots;
+  const TIMING = [["in time", "right"], ["too late", "wrong"], ["could not be checked", "unknown"]];
   const LEAST_S = 0.05;
 
   // What nobody could have seen was not found either.
@@ -26,7 +25,7 @@
 
   function classesPlot(id, own) {
     if (!own.hazards) { empty(id, noHazard(own)); return; }
-    const [layers, most] = stacked(OUTCOMES, own.classes.map(([, ...counts], at) => [at - 0.3, at + 0.3, counts]));
+    const [layers, most] = stacked(TIMING, own.classes.map(([, ...counts], at) => [at - 0.3, at + 0.3, counts]));
     draw(id, { height: 240, layers, x: { kind: "names", names: own.classes.map((row) => row[0]), lo: -0.6, hi: own.classes.length - 0.4 },
       y: { lo: 0, hi: most, title: "hazards" } });
   }
@@ -62,10 +61,10 @@
     if (!own.location.length) { empty(id, "No location error is known."); return; }
     const bins = new Map();
     for (const [outcome, at, count] of own.location) {
-      if (!bins.has(at)) bins.set(at, OFFERS.map(() => 0));
-      bins.get(at)[OFFERS.findIndex(([key]) => key === outcome)] += count;
+      if (!bins.has(at)) bins.set(at, OUTCOMES.map(() => 0));
+      bins.get(at)[OUTCOMES.findIndex(([key]) => key === outcome)] += count;
     }
-    const [layers, most] = stacked(OFFERS.map(([tone, name]) => [name, tone]), [...bins].map(([at, counts]) => [at, at + 1, counts]));
+    const [layers, most] = stacked(OUTCOMES.map(([tone, name]) => [name, tone]), [...bins].map(([at, counts]) => [at, at + 1, counts]));
     const limit = data.limits.failure_limit_m;
     const reach = Math.max(...[...bins.keys()].map(Math.abs)) + 3;
     draw(id, { height: 280, layers, y: { lo: 0, hi: most, title: "offers" },

@@ -217,7 +217,7 @@ def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
 def _pages_on_demand(campaign: Campaign) -> str:
     """How to get the pages that are not there."""
     without = campaign.runs.filter(~pl.col("run_id").is_in(list(campaign.hrefs)))["run_id"].n_unique()
-    command = "<code>balise report OUT --run RUN</code>"
+    command = "<code>balise report OUT --run RUN</code> (in a project without OUT)"
     return f"<p>{plural(without, 'run')} without a page: {command} writes one.</p>" if without else ""
 
 

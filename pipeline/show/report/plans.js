@@ -90,7 +90,7 @@ const Plans = (() => {
     const angle = direction(spec.xs, spec.ys);
     const points = turned({ x: Array.from(spec.xs), y: Array.from(spec.ys) }, angle);
     const [x, y] = spec.box ?? [range(points.x, ROOM_M), range(points.y, ROOM_M)];
-    const width = document.getElementById(id).clientWidth - EDGES_PX;
+    const width = Plots.widthOf(id) - EDGES_PX;
     const wanted = (width * (y.hi - y.lo)) / (x.hi - x.lo) + EDGES_PX;
     const height = Math.round(Math.min(HEIGHT.most, Math.max(HEIGHT.least, wanted)));
     const back = (px, py) => turn(-angle, px, py);

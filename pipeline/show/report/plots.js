@@ -10,6 +10,11 @@ const Plots = (() => {
     right: ["circle", 5], read: ["square", 4.5], lost: ["diamond", 6.5], unknown: ["ring", 5], wrong: ["cross", 6.5],
     hazard: ["cross", 6],
   };
+  // What became of a passage, from harmless to bad: its tone, and what it is called.
+  const OUTCOMES = [
+    ["read", "balise read"], ["right", "accepted, right"], ["lost", "lost"],
+    ["unknown", "accepted, could not be checked"], ["wrong", "accepted at a wrong place"],
+  ];
   const ARRAYS = { f4: Float32Array, u4: Uint32Array, u1: Uint8Array };
   const data = JSON.parse(document.getElementById("data").textContent);
   const drawn = new Map();
@@ -169,11 +174,19 @@ const Plots = (() => {
     place.prepend(list);
   }
 
+  // While a page is printed all is as wide as a sheet, whatever the window.
+  const SHEET_PX = 1300;
+  let printing = false;
+  const widthOf = (id) => {
+    const { clientWidth } = document.getElementById(id);
+    return clientWidth && printing ? SHEET_PX : clientWidth;
+  };
+
   function draw(id, spec) {
     const place = document.getElementById(id);
     drawn.set(id, spec);
     place.closest("figure").classList.remove("nothing");
-    const width = place.clientWidth;
+    const width = widthOf(id);
     if (!width) return;
     const left = spec.compass !== undefined ? EDGE.right : spec.x.kind === "time" ? EDGE.time : spec.y.kind === "names" ? EDGE.names : EDGE.left;
     const frame = { x0: left, x1: width - EDGE.right, y0: EDGE.top, y1: spec.height - (spec.x.title ? EDGE.bottom : spec.compass !== undefined ? EDGE.right : 24) };
@@ -315,12 +328,12 @@ const Plots = (() => {
     place.closest("figure").classList.add("nothing");
   }
 
-  // With another width all is drawn again; paper scales what is there.
+  const drawAll = () => { for (const [id, spec] of drawn) draw(id, spec); };
   let width = window.innerWidth;
   window.addEventListener("resize", () => {
     if (window.innerWidth === width) return;
     width = window.innerWidth;
-    for (const [id, spec] of drawn) draw(id, spec);
+    drawAll();
   });
 
   // Ranges that hold all values with a little room.
@@ -338,7 +351,15 @@ const Plots = (() => {
   }
 
   // Paper shows what a click would open.
-  window.addEventListener("beforeprint", () => { for (const one of document.querySelectorAll("details")) one.open = true; });
+  window.addEventListener("beforeprint", () => {
+    printing = true;
+    for (const one of document.querySelectorAll("details")) one.open = true;
+    drawAll();
+  });
+  window.addEventListener("afterprint", () => {
+    printing = false;
+    drawAll();
+  });
 
   // A page is used without a mouse too.
   function keys(actions) {
@@ -353,5 +374,5 @@ const Plots = (() => {
 
   const follow = (go) => { document.querySelector(`a[data-go="${go}"]`)?.click(); };
 
-  return { data, draw, empty, follow, keys, range, unpack };
+  return { OUTCOMES, data, draw, empty, follow, keys, range, unpack, widthOf };
 })();

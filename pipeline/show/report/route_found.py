@@ -17,14 +17,14 @@ from pipeline.stages.epochs.clock import least_belief
 _NOTE = (
     "This is the path that the positions were matched to, with how sure it was at the time "
     "(<code>gate_probability</code>, which decides what is used) and in hindsight (<code>path_probability</code>). "
-    "Correct it where you know better, and hand it in with <code>balise replay --route FILE</code> if you know it to "
-    "be true: nothing stays ambiguous then. The results do not hold which rival tracks were possible: the notes above "
-    "name them, and <code>balise replay --write-route DIR</code> writes them beside each net element. A net element "
-    "without any position is not in this list."
+    "Correct it where you know better, and hand it in if you know it to be true: nothing stays ambiguous then "
+    "(<code>balise replay --route FILE</code>, in a project <code>route</code> under [replay]). Rival tracks are named "
+    "in the notes above and in what <code>--write-route</code> writes. A net element without any position is not in "
+    "this list."
 )
 _TURNED = (
     "The train came back over a net element, and the results do not tell the legs of such a ride apart: "
-    "<code>balise replay --write-route DIR</code> writes the route of this run."
+    "<code>balise replay --write-route DIR</code> (in a project <code>write_route</code> under [replay]) writes it."
 )
 
 

@@ -1,7 +1,7 @@
 "use strict";
 // The page of a run: every drawing over time shows the same stretch of it.
 (() => {
-  const { data, draw, empty, range, unpack } = Plots;
+  const { OUTCOMES, data, draw, empty, range, unpack } = Plots;
   const { clock, number } = Scales;
   const POINTS = 1200;
   const PIECES = 400;
@@ -10,10 +10,6 @@
   const RATIO_REACH = 5;
   const FEW = 20;
   const KMH = 3.6;
-  const OUTCOMES = [
-    ["read", "balise read"], ["right", "accepted, right"], ["lost", "lost"],
-    ["unknown", "accepted, could not be checked"], ["wrong", "accepted at a wrong place"],
-  ];
   // Which look a state has, and what it is called.
   const STATES = {
     P0: ["right", "P0: in order"], P1: ["wrong", "P1: wrong and in use"], P2: ["lost", "P2: position blocked"],

@@ -30,7 +30,7 @@ from pipeline.show.report.markup import (
     verdict_head,
 )
 from pipeline.show.report.route_found import route_section
-from pipeline.show.report.series import MOMENTS, moments_of, monitor_lines, reasons, stanford_data, time_data
+from pipeline.show.report.series import MOMENTS, moments_of, monitor_lines, stanford_data, time_data
 from pipeline.show.report.words import WORDS, plots_of
 from pipeline.stages.run_row.verdict import LEVEL_LISTS
 from schemas.campaign import CampaignLevels
@@ -223,7 +223,6 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
         part("passages", "Passages", rows("passages", in_order, passages, _PASSAGES, Passages, {"status": _status})),
         part("levels", "Service levels", rows("levels", ALLOWED, levels, (), CampaignLevels)),
         part("alarms", "Alarms", rows("alarms", "Alarm episodes", alarms, _ALARMS, Alarms)),
-        part("reasons", "Monitors not evaluated", rows("reasons", "Why monitors could not judge", reasons(epochs))),
         route_section(f"route-{key}", tables.run_id, epochs, made.config.matching.ambiguity_probability),
         part("all", "All figures", figures(f"table-all-{key}", "All figures of the run", known, Runs)),
     ]

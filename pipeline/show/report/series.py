@@ -81,16 +81,6 @@ def moments_of(*frames: pl.DataFrame) -> Ints:
     return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
 
 
-def reasons(epochs: pl.DataFrame) -> pl.DataFrame:
-    """Why monitors were not evaluated: `reason, epochs, monitors`; of each monitor the four most frequent."""
-    counts = [
-        epochs.select(reason=f"{name}_reason").drop_nulls().group_by("reason").len("epochs").with_columns(monitor=pl.lit(name))
-        .sort("epochs", "reason", descending=[True, False]).head(4)
-        for name in MONITORS
-    ]  # fmt: skip
-    return pl.concat(counts).group_by("reason", "epochs", maintain_order=True).agg(monitors="monitor")
-
-
 def monitor_lines() -> dict[str, list[list[str]]]:
     """Name and label of the lines of each drawing of monitors."""
     drawings = dict.fromkeys(monitor.drawing for monitor in ALL_MONITORS)

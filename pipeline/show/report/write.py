@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import quote
@@ -12,7 +12,7 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline import storage
-from pipeline.results import catalogue
+from pipeline.results import catalogue, store
 from pipeline.results.figures.campaign_figures import derived_tables
 from pipeline.results.manifest import note_pages
 from pipeline.results.marker import sha256
@@ -38,7 +38,6 @@ from pipeline.studies.safety.tally import COUNTS, added
 from schemas.config import Configuration, to_toml
 from schemas.errors import UsageError
 from schemas.run import Site
-from schemas.tables import TABLES
 
 # Kept of each run until it changes: what its page was made from, the digest of the page, and what the run adds to the
 # page of the campaign, rows of `availability_pieces` and `side_by_side`.
@@ -50,7 +49,7 @@ _RUNS_AT_ONCE = 256
 
 @dataclass(frozen=True)
 class _Page:
-    """What the page of one run is made from; `made_of`: the digest of that, empty where nobody knows the state."""
+    """What the page of one run is made from; `made_of`: the digest of that, empty where nobody knows it."""
 
     out: Path
     run: str
@@ -68,15 +67,15 @@ def write_report(out: Path, site: Site | None = None, jobs: int = 0, most_pages:
     from these very tables, settings and program are left as they are. `jobs` processes make the others, by
     default one per core where there are many.
     """
-    states = catalogue.states(out, tuple(TABLES)) or {}
-    pages = _pages(out, site, states, most_pages)
+    markers = _markers(out)
+    pages = _pages(out, site, markers, most_pages)
     rows = _known(out, pages)
     left = [page for page in pages if page.run not in rows] if len(pages) <= most_pages else []
     # Starting a process takes as long as some pages.
     jobs = jobs or min(os.cpu_count() or 1, 1 + len(left) // 20)
     rows |= zip((page.run for page in left), mapped(_written, left, jobs), strict=True)
     there = [page for page in pages if page.run in rows]
-    _keep(out, states, [rows[page.run] for page in there])
+    _keep(out, markers, [rows[page.run] for page in there])
     folder = out / "report" / "runs"
     for name in set(files.list_dir(folder) if folder.exists() else []) - {page.path.name for page in there}:
         if name.endswith(".html"):
@@ -91,18 +90,18 @@ def write_report(out: Path, site: Site | None = None, jobs: int = 0, most_pages:
 
 def write_page(out: Path, run_id: str, site: Site | None = None, most_pages: int = MOST_PAGES) -> Path:
     """Write the page of one run alone. Raises `UsageError` where it is not in the result."""
-    states = catalogue.states(out, tuple(TABLES)) or {}
-    pages = {page.run: page for page in _pages(out, site, states, most_pages)}
+    markers = _markers(out)
+    pages = {page.run: page for page in _pages(out, site, markers, most_pages)}
     if run_id not in pages:
         raise UsageError(f"has no run {run_id!r}", place=str(out), found=", ".join([*pages][:10]))
     known = _known(out, list(pages.values()))
     known[run_id] = _written(pages[run_id])
-    _keep(out, states, [known[run] for run in pages if run in known])
+    _keep(out, markers, [known[run] for run in pages if run in known])
     _noted(out, [out / "report" / name for name in storage.files_below(out / "report")])
     return pages[run_id].path
 
 
-def _pages(out: Path, site: Site | None, states: catalogue.RunStates, most_pages: int) -> list[_Page]:
+def _pages(out: Path, site: Site | None, markers: Mapping[str, str], most_pages: int) -> list[_Page]:
     """The pages that there may be; of more than `most_pages` none leads to its neighbours, which may have none."""
     names = {run: page_name(run) for run in complete_runs(out)}
     config = read_config(out)
@@ -110,15 +109,20 @@ def _pages(out: Path, site: Site | None, states: catalogue.RunStates, most_pages
     ways = [None, *((run, quote(name)) if len(names) <= most_pages else None for run, name in names.items()), None]
     folder = out / "report" / "runs"
     return [
-        _with_digest(_Page(out, run, folder / name, made, Neighbours(ways[at], ways[at + 2])), states.get(run))
+        _with_digest(_Page(out, run, folder / name, made, Neighbours(ways[at], ways[at + 2])), markers.get(run, ""))
         for at, (run, name) in enumerate(names.items())
     ]
 
 
-def _keep(out: Path, states: catalogue.RunStates, rows: Sequence[pl.DataFrame]) -> None:
+def _keep(out: Path, markers: Mapping[str, str], rows: Sequence[pl.DataFrame]) -> None:
     # Runs that changed while they were read must not pass for what was read.
-    if rows and states and states == catalogue.states(out, tuple(TABLES)):
+    if rows and markers == _markers(out):
         catalogue.keep(out, _KEPT, software_digest(), parquet_bytes(pl.concat(rows)))
+
+
+def _markers(out: Path) -> dict[str, str]:
+    """The digest of each run's marker, which holds those of its tables."""
+    return {marker.run_id: marker.sha256 for marker in store.markers(out)}
 
 
 def _noted(out: Path, pages: list[Path]) -> list[Path]:
@@ -133,16 +137,16 @@ def page_name(run_id: str) -> str:
     return f"{file_name(run_id)}.html"
 
 
-def _with_digest(page: _Page, state: str | None) -> _Page:
+def _with_digest(page: _Page, marker: str) -> _Page:
     """With the SHA-256 over all that the page follows from: tables, settings, site, neighbours and program.
 
-    Empty where files have no state, or the site has no digest: such a page is never known to be there.
+    Empty where the site has no digest: such a page is never known to be there.
     """
     site = page.made.site
-    if not state or (site is not None and not site.digest):
+    if not marker or (site is not None and not site.digest):
         return page
     places = (page.run, page.neighbours, None if site is None else site.digest)
-    text = f"{software_digest()}\n{page.made.config_text}\n{state}\n{places}"
+    text = f"{software_digest()}\n{page.made.config_text}\n{marker}\n{places}"
     return replace(page, made_of=hashlib.sha256(text.encode()).hexdigest())
 
 
@@ -192,14 +196,14 @@ def _of_tables(out: Path, made: Made) -> tuple[pl.DataFrame, pl.DataFrame]:
         check_site(made.site, metadata.get("site_digest"), run)
     portions = [names[first : first + _RUNS_AT_ONCE] for first in range(0, len(names), _RUNS_AT_ONCE)]
     pieces = [availability_pieces(tables_of(out, "epochs", some, PIECE_COLUMNS).lazy()) for some in told(portions)]
-    runs, hazards, alarms = (catalogue.scan(out, table).collect() for table in ("runs", "hazards", "alarms"))
+    runs, hazards, alarms = (store.read_table(out, table).collect() for table in ("runs", "hazards", "alarms"))
     return together(pl.concat(pieces)), added(compare_architectures(out, runs, hazards, alarms, made.config).values())
 
 
 def _campaign(
     out: Path, made: Made, hrefs: dict[str, str], pieces: pl.DataFrame, architectures: pl.DataFrame
 ) -> Campaign:
-    tables = {table: catalogue.scan(out, table).collect() for table in catalogue.CATALOGUED}
+    tables = store.small_tables(out)
     return Campaign(
         runs=tables["runs"],
         hazards=tables["hazards"],

@@ -64,13 +64,11 @@ class KnownStretch:
             clock_m=float(self.clock_m[sample]) + open_m,
         )
 
-    def ends(self, counter: Counter | None) -> tuple[TrueAnchor, TrueAnchor]:
+    def ends(self, counter: Counter) -> tuple[TrueAnchor, TrueAnchor]:
         """The outermost samples at which the odometer counted: only from these is a place carried."""
-        ends = np.array([0, self.t_ns.size - 1])
-        if counter is not None:
-            counted = np.flatnonzero(counter.odometer.known_at(self.t_ns))
-            ends = counted if counted.size else ends
-        return self.anchor(int(ends[0])), self.anchor(int(ends[-1]))
+        counted = np.flatnonzero(counter.odometer.known_at(self.t_ns))
+        first, last = (counted if counted.size else np.arange(self.t_ns.size))[[0, -1]].tolist()
+        return self.anchor(first), self.anchor(last)
 
 
 @dataclass(frozen=True)
@@ -92,11 +90,9 @@ class Sided:
 
 def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) -> Sided:
     """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
-    path = stretch.paths[0]
-    rows = _every(stretch.t_ns, 1.0)
-    step_m = np.where(np.diff(path.leg[rows]) == 0, np.diff(path.at_m[rows]), 0.0)
+    begin, end, step_m = _steps_of(stretch, 1.0)
     if counter is not None:
-        counted_m = counter.distance_m(stretch.t_ns[rows[:-1]], stretch.t_ns[rows[1:]])
+        counted_m = counter.distance_m(stretch.t_ns[begin], stretch.t_ns[end])
         step_m = np.sign(step_m) * np.nan_to_num(counted_m)
     moved_m = np.cumsum(step_m)
     first = np.flatnonzero(np.abs(moved_m) >= least_m)
@@ -106,29 +102,28 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
     return Sided(stretch, sense, with_m, against_m)
 
 
-def _every(t_ns: Ints, step_s: float) -> Ints:
-    """Samples so far apart in time."""
+def _steps_of(stretch: ReferenceStretch, step_s: float) -> tuple[Ints, Ints, Floats]:
+    """Pairs of samples so far apart in time on one leg of the first path, and the way between them [m]."""
+    path = stretch.paths[0]
+    t_ns = stretch.t_ns
     instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, round(step_s * NS_PER_S), dtype=np.int64)
-    return np.unique(np.searchsorted(t_ns, instants))
-
-
-def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> RecorderLag:
-    """The reference's clock against the odometer's, by its ways of ten seconds."""
-    if not sides:
-        return RecorderLag()
-    begins, ends, ways = (np.concatenate(column) for column in zip(*(_ways(side) for side in sides), strict=True))
-    return lag_of(begins, ends, ways, counter)
-
-
-def _ways(side: Sided) -> tuple[Ints, Ints, Floats]:
-    """Begins, ends and lengths of the ways of ten seconds, as the odometer counts up."""
-    path = side.stretch.paths[0]
-    t_ns = side.stretch.t_ns
-    rows = _every(t_ns, _LAG_WINDOW_S)
+    rows = np.unique(np.searchsorted(t_ns, instants))
     whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
     begin = rows[:-1][whole]
     end = rows[1:][whole]
-    return t_ns[begin], t_ns[end], side.sense * (path.at_m[end] - path.at_m[begin])
+    return begin, end, path.at_m[end] - path.at_m[begin]
+
+
+def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> RecorderLag:
+    """The reference's clock against the odometer's, by its ways of ten seconds, as the odometer counts up."""
+    ways = []
+    for side in sides:
+        begin, end, way_m = _steps_of(side.stretch, _LAG_WINDOW_S)
+        ways.append((side.stretch.t_ns[begin], side.stretch.t_ns[end], side.sense * way_m))
+    if not ways:
+        return RecorderLag()
+    begins, ends, lengths = (np.concatenate(column) for column in zip(*ways, strict=True))
+    return lag_of(begins, ends, lengths, counter)
 
 
 def known_stretch(
@@ -140,8 +135,8 @@ def known_stretch(
     config: Configuration,
 ) -> KnownStretch:
     """The stretch as evidence; `reads` close a step of the reference where they confirm it."""
-    stretch = side.stretch
-    t_ns = stretch.t_ns - round(clock.shift_s * NS_PER_S)
+    t_ns = side.stretch.t_ns - round(clock.shift_s * NS_PER_S)
+    stretch = replace(side.stretch, t_ns=t_ns)
     paths: list[KnownPath] = []
     speed_mps = np.zeros(t_ns.size)
     for path in stretch.paths:
@@ -149,9 +144,8 @@ def known_stretch(
         path_mps = _speed_mps(t_ns, at_m, path.leg)
         speed_mps = np.maximum(speed_mps, path_mps)
         known = KnownPath(path, side.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
-        reads_ns = _confirming_ns(known, t_ns, stretch.sigma_m, path_mps * clock.delta_s, reads, config.hazards)
-        low_m, high_m, step_m = _left_open(known, t_ns, stretch.sigma_m, counters, reads_ns, config)
-        paths.append(replace(known, low_m=at_m + low_m, high_m=at_m + high_m, step_m=step_m))
+        reads_ns = _confirming_ns(known, stretch, path_mps * clock.delta_s, reads, config.hazards)
+        paths.append(_left_open(known, stretch, counters, reads_ns, config))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
     around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in (-clock.delta_s, 0.0, clock.delta_s)]
     return KnownStretch(t_ns, stretch.sigma_m, np.maximum.reduce(around) * clock.delta_s, tuple(paths))
@@ -160,59 +154,56 @@ def known_stretch(
 def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
     """Speed over a second about each sample."""
     half_ns = NS_PER_S // 2
-    begin = np.searchsorted(t_ns, t_ns - half_ns)
     end = np.minimum(np.searchsorted(t_ns, t_ns + half_ns), t_ns.size - 1)
     # A slow log has no other sample within the second before its last one.
-    begin = np.minimum(begin, np.maximum(end - 1, 0))
+    begin = np.minimum(np.searchsorted(t_ns, t_ns - half_ns), np.maximum(end - 1, 0))
     elapsed_s = np.maximum((t_ns[end] - t_ns[begin]) / NS_PER_S, 1e-9)
     return np.where((leg[begin] == leg[end]) & (end > begin), np.abs(at_m[end] - at_m[begin]) / elapsed_s, 0.0)
 
 
 def _confirming_ns(
-    known: KnownPath,
-    t_ns: Ints,
-    sigma_m: Floats,
-    clock_m: Floats,
-    reads: Sequence[TrueAnchor],
-    config: HazardConfig,
-) -> Ints:
+    known: KnownPath, stretch: ReferenceStretch, clock_m: Floats, reads: Sequence[TrueAnchor], config: HazardConfig
+) -> list[int]:
     """Times of reads at balises where the reference was too, within k sigmas of both and both clocks."""
-    confirming: list[int] = []
+    t_ns = stretch.t_ns
     since_ns = (t_ns - t_ns[0]).astype(np.float64)
+    confirming: set[int] = set()
     for read in reads:
         if not t_ns[0] <= read.t_ns <= t_ns[-1]:
             continue
         at_m = np.interp([float(read.t_ns - t_ns[0])], since_ns, known.at_m)
         sample = int(np.searchsorted(t_ns, read.t_ns))
         route = known.path.legs[int(known.path.leg[sample])]
-        half_m = config.evidence_factor * float(np.hypot(sigma_m[sample], read.sigma_m))
+        half_m = config.evidence_factor * float(np.hypot(stretch.sigma_m[sample], read.sigma_m))
         half_m += float(clock_m[sample]) + read.clock_m
         for place in read.places:
             there_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
             if abs(float(there_m[0] - at_m[0])) <= half_m:
-                confirming.append(read.t_ns)
-    return np.unique(np.array(confirming, dtype=np.int64))
+                confirming.add(read.t_ns)
+    return sorted(confirming)
 
 
 def _left_open(
-    known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter], reads_ns: Ints, config: Configuration
-) -> tuple[Floats, Floats, Floats]:
-    """How far behind and ahead of each sample the train may be after a step of the reference, and the steps [m].
+    known: KnownPath, stretch: ReferenceStretch, counters: Sequence[Counter], reads_ns: list[int], config: Configuration
+) -> KnownPath:
+    """The path with how far behind and ahead of each sample the train may be after a step of the reference.
 
     After a step that every odometer contradicts by more than k_T sigmas, the reference may be wrong before or after
     it: both sides stay possible, until the step back or the next read that confirms the reference (DOMAIN section 5.1).
     """
-    low_m, high_m, open_step_m = np.zeros((3, t_ns.size))
+    t_ns = stretch.t_ns
     if t_ns.size < 2:
-        return low_m, high_m, open_step_m
-    step_m, root_m = _contradicted(known, t_ns, sigma_m, counters)
+        return known
+    low_m, high_m, open_step_m = np.zeros((3, t_ns.size))
+    step_m, root_m = _contradicted(known, stretch, counters)
     limit_m = config.align.sure_sigmas * root_m
     stepped = np.flatnonzero((np.abs(step_m) > limit_m) & _uneven(known.at_m, t_ns, limit_m))
     open_step_m[stepped] = np.abs(step_m[stepped])
     events = [(int(t_ns[row + 1]), float(step_m[row]), float(limit_m[row])) for row in stepped.tolist()]
-    open_m: list[float] = []
     # A read that confirms is a step of 0 m with any noise: it closes every step before it.
-    for at_ns, jump_m, noise_m in sorted(events + [(read_ns, 0.0, np.inf) for read_ns in reads_ns.tolist()]):
+    events += [(read_ns, 0.0, np.inf) for read_ns in reads_ns]
+    open_m: list[float] = []
+    for at_ns, jump_m, noise_m in sorted(events):
         # From where each open step began to here, the oldest first: near 0 where this step leads back.
         sides_m = np.cumsum([jump_m, *open_m[::-1]])[:0:-1]
         back = np.flatnonzero(np.abs(sides_m) <= np.sqrt(2.0) * noise_m)
@@ -221,7 +212,7 @@ def _left_open(
         rows = slice(int(np.searchsorted(t_ns, at_ns)), None)
         low_m[rows] = -behind_m.max()
         high_m[rows] = -behind_m.min()
-    return low_m, high_m, open_step_m
+    return replace(known, low_m=known.at_m + low_m, high_m=known.at_m + high_m, step_m=open_step_m)
 
 
 def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
@@ -230,22 +221,22 @@ def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
     speed_mps = np.diff(at_m) / dt_s
     beside = max(1, round(_EVEN_S / float(np.median(dt_s))))
     around = sliding_window_view(np.pad(speed_mps, beside, mode="edge"), 2 * beside + 1)
-    uneven: Bools = np.abs(speed_mps - np.median(around, axis=1)) * dt_s > limit_m
-    return uneven
+    return np.greater(np.abs(speed_mps - np.median(around, axis=1)) * dt_s, limit_m)
 
 
-def _contradicted(known: KnownPath, t_ns: Ints, sigma_m: Floats, counters: Sequence[Counter]) -> tuple[Floats, Floats]:
+def _contradicted(known: KnownPath, stretch: ReferenceStretch, counters: Sequence[Counter]) -> tuple[Floats, Floats]:
     """Per step to the next sample: its difference from the odometer that agrees best, and the sigma of that [m]."""
-    whole = np.diff(known.path.leg) == 0
+    t_ns = stretch.t_ns
     least = np.full(t_ns.size - 1, np.inf)
     root = np.ones(t_ns.size - 1)
     for counter in counters:
         way = counter.between(t_ns[:-1], t_ns[1:])
-        step_sigma_m = np.sqrt(sigma_m[1:] ** 2 + sigma_m[:-1] ** 2 + way.variance_m2)
+        step_sigma_m = np.sqrt(stretch.sigma_m[1:] ** 2 + stretch.sigma_m[:-1] ** 2 + way.variance_m2)
         off_m = np.diff(known.at_m) - known.sense * way.distance_m
         nearer = np.isfinite(off_m) & (np.abs(off_m) / step_sigma_m < np.abs(least) / root)
         least = np.where(nearer, off_m, least)
         root = np.where(nearer, step_sigma_m, root)
+    whole = np.diff(known.path.leg) == 0
     return np.where(whole & np.isfinite(least), least, 0.0), root
 
 
@@ -276,8 +267,5 @@ def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Count
 
 def outside(anchors: Sequence[TrueAnchor], stretches: Sequence[KnownStretch]) -> list[TrueAnchor]:
     """Anchors at times that no stretch covers."""
-    t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
-    inside: Bools = np.zeros(t_ns.size, dtype=np.bool_)
-    for stretch in stretches:
-        inside |= (t_ns >= stretch.t_ns[0]) & (t_ns <= stretch.t_ns[-1])
-    return [anchor for anchor, within in zip(anchors, inside.tolist(), strict=True) if not within]
+    spans = [stretch.t_ns[[0, -1]].tolist() for stretch in stretches]
+    return [anchor for anchor in anchors if not any(begin <= anchor.t_ns <= end for begin, end in spans)]

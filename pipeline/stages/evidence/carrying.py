@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.odometry.odometry import OdometerWay as Counted
+from pipeline.stages.odometry.odometry import OdometerWay
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Floats, Ints, runs_of
 from schemas.config import Configuration
 from schemas.enums import Evidence
 
 Interval = tuple[Floats, Floats]
+"""Least and largest coordinate [m], NaN where nothing is known."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,10 @@ class Counter:
         """Scale and its sigma are those of a vehicle file."""
         return self.odometer.scale is not None
 
-    def between(self, begin_ns: Ints | int, end_ns: Ints) -> Counted:
+    def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
         """True distance between instants and its variance; NaN over a break."""
         counted = self.odometer.between(begin_ns, end_ns)
-        return Counted(self._unbroken(begin_ns, end_ns, counted.distance_m), counted.variance_m2)
+        return OdometerWay(self._unbroken(begin_ns, end_ns, counted.distance_m), counted.variance_m2)
 
     def distance_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """The distance of `between` alone, which takes half the time."""
@@ -63,25 +64,23 @@ class Counter:
 
     def driven_m(self, since_ns: Ints | int, t_ns: Ints) -> Floats:
         """Way driven, turns included [m]."""
-        driven: Floats = np.abs(self.odometer.travelled_at(t_ns) - self.odometer.travelled_at(np.atleast_1d(since_ns)))
-        return driven
+        travelled_at = self.odometer.travelled_at
+        return np.asarray(np.abs(travelled_at(t_ns) - travelled_at(np.atleast_1d(since_ns))))
 
     def speed_mps(self, t_ns: Ints) -> Floats:
         """Speed over a second about each instant [m/s]; NaN where it did not count throughout."""
         half_ns = round(0.5 * self.odometer.config.speed_window_s * NS_PER_S)
-        speed: Floats = self.distance_m(t_ns - half_ns, t_ns + half_ns) / (2 * half_ns / NS_PER_S)
-        return speed
+        return np.asarray(self.distance_m(t_ns - half_ns, t_ns + half_ns) / (2 * half_ns / NS_PER_S))
 
     def best_speed_mps(self, t_ns: Ints) -> Floats:
         """Speed over as much of that second as was recorded [m/s]; a best guess over a break."""
         odometer = self.odometer
-        at_s = self.odometer.seconds(t_ns)
         half_s = 0.5 * odometer.config.speed_window_s
-        begin_s = np.clip(at_s - half_s, odometer.t_s[0], odometer.t_s[-1])
-        end_s = np.clip(at_s + half_s, odometer.t_s[0], odometer.t_s[-1])
+        begin_s, end_s = (
+            np.clip(odometer.seconds(t_ns) + off_s, odometer.t_s[0], odometer.t_s[-1]) for off_s in (-half_s, half_s)
+        )
         moved_m = odometer.distance_at_s(end_s) - odometer.distance_at_s(begin_s)
-        speed: Floats = (odometer.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9)
-        return speed
+        return np.asarray((odometer.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9))
 
 
 def _stands_ns(odometer: Odometry) -> Ints:
@@ -93,15 +92,21 @@ def _stands_ns(odometer: Odometry) -> Ints:
 
 def beside_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
     """Half the interval away from a place known to `known_m`: 5 m + 5 % of the way (SUBSET-041 5.3.1.1)."""
-    half: Floats = max(config.lds.odometer_fixed_m, known_m) + config.lds.odometer_share * driven_m
-    return half
+    return np.asarray(max(config.lds.odometer_fixed_m, known_m) + config.lds.odometer_share * driven_m)
 
 
 def carried(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
-    """Least and largest coordinate on one side of an anchor at `at_m`; NaN where the odometer is silent."""
-    centre = at_m + counter.distance_m(anchor.t_ns, t_ns)
+    """On one side of an anchor at `at_m`."""
     known_m = config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m
-    half = beside_m(counter.driven_m(anchor.t_ns, t_ns), known_m, config)
+    return _carried_from(counter, anchor.t_ns, at_m, t_ns, known_m, config)
+
+
+def _carried_from(
+    counter: Counter, since_ns: Ints | int, at_m: Floats | float, t_ns: Ints, known_m: float, config: Configuration
+) -> Interval:
+    """Places at some instants, known to `known_m`, plus the distance since, +- (5 m + 5 %)."""
+    centre = at_m + counter.distance_m(since_ns, t_ns)
+    half = beside_m(counter.driven_m(since_ns, t_ns), known_m, config)
     return centre - half, centre + half
 
 
@@ -112,7 +117,7 @@ def between_anchors(
     t_ns: Ints,
     config: Configuration,
 ) -> Interval:
-    """Least and largest coordinate between two anchors at these coordinates (DOMAIN section 5.1, carrying).
+    """Between two anchors at these coordinates (DOMAIN section 5.1, carrying).
 
     Where the odometer of a vehicle file closes, the inverse-variance mean of both +- (k sigmas + closing error), as the
     whole closing error may have arisen at one place. Else the hull of both.
@@ -140,10 +145,9 @@ def closes(counter: Counter, anchors: tuple[TrueAnchor, TrueAnchor], apart_m: fl
     begin, end = anchors
     end_ns = np.array([end.t_ns])
     way = counter.between(begin.t_ns, end_ns)
-    if counter.by_file:
-        root = np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + way.variance_m2)
-        limit = config.hazards.evidence_factor * root
-    else:
+    root = np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + way.variance_m2)
+    limit = config.hazards.evidence_factor * root
+    if not counter.by_file:
         limit = beside_m(counter.driven_m(begin.t_ns, end_ns), 0.0, config)
     return bool((np.abs(apart_m - way.distance_m) <= limit)[0])
 
@@ -156,7 +160,7 @@ def carried_forward(
     stood: Sequence[tuple[int, int]],
     config: Configuration,
 ) -> Interval:
-    """Least and largest path position of the train [m]: last accepted balise, plus the distance since, +- (5 m + 5 %).
+    """Path position of the train: the last accepted balise, plus the distance since, +- (5 m + 5 %).
 
     NaN before the first balise, over a break and over a stand in `stood`. `accepted_ns` in order, at `path_m` of the
     solution's own path, with which the odometer grows.
@@ -167,34 +171,28 @@ def carried_forward(
     if used.size:
         last = np.searchsorted(accepted_ns[used], t_ns, side="right") - 1
         rows = np.flatnonzero(last >= 0)
-        since_vb = used[last[rows]]
-        interval = _since_accepted(counter, accepted_ns[since_vb], path_m[since_vb], t_ns[rows], config)
+        since = used[last[rows]]
         # A stand between balise and instant: the wheel may have stood while the train ran.
         over_stand = np.zeros(rows.size, dtype=np.bool_)
         for begin_ns, end_ns in stood:
-            over_stand |= (t_ns[rows] >= begin_ns) & (accepted_ns[since_vb] <= end_ns)
-        low[rows], high[rows] = (np.where(over_stand, np.nan, values) for values in interval)
+            over_stand |= (t_ns[rows] >= begin_ns) & (accepted_ns[since] <= end_ns)
+        interval = _carried_from(counter, accepted_ns[since], path_m[since], t_ns[rows], 0.0, config)
+        low[rows], high[rows] = np.where(over_stand, np.nan, interval)
     return low, high
-
-
-def _since_accepted(counter: Counter, since_ns: Ints, at_m: Floats, t_ns: Ints, config: Configuration) -> Interval:
-    """Each balise plus the distance since it, +- (5 m + 5 %) (SUBSET-041 5.3.1.1)."""
-    centre = at_m + counter.distance_m(since_ns, t_ns)
-    half = beside_m(counter.driven_m(since_ns, t_ns), 0.0, config)
-    return centre - half, centre + half
 
 
 def _consistent(accepted_ns: Ints, path_m: Floats, counter: Counter, config: Configuration) -> Ints:
     """Accepted balises that agree, within the failure limit, with the odometer since the last one that did."""
     used: list[int] = []
     limit_m = config.hazards.failure_limit_m
-    for number in range(path_m.size):
-        here = slice(number, number + 1)  # arrays of one, as `_since_accepted` takes them
+    for number, at_m in enumerate(path_m.tolist()):
+        here_ns = accepted_ns[number : number + 1]
         if used:
-            before = np.array(used[-1:])
-            low, high = _since_accepted(counter, accepted_ns[before], path_m[before], accepted_ns[here], config)
-            if path_m[number] < low[0] - limit_m or path_m[number] > high[0] + limit_m:
+            before = used[-1]
+            since_ns = accepted_ns[before : before + 1]
+            low, high = _carried_from(counter, since_ns, float(path_m[before]), here_ns, 0.0, config)
+            if at_m < low[0] - limit_m or at_m > high[0] + limit_m:
                 continue
-        if counter.odometer.known_at(accepted_ns[here])[0]:
+        if counter.odometer.known_at(here_ns)[0]:
             used.append(number)
     return np.array(used, dtype=np.int64)

@@ -34,10 +34,9 @@ class RecorderLag:
 class RecorderClock:
     """How a recorder's clock is taken: its stamps less `shift_s`, +- `delta_s`; `assumed`: it could not be measured."""
 
-    lag: RecorderLag
     shift_s: float
     delta_s: float
-    assumed: bool
+    assumed: bool = False
 
 
 def clock_of(lag: RecorderLag, vehicle_file: bool, config: HazardConfig) -> RecorderClock:
@@ -46,13 +45,12 @@ def clock_of(lag: RecorderLag, vehicle_file: bool, config: HazardConfig) -> Reco
     `vehicle_file`: it gives the latency of the GNSS against the odometer, whose clock the judge uses then.
     """
     noise_s = config.evidence_factor * lag.sigma_s
-    if noise_s <= config.evidence_clock_s:
-        if vehicle_file:
-            return RecorderClock(lag, lag.lag_s, noise_s, assumed=False)
-        return RecorderClock(lag, 0.0, abs(lag.lag_s) + noise_s, assumed=False)
-    if abs(lag.lag_s) > noise_s:
-        return RecorderClock(lag, 0.0, abs(lag.lag_s) + noise_s, assumed=False)
-    return RecorderClock(lag, 0.0, config.evidence_clock_s, assumed=True)
+    measured = noise_s <= config.evidence_clock_s
+    if measured and vehicle_file:
+        return RecorderClock(lag.lag_s, noise_s)
+    if measured or abs(lag.lag_s) > noise_s:
+        return RecorderClock(0.0, abs(lag.lag_s) + noise_s)
+    return RecorderClock(0.0, config.evidence_clock_s, assumed=True)
 
 
 def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None) -> RecorderLag:
@@ -74,14 +72,9 @@ def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None)
     half = begin_ns.size // 2
     parts = (slice(None, half), slice(half, None))
     halves = [_rest_of_lag(begin_ns[part], end_ns[part], way_m[part], counter, lag_s) for part in parts]
-    comparable_s = [rest_s for rest_s, half_sigma_s in halves if half_sigma_s < 3.0 * sigma_s]
-    if len(comparable_s) == 2:
-        sigma_s = max(sigma_s, 0.5 * abs(comparable_s[0] - comparable_s[1]))
+    if max(half_sigma_s for _, half_sigma_s in halves) < 3.0 * sigma_s:
+        sigma_s = max(sigma_s, 0.5 * abs(halves[0][0] - halves[1][0]))
     return RecorderLag(float(lag_s), float(sigma_s))
-
-
-def _shifted(t_ns: Ints, lag_s: float) -> Ints:
-    return np.asarray(t_ns - round(lag_s * NS_PER_S), dtype=np.int64)
 
 
 def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter) -> float:
@@ -89,7 +82,8 @@ def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter)
     lags_s = np.arange(-_FARTHEST_S, _FARTHEST_S + _STEP_S, _STEP_S)
     spreads = []
     for lag_s in lags_s.tolist():
-        counted = counter.distance_m(_shifted(begin_ns, lag_s), _shifted(end_ns, lag_s))
+        lag_ns = round(lag_s * NS_PER_S)
+        counted = counter.distance_m(begin_ns - lag_ns, end_ns - lag_ns)
         known = np.isfinite(counted)
         enough = known.sum() >= 0.5 * known.size and float(np.abs(counted[known]).sum()) > 0.0
         spreads.append(float(np.median(np.abs(way_m - counted)[known])) if enough else np.inf)
@@ -100,24 +94,22 @@ def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter)
 
 def _rest_of_lag(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter, lag_s: float) -> tuple[float, float]:
     """The remaining lag once `lag_s` is taken off, and its sigma [s], infinite where the ways cannot show it."""
-    begin_ns = _shifted(begin_ns, lag_s)
-    end_ns = _shifted(end_ns, lag_s)
-    counted = counter.distance_m(begin_ns, end_ns)
-    change = counter.speed_mps(end_ns) - counter.speed_mps(begin_ns)
+    lag_ns = round(lag_s * NS_PER_S)
+    counted = counter.distance_m(begin_ns - lag_ns, end_ns - lag_ns)
+    change = counter.speed_mps(end_ns - lag_ns) - counter.speed_mps(begin_ns - lag_ns)
     # Noise of the odometer would look like a lag. Where its recording begins or ends the speed is NaN, not a change.
     change = np.where(np.abs(change) <= counter.odometer.deadband_mps, 0.0, change)
-    used = np.isfinite(counted) & np.isfinite(change)
-    if used.sum() < _FEWEST:
-        return 0.0, np.inf
+    design = np.column_stack([counted, -change])
+    used = np.isfinite(design).all(axis=1)
     estimate = np.array([1.0, 0.0])
     sigma = np.inf
     for _ in range(_ROUNDS):
-        design = np.column_stack([counted, -change])[used]
-        normal = design.T @ design
-        if used.sum() < _FEWEST or np.linalg.det(normal) <= 1e-9 * max(float(np.prod(np.diag(normal))), 1e-9):
+        normal = design[used].T @ design[used]
+        singular = np.linalg.det(normal) <= 1e-9 * max(float(np.prod(np.diag(normal))), 1e-9)
+        if used.sum() < _FEWEST or singular:
             return 0.0, np.inf
-        estimate = np.linalg.solve(normal, design.T @ way_m[used])
-        residual = way_m - np.column_stack([counted, -change]) @ estimate
+        estimate = np.linalg.solve(normal, design[used].T @ way_m[used])
+        residual = way_m - design @ estimate
         spread = float(np.std(residual[used]) * np.sqrt(used.sum() / (used.sum() - 2.0)))
         sigma = spread * float(np.sqrt(np.linalg.inv(normal)[1, 1]))
         # 1.4826 MAD is the sigma of normal residuals, whatever a few outliers do.

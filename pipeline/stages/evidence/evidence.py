@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.evidence.anchors import (
-    KnownStretch,
-    Sided,
-    known_stretch,
-    on_clock,
-    outside,
-    read_anchors,
-    reference_lag,
-    sided,
-)
+from pipeline.stages.evidence import anchors
+from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
 from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried
 from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, clock_of, lag_of
-from pipeline.stages.evidence.gaps import Gap, GapChain, gaps_of, unreachable, without_sign
+from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
@@ -47,7 +39,7 @@ class Alternative:
     def middle_m(self) -> Floats:
         return 0.5 * (self.low_m + self.high_m)
 
-    def where(self, kept: Bools) -> Alternative:
+    def where(self, kept: Bools | Ints) -> Alternative:
         """At some of its instants only."""
         return Alternative(self.rows[kept], self.route, self.low_m[kept], self.high_m[kept])
 
@@ -60,20 +52,11 @@ class Alternative:
 class EvidenceSet:
     """Evidence at instants: where there are several alternatives the train was on one of them.
 
-    `kind`: number in `KINDS`, -1 where nothing is known; `disputed`: where reference and reads exclude each other.
+    `kind`: number in `KINDS`, -1 where nothing is known.
     """
 
     kind: Ints
     alternatives: tuple[Alternative, ...]
-    disputed: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-
-
-@dataclass(frozen=True)
-class Carried:
-    """What one odometer carries from anchors, by its gaps."""
-
-    counter: Counter
-    gaps: tuple[Gap, ...]
 
 
 @dataclass(frozen=True)
@@ -96,27 +79,32 @@ class TrainEvidence:
     stood: tuple[Span, ...] = ()
 
     @property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Those of the odometer of the LDS."""
+        return self.carried[0].gaps if self.carried else ()
+
+    @property
     def contradicted(self) -> int:
         """Gaps between anchors whose length by the odometer, scaled by the vehicle file, fits no way on the track."""
-        by_file = [carried.gaps for carried in self.carried[:1] if carried.counter.by_file]
-        return sum(bool(gap.ways) and len(gap.anchors) == 2 and not gap.closed for gaps in by_file for gap in gaps)
+        by_file = bool(self.carried) and self.carried[0].counter.by_file
+        return sum(bool(gap.ways) and len(gap.anchors) == 2 and not gap.closed for gap in self.gaps if by_file)
 
     @property
     def unreachable(self) -> int:
         """Pairs of anchors that no train can have passed one after the other."""
-        return sum(len(unreachable(carried.gaps)) for carried in self.carried[:1])
+        return sum(gap.unreachable for gap in self.gaps)
 
     @property
     def disputed(self) -> int:
         """Reads that exclude the reference at k_T sigmas: at k = 3 noise alone would do so in a long run."""
         t_ns = self.reads_ns
-        kind = np.full(self.reads_ns.size, NOTHING)
+        anywhere = np.ones(t_ns.size, dtype=np.bool_)
         factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
-        by_reference = self._covered(t_ns, kind == NOTHING, kind)
-        by_reads = self._carried(self.by_reads, t_ns, kind != NOTHING, kind)
-        wide_reference = [alternative.widened(factor) for alternative in by_reference]
-        wide_reads = [alternative.widened(factor) for alternative in by_reads]
-        return int(common(wide_reference, wide_reads, t_ns.size)[1].size)
+        kind = np.full(t_ns.size, NOTHING)
+        by_reference = [there.widened(factor) for there in self._covered(t_ns, anywhere, kind)]
+        # Outside the time of the reference there is nothing to exclude.
+        by_reads = [there.widened(factor) for there in self._carried(self.by_reads, t_ns, kind != NOTHING, kind)]
+        return int(common(by_reference, by_reads, t_ns.size)[1].size)
 
     @property
     def clock_assumed(self) -> bool:
@@ -126,8 +114,8 @@ class TrainEvidence:
     @property
     def anchored_ns(self) -> Span | None:
         """First and last anchor; None without anchors."""
-        times = [anchor.t_ns for carried in self.carried[:1] for gap in carried.gaps for anchor in gap.anchors]
-        times += [int(t_ns) for carried in self.stretches for t_ns in carried.t_ns[[0, -1]]]
+        times = [anchor.t_ns for gap in self.gaps for anchor in gap.anchors]
+        times += [int(t_ns) for stretch in self.stretches for t_ns in stretch.t_ns[[0, -1]]]
         return (min(times), max(times)) if times else None
 
     def at(self, t_ns: Ints) -> EvidenceSet:
@@ -136,44 +124,26 @@ class TrainEvidence:
         heard = ~within_spans(t_ns, self.silent)
         alternatives = self._covered(t_ns, heard, kind)
         alternatives += self._carried(self.carried, t_ns, heard & (kind == NOTHING), kind)
-        if not self.stretches or not self.by_reads:
-            return EvidenceSet(kind, tuple(alternatives))
-        of_reads = np.full(t_ns.size, NOTHING)
-        by_reads = self._carried(self.by_reads, t_ns, heard, of_reads)
-        both, disputed = common(alternatives, by_reads, t_ns.size)
-        return EvidenceSet(np.where(kind == NOTHING, of_reads, kind), tuple(both), disputed=disputed)
+        if self.stretches and self.by_reads:
+            of_reads = np.full(t_ns.size, NOTHING)
+            by_reads = self._carried(self.by_reads, t_ns, heard, of_reads)
+            alternatives, _ = common(alternatives, by_reads, t_ns.size)
+            kind = np.where(kind == NOTHING, of_reads, kind)
+        return EvidenceSet(kind, tuple(alternatives))
 
     def _covered(self, t_ns: Ints, heard: Bools, kind: Ints) -> list[Alternative]:
-        """By the reference: straight lines between samples, each +- (k sigma + speed times clock)."""
-        factor = self.config.hazards.evidence_factor
+        """By the reference; writes into `kind` where it speaks."""
         alternatives: list[Alternative] = []
         for stretch in self.stretches:
             rows = np.flatnonzero((t_ns >= stretch.t_ns[0]) & (t_ns <= stretch.t_ns[-1]) & heard)
-            after = np.searchsorted(stretch.t_ns, t_ns[rows], side="left")
-            before = np.where(stretch.t_ns[after] == t_ns[rows], after, np.maximum(after - 1, 0))
-            half = factor * stretch.sigma_m + stretch.clock_m
-            half = np.maximum(half[before], half[after])
-            since = (t_ns[rows] - stretch.t_ns[0]).astype(np.float64)
             for path in stretch.paths:
-                leg = path.path.leg
-                stamps = stretch.t_ns - stretch.t_ns[0]
-                centre = np.interp(since, stamps, path.at_m)
-                low = np.minimum((path.low_m - path.at_m)[before], (path.low_m - path.at_m)[after])
-                high = np.maximum((path.high_m - path.at_m)[before], (path.high_m - path.at_m)[after])
-                # No straight line leads over a contradicted step: its moment is not known.
-                stepping = np.where(before != after, path.step_m[before], 0.0)
-                low = low - stepping
-                high = high + stepping
-                for number in np.unique(leg[before]).tolist():
-                    on_leg = np.flatnonzero((leg[before] == number) & (leg[after] == number))
-                    low_m = (centre + low - half)[on_leg]
-                    high_m = (centre + high + half)[on_leg]
-                    alternatives.append(Alternative(rows[on_leg], path.path.legs[number], low_m, high_m))
-                    kind[rows[on_leg]] = KINDS.index(Kind.REFERENCE)
+                for there in _on_path(stretch, path, rows, t_ns[rows], self.config.hazards.evidence_factor):
+                    alternatives.append(there)
+                    kind[there.rows] = KINDS.index(Kind.REFERENCE)
         return alternatives
 
     def _carried(self, sources: Sequence[Carried], t_ns: Ints, wanted: Bools, kind: Ints) -> list[Alternative]:
-        """By each odometer, from the anchors of its gaps: the train was where one of them says."""
+        """By each odometer, from the anchors of its gaps: the train was where one of them says; writes into `kind`."""
         alternatives: list[Alternative] = []
         for source in sources:
             open_rows = wanted.copy()
@@ -183,22 +153,39 @@ class TrainEvidence:
                     inside &= ~_after_standing(t_ns, gap, self.stood)
                 rows = np.flatnonzero(inside)
                 for way in gap.ways or [] if rows.size else []:
-                    low, high = self._interval(source.counter, gap, way, t_ns[rows])
-                    reached = np.isfinite(low)
-                    route = way.chain.route(self.network)
-                    alternatives.append(Alternative(rows[reached], route, low[reached], high[reached]))
-                    open_rows[rows[reached]] = False
+                    low_m, high_m = self._interval(source.counter, gap, way, t_ns[rows])
+                    there = Alternative(rows, way.chain.route(self.network), low_m, high_m).where(np.isfinite(low_m))
+                    alternatives.append(there)
+                    open_rows[there.rows] = False
                     by_read = any(anchor.kind is Kind.BALISE for anchor in gap.anchors)
-                    kind[rows[reached]] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
+                    kind[there.rows] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
         return alternatives
 
     def _interval(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints) -> Interval:
         if gap.begin is not None and gap.end is not None:
-            begin_m, end_m = way.at_m
-            return between_anchors(counter, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.config)
-        (anchor,) = gap.anchors
-        (at_m,) = way.at_m
-        return carried(counter, anchor, at_m, t_ns, self.config)
+            return between_anchors(counter, (gap.begin, gap.end), (way.at_m[0], way.at_m[1]), t_ns, self.config)
+        return carried(counter, gap.anchors[0], way.at_m[0], t_ns, self.config)
+
+
+def _on_path(stretch: KnownStretch, path: KnownPath, rows: Ints, t_ns: Ints, factor: float) -> list[Alternative]:
+    """Straight lines between samples, each +- (k sigma + speed times clock), leg by leg; `rows`: of the instants."""
+    after = np.searchsorted(stretch.t_ns, t_ns, side="left")
+    before = np.where(stretch.t_ns[after] == t_ns, after, np.maximum(after - 1, 0))
+    half_m = factor * stretch.sigma_m + stretch.clock_m
+    since_ns = (t_ns - stretch.t_ns[0]).astype(np.float64)
+    centre_m = np.interp(since_ns, stretch.t_ns - stretch.t_ns[0], path.at_m)
+    behind_m = path.low_m - path.at_m
+    ahead_m = path.high_m - path.at_m
+    # No straight line leads over a contradicted step: its moment is not known.
+    stepping_m = np.where(before != after, path.step_m[before], 0.0)
+    widest_m = np.maximum(half_m[before], half_m[after])
+    low_m = centre_m + (np.minimum(behind_m[before], behind_m[after]) - stepping_m) - widest_m
+    high_m = centre_m + (np.maximum(ahead_m[before], ahead_m[after]) + stepping_m) + widest_m
+    leg = path.path.leg
+    return [
+        Alternative(rows, path.path.legs[number], low_m, high_m).where((leg[before] == number) & (leg[after] == number))
+        for number in np.unique(leg[before]).tolist()
+    ]
 
 
 def common(first: Sequence[Alternative], second: Sequence[Alternative], size: int) -> tuple[list[Alternative], Ints]:
@@ -207,23 +194,24 @@ def common(first: Sequence[Alternative], second: Sequence[Alternative], size: in
     Where they agree: the net elements common to both, with the narrower interval. Where only one speaks, or they
     exclude each other, every alternative of either stays possible.
     """
-    spoken = np.zeros((2, size), dtype=np.bool_)
-    for source, alternatives in enumerate((first, second)):
-        for alternative in alternatives:
-            spoken[source, alternative.rows] = True
     narrowed = [_narrowed(left, right) for left in first for right in second]
-    agreed = np.zeros(size, dtype=np.bool_)
-    for alternative in narrowed:
-        agreed[alternative.rows] = True
+    agreed = _spoken(narrowed, size)
     alone = [alternative.where(~agreed[alternative.rows]) for alternative in (*first, *second)]
-    return narrowed + alone, np.flatnonzero(spoken.all(axis=0) & ~agreed)
+    return narrowed + alone, np.flatnonzero(_spoken(first, size) & _spoken(second, size) & ~agreed)
+
+
+def _spoken(alternatives: Sequence[Alternative], size: int) -> Bools:
+    spoken = np.zeros(size, dtype=np.bool_)
+    for alternative in alternatives:
+        spoken[alternative.rows] = True
+    return spoken
 
 
 def _narrowed(first: Alternative, second: Alternative) -> Alternative:
     """Where the intervals of both overlap, at the instants of both; in coordinates of the first's route."""
     _, in_first, in_second = np.intersect1d(first.rows, second.rows, assume_unique=True, return_indices=True)
-    first = Alternative(first.rows[in_first], first.route, first.low_m[in_first], first.high_m[in_first])
-    second = Alternative(second.rows[in_second], second.route, second.low_m[in_second], second.high_m[in_second])
+    first = first.where(in_first)
+    second = second.where(in_second)
     element, measure_m, sense = first.route.locate(first.middle_m)
     at_m, along = second.route.coordinate(element, measure_m, second.middle_m)
     ends_m = [first.middle_m + sense * along * (end_m - at_m) for end_m in (second.low_m, second.high_m)]
@@ -268,69 +256,41 @@ def evidence_of(
     by_file = vehicle.gnss_latency_s is not None
     counters = [Counter.of(odometer) for odometer in odometers]
     main = counters[0] if counters else None
-    sides = [sided(stretch, main, config.matching.orientation_distance_m) for stretch in reference[0]]
-    carrier = _Carrier.of(sides, network, config)
-    of_reference = clock_of(reference_lag(sides, main), by_file, hazards)
-    recorded_reads = read_anchors(reads, balises, network.track, hazards)
-    lag_of_reads = RecorderLag() if main is None else _lag_of_reads(carrier.by(main, _points(recorded_reads)))
+    least_m = config.matching.orientation_distance_m
+    sides = [anchors.sided(stretch, main, least_m) for stretch in reference[0]]
+    facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
+    turned = any(min(side.with_m, side.against_m) >= least_m for side in sides)
+    searches = [GapSearch(counter, network, config, facing, turned) for counter in counters]
+    of_reference = clock_of(anchors.reference_lag(sides, main), by_file, hazards)
+    recorded = anchors.read_anchors(reads, balises, network.track, hazards)
+    lag_of_reads = RecorderLag() if main is None else _lag_of_reads(searches[0].carried(_points(recorded)))
     of_reads = clock_of(lag_of_reads, by_file, hazards)
-    clocked_reads = [] if main is None else on_clock(recorded_reads, of_reads, main)
-    reads_ns = np.array([stretch.t_ns for stretch in clocked_reads], dtype=np.int64)
+    clocked = [] if main is None else anchors.on_clock(recorded, of_reads, main)
     ahead_m = vehicle.gnss_antenna_ahead_m
-    stretches = tuple(known_stretch(side, of_reference, counters, clocked_reads, ahead_m, config) for side in sides)
-    reads_apart = outside(clocked_reads, stretches)
+    stretches = tuple(anchors.known_stretch(side, of_reference, counters, clocked, ahead_m, config) for side in sides)
+    apart = anchors.outside(clocked, stretches)
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return TrainEvidence(
         stretches=stretches,
         silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]),
         carried=tuple(
-            carrier.by(counter, [*(stretch.ends(counter) for stretch in stretches), *_points(reads_apart)])
-            for counter in counters
+            search.carried([*(stretch.ends(search.counter) for stretch in stretches), *_points(apart)])
+            for search in searches
         ),
-        by_reads=tuple(carrier.by(counter, _points(clocked_reads)) for counter in counters) if stretches else (),
-        reads_ns=reads_ns,
-        clocks=(of_reference,) * bool(stretches) + (of_reads,) * bool(reads_apart),
+        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if stretches else (),
+        reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
+        clocks=(of_reference,) * bool(stretches) + (of_reads,) * bool(apart),
         network=network,
         config=config,
     )
 
 
-def _points(anchors: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
-    return [(anchor, anchor) for anchor in anchors]
-
-
-@dataclass(frozen=True)
-class _Carrier:
-    """What every odometer carries over: the network, and which way the train ran as the odometer of the LDS counted up.
-
-    `facing`: oriented net elements; `turned`: it counted up in both directions.
-    """
-
-    network: Network
-    config: Configuration
-    facing: frozenset[int]
-    turned: bool
-
-    @classmethod
-    def of(cls, sides: Sequence[Sided], network: Network, config: Configuration) -> _Carrier:
-        least_m = config.matching.orientation_distance_m
-        facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
-        return cls(network, config, facing, any(min(side.with_m, side.against_m) >= least_m for side in sides))
-
-    def by(self, counter: Counter, borders: list[tuple[TrueAnchor, TrueAnchor]]) -> Carried:
-        """The gaps between what is known; an odometer that counts up in both directions carries over no stand."""
-        if not borders:
-            return Carried(counter, ())
-        borders = sorted(borders, key=lambda border: border[0].t_ns)
-        gaps = gaps_of(borders, self.facing, counter, self.network, self.config)
-        if self.turned or without_sign(gaps, self.facing, self.network):
-            counter = Counter.of(counter.odometer, without_sign=True)
-            gaps = gaps_of(borders, self.facing, counter, self.network, self.config)
-        return Carried(counter, tuple(gaps))
+def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    return [(anchor, anchor) for anchor in known]
 
 
 def _lag_of_reads(source: Carried) -> RecorderLag:
     """The clock of the reads against the odometer's, by the ways between reads that one closed chain leaves."""
-    between = [(gap.begin_ns, gap.end_ns, way.at_m[1] - way.at_m[0]) for gap in source.gaps for way in gap.alone]
-    begins, ends, ways = zip(*between, strict=True) if between else ((), (), ())
-    return lag_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(ways, np.float64), source.counter)
+    ways = [(gap.begin_ns, gap.end_ns, way.apart_m) for gap in source.gaps for way in gap.alone]
+    begins, ends, lengths = zip(*ways, strict=True) if ways else ((), (), ())
+    return lag_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(lengths, np.float64), source.counter)

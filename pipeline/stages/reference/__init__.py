@@ -4,7 +4,7 @@ In: the reference stream, the survey as a network. Out: stretches of samples wit
 Nothing that came from GNSS or the odometer is known here.
 
 Which elements lie near which samples: `near`. Where may the train have left the survey: `open_ends`. Which ways lead
-through a stretch: `visits`, and which of them lie near enough: `stretches`.
+through a stretch: `moves`, `visits`, and which of them lie near enough: `stretches`.
 """
 
 from pipeline.stages.reference.stretches import ReferencePath, ReferenceStretch, reference_stretches

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import dist
 
 import numpy as np
 import polars as pl
 
+from pipeline.stages.reference.moves import Moves
 from pipeline.stages.reference.near import Foot, Near, near_elements
 from pipeline.stages.reference.open_ends import off_the_survey
 from pipeline.stages.reference.visits import ElementStay, Node, Transition, nodes_of, pieces_of, ways_over
 from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.geodesy import Points, points_of
-from pipeline.stages.track.network import MIN_REACH_M, Network
+from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
@@ -45,22 +47,10 @@ class ReferenceStretch:
     paths: tuple[ReferencePath, ...]
 
 
-@dataclass(frozen=True)
-class ReferenceSamples:
-    """The samples of a run in order of time."""
-
-    t_ns: Ints
-    points: Points
-    sigma_m: Floats
-
-    def take(self, rows: Ints) -> ReferenceSamples:
-        return ReferenceSamples(self.t_ns[rows], self.points.take(rows), self.sigma_m[rows])
-
-
 def reference_stretches(
     reference: pl.DataFrame | None, network: Network, numbers: dict[str, int], config: Configuration
 ) -> tuple[list[ReferenceStretch], list[tuple[int, int]]]:
-    """Stretches of the reference with their ways, and the times at which it was heard and lay nowhere [ns].
+    """Stretches of the reference with their ways, and the times at which samples exist but lie on no track [ns].
 
     `network`: with elements that turn round in pieces; `numbers`: net elements as the caller counts them. An element is
     in the set if a navigable way through the whole stretch runs over it, whose median distance from the samples is
@@ -68,21 +58,24 @@ def reference_stretches(
     """
     if reference is None or reference.is_empty():
         return [], []
-    stated = reference["sigma_m"].fill_null(config.hazards.reference_sigma_m).to_numpy()
+    hazards = config.hazards
+    t_ns = times_ns(reference)
+    sigma_m = reference["sigma_m"].fill_null(hazards.reference_sigma_m).to_numpy()
     points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))
-    samples = ReferenceSamples(times_ns(reference), points, stated)
     # A sample beyond k_T roots of every track is no sample of the track.
-    factor = config.align.sure_sigmas
-    near = near_elements(samples.points, samples.sigma_m, network, factor, config.hazards.survey_sigma_m)
-    off_survey = off_the_survey(samples.points, samples.sigma_m, near, network, config.hazards)
-    placed = np.flatnonzero(near.any_near & ~off_survey)
+    near = near_elements(points, sigma_m, network, config.align.sure_sigmas, hazards.survey_sigma_m)
+    placed = np.flatnonzero(near.any_near & ~off_the_survey(points, sigma_m, near, network, hazards))
+    search = _Search(points, sigma_m, near, network, numbers, config)
     stretches: list[ReferenceStretch] = []
-    covered = np.zeros(samples.t_ns.size, dtype=np.bool_)
-    for rows in _between_gaps(samples.t_ns, placed, config.hazards.reference_gap_s):
-        for stretch in _placed(samples, near, rows, network, numbers, config):
-            stretches.append(stretch)
-            covered[np.searchsorted(samples.t_ns, stretch.t_ns)] = True
-    return stretches, _silent_spans(samples.t_ns, covered, config.hazards.reference_gap_s)
+    covered = np.zeros(t_ns.size, dtype=np.bool_)
+    for rows in _between_gaps(t_ns, placed, hazards.reference_gap_s):
+        part = search.passable(rows)
+        paths = search.paths(part)
+        if paths:
+            inside = slice(part.begin, part.end + 1)
+            stretches.append(ReferenceStretch(t_ns[inside], sigma_m[inside], paths))
+            covered[inside] = True
+    return stretches, _silent_spans(t_ns, covered, hazards.reference_gap_s)
 
 
 def _between_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
@@ -103,236 +96,169 @@ def _silent_spans(t_ns: Ints, covered: Bools, gap_s: float) -> list[tuple[int, i
         before_ns = int(known_ns[after - 1]) if after else at_ns - gap_ns
         after_ns = int(known_ns[after]) if after < known_ns.size else at_ns + gap_ns
         begin_ns = max(before_ns, at_ns - gap_ns) + 1
-        end_ns = min(after_ns, at_ns + gap_ns)
         if spans and begin_ns <= spans[-1][1]:
             begin_ns = spans.pop()[0]
-        spans.append((begin_ns, end_ns))
+        spans.append((begin_ns, min(after_ns, at_ns + gap_ns)))
     return spans
 
 
-def _placed(
-    samples: ReferenceSamples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
-) -> list[ReferenceStretch]:
-    """The stretches of samples without a gap among them: each part with a way through, with all ways that do not fail.
-
-    A part without any such way, or with more than `routes_limit`, is left out.
+@dataclass(frozen=True)
+class _Part:
+    """Samples some metres apart (`steps`, by their numbers) with a way through: oriented elements at the first, and the
+    moves to each next one.
     """
-    part_samples = samples.take(rows)
-    all_steps = _steps(part_samples)
-    stretches: list[ReferenceStretch] = []
-    for part in _connected(list(_parts(part_samples, near.feet(rows[all_steps]), all_steps, network))):
-        steps = all_steps[part.first : part.last + 1]
-        last = len(part.layers)
-        nodes = nodes_of(part.starts, part.layers)
-        failed = _failed(nodes, near, rows, part_samples.sigma_m, steps, config)
-        ways = ways_over(nodes, last, failed, config.hazards.routes_limit)
-        if ways:
-            paths = tuple(_path(way.stays(last), near, rows, steps, network, numbers) for way in ways)
-            inside = slice(int(steps[0]), int(steps[-1]) + 1)
-            stretches.append(ReferenceStretch(part_samples.t_ns[inside], part_samples.sigma_m[inside], paths))
-    return stretches
 
+    steps: Ints
+    starts: set[int]
+    layers: list[list[Transition]]
 
-def _steps(samples: ReferenceSamples) -> Ints:
-    """Samples some metres apart, those where the train turned, the first and the last."""
-    surface = samples.points.surface
-    apart_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m).tolist()
-    places = surface.tolist()
-    steps = [0]
-    far = 0
-    far_m = 0.0
-    for number, place in enumerate(places):
-        away_m = dist(place, places[steps[-1]])
-        turned = far_m - away_m > 0.5 * apart_m[number]
-        if turned or away_m >= apart_m[number]:
-            steps.append(far if turned else number)
-            far = number
-            far_m = dist(place, places[steps[-1]])
-        elif away_m > far_m:
-            far = number
-            far_m = away_m
-    if steps[-1] != len(places) - 1:
-        steps.append(len(places) - 1)
-    return np.array(steps, dtype=np.int64)
+    @property
+    def begin(self) -> int:
+        return int(self.steps[0])
+
+    @property
+    def end(self) -> int:
+        return int(self.steps[-1])
+
+    @cached_property
+    def nodes(self) -> list[Node]:
+        return nodes_of(self.starts, self.layers)
 
 
 @dataclass(frozen=True)
-class _PassableSteps:
-    """Steps with a way through: the first of them, oriented elements there, and the moves to each next step.
+class _Search:
+    """The samples of a run, and where they may lie on the network."""
 
-    `onward`: whether a train may have gone from the last step of one part to the first of another.
-    """
+    points: Points
+    sigma_m: Floats
+    near: Near
+    network: Network
+    numbers: dict[str, int]
+    config: Configuration
 
-    first: int
-    starts: set[int]
-    layers: list[list[Transition]]
-    onward: Callable[[int, int], bool]
+    def passable(self, rows: Ints) -> _Part:
+        """The longest part of samples without a gap among them that a train can have run.
 
-    @property
-    def last(self) -> int:
-        return self.first + len(self.layers)
+        Where no move leads on, the reference leapt to another track: of the other parts nobody knows.
+        """
+        return max(self._parts(self._steps(rows)), key=lambda part: len(part.layers))
 
+    def _steps(self, rows: Ints) -> Ints:
+        """Samples some metres apart, those where the train turned, the first and the last."""
+        places = self.points.surface[rows].tolist()
+        steps = [0]
+        far = 0
+        far_m = 0.0
+        for number, apart_m in enumerate(np.maximum(_STEP_M, 6.0 * self.sigma_m[rows]).tolist()):
+            away_m = dist(places[number], places[steps[-1]])
+            turned = far_m - away_m > 0.5 * apart_m
+            if turned or away_m >= apart_m:
+                steps.append(far if turned else number)
+                far = number
+                far_m = dist(places[number], places[steps[-1]])
+            elif away_m > far_m:
+                far = number
+                far_m = away_m
+        if steps[-1] != rows.size - 1:
+            steps.append(rows.size - 1)
+        return rows[steps]
 
-def _parts(
-    samples: ReferenceSamples, feet: Sequence[Sequence[Foot]], steps: Ints, network: Network
-) -> Iterator[_PassableSteps]:
-    """The parts of the steps; a new one begins where no move leads on: the reference leapt to another track."""
-    at_m = samples.points.surface[steps]
-    noise_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m[steps])
-    places = [_inside(one, network) for one in feet]
+    def _parts(self, steps: Ints) -> Iterator[_Part]:
+        """The parts of the steps; a new one begins where no move leads on."""
+        places = [self._inside(feet) for feet in self.near.feet(steps)]
+        apart_m = np.linalg.norm(np.diff(self.points.surface[steps], axis=0), axis=1)
+        noise_m = np.maximum(_STEP_M, 6.0 * self.sigma_m[steps[1:]])
+        moves = Moves(self.network)
+        first = 0
+        layers: list[list[Transition]] = []
+        alive = starts = {2 * element for element in places[0]}
+        for step, limit_m in enumerate(np.minimum(_CURVED * apart_m + noise_m, _FARTHEST_M).tolist()):
+            here = places[step]
+            there = places[step + 1]
+            onward = [move for start in sorted(alive) for move in moves.onward(start, here, there, limit_m)]
+            if onward:
+                layers.append(onward)
+                alive = {move.to for move in onward}
+            else:
+                yield _Part(steps[first : step + 1], starts, layers)
+                first = step + 1
+                layers = []
+                alive = starts = {2 * element for element in there}
+        yield _Part(steps[first:], starts, layers)
 
-    def limit_m(step: int, next_step: int) -> float:
-        return min(float(_CURVED * np.linalg.norm(at_m[next_step] - at_m[step]) + noise_m[next_step]), _FARTHEST_M)
+    def _inside(self, feet: Sequence[Foot]) -> dict[int, float]:
+        """Net elements of one sample and its measure on each, without those past whose end it is nearer to the next."""
+        distances = {foot.element: foot.distance_m for foot in feet}
 
-    network_moves = _Onward(network)
+        def beyond(foot: Foot) -> bool:
+            following = () if foot.end is None else self.network.successors[2 * foot.element + 1 - foot.end]
+            return any(distances.get(edge.to // 2, np.inf) < foot.distance_m for edge in following)
 
-    def onward(step: int, next_step: int) -> bool:
-        ways_round = [2 * element + side for element in places[step] for side in (0, 1)]
-        limit = limit_m(step, next_step)
-        return any(any(network_moves.moves(one, places[step], places[next_step], limit)) for one in ways_round)
+        return {foot.element: foot.measure_m for foot in feet if not beyond(foot)}
 
-    first = 0
-    layers = list[list[Transition]]()
-    alive = starts = {2 * element for element in places[0]}
-    for step in range(len(places) - 1):
-        here = places[step]
-        there = places[step + 1]
-        limit = limit_m(step, step + 1)
-        moves = [move for one in sorted(alive) for move in network_moves.moves(one, here, there, limit)]
-        if moves:
-            layers.append(moves)
-            alive = {move.to for move in moves}
-        else:
-            yield _PassableSteps(first, starts, layers, onward)
-            first = step + 1
-            layers = []
-            alive = starts = {2 * element for element in there}
-    yield _PassableSteps(first, starts, layers, onward)
+    def paths(self, part: _Part) -> tuple[ReferencePath, ...]:
+        """All ways through a part that do not fail; none where they are more than `routes_limit`."""
+        last = len(part.layers)
+        ways = ways_over(part.nodes, last, self._failed(part), self.config.hazards.routes_limit)
+        return tuple(self._path(stays, part) for stays in ways)
 
+    def _failed(self, part: _Part) -> set[Node]:
+        """Visits of pieces that lie farther from the samples than k roots, by the median; without samples none does.
 
-def _connected(parts: list[_PassableSteps]) -> list[_PassableSteps]:
-    """The longest part, and those that a train can have come from or gone on to: where else it was nobody knows."""
-    longest = max(range(len(parts)), key=lambda number: len(parts[number].layers))
-    kept = [parts[longest]]
-    for ahead in parts[longest + 1 :]:
-        if ahead.onward(kept[-1].last, ahead.first):
-            kept.append(ahead)
-    for before in parts[:longest][::-1]:
-        if before.onward(before.last, kept[0].first):
-            kept.insert(0, before)
-    return kept
+        The root is that of the sample and of the survey, of all elements compared the one that is known worst.
+        """
+        near = self.near
+        survey_m = np.zeros(part.end - part.begin + 1)
+        for node in part.nodes:
+            pairs = near.of(node.oriented // 2, int(part.steps[node.first]), int(part.steps[node.last]))
+            row = near.sample[pairs] - part.begin
+            survey_m[row] = np.maximum(survey_m[row], near.survey_sigma_m[pairs])
+        sigma_m = self.sigma_m[part.begin : part.end + 1]
+        root_m = self.config.hazards.evidence_factor * np.hypot(sigma_m, survey_m)
+        failed: set[Node] = set()
+        for piece in pieces_of(part.nodes):
+            sampled = [node for node in piece if node.sampled]
+            if not sampled:
+                continue
+            begin = int(part.steps[min(node.first for node in sampled)])
+            end = int(part.steps[max(node.last for node in sampled)])
+            distance_m = np.full(end - begin + 1, np.inf)
+            for element in {node.oriented // 2 for node in piece}:
+                pairs = near.of(element, begin, end)
+                row = near.sample[pairs] - begin
+                distance_m[row] = np.minimum(distance_m[row], near.distance_m[pairs])
+            if np.median(distance_m / root_m[begin - part.begin : end - part.begin + 1]) > 1.0:
+                failed |= set(piece)
+        return failed
 
-
-def _inside(feet: Sequence[Foot], network: Network) -> dict[int, float]:
-    """Net elements of one sample with its measure on each, without those past whose end it is nearer to the next."""
-    distances = {foot.element: foot.distance_m for foot in feet}
-
-    def beyond(foot: Foot) -> bool:
-        following = () if foot.end is None else network.successors[2 * foot.element + 1 - foot.end]
-        return any(distances.get(edge.to // 2, np.inf) < foot.distance_m for edge in following)
-
-    return {foot.element: foot.measure_m for foot in feet if not beyond(foot)}
-
-
-class _Onward:
-    """Moves over the network, of a length up to a limit."""
-
-    def __init__(self, network: Network) -> None:
-        self.network = network
-        self.known: dict[int, tuple[float, list[tuple[int, float, tuple[int, ...]]]]] = {}
-
-    def moves(
-        self, start: int, here: dict[int, float], there: dict[int, float], limit_m: float
-    ) -> Iterator[Transition]:
-        """From an oriented element at one step to those near the next, forward or back."""
-        element = start // 2
-        along_m = self.network.track.along_m
-        if element in there and abs(there[element] - here[element]) <= limit_m:
-            yield Transition(start, start)
-        for back in (0, 1):
-            left_m = self.network.length_m(start) - along_m(start ^ back, here[element])
-            for to, gap_m, between in self._from(start ^ back, limit_m - left_m) if left_m <= limit_m else ():
-                if to // 2 in there and left_m + gap_m + along_m(to, there[to // 2]) <= limit_m:
-                    yield Transition(start, to ^ back, tuple(oriented ^ back for oriented in between), bool(back))
-
-    def _from(self, side: int, limit_m: float) -> list[tuple[int, float, tuple[int, ...]]]:
-        """What can be entered beyond the end of an oriented element, how far beyond, and over which elements."""
-        searched_m, entered = self.known.get(side, (-1.0, []))
-        if searched_m < limit_m:
-            searched_m = max(limit_m, MIN_REACH_M)
-            entered = []
-            open_ways = [(side, 0.0, tuple[int, ...]())]
-            while open_ways:
-                last, gone_m, between = open_ways.pop()
-                for edge in self.network.successors[last]:
-                    if edge.forward and gone_m + edge.gap_m <= searched_m:
-                        entered.append((edge.to, gone_m + edge.gap_m, between))
-                        length_m = self.network.length_m(edge.to)
-                        open_ways.append((edge.to, gone_m + edge.gap_m + length_m, (*between, edge.to)))
-            self.known[side] = searched_m, entered
-        return entered
-
-
-def _failed(
-    nodes: Sequence[Node], near: Near, rows: Ints, sigma_m: Floats, steps: Ints, config: Configuration
-) -> set[Node]:
-    """Visits of pieces that lie farther from the samples than k roots, by the median; without samples none does.
-
-    The root is that of the sample and of the survey, of all elements compared the one that is known worst.
-    """
-    survey_m = np.zeros(rows.size)
-    for node in nodes:
-        pairs = near.of(node.oriented // 2, int(rows[steps[node.first]]), int(rows[steps[node.last]]))
-        row = near.sample[pairs] - rows[0]
-        survey_m[row] = np.maximum(survey_m[row], near.survey_sigma_m[pairs])
-    root_m = config.hazards.evidence_factor * np.hypot(sigma_m, survey_m)
-    failed: set[Node] = set()
-    for piece in pieces_of(nodes):
-        sampled = [node for node in piece if node.sampled]
-        if not sampled:
-            continue
-        begin = int(steps[min(node.first for node in sampled)])
-        end = int(steps[max(node.last for node in sampled)])
-        distance_m = np.full(end - begin + 1, np.inf)
-        for element in {node.oriented // 2 for node in piece}:
-            pairs = near.of(element, int(rows[begin]), int(rows[end]))
-            row = near.sample[pairs] - rows[begin]
-            distance_m[row] = np.minimum(distance_m[row], near.distance_m[pairs])
-        if np.median(distance_m / root_m[begin : end + 1]) > 1.0:
-            failed |= set(piece)
-    return failed
-
-
-def _path(
-    stays: Sequence[ElementStay], near: Near, rows: Ints, steps: Ints, network: Network, numbers: dict[str, int]
-) -> ReferencePath:
-    """A way with coordinates: each sample on the nearest of the elements that the way visits about then."""
-    begin = int(steps[0])
-    count = int(steps[-1] - steps[0]) + 1
-    nearest_m = np.full(count, np.inf)
-    at_m = np.full(count, np.nan)
-    leg = np.full(count, -1)
-    legs, placed = _legs(stays, network)
-    for stay, (number, entry_m) in zip(stays, placed, strict=True):
-        low = max(stay.first - 1, 0)
-        high = min(stay.last + 1, steps.size - 1)
-        pairs = near.of(stay.oriented // 2, int(rows[steps[low]]), int(rows[steps[high]]))
-        sample = near.sample[pairs] - rows[begin]
-        nearer = near.distance_m[pairs] < nearest_m[sample]
-        sample = sample[nearer]
-        pair = np.arange(pairs.start, pairs.stop)[nearer]
-        measure_m = near.measure_m[pair]
-        element = stay.oriented // 2
-        along_m = measure_m - network.track.begin_m[element]
-        against_m = network.track.end_m[element] - measure_m
-        nearest_m[sample] = near.distance_m[pair]
-        leg[sample] = number
-        at_m[sample] = entry_m + (against_m if stay.oriented % 2 else along_m)
-    on_way = np.flatnonzero(leg >= 0)
-    samples = np.arange(count)
-    leg = leg[on_way[np.maximum(np.searchsorted(on_way, samples, side="right") - 1, 0)]]
-    routes = tuple(chain.route(network, numbers) for chain in legs)
-    return ReferencePath(leg, np.interp(samples, on_way, at_m[on_way]), routes)
+    def _path(self, stays: Sequence[ElementStay], part: _Part) -> ReferencePath:
+        """A way with coordinates: each sample on the nearest of the elements that the way visits about then."""
+        near = self.near
+        track = self.network.track
+        count = part.end - part.begin + 1
+        nearest_m = np.full(count, np.inf)
+        at_m = np.full(count, np.nan)
+        leg = np.full(count, -1)
+        legs, placed = _legs(stays, self.network)
+        for stay, (number, entry_m) in zip(stays, placed, strict=True):
+            element = stay.oriented // 2
+            low = part.steps[max(stay.first - 1, 0)]
+            high = part.steps[min(stay.last + 1, part.steps.size - 1)]
+            pairs = near.of(element, int(low), int(high))
+            sample = near.sample[pairs] - part.begin
+            nearer = near.distance_m[pairs] < nearest_m[sample]
+            sample = sample[nearer]
+            measure_m = near.measure_m[pairs][nearer]
+            against = stay.oriented % 2
+            along_m = track.end_m[element] - measure_m if against else measure_m - track.begin_m[element]
+            nearest_m[sample] = near.distance_m[pairs][nearer]
+            leg[sample] = number
+            at_m[sample] = entry_m + along_m
+        on_way = np.flatnonzero(leg >= 0)
+        samples = np.arange(count)
+        leg = leg[on_way[np.maximum(np.searchsorted(on_way, samples, side="right") - 1, 0)]]
+        routes = tuple(chain.route(self.network, self.numbers) for chain in legs)
+        return ReferencePath(leg, np.interp(samples, on_way, at_m[on_way]), routes)
 
 
 def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
@@ -345,7 +271,7 @@ def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], 
     here = 0
     for stay in stays[1:]:
         chain = chains[-1]
-        last = chains[-1].oriented[here]
+        last = chain.oriented[here]
         onward = here + (-1 if stay.back else 1)
         if 0 <= onward < len(chain.oriented) and chain.oriented[onward] == stay.oriented:
             here = onward

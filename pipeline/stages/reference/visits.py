@@ -53,24 +53,6 @@ class ElementStay:
     back: bool
 
 
-@dataclass(frozen=True)
-class WayThrough:
-    """A way through a stretch: its first visit, and how it goes on."""
-
-    start: Node
-    links: tuple[Link, ...]
-
-    def stays(self, last: int) -> list[ElementStay]:
-        """The elements that it runs over, in order of time; `last`: the last step."""
-        nodes = [self.start, *(link.there for link in self.links)]
-        # A link behind step `at` enters a sampled element at the next step, one passed between samples at the same.
-        entered = [0, *(link.at + int(link.there.sampled) for link in self.links)]
-        left = [*(link.at for link in self.links), last]
-        backs = [False, *(link.back for link in self.links)]
-        rows = zip(nodes, entered, left, backs, strict=True)
-        return [ElementStay(node.oriented, begin, end, back) for node, begin, end, back in rows]
-
-
 def nodes_of(starts: set[int], layers: Sequence[Sequence[Transition]]) -> list[Node]:
     """Visits of every element that lies on a way from the first step to the last.
 
@@ -88,13 +70,11 @@ def nodes_of(starts: set[int], layers: Sequence[Sequence[Transition]]) -> list[N
                 following[move.to] = current[move.start]
                 current[move.start].last = step + 1
         for move in moves:
-            if move.stays:
-                continue
             if move.to not in following:
                 following[move.to] = Node(move.to, step + 1, step + 1)
                 nodes.append(following[move.to])
             ends = current[move.start], following[move.to]
-            if (ends[0], move.between, ends[1]) not in known:
+            if not move.stays and (ends[0], move.between, ends[1]) not in known:
                 known.add((ends[0], move.between, ends[1]))
                 nodes += _linked(move, *ends, step)
         current = following
@@ -135,7 +115,7 @@ def pieces_of(nodes: Sequence[Node]) -> list[list[Node]]:
     return list({id(piece): piece for piece in pieces.values()}.values())
 
 
-def ways_over(nodes: Sequence[Node], last: int, failed: set[Node], most: int) -> list[WayThrough]:
+def ways_over(nodes: Sequence[Node], last: int, failed: set[Node], most: int) -> list[list[ElementStay]]:
     """Ways from the first step to the last that together run over every link between visits that did not fail.
 
     Nothing where there are more than `most`.
@@ -144,14 +124,13 @@ def ways_over(nodes: Sequence[Node], last: int, failed: set[Node], most: int) ->
     leading_on = _closure(ends, failed, forward=False)
     begins = {node for node in leading_on if node.first == 0 and node.sampled}
     alive = leading_on & _closure(begins, failed, forward=True)
-    ways = [WayThrough(node, ()) for node in nodes if node in begins & ends & alive]
+    ways = [_stays(node, [], last) for node in nodes if node in begins & ends & alive]
     covered: set[Link] = set()
-    alive_links = [link for node in nodes if node in alive for link in node.after if link.there in alive]
-    for link in alive_links:
-        way = None if link in covered else _way_over(link, begins, ends, alive, covered)
-        if way is not None:
-            ways.append(way)
-            covered |= set(way.links)
+    for link in [link for node in nodes if node in alive for link in node.after if link.there in alive]:
+        links = None if link in covered else _way_over(link, begins, ends, alive, covered)
+        if links is not None:
+            ways.append(_stays(links[0].here, links, last))
+            covered |= set(links)
         if len(ways) > most:
             return []
     return ways
@@ -172,7 +151,7 @@ def _closure(start: set[Node], failed: set[Node], forward: bool) -> set[Node]:
 
 def _way_over(
     link: Link, begins: set[Node], ends: set[Node], alive: set[Node], covered: set[Link]
-) -> WayThrough | None:
+) -> list[Link] | None:
     """A whole way over a link, grown at both ends; each next link is the nearest in time, then one not yet covered."""
 
     def nearest(links: list[Link]) -> Link | None:
@@ -180,17 +159,30 @@ def _way_over(
 
     links = [link]
     while links[-1].there not in ends:
-        here = links[-1].there
         at = links[-1].at
-        onward = nearest([link for link in here.after if link.there in alive and link.at >= at])
+        onward = nearest([option for option in links[-1].there.after if option.there in alive and option.at >= at])
         if onward is None:
             return None
         links.append(onward)
     while links[0].here not in begins:
-        there = links[0].here
         at = links[0].at
-        before = nearest([link for link in there.before if link.here in alive and link.at <= at])
+        before = nearest([option for option in links[0].here.before if option.here in alive and option.at <= at])
         if before is None:
             return None
         links.insert(0, before)
-    return WayThrough(links[0].here, tuple(links))
+    return links
+
+
+def _stays(start: Node, links: Sequence[Link], last: int) -> list[ElementStay]:
+    """The elements that a way from a visit over these links runs over, in order of time; `last`: the last step."""
+    stays: list[ElementStay] = []
+    node = start
+    entered = 0
+    back = False
+    for link in links:
+        stays.append(ElementStay(node.oriented, entered, link.at, back))
+        node = link.there
+        # A link behind step `at` enters a sampled element at the next step, one passed between samples at the same.
+        entered = link.at + int(node.sampled)
+        back = link.back
+    return [*stays, ElementStay(node.oriented, entered, last, back)]

@@ -31,6 +31,11 @@ class Pieces:
         return np.clip(piece, begin, last).astype(np.int64)
 
     @property
+    def middle_m(self) -> Floats:
+        middle: Floats = 0.5 * (self.from_m + self.to_m)
+        return middle
+
+    @property
     def names(self) -> list[str]:
         return [self.track.ids[number] for number in self.element]
 
@@ -49,8 +54,7 @@ def pieces_of(site: Site, piece_m: float) -> Pieces:
 
 def middles(site: Site, pieces: Pieces) -> Floats:
     """East and north of each piece's middle [m], `[piece, 2]`."""
-    middle_m = 0.5 * (pieces.from_m + pieces.to_m)
-    return plane_of(site, ground_of(site.track, pl.Series(pieces.names, dtype=pl.String), middle_m))
+    return plane_of(site, ground_of(site.track, pl.Series(pieces.names, dtype=pl.String), pieces.middle_m))
 
 
 def plane_of(site: Site, ground: GroundPositions) -> Floats:

@@ -14,9 +14,9 @@ from pipeline.stages.track.network import Network, network_of
 from pipeline.studies.line.classes import KEYS
 from pipeline.studies.line.pieces import Pieces
 from pipeline.studies.line.spans import SpanState
-from schemas.arrays import Bools, Floats, floats
+from schemas.arrays import Bools
 from schemas.config import LdsConfig
-from schemas.conform import conform
+from schemas.conform import conform, dtypes
 from schemas.enums import BaliseDirection, BaliseKind, Reaction
 from schemas.line import LineBalises, LineCriteria, LineDirection, LineProposals, PieceClass
 from schemas.run import Site
@@ -38,57 +38,39 @@ class LineEvidence:
     lds: LdsConfig
 
 
-@dataclass(frozen=True)
-class _PieceOnWay:
-    """A piece on a way, its middle `at_m` from the begin of the way; `growing`: the way runs with its measure."""
-
-    piece: int
-    at_m: float
-    growing: bool
-
-
-@dataclass(frozen=True)
-class _Proposed:
-    """A balise that was placed; `distance_m` from the one before on the way, over the pieces `since` that one.
-
-    `direction`: along its net element, in which it is valid; a physical one in both.
-    """
-
-    piece: int
-    virtual: bool
-    direction: BaliseDirection
-    distance_m: float | None
-    near: str
-    since: tuple[int, ...]
+_WAY = {"piece": pl.Int64, "at_m": pl.Float64, "growing": pl.Boolean}
+"""A way: pieces in the order of a train, their middles from its begin; `growing`: with their measure."""
+_PLACED: dict[str, pl.DataType | type[pl.DataType]] = {
+    "piece": pl.Int64,
+    "growing": pl.Boolean,
+    "virtual": pl.Boolean,
+    "distance_m": pl.Float64,
+    "since": pl.List(pl.Int64),
+}
+"""A balise on a piece of a way; `distance_m` from the one before, over the pieces `since` that one."""
 
 
 def proposals(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
     """`LineProposals` and `LineBalises`; none where no piece is suitable."""
     rows = []
-    balises = []
+    balises = [pl.DataFrame(schema=dtypes(LineBalises))]
     ways = _ways(line)
     growing = np.ones(len(line.pieces.element), dtype=np.bool_)
-    for place in (place for way in ways for place in way):
-        growing[place.piece] = place.growing
+    for way in ways:
+        growing[way["piece"].to_numpy()] = way["growing"].to_numpy()
+    near = _near(line)
     for mode, sides in MODES.items():
         allowed = _allowed(line, sides, growing)
         if not allowed.any():
             continue
         for spacing_m in line.criteria.spacings_m:
             name = f"{mode}-{spacing_m:g}m"
-            placed = _disjoint(
-                line, [placement for way in ways for placement in _walk(line, way, allowed, sides, spacing_m)]
-            )
+            walked = [row for way in ways for row in _walk(way, allowed, near["near_m"], spacing_m, line.criteria)]
+            placed = _disjoint(line, _placed(line, walked, sides, near["near"]))
             balises.append(_balises(line, name, placed))
             rows.append(_figures(line, name, spacing_m, mode, placed, growing))
-    empty = {name: pl.Series([], dtype=column.dtype) for name, column in LineBalises.columns().items()}
-    table = pl.concat(balises) if balises else pl.DataFrame(empty)
-    return _conformed(rows), conform(table, LineBalises)
-
-
-def _conformed(rows: list[dict[str, object]]) -> pl.DataFrame:
-    schema = {name: column.dtype for name, column in LineProposals.columns().items()}
-    return conform(pl.DataFrame(rows, schema=schema), LineProposals)
+    table = pl.DataFrame(rows, schema=dtypes(LineProposals))
+    return conform(table, LineProposals), conform(pl.concat(balises), LineBalises)
 
 
 def site_balises(balises: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
@@ -105,14 +87,6 @@ def site_balises(balises: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     )
 
 
-def _travelled(line: LineEvidence) -> Bools:
-    """Pieces that some run passed, whatever was found there; `[piece, 0 growing 1 falling]`."""
-    seen = np.zeros((len(line.pieces.element), 2), dtype=np.bool_)
-    rows = line.passes.filter(line.passes["state"] != int(SpanState.WRONG_TRACK)).select("piece", "growing").unique()
-    seen[rows["piece"].to_numpy(), (~rows["growing"]).cast(pl.Int64).to_numpy()] = True
-    return seen
-
-
 def _allowed(line: LineEvidence, sides: Sequence[bool], growing: Bools) -> Bools:
     """Pieces suitable in every one of these directions along their ways."""
     suitable = (line.table["piece_class"].cast(pl.String) == PieceClass.SUITABLE.value).to_numpy()
@@ -123,17 +97,17 @@ def _allowed(line: LineEvidence, sides: Sequence[bool], growing: Bools) -> Bools
     return allowed
 
 
-def _ways(line: LineEvidence) -> list[list[_PieceOnWay]]:
-    """The pieces of the travelled net elements in chains that trains can run, each element once."""
+def _ways(line: LineEvidence) -> list[pl.DataFrame]:
+    """The pieces of the travelled net elements in chains that trains can run (`_WAY`), each element once."""
     network = network_of(line.pieces.track, line.site.links)
-    seen = _travelled(line).any(axis=1)
-    wanted = {int(element) for element in np.unique(line.pieces.element[seen])}
+    passed = line.passes.filter(pl.col("state") != int(SpanState.WRONG_TRACK))["piece"].unique()
+    wanted = {int(element) for element in np.unique(line.pieces.element[passed.to_numpy()])}
     ways = []
     while wanted:
         start = min(
             (2 * piece + side for piece in wanted for side in (0, 1)), key=lambda way: _rank(network, way, wanted)
         )
-        ways.append(list(_chain(network, line.pieces, start, wanted)))
+        ways.append(pl.DataFrame(list(_chain(network, line.pieces, start, wanted)), schema=_WAY, orient="row"))
     return ways
 
 
@@ -143,184 +117,145 @@ def _rank(network: Network, oriented: int, wanted: set[int]) -> tuple[int, int]:
     return min(entries, 1), oriented
 
 
-def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> Iterator[_PieceOnWay]:
+def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> Iterator[tuple[int, float, bool]]:
     oriented: int | None = start
     entry_m = 0.0
     while oriented is not None:
-        element = oriented // 2
+        element, against = divmod(oriented, 2)
         wanted.discard(element)
         numbers = range(int(pieces.first[element]), int(pieces.first[element + 1]))
         begin_m = float(pieces.from_m[numbers[0]])
         end_m = float(pieces.to_m[numbers[-1]])
-        for number in numbers if oriented % 2 == 0 else reversed(numbers):
-            middle_m = 0.5 * float(pieces.from_m[number] + pieces.to_m[number])
-            at_m = middle_m - begin_m if oriented % 2 == 0 else end_m - middle_m
-            yield _PieceOnWay(number, entry_m + at_m, oriented % 2 == 0)
+        for number in reversed(numbers) if against else numbers:
+            middle_m = float(pieces.middle_m[number])
+            yield number, entry_m + (end_m - middle_m if against else middle_m - begin_m), not against
         edges = [edge for edge in network.successors[oriented] if edge.to // 2 in wanted]
         entry_m += network.length_m(oriented) + (edges[0].gap_m if edges else 0.0)
         oriented = edges[0].to if edges else None
 
 
+def _near(line: LineEvidence) -> pl.DataFrame:
+    """`near, near_m`: per piece the nearest station or signal of the same net element; else "" and infinite."""
+    pieces = line.pieces
+    names = np.full(len(pieces.element), "", dtype=object)
+    nearest_m = np.full(len(pieces.element), np.inf)
+    for name, element_name, measure_m in line.points.select("name", "netelement_id", "measure_m").iter_rows():
+        away_m = np.abs(pieces.middle_m - measure_m)
+        here = pieces.element == pieces.track.index[element_name]
+        nearer = here & (away_m <= line.criteria.near_m) & (away_m < nearest_m)
+        names[nearer] = name
+        nearest_m[nearer] = away_m[nearer]
+    return pl.DataFrame({"near": pl.Series(names.tolist(), dtype=pl.String), "near_m": nearest_m})
+
+
 def _walk(
-    line: LineEvidence, way: Sequence[_PieceOnWay], allowed: Bools, sides: Sequence[bool], spacing_m: float
-) -> Iterator[_Proposed]:
-    """At each step the best piece about a spacing on; where none is allowed a physical one.
+    way: pl.DataFrame, allowed: Bools, near_m: pl.Series, spacing_m: float, criteria: LineCriteria
+) -> Iterator[tuple[object, ...]]:
+    """Rows of `_PLACED`: at each step the best piece about a spacing on; where none is allowed a physical one.
 
     Best is near a station or signal, then at the spacing itself.
     """
-    at_m = np.array([place.at_m for place in way])
-    good = allowed[[place.piece for place in way]]
-    spacing_m = min(spacing_m, line.criteria.longest_m)
-    near = _near(line)
-    play_m = line.criteria.spacing_play * spacing_m
-    longest_m = min(spacing_m + play_m, line.criteria.longest_m)
+    piece, at_m, growing = (way[name].to_numpy() for name in _WAY)
+    away_m = near_m.to_numpy()[piece]
+    spacing_m = min(spacing_m, criteria.longest_m)
+    play_m = criteria.spacing_play * spacing_m
+    longest_m = min(spacing_m + play_m, criteria.longest_m)
     last_m = float(at_m[0]) - spacing_m
     begun = False
-    limit_m = float(at_m[-1])
-    while last_m + spacing_m <= limit_m:
+    while last_m + spacing_m <= at_m[-1]:
+        off_m = np.abs(at_m - (last_m + spacing_m))
         inside = (at_m >= last_m + spacing_m - play_m) & (at_m <= last_m + longest_m)
-        choice = _best(way, np.flatnonzero(inside & good), last_m + spacing_m, near)
-        virtual = choice is not None
-        index = int(np.argmin(np.abs(at_m - last_m - spacing_m))) if choice is None else choice
-        distance_m = float(at_m[index]) - last_m if begun else None
-        since = tuple(place.piece for place in way if last_m < place.at_m <= at_m[index])
-        direction = _direction(way[index], sides) if virtual else BaliseDirection.BOTH
-        yield _Proposed(
-            way[index].piece, virtual, direction, distance_m, near.get(way[index].piece, ("", 0.0))[0], since
-        )
-        last_m = max(float(at_m[index]), last_m + spacing_m - play_m)
+        virtual = np.flatnonzero(inside & allowed[piece])
+        index = virtual[np.lexsort((off_m[virtual], away_m[virtual]))[0]] if virtual.size else int(off_m.argmin())
+        here_m = float(at_m[index])
+        since = piece[(at_m > last_m) & (at_m <= here_m)].tolist()
+        yield int(piece[index]), bool(growing[index]), virtual.size > 0, here_m - last_m if begun else None, since
+        last_m = max(here_m, last_m + spacing_m - play_m)
         begun = True
 
 
-def _direction(place: _PieceOnWay, sides: Sequence[bool]) -> BaliseDirection:
-    """In which direction along its net element a balise serves travel ahead along the way, or against it."""
-    if len(sides) > 1:
-        return BaliseDirection.BOTH
-    return BaliseDirection.AB if place.growing == sides[0] else BaliseDirection.BA
-
-
-def _best(
-    way: Sequence[_PieceOnWay],
-    candidates: np.ndarray[tuple[int], np.dtype[np.int64]],
-    target_m: float,
-    near: dict[int, tuple[str, float]],
-) -> int | None:
-    def worth(index: int) -> tuple[bool, float, float]:
-        served = near.get(way[index].piece)
-        return served is None, served[1] if served else 0.0, abs(way[index].at_m - target_m)
-
-    return min((int(index) for index in candidates), key=worth, default=None)
-
-
-def _near(line: LineEvidence) -> dict[int, tuple[str, float]]:
-    """Pieces near stations and signals of the same net element: name and distance [m]."""
-    nearest: dict[int, tuple[str, float]] = {}
-    middle_m = 0.5 * (line.pieces.from_m + line.pieces.to_m)
-    for name, element_name, measure_m in line.points.select("name", "netelement_id", "measure_m").iter_rows():
-        element = line.pieces.track.index[element_name]
-        for piece in range(int(line.pieces.first[element]), int(line.pieces.first[element + 1])):
-            away_m = abs(float(middle_m[piece]) - measure_m)
-            if away_m <= line.criteria.near_m and (piece not in nearest or away_m < nearest[piece][1]):
-                nearest[piece] = (name, away_m)
-    return nearest
-
-
-def _disjoint(line: LineEvidence, placed: list[_Proposed]) -> list[_Proposed]:
-    """Without balises whose windows linking cannot tell apart, as where ways meet; the later one goes."""
-    while True:
-        named = {f"B{placement.piece}": placement for placement in placed}
-        balises = _named(line, placed).with_columns(balise_id=pl.Series(list(named), dtype=pl.String))
-        # Announced in one list, whatever their kind.
-        table = site_balises(balises, line.criteria).with_columns(kind=pl.lit(BaliseKind.VIRTUAL.value))
-        clashes = window_findings(replace(line.site, balises=table), line.lds)
-        if not clashes:
-            return placed
-        gone = {max(clash.place.removeprefix("balises ").split(", "), key=list(named).index) for clash in clashes[:1]}
-        placed = [placement for name, placement in named.items() if name not in gone]
-
-
-def _named(line: LineEvidence, placed: Sequence[_Proposed]) -> pl.DataFrame:
-    """Place, kind and direction of each balise."""
-    piece = [placement.piece for placement in placed]
-    middle_m = 0.5 * (line.pieces.from_m + line.pieces.to_m)[piece]
-    names = line.pieces.names
-    kind = [(BaliseKind.VIRTUAL if placement.virtual else BaliseKind.PHYSICAL).value for placement in placed]
-    columns = {
-        "netelement_id": [names[number] for number in piece],
-        "measure_m": np.round(middle_m, 3),
-        "kind": kind,
-        "direction": [placement.direction.value for placement in placed],
-    }
-    return pl.DataFrame(columns, schema={name: LineBalises.columns()[name].dtype for name in columns})
-
-
-def _balises(line: LineEvidence, name: str, placed: Sequence[_Proposed]) -> pl.DataFrame:
-    why = pl.format("{} {}: {}", "direction", "piece_class", "cause").str.join(", ")
-    worst = dict(line.table.group_by("piece").agg(why).iter_rows())
-    proved = _allowed(line, MODES["both"], np.ones(len(line.pieces.element), dtype=np.bool_))
-    errors = dict(line.table.group_by("piece").agg(pl.col("largest_undetected_m").max()).iter_rows())
-    distance = pl.Series([placement.distance_m for placement in placed], dtype=pl.Float64)
-    numbers = {True: 0, False: 0}
-    ids = []
-    for placement in placed:
-        numbers[placement.virtual] += 1
-        ids.append(f"{'VB' if placement.virtual else 'PB'}{numbers[placement.virtual]:03d}")
-    return (
-        _named(line, placed)
-        .with_columns(
-            proposal=pl.lit(name),
-            balise_id=pl.Series(ids, dtype=pl.String),
-            why=pl.Series(
-                ["" if placement.virtual else worst[placement.piece] for placement in placed], dtype=pl.String
-            ),
-            near=pl.Series([placement.near for placement in placed], dtype=pl.String),
-            distance_m=distance,
-            odometer_confidence_m=line.lds.odometer_fixed_m + line.lds.odometer_share * distance,
-            largest_undetected_m=pl.Series([_largest(errors, placement) for placement in placed], dtype=pl.Float64),
-            proved=pl.Series(
-                [bool(proved[placement.piece]) and placement.virtual for placement in placed], dtype=pl.Boolean
-            ),
-        )
-        .select(*LineBalises.columns())
+def _placed(
+    line: LineEvidence, walked: Sequence[tuple[object, ...]], sides: Sequence[bool], near: pl.Series
+) -> pl.DataFrame:
+    """`_PLACED` with place, kind, the direction in which a virtual one serves its travel, and what it is near."""
+    placed = pl.DataFrame(walked, schema=_PLACED, orient="row")
+    piece = placed["piece"].to_numpy()
+    one_way = pl.col("virtual") & (len(sides) == 1)
+    along = pl.when(pl.col("growing") == sides[0]).then(pl.lit(BaliseDirection.AB.value))
+    return placed.with_columns(
+        netelement_id=pl.Series([line.pieces.names[number] for number in piece], dtype=pl.String),
+        measure_m=np.round(line.pieces.middle_m[piece], 3),
+        kind=pl.when("virtual").then(pl.lit(BaliseKind.VIRTUAL.value)).otherwise(pl.lit(BaliseKind.PHYSICAL.value)),
+        direction=pl.when(one_way)
+        .then(along.otherwise(pl.lit(BaliseDirection.BA.value)))
+        .otherwise(pl.lit(BaliseDirection.BOTH.value)),
+        near=near.gather(piece),
     )
 
 
-def _largest(errors: dict[int, float | None], placement: _Proposed) -> float | None:
-    known = (errors.get(piece) for piece in placement.since)
-    return max((error for error in known if error is not None), default=None)
+def _disjoint(line: LineEvidence, placed: pl.DataFrame) -> pl.DataFrame:
+    """Without balises whose windows linking cannot tell apart, as where ways meet; the later one goes."""
+    while True:
+        # Announced in one list, whatever their kind.
+        balises = placed.select(
+            pl.format("B{}", "piece").alias("balise_id"),
+            *("netelement_id", "measure_m", "direction"),
+            kind=pl.lit(BaliseKind.VIRTUAL.value),
+        )
+        clashes = window_findings(replace(line.site, balises=site_balises(balises, line.criteria)), line.lds)
+        if not clashes:
+            return placed
+        order = balises["balise_id"].to_list()
+        gone = max(clashes[0].place.removeprefix("balises ").split(", "), key=order.index)
+        placed = placed.filter(balises["balise_id"] != gone)
+
+
+def _balises(line: LineEvidence, name: str, placed: pl.DataFrame) -> pl.DataFrame:
+    """`LineBalises` of one proposal."""
+    why = pl.format("{} {}: {}", "direction", "piece_class", "cause").str.join(", ")
+    of_pieces = line.table.group_by("piece").agg(why=why, error_m=pl.col("largest_undetected_m").max()).sort("piece")
+    proved = _allowed(line, MODES["both"], np.ones(len(line.pieces.element), dtype=np.bool_))
+    virtual = pl.col("virtual")
+    number = pl.int_range(1, pl.len() + 1).over("virtual").cast(pl.String).str.zfill(3)
+    errors = [of_pieces["error_m"].gather(since).max() for since in placed["since"]]
+    return placed.with_columns(
+        proposal=pl.lit(name),
+        balise_id=pl.when(virtual).then(pl.lit("VB")).otherwise(pl.lit("PB")) + number,
+        why=pl.when(virtual).then(pl.lit("")).otherwise(of_pieces["why"].gather(placed["piece"])),
+        odometer_confidence_m=line.lds.odometer_fixed_m + line.lds.odometer_share * pl.col("distance_m"),
+        largest_undetected_m=pl.Series(errors, dtype=pl.Float64),
+        proved=virtual & pl.Series(proved[placed["piece"].to_numpy()]),
+    ).select(pl.col(column).cast(dtype) for column, dtype in dtypes(LineBalises).items())
 
 
 def _figures(
-    line: LineEvidence, name: str, spacing_m: float, mode: str, placed: Sequence[_Proposed], growing: Bools
+    line: LineEvidence, name: str, spacing_m: float, mode: str, placed: pl.DataFrame, growing: Bools
 ) -> dict[str, object]:
-    virtual = [placement.piece for placement in placed if placement.virtual]
-    sides = [(piece, bool(growing[piece]) == ahead, ahead) for piece in virtual for ahead in MODES[mode]]
+    virtual = placed.filter("virtual")
+    sides = [(piece, bool(growing[piece]) == ahead, ahead) for piece in virtual["piece"] for ahead in MODES[mode]]
     schema = {"piece": pl.Int64, "growing": pl.Boolean, "ahead": pl.Boolean}
     wanted = pl.DataFrame(sides, schema=schema, orient="row")
     sided = line.table.with_columns(growing=pl.col("direction").cast(pl.String) == LineDirection.GROWING.value)
-    lost = wanted.join(sided, on=KEYS).group_by("ahead").agg(pl.col("loss_share").sum(), pl.col("loss_high").sum())
+    lost = wanted.join(sided, on=KEYS).group_by("ahead").agg(pl.col("loss_share", "loss_high").sum())
     decided = (pl.col("state") >= int(SpanState.UNKNOWN)) | (pl.col("state") == int(SpanState.RIGHT))
     judged = line.passes.filter(decided).join(wanted, on=KEYS)
     # What the evidence should have judged and did not may have been wrong.
     maybe = pl.col("state").is_in([int(SpanState.UNKNOWN), int(SpanState.WRONG_IN_USE)])
-    journeys = judged.group_by("run_id").agg(wrong=maybe.any())
-    distances: Floats = np.array([placement.distance_m for placement in placed if placement.distance_m is not None])
-    longest_m = float(distances.max()) if len(distances) else None
-    served = {placement.near for placement in placed if placement.near and placement.virtual}
+    wrong = judged.group_by("run_id").agg(wrong=maybe.any())["wrong"]
+    longest_m = max(placed["distance_m"].drop_nulls().to_list(), default=None)
+    confidence_m = None if longest_m is None else line.lds.odometer_fixed_m + line.lds.odometer_share * longest_m
     return {
         "proposal": name,
         "spacing_m": spacing_m,
         "directions": mode,
-        "virtual": len(virtual),
-        "physical": len(placed) - len(virtual),
+        "virtual": virtual.height,
+        "physical": placed.height - virtual.height,
         "longest_distance_m": longest_m,
-        "odometer_confidence_m": None
-        if longest_m is None
-        else line.lds.odometer_fixed_m + line.lds.odometer_share * longest_m,
-        "expected_lost": max(floats(lost, "loss_share").tolist(), default=None),
-        "expected_lost_high": max(floats(lost, "loss_high").tolist(), default=None),
-        "journeys": journeys.height,
-        "unsafe_high": clopper_pearson(int(journeys["wrong"].sum()), journeys.height, line.criteria.confidence).high,
-        "points_served": len(served),
+        "odometer_confidence_m": confidence_m,
+        "expected_lost": lost["loss_share"].max(),
+        "expected_lost_high": lost["loss_high"].max(),
+        "journeys": len(wrong),
+        "unsafe_high": clopper_pearson(int(wrong.sum()), len(wrong), line.criteria.confidence).high,
+        "points_served": virtual.filter(pl.col("near") != "")["near"].n_unique(),
         "points": line.points.height,
     }

@@ -10,7 +10,7 @@ from typing import Any
 import polars as pl
 
 from pipeline import storage
-from pipeline.results import catalogue, store
+from pipeline.results import store
 from pipeline.results.figures.campaign_figures import derived_tables
 from pipeline.results.figures.map_errors import map_suspects
 from pipeline.results.manifest import NAME, read_manifest
@@ -49,7 +49,7 @@ def assess(out: Address, config: Configuration | None = None, replay: Replay | N
     if config is not None:
         settings = settings.model_copy(update={"safety": config.safety})
     names = ("runs", "hazards", "passages", "alarms")
-    runs, hazards, passages, alarms = (catalogue.scan(out, name).collect() for name in names)
+    runs, hazards, passages, alarms = (store.read_table(out, name).collect() for name in names)
     derived = derived_tables(runs, hazards, passages, alarms, settings)
     of_runs = compare_architectures(out, runs, hazards, alarms, settings)
     tables = {

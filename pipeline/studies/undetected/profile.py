@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.studies.undetected.columns import Diagnosis, rows_of, rows_of_passages
+from pipeline.stages.ride import Ride
+from pipeline.studies.undetected.columns import rows_of, rows_of_passages, windows_of
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.exact import MARGIN, largest_profile
 from pipeline.studies.undetected.steps_and_ramps import largest_of_shape
-from pipeline.studies.undetected.watched import windows
 from schemas.arrays import NS_PER_S, ints, times_ns
-from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from schemas.tables import SCALES
 
@@ -36,57 +35,48 @@ class FaultProfile:
     monitors: tuple[str, ...]
 
 
-def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle, config: Configuration) -> FaultProfile:
+def profile_at(ride: Ride, epoch: int, behind: bool) -> FaultProfile:
     """The largest unnoticed fault at an epoch, ahead or behind in the direction of travel there."""
-    rows = rows_of(diagnosis, vehicle, config)
-    t_ns = times_ns(diagnosis.epochs)
+    epochs = ride.solution.epochs
+    rows = rows_of(ride)
     row = int(np.searchsorted(rows.epoch, epoch))
-    window = next(
-        (candidate for candidate in windows(rows, t_ns, diagnosis.fixes_ns) if candidate.start < row <= candidate.end),
-        None,
-    )
+    window = next((part for part in windows_of(ride, rows) if part.start < row <= part.end), None)
     if window is None or row >= rows.rows or rows.epoch[row] != epoch:
         raise UsageError(
             "has no fault to look for",
             place=f"epoch {epoch}",
             expected="an epoch with a position and an odometer, not negated, after the last independent fix",
         )
-    against = behind != bool(ints(diagnosis.epochs["direction"], unknown=1)[epoch] < 0)
+    against = behind != bool(ints(epochs["direction"], unknown=1)[epoch] < 0)
     part = rows.since(window.start, row, window.since_s)
     seen = part.mirrored() if against else part
     optimum = largest_profile(seen, MARGIN)
-    names = [name for name, on in zip(SCALES, diagnosis.bank.enabled, strict=True) if on or name == "raw"]
+    enabled = ride.bank.along().enabled
+    names = [name for name, on in zip(SCALES, enabled, strict=True) if on or name == "raw"]
     return FaultProfile(
         fault=pl.DataFrame(
             {"t_s": [window.since_s, *part.t_s[1:]], "size_m": -optimum.fault_m if against else optimum.fault_m}
         ),
-        t=pl.Series("t", [window.since_ns, int(t_ns[epoch])]).cast(pl.Datetime("ns", "UTC")),
+        t=pl.Series("t", [window.since_ns, int(times_ns(epochs)[epoch])]).cast(pl.Datetime("ns", "UTC")),
         error_m=optimum.error_m,
-        bound_m=float(largest_errors(seen, config.undetected).most_m[-1]),
+        bound_m=float(largest_errors(seen, ride.prepared.config.undetected).most_m[-1]),
         step_m=largest_of_shape(seen, "step"),
         ramp_m=largest_of_shape(seen, "ramp"),
         monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in optimum.binding),
     )
 
 
-def epoch_of(
-    diagnosis: Diagnosis,
-    passages: pl.DataFrame,
-    crossings: pl.DataFrame,
-    vehicle: Vehicle,
-    config: Configuration,
-    balise: str | None,
-    at_s: float | None,
-) -> int:
+def epoch_of(ride: Ride, balise: str | None, at_s: float | None) -> int:
     """The epoch that is asked for: of the first passage of a balise, the last one up to a time, or the last one."""
-    rows = rows_of(diagnosis, vehicle, config)
-    t_ns = times_ns(diagnosis.epochs)
+    rows = rows_of(ride)
+    passages = ride.lds.passages
     if balise is None:
+        t_ns = times_ns(ride.solution.epochs)
         stamps = t_ns[rows.epoch]
         latest = stamps[-1:].sum() if at_s is None else t_ns[0] + round(at_s * NS_PER_S)
         row = int(np.searchsorted(stamps, latest, side="right")) - 1
         return int(rows.epoch[row]) if row >= 0 else 0
-    at = rows_of_passages(passages, crossings, rows, t_ns, config)
+    at = rows_of_passages(ride, rows)
     of_balise = (passages["balise_id"] == balise).to_numpy() & (at >= 0)
     if not of_balise.any():
         known = ", ".join(passages["balise_id"].unique(maintain_order=True).to_list())

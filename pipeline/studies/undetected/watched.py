@@ -24,6 +24,7 @@ from schemas.run import RunLog
 
 NO_ROW = -1
 _BESIDE_CURVES = ("curvature_per_m", "cross_track_m")
+_RELINKED = ("anchor", "low_m", "high_m", "held_low_m", "held_high_m", "free")
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ def watched(
     threshold = _thresholds(bank, epoch, config.undetected.max_rate_mps)
     alphas = np.array(config.monitors.ewma_alphas)[bank.enabled[1:]]
     learned_m, learned_late_m = _learned(epochs, epoch, vehicle, config)
+    endless = np.full(epoch.size, np.inf)
     rows = Watched(
         epoch=epoch,
         t_s=t_s,
@@ -140,11 +142,11 @@ def watched(
         weight=np.ascontiguousarray(ewma_weight(alphas, series.dt_s[kept])),
         average_mps=np.where(fresh[:, None], 0.0, bank.value[epoch][:, 1:][:, bank.enabled[1:]]),
         threshold_mps=threshold[:, 1:][:, bank.enabled[1:]],
-        low_m=np.full(epoch.size, -np.inf),
-        high_m=np.full(epoch.size, np.inf),
+        low_m=-endless,
+        high_m=endless,
         anchor=np.full(epoch.size, NO_ROW),
-        held_low_m=np.full(epoch.size, -np.inf),
-        held_high_m=np.full(epoch.size, np.inf),
+        held_low_m=-endless,
+        held_high_m=endless,
         learned_m=learned_m,
         learned_late_m=learned_late_m,
     )
@@ -158,7 +160,7 @@ def _thresholds(bank: AxisRecord, epoch: Ints, fastest_mps: float) -> Floats:
     then passes.
     """
     threshold = np.where(np.isfinite(bank.threshold), bank.threshold, np.abs(bank.value) + fastest_mps)[epoch]
-    return np.where(np.isfinite(threshold), threshold, np.inf)
+    return np.nan_to_num(threshold, nan=np.inf, posinf=np.inf, neginf=np.inf)
 
 
 def _share_seen(epochs: pl.DataFrame, epoch: Ints, most: float) -> float:
@@ -191,28 +193,23 @@ def _learned(epochs: pl.DataFrame, epoch: Ints, vehicle: Vehicle, config: Config
 
 def _with_relinks(rows: Watched, held: tuple[Held, ...]) -> Watched:
     """Re-links that held: fault here minus fault at the anchor (none at a telegram) within the bound as recorded."""
-    anchor = rows.anchor.copy()
-    low = rows.low_m.copy()
-    high = rows.high_m.copy()
-    held_low = rows.held_low_m.copy()
-    held_high = rows.held_high_m.copy()
-    free = rows.free.copy()
+    bounds = {name: getattr(rows, name).copy() for name in _RELINKED}
     for relink in held:
         row = int(np.searchsorted(rows.epoch, relink.epoch))
         if row >= rows.rows or rows.epoch[row] != relink.epoch:
             continue
-        late_m = rows.learned_late_m[row]
-        bounds = -relink.bound_m - relink.moved_m - late_m, relink.bound_m - relink.moved_m + late_m
+        room_m = relink.bound_m + rows.learned_late_m[row]
         if relink.anchor_epoch is None:
-            low[row] = max(low[row], bounds[0])
-            high[row] = min(high[row], bounds[1])
+            bounds["low_m"][row] = max(bounds["low_m"][row], -relink.moved_m - room_m)
+            bounds["high_m"][row] = min(bounds["high_m"][row], room_m - relink.moved_m)
         else:
-            anchor[row] = int(np.searchsorted(rows.epoch, relink.anchor_epoch))
-            late_m = rows.learned_late_m[anchor[row]]
-            held_low[row] = bounds[0] - late_m
-            held_high[row] = bounds[1] + late_m
-        free[row] = not rows.fresh[row]
-    return replace(rows, anchor=anchor, low_m=low, high_m=high, held_low_m=held_low, held_high_m=held_high, free=free)
+            anchor = int(np.searchsorted(rows.epoch, relink.anchor_epoch))
+            room_m += rows.learned_late_m[anchor]
+            bounds["anchor"][row] = anchor
+            bounds["held_low_m"][row] = -relink.moved_m - room_m
+            bounds["held_high_m"][row] = room_m - relink.moved_m
+        bounds["free"][row] = not rows.fresh[row]
+    return replace(rows, **bounds)
 
 
 def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...], config: UndetectedConfig) -> Ints:

@@ -43,7 +43,7 @@ def content(exported: Path) -> dict[str, list[tuple[int, Any]]]:
 
 
 def test_every_topic_is_there(content: dict[str, list[tuple[int, Any]]], result: Result) -> None:
-    own = ("raw", "gnss", "matched", "truth", "lds", "monitors", "hazards", "alarms", "passages")
+    own = ("raw", "gnss", "matched", "truth", "lds", "monitors", "hazards", "passages")
     assert set(content) == {"/site/track", "/site/balises", *(f"/primary/{name}" for name in own)}
     assert len(content["/primary/raw"]) == result.log.gnss.height
     assert len(content["/primary/lds"]) == result.tables.epochs.height
@@ -157,7 +157,7 @@ def test_without_site_and_log_the_file_says_what_it_lacks(result: Result, tmp_pa
     to = tmp_path / "bare.mcap"
     _, missing = export_run(result.out, "jump_two", to)
     assert len(missing) == 2
-    assert set(decoded(to)) == {f"/primary/{name}" for name in ("lds", "monitors", "hazards", "alarms", "passages")}
+    assert set(decoded(to)) == {f"/primary/{name}" for name in ("lds", "monitors", "hazards", "passages")}
 
 
 def test_refusals(result: Result, tmp_path: Path) -> None:

@@ -332,7 +332,7 @@ def test_above_the_limit_pages_are_written_on_demand(replayed: dict[str, RunTabl
     whole = data_of(tmp_path, "index.html")
     (index,) = write_report(tmp_path, most_pages=2)
     page = index.read_text()
-    assert "3 runs without a page: <code>balise report OUT --run RUN</code>" in page
+    assert "3 runs without a page: <code>balise report OUT --run RUN</code> (in a project without OUT)" in page
     assert "runs/two.html" not in page
     assert data_of(tmp_path, "index.html")["solutions"] == whole["solutions"]
     assert write_page(tmp_path, "two", most_pages=2) == tmp_path / "report/runs/two.html"

@@ -120,7 +120,10 @@ def test_a_safe_run_says_what_it_rests_on(tmp_path: Path) -> None:
     assert "The largest error that no monitor would have noticed was 14.3 m (not proved on curves)." in banner["known"]
     assert "29.0 m (not proved on curves), beyond the failure limit for 12.5% of the epochs in use." in banner["beyond"]
     for name in ("silent", "all"):
-        assert "no monitor would have noticed was not computed (`balise replay --undetected`)" in banner[name]
+        assert (
+            "no monitor would have noticed was not computed (`balise replay --undetected`; `undetected` in balise.toml)"
+            in banner[name]
+        )
 
 
 def test_physical_balises_are_not_the_worst_for_want_of_a_judge() -> None:

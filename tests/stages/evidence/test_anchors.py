@@ -19,7 +19,7 @@ from schemas.enums import Evidence
 from tests.stages.matching.builders import odometer
 
 CONFIG = Configuration()
-SURE = RecorderClock(RecorderLag(0.0, 0.0), 0.0, 0.0, assumed=False)
+SURE = RecorderClock(0.0, 0.0)
 
 
 def ns(t_s: Floats) -> Ints:

@@ -9,7 +9,7 @@ import pytest
 from pipeline.stages.evidence import evidence_of
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
 from pipeline.stages.evidence.evidence import KINDS, _after_standing
-from pipeline.stages.evidence.gaps import Gap, gaps_of
+from pipeline.stages.evidence.gaps import Gap, GapSearch
 from pipeline.stages.odometry import Odometry, odometry_of
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Floats, Ints
@@ -41,7 +41,7 @@ def test_gaps_are_before_between_and_after_what_is_known() -> None:
     """The odometer counts from 0 to 10 s; the reference tells from 2 to 5 s and from 7 to 9 s."""
     a, b, c, d = (anchor(t_s, 10.0 * t_s) for t_s in (2, 5, 7, 9))
     counter = Counter.of(counting(np.arange(0.0, 110.0, 10.0)))
-    found = gaps_of([(a, b), (c, d)], set(), counter, line("both"), Configuration())
+    found = GapSearch(counter, line("both"), Configuration()).gaps_of([(a, b), (c, d)])
     assert [(gap.begin_ns, gap.end_ns) for gap in found] == [
         tuple(seconds(*ends)) for ends in ((0, 2), (5, 7), (9, 10))
     ]
@@ -54,7 +54,7 @@ def test_where_the_odometer_slipped_a_longer_way_is_one_too(counted_mps: float, 
     config = Configuration(hazards=HazardConfig(slip_m=0.0, slip_share=share))
     a, b = anchor(2, 20.0), anchor(8, 80.0)
     counter = Counter.of(counting(np.arange(11) * counted_mps))
-    _, between, _ = gaps_of([(a, a), (b, b)], set(), counter, line("both"), config)
+    _, between, _ = GapSearch(counter, line("both"), config).gaps_of([(a, a), (b, b)])
     assert bool(between.ways) is known
 
 

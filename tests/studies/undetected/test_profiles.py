@@ -12,7 +12,6 @@ from datasets.faults import FaultSpec, faults_table, offset_m
 from datasets.inject import inject, load_faults
 from pipeline.one_run import replay, ride_alone
 from pipeline.studies.undetected.profile import profile_at
-from pipeline.studies.undetected.ride import diagnosis_of
 from schemas.config import Configuration
 from schemas.errors import ConfigError, UsageError
 from tests.replay.journeys import VEHICLE, journey
@@ -56,11 +55,11 @@ def test_a_fault_along_the_site_moves_the_position_on_its_path_and_not_beside_it
 
 def test_there_is_no_profile_where_nothing_watched() -> None:
     run, site = journey(gnss=ONE_HZ)
-    diagnosis = diagnosis_of(ride_alone(run, site, VEHICLE, Configuration(), "primary"))
+    ride = ride_alone(run, site, VEHICLE, Configuration(), "primary")
     with pytest.raises(UsageError, match="epoch 0"):
-        profile_at(diagnosis, 0, False, VEHICLE, Configuration())
-    found = profile_at(diagnosis, 60, False, VEHICLE, Configuration())
-    behind = profile_at(diagnosis, 60, True, VEHICLE, Configuration())
+        profile_at(ride, 0, False)
+    found = profile_at(ride, 60, False)
+    behind = profile_at(ride, 60, True)
     assert found.fault["size_m"][-1] == pytest.approx(found.error_m)
     assert behind.fault["size_m"][-1] == pytest.approx(-behind.error_m)
     assert found.fault["size_m"][0] == 0.0

@@ -15,10 +15,10 @@ from datasets.inject import inject
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.one_run import replay, ride_alone
-from pipeline.studies.undetected.columns import Diagnosis, rows_of
+from pipeline.stages.ride import Ride
+from pipeline.studies.undetected.columns import rows_of
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.position_tests import range_bounds
-from pipeline.studies.undetected.ride import diagnosis_of
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
@@ -95,13 +95,11 @@ def test_spacing_is_the_way_to_the_limit(tables: RunTables) -> None:
     assert row["physical_spacing_s"] <= first_s
 
 
-def since_the_start(
-    run: RunLog, site: Site, vehicle: Vehicle, settings: Configuration
-) -> tuple[Floats, Ints, Diagnosis]:
+def since_the_start(run: RunLog, site: Site, vehicle: Vehicle, settings: Configuration) -> tuple[Floats, Ints, Ride]:
     """The largest errors ahead since the first row, their epochs, and what watched."""
-    diagnosis = diagnosis_of(ride_alone(run, site, vehicle, settings, "primary"))
-    rows = rows_of(diagnosis, vehicle, settings)
-    return largest_errors(rows.since(0, rows.rows - 1), settings.undetected).most_m, rows.epoch[1:], diagnosis
+    ride = ride_alone(run, site, vehicle, settings, "primary")
+    rows = rows_of(ride)
+    return largest_errors(rows.since(0, rows.rows - 1), settings.undetected).most_m, rows.epoch[1:], ride
 
 
 def test_no_vehicle_file_no_close_bound() -> None:
@@ -155,12 +153,13 @@ def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[
     assert both.satellites is not None
     alone = pl.col("solution") == "gps"
     run = both.with_streams(gnss=both.gnss.filter(alone).head(12), satellites=both.satellites.filter(alone))
-    diagnosis = diagnosis_of(ride_alone(run, site, VEHICLE, Configuration(), "gps"))
-    assert diagnosis.satellites is not None
-    low_m, high_m = range_bounds(diagnosis.epochs, diagnosis.satellites, Configuration())
+    ride = ride_alone(run, site, VEHICLE, Configuration(), "gps")
+    satellites = ride.prepared.ranges("gps")
+    assert satellites is not None
+    low_m, high_m = range_bounds(ride.solution.epochs, satellites, Configuration())
     clean, at = replay(run, site, VEHICLE), 9
     most_m, least_m = -np.inf, np.inf
-    for name in sorted(diagnosis.satellites.filter(pl.col("used"))["sv"].unique()):
+    for name in sorted(satellites.filter(pl.col("used"))["sv"].unique()):
         reached = _unseen(run, site, clean, name, at)
         most_m, least_m = max(most_m, *reached), min(least_m, *reached)
     assert high_m[at] == pytest.approx(most_m, abs=0.02)
@@ -185,9 +184,10 @@ def test_a_second_solution_without_the_fault_holds_it(sky: tuple[RunLog, Site]) 
     # A bank that forgets within seconds holds little by itself.
     chosen = {"monitors": {"channel_reference": "gps", "disabled": ["along_ewma_0p01", "along_ewma_0p001"]}}
     one = Configuration.model_validate({"undetected": {"solutions_at_fault": "one"}} | chosen)
-    held, epoch, diagnosis = since_the_start(*sky, VEHICLE, one)
+    held, epoch, ride = since_the_start(*sky, VEHICLE, one)
     free, _, _ = since_the_start(*sky, VEHICLE, Configuration.model_validate(chosen))
-    room = (floats(diagnosis.channel, "threshold") - floats(diagnosis.channel, "value"))[epoch]
+    channel = ride.singles["channel"]
+    room = (floats(channel, "threshold") - floats(channel, "value"))[epoch]
     assert (held <= room + 1e-9).all()
     assert (held <= free + 1e-9).all()
     assert (held < free - 0.5).any()
