@@ -137,7 +137,6 @@ _LAGS = {
     "1 days": 86_400.0,
     "7 days": 604_800.0,
     "1024 weeks": 619_315_200.0,
-    "1 h and GPS time": 3618.0,
 }
 _O: Stream = "odometer"
 _G: Stream = "gnss"
@@ -248,8 +247,8 @@ def _places() -> list[Wrong]:
         Wrong("latitude south", (*written, "latitude has the wrong sign"), scaled(_G, latitude_deg=-1.0)),
         Wrong("radians", (*written, "radians"), scaled(_G, latitude_deg=np.pi / 180, longitude_deg=np.pi / 180)),
         Wrong("ddmm.mm", (*written, "minutes"), _minutes),
-        Wrong("survey: axes", (*written, "in the survey", "exchanged"), site=lambda site: _turned(site, *axes)),
-        Wrong("reference: feet", ("heights", "of the reference", "feet"), _feet, fails=False, needs=_HEIGHTS),
+        Wrong("survey: axes", (*written, "exchanged"), site=lambda site: _turned(site, *axes)),
+        Wrong("reference: feet", ("heights", "unit"), _feet, fails=False, needs=_HEIGHTS),
         Wrong("reference: axes", ("reference", "exchanged"), exchanged(_R, *axes), needs=("reference.t",)),
         *(
             Wrong(
@@ -259,19 +258,19 @@ def _places() -> list[Wrong]:
             for where, aside, along in (("aside", 1.0, 0.0), ("askew", 0.8, 0.6))
         ),
         *(
-            Wrong(f"survey in EPSG:{code}", (*survey, str(code)), site=in_datum(code), fails=False, place=place)
+            Wrong(f"survey in EPSG:{code}", survey, site=in_datum(code), fails=False, place=place)
             for code, place in _DATUMS.items()
         ),
         Wrong(
             "survey: sea level",
-            ("heights", "geoid"),
+            ("heights", "above the sea"),
             site=moved_site(0.0, 0.0, -47.0),
             fails=False,
             needs=("gnss.height_m",),
         ),
         Wrong(
             "heights in feet",
-            ("heights", "feet"),
+            ("heights", "unit"),
             scaled(_G, height_m=3.2808399),
             fails=False,
             needs=("gnss.height_m",),

@@ -191,27 +191,34 @@ def _make_site(steps: _Steps) -> None:
     config = steps.opened.given_config()
     vehicle = steps.opened.given_vehicle()
     wish = wish_for(steps.opened, entry)
-    site = Path(steps.opened.place(steps.opened.project.site))
-
-    def write() -> list[Path]:
-        steps.call.said("site", f"made of {', '.join(path.name for path in wish.surveys)}")
-        made = make_site(wish, vehicle, config)
-        write_made(made, site_page(site.resolve().name, made), site, True)
-        count = len(made.findings)
-        steps.call.said("site", f"{count} findings in {site / 'findings.csv'}; look at {site / 'site.html'}")
-        names = ("track.parquet", "links.parquet", "balises.parquet", "findings.csv", "site.html")
-        return [site / name for name in names if (site / name).exists()]
-
-    settings = [part.model_dump(mode="json") for part in (entry, vehicle, config.survey, config.site, config.ingest)]
     sources = [*wish.surveys, *([wish.balise_list] if wish.balise_list else [])]
+    _require_there(sources, steps.opened)
+    site = Path(steps.opened.place(steps.opened.project.site))
+    settings = [part.model_dump(mode="json") for part in (entry, vehicle, config.survey, config.site, config.ingest)]
+    product = Product(f"site {steps.opened.project.site}", site, digest_over(settings, sources))
+    if not steps.bring(product, lambda: _write_site(steps, wish, site)):
+        steps.call.said("site", "up to date")
+
+
+def _require_there(sources: Sequence[Path], opened: Opened) -> None:
     for source in sources:
         if not source.exists():
-            remedy = "Put it back, or correct [track]; paths are relative to balise.toml."
             raise UsageError(
-                "does not exist", place=str(source), expected=f"as {steps.opened.file} names it", remedy=remedy
+                "does not exist",
+                place=str(source),
+                expected=f"as {opened.file} names it",
+                remedy="Put it back, or correct [track]; paths are relative to balise.toml.",
             )
-    if not steps.bring(Product(f"site {steps.opened.project.site}", site, digest_over(settings, sources)), write):
-        steps.call.said("site", "up to date")
+
+
+def _write_site(steps: _Steps, wish: Wish, site: Path) -> list[Path]:
+    steps.call.said("site", f"made of {', '.join(path.name for path in wish.surveys)}")
+    made = make_site(wish, steps.opened.given_vehicle(), steps.opened.given_config())
+    write_made(made, site_page(site.resolve().name, made), site, True)
+    count = len(made.findings)
+    steps.call.said("site", f"{count} findings in {site / 'findings.csv'}; look at {site / 'site.html'}")
+    names = ("track.parquet", "links.parquet", "balises.parquet", "findings.csv", "site.html")
+    return [site / name for name in names if (site / name).exists()]
 
 
 def wish_for(opened: Opened, entry: TrackEntry) -> Wish:

@@ -141,36 +141,40 @@ def _looked_at(
     wanted: Wanted, config: IngestConfig, recordings: Recordings, remarks: list[str]
 ) -> tuple[list[SeenLog], list[Path]]:
     """Every log that was named, and of folders those that can be read; then files of folders that may be logs."""
+    named = _named_logs(wanted)
     seen: dict[Path, SeenLog] = {}
-    unread: dict[Path, tuple[BaliseError, bool]] = {}
-    named_places: list[Path] = []
-    surveys = {path.absolute() for path in wanted.track} | {Path(wanted.balises or "").absolute()}
-    for raw in [*_expanded(wanted.raws), *wanted.references]:
-        whole = is_one_log(raw)
-        for path in [raw] if whole else logs_below(raw):
-            place = path.absolute()
-            if place in seen or place in unread or place in surveys:
-                continue
-            named_places.append(place)
-            try:
-                seen[place] = replace(look_at(path, config, wanted.day, recordings), path=place)
-            except BaliseError as error:
-                unread[place] = error, whole and wanted.strict
+    unread: dict[Path, BaliseError] = {}
+    for place, (path, _) in named.items():
+        try:
+            seen[place] = replace(look_at(path, config, wanted.day, recordings), path=place)
+        except BaliseError as error:
+            unread[place] = error
     lost: list[Path] = []
     sure = list(seen.values())
-    for place, (reason, is_needed) in unread.items():
-        log = look_at_dates(place, config, sure)
-        if log is not None:
+    for place, reason in unread.items():
+        if (log := look_at_dates(place, config, sure)) is not None:
             seen[place] = log
             remarks.append(f"{place.name}: days and months of its dates in the order that fits the other logs")
-        elif is_needed:
+        elif named[place][1]:
             raise reason
         elif is_prose(place):
             remarks.append(f"not used: {reason}")
         else:
             lost.append(place)
             remarks.append(f"NOT READ, `balise run` will say so: {reason}")
-    return sorted(seen.values(), key=lambda log: named_places.index(log.path)), lost
+    return [seen[place] for place in named if place in seen], lost
+
+
+def _named_logs(wanted: Wanted) -> dict[Path, tuple[Path, bool]]:
+    """By its place each log as it was named, or lies in a folder; and whether it is an error that it cannot be read."""
+    surveys = {path.absolute() for path in wanted.track} | {Path(wanted.balises or "").absolute()}
+    named: dict[Path, tuple[Path, bool]] = {}
+    for raw in [*_expanded(wanted.raws), *wanted.references]:
+        is_log = is_one_log(raw)
+        for path in [raw] if is_log else logs_below(raw):
+            if path.absolute() not in surveys:
+                named.setdefault(path.absolute(), (path, is_log and wanted.strict))
+    return named
 
 
 def _expanded(raws: Sequence[Path]) -> list[Path]:

@@ -61,11 +61,9 @@ class Column:
 
     @property
     def least_heading(self) -> int:
-        """The width at which the heading takes no more than its lines."""
+        """The width at which the heading takes about three lines, and none of its words breaks."""
         longest = max(map(len, re.split(r"\s+|(?<=_)", self.heading)))
-        widths = range(max(1, longest), len(self.heading) + 1)
-        fits = (width for width in widths if len(_broken_heading(self.heading, width)) <= _HEADING_LINES)
-        return next(fits, max(1, len(self.heading)))
+        return max(1, longest, math.ceil(len(self.heading) / _HEADING_LINES))
 
 
 def fitted(columns: Sequence[Column], width: int | None) -> list[str]:

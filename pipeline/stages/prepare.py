@@ -22,10 +22,8 @@ from schemas.run import RunLog, Site
 
 @dataclass(frozen=True)
 class PreparedRun:
-    """One run on its site, as replay, calibration, injection and route begin with it.
-
-    `recorded`: in order of time; `run`: the same without streams of another day. `odometers`: each as it counted, the
-    one of the LDS first; `odometry`: that one, by the others where it slips.
+    """`recorded`: in order of time; `run`: without streams of another day. `odometers`: each as it counted, the one of
+    the LDS first; `odometry`: that one, by the others where it slips.
     """
 
     recorded: RunLog
@@ -51,7 +49,6 @@ class PreparedRun:
         return self._fixes[solution]
 
     def ranges(self, solution: str) -> pl.DataFrame | None:
-        """Its satellites, where they were recorded."""
         satellites = self.run.satellites
         return None if satellites is None else satellites.filter(pl.col("solution") == solution)
 
@@ -87,7 +84,7 @@ class PreparedRun:
 def prepare(
     run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, clock_advice: ClockAdvice = no_advice
 ) -> PreparedRun:
-    """Clean the streams and make the odometer; `clock_advice` helps where the recorders' times do not meet."""
+    """`clock_advice` helps where the recorders' times do not meet."""
     recorded, counts = clean(run, config, clock_advice)
     journey = of_the_journey(recorded)
     odometry = odometry_of(journey.odometer, vehicle, config)

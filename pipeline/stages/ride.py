@@ -27,8 +27,7 @@ from schemas.enums import NotEvaluated
 class Ride:
     """What the train made of one solution; `odometry` grows with its path.
 
-    `other`: the solution that the channel monitor compares with, on this one's path; `singles`: monitors without
-    memory, by name.
+    `other`: the solution of the channel monitor, on this one's path; `singles`: monitors without memory, by name.
     """
 
     prepared: PreparedRun
@@ -72,7 +71,6 @@ def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], 
 def _direction(
     prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matched: Match, evidence: TrainEvidence
 ) -> pl.Series:
-    """The direction of travel by the evidence, before the solution is monitored."""
     nothing = pl.DataFrame()
     unjudged = Solution(solution, prepared.fixes(solution), aligned, nothing, nothing, nothing, matched.path)
     return direction_by_evidence(Case(unjudged, evidence, None, prepared.vehicle, prepared.config))
@@ -81,7 +79,7 @@ def _direction(
 def _other_solution(
     prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matches: Mapping[str, Match]
 ) -> pl.DataFrame | None:
-    """The solution that the channel monitor compares with, on this one's path; None if not named or not recorded."""
+    """None if not named or not recorded."""
     channel = prepared.config.monitors.channel_reference
     if channel is None or channel == solution or channel not in matches:
         return None
@@ -91,7 +89,6 @@ def _other_solution(
 def _without_memory(
     prepared: PreparedRun, solution: str, aligned: pl.DataFrame, channel: pl.DataFrame | None
 ) -> dict[str, pl.DataFrame]:
-    """The monitors without memory, each by its name."""
     named = prepared.config.monitors.channel_reference
     absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
     seen = Seen(aligned, prepared.ranges(solution), channel, absent, prepared.config)

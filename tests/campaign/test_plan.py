@@ -7,10 +7,11 @@ from pathlib import Path
 import fsspec
 import pytest
 
+from pipeline import storage
 from pipeline.campaign import find_runs, run_campaign
 from pipeline.results import store
 from pipeline.storage import files
-from pipeline.storage.address import Address
+from pipeline.storage.address import Address, join
 from schemas.errors import InputError, UsageError
 from tests.campaign.compare import plan_of
 from tests.conftest import SmallTrial
@@ -78,20 +79,23 @@ def test_addresses() -> None:
         find_runs(["memory://find/*.bag"])
 
 
-def test_a_store_that_falls_silent_leaves_no_run_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    store = fsspec.filesystem("memory")
-    for name in ("/silent/x/gnss.parquet", "/silent/y/gnss.parquet"):
-        store.pipe_file(name, b"")
+@pytest.mark.parametrize("in_a_store", [True, False])
+def test_a_folder_that_cannot_be_listed_leaves_no_run_out(
+    tmp_path: Path, in_a_store: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = "memory://silent" if in_a_store else str(tmp_path / "silent")
+    for name in ("x/gnss.parquet", "y/gnss.parquet"):
+        storage.write_bytes(join(out if in_a_store else Path(out), name), b"")
     listed = files.list_dir
 
     def silent(folder: Address) -> list[str]:
         if str(folder).endswith("/y"):
-            raise InputError("the store gave no usable answer for 45 s: no answer", place=str(folder))
+            raise InputError("cannot be read: Permission denied", place=str(folder))
         return listed(folder)
 
     monkeypatch.setattr(files, "list_dir", silent)
-    with pytest.raises(InputError, match="silent/y: the store gave no usable answer"):
-        find_runs(["memory://silent"])
+    with pytest.raises(InputError, match="silent/y: cannot be read"):
+        find_runs([out])
 
 
 def test_names_too_long_to_file_are_refused_at_once(small_trial: SmallTrial, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ COLUMN = [
     (TABLES, "    part_verdict = one_of(", '    epochs_on_track = count("epochs on the track")\n'),
     (
         FIGURES,
-        '        "outages": len(lost),',
+        '        "outages": lost_s.size,',
         '        "epochs_on_track": int(epochs["on_track"].sum()),\n',
     ),
 ]

@@ -9,8 +9,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
+from pipeline.make.receivers.unpack import opened_zstd
 from pipeline.read.ingest.mcap_run import walk_log
 from pipeline.storage.budget import Budget
 from schemas.config import IngestConfig
@@ -28,7 +27,7 @@ def budget_of_bag(path: Path, config: IngestConfig) -> Budget:
             walk_log(file, config, _Nothing())
         elif file.suffix == ".zstd":
             budget = Budget(str(file), file.stat().st_size, config)
-            with _opened_zstd(pa.OSFile(str(file))) as packed, Path(os.devnull).open("wb") as nowhere:
+            with opened_zstd(file) as packed, Path(os.devnull).open("wb") as nowhere:
                 budget.copy(packed, nowhere)
     return Budget(str(path), sum(file.stat().st_size for file in files), config)
 
@@ -49,7 +48,7 @@ def unpacker_of(bag: Any, place: str, config: IngestConfig) -> Unpack:
         elif reader.storage.metadata.compression_mode == "message":
             reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
             packed_messages = True
-    return _bounded(_opened_zstd, place, config) if packed_messages else bytes
+    return _bounded(opened_zstd, place, config) if packed_messages else bytes
 
 
 def _bounded_chunk(chunk: Any, place: str, config: IngestConfig) -> Any:
@@ -58,10 +57,6 @@ def _bounded_chunk(chunk: Any, place: str, config: IngestConfig) -> Any:
     openers = {bz2.decompress: bz2.open, lz4.decompress: lz4.open}
     opener = openers.get(chunk.decompressor)
     return chunk if opener is None else chunk._replace(decompressor=_bounded(opener, place, config))
-
-
-def _opened_zstd(packed: Any) -> Any:
-    return pa.CompressedInputStream(packed, "zstd")
 
 
 def _bounded(opener: Callable[[BytesIO], Any], place: str, config: IngestConfig) -> Unpack:

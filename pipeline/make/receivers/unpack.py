@@ -91,8 +91,10 @@ def _unpack_one(opener: Callable[[Path], Any]) -> Callable[[Path, Path, Budget],
     return unpack
 
 
-def _opened_zst(archive: Path) -> Any:
-    return pa.CompressedInputStream(pa.OSFile(str(archive)), "zstd")
+def opened_zstd(packed: Any) -> Any:
+    """The content of a path, or of something that can be read."""
+    source = pa.OSFile(str(packed)) if isinstance(packed, Path) else packed
+    return pa.CompressedInputStream(source, "zstd")
 
 
 def _write(packed: IO[bytes], name: str, place: Path, budget: Budget) -> None:
@@ -115,7 +117,7 @@ _UNPACKERS: dict[str, Callable[[Path, Path, Budget], None]] = {
     ".tgz": _unpack_one(gzip.open),
     ".bz2": _unpack_one(bz2.open),
     ".xz": _unpack_one(lzma.open),
-    ".zst": _unpack_one(_opened_zst),
+    ".zst": _unpack_one(opened_zstd),
 }
 
 

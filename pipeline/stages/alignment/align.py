@@ -16,7 +16,6 @@ from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
 from schemas.enums import NotEvaluated
 
 BEYOND_SPAN = NotEvaluated.BEYOND_SPAN
-INTERRUPTED = NotEvaluated.INTERRUPTED
 _OF_ODOMETER = (
     *("along_m", "odometer_m", "travelled_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m"),
     *("odometer_period_s", "odometer_scale", "scale_sigma"),
@@ -24,10 +23,7 @@ _OF_ODOMETER = (
 
 
 def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
-    """Positions of one solution with the odometer beside them: `schemas.stages.Aligned`.
-
-    `odometry` grows with the path. Scale and latency are known by the vehicle file or learned causally.
-    """
+    """Positions of one solution with the odometer beside them: `schemas.stages.Aligned`."""
     positions = positions.with_columns(pl.col(r"^digits_(along|cross|up)_m$").clip(upper_bound=most_scatter_m(config)))
     positions = positions.with_columns(*_sigmas(config.monitors), _confidence(config.lds))
     if odometry is None:
@@ -41,7 +37,7 @@ def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, 
 
 
 def _sigmas(config: MonitorConfig) -> list[pl.Expr]:
-    """Sigmas of a position that every test counts with: a + b sigma as `calibrate` fitted it, and the digits."""
+    """Sigmas that every test counts with: a + b sigma as `calibrate` fitted it, and the digits."""
     calibrated = {
         f"calibrated_{axis}_m": config.sigma_intercept_m + config.sigma_slope * pl.col(f"sigma_{axis}_m")
         for axis in ("along", "cross", "up")
@@ -51,7 +47,7 @@ def _sigmas(config: MonitorConfig) -> list[pl.Expr]:
 
 
 def _confidence(lds: LdsConfig) -> pl.Expr:
-    """Half-width of the confidence interval along the track: K sigma, or the receiver's HPL (DOMAIN section 4)."""
+    """K sigma along the track, or the receiver's HPL (DOMAIN section 4)."""
     half_width = lds.ci_factor * pl.col("sigma_along_m") if lds.ci_source == "sigma" else pl.col("hpl_m")
     return half_width.alias("confidence_m")
 
@@ -59,8 +55,7 @@ def _confidence(lds: LdsConfig) -> pl.Expr:
 def unrolled(epochs: pl.DataFrame, near: Bools) -> Floats:
     """Path position less what a curve adds to the way of a position beside the track [m]; NaN off the track.
 
-    A point y to the left of a track with left curvature k moves dx / (1 - k y) along it while the train moves dx. Both
-    are known, so this is corrected and not counted as noise.
+    A point y to the left of a track with left curvature k moves dx / (1 - k y) along it while the train moves dx.
     """
     along = np.full(near.size, np.nan)
     rows = np.flatnonzero(near)
@@ -73,8 +68,7 @@ def unrolled(epochs: pl.DataFrame, near: Bools) -> Floats:
 def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometry: Odometry) -> pl.Series:
     """Odometer distance at any times [m], on the scale of `aligned`'s `odometer_m`; null beyond what is known.
 
-    Carried on from the nearest epoch before (or the first one) with the scale in use there; `odometry` grows with the
-    path.
+    Carried on from the nearest epoch before (or the first one) with the scale in use there.
     """
     anchors = aligned.drop_nulls("odometer_m")
     if anchors.is_empty():
@@ -92,7 +86,7 @@ def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometry: Odometry) -> 
 def _columns(
     t_ns: Ints, jitter_s: float, odometry: Odometry, in_use: Estimates, config: Configuration
 ) -> list[pl.Series]:
-    """The odometer's columns of `schemas.stages.Aligned`, each read at the epoch less the latency in use there."""
+    """Each read at the epoch less the latency in use there."""
     at = odometry.seconds(t_ns) - in_use.latency_s
     known = odometry.known_at_s(at)
     rows = np.flatnonzero(known)
@@ -107,7 +101,7 @@ def _columns(
         held = with_hysteresis(total, hysteresis_m(rows_m, config.align))
         turning = speed_of_positions(at, held, config.align.speed_window_s)
     inside = (at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])
-    reason = first_reason((~known & inside, INTERRUPTED), (~known, BEYOND_SPAN))
+    reason = first_reason((~known & inside, NotEvaluated.INTERRUPTED), (~known, BEYOND_SPAN))
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
         pl.Series("travelled_m", travelled, nan_to_null=True),
@@ -130,14 +124,14 @@ def _columns(
 
 
 def _direction(speed_mps: Floats, deadband_mps: float) -> pl.Series:
-    """+1 or -1 along growing path, held inside the dead band and where the speed is not known."""
+    """+1 or -1 along growing path, held inside the dead band."""
     moving = np.where(np.abs(np.nan_to_num(speed_mps)) > deadband_mps, np.sign(np.nan_to_num(speed_mps)), 0.0)
     signs = pl.Series(moving).replace(0.0, None).forward_fill().backward_fill().fill_null(1.0)
     return signs.cast(pl.Int8)
 
 
 def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
-    """No odometer: speed and direction from GNSS (velocity, else positions over the second before)."""
+    """Speed and direction from GNSS: velocity, else positions."""
     nothing = pl.lit(None, pl.Float64)
     t_s = times_ns(positions) * 1e-9
     path_m = np.where(flags(positions, "on_track"), floats(positions, "path_m"), np.nan)
@@ -160,7 +154,7 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
 
 
 def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float) -> Floats:
-    """Speed [m/s] from positions at least `window_s` apart, causal; NaN where there are none."""
+    """By positions at least `window_s` apart, causal [m/s]; NaN where there are none."""
     speed = np.full(t_s.size, np.nan)
     valid = np.flatnonzero(np.isfinite(path_m))
     if valid.size < 2:

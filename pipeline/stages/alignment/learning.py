@@ -34,7 +34,7 @@ def learn(
 ) -> Estimates:
     """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only.
 
-    `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `usable`: those on the track.
+    `positions`: `t, along_m, calibrated_along_m, digits_along_m`.
     """
     prior = prior_of(vehicle, config.align)
     learned = prior.over(positions.height)
@@ -51,9 +51,8 @@ def learn(
 class _Learner:
     """Runs the filter along the run, once the noise is known, and freezes it under alarm of the along-track monitors.
 
-    From the first failing epoch on the estimates stand still until the rule of recovery holds (`RecoveryRule`): a
-    lasting fault must not be learned as scale. Nor must an offset with which the position comes back from a break or an
-    alarm, or the decay of that offset (`ScaleLatencyFilter.resume`).
+    From the first failing epoch on the estimates stand still until the rule of recovery holds: a lasting fault must not
+    be learned as scale, nor an offset with which the position comes back (`ScaleLatencyFilter.resume`).
     """
 
     def __init__(
@@ -123,11 +122,10 @@ class _Learner:
                 state = self._filter.restart(state, *self._observation(position), unsettled_m2)
 
     def _observation(self, position: int) -> tuple[float, float]:
-        """Time [s] and GNSS path position [m] at a position."""
         return float(self._t_s[position]), float(self._path_m[position])
 
     def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
-        """Learn block by block; returns the state in use at the first failing epoch, and its position."""
+        """The state in use at the first failing epoch, and its position."""
         bank: AxisState | None = None
         use_from = np.array([begin])
         joints = state.joint[None]
@@ -155,10 +153,7 @@ class _Learner:
         return state, position
 
     def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Ints, Floats]:
-        """The filter over positions [begin, end): its last state, and its joint states with the first use of each.
-
-        The first use comes before the joint states in the result.
-        """
+        """The filter over positions [begin, end): its last state, first use of each joint state, joint states."""
         due = self._due(state.t_s, begin, end)
         before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
         broken = (self._segment[before] != self._segment[due]) | (self._breaks[before] != self._breaks[due])
@@ -177,10 +172,7 @@ class _Learner:
         return state, np.maximum(use_from, due + 1), joints
 
     def _beyond_break(self, state: FilterState, before: int, position: int) -> FilterState:
-        """The state at the first position after a break.
-
-        Where the odometer lost its distance the offset begins anew: no comparison shows whether the position moved.
-        """
+        """Where the odometer lost its distance the offset begins anew: nothing shows whether the position moved."""
         if self._segment[before] == self._segment[position]:
             observed = *self._observation(position), float(self._sigma_m[position]), self._jitter_s
             return self._filter.resume(state, *observed, self._limit_m)
@@ -188,7 +180,7 @@ class _Learner:
         return self._filter.restart(state, *self._observation(position), self._limit_m**2 if away else 0.0)
 
     def _due(self, last_s: float, begin: int, end: int) -> Ints:
-        """Positions of the updates: the first a filter period after the last one, and so on."""
+        """Positions of the updates: a filter period apart."""
         period_s = self._config.align.filter_period_s * (1.0 - 1e-6)
         due: list[int] = []
         position = self._next(last_s + period_s, begin)
@@ -203,11 +195,10 @@ class _Learner:
         self._learned.put(epochs[use_from], estimates_of(joints))
 
     def _next(self, t_s: float, at_least: int) -> int:
-        """First position at or after this time, and not before `at_least`."""
         return max(at_least, bisect_left(self._times, t_s))
 
     def _series(self, begin: int, end: int, restart: int) -> AxisSeries:
-        """Along-track increments of these positions; the one at `restart` has none before it."""
+        """Increments of these positions; the one at `restart` has none before it."""
         part = slice(max(begin - 1, restart), end)
         in_use = self._learned.at(self._rows[part])
         at_s = self._t_s[part] - in_use.latency_s
@@ -229,16 +220,16 @@ class _Learner:
         return along_series(epochs, odometer, self._config).between(begin - part.start, end - part.start)
 
     def _rows_m(self, at_s: Floats) -> Floats | None:
-        """Quantisation noise of the odometer's rows, by the speed: 0 at a stand may be more under way. None without."""
+        """Noise of the odometer's rows; None where it has none: 0 at a stand may be more under way."""
         if not self._odometry.noise.quantisation:
             return None
         return np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config))
 
     def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:
-        """Position from which learning goes on after the alarm (the number of positions if never), and what may settle.
+        """Position from which learning goes on after the alarm, and what the offset has still to settle by [m^2].
 
-        Learning goes on where GNSS minus odometer is back within the recovery bound, `recovery_s` after the last
-        failure. The offset left then, squared, and its variance [m^2] have still to settle.
+        That is where GNSS minus odometer is back within the recovery bound, `recovery_s` after the last failure; else
+        the number of positions.
         """
         begin = position = alarm - 1  # the first position of all cannot fail
         bank: AxisState | None = None
@@ -266,7 +257,7 @@ class _Learner:
         return self._rows.size, 0.0
 
     def _drift_m2(self, anchor: int, begin: int, end: int, scale_sigma: float) -> Floats:
-        """By how much GNSS minus odometer moves from the anchor to these positions without a fault [m^2]."""
+        """What GNSS minus odometer moves by from the anchor to these positions without a fault [m^2]."""
         sigma_m = self._sigma_m
         t_ns = self._t_ns
         way_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
@@ -277,11 +268,10 @@ class _Learner:
 
 
 def _gaps_before(at_s: Floats, t_s: Floats, gap_s: float) -> Ints:
-    """At each of `at_s`, how many gaps in the times `t_s` have ended: equal numbers mean no gap in between."""
+    """How many gaps in the times `t_s` have ended at each of `at_s`."""
     ends = t_s[1:][np.diff(t_s) > gap_s]
     return np.searchsorted(ends, at_s, side="right")
 
 
 def _in_use(use_from: Ints, position: int) -> int:
-    """Index of the last state that may be used at a position."""
     return int(np.searchsorted(use_from, position, side="right")) - 1

@@ -27,16 +27,12 @@ from schemas.config import AlignConfig, Vehicle
 
 
 class Estimates(NamedTuple):
-    """Scale (true over odometer distance) and latency [s] with standard deviations, at an instant or epoch by epoch."""
+    """Scale (true over odometer distance) and latency [s] with standard deviations."""
 
     scale: Floats
     scale_sigma: Floats
     latency_s: Floats
     latency_sigma_s: Floats
-
-    @classmethod
-    def of(cls, scale: float, scale_sigma: float, latency_s: float, latency_sigma_s: float) -> Estimates:
-        return cls(*(np.asarray(value) for value in (scale, scale_sigma, latency_s, latency_sigma_s)))
 
     def over(self, epochs: int) -> Estimates:
         return Estimates(*(np.full(epochs, value) for value in self))
@@ -45,16 +41,16 @@ class Estimates(NamedTuple):
         return Estimates(*(column[rows] for column in self))
 
     def put(self, begins: Ints, changes: Estimates) -> None:
-        """Set changes: each holds from its epoch to the next, the last for good."""
+        """Each change holds from its epoch to the next, the last for good."""
         lengths = np.diff(begins, append=self.scale.size)
         for column, value in zip(self, changes, strict=True):
             column[begins[0] :] = np.repeat(value, lengths)
 
 
 def stamp_jitter_s(t_s: Floats, clock_periods: float) -> float:
-    """Standard deviation of the stamps about a regular clock [s]; steps of more than `clock_periods` are left out.
+    """Standard deviation of stamps about a regular clock [s]; steps over more than `clock_periods` are left out.
 
-    A recorder that stamps on receipt scatters them: at 40 m/s ten milliseconds are 0.4 m from one epoch to the next.
+    A recorder that stamps on receipt scatters them: ten milliseconds are 0.4 m at 40 m/s.
     """
     dt = np.diff(t_s)
     period = float(np.median(dt))
@@ -86,7 +82,6 @@ class FilterState(NamedTuple):
 
 
 def estimates_of(joints: Floats) -> Estimates:
-    """Scale and latency of joint states, shape (..., states, states + 1)."""
     means = joints[..., -1]
     deviations = np.sqrt(np.diagonal(joints, axis1=-2, axis2=-1))
     return Estimates(1.0 + means[..., _SCALE], deviations[..., _SCALE], means[..., _LATENCY], deviations[..., _LATENCY])
@@ -94,7 +89,7 @@ def estimates_of(joints: Floats) -> Estimates:
 
 @dataclass(frozen=True)
 class ScaleLatencyFilter:
-    """Model of the errors; states are passed in and out."""
+    """States are passed in and out."""
 
     shares: Floats
     taus_s: Floats
@@ -102,7 +97,7 @@ class ScaleLatencyFilter:
     config: AlignConfig
 
     def start(self, prior: Estimates, t_s: float, path_m: float) -> FilterState:
-        """A new state at this epoch: offset and GNSS errors unknown, scale and latency as in `prior`."""
+        """Offset and GNSS errors unknown, scale and latency as in `prior`."""
         errors = self.shares.size
         origin_m = float(self.odometry.distance_at_s(np.array([t_s - prior.latency_s]))[0])
         mean = np.concatenate([[path_m, prior.scale - 1.0, prior.latency_s], np.zeros(errors)])
@@ -111,7 +106,7 @@ class ScaleLatencyFilter:
         return FilterState(np.column_stack([covariance, mean]), t_s, origin_m)
 
     def restart(self, state: FilterState, t_s: float, path_m: float, unsettled_m2: float = 0.0) -> FilterState:
-        """Offset and GNSS errors unknown again; what was learned of scale and latency stays."""
+        """The same, but what was learned of scale and latency stays."""
         fresh = self.start(estimates_of(state.joint), t_s, path_m)
         kept = slice(_SCALE, _ERRORS)
         fresh.joint[kept, kept] = state.joint[kept, kept]
@@ -139,7 +134,6 @@ class ScaleLatencyFilter:
         return FilterState(joint, t_s, state.origin_m, left_m2 + brought_m2)
 
     def after(self, state: FilterState, joint: Floats, t_s: float) -> FilterState:
-        """The state that has become `joint` by a later time."""
         return state._replace(joint=joint, t_s=t_s, unsettled_m2=self._unsettled_m2(state, t_s))
 
     def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: float) -> Floats:
@@ -165,13 +159,13 @@ class ScaleLatencyFilter:
         return joints
 
     def _rows(self, sigma_m: Floats) -> Floats:
-        """Observation matrix, a row per epoch: d(position) / d(state); scale and latency are filled in by `_seen`."""
+        """Observation matrix: d(position) / d(state); scale and latency are filled in by `_seen`."""
         rows: Floats = sigma_m[:, None] * np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
         rows[:, _OFFSET] = 1.0
         return rows
 
     def _predict(self, before: Floats, step_ns: int, settled_m2: float, joint: Floats) -> None:
-        """Predict `joint` from the state before: decay, noise, and the offset that settles over the step."""
+        """Decay, noise, and the offset that settles over the step."""
         decay, noise = self._transition(step_ns)
         np.multiply(before, decay, out=joint)
         joint += noise
@@ -180,7 +174,7 @@ class ScaleLatencyFilter:
     def _seen(self, joint: Floats, row: Floats, now_s: float, place_m: float, origin_m: float) -> tuple[Floats, float]:
         """H P and, as its last element, predicted minus observed position; and the speed. Completes `row` (H).
 
-        H is linear in the latency, but the distance is already read at the mean latency, whose part is taken out again.
+        The distance is already read at the mean latency, whose part in H is taken out again.
         """
         scale = 1.0 + joint.item(_SCALE, -1)
         latency_s = joint.item(_LATENCY, -1)
@@ -197,11 +191,10 @@ class ScaleLatencyFilter:
         return rows.still_m2 + (jitter_s**2 + rows.moving_s2) * speed_mps**2
 
     def _unsettled_m2(self, state: FilterState, t_s: float) -> float:
-        """What the offset has still to walk at a later time."""
         return state.unsettled_m2 * math.exp((state.t_s - t_s) / self.config.settling_tau_s)
 
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
-        """Way from the origin [m] and speed [m/s], as `Odometry.reading_at_s` of one instant, several times faster."""
+        """As `Odometry.reading_at_s` of one instant, several times faster."""
         times_s = self.odometry.t_s
         span_s = self.config.latency_span_s
         begin_s = max(at_s - span_s, times_s.item(0))
@@ -211,7 +204,7 @@ class ScaleLatencyFilter:
 
     @cached_property
     def _transition(self) -> Callable[[int], tuple[Floats, Floats]]:
-        """`_transition_over` with a memory: a receiver's epochs are mostly the same time apart."""
+        """With a memory: a receiver's epochs are mostly the same time apart."""
         return lru_cache(maxsize=32)(self._transition_over)
 
     def _transition_over(self, dt_ns: int) -> tuple[Floats, Floats]:
@@ -224,7 +217,7 @@ class ScaleLatencyFilter:
 
 
 def moved_m2(beside_m: float, variance_m2: float, limit_m: float, probability: float) -> float:
-    """Mean square of a position's move over a break, given that it appears `beside_m` from its predicted place (Bayes).
+    """Mean square of a move over a break, given that the position appears `beside_m` from its place (Bayes).
 
     Prior: moved with `probability`, then normally distributed with a sigma of `limit_m`.
     """
@@ -239,12 +232,11 @@ def _nanoseconds(seconds: float) -> int:
 
 
 def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimates:
-    """Scale and latency as the vehicle file gives them, else the configured prior around 1 and 0."""
-    scale_known = vehicle.odometer_scale is not None
-    latency_known = vehicle.gnss_latency_s is not None
-    return Estimates.of(
-        scale=vehicle.odometer_scale if vehicle.odometer_scale is not None else 1.0,
-        scale_sigma=(vehicle.odometer_scale_sigma or 0.0) if scale_known else config.scale_prior_sigma,
-        latency_s=vehicle.gnss_latency_s if vehicle.gnss_latency_s is not None else 0.0,
-        latency_sigma_s=(vehicle.gnss_latency_sigma_s or 0.0) if latency_known else config.latency_prior_sigma_s,
-    )
+    """By the vehicle file, else the configured prior around 1 and 0."""
+    scale = 1.0, config.scale_prior_sigma
+    latency_s = 0.0, config.latency_prior_sigma_s
+    if vehicle.odometer_scale is not None:
+        scale = vehicle.odometer_scale, vehicle.odometer_scale_sigma or 0.0
+    if vehicle.gnss_latency_s is not None:
+        latency_s = vehicle.gnss_latency_s, vehicle.gnss_latency_sigma_s or 0.0
+    return Estimates(*(np.asarray(value) for value in (*scale, *latency_s)))

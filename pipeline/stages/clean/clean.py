@@ -40,9 +40,8 @@ def no_advice(run: RunLog) -> str:
 class StreamCounts:
     """Rows dropped because their key stands twice, and rows that came before an earlier one.
 
-    `far_off`: dropped for a time of another day than the others, or than the positions. Of GNSS also `contradicting`,
-    how many of the doubles are of another place than the one that stays, and `placeholders`, how many positions are
-    none.
+    `far_off`: dropped for a time of another day. Of GNSS also `contradicting`: doubles at another place than the one
+    that stays; and `placeholders`.
     """
 
     duplicates: int = 0
@@ -54,7 +53,7 @@ class StreamCounts:
 
 @dataclass(frozen=True)
 class CleanCounts:
-    """What cleaning mended, per GNSS solution and per other stream."""
+    """Per GNSS solution and per stream."""
 
     solutions: dict[str, StreamCounts] = field(default_factory=dict)
     streams: dict[str, StreamCounts] = field(default_factory=dict)
@@ -65,13 +64,11 @@ def clean(
     config: Configuration = Configuration(),  # noqa: B008 - frozen
     clock_advice: ClockAdvice = no_advice,
 ) -> tuple[RunLog, CleanCounts]:
-    """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
+    """The run with every stream in order and each stamp once (the first recorded one stays).
 
-    A few rows more than a day from the others (a receiver that did not know the date yet), all before 1970, and single
-    reads, reference and satellites of another day than the positions are left out; placeholders stay as epochs without
-    a fix.
-    Raises `InputError` where no solution or not the odometer has two different times, both have no time in common, or
-    a stream lasts longer than a journey: nothing can be replayed.
+    Left out are a few rows more than a day from the others (a receiver that did not know the date yet), all before
+    1970, and reads, reference and satellites of another day than the positions; placeholders stay as epochs without a
+    fix. `InputError` where nothing can be replayed: no two times, none in common, longer than a journey.
     """
     dated = _dated_streams(run, config.ingest.wrong_dates_share)
     streams: dict[str, pl.DataFrame] = {}
@@ -91,7 +88,7 @@ def clean(
 
 
 def _dated_streams(run: RunLog, few: float) -> dict[Stream, tuple[pl.DataFrame, pl.DataFrame]]:
-    """Each stream without its strays, and these; GNSS comes first, as positions decide for the others."""
+    """Each stream without its strays, and these; positions decide for the others, so GNSS comes first."""
     dated: dict[Stream, tuple[pl.DataFrame, pl.DataFrame]] = {}
     for name in STREAMS:
         frame = run.stream(name)
@@ -109,7 +106,6 @@ def _dated_streams(run: RunLog, few: float) -> dict[Stream, tuple[pl.DataFrame, 
 def _solution_counts(
     recorded: pl.DataFrame, far: pl.DataFrame, placeholders: Mapping[str, int]
 ) -> dict[str, StreamCounts]:
-    """What was counted in each solution of the GNSS stream."""
     counts: dict[str, StreamCounts] = {}
     for part in recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True):
         name = part["solution"][0]
@@ -118,7 +114,7 @@ def _solution_counts(
 
 
 def _require_times(run: RunLog, clock_advice: ClockAdvice) -> None:
-    """Refuse a cleaned run in which no solution, or not the odometer, has two times, or both have none in common."""
+    """Refuse a run without two times of a solution or of the odometer, or none in common."""
     sizes = run.gnss.group_by("solution", maintain_order=True).len()
     if not (sizes["len"] >= 2).any():
         of = f" of solution {run.gnss['solution'][0]!r}" if run.gnss.height else ""
@@ -129,9 +125,9 @@ def _require_times(run: RunLog, clock_advice: ClockAdvice) -> None:
 
 
 def of_the_journey(run: RunLog) -> RunLog:
-    """The cleaned run without the streams of which no row lies within a day of a position; `notes` say so.
+    """The run without the streams of which no row lies within a day of a position; `notes` say so.
 
-    Their clocks are wrong, as the fit of the run says: what is judged must not carry anything over years.
+    Their clocks are wrong: what is judged must not carry anything over years.
     """
     away = [
         name
@@ -176,7 +172,7 @@ def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame
 
 
 def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
-    """Adds how many rows each stream lost; for GNSS the `runs` row of each solution has that count."""
+    """How many rows each stream lost; for GNSS the `runs` row has that count."""
     left_out = [
         f"{name}: {count.far_off} rows left out: their time is more than a day from the others or the positions"
         for name, count in counts.items()
@@ -209,7 +205,7 @@ def _far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
 
 
 def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
-    """Times more than a day before or after every position, in 64 bits without overflow."""
+    """Times more than a day from every position, in 64 bits without overflow."""
     t_ns, known = (series.cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy() for series in (t, positions))
     if not known.size:
         return np.zeros(t.len(), dtype=np.bool_)
@@ -220,7 +216,6 @@ def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
 
 
 def _of_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
-    """Counts of one solution; contradicting are duplicates at another place than the first row of their time."""
     counts = _in_order(part, ["t"])[1]
     contradicting = 0
     if counts.duplicates:
@@ -236,7 +231,7 @@ def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
 
 
 def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
-    """The rows in order of time, the first of each `keys`; how many were duplicates, how many recorded too late."""
+    """In order of time, the first of each `keys`; how many were duplicates, how many recorded too late."""
     frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
     if (np.diff(frame["t"].to_physical().to_numpy()) > 0).all():
         return frame, StreamCounts()
@@ -252,7 +247,7 @@ def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, Strea
 
 
 def _require_common_time(run: RunLog, clock_advice: ClockAdvice) -> None:
-    """Refuse an odometer of another time than the GNSS: not one position could be held against it."""
+    """Else not one position could be held against the odometer."""
     gnss = run.gnss
     odometer = run.odometer
     if gnss.is_empty() or odometer is None:

@@ -1,6 +1,6 @@
 """The gate before any computation: can a stream be of one journey, by its times alone?
 
-Behind it nothing need ask how long a stream lasts: no array that follows its span is larger than the gate allows.
+Behind it no array that follows a stream's span is larger than the gate allows.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ _NS_PER_H = 3_600 * NS_PER_S
 
 
 def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
-    """Refuse a cleaned stream with fewer than two times."""
     if stream.height < 2:
         raise InputError(
             f"all rows have the same time{of}" if stream.height else f"no row has a time after 1970{of}",
@@ -30,7 +29,7 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
 
 
 def require_one_journey(fixes: pl.DataFrame, place: str, config: IngestConfig) -> None:
-    """Refuse a cleaned solution with a gap of more than a day, or one that lasts too long."""
+    """Refuse a solution with a gap of more than a day, or one that lasts too long."""
     gaps = np.diff(fixes["t"].to_physical().to_numpy()) > DAY_NS
     if gaps.any():
         row = int(gaps.argmax())
@@ -45,7 +44,7 @@ def require_one_journey(fixes: pl.DataFrame, place: str, config: IngestConfig) -
 
 
 def require_spans(run: RunLog, config: IngestConfig) -> None:
-    """Refuse a cleaned run of which a stream beside the positions lasts too long; of these each solution is asked."""
+    """Of the streams beside the positions; of these each solution is asked."""
     odometers = [("odometer", odometer) for odometer in (run.odometer, *run.other_odometers)]
     satellites = [] if run.satellites is None else run.satellites.partition_by("solution", maintain_order=True)
     others = [("reference", run.reference), ("balise_reads", run.balise_reads)]
@@ -55,7 +54,6 @@ def require_spans(run: RunLog, config: IngestConfig) -> None:
 
 
 def require_span(t: pl.Series, place: str, config: IngestConfig) -> None:
-    """Refuse times in order whose first and last are too far apart, in numbers that do not overflow."""
     if t.len() and int(t.to_physical()[-1]) - int(t.to_physical()[0]) > config.longest_journey_h * _NS_PER_H:
         raise InputError(
             "lasts longer than a journey",

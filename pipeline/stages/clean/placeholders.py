@@ -14,8 +14,8 @@ from schemas.enums import Fix
 def without_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps: float) -> tuple[pl.DataFrame, int]:
     """One solution in order of time, placeholders without a fix, and how many they are.
 
-    They are 0/0; places repeated to the last digit and farther than `placeholder_far_m` from the rest; and what comes
-    before the first fix, where the run goes on so far away that no train can have gone there, at `fastest_mps`.
+    0/0; places repeated to the last digit and farther than `placeholder_far_m` from the rest; and what comes before the
+    first fix, where the run goes on so far away that no train can have gone there.
     """
     latitude = floats(fixes, "latitude_deg")
     longitude = floats(fixes, "longitude_deg")
@@ -67,7 +67,6 @@ def _far(t_ns: Ints, places: Floats, config: IngestConfig, fastest_mps: float) -
 
 
 def _is_brief(t_ns: Ints, until: int, config: IngestConfig) -> bool:
-    """Whether the run up to this row is short enough to be the search for a first fix."""
     spent_s = (t_ns[until - 1] - t_ns[0]) / NS_PER_S
     whole_s = (t_ns[-1] - t_ns[0]) / NS_PER_S
     return bool(

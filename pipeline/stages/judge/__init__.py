@@ -3,6 +3,11 @@
 In: a solution as it was replayed, the evidence of its run, the odometer (`Case`). Out: `Judged`, the contract's tables.
 Touches no file. Velocity, and scale and latency learned in the run, decide no judgement, time or verdict.
 
+- One epoch, from position to judgement: `judge.judge`, `epochs.judged_epochs`, `judgement.judge_positions`.
+- One crossing, from offer to `unsafe_accepted`: `epochs.judged_offers`, `passages.passages_table`, and in `run_row`
+  `run_figures.acceptances`.
+- One failure, from onset to `within_budget`: `failures.course_of`, `failures.find_failures`, `failures.within_budget`.
+
 | question | module |
 |---|---|
 | in which order is it judged | `judge.py` |

@@ -77,8 +77,9 @@ class Course:
 
     def jumps_in(self, begin: int, end: int) -> list[Jump]:
         """Jumps, in order of time, that end at `begin` or later and begin before `end`."""
+        first = bisect_left(self.jumps, begin, key=lambda jump: jump.last)
         last = bisect_left(self.jumps, end, key=lambda jump: jump.first)
-        return [jump for jump in self.jumps[:last] if jump.last >= begin]
+        return [jump for jump in self.jumps[max(first - 1, 0) : last] if jump.last >= begin]
 
     def after_quiet(self, floor: int, number: int) -> int:
         """The position after the last quiet one between `floor` and a position."""

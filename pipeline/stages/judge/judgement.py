@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import polars as pl
@@ -86,33 +87,33 @@ class Judgements:
         low_m = np.where(forward, self.low_m, -self.high_m)
         return replace(self, low_m=low_m, high_m=np.where(forward, self.high_m, -self.low_m))
 
-    @property
+    @cached_property
     def is_right(self) -> Bools:
         return np.isin(self.code, RIGHT)
 
-    @property
+    @cached_property
     def is_wrong(self) -> Bools:
         return np.isin(self.code, WRONG)
 
-    @property
+    @cached_property
     def by_truth(self) -> Bools:
         """By reference or balise reads, which alone can call a position right."""
         return np.isin(self.kind, [REFERENCE, BALISE])
 
-    @property
+    @cached_property
     def middle_m(self) -> Floats:
         return 0.5 * (self.low_m + self.high_m)
 
-    @property
+    @cached_property
     def half_m(self) -> Floats:
         return 0.5 * (self.high_m - self.low_m)
 
-    @property
+    @cached_property
     def least_m(self) -> Floats:
         """The smallest size that the error may have."""
         return np.asarray(np.maximum(np.maximum(self.low_m, -self.high_m), 0.0))
 
-    @property
+    @cached_property
     def largest_m(self) -> Floats:
         """The largest size that the error may have."""
         return np.asarray(np.maximum(-self.low_m, self.high_m))

@@ -15,13 +15,13 @@ from schemas.conform import dtypes
 from schemas.enums import BaliseKind, LinkingError, PassageStatus, Reaction
 from schemas.stages import Crossings
 
+PLACE = ("balise_id", "netelement_id", "measure_m", "path_m")
+"""Columns of a balise and where it lies."""
+
 
 @dataclass(frozen=True, slots=True)
 class Balise:
-    """One balise on one leg of the travelled path.
-
-    `valid_direction`: the direction of travel along growing path in which it is valid, +1 or -1; 0 both.
-    """
+    """One balise on one leg of the travelled path; `valid_direction`: along growing path +1, against it -1, both 0."""
 
     leg: int
     balise_id: str
@@ -35,7 +35,7 @@ class Balise:
     valid_direction: int
 
     def is_valid(self, direction: int) -> bool:
-        """A train in this direction of travel knows of it; to any other it does not exist (DOMAIN section 4)."""
+        """To a train in another direction it does not exist (DOMAIN section 4)."""
         return self.valid_direction in (0, direction)
 
 
@@ -43,10 +43,9 @@ class Balise:
 class Crossing:
     """The position passes a virtual balise, or the reader reads a physical one.
 
-    `before`, `epoch`: rows of the epochs around it. `sense`: +1 where the position passes the balise along growing
-    path; `direction`: direction of travel as known at `epoch`. Time, odometer and way run are interpolated; after a
-    gap they are those of `epoch`. `absence`: what to say of it in a gap, None between near epochs and of telegrams.
-    `offered`, `status`: what became of it, as in `Crossings`; `initialising`: accepted before anything was validated.
+    `before`, `epoch`: rows of the epochs around it. `sense`: of the position's step, +1 along growing path;
+    `direction`: of travel as known at `epoch`. Time, odometer and way are interpolated; after a gap they are those of
+    `epoch`, and `absence` says what a balise passed in it is.
     """
 
     balise: Balise
@@ -69,10 +68,10 @@ _SEVERITY = (Reaction.NONE, Reaction.SERVICE_BRAKE, Reaction.TRIP)
 
 @dataclass(slots=True)
 class Passage:
-    """What the train makes of a balise that it passes: a row of `passages` in the making.
+    """A row of `passages` in the making.
 
-    `crossing`: the one that offered it; `t_ns`: of the offer, else when it was settled; `direction`: of travel as
-    known then; `announced_odometer_m`: where the train passes it by linking.
+    `crossing`: what offered it; `t_ns`: of the offer, else when it was settled; `announced_odometer_m`: where the train
+    passes it by linking.
     """
 
     balise: Balise
@@ -94,30 +93,17 @@ class Passage:
 
 
 def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
-    """Balises of one kind in order of leg, path position and identity."""
-    rows = frame.filter(pl.col("kind").cast(pl.String) == kind.value).sort("leg", "path_m", "balise_id")
-    return [
-        Balise(
-            leg=row["leg"],
-            balise_id=row["balise_id"],
-            kind=kind,
-            netelement_id=row["netelement_id"],
-            measure_m=row["measure_m"],
-            path_m=row["path_m"],
-            accuracy_m=row["location_accuracy_m"],
-            linked=row["linked"],
-            reaction=Reaction(row["link_reaction"]),
-            valid_direction=row["valid_direction"],
-        )
-        for row in rows.iter_rows(named=True)
-    ]
+    of_kind = frame.filter(pl.col("kind").cast(pl.String) == kind.value).sort("leg", "path_m", "balise_id")
+    rows = of_kind.select(
+        *("leg", "linked", "valid_direction", *PLACE), accuracy_m="location_accuracy_m", reaction="link_reaction"
+    )
+    return [Balise(kind=kind, **row | {"reaction": Reaction(row["reaction"])}) for row in rows.iter_rows(named=True)]
 
 
 def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing]:
     """Crossings of virtual balises, those of one step in the order of being passed.
 
-    A balise is passed growing when the position comes from before it to it or beyond, and falling when it comes from
-    there to before it, so that touching it and turning back are two crossings.
+    Growing from before it to it or beyond, falling from there to before it: touching it and turning back are two.
     """
     known = np.flatnonzero(journey.positioned)
     crossings: list[Crossing] = []
@@ -138,16 +124,13 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing
 
 
 def _is_valid(crossing: Crossing, journey: Journey) -> bool:
-    """Valid in the train's direction of travel, whatever that of the position's step (DOMAIN section 4).
-
-    A turn is known some metres after it (`odometer_fixed_m`): on these a balise of one direction is offered in neither.
-    """
+    """Valid in the train's direction, as known then and as it was: in the metres after a turn in neither."""
     as_it_was = journey.direction_at(crossing.t_ns)
     return crossing.balise.is_valid(crossing.direction) and crossing.balise.is_valid(as_it_was)
 
 
 def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tuple[Balise, int]]:
-    """The balises passed by a step, with its sense; `before`, `after`: how many balises lie behind it at its ends."""
+    """The balises passed by a step, with its sense; `before`, `after`: how many lie behind it at its ends."""
     if after > before:
         yield from ((balise, 1) for balise in balises[before:after])
     else:
@@ -155,7 +138,6 @@ def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tu
 
 
 def _crossing(journey: Journey, balise: Balise, before: int, epoch: int, sense: int) -> Crossing:
-    """The step from `before` to `epoch` passes a balise: interpolated, in a gap as at `epoch`."""
     near = bool(journey.t_ns[epoch] - journey.t_ns[before] <= journey.gap_ns)
     share = 1.0
     t_ns = journey.t_ns
@@ -184,23 +166,21 @@ def _known(value: float) -> float | None:
 
 
 def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
-    """All crossings of a solution; the place in this list is the `crossing_id`."""
+    """The place in this list is the `crossing_id`."""
     return sorted(crossings, key=lambda crossing: (crossing.t_ns, crossing.epoch, crossing.balise.kind.value))
 
 
 def crossing_rows(crossings: Sequence[Crossing], journey: Journey) -> pl.DataFrame:
-    """The table of crossings (`Crossings`), `crossings` in order of time."""
     rows = [_row(number, crossing, journey) for number, crossing in enumerate(crossings)]
     return pl.DataFrame(rows, schema=dtypes(Crossings))
 
 
 def _row(number: int, crossing: Crossing, journey: Journey) -> dict[str, object]:
     offer = ("before", "epoch", "sense", "odometer_m", "offered")
-    place = ("balise_id", "netelement_id", "measure_m", "leg", "path_m")
     return {
         "crossing_id": number,
         **{name: getattr(crossing, name) for name in offer},
-        **{name: getattr(crossing.balise, name) for name in place},
+        **{name: getattr(crossing.balise, name) for name in ("leg", *PLACE)},
         "kind": crossing.balise.kind.value,
         "t": crossing.t_ns,
         "direction": journey.direction_at(crossing.t_ns),
@@ -211,7 +191,7 @@ def _row(number: int, crossing: Crossing, journey: Journey) -> dict[str, object]
 def reads_of(
     frame: pl.DataFrame | None, balises: list[Balise], journey: Journey
 ) -> tuple[list[Crossing], pl.DataFrame]:
-    """Telegrams (`t, balise_id`, `odometer_m` at each) in order of time, and those of balises not on the path."""
+    """Telegrams (`t, balise_id`, `odometer_m`) in order of time, and those of balises not on the path."""
     if frame is None:
         return [], pl.DataFrame(schema={"t": pl.Datetime("ns", "UTC"), "balise_id": pl.String})
     places: dict[str, list[Balise]] = {}

@@ -14,10 +14,7 @@ from schemas.enums import BaliseKind, PassageStatus
 
 
 class BaliseDetection:
-    """Virtual and physical balises along a journey; asked epoch by epoch, in order.
-
-    `events`: the epochs at which a balise is crossed or read, or the train turns.
-    """
+    """Virtual and physical balises, asked epoch by epoch, in order. `events`: epochs at which something happens."""
 
     def __init__(
         self,
@@ -47,29 +44,28 @@ class BaliseDetection:
 
     @property
     def disarmed(self) -> bool:
-        """A balise was detected so near that noise could detect it again."""
+        """Noise could detect a balise again."""
         return bool(self._disarmed)
 
     def turn(self, epoch: int) -> None:
-        """Both chains learn that the train goes another way from this epoch on."""
         for chain in (self.virtual, self.physical) if epoch in self._turns else ():
             chain.turn(self._journey, epoch)
 
     def read(self, epoch: int) -> list[Crossing]:
-        """Telegrams accepted by the rules of linking; only windows can reject them, no monitor."""
+        """Telegrams accepted by linking: windows can reject them, no monitor."""
         reads = self._at[BaliseKind.PHYSICAL].get(epoch, ())
         return [read for read in reads if not self._disarmed.holds(read.balise) and self._offer(read, None)]
 
     def pass_virtual(self, epoch: int, distrusted: bool, entering: bool) -> tuple[list[Crossing], bool]:
-        """Offer what the position crossed in this step: what was accepted, and is the order of identities broken?
+        """What was accepted of this step's crossings, and is the order of identities broken?
 
         `distrusted`: negated, withheld, or a monitor fails; `entering`: no chain has begun.
         """
         offered: list[Crossing] = []
         for crossing in self._at[BaliseKind.VIRTUAL].get(epoch, ()):
             if self._disarmed.holds(crossing.balise):
-                self.virtual.cross_again(crossing)
-            elif crossing.absence is None:
+                continue
+            if crossing.absence is None:
                 offered.append(crossing)
             else:
                 self.virtual.pass_unoffered(crossing, crossing.absence)
@@ -82,12 +78,10 @@ class BaliseDetection:
         return accepted, self._order_fails(epoch, offered, overdue)
 
     def rearm(self, epoch: int) -> None:
-        """Balises that the train has left behind can be detected again."""
         if self._disarmed:
             self._disarmed.rearm(epoch)
 
     def close_windows(self, epoch: int, t_ns: int) -> None:
-        """Windows that the train has left are closed."""
         along_m = self._along_m[epoch]
         if along_m > self.virtual.closing_m:
             self.virtual.advance(float(self._journey.odometer_m[epoch]), t_ns, self._absence(epoch))
@@ -107,10 +101,7 @@ class BaliseDetection:
         return chain.offer(crossing, refusal)
 
     def _refusal_of(self, crossing: Crossing, distrusted: bool, entering: bool) -> PassageStatus | None:
-        """Why a virtual balise is not detected at this crossing, whatever linking says.
-
-        A step out of an ambiguous position crosses what the train did not.
-        """
+        """Why this crossing is no detection. A step out of an ambiguous position crosses what the train did not."""
         if distrusted:
             # "The noise is known and no monitor has failed" is one condition of a detection (DOMAIN section 4).
             return PassageStatus.REJECTED_MONITOR
@@ -135,9 +126,9 @@ class BaliseDetection:
 
 
 class Disarmed:
-    """Balises just detected, re-armed max(`rearm_m`, `rearm_sigmas`) away by the odometer (DOMAIN section 4).
+    """Balises just detected, re-armed max(`rearm_m`, `rearm_sigmas`) away (DOMAIN section 4).
 
-    Where the run has no odometer, the position's distance from the balise has to serve.
+    By the odometer; without one by the position's distance from the balise.
     """
 
     def __init__(self, journey: Journey, config: LdsConfig) -> None:
@@ -149,7 +140,6 @@ class Disarmed:
         return bool(self._at)
 
     def holds(self, balise: Balise) -> bool:
-        """A crossing of this balise is not an offer."""
         return balise.balise_id in self._at
 
     def add(self, crossing: Crossing) -> None:
@@ -157,7 +147,6 @@ class Disarmed:
         self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
 
     def rearm(self, epoch: int) -> None:
-        """Re-arm what the train has left behind at `epoch`."""
         away_m = max(self._config.rearm_m, self._config.rearm_sigmas * float(self._journey.sigma_m[epoch]))
         for name, (balise, at_m) in list(self._at.items()):
             if abs(self._moved_m(epoch, balise, at_m)) >= away_m:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,49 +14,46 @@ from schemas.config import Configuration, LdsConfig
 from schemas.enums import PassageStatus
 
 
-@dataclass(frozen=True)
 class Journey:
-    """Epochs in order of time; a NaN is a value that is not known. Names are those of `schemas.stages.Aligned`, but:
+    """Epochs in order of time; NaN is not known. Names are those of `schemas.stages.Aligned`, but:
 
-    `positioned`: placed on the path. `refusal`: why a detection here would not count, `None` where it would.
-    `direction` of travel (+1/-1 along growing path) as known at that epoch; `travel`: that of the step to the next
-    epoch, put back to where the train turned (for labels only). `segment`: between segments the odometer lost its
-    distance; `counter`: the same, over slip. `blind`: no position for longer than a crossing is interpolated over.
+    `refusal`: why a detection here would not count, None where it would. `direction` of travel (+1/-1 along growing
+    path) as known at that epoch; `travel`: as it was in the step to the next epoch (for labels only). `segment`:
+    changes where the odometer lost its distance; `counter`: the same, over slip and guessed pauses. `blind`: no
+    position for longer than a crossing is interpolated over.
     """
 
-    t_ns: Ints
-    leg: Ints
-    path_m: Floats
-    positioned: Bools
-    placed_nowhere: Bools
-    refusal: list[PassageStatus | None]
-    sigma_m: Floats
-    confidence_m: Floats
-    odometer_m: Floats
-    segment: Ints
-    slips: Bools
-    counter: Ints
-    slip_doubt_m: Floats
-    scale_sigma: float | None
-    direction: Ints
-    travel: Ints
-    travelled_m: Floats
-    blind: Bools
-    gap_ns: int
+    def __init__(self, epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> None:
+        """The only place where the LDS reads columns of aligned epochs."""
+        self.t_ns = times_ns(epochs)
+        self.leg: Ints = epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64)
+        self.path_m = floats(epochs, "path_m")
+        self.positioned: Bools = np.isfinite(self.path_m)
+        self.placed_nowhere: Bools = flags(epochs, "fix_valid") & ~self.positioned
+        self.refusal = _refusals(epochs, self.positioned, config)
+        self.sigma_m = floats(epochs.select(pl.col("position_sigma_m").forward_fill()), "position_sigma_m")
+        self.confidence_m = floats(epochs, "confidence_m")
+        self.odometer_m = floats(epochs, "odometer_m")
+        self.segment: Ints = epochs["odometer_segment"].to_numpy().astype(np.int64)
+        self.slips = flags(epochs, "odometer_slips")
+        self.counter: Ints = epochs["odometer_counter"].to_numpy().astype(np.int64)
+        self.slip_doubt_m = floats(epochs, "slip_doubt_m")
+        self.scale_sigma = scale_sigma
+        self.direction, self.travel = _directions(self.odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
+        self.travelled_m = floats(epochs, "travelled_m")
+        self.gap_ns = crossing_gap_ns(self.t_ns, config.lds)
+        self.blind = _blind(self.t_ns, self.positioned, self.gap_ns)
 
     @cached_property
     def usable(self) -> Bools:
-        """A detection at this epoch would count."""
         return np.array([refusal is None for refusal in self.refusal], dtype=bool)
 
     @cached_property
     def ambiguous(self) -> Bools:
-        """The place on the track is in doubt."""
         return np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in self.refusal], dtype=bool)
 
     @cached_property
     def on_odometer(self) -> Ints:
-        """Epochs at which the odometer is known."""
         return np.flatnonzero(np.isfinite(self.odometer_m))
 
     @property
@@ -70,39 +66,7 @@ class Journey:
         return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
 
     def direction_at(self, t_ns: int) -> int:
-        """Direction of travel at a time, turns as they were."""
         return int(self.travel[max(int(np.searchsorted(self.t_ns, t_ns)) - 1, 0)])
-
-
-def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> Journey:
-    """Take the columns of matched and aligned epochs: the only place where the LDS reads them (see `run_lds`)."""
-    t_ns = times_ns(epochs)
-    path_m = floats(epochs, "path_m")
-    positioned = np.isfinite(path_m)
-    odometer_m = floats(epochs, "odometer_m")
-    direction, travel = _directions(odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
-    gap_ns = crossing_gap_ns(t_ns, config.lds)
-    return Journey(
-        t_ns=t_ns,
-        leg=epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64),
-        path_m=path_m,
-        positioned=positioned,
-        placed_nowhere=flags(epochs, "fix_valid") & ~positioned,
-        refusal=_refusals(epochs, positioned, config),
-        sigma_m=floats(epochs.select(pl.col("position_sigma_m").forward_fill()), "position_sigma_m"),
-        confidence_m=floats(epochs, "confidence_m"),
-        odometer_m=odometer_m,
-        segment=epochs["odometer_segment"].to_numpy().astype(np.int64),
-        slips=flags(epochs, "odometer_slips"),
-        counter=epochs["odometer_counter"].to_numpy().astype(np.int64),
-        slip_doubt_m=floats(epochs, "slip_doubt_m"),
-        scale_sigma=scale_sigma,
-        direction=direction,
-        travel=travel,
-        travelled_m=floats(epochs, "travelled_m"),
-        blind=_blind(t_ns, positioned, gap_ns),
-        gap_ns=gap_ns,
-    )
 
 
 def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
@@ -115,7 +79,7 @@ def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
 
 
 def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) -> list[PassageStatus | None]:
-    """Ambiguity before confidence; what is not known (null) is never taken as good."""
+    """Ambiguity before confidence; null is never taken as good."""
     refusals = np.full(positioned.size, None)
     refusals[~met(epochs, confident(config))] = PassageStatus.REJECTED_CONFIDENCE
     refusals[~met(epochs, unambiguous(config))] = PassageStatus.REJECTED_AMBIGUOUS
@@ -126,8 +90,7 @@ def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) ->
 def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[Ints, Ints]:
     """Direction of travel along growing path, as known at each epoch and as it was.
 
-    With an odometer the train has turned once it came back by `turn_m` (the odometer's own fixed
-    error): a wheel's jitter at standstill is no turn. Without one: the matched direction, held.
+    With an odometer the train has turned once it came back by `turn_m`: a wheel's jitter at a stand is no turn.
     """
     if not np.isfinite(odometer_m).any():
         held = matched.replace(0, None).fill_null(strategy="forward").fill_null(1)
@@ -142,21 +105,21 @@ def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[
 
 
 def turning_epochs(journey: Journey) -> frozenset[int]:
-    """Epochs at which direction or leg differ from those of the epoch before, odometer known."""
+    """Epochs at which direction or leg change, odometer known."""
     known = journey.on_odometer
     changed = (np.diff(journey.direction[known]) != 0) | (np.diff(journey.leg[known]) != 0)
     return frozenset(known[1:][changed].tolist())
 
 
 def odometer_epochs(journey: Journey) -> list[int]:
-    """Epochs at which the odometer begins to slip, or is in another continuity segment than at the epoch before."""
+    """Epochs at which the odometer begins to slip or a continuity segment."""
     changes = (np.diff(journey.segment) != 0) | (journey.slips[1:] & ~journey.slips[:-1])
     epochs: list[int] = (np.flatnonzero(changes) + 1).tolist()
     return epochs
 
 
 def mission_epochs(journey: Journey, config: LdsConfig) -> frozenset[int]:
-    """The first epochs at or after the configured starts of mission that lie inside the run."""
+    """The first epochs at or after the configured starts of mission."""
     starts_ns = np.array([round(start.timestamp() * NS_PER_S) for start in config.starts_of_mission], dtype=np.int64)
     inside = starts_ns[(starts_ns > journey.t_ns[:1].sum()) & (starts_ns <= journey.t_ns[-1:].sum())]
     return frozenset(np.searchsorted(journey.t_ns, inside).tolist())

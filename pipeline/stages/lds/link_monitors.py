@@ -27,17 +27,12 @@ from schemas.enums import NotEvaluated
 ORDER_THRESHOLD = 0.5
 _BLOCK = 4096  # epochs evaluated at once
 
-AMBIGUOUS = NotEvaluated.AMBIGUOUS_OR_OFF
-FIRST_EPOCH = NotEvaluated.NO_EPOCH_BEFORE
-NEVER = NotEvaluated.NEVER_VALIDATED
-LOST = NotEvaluated.DISTANCE_LOST
-
 
 def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:
     """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards).
 
-    Two or more at once, or one against the direction of travel, are out of order where the
-    odometer's step does not explain the position's; `overdue` ones, whose window has closed, always.
+    Two at once, or one against the direction of travel, where the odometer's step does not explain the position's;
+    `overdue` ones, whose window has closed, always.
     """
     before = offered[0].before
     after = offered[0].epoch
@@ -50,7 +45,7 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Co
 
 
 class LinkOrder:
-    """Order of balise identities, step by step."""
+    """Order of identities, step by step."""
 
     def __init__(self, journey: Journey, config: Configuration) -> None:
         self._reason = _order_reasons(journey, "link_order" in config.monitors.disabled)
@@ -64,7 +59,6 @@ class LinkOrder:
         self._value[epoch] = out_of_order
 
     def columns(self) -> list[pl.Series]:
-        """`link_order_*` as in the contract of epochs."""
         threshold = np.full(self._value.size, ORDER_THRESHOLD)
         return of_monitor("link_order", verdicts(self._value, threshold, self._reason))
 
@@ -72,9 +66,8 @@ class LinkOrder:
 class LinkDistance:
     """GNSS against odometer distance since the LRVB, or since the TVB that began the chain.
 
-    Bounds: the odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T. At the first
-    position after an outage, and for a while after a return, it is the distance since the re-link anchor, within the
-    bound of a re-link (`relink`).
+    Bounds: 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of both positions at k_T. After an outage and for a while
+    after a return it is the distance since the re-link anchor, within the bound of a re-link.
     """
 
     def __init__(self, journey: Journey, config: Configuration) -> None:
@@ -93,22 +86,20 @@ class LinkDistance:
         self._since_return = np.full((2, journey.t_ns.size), np.nan)  # moved since the re-link anchor, its bound
 
     def measure_from(self, anchor: Anchor | None, epoch: int) -> None:
-        """From `epoch` on the distance counts from this anchor."""
         self._anchor = anchor
         self._done = epoch
 
     def hold_to(self, epoch: int, moved_m: Floats, bound_m: Floats) -> None:
-        """From `epoch` on the position is held to the re-link anchor, for as long as these are; then measure anew."""
+        """From `epoch` on the distance since the re-link anchor counts, for as long as it is given."""
         self._since_return[:, epoch:] = np.nan
         self._since_return[:, epoch : epoch + moved_m.size] = moved_m, bound_m
         self._done = epoch
 
     def is_possible(self, epoch: int) -> bool:
-        """There is a position and an odometer to compare at this epoch."""
         return bool(self._possible[epoch])
 
     def can_measure(self, epoch: int) -> bool:
-        """What the distance counts from is in the same continuity segment of the odometer as this epoch."""
+        """The odometer's distance is known from the anchor on."""
         segment = self._journey.segment
         return self._anchor is not None and bool(segment[self._anchor.epoch] == segment[epoch])
 
@@ -141,14 +132,14 @@ class LinkDistance:
         moved_m, bound_m = self._since_return[:, ahead]
         held = known & np.isfinite(moved_m)
         self._reason[ahead][self._possible[ahead]] = None
-        self._reason[ahead][lost] = LOST
+        self._reason[ahead][lost] = NotEvaluated.DISTANCE_LOST
         since_m = np.where(held, moved_m, self._offset_m[ahead] - anchor.offset_m)
         self._value[ahead] = np.where(known, since_m, np.nan)
         self._threshold[ahead] = np.where(known, np.where(held, bound_m, threshold_m), np.nan)
         self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
 
     def hold_against(self, comparison: Comparison, epoch: int) -> None:
-        """The verdict on a position after an outage joins that of the bounds at `epoch`, whose fail remains."""
+        """The verdict of a re-link joins that of the bounds at `epoch`, whose fail remains."""
         if self.fails(epoch):
             return
         self._value[epoch] = comparison.moved_m
@@ -157,22 +148,20 @@ class LinkDistance:
         self._reason[epoch] = comparison.reason
 
     def forget(self, epoch: int) -> None:
-        """From `epoch` on there is nothing to measure from."""
         self.measure_from(None, epoch)
         self._since_return[:, epoch:] = np.nan
         self._value[epoch:] = self._threshold[epoch:] = np.nan
         self._reason[epoch:][self._possible[epoch:]] = None
 
     def columns(self) -> list[pl.Series]:
-        """`link_distance_*` as in the contract of epochs."""
         reasons = pl.Series(self._reason.tolist(), dtype=pl.String)
         unknown = reasons.is_null() & pl.Series(np.isnan(self._value))
-        reasons = first_reason((reasons.is_not_null(), reasons), (unknown, NEVER))
+        reasons = first_reason((reasons.is_not_null(), reasons), (unknown, NotEvaluated.NEVER_VALIDATED))
         return of_monitor("link_distance", verdicts(self._value, self._threshold, reasons))
 
 
 def _order_reasons(journey: Journey, disabled: bool) -> pl.Series:
-    """Per step, so both its ends must be good for it; a step ends at the epoch that it is noted at."""
+    """Per step: both its ends must be good for it."""
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
     before[known[1:]] = known[:-1]
@@ -182,9 +171,9 @@ def _order_reasons(journey: Journey, disabled: bool) -> pl.Series:
         (np.full(before.size, disabled), DISABLED),
         (~odometer, NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
-        (before < 0, FIRST_EPOCH),
+        (before < 0, NotEvaluated.NO_EPOCH_BEFORE),
         (~odometer[before], NO_ODOMETER),
-        (journey.ambiguous | journey.ambiguous[before], AMBIGUOUS),
+        (journey.ambiguous | journey.ambiguous[before], NotEvaluated.AMBIGUOUS_OR_OFF),
         (~(sigma & sigma[before]), NO_SIGMA),
     )
 
@@ -194,6 +183,6 @@ def _distance_reasons(journey: Journey, disabled: bool) -> pl.Series:
         (np.full(journey.t_ns.size, disabled), DISABLED),
         (~np.isfinite(journey.odometer_m), NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
-        (journey.ambiguous, AMBIGUOUS),
+        (journey.ambiguous, NotEvaluated.AMBIGUOUS_OR_OFF),
         (~np.isfinite(journey.sigma_m), NO_SIGMA),
     )

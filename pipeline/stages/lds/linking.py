@@ -1,7 +1,7 @@
 """ETCS linking: one chain of announced balises, virtual or physical, and what the train makes of each.
 
-Distances along the chain are odometer distances from the last relevant balise (LRVB or LRBG), positive
-in the direction of travel. One balise is expected at a time, in the order announced.
+Distances are odometer distances from the last relevant balise, positive in the direction of travel. One balise is
+expected at a time, in the order announced.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class LinkingReference:
 
 @dataclass(frozen=True, slots=True)
 class LrvbChange:
-    """From `epoch` on: the LRVB, and whether the TVB chain has begun."""
+    """From `epoch` on."""
 
     epoch: int
     lrvb: LinkingReference | None
@@ -45,7 +45,7 @@ class _Turn:
 
 
 class _Announced:
-    """Announced balises in order of travel; identities are found without walking along all of them."""
+    """Announced balises in order of travel."""
 
     def __init__(self, balises: Sequence[Balise], direction: int) -> None:
         self.balises = balises
@@ -56,7 +56,6 @@ class _Announced:
             self._places.setdefault(balise.balise_id, []).append(place)
 
     def place_of(self, balise_id: str, begin: int) -> int | None:
-        """The first place of this identity from `begin` on."""
         places = self._places.get(balise_id, [])
         first = bisect_left(places, begin)
         return places[first] if first < len(places) else None
@@ -85,38 +84,34 @@ class LinkingChain:
         self._optional: set[str] = set()
         self._missed_in_a_row = 0
         self.closing_m = float("inf")
-        # The passage that a balise ahead already has, through an offer before its window closed ...
+        # Passages of balises ahead, by an offer before their window closed, and of those whose closed without any.
         self._own: dict[str, Passage] = {}
-        # ... the same, crossed back since without an offer of its own ...
-        self._set_aside: dict[str, Passage] = {}
-        # ... and that of a balise whose window closed without any offer.
         self._unoffered: dict[str, Passage] = {}
 
     @property
     def linking(self) -> bool:
-        """A reference with a known odometer reading: windows can be drawn from it."""
+        """Windows can be drawn from the reference."""
         return self.reference is not None and self.reference.odometer_m is not None
 
     def forget(self) -> None:
-        """A new initialisation: no reference, no linking."""
         self.reference = None
         self._expect(_Announced([], 1), 0)
-        for passages in (self._own, self._set_aside, self._unoffered):
-            passages.clear()
+        self._own.clear()
+        self._unoffered.clear()
 
     def is_overdue(self, balise: Balise) -> bool:
         """Its window has closed without any offer."""
         return balise.balise_id in self._unoffered
 
     def advance(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
-        """The train has come to this odometer reading; `absence`: status of balises not found in their window."""
+        """The train has come to this reading; `absence`: status of balises not found in their window."""
         if self.linking:
             self._close_windows(self._distance_m(odometer_m), t_ns, absence)
 
     def turn(self, journey: Journey, epoch: int) -> None:
-        """From `epoch` on the train goes the other way, or on another leg: expect the balises on its new way.
+        """The train goes the other way, or on another leg: expect the balises on its new way.
 
-        Balises whose window covers the place of the turn may have been passed or not: they are optional.
+        Those whose window covers the place of the turn may have been passed or not: they are optional.
         """
         if self.reference is None or not self.linking:
             return
@@ -124,8 +119,8 @@ class LinkingChain:
         self._leg = int(journey.leg[epoch])
         travelled_m = float(journey.travelled_m[epoch]) - self.reference.travelled_m
         self._turn = _Turn(self._distance_m(float(journey.odometer_m[epoch])), travelled_m)
-        for passages in (self._own, self._set_aside, self._unoffered):
-            passages.clear()
+        self._own.clear()
+        self._unoffered.clear()
         windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel().balises]
         here_m = self._turn.distance_m
         self._optional = {balise.balise_id for balise, window in windows if window.holds(here_m)}
@@ -133,10 +128,7 @@ class LinkingChain:
         self._expect(_Announced(ahead, self._direction), 0)
 
     def offer(self, crossing: Crossing, refusal: PassageStatus | None) -> bool:
-        """Judge an offered balise and write its passage; true where it is accepted.
-
-        `refusal`: why it does not count as a detection, None where it does.
-        """
+        """Judge an offered balise; true where accepted. `refusal`: why it does not count as a detection."""
         distance_m = None
         if self.linking and crossing.odometer_m is not None:
             distance_m = self._distance_m(crossing.odometer_m)
@@ -166,7 +158,7 @@ class LinkingChain:
         crossing.status = status
         name = crossing.balise.balise_id
         if crossing.sense != crossing.direction:
-            self.cross_again(crossing)
+            self._own.pop(name, None)
         elif name in self._unoffered:
             self._unoffered[name].status = status
         else:
@@ -174,16 +166,8 @@ class LinkingChain:
             passage.status = status
             self._own[name] = passage
 
-    def cross_again(self, crossing: Crossing) -> None:
-        """Crossed once more before it was re-armed: not offered, but the position changed sides."""
-        forward = crossing.sense == crossing.direction
-        source, destination = (self._set_aside, self._own) if forward else (self._own, self._set_aside)
-        passage = source.pop(crossing.balise.balise_id, None)
-        if passage is not None:
-            destination[crossing.balise.balise_id] = passage
-
     def finish(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
-        """The run ends without a position: balises passed by the odometer get the status `absence`."""
+        """The run ends without a position: balises passed by the odometer are `absence`."""
         if not self.linking:
             return
         distance_m = self._distance_m(odometer_m)
@@ -230,10 +214,7 @@ class LinkingChain:
             passage.record(LinkingError.EARLY, balise.reaction)
 
     def _expected_at(self, balise: Balise) -> Balise | None:
-        """The balise expected when this one is offered; `None` where the offered one is not ahead.
-
-        That is the first ahead that is not optional; optional balises may be skipped.
-        """
+        """The first ahead that is not optional; None where the offered balise is not ahead."""
         place = self._ahead.place_of(balise.balise_id, self._next)
         if place is None:
             return None
@@ -262,7 +243,6 @@ class LinkingChain:
             passage.record(LinkingError.MISSED, Reaction.SERVICE_BRAKE)
 
     def _refer_to(self, crossing: Crossing) -> None:
-        """An accepted balise becomes the reference; what lies beyond it is expected next."""
         balise = crossing.balise
         self.reference = LinkingReference(balise, crossing.odometer_m, crossing.travelled_m)
         self._direction = crossing.direction
@@ -275,7 +255,6 @@ class LinkingChain:
         self._expect(way, way.first_beyond(balise.path_m))
 
     def _in_order_of_travel(self) -> _Announced:
-        """Balises of the leg that are valid in the direction of travel."""
         leg = self._leg
         direction = self._direction
         if (leg, direction) not in self._ways:
@@ -284,7 +263,6 @@ class LinkingChain:
         return self._ways[leg, direction]
 
     def _expect(self, announced: _Announced, first: int) -> None:
-        """From now on these balises are expected, from the place `first` on."""
         self._ahead = announced
         self._next = first
         self.closing_m = float("inf")
@@ -293,14 +271,13 @@ class LinkingChain:
             self.closing_m = start_m + self._window(announced.balises[first]).close_m
 
     def _passage_of(self, crossing: Crossing) -> Passage:
-        """The passage that this offer belongs to: a new one, or one whose window closed before."""
+        """A new passage, or one whose window closed before."""
         name = crossing.balise.balise_id
         forward = crossing.sense == crossing.direction
         passage = self._unoffered.pop(name, None) if forward else None
         if passage is None:
             passage = self._new_passage(crossing.balise, crossing.t_ns, crossing.direction)
             self._own.pop(name, None)
-            self._set_aside.pop(name, None)
             if forward:
                 self._own[name] = passage
         passage.crossing = crossing

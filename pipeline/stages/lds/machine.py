@@ -1,7 +1,6 @@
 """The location determination system: one walk along the epochs of a solution, with one state of its position.
 
-In any state a position is *withheld* where the diagnosis itself says that it cannot stand behind it (DOMAIN section
-5.2): no VB is accepted, no TVB is valid.
+A position is *withheld* where the diagnosis cannot stand behind it (DOMAIN section 5.2): no VB, no TVB.
 """
 
 from __future__ import annotations
@@ -46,8 +45,7 @@ class Use(Enum):
 class LocationSystem:
     """Walks once along a journey; the results stand in its public attributes afterwards.
 
-    Per epoch: `tvb`, `alarm`, `negated`, `evaluated` (`along_raw` has a verdict), `withheld_for` (why the position is
-    not used though no monitor fails, None where it is).
+    Per epoch: `tvb`, `alarm`, `negated`, `evaluated` (`along_raw` has a verdict), `withheld_for`.
     """
 
     def __init__(
@@ -89,11 +87,9 @@ class LocationSystem:
 
     @property
     def held(self) -> list[Held]:
-        """The re-links that held, in order."""
         return self._relink.held
 
     def run(self) -> None:
-        """Walk along all epochs."""
         epoch = 0
         while epoch < len(self._t_ns):
             end = self._uneventful_until(epoch)
@@ -106,10 +102,9 @@ class LocationSystem:
             self.balises.finish(self._t_ns[-1])
 
     def _uneventful_until(self, epoch: int) -> int:
-        """The first epoch from here on for `_step`; those before it are TVBs where evaluated and usable.
+        """The first epoch from here on for `_step`; those before are TVBs where evaluated and usable.
 
-        Uneventful is a position in use, in a begun chain, up to the next event (balise, read, turn, outage, loss of
-        distance), alarm or end of a window.
+        Uneventful is a position in use, in a begun chain, up to the next event, alarm or end of a window.
         """
         if self._use is not Use.IN_USE or self._withheld_for(epoch) is not None:
             return epoch
@@ -159,7 +154,6 @@ class LocationSystem:
             self._validate(epoch)
 
     def _withheld_for(self, epoch: int) -> LostTo | None:
-        """Why the diagnosis withholds the position here, None where it does not (DOMAIN section 5.2)."""
         if not self._bank.noise_known_at(epoch):
             return LostTo.NOISE
         if self._journey.slips[epoch]:
@@ -167,7 +161,7 @@ class LocationSystem:
         return LostTo.RELINK if self._use is Use.SLIPPED or self._bank.begins_at(epoch) else None
 
     def _watch(self, epoch: int) -> None:
-        """Leave or re-enter use: slip and its end, noise that hides the position, outages, the return from them."""
+        """Leave or re-enter use: slip, noise that hides the position, outages, and the return from them."""
         if self._journey.slips[epoch]:
             self._consistent_since_ns = None
             if self._use in (Use.IN_USE, Use.UNSEEN) and self._validated:
@@ -197,7 +191,7 @@ class LocationSystem:
             self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
 
     def _relink_unseen(self, epoch: int) -> None:
-        """The first usable position after an outage or the noise: it re-links, or is negated."""
+        """It re-links, or is negated."""
         self._use = Use.IN_USE
         if self._validated and self._t_ns[epoch] - self._unseen_ns > self._bridged_ns:
             comparison = self._relink.compare(epoch, self._relink.anchor_at(epoch))
@@ -206,7 +200,7 @@ class LocationSystem:
                 self._negate(epoch)
 
     def _accept(self, crossing: Crossing, epoch: int) -> None:
-        """An accepted virtual balise is the LRVB and begins the chain of TVBs; the linking distance counts from it."""
+        """It is the LRVB and begins the chain of TVBs."""
         self.accepted_at_ns[epoch] = crossing.t_ns
         crossing.initialising = not self._validated
         self._validated = True
@@ -217,14 +211,14 @@ class LocationSystem:
         self._note_lrvb(epoch)
 
     def _validate(self, epoch: int) -> None:
-        """A usable position not withheld is a TVB, once the chain has begun; else it may begin it."""
+        """A usable position is a TVB, once the chain has begun; else it may begin it."""
         if self._has_initialised(epoch) if self._chain_from is None else epoch > self._chain_from:
             self.tvb[epoch] = self._validated = True
             if not self.distance.can_measure(epoch):
                 self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
 
     def _has_initialised(self, epoch: int) -> bool:
-        """Consistent for `init_s` without a break: a TVB may arise between two VBs (SR)."""
+        """Consistent for `init_s`: a TVB may arise between two VBs (SR)."""
         t_ns = self._t_ns[epoch]
         if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns:
             self._consistent_since_ns = t_ns
@@ -236,7 +230,6 @@ class LocationSystem:
         return True
 
     def _negate(self, epoch: int) -> None:
-        """An alarm: fix the re-link anchor, freeze the noise, wait for recovery."""
         # Slow averages that fail alone show a drift as old as their memory; after a jump they fail too, but it is new.
         self._relink.note_alarm(epoch, 0.0 if self._bank.fast_failed(epoch) else self._bank.failing_memory_s(epoch))
         if self._bank.failed(epoch):
@@ -248,7 +241,7 @@ class LocationSystem:
         self._consistent_since_ns = None
 
     def _seek_return(self, epoch: int, disordered: bool) -> None:
-        """Negated: return after recovery if the position re-links, or anew where nothing was validated before."""
+        """Return after recovery if the position re-links, or anew where nothing was validated before."""
         self.negated[epoch] = True
         if not self._recovery.is_over(epoch, self.evaluated[epoch], disordered):
             return
@@ -278,7 +271,7 @@ class LocationSystem:
         self.distance.hold_to(epoch, *self._relink.moved_m(anchor, epoch, end))
 
     def _initialise_anew(self, epoch: int) -> None:
-        """No reference and no linking: a start of mission, or a fault before anything was validated."""
+        """A start of mission, or a fault before anything was validated."""
         self.balises.virtual.forget()
         self.distance.forget(epoch)
         self._chain_from = self._consistent_since_ns = None
@@ -289,7 +282,7 @@ class LocationSystem:
         self._note_lrvb(epoch)
 
     def _return(self, epoch: int) -> None:
-        """The position is in use again, but withheld at this epoch, from which the bank restarts."""
+        """In use again, but withheld at this epoch, from which the bank restarts."""
         self._use = Use.IN_USE
         self.negated[epoch] = False
         self._bank.restart(epoch)

@@ -1,10 +1,9 @@
 """The re-link: is GNSS minus odometer what it was at the anchor? (DOMAIN section 4)
 
-After an alarm the anchor is a TVB well before it, for a slow drift has moved the last one already; alarms that follow
-may be about the same fault, so that a return does not move it. Only a telegram does: it says where the train is. After
-slip that the odometer reports, no fault is suspected, so the anchor is the last TVB before the slip, but the first one
-while a position is held to it after a return. A wheel that slips is counted wrongly: that widens the bound, up to half
-the failure limit; if the count may be off by more, only a telegram re-links.
+After an alarm the anchor is a TVB well before it, for a slow drift has moved the last one already; a return does not
+move it, only a telegram does. After slip that the odometer reports no fault is suspected: the anchor is the last TVB
+before it, but the first one while a position is held to that. What the odometer may have miscounted widens the bound,
+up to half the failure limit; if that is more, only a telegram re-links.
 """
 
 from __future__ import annotations
@@ -26,10 +25,7 @@ from schemas.enums import BaliseKind, NotEvaluated
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """GNSS minus odometer [m] where it was trusted: at a TVB, or at a telegram of a physical balise.
-
-    `sigma_m`: of the position, or of the read. `epoch`: of a telegram the first one at or after it.
-    """
+    """GNSS minus odometer [m] where it was trusted: at a TVB, or a telegram. `sigma_m`: of the position or the read."""
 
     epoch: int
     t_ns: int
@@ -47,7 +43,7 @@ class Anchor:
 
     @classmethod
     def at_crossing(cls, journey: Journey, crossing: Crossing, sigma_m: float) -> Anchor | None:
-        """The balise's own place against the odometer; None where that is not known, or its distance was lost there."""
+        """By the balise's own place; None where the odometer is not known there."""
         whole = journey.segment[crossing.epoch] == journey.segment[crossing.before]
         if crossing.odometer_m is None or not whole or not isfinite(crossing.travelled_m):
             return None
@@ -58,7 +54,7 @@ class Anchor:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """How far GNSS minus odometer moved since the anchor, and how far it may have; else why nothing can be said."""
+    """How far GNSS minus odometer moved since the anchor, and may have; else why nothing can be said."""
 
     moved_m: float = np.nan
     bound_m: float = np.nan
@@ -66,7 +62,6 @@ class Comparison:
 
     @property
     def holds(self) -> bool:
-        """The position is where the anchor and the odometer expect it."""
         return self.reason is None and abs(self.moved_m) <= self.bound_m
 
 
@@ -80,7 +75,7 @@ class Held(NamedTuple):
 
 
 class Relink:
-    """The anchor of one solution, and the comparison with it. `tvb`: flags of the epochs, as far as they are known."""
+    """The anchor of one solution, and the comparison with it. `tvb`: flags of the epochs so far."""
 
     def __init__(self, journey: Journey, tvb: list[bool], config: Configuration) -> None:
         self._journey = journey
@@ -93,20 +88,15 @@ class Relink:
         self.held: list[Held] = []
 
     def begin_mission(self, epoch: int) -> None:
-        """Whatever was before `epoch` no longer counts."""
         self._fixed = None
         self._alarmed = False
         self._mission_from = epoch
 
     def note_read(self, read: Crossing) -> None:
-        """A telegram says where the train is."""
         self._fixed = Anchor.at_crossing(self._journey, read, self._config.hazards.balise_read_sigma_m) or self._fixed
 
     def note_alarm(self, epoch: int, memory_s: float = 0.0) -> None:
-        """The first alarm with an anchor before it fixes that; only a telegram moves it from there.
-
-        `memory_s`: of the slowest average that fails: the drift may have gone on for so long.
-        """
+        """The first alarm with an anchor before it fixes that. `memory_s`: the drift may be so old."""
         self._fixed = self.anchor_at(epoch, memory_s)
         self._alarmed = self._fixed is not None
 
@@ -120,7 +110,7 @@ class Relink:
         return self._last_validated(epoch, 0.0)
 
     def _last_validated(self, epoch: int, lag_s: float) -> Anchor | None:
-        """The last TVB at least `lag_s` before `epoch`, else the first of the mission; or a later telegram."""
+        """The last TVB `lag_s` before `epoch`, else the first of the mission; or a later telegram."""
         tvbs = self._mission_from + np.flatnonzero(self._tvb[self._mission_from : epoch])
         if not tvbs.size:
             return self._fixed
@@ -130,7 +120,6 @@ class Relink:
         return tvb if self._fixed is None or tvb.t_ns > self._fixed.t_ns else self._fixed
 
     def compare(self, epoch: int, anchor: Anchor | None) -> Comparison:
-        """Hold the position at `epoch` against an anchor."""
         if not self._config.lds.relink:
             return Comparison(reason=NotEvaluated.RELINK_OFF)
         if anchor is None:
@@ -176,7 +165,6 @@ class Recovery:
         self._failed_at_ns = self._observed_at_ns = 0
 
     def begin(self, epoch: int) -> None:
-        """The position is negated at `epoch`."""
         self._failed_at_ns = self._observed_at_ns = int(self._journey.t_ns[epoch])
 
     def is_over(self, epoch: int, evaluated: bool, failing: bool) -> bool:

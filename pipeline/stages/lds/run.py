@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.lds.crossings import (
+    PLACE,
     Crossing,
     Passage,
     balises_of,
@@ -17,7 +18,7 @@ from pipeline.stages.lds.crossings import (
     in_order_of_time,
     reads_of,
 )
-from pipeline.stages.lds.journey import Journey, journey_of
+from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.linking import LrvbChange
 from pipeline.stages.lds.machine import LocationSystem
 from pipeline.stages.lds.relink import Held
@@ -28,17 +29,14 @@ from schemas.conform import dtypes
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode
 from schemas.tables import Epochs, Passages
 
-# Numerics: so many epochs are looked at first, back from where a window closed; then twice as many.
-_RECKONED_AT_ONCE = 256
-
 
 @dataclass(frozen=True)
 class LdsResult:
     """What the LDS made of one solution.
 
-    `epochs`: `t` and the LDS columns, row for row with the input. `crossings`: `schemas.stages.Crossings`. `passages`:
-    as in the contract, what needs a truth null or `none`, and `t_reckoned`: when the train passes a balise that was not
-    offered, by LRVB and odometer. `unknown_reads`: telegrams of balises not on the path. `held`: re-links that held.
+    `epochs`: `t` and the LDS columns. `passages`: as in the contract, what needs a truth null or `none`, and
+    `t_reckoned`: when LRVB and odometer say that the train passes a balise that was not offered. `unknown_reads`: of
+    balises not on the path. `held`: re-links that held.
     """
 
     epochs: pl.DataFrame
@@ -59,12 +57,11 @@ def run_lds(
 ) -> LdsResult:
     """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
 
-    `epochs`: `schemas.stages.Aligned`, of which `journey_of` takes its columns. `balises`: those of the travelled path.
-    `balise_reads`: `t, balise_id`, `odometer_m` at the read where the run has an odometer. A run without that stream
-    has no reader, so its physical balises have no passages. `scale_sigma`: of the odometer, None unless a vehicle file
-    gives it with the scale.
+    `epochs`: `schemas.stages.Aligned`. `balises`: of the travelled path. `balise_reads`: `t, balise_id`, and
+    `odometer_m`; without that stream physical balises have no passages. `scale_sigma`: of the odometer by a vehicle
+    file, else None.
     """
-    journey = journey_of(epochs, scale_sigma, config)
+    journey = Journey(epochs, scale_sigma, config)
     on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
     reads, unknown = reads_of(balise_reads, on_path[BaliseKind.PHYSICAL], journey)
     crossings = in_order_of_time([*find_crossings(journey, on_path[BaliseKind.VIRTUAL]), *reads])
@@ -81,7 +78,6 @@ def run_lds(
 
 
 def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config: LdsConfig) -> pl.DataFrame:
-    """`t` and the LDS columns, row for row with the journey."""
     names = [change.lrvb and change.lrvb.balise.balise_id for change in system.lrvb_changes]
     starts = np.array([change.epoch for change in system.lrvb_changes])
     index = np.searchsorted(starts, np.arange(journey.t_ns.size), side="right") - 1
@@ -107,17 +103,14 @@ def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config
 
 
 def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools) -> Bools:
-    """P3 (DOMAIN section 4): `along_raw` has no verdict. A position withheld for that is availability lost instead.
-
-    A run without an odometer has no diagnosis along the track at all.
-    """
+    """P3 (DOMAIN section 4): `along_raw` has no verdict, and the position is not withheld."""
     undiagnosed = ~np.array(system.evaluated, dtype=bool)
     faulty: Bools = undiagnosed & ~withheld if journey.has_odometer else undiagnosed
     return faulty
 
 
 def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld: Bools) -> pl.Series:
-    """`lds_mode` of each epoch; `index`: the change of LRVB in force there."""
+    """`index`: the change of LRVB in force at each epoch."""
     linked = np.array(
         [
             (change.lrvb is not None and change.lrvb.odometer_m is not None)
@@ -135,10 +128,7 @@ def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld
 def _reported_m(
     changes: list[LrvbChange], index: np.ndarray, journey: Journey, config: LdsConfig
 ) -> tuple[Floats, Floats]:
-    """Odometer distance since the LRVB, and the over- and under-reading amount of that report.
-
-    SUBSET-026 3.6.4: location accuracy of the reference plus the odometer's confidence on the way run.
-    """
+    """Odometer distance since the LRVB, and by how much it over- or under-reads (SUBSET-026 3.6.4)."""
     values = [
         (np.nan, np.nan, np.nan)
         if (lrvb := change.lrvb) is None
@@ -156,10 +146,7 @@ def _reported_m(
 
 
 def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:
-    """Time since the last linked TVB or accepted VB before this epoch's own validation.
-
-    That is the interval of TVB eq. 7; measured after validation it would hide an outage without epochs.
-    """
+    """Time since the last TVB or accepted VB before this epoch's own: TVB eq. 7; an outage shows."""
     never = np.iinfo(np.int64).min
     validated_ns = np.where(system.tvb, journey.t_ns, never)
     before_ns = np.concatenate(([never], validated_ns[:-1]))[: journey.t_ns.size]
@@ -175,7 +162,6 @@ def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:
 def passage_rows(
     passages: Sequence[Passage], crossings: Sequence[Crossing], journey: Journey, solution: str
 ) -> pl.DataFrame:
-    """Passages in order of time, as in the contract, and `t_reckoned`; `crossings` in order of time."""
     ids = {id(crossing): number for number, crossing in enumerate(crossings)}
     rows = [_row(passage, ids, journey, solution) for passage in passages]
     when = [row["t_offered"] or row["t_reckoned"] or passage.t_ns for row, passage in zip(rows, passages, strict=True)]
@@ -191,11 +177,8 @@ def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str)
     direction = journey.direction_at(passage.t_ns)
     return {
         "solution": solution,
-        "balise_id": balise.balise_id,
+        **{name: getattr(balise, name) for name in PLACE},
         "kind": balise.kind.value,
-        "netelement_id": balise.netelement_id,
-        "measure_m": balise.measure_m,
-        "path_m": balise.path_m,
         "direction": (Direction.GROWING if direction > 0 else Direction.FALLING).value,
         "status": passage.status.value,
         "t_offered": crossing and crossing.t_ns,
@@ -220,18 +203,12 @@ def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
     if passage.crossing is not None or passage.announced_odometer_m is None:
         return None
     known = journey.on_odometer
-    end = int(np.searchsorted(journey.t_ns[known], passage.t_ns, side="right"))
-    size = _RECKONED_AT_ONCE
-    while end > 1:
-        rows = known[max(end - size, 0) : end]
-        beyond = journey.odometer_m[rows] >= passage.announced_odometer_m
-        steps = np.flatnonzero(beyond[1:] != beyond[:-1])
-        if steps.size:
-            before = rows[steps[-1]]
-            after = rows[steps[-1] + 1]
-            part_m = passage.announced_odometer_m - journey.odometer_m[before]
-            share = float(part_m / (journey.odometer_m[after] - journey.odometer_m[before]))
-            return int(journey.t_ns[before]) + round(share * int(journey.t_ns[after] - journey.t_ns[before]))
-        end = end - rows.size + 1
-        size = 2 * size
-    return None
+    rows = known[: int(np.searchsorted(journey.t_ns[known], passage.t_ns, side="right"))]
+    beyond = journey.odometer_m[rows] >= passage.announced_odometer_m
+    steps = np.flatnonzero(np.diff(beyond))
+    if not steps.size:
+        return None
+    before, after = rows[steps[-1] : steps[-1] + 2].tolist()
+    part_m = passage.announced_odometer_m - journey.odometer_m[before]
+    share = float(part_m / (journey.odometer_m[after] - journey.odometer_m[before]))
+    return int(journey.t_ns[before]) + round(share * int(journey.t_ns[after] - journey.t_ns[before]))

@@ -33,10 +33,9 @@ def window_m(distance_m: float, accuracy_m: float, reference_accuracy_m: float, 
 
 
 def window_after_turn_m(distance_m: float, travelled_m: float, margin_m: float, config: LdsConfig = DEFAULTS) -> Window:
-    """Window of a balise where the train turned round since the reference.
+    """Where the train turned round since the reference: 5 % of the whole way run, not of the net distance.
 
-    The odometer's 5 % then counts on the whole way run (`travelled_m`), not on the net distance;
-    `margin_m` is Q + Q_r + 5 m. The clauses know no such case: linking holds for one direction.
+    `margin_m` is Q + Q_r + 5 m. The clauses know no such case.
     """
     half_m = (margin_m + config.odometer_share * travelled_m) / (1.0 - config.odometer_share)
     return Window(distance_m - half_m, distance_m + half_m)
@@ -45,10 +44,7 @@ def window_after_turn_m(distance_m: float, travelled_m: float, margin_m: float, 
 def minimal_spacing_m(
     distance_m: float, accuracy_m: float, next_accuracy_m: float, reference_accuracy_m: float, config: LdsConfig
 ) -> float:
-    """Smallest distance from a balise at `distance_m` to the next whose window does not overlap its own.
-
-    The balise, the next and the reference each have their location accuracy (LOC section III: one for all).
-    """
+    """Smallest distance to the next balise whose window does not overlap its own (LOC section III)."""
     margin_m = next_accuracy_m + reference_accuracy_m + config.odometer_fixed_m
     close_m = window_m(distance_m, accuracy_m, reference_accuracy_m, config).close_m
     return close_m * (1.0 + config.odometer_share) + margin_m - distance_m

@@ -1,7 +1,6 @@
 """One axis of the bank: increments between usable epochs as rates, raw and through EWMAs, with their sigmas.
 
-Errors and steps of every axis are built here, and the increments of GNSS minus odometer (DIAG eq. 1-3), for the bank
-and for learning.
+Along the track (DIAG eq. 1-3) for the bank and for learning.
 """
 
 from __future__ import annotations
@@ -30,14 +29,13 @@ FIRST_BLOCK, BLOCK = 2048, 8192
 
 @dataclass(frozen=True)
 class AxisSeries:
-    """Increments of one axis, one row per usable epoch, in order; all arrays of the same length m.
+    """Increments of one axis, one row per usable epoch, in order; all arrays of one length m.
 
-    `epoch`: row among all epochs. `fresh`: no increment leads here (start, long gap, lost distance). `rate_mps`:
-    increment of GNSS minus odometer or track over `dt_s`. `border`: it crosses into another net element, whose survey
-    has another offset, of variance `border_m2`. `sigma_m`, `sigma_before_m`, `decorrelation` (m, sources): sqrt R_j
-    here and at the row before (`before_steps`), 1 - phi_j. `white_m2`: odometer noise of the increment. `lasting_mps`
-    (m, errors): what one sigma of each error that stays makes of the rate, signed: scale and latency of the odometer,
-    the position error that a curve turns into this axis.
+    `epoch`: row among all epochs. `fresh`: no increment leads here. `rate_mps`: increment over `dt_s`. `border`: into
+    another net element, whose survey has another offset, of variance `border_m2`. `sigma_m`, `sigma_before_m`,
+    `decorrelation` (m, sources): sqrt R_j here and at the row before (`before_steps`), 1 - phi_j. `white_m2`: odometer
+    noise of the increment. `lasting_mps` (m, errors): what one sigma of each error that stays makes of the rate,
+    signed: scale, latency, the position error that a curve turns into this axis.
     """
 
     epoch: Ints
@@ -53,7 +51,6 @@ class AxisSeries:
     lasting_mps: Floats
 
     def between(self, low: int, high: int) -> AxisSeries:
-        """Rows [low, high)."""
         return AxisSeries(**{item.name: getattr(self, item.name)[low:high] for item in fields(self)})
 
 
@@ -64,7 +61,7 @@ Source = tuple[Floats, Floats]
 def errors_of(sigma_m: Floats, dt_s: Floats, beside: Sequence[Source], config: MonitorConfig) -> dict[str, Floats]:
     """The error fields of a series: Gauss-Markov errors of positions of this sigma, and what stands beside them.
 
-    In Fortran order, for the recursions go along the rows, one source after the other.
+    In Fortran order: the recursions go along the rows.
     """
     shares, taus_s = error_model(config)
     model = [(np.sqrt(share) * sigma_m, -np.expm1(-dt_s / tau_s)) for share, tau_s in zip(shares, taus_s, strict=True)]
@@ -74,14 +71,14 @@ def errors_of(sigma_m: Floats, dt_s: Floats, beside: Sequence[Source], config: M
 
 
 def error_model(config: MonitorConfig) -> tuple[Floats, Floats]:
-    """Shares of the position variance and correlation times [s] of the Gauss-Markov errors (DIAG Table 1)."""
+    """Shares of the position variance and correlation times [s] (DIAG Table 1)."""
     shares = [config.ionosphere_share, config.troposphere_share, config.orbit_clock_share, config.user_share]
     taus = [config.ionosphere_tau_s, config.troposphere_tau_s, config.orbit_clock_tau_s, config.user_tau_s]
     return np.array(shares), np.array(taus)
 
 
 def time_steps(t_s: Floats, gap_reset_s: float) -> tuple[Floats, Bools]:
-    """Time since the row before [s] (1 s stands in where there is none), and rows that nothing leads to."""
+    """Time since the row before [s], 1 s where there is none, and rows that nothing leads to."""
     dt_s = np.diff(t_s, prepend=t_s[:1] - 1.0)
     fresh = dt_s > gap_reset_s
     fresh[:1] = True
@@ -93,8 +90,8 @@ def run_axis(
 ) -> tuple[Floats, Floats, AxisState]:
     """Values and sigmas of the axis [m/s] from `state`, or from a restart, on, and the state to carry on with.
 
-    Shapes (rows, 1 + alphas), of one row at least: raw first, then the EWMAs. `noise_m2`: of the same shape, the fast
-    noise beyond the model (`noise.py`), none by default; where it is not known neither is the sigma.
+    Shapes (rows, 1 + alphas): raw, then the EWMAs. `noise_m2`: of the same shape, the fast noise beyond the model;
+    where it is NaN, so is the sigma.
     """
     noise_m2 = np.zeros((series.dt_s.size, 1 + alphas.size)) if noise_m2 is None else noise_m2
     known_m2 = np.nan_to_num(noise_m2)
@@ -131,11 +128,9 @@ def _raw_variance(series: AxisSeries, increment_m2: Floats) -> Floats:
 class AlongEpochs:
     """Epochs with a position and an odometer, in order, and the errors there; all arrays of one length m.
 
-    `epoch`: row among all epochs; `segment`: the odometer's continuity segment; `sigma_m`: of the Gauss-Markov errors;
-    `digits_m`: how coarsely positions are written down; `jitter_s`: how the stamps scatter about the receiver's clock;
-    `scale_sigma`, `latency_sigma_s`: of the estimates in use; `white_m2_per_s`: what the odometer's distance gathers in
-    a second; `rows_m`: quantisation noise of its rows, `period_s` apart, None where the odometer has none at
-    all: the same over a whole run, for the recursions carry each source on.
+    `sigma_m`: of the Gauss-Markov errors; `digits_m`: how coarsely positions are written; `jitter_s`: scatter of the
+    stamps; `white_m2_per_s`: what the odometer's distance gathers; `rows_m`: quantisation noise of its rows, `period_s`
+    apart, None where it has none in the whole run, for the recursions carry each source on.
     """
 
     epoch: Ints
@@ -153,7 +148,6 @@ class AlongEpochs:
 
 
 def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuration) -> AxisSeries:
-    """Increments from each epoch to the next, with what scale and latency leave uncertain."""
     dt, fresh = time_steps(epochs.t_s, config.align.gap_reset_s)
     zero = np.zeros(dt.size)
     # New at each epoch: a stamp's error times the speed, and the digits. The odometer's rows lose theirs by and by.
@@ -177,11 +171,11 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
 
 
 def _rows_decorrelation(dt_s: Floats, period_s: Floats | float, config: MonitorConfig) -> Floats:
-    """1 - phi of the rows' noise over these steps: none is left from row to row; between them little changes.
+    """1 - phi of the rows' noise over these steps: none is left from row to row.
 
-    The square is what a step changes on a straight line between two rows. Errors that change so little and at random
-    would last for `period_s`^2 / dt, and averages would follow them: they have none that lasts longer than half of
-    the fastest average's memory. So the variance of all averages is that of rows up to so far apart, or above it.
+    The square is what a step changes on a straight line between two rows. Errors that change so little at random would
+    last for `period_s`^2 / dt, and averages would follow them: so they last half of the fastest average's memory at
+    most, and the variance of all averages is that of rows so far apart, or above it.
     """
     changed = np.minimum(dt_s / np.maximum(period_s, 1e-9), 1.0) ** 2
     lasts_s = 0.5 / config.ewma_alphas[0]
@@ -192,8 +186,7 @@ def _rows_decorrelation(dt_s: Floats, period_s: Floats | float, config: MonitorC
 def most_scatter_m(config: Configuration) -> float:
     """The largest deviation of an odometer's row, or of digits, that the thresholds allow for [m].
 
-    With more, the threshold k_T sqrt(2) sigma of two rows would exceed the failure limit and hide a failure. A record
-    that scatters by more raises false alarms instead.
+    With more, k_T sqrt(2) sigma of two rows would exceed the failure limit: false alarms rather than a failure hidden.
     """
     factor = config.monitors.threshold_factor
     return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))

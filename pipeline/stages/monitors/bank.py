@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -32,26 +32,12 @@ WHITE_PART = float(np.sqrt(OF_WALK / OF_WHITE_NOISE))
 """White noise over what is measured, which is taken for a random walk."""
 
 
-@dataclass(frozen=True)
-class AxisRecord:
-    """What one axis of the bank saw over a whole run, restarts included.
-
-    `series`: its increments, `fresh` where a restart was too. `value`, `threshold`: per epoch and monitor (raw, then
-    the EWMAs) [m/s]; the threshold NaN where not evaluated, the value where there is none. `enabled`: which of the
-    monitors are.
-    """
-
-    series: AxisSeries
-    value: Floats
-    threshold: Floats
-    enabled: Bools
-
-
-class _AxisBank:
+class AxisBank:
     """One axis of the bank over all epochs of a solution; rows are evaluated up to `_done`.
 
-    `noise_m`: fast noise that the thresholds count with, per epoch and monitor; NaN where not known or no row is.
-    `noise_known`: it is known, and no failure can hide in it; true where the axis has no row.
+    `series`: its increments, `fresh` where a restart was too. `value`, `threshold`, `noise_m` (fast noise in the
+    thresholds): per epoch and monitor (raw, then the EWMAs), NaN where there is none. `noise_known`: no failure can
+    hide in it; true where the axis has no row. `enabled`: which of the monitors are.
     """
 
     def __init__(self, axis: Axis, epochs: int, config: Configuration) -> None:
@@ -59,7 +45,7 @@ class _AxisBank:
         self.series = axis.series
         self._config = config
         self._alphas = np.array(config.monitors.ewma_alphas)
-        self._enabled = np.array([f"{axis.name}_{scale}" not in config.monitors.disabled for scale in SCALES])
+        self.enabled = np.array([f"{axis.name}_{scale}" not in config.monitors.disabled for scale in SCALES])
         shape = epochs, len(SCALES)
         self.value, self.threshold, self.noise_m = (np.full(shape, np.nan, order="F") for _ in range(3))
         self.state = np.full(shape, NOT_EVALUATED, dtype=np.int8, order="F")
@@ -70,14 +56,13 @@ class _AxisBank:
         self._begin_at(0, None, BLOCK)
 
     def _begin_at(self, row: int, state: AxisState | None, block: int) -> None:
-        """Rows from this one on are evaluated next, from this state of the recursions on."""
         self._done = row
         self._state = state
         self._block = block
         self._last_block = row, state
 
     def advance(self, epoch: int) -> int:
-        """Evaluate up to this epoch at least; returns the last epoch that is evaluated now."""
+        """Evaluate up to this epoch; returns the last one that is evaluated now."""
         rows = self.series.epoch
         while self._done < rows.size and rows[self._done] <= epoch:
             end = min(self._done + self._block, rows.size)
@@ -90,9 +75,9 @@ class _AxisBank:
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats, noise_m: Floats) -> None:
-        present = ~part.fresh[:, None] & self._enabled[None, :]
+        present = ~part.fresh[:, None] & self.enabled[None, :]
         # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
-        known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self._enabled.any(), axis=1)
+        known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self.enabled.any(), axis=1)
         judged = present & known[:, None]
         self.state[part.epoch] = states_of(value, threshold, judged)
         self.value[part.epoch] = np.where(present, value, np.nan)
@@ -113,27 +98,23 @@ class _AxisBank:
             self._begin_at(*self._last_block, FIRST_BLOCK)
 
     def restart(self, epoch: int) -> None:
-        """Forget all before this epoch but the noise; the first increment is from the first usable epoch on."""
+        """Forget all but the noise; the first increment is from the first usable epoch on."""
         row = int(np.searchsorted(self.series.epoch, epoch))
         self.series = replace(self.series, fresh=self.series.fresh | (np.arange(self.series.fresh.size) == row))
         self._meter.restart(row)
         self._begin_at(row, None, FIRST_BLOCK)
 
-    def record(self) -> AxisRecord:
-        return AxisRecord(self.series, self.value, self.threshold, self._enabled)
-
     def white_noise_m(self) -> float | None:
-        """sqrt(4 M / 6) of one epoch at the end; None where it was never known (DOMAIN section 3)."""
+        """sqrt(4 M / 6) of one epoch at the end; None where never known (DOMAIN section 3)."""
         known = self.noise_m[:, 0][np.isfinite(self.noise_m[:, 0])]
         return float(known[-1]) * WHITE_PART if known.size else None
 
     def median_noise_m(self) -> tuple[float, ...]:
-        """By monitor, over the epochs at which it was known; empty where it never was."""
+        """By monitor; empty where it never was known."""
         known = self.noise_m[np.isfinite(self.noise_m).all(axis=1)]
         return tuple(np.median(known, axis=0).tolist()) if known.size else ()
 
     def columns(self) -> list[pl.Series]:
-        """Value, threshold, state and reason of each monitor of the axis."""
         unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
         unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
         too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
@@ -141,7 +122,7 @@ class _AxisBank:
         reasons = self.axis.reasons.fill_null(of_noise).fill_null(FIRST_EPOCH)
         columns: list[pl.Series] = []
         for index, scale in enumerate(SCALES):
-            why = reasons if self._enabled[index] else self.axis.reasons.fill_null(DISABLED)
+            why = reasons if self.enabled[index] else self.axis.reasons.fill_null(DISABLED)
             frame = verdicts(self.value[:, index], self.threshold[:, index], why, self.state[:, index])
             columns += of_monitor(f"{self.axis.name}_{scale}", frame)
         return columns
@@ -150,17 +131,16 @@ class _AxisBank:
 class MonitorBank:
     """The bank as the location determination system sees it: monitors of one solution, from the last restart on.
 
-    Epochs are rows of the solution's epochs. The answers for an epoch may change with `freeze` or `restart` at that
-    epoch or before it, never through later ones. `single`: monitors without memory beyond an epoch, evaluated
-    beforehand, `value, threshold, state, reason` by name. `watched`: epochs with a row along the track. A fail of any
-    monitor at an epoch is an alarm.
+    Epochs are rows of the solution's epochs. Answers for an epoch may change with `freeze` or `restart` at or before
+    it, never through later ones. `single`: monitors without memory. `watched`: epochs with a row along the track. A
+    fail of any monitor is an alarm.
     """
 
     def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration):
         self._count = epochs.height
         disabled = config.monitors.disabled
         self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in config.monitors.ewma_alphas)])
-        self._axes = tuple(_AxisBank(axis, self._count, config) for axis in axes_of(epochs, config))
+        self._axes = tuple(AxisBank(axis, self._count, config) for axis in axes_of(epochs, config))
         along, across, _ = self._axes
         # In a run without an odometer the axis across the track has to say where the bank begins.
         self._begins = (along if along.series.epoch.size else across).begins
@@ -190,83 +170,77 @@ class MonitorBank:
         self._look(self._count - 1)
 
     def failed(self, epoch: int) -> bool:
-        """Any monitor of the bank fails at this epoch."""
         self._look(epoch)
         return bool(self._any[epoch])
 
     def fast_failed(self, epoch: int) -> bool:
         """A monitor fails that does not ring: raw, fastest EWMA, or without memory. Only these hold back recovery.
 
-        A monitor without memory (Doppler, ranges, channels) belongs here: it does not outlive its fault, and a return
-        while it fails would restart the bank every `recovery_s` and so blind its slow averages.
+        One without memory does not outlive its fault; a return while it fails would restart the bank every `recovery_s`
+        and so blind its slow averages.
         """
         self._look(epoch)
         return bool(self._fast[epoch])
 
     def failing_memory_s(self, epoch: int) -> float:
-        """Memory of the slowest failing average [s]: its fault may be that old; 0 where none fails."""
+        """Memory of the slowest failing average [s]: its fault may be that old."""
         self._look(epoch)
         failing = np.any([axis.state[epoch] == FAIL for axis in self._axes], axis=0)
         return float(np.max(self._memories_s * failing))
 
     def along_evaluated(self, epoch: int) -> bool:
-        """`along_raw` has a verdict (pass or fail) at this epoch; an average alone says nothing of a step."""
+        """`along_raw` has a verdict; an average alone says nothing of a step."""
         self._look(epoch)
         return bool(self._along[epoch])
 
     def quiet_until(self, epoch: int, end: int) -> int:
-        """The first epoch from `epoch` on at which a monitor fails, the bank begins or the noise is not known.
-
-        At most `end`, and the first epoch that is not looked at yet.
-        """
+        """The first epoch from `epoch` on, at most `end`, at which something fails, begins or is not known yet."""
         self._look(epoch)
         ahead = self._stops[epoch : min(self._known_to + 1, end)]
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
     def along_evaluated_between(self, epoch: int, end: int) -> Bools:
-        """`along_evaluated` of the epochs [epoch, end), none of them beyond what `quiet_until` answered."""
+        """Of epochs for which `quiet_until` answered."""
         return self._along[epoch:end]
 
     def noise_known_at(self, epoch: int) -> bool:
-        """The fast noise along the track is known at this epoch, and no failure can hide in it."""
+        """The fast noise along the track is known, and no failure can hide in it."""
         self._look(epoch)
         return bool(self._noise_known[epoch])
 
     def begins_at(self, epoch: int) -> bool:
-        """The bank begins here: at the start, after a gap, after lost distance or at a restart; nothing leads here."""
+        """Nothing leads here: start, gap, lost distance, restart."""
         self._look(epoch)
         return bool(self._begins[epoch])
 
     def freeze(self, epoch: int) -> None:
-        """The position is negated from this epoch on: until the next restart nothing enters the measured noise."""
+        """Negated from this epoch on: until a restart nothing enters the measured noise."""
         for axis in self._axes:
             axis.freeze(epoch)
         self._known_to = min(self._known_to, epoch)
 
     def restart(self, epoch: int) -> None:
-        """All recursions start anew at this epoch; their first increment is from it to the next."""
         for axis in self._axes:
             axis.restart(epoch)
         self._known_to = epoch - 1
 
-    def along(self) -> AxisRecord:
-        """What the monitors along the track saw, once the LDS has walked to the end of the run."""
+    def along(self) -> AxisBank:
+        """What the monitors along the track saw, after the walk."""
         self._look_to_the_end()
-        return self._axes[0].record()
+        return self._axes[0]
 
     def white_noise(self) -> dict[str, float | None]:
-        """`white_noise_*_m` of the run: the noise at one epoch, were it white, as last measured [m]."""
+        """`white_noise_*_m` of the run [m]."""
         return {f"white_noise_{axis.axis.name}_m": axis.white_noise_m() for axis in self._axes}
 
     def median_noise_m(self) -> dict[str, tuple[float, ...]]:
-        """`noise_*_m` of the configuration, as this run shows them; axes whose noise was never known are left out."""
+        """`noise_*_m` of the configuration, as this run shows them."""
         self._look_to_the_end()
         shown = {f"noise_{axis.axis.name}_m": axis.median_noise_m() for axis in self._axes}
         return {name: noise_m for name, noise_m in shown.items() if noise_m}
 
     def columns(self) -> list[pl.Series]:
-        """All monitor columns of the epochs table but those of the linking monitors."""
         self._look_to_the_end()
         columns = [column for axis in self._axes for column in axis.columns()]
         return columns + [column for name, frame in self._single.items() for column in of_monitor(name, frame)]

@@ -1,7 +1,7 @@
 """The fast noise of one axis, measured in the run from what came before (DOMAIN section 3).
 
-DIAG's errors are smooth from epoch to epoch, those of receivers are not. What second differences of the offset (GNSS
-minus odometer or track) show beyond the model is added to the thresholds: a constant ramp has no second difference.
+What second differences of the offset (GNSS minus odometer or track) show beyond the model is added to the thresholds: a
+constant ramp has no second difference.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class NoiseMeter:
     """Fast noise of one axis, row by row of its series; rows under alarm never enter."""
 
     def __init__(self, series: AxisSeries, moving: Bools, given_m: tuple[float, ...] | None, config: Configuration):
-        """`series`: of the whole run; `moving`: per row; `given_m`: by monitor, replaces what is measured."""
+        """`series`: of the whole run; `given_m`: by monitor, replaces what is measured."""
         self._series = series
         self._config = config.monitors
         self._limit_m2 = config.noise_limit_m**2
@@ -44,7 +44,6 @@ class NoiseMeter:
         self._entering = [np.arange(samples.row.size) for samples in self._samples]
 
     def freeze(self, row: int) -> None:
-        """Samples of this row and later ones are no longer counted."""
         for index, samples in enumerate(self._samples):
             entering = self._entering[index]
             self._entering[index] = entering[: np.searchsorted(samples.row[entering], row)]
@@ -57,7 +56,7 @@ class NoiseMeter:
             self._entering[index] = np.concatenate([self._entering[index], later])
 
     def known_from(self) -> int:
-        """The first row whose noise is known; the number of rows where it never is."""
+        """The first row whose noise is known; the number of rows where none is."""
         if self._given_m2 is not None:
             return 0
         if not self._samples or self._samples[0].row.size < self._samples[0].ready:
@@ -81,9 +80,9 @@ class NoiseMeter:
     def _by_lag(self, renewals: Ints) -> Floats:
         """M of every lag (columns) at these renewals (rows): measured, or expected from the shorter lags until it is.
 
-        Expected: M(lag) = M(shorter) + growth x (model(lag) - model(shorter)). The growth is that of the lag before,
-        so 0 for white noise and more for smooth errors of a larger sigma than stated; at the shortest lag all noise is
-        taken for smooth. Where it declined from lag to lag it declines on in the same ratio; it never rises.
+        M(lag) = M(shorter) + growth x (model(lag) - model(shorter)). The growth is that of the lag before, 0 for white
+        noise; at the shortest lag all noise is taken for smooth. A decline from lag to lag goes on in the same ratio;
+        it never rises.
         """
         row = np.searchsorted(self._renewal, renewals)
         model_m2 = np.column_stack([_model_at_m2(self._series, row, lag_s, self._config) for lag_s in self._lags_s])
@@ -106,7 +105,7 @@ class NoiseMeter:
         return noise_m2
 
     def _measured(self, index: int, renewals: Ints, row: Ints) -> tuple[Floats, Bools]:
-        """M of one lag by the samples before each renewal (first row `row`), and whether there were enough of them."""
+        """M of one lag by the samples before each renewal (first row `row`), and whether they were enough."""
         samples = self._samples[index]
         entering = self._entering[index]
         before = np.searchsorted(samples.renewal[entering], renewals)
@@ -124,7 +123,7 @@ class NoiseMeter:
         return self._capped(shown_m2[window], shown_m2[window] * doubted * larger), ready
 
     def _capped(self, known_m2: Floats, more_m2: Floats) -> Floats:
-        """`more_m2`, the noise with its doubt, up to the limit: doubt alone does not make an axis blind."""
+        """Noise with its doubt, up to the limit: doubt alone does not make an axis blind."""
         return np.minimum(more_m2, np.maximum(known_m2, self._limit_m2))
 
 
@@ -132,9 +131,9 @@ class NoiseMeter:
 class _SecondDifferences:
     """Second differences over one lag, in order of time.
 
-    `row`, `oldest`: of t and of t - 2 L; `renewal`: number of the renewal period of t; `noise_m2` (quantiles, samples):
-    what would explain the sample if it were that quantile; `stated_m2`: variance of the smooth errors there.
-    `window`: how many samples are looked back at; `ready`: how many are enough; `span`: how many of them fill 2 L.
+    `row`, `oldest`: of t and t - 2 L; `renewal`: period of t; `noise_m2` (quantiles, samples): what would explain the
+    sample if it were that quantile; `stated_m2`: variance of the smooth errors. In samples: `window` to look back at,
+    `ready` are enough, `span` fill 2 L.
     """
 
     row: Ints
@@ -150,7 +149,7 @@ class _SecondDifferences:
     def looked_back(self, entering: Ints, ends: Ints) -> tuple[Floats, Floats, Floats]:
         """Of the window of counted samples before each of `ends`: M, its relative standard error, the stated variance.
 
-        M is the largest over the quantiles; a window still short at the begin is filled with -inf, which sorts first.
+        M is the largest over the quantiles; a window still short is filled with -inf, which sorts first.
         """
         begins = np.maximum(ends - self.window, 0)
         count = np.maximum(ends - begins, 1)
@@ -180,7 +179,7 @@ class _Triples(NamedTuple):
 
 
 class _Sampler:
-    """Second differences of a series, by running sums whose differences are what happened between two rows."""
+    """Second differences by running sums, whose differences are what happened between two rows."""
 
     def __init__(self, series: AxisSeries, moving: Bools, config: MonitorConfig) -> None:
         self._series = series
@@ -200,7 +199,7 @@ class _Sampler:
         self._lasting_m = [np.cumsum(rate_mps * series.dt_s) for rate_mps in series.lasting_mps.T if rate_mps.any()]
 
     def over(self, lag_s: float) -> _SecondDifferences:
-        """Those of one lag: M = (second difference^2 / quantile of chi^2 - model) / 4 (DOMAIN section 3)."""
+        """M = (second difference^2 / quantile of chi^2 - model) / 4 (DOMAIN section 3)."""
         config = self._config
         spacing_s = max(self.period_s, 0.1 * lag_s, config.noise_spacing_s)
         rows = self._triples(lag_s, spacing_s)
@@ -238,8 +237,7 @@ class _Sampler:
     def _model_m2(self, lag_s: float, rows: _Triples) -> Floats:
         """Variance of the second differences by the whole model, sample by sample [m^2].
 
-        Beside the smooth errors: digits, jitter, rows and survey as far as they are modelled, the odometer's white
-        noise, and what scale and latency leave uncertain.
+        Smooth errors; digits, jitter, rows and survey; the odometer's white noise; scale and latency.
         """
         series = self._series
         model_m2 = _smooth_m2(series, rows.last, lag_s, self._config)
@@ -255,7 +253,7 @@ class _Sampler:
 
 
 def _lags_s(period_s: float, memories_s: Floats) -> list[float]:
-    """One epoch, 1 s, and the memories of the averages, as far as they are longer than an epoch."""
+    """One epoch, 1 s, and the memories of the averages, if longer."""
     return [period_s, *(lag_s for lag_s in sorted({1.0, *memories_s.tolist()}) if lag_s > 1.5 * period_s)]
 
 
@@ -264,17 +262,17 @@ def _ratio(part: Floats, whole: Floats) -> Floats:
 
 
 def _stated_m2(series: AxisSeries, row: Ints, config: MonitorConfig) -> Floats:
-    """Variance of the Gauss-Markov errors at these rows [m^2]."""
+    """Of the Gauss-Markov errors [m^2]."""
     return np.asarray((series.sigma_m[row, : error_model(config)[1].size] ** 2).sum(axis=1))
 
 
 def _model_at_m2(series: AxisSeries, row: Ints, lag_s: float, config: MonitorConfig) -> Floats:
-    """Variance of second differences at these rows: smooth errors, and the odometer's walk [m^2]."""
+    """Of second differences: smooth errors, and the odometer's walk [m^2]."""
     return _smooth_m2(series, row, lag_s, config) + 2.0 * lag_s * (series.white_m2 / series.dt_s)[row]
 
 
 def _smooth_m2(series: AxisSeries, row: Ints, lag_s: float, config: MonitorConfig) -> Floats:
-    """Of the Gauss-Markov errors: sum of R_j (6 - 8 exp(-L/tau) + 2 exp(-2L/tau)) (DOMAIN section 3) [m^2]."""
+    """Sum of R_j (6 - 8 exp(-L/tau) + 2 exp(-2L/tau)) (DOMAIN section 3) [m^2]."""
     taus_s = error_model(config)[1]
     decay = np.exp(-lag_s / taus_s)
     return np.asarray(series.sigma_m[row, : taus_s.size] ** 2 @ (2.0 * (1.0 - decay) * (3.0 - decay)))

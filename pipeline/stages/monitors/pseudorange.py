@@ -1,10 +1,9 @@
 """Pseudorange monitor: do the ranges agree with a position on the track? (TVB section 6; DOMAIN section 3).
 
-The residuals that the receiver recorded belong to its published position. Here they are moved to the point of
-the track beside it, and only what the track does not know stays free: the error along it, and one clock
-per constellation. The survey's error across and in height enters as a prior of its own sigma. What remains, as
-weighted sum of squares, is chi-square distributed while all ranges are healthy. A slow ramp in one range, which
-no increment shows, stays in it for as long as it lasts.
+The recorded residuals belong to the published position. They are moved to the point of the track beside it, and only
+the error along it and one clock per constellation stay free; across and in height the survey's sigma is a prior. What
+remains, as weighted sum of squares, is chi-square distributed while all ranges are healthy; a slow ramp in one range
+stays in it for as long as it lasts.
 """
 
 from __future__ import annotations
@@ -34,8 +33,7 @@ _RIDGE = 1e-13
 def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, config: Configuration) -> pl.DataFrame:
     """`value, threshold, state, reason`, row for row with the matched epochs of one solution.
 
-    `satellites`: the recorded stream, of this solution. Value: weighted sum of squares [1]; threshold: its
-    chi-square quantile at the configured false-alarm probability for the epoch's degrees of freedom.
+    Value: weighted sum of squares [1]; threshold: its chi-square quantile for the epoch's degrees of freedom.
     """
     if satellites is None or satellites.is_empty():
         return no_verdicts(epochs.height, NO_RANGES)
@@ -58,7 +56,7 @@ def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, c
 
 @dataclass(frozen=True)
 class _Ranges:
-    """Used satellites with a residual, ordered by epoch; `system` numbers the constellations."""
+    """Used satellites with a residual, by epoch; `system` numbers the constellations."""
 
     epoch: Ints
     system: Ints
@@ -73,7 +71,7 @@ class _Ranges:
 
 @dataclass(frozen=True)
 class _TrackFrame:
-    """The track at each epoch: unit vectors east, north, up and offset of the position from it [m]."""
+    """At each epoch: unit vectors east, north, up, and the position's offset [m]."""
 
     along: Floats
     cross: Floats
@@ -134,8 +132,8 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _TrackFrame:
 class Equations:
     """The ranges of some epochs against a position on the track; shapes (epochs, satellites, ...).
 
-    `epoch`: which of them. `rows`: change of range per metre east, north, up; `clocks`: whose clock counts. `design`:
-    what may be wrong (along, across, up, clocks) with `prior` as precision. `along` (epochs, 3): the track's direction.
+    `rows`: change of range per metre east, north, up; `design`: what may be wrong (along, across, up, clocks) with
+    `prior` as precision. `along` (epochs, 3): the track's direction.
     """
 
     epoch: Ints
@@ -151,7 +149,7 @@ class Equations:
 
 
 def equations_of(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configuration) -> Iterator[Equations]:
-    """The equations that the monitor tests, some thousand epochs at once; arguments as of `pseudorange_monitor`."""
+    """Some thousand epochs at once."""
     ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
     return _chunks(ranges, _track_of(epochs, config))
 
@@ -164,7 +162,6 @@ def _chunks(ranges: _Ranges, track: _TrackFrame) -> Iterator[Equations]:
 
 
 def _equations(ranges: _Ranges, track: _TrackFrame, epochs: Ints) -> Equations:
-    """Of these epochs, which all have satellites."""
     first = np.searchsorted(ranges.epoch, epochs)
     count = np.searchsorted(ranges.epoch, epochs, side="right") - first
     slot = np.arange(int(count.max()))
@@ -185,9 +182,8 @@ def _equations(ranges: _Ranges, track: _TrackFrame, epochs: Ints) -> Equations:
 def _priors(track: _TrackFrame, epochs: Ints, present: Bools) -> tuple[Floats, Ints]:
     """Prior precision of along, cross, up and clocks [1/m^2], and how many of them are free.
 
-    Nothing is known of the error along the track and of clocks, the survey's sigma holds the others; without
-    heights in the survey the height is free too. A constellation without satellites gets a precision that
-    keeps the equations solvable and changes nothing.
+    Along, clocks and, without heights in the survey, the height. A constellation without satellites gets a precision
+    that keeps the equations solvable and changes nothing.
     """
     precision = 1.0 / track.sigma_m[epochs] ** 2
     height = np.where(track.height_known[epochs], precision, 0.0)
@@ -205,7 +201,6 @@ def _left_over(part: Equations) -> Floats:
 
 
 def normal_of(design: Floats, weight: Floats, prior: Floats) -> Floats:
-    """Normal equations of each epoch, priors on the diagonal."""
     normal = np.einsum("eni,enj->eij", design * weight[..., None], design)
     index = np.arange(prior.shape[1])
     normal[:, index, index] += prior

@@ -1,8 +1,4 @@
-"""Recursions along time that the monitor bank is made of, vectorised.
-
-EWMA of the rates (DIAG eq. 8, with a weight that depends on the time step) and the exact variance of
-each EWMA for independent first-order Gauss-Markov errors and white odometer noise (DOMAIN section 3).
-"""
+"""Recursions along time: EWMA of the rates (DIAG eq. 8) and its exact variance (DOMAIN section 3), vectorised."""
 
 from __future__ import annotations
 
@@ -17,15 +13,14 @@ from schemas.arrays import Floats
 def linear_recurrence(decay: Floats, drive: Floats, initial: Floats) -> Floats:
     """Solve `y[k] = decay[k] * y[k-1] + drive[k]` with `y[-1] = initial`, shapes (n, c), (n, c), (c,).
 
-    In Fortran order, one channel after the other. A recurrence of first order is a triangular system of two
-    diagonals, which LAPACK solves row by row: term by term the loop that this stands for.
+    A triangular system of two diagonals, which LAPACK solves row by row: term by term that loop.
     """
     y = np.array(np.broadcast_to(drive, (len(decay), len(initial))), dtype=np.float64, order="F")
     return _solved(decay, y, initial)
 
 
 def _solved(decay: Floats, y: Floats, initial: Floats) -> Floats:
-    """`linear_recurrence` of the drive `y`, an array in Fortran order that the result takes the place of."""
+    """`y`: the drive, in Fortran order; the result takes its place."""
     if not len(y):
         return y
     y[0] += decay[0] * initial
@@ -37,7 +32,7 @@ def _solved(decay: Floats, y: Floats, initial: Floats) -> Floats:
 
 
 def ewma_weight(alpha: Floats, dt_s: Floats) -> Floats:
-    """Weight of a new sample after `dt_s`: 1 - (1 - alpha)^(dt / 1 s); shape (n, alphas), in Fortran order."""
+    """1 - (1 - alpha)^(dt / 1 s); shape (n, alphas), in Fortran order."""
     return 1.0 - ((1.0 - alpha[:, None]) ** dt_s[None, :]).T
 
 
@@ -45,8 +40,7 @@ def ewma_weight(alpha: Floats, dt_s: Floats) -> Floats:
 class AxisState:
     """What the recursions of one axis carry on; all zero at a restart. Shapes (alphas,), (alphas, sources).
 
-    `noise_variance`, `noise_covariance`: of the noise that each average has of its own; `lasting` (errors, alphas):
-    what one sigma of each error that stays has made of the averages.
+    `noise_*`: of the noise that each average has of its own; `lasting` (errors, alphas).
     """
 
     ewma: Floats
@@ -75,18 +69,16 @@ def variance_of_ewma(
     """Variance of the EWMAs of a rate [m^2/s^2], epoch by epoch, from a restart or a carried state.
 
     `keep` (n, alphas): b = 1 - alpha(dt), `gain` (n, alphas): alpha(dt) / dt, both zero at a row that restarts;
-    `sigma_m`, `sigma_before_m` (n, sources): sqrt R_j at the row and at the row before it; `decorrelation`
-    (n, sources): 1 - phi_j, given as such because it is tiny at 10 Hz; `increment_m2` (n,): variance of the increment
-    (`increment_variance` and white noise), of which `white_m2` (n,) is white. Returns the variance (n, alphas) and
-    what is carried on: the recursion's own last variance (alphas,) and covariances c_j = cov(u, e_j) (alphas, sources).
+    `decorrelation`: 1 - phi_j, given as such because it is tiny at 10 Hz; `increment_m2` (n,): variance of the
+    increment, of which `white_m2` (n,) is white. Returns the variance (n, alphas) and what is carried on: its last
+    value (alphas,) and covariances c_j = cov(u, e_j) (alphas, sources).
 
-    The recursion of DOMAIN section 3, in which (1-phi)^2 R + R (1-phi^2) = 2 R (1-phi) and phi (phi-1) R +
-    R (1-phi^2) = R (1-phi). Where sigma changes by the step (s_p to s_k: a fix lost to dead reckoning), the error
-    goes with it as e = s n with n of unit variance, from there on (`sigma_before_m` as `before_steps` gives it; in
-    the printed form it is s_k itself); there, with r = s_k / s_p,
+    The recursion of DOMAIN section 3. Where sigma changes by the step (s_p to s_k: a fix lost to dead reckoning), the
+    error goes with it as e = s n with n of unit variance, from there on; with r = s_k / s_p,
 
-        v <- b^2 v + (alpha g)^2 [s_k^2 + s_p^2 - 2 phi s_k s_p] + 2 alpha g b c (phi r - 1) + (alpha g)^2 white
-        c <- b phi r c + alpha g s_k (s_k - phi s_p)
+    v <- b^2 v + (alpha g)^2 [s_k^2 + s_p^2 - 2 phi s_k s_p] + 2 alpha g b c (phi r - 1) + (alpha g)^2 white
+
+    c <- b phi r c + alpha g s_k (s_k - phi s_p)
     """
     carried, fresh_m2, change = _memory(sigma_m, sigma_before_m, decorrelation)
     coupling = np.empty_like(gain)
@@ -107,11 +99,10 @@ def variance_of_ewma(
 def noise_of_ewma(
     keep: Floats, gain: Floats, noise_m2: Floats, state: AxisState
 ) -> tuple[Floats, tuple[Floats, Floats]]:
-    """Variance of the EWMAs of a rate by memoryless noise [m^2/s^2], of its own size for each; all shapes (n, alphas).
+    """Variance of the EWMAs by memoryless noise [m^2/s^2], of its own size for each; all shapes (n, alphas).
 
-    The recursion of DOMAIN section 3 with phi = 0 and R = `noise_m2`; its limit at a constant step is
-    M 2 alpha^2 g^2 / (2 - alpha). Returns what is carried on too: the recursion's own last
-    variance and covariances (alphas,).
+    The recursion with phi = 0 and R = `noise_m2`; at a constant step M 2 alpha^2 g^2 / (2 - alpha). Returns what is
+    carried on too: last variance and covariances (alphas,).
     """
     covariance = gain * noise_m2
     if not (noise_m2.any() or state.noise_variance.any()):
@@ -123,7 +114,7 @@ def noise_of_ewma(
 
 
 def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> tuple[Floats, Floats, Floats]:
-    """Of the recursion (`variance_of_ewma`): phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n, sources)."""
+    """Of the recursion: phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n, sources)."""
     if np.array_equal(sigma_m, sigma_before_m):
         return 1.0 - decorrelation, sigma_m * (decorrelation * sigma_m), -decorrelation
     ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
@@ -135,8 +126,8 @@ def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> t
 def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Floats:
     """Per source the sigma s_p at the row before, for the recursion; shapes (n, sources).
 
-    Before the first step of a source (a change of its sigma by more than `factor`) that is the row's own sigma, as in
-    the printed recursion; from the step on it is that of the row before. Sources without memory (phi = 0) have no step.
+    Before the first step of a source (a change of its sigma by more than `factor`) the row's own, as printed. Sources
+    without memory have no step.
     """
     before = sigma_m
     for source, (sigma, lost) in enumerate(zip(sigma_m.T, decorrelation.T, strict=True)):
@@ -150,7 +141,7 @@ def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Float
 
 
 def increment_variance(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> Floats:
-    """Variance of the increments of all sources together [m^2]; shape (n,). 2 R (1-phi) where R stays."""
+    """Of all sources together [m^2]; shape (n,). 2 R (1-phi) where R stays."""
     correlated = 2.0 * decorrelation * sigma_m * sigma_before_m
     if np.array_equal(sigma_m, sigma_before_m):
         return np.asarray(correlated.sum(axis=1))

@@ -19,7 +19,7 @@ _ZENITH_TROPOSPHERE_M = 0.12
 
 
 def line_of_sight_rows(azimuth_deg: Floats, elevation_deg: Floats) -> Floats:
-    """Change of range per metre of receiver movement east, north, up; shape (..., 3)."""
+    """Change of range per metre east, north, up; shape (..., 3)."""
     azimuth = np.radians(azimuth_deg)
     elevation = np.radians(elevation_deg)
     return np.stack(
@@ -29,13 +29,13 @@ def line_of_sight_rows(azimuth_deg: Floats, elevation_deg: Floats) -> Floats:
 
 
 def clock_columns(svs: Sequence[str]) -> Floats:
-    """One receiver clock per constellation (first letter of the satellite's name), shape (n, clocks)."""
+    """One receiver clock per constellation, shape (n, clocks)."""
     systems = sorted({sv[:1] for sv in svs})
     return np.array([[float(sv.startswith(system)) for system in systems] for sv in svs])
 
 
 def ionosphere_m2(elevation_deg: Floats, zenith_m: float) -> Floats:
-    """Variance of a vertical error of `zenith_m` seen at an elevation (DO-229 A.4.4.10.4, obliquity) [m^2]."""
+    """Variance of a vertical error at an elevation (DO-229 A.4.4.10.4, obliquity) [m^2]."""
     elevation = np.radians(np.maximum(elevation_deg, 0.0))
     ratio = _EARTH_RADIUS_KM * np.cos(elevation) / (_EARTH_RADIUS_KM + _IONOSPHERE_HEIGHT_KM)
     variance: Floats = zenith_m**2 / (1.0 - ratio**2)
@@ -43,16 +43,16 @@ def ionosphere_m2(elevation_deg: Floats, zenith_m: float) -> Floats:
 
 
 def troposphere_m2(elevation_deg: Floats, zenith_m: float) -> Floats:
-    """Variance of the troposphere's error of `zenith_m` seen at an elevation (DO-229 A.4.2.4) [m^2]."""
+    """The same of the troposphere (DO-229 A.4.2.4) [m^2]."""
     elevation = np.radians(np.maximum(elevation_deg, 0.0))
     variance: Floats = (zenith_m * 1.001) ** 2 / (0.002001 + np.sin(elevation) ** 2)
     return variance
 
 
 def range_variances_m2(elevation_deg: Floats) -> Floats:
-    """Variances of range errors by elevation [m^2]: ionosphere, troposphere, orbit and clock, user; shape (..., 4).
+    """Ionosphere, troposphere, orbit and clock, user [m^2]; shape (..., 4).
 
-    DIAG Table 1 for a range corrected by SBAS, with the elevation models of DO-229.
+    DIAG Table 1 for a range corrected by SBAS.
     """
     ionosphere = ionosphere_m2(elevation_deg, _ZENITH_IONOSPHERE_M)
     troposphere = troposphere_m2(elevation_deg, _ZENITH_TROPOSPHERE_M)

@@ -1,6 +1,6 @@
-"""Monitors that look at one epoch, or at the second before it, without memory: Doppler, ranges, channel comparison.
+"""Monitors that look at one epoch, or the second before it, without memory: Doppler, ranges, channel comparison.
 
-Each yields a frame `value, threshold, state, reason`, row for row with the epochs; `WITHOUT_MEMORY` lists them.
+Each yields `value, threshold, state, reason`, row for row with the epochs.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from schemas.enums import NotEvaluated
 
 NO_VELOCITY = NotEvaluated.NO_VELOCITY
 NO_OTHER_SOLUTION = NotEvaluated.NO_OTHER_SOLUTION
-NO_OTHER_EPOCH = NotEvaluated.NO_OTHER_EPOCH
 
 
 def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """GNSS velocity along track against odometer speed, both over the second before [m/s].
 
-    Tells an odometer fault (slip, slide, radar on wet ground) from a fault of GNSS positions (DOMAIN section 3).
+    Separates an odometer fault (slip, slide, radar on wet ground) from one of GNSS positions.
     """
     t_ns = times_ns(epochs)
     t_s = (t_ns - t_ns[0]) * 1e-9
@@ -63,9 +62,8 @@ def channel_monitor(
 ) -> pl.DataFrame:
     """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
 
-    `channel`: `t, path_m, sigma_along_m, fix_valid, on_track` of the other solution, on the same path; at an epoch its
-    last position since the epoch before counts, against this solution's at that time (`paired`). Errors common to both
-    (troposphere) make the threshold larger than needed. `absent`: the reason where there is no other solution.
+    `channel`: the other solution, on the same path; its last position since the epoch before counts (`paired`). Errors
+    common to both make the threshold larger than needed. `absent`: the reason where there is no other.
     """
     if channel is None:
         return no_verdicts(epochs.height, absent)
@@ -77,7 +75,7 @@ def channel_monitor(
     both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
     placed = epochs["fix_valid"] & epochs["on_track"] & epochs["sigma_along_m"].is_not_null()
     reasons = first_reason(
-        (~placed, NO_POSITION), (met["path_m"].is_null() | met["sigma_along_m"].is_null(), NO_OTHER_EPOCH)
+        (~placed, NO_POSITION), (met["path_m"].is_null() | met["sigma_along_m"].is_null(), NotEvaluated.NO_OTHER_EPOCH)
     )
     return verdicts(value, config.monitors.threshold_factor * both_m, reasons)
 
@@ -85,7 +83,7 @@ def channel_monitor(
 def _window(
     t_s: Floats, usable: npt.NDArray[np.bool_], segment: npt.NDArray[np.int64], config: Configuration
 ) -> tuple[npt.NDArray[np.int64], Floats]:
-    """Epoch `speed_window_s` before or earlier, and the time since; NaN unless all between are usable and connected."""
+    """Epoch `speed_window_s` before or earlier, and the time since; NaN unless all between is usable and connected."""
     least_s = config.align.speed_window_s * (1.0 - 1e-6)
     first = np.maximum(np.searchsorted(t_s, t_s - least_s, side="right") - 1, 0)
     bad = np.concatenate([[0], np.cumsum(~usable)])
@@ -97,7 +95,7 @@ def _window(
 
 
 def _way(t_s: Floats, velocity: Floats) -> Floats:
-    """Way of each step by trapezoids [m], zero where a velocity is missing; as many as epochs."""
+    """By trapezoids [m], zero where a velocity is missing."""
     steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t_s)
     return np.concatenate([np.nan_to_num(steps), [0.0]])
 
@@ -108,11 +106,9 @@ _PLACE = ("netelement_id", "measure_m", "path_m")
 def on_path_of(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
     """The rows of `channel` with `path_m` as it counts on the path of `epochs`; null where nothing joins the paths.
 
-    Each solution has its own matched path. Where one of them began later, on another net element or in the other
-    direction, their path positions count from different places.
-    Both in order of time with `t, netelement_id, measure_m, path_m`. On a net element that both are on at one time
-    the measure says how far apart they are; elsewhere the paths stand to each other as they did there before (at
-    the beginning: as they will).
+    Each solution has its own matched path, which may begin elsewhere or in the other direction. On a net element that
+    both are on at one time the measure says how far apart they are; elsewhere the paths stand to each other as they did
+    before (at the beginning: as they will).
     """
     mine = _with_sense(epochs)
     theirs = _with_sense(channel).with_row_index("row")
@@ -137,9 +133,8 @@ def on_path_of(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> p
 def paired(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
     """For each epoch: `row_other`, the last row of `channel` since the epoch before, and this solution's `path_m` then.
 
-    Two receivers need not measure at the same times. Where they do, `path_m` is the epoch's own; else it lies between
-    the positions of this epoch and the one before, if both have one and are no more than `crossing_gap_s` apart.
-    Null where there is nothing to compare. `epochs` with `t, path_m` (null where not usable), `channel` with `t`.
+    That is the epoch's own, or between this epoch and the one before, if no more than `crossing_gap_s` apart; else
+    null.
     """
     stamps = channel.select(t_other=_stamp()).with_row_index("row_other")
     mine = epochs.select("path_m", t_ns=_stamp())
@@ -159,9 +154,7 @@ def _stamp() -> pl.Expr:
 
 
 def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
-    """Places with `sense`: +1 where the path runs with the measure of its net element, -1 against it; 0 where a
-    visit does not tell.
-    """
+    """Places with `sense`: +1 where the path runs with the measure, -1 against it; 0 where a visit does not show."""
     path, measure = (pl.col(name) - pl.col(name).mean().over("visit") for name in ("path_m", "measure_m"))
     placed = epochs.select(*_PLACE, t_ns=_stamp(), visit=pl.col("netelement_id").rle_id())
     placed = placed.with_columns(moved=path * measure)
@@ -170,10 +163,7 @@ def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
 
 @dataclass(frozen=True)
 class Seen:
-    """What monitors without memory may look at: aligned epochs, satellites of the solution, another solution.
-
-    `other`: that solution on this one's path; `absent`: the reason where there is none.
-    """
+    """What monitors without memory may look at; `other` on this solution's path, `absent`: why there is none."""
 
     epochs: pl.DataFrame
     satellites: pl.DataFrame | None

@@ -1,8 +1,4 @@
-"""The odometer's distance without quantisation noise, which is neither way nor turn.
-
-The distance follows the rows with a hysteresis as wide as they scatter: a stand at the edge of two counts is no
-movement.
-"""
+"""The odometer's distance without quantisation noise, by a hysteresis as wide as its rows scatter."""
 
 from __future__ import annotations
 
@@ -20,7 +16,7 @@ def hysteresis_m(sigma_m: Floats, config: AlignConfig) -> Floats:
 def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
     """The distance with a hysteresis to both sides [m], causal; NaN where it is not known.
 
-    The result stays `width_m` behind a movement, and turns once the distance came back by twice that.
+    It stays `width_m` behind a movement, and turns once the distance came back by twice that.
     """
     held_m = np.full(distance_m.size, np.nan)
     rows = np.flatnonzero(np.isfinite(distance_m))
@@ -38,10 +34,7 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
 
 
 def turns_of(distance_m: Floats, back_m: float) -> list[tuple[int, int, int]]:
-    """Turns: row of the farthest place, row at which it had come back by `back_m`, sense from then on (+1 or -1).
-
-    The distance is assumed to grow at first.
-    """
+    """Turns: row of the farthest place, row at which it had come back by `back_m`, sense from then on; +1 at first."""
     turns: list[tuple[int, int, int]] = []
     start, sense = 0, 1
     while start < distance_m.size:
@@ -57,7 +50,7 @@ def turns_of(distance_m: Floats, back_m: float) -> list[tuple[int, int, int]]:
 
 
 def driven_m(distance_m: Floats, width_m: Floats) -> Floats:
-    """Way driven up to each row, to and fro [m], by a known distance that scatters within the hysteresis."""
+    """Way driven up to each row, to and fro [m]."""
     steps = np.diff(with_hysteresis(distance_m, width_m))
     moves = np.flatnonzero(steps)
     turns = moves[1:][np.sign(steps[moves[1:]]) != np.sign(steps[moves[:-1]])]
@@ -68,7 +61,7 @@ def driven_m(distance_m: Floats, width_m: Floats) -> Floats:
 
 
 def under_way(t_s: Floats, way_m: Floats, deadband_mps: float, window_s: float) -> Bools:
-    """Whether more was driven over the window before each time than the dead band; `way_m`: way driven up to it."""
+    """Whether more was driven over the window before each time than the dead band."""
     moving: Bools = way_m - np.interp(t_s - window_s, t_s, way_m) > deadband_mps * window_s
     return moving
 
@@ -103,8 +96,8 @@ def evenly_driven(
 ) -> tuple[Floats, Floats]:
     """Support points (times, distances [m]) of a distance without quantisation noise, linear between; not causal.
 
-    These are the rows that move the held distance. Where the way to the next is slower than `least_mps` the train
-    stood: the last row near the place of the stand is one more point, from which it departs.
+    The rows that move the held distance; where the way to the next is slower than `least_mps` the train stood, and the
+    last row near the place of the stand, from which it departs, is one more.
     """
     width_m = hysteresis_m(sigma_m, config)
     steps = np.diff(with_hysteresis(distance_m, width_m), prepend=np.nan)
@@ -126,7 +119,7 @@ def evenly_driven(
 
 
 def _departure(t_s: Floats, distance_m: Floats, sigma_m: Floats) -> tuple[float, float]:
-    """The last time of a stand near its place, and the place: from there the train departs."""
+    """The last time of a stand near its place, and the place."""
     place_m = float(np.median(distance_m))
     # A uniform error of sigma s has its edges at sqrt(3) s.
     near = np.flatnonzero(np.abs(distance_m - place_m) <= np.sqrt(3.0) * sigma_m)

@@ -28,7 +28,7 @@ class OdometerWay(NamedTuple):
 
 
 class Increments(NamedTuple):
-    """Corrected distance [m] and change of speed [m/s] from the instant before; zero at the first."""
+    """Corrected distance [m] and change of speed [m/s] from the instant before."""
 
     distance_m: Floats
     speed_mps: Floats
@@ -47,13 +47,12 @@ class Noise:
 class Odometry:
     """Distance over time in continuity segments, with its noise.
 
-    Instants are int64 nanoseconds; `t_s` of the samples (rows, and what was filled in) and all `_s` arguments are
-    seconds since `epoch_ns`. Distances are as recorded, but for `between` and `increments`, and grow with the path once
-    `oriented`. `segment`: how often the distance was lost before a sample; `counter`: the same, over slip and pauses
-    between speeds, where the way is known roughly; `slip_doubt_m`: by how much that may be off so far. `pause[i]`:
-    between samples i and i+1 nothing is interpolated. `scale`: true over recorded distance, None without its sigma.
-    `leaps_ns`: rows to which the counter leaps (`rows.leaps`); `bridged_m2`: variance of the distance over those that
-    are bridged, a sum.
+    Instants are int64 nanoseconds; `t_s` (rows, and what was filled in) and all `_s` arguments are seconds since
+    `epoch_ns`. Distances are as recorded, but for `between` and `increments`. `segment`: how often the distance was
+    lost before a sample; `counter`: the same, over slip and pauses between speeds, where the way is known to
+    `slip_doubt_m`, a sum. `pause[i]`: between samples i and i+1 nothing is interpolated. `scale`: true over recorded
+    distance, None without its sigma. `leaps_ns`: rows to which the counter leaps; `bridged_m2`: variance over bridged
+    ones, a sum.
     """
 
     epoch_ns: int
@@ -82,22 +81,21 @@ class Odometry:
         return self.epoch_ns + int(np.ceil(self.t_s[-1] * 1e9))
 
     def oriented(self, sign: int) -> Odometry:
-        """The same odometer, growing with the path; `sign` is +1 or -1."""
+        """Growing with the path; `sign` is +1 or -1."""
         return self if sign > 0 else replace(self, distance_m=-self.distance_m)
 
     def seconds(self, t_ns: Ints) -> Floats:
-        """Instants on the odometer's own scale [s]."""
         return ((t_ns - self.epoch_ns) * 1e-9).astype(np.float64)
 
     def known_at(self, t_ns: Ints) -> Bools:
         return self.known_at_s(self.seconds(t_ns))
 
     def segment_at(self, t_ns: Ints) -> Ints:
-        """Distances can be compared only where the continuity segment is the same."""
+        """Distances compare only within one."""
         return self.segment_at_s(self.seconds(t_ns))
 
     def slips_at_s(self, t_s: Floats) -> Bools:
-        """Whether the odometer reports slip at the sample before or after."""
+        """By the sample before or after."""
         before, after = self._around(t_s)
         slips: Bools = self.slip[before] | self.slip[after]
         return slips
@@ -110,16 +108,15 @@ class Odometry:
         return np.interp(t_s, self.t_s, self.slip_doubt_m)
 
     def distance_at(self, t_ns: Ints) -> Floats:
-        """Distance at these instants [m], as recorded; NaN where it is not known."""
+        """As recorded [m]; NaN where it is not known."""
         t_s = self.seconds(t_ns)
         return np.where(self.known_at_s(t_s), self.distance_at_s(t_s), np.nan)
 
     def travelled_at(self, t_ns: Ints) -> Floats:
-        """Way driven since the first row [m], to and fro, without noise of rows and stands; interpolated over gaps."""
+        """Way driven since the first row [m], to and fro; interpolated over gaps."""
         return np.interp(self.seconds(t_ns), self.t_s, self._travelled_m)
 
     def moving_s_at(self, t_ns: Ints) -> Floats:
-        """Time moving since the first row [s]."""
         return np.interp(self.seconds(t_ns), *self._moving_s)
 
     def moved(self, t_ns: Ints) -> Bools:
@@ -127,10 +124,10 @@ class Odometry:
         return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
 
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
-        """True distance from some instants, or from one, to others, and its variance.
+        """True distance between instants, and its variance.
 
-        s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) +
-        (sigma_s D)^2 (DOMAIN section 5.1). NaN where either end is not known or the distance was lost in between.
+        s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) + (sigma_s
+        D)^2 (DOMAIN section 5.1). NaN where either end is not known or the distance was lost in between.
         """
         scale = self.scale or 1.0
         scale_sigma = self.scale_sigma or 0.0
@@ -151,35 +148,34 @@ class Odometry:
         return np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
 
     def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
-        """Increments between consecutive instants, both ends with the scale and latency in use at the later one."""
+        """Both ends of a step with the scale and latency in use at the later one."""
         before, now = self._steps_s(t_ns, latency_s)
         distance = scale * (self.distance_at_s(now) - self.distance_at_s(before))
         return Increments(distance, scale * (self.speed_at_s(now) - self.speed_at_s(before)))
 
     def driven(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Floats:
-        """Way driven between consecutive instants, to and fro [m], as `increments`."""
+        """Way driven between consecutive instants, to and fro [m]."""
         begin_m, end_m = (np.interp(at_s, self.t_s, self._travelled_m) for at_s in self._steps_s(t_ns, latency_s))
         return np.asarray(scale * (end_m - begin_m))
 
     def _steps_s(self, t_ns: Ints, latency_s: Floats) -> tuple[Floats, Floats]:
-        """Begin and end of the step to each instant [s], less the latency in use at its end; none at the first."""
+        """Begin and end of the step to each instant, less the latency in use at its end; none at the first."""
         t_s = self.seconds(t_ns)
         now = t_s - latency_s
         return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
 
     def white_m2_per_s_at(self, t_s: Floats) -> Floats:
-        """White noise of the steps to these instants from the ones before, with that of bridged resets [m^2/s]."""
+        """White noise of the steps to these instants, with that of bridged resets [m^2/s]."""
         white = np.full(t_s.size, self.noise.white_m2_per_s)
         dt_s = np.diff(t_s)
         white[1:] += np.where(dt_s > 0.0, np.diff(self.bridged_m2_at(t_s)) / np.maximum(dt_s, 1e-9), 0.0)
         return white
 
     def bridged_m2_at(self, t_s: Floats) -> Floats:
-        """Variance of the distance over bridged resets so far [m^2]."""
         return np.zeros(t_s.size) if self.bridged_m2 is None else np.interp(t_s, self.t_s, self.bridged_m2)
 
     def known_at_s(self, t_s: Floats) -> Bools:
-        """Whether the distance is known: between two samples without a pause, none of which reports slip."""
+        """Between two samples without a pause, none of which reports slip."""
         before, after = self._around(t_s)
         paused = (before != after) & self.pause[np.minimum(before, self.pause.size - 1)]
         inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
@@ -191,18 +187,18 @@ class Odometry:
         return segment
 
     def distance_at_s(self, t_s: Floats) -> Floats:
-        """Distance [m]; interpolated where it is not known, the end value outside the recording."""
+        """Interpolated where it is not known, the end value outside the recording [m]."""
         return np.interp(t_s, self.t_s, self.distance_m)
 
     def speed_at_s(self, t_s: Floats) -> Floats:
-        """Mean speed over the second before [m/s]: causal, and free of the noise of single samples."""
+        """Mean over the second before [m/s]."""
         start = np.maximum(t_s - self.config.speed_window_s, self.t_s[0])
         span = np.maximum(np.minimum(t_s, self.t_s[-1]) - start, 1e-9)
         speed: Floats = (self.distance_at_s(t_s) - self.distance_at_s(start)) / span
         return speed
 
     def span_s(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Begin and end of the time about an instant over which its speed is taken, inside the recording."""
+        """Begin and end of the time about an instant over which its speed is taken."""
         about_s = self.config.latency_span_s
         return np.maximum(t_s - about_s, self.t_s[0]), np.minimum(t_s + about_s, self.t_s[-1])
 
@@ -244,11 +240,11 @@ class Odometry:
 
 
 def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> Odometry | None:
-    """The odometer of a cleaned stream (CONTRACT section 1), as recorded; None without at least two rows.
+    """The odometer of a cleaned stream, as recorded; None without at least two rows.
 
-    Distance as recorded, else by the speeds. A new continuity segment begins where the way is lost: a pause beyond
-    `odometer_gap_s` without a counter, slip that the odometer reports, a leap that no speed bridges. White noise is
-    `odometer_sigma_mps`, or a larger declared `sigma_speed_mps`, taken as independent from row to row.
+    A new continuity segment begins where the way is lost: a pause beyond `odometer_gap_s` without a counter, slip that
+    the odometer reports, a leap that no speed bridges. White noise is `odometer_sigma_mps`, or a larger declared
+    `sigma_speed_mps`, taken as independent from row to row.
     """
     if stream is None or stream.height < 2:
         return None
@@ -306,7 +302,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 
 
 def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: Configuration) -> Noise:
-    """The noise with what quantisation adds; `whole`: steps that the counter recorded without a gap."""
+    """`whole`: steps that the counter recorded without a gap."""
     counter_m = count_step_m(distance_m, whole, config.align)
     deadband_mps = config.matching.deadband_mps
     scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, deadband_mps, config.align)
@@ -314,15 +310,15 @@ def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float,
 
 
 def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
-    """Rows at which the odometer reports slip: by its flag, or by a sigma of its speed beyond any use."""
+    """By the flag, or by a sigma of the speed beyond any use."""
     slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
     return slips
 
 
 def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
-    """By how much the count of each step that begins or ends in slip may be off [m].
+    """By how much the count of each step into, in or out of slip may be off [m].
 
-    A share of the step, or its reported sigma times dt: the error lasts while it slips, so it grows with the time.
+    A share of the step, or its reported sigma times dt: the error lasts while it slips.
     """
     sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
     doubt_m = np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s)
@@ -330,7 +326,6 @@ def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, c
 
 
 def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
-    """White noise by the recorded sigma of the speed; 0 without one."""
     declared = stream["sigma_speed_mps"].median()
     return float(declared) ** 2 * period_s if isinstance(declared, float) else 0.0
 
@@ -342,5 +337,4 @@ def _leaps_ns(stream: pl.DataFrame, config: AlignConfig) -> tuple[int, ...]:
 
 
 def _sums(steps: Floats) -> Floats:
-    """Sums of the steps before each row; 0 at the first."""
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -13,9 +13,9 @@ from schemas.config import AlignConfig
 
 
 def counted_over_slip(odometry: Odometry, others: Sequence[Odometry], config: AlignConfig) -> Odometry:
-    """The odometer, with its distance over each slip taken from the first other odometer that counted throughout.
+    """The distance over each slip by the first other odometer that counted throughout.
 
-    Slip stays reported, but the re-link after it compares with a distance in doubt by only `other_way_share` of it.
+    Slip stays reported, but only `other_way_share` of the way is in doubt.
     """
     if not others or not odometry.slip.any():
         return odometry
@@ -36,7 +36,7 @@ def counted_over_slip(odometry: Odometry, others: Sequence[Odometry], config: Al
 
 
 def _sense(odometry: Odometry, witness: Odometry, t_ns: Ints) -> float:
-    """+1 where both count up alike, -1 where one of the two counts backwards: the sign of the steps' correlation."""
+    """-1 where one of the two counts backwards: the sign of the steps' correlation."""
     products = np.diff(odometry.distance_m) * np.diff(witness.distance_at_s(witness.seconds(t_ns)))
     return -1.0 if products.sum() < 0.0 else 1.0
 

@@ -9,10 +9,9 @@ from schemas.arrays import Floats, Ints
 
 
 def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) -> int:
-    """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement.
+    """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement, or the largest.
 
-    Starts a metre apart have a vote each, so that a leap of the position does not turn the odometer round. A run that
-    never moves so far is judged by its largest movement.
+    Starts a metre apart have a vote each, so that a leap of the position does not turn the odometer round.
     """
     recorded_m = odometry.distance_at(t_ns)
     usable = np.flatnonzero(np.isfinite(path_m) & np.isfinite(recorded_m))
@@ -30,7 +29,7 @@ def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) 
 
 
 def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distance_m: float) -> bool:
-    """Whether the first `distance_m` of net movement, by the odometer if there is one, went with the positions."""
+    """Whether the first `distance_m` of net movement went with the positions."""
     known = np.isfinite(position_m)
     if not known.any():
         return True
@@ -48,7 +47,7 @@ def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distan
 
 
 def _side(odometer: Floats, path: Floats, distance_m: float) -> int:
-    """Whether path and odometer go the same way (1), opposite ways (-1) or nowhere (0) over these metres."""
+    """Whether path and odometer go the same way (1), opposite ways (-1) or nowhere (0)."""
     moved = odometer - odometer[0]
     far = np.flatnonzero(np.abs(moved) >= distance_m)
     end = int(far[0]) if far.size else int(np.argmax(np.abs(moved)))

@@ -27,7 +27,7 @@ _ROUNDED_M = 1e-3
 
 @dataclass(frozen=True)
 class QuantisationNoise:
-    """Variance [m^2] of a row at standstill, and by how much it grows with the square of the speed [s^2]."""
+    """Variance [m^2] of a row at a stand, and its growth with the square of the speed [s^2]."""
 
     still_m2: float = 0.0
     moving_s2: float = 0.0
@@ -51,19 +51,18 @@ def quantisation_noise(
     deadband_mps: float,
     config: AlignConfig,
 ) -> QuantisationNoise:
-    """What rows scatter about smooth curves beyond what white noise of the increments explains.
+    """What rows scatter about smooth curves beyond white noise of the increments.
 
-    `whole` (rows - 1,): ways between rows that are recorded. Medians over pieces in which the train moves, so that
-    slips do not count. Noise of stamps grows with the square of the speed: lower and higher speeds are separated where
-    their squares differ by `quantisation_factor`. A counter has the noise of its step (`counter_m`) at least: it does
-    not show while each row gains as many steps as the last.
+    `whole` (rows - 1,): ways that are recorded. Medians over pieces in which the train moves, so that slips do not
+    count. Noise of stamps grows with the square of the speed: low and high speeds are separated where their squares
+    differ by `quantisation_factor`. A counter has the noise of its step at least: it does not show at one speed.
     """
     scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s, deadband_mps, config)
     return replace(scatter, still_m2=max(scatter.still_m2, counter_m**2 / 12.0))
 
 
 def count_step_m(distance_m: Floats, whole: Bools, config: AlignConfig) -> float:
-    """The step of a counter [m], 0 where there is none, or one finer than `counter_step_m`."""
+    """0 where there is none, or one finer than `counter_step_m`."""
     ways = np.abs(np.diff(distance_m)[whole])
     return step_of(ways, ways, config.counter_step_m, _ROUNDED_M)
 
@@ -90,7 +89,7 @@ def _scatter_beyond(
 def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, deadband_mps: float, config: AlignConfig) -> Ints:
     """Rows of pieces without a gap in which the train moves, spread over the run; shape (pieces, rows).
 
-    Rows farther apart tell of a train that drives otherwise than a moment ago, not of their noise.
+    None where rows are so far apart that the train drives otherwise from one to the next.
     """
     period_s = float(np.median(np.diff(t_s)))
     if period_s > config.straight_s or period_s <= 0.0:
@@ -122,7 +121,7 @@ def _scatter(since_s: Floats, way_m: Floats, white_m2_per_s: float) -> tuple[Flo
 
 
 def _beyond(scatter_m2: Floats, explained_m2: Floats, config: AlignConfig) -> float:
-    """The median scatter less what explains it [m^2], none where that is most of it."""
+    """The median scatter less what explains it [m^2]; none where that is most of it."""
     scatter = float(np.median(scatter_m2))
     explained = float(np.median(explained_m2))
     return scatter - explained if scatter > config.quantisation_factor * explained else 0.0

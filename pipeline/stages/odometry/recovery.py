@@ -1,7 +1,4 @@
-"""May a position, or what is learned from it, be used again after an alarm? The one rule (DOMAIN section 4).
-
-Asked by the LDS (`lds.relink`) and by the learning of scale and latency (`alignment.learning`).
-"""
+"""May a position, or what is learned from it, be used again after an alarm? The one rule (DOMAIN section 4)."""
 
 from __future__ import annotations
 
@@ -28,14 +25,10 @@ class RecoveryRule:
         return 0.5 * self.config.hazards.failure_limit_m
 
     def is_quiet(self, quiet_s: float | Floats) -> Bools:
-        """Nothing has failed fast for long enough."""
         return np.asarray(quiet_s) >= self.config.lds.recovery_s
 
     def variance_m2(self, positions_m2: Number, elapsed_s: Number, way_m: Number, sigma_scale: float) -> Number:
-        """2 sigma_x^2 + sigma_odo^2 t + (sigma_scale d)^2 [m^2]: what GNSS minus odometer moves by without a fault.
-
-        `positions_m2`: 2 sigma_x^2, the sum of the variances of both positions.
-        """
+        """What GNSS minus odometer moves by without a fault [m^2]; `positions_m2`: variances of both positions."""
         return positions_m2 + self.config.monitors.odometer_sigma_mps**2 * elapsed_s + (sigma_scale * way_m) ** 2
 
     def bound_m(self, variance_m2: float | Floats) -> Floats:

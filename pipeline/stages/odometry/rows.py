@@ -1,7 +1,6 @@
-"""The way from each recorded row of an odometer to the next: by its distance where that tells it, else by its speeds.
+"""The way from each row of an odometer to the next: by its distance where that says it, else by its speeds.
 
-Where rows hold the one or the other by turns (two sensors in one stream), each is carried between its own rows. Between
-rows far apart distances lie on curves that a train can drive.
+Rows may hold the one or the other by turns. Between rows far apart distances lie on curves that a train can drive.
 """
 
 from __future__ import annotations
@@ -15,10 +14,7 @@ from schemas.config import AlignConfig
 
 
 class Ways(NamedTuple):
-    """Per step from a row to the next: way [m], NaN where not known, and whether it is of the recorded distance.
-
-    `doubt_m`: by how much the way over a bridged reset may be off, 0 elsewhere.
-    """
+    """Per step: way [m], NaN where not known; whether it is of the recorded distance; doubt over a bridged reset."""
 
     way_m: Floats
     counted: Bools
@@ -28,8 +24,8 @@ class Ways(NamedTuple):
 def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: float, config: AlignConfig) -> Ways:
     """Ways between rows at these times [s]; `distance_m` and `speed_mps` as recorded, NaN where not.
 
-    Over a leap of the distance the speeds count, if they agree with the distance elsewhere. Where rows hold distance
-    and speed by turns, nothing is interpolated over more than `limit_s`.
+    Over a leap of the distance the speeds count, if they agree with the distance elsewhere. By turns, nothing is
+    interpolated over more than `limit_s`.
     """
     distance_m = _without_spikes(t_s, distance_m, config)
     leap = leaps(t_s, distance_m, config)
@@ -99,39 +95,54 @@ def _too_far(way_m: Floats, dt_s: Floats, config: AlignConfig) -> Bools:
     return far
 
 
-def _resets(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
-    """Moves from one back, longer than a train can brake, turn, brake and turn again, to the next like the one before.
+class _Moves(NamedTuple):
+    """Steps between known rows in which the distance changes: first and last row, way [m], time [s]."""
 
-    Where these differ a single row was wrong, which makes one of them longer; where the moves between make up for the
-    way, a few were.
-    """
-    resets = np.zeros(t_s.size - 1, dtype=np.bool_)
+    first: Ints
+    last: Ints
+    way_m: Floats
+    time_s: Floats
+
+
+def _moves(t_s: Floats, distance_m: Floats) -> _Moves:
     rows = np.flatnonzero(np.isfinite(distance_m))
     moves = np.flatnonzero(np.diff(distance_m[rows]))
     first = rows[moves]
     last = rows[moves + 1]
-    way_m = distance_m[last] - distance_m[first]
-    time_s = t_s[last] - t_s[first]
-    back = (way_m[1:] * way_m[:-1] < 0.0) & (np.abs(way_m[1:]) > _turned_m(time_s[1:], config))
+    return _Moves(first, last, distance_m[last] - distance_m[first], t_s[last] - t_s[first])
+
+
+def _resets(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
+    """Steps from a move back, longer than a train can brake, turn, brake and turn again, to where it counts on."""
+    resets = np.zeros(t_s.size - 1, dtype=np.bool_)
+    moves = _moves(t_s, distance_m)
+    way_m = moves.way_m
+    back = (way_m[1:] * way_m[:-1] < 0.0) & (np.abs(way_m[1:]) > _turned_m(moves.time_s[1:], config))
     for move in (np.flatnonzero(back) + 1).tolist():
-        before_m = way_m[move - 1]
-        after = slice(move + 1, move + 1 + config.reset_moves)
-        since_s = t_s[last[move : after.stop - 1]] - t_s[first[move]]
-        most_m = _turned_m(since_s[: way_m[after].size], config)
-        alike = np.flatnonzero((way_m[after] * before_m > 0.0) & (np.abs(way_m[after] - before_m) <= most_m))
-        if not alike.size:
-            continue
-        end = int(last[move + alike[0]])
-        expected_m = before_m / time_s[move - 1] * since_s[alike[0]]
-        if np.abs(distance_m[end] - distance_m[first[move]] - expected_m) > most_m[alike[0]]:
-            resets[first[move] : end] = True
+        resets[moves.first[move] : _counts_on(moves, move, t_s, distance_m, config)] = True
     return resets
+
+
+def _counts_on(moves: _Moves, back: int, t_s: Floats, distance_m: Floats, config: AlignConfig) -> int:
+    """The row from which a counter counts on that was reset in the move `back`; the first row of that if it was not.
+
+    The next move is like the one before: a single wrong row makes one of them longer by as much as it is off.
+    """
+    begin = int(moves.first[back])
+    before_m = moves.way_m[back - 1]
+    for after in range(back + 1, min(back + 1 + config.reset_moves, moves.way_m.size)):
+        end = int(moves.last[after - 1])
+        most_m = _turned_m(t_s[end] - t_s[begin], config)
+        if moves.way_m[after] * before_m > 0.0 and abs(moves.way_m[after] - before_m) <= most_m:
+            # Where the train has just driven on over these moves, they are of a few wrong rows.
+            driven_m = before_m / moves.time_s[back - 1] * (t_s[end] - t_s[begin])
+            return end if abs(distance_m[end] - distance_m[begin] - driven_m) > most_m else begin
+    return begin
 
 
 def _turned_m(dt_s: Floats, config: AlignConfig) -> Floats:
     """The farthest that a distance falls without a reset: by the fixed error, and from rest to rest."""
-    way_m: Floats = config.reset_back_m + 0.25 * config.braking_mps2 * dt_s**2
-    return way_m
+    return config.reset_back_m + 0.25 * config.braking_mps2 * dt_s**2
 
 
 def _without_spikes(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Floats:
@@ -146,7 +157,7 @@ def _without_spikes(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Flo
 
 
 def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignConfig) -> Floats:
-    """Ways by the speeds; none over leaps if speeds and counter disagree elsewhere (a wrong unit, sign or sensor)."""
+    """None over leaps if speeds and counter disagree elsewhere (a wrong unit, sign or sensor)."""
     both = np.isfinite(recorded_m) & np.isfinite(driven_m)
     if not leap.any() or not both.any():
         return driven_m
@@ -158,13 +169,13 @@ def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignCon
 
 
 def _driven(t_s: Floats, speed_mps: Floats) -> Floats:
-    """The way of each step by its two speeds (trapezoids) [m]."""
+    """By trapezoids [m]."""
     steps: Floats = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(t_s)
     return steps
 
 
 def _carried(t_s: Floats, values: Floats, limit_s: float) -> Floats:
-    """Values interpolated between known rows no farther apart than the limit; NaN elsewhere."""
+    """Interpolated between known rows no farther apart than the limit; NaN elsewhere."""
     known = np.flatnonzero(np.isfinite(values))
     if known.size < 2:
         return values
@@ -181,8 +192,8 @@ def filled_in(
 ) -> tuple[Floats, Floats, Ints]:
     """Samples with finer ones between the given rows and the next, on cubic curves: times, distances, row of each.
 
-    Slopes at the rows are the speeds where these agree with the way between, else those of a monotone curve (PCHIP),
-    and at most three times the mean slope, so that the cubic does not turn back (Fritsch and Carlson).
+    Slopes at the rows are the speeds where these agree with the way between, else of a monotone curve (PCHIP), and at
+    most three times the mean slope, so that the cubic does not turn back (Fritsch and Carlson).
     """
     from scipy.interpolate import PchipInterpolator  # hardly a log needs it, and it takes long to load
 

@@ -1,16 +1,10 @@
 """Scale and lag of a counter against another recorder of the same journey: one equation, however it is weighed.
 
-    way of the other = scale * way counted - scale * lag * change of speed
+way of the other = scale * way counted - scale * lag * change of speed,
 
-with ways and speeds counted at the stamps less an assumed lag, and `lag` what is left of it. That is linear in scale
-and scale * lag. The causal filter (`alignment.odometer_filter`) follows it from epoch to epoch; the fit of a run
-(`plausibility.pairs`) solves it the other way round, by windows and without outliers. Calibration weighs observations
-of whole runs and solves them here:
-
-    estimate = scale_and_lag(columns.T @ (weight * columns), columns.T @ (weight * way), spread, assumed_s)
-
-where `columns` are (way counted, minus change of speed), shape (n, 2), and `spread` is the standard deviation of an
-observation of weight 1.
+with ways and speeds counted at the stamps less an assumed lag, and `lag` what is left of it: linear in scale and scale
+* lag. The causal filter (`alignment.odometer_filter`) follows it from epoch to epoch, the fit of a run
+(`plausibility.pairs`) by windows without outliers; calibration weighs observations of whole runs and solves them here.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ _FEWEST_BENDS = 8
 def step_of(changes: Floats, single: Floats, least: float, rounded: float) -> float:
     """The step that all these changes are multiples of, in their unit; 0 where there is none of at least `least`.
 
-    `single`: differences of which some are of one step. A change that is always the same shows no step: so does a
-    smooth way at one speed. Less than `rounded` is no difference: decimal numbers are not whole in binary.
+    `single`: differences of which some are of one step; up to `rounded` is none, as decimal numbers are not whole in
+    binary. A change that is always the same shows no step.
     """
     single = np.abs(single)
     single = single[single > rounded]

@@ -31,18 +31,18 @@ def off_the_survey(points: Points, sigma_m: Floats, near: Near, network: Network
         pairs = near.of(element, 0, len(points))
         sample = near.sample[pairs]
         behind = np.abs(near.measure_m[pairs] - ends_m[end][element]) < AT_END_M
+        other_near = tracks > np.bincount(sample, minlength=tracks.size)
         for first, sense in _left(sample, behind, possible[pairs]):
-            stop = np.linalg.norm(points.surface - ends[element, end], axis=1) > config.open_end_m
-            stop[sample[~behind]] = True
-            ahead = slice(first, None, sense)
-            off[ahead] |= (
-                ~np.logical_or.accumulate(stop[ahead]) & (tracks > np.bincount(sample, minlength=len(tracks)))[ahead]
-            )
+            back = np.linalg.norm(points.surface - ends[element, end], axis=1) > config.open_end_m
+            back[sample[~behind]] = True
+            # In the sense in which the train left, all samples until it may be back.
+            onward = slice(first, None, sense)
+            off[onward] |= ~np.logical_or.accumulate(back[onward]) & other_near[onward]
     return off
 
 
 def _left(sample: Ints, behind: Bools, possible: Bools) -> Iterator[tuple[int, int]]:
-    """Samples at which the train leaves the element over its end: sample and sense of time."""
+    """Samples at which the train leaves the element over its end, and in which sense of time (+1, -1)."""
     for number in np.flatnonzero(behind[1:] & ~behind[:-1]).tolist():
         if np.median(possible[max(number + 1 - _SAMPLES, 0) : number + 1]) >= 0.5:
             yield int(sample[number + 1]), 1

@@ -69,11 +69,13 @@ def claim(
 
 def _once_a_day(of_run: Tallies, day: tuple[object, ...], days: set[tuple[object, ...]]) -> Tallies:
     """Without the trials of requirements that another run of the day was a trial of; time and events stay."""
-    spent = {key for key, counts in of_run.items() if counts.trials and (*day, *key) in days}
-    days.update((*day, *key) for key, counts in of_run.items() if counts.trials)
-    return {
-        key: replace(counts, trials=0, kept=0, broken=0) if key in spent else counts for key, counts in of_run.items()
-    }
+    once = dict(of_run)
+    for key, counts in of_run.items():
+        if counts.trials and (*day, *key) in days:
+            once[key] = replace(counts, trials=0, kept=0, broken=0)
+        elif counts.trials:
+            days.add((*day, *key))
+    return once
 
 
 def _tallies_of(

@@ -302,6 +302,7 @@ def _start(profile: RequirementProfile) -> list[Requirement]:
 
 
 def _first_s(ride: ClaimRide, there: Bools) -> float | None:
+    """Time from the first epoch to the first one of these [s]."""
     t_ns = ride.front.clock.t_ns
     return float((t_ns[there][0] - t_ns[0]) / NS_PER_S) if there.any() else None
 

@@ -69,11 +69,12 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Counts per piece and direction; hours of the day are those of all right passes."""
     state = pl.col("state")
     cause = pl.col("cause")
-    usual = pl.col("satellites").filter(state == int(SpanState.RIGHT)).median().over("run_id")
-    passes = passes.with_columns(few=pl.col("satellites") <= criteria.satellites_share * usual)
     right = state == int(SpanState.RIGHT)
     wrong = state == int(SpanState.WRONG_IN_USE)
     lost = (state >= int(FIRST_LOSS)) & ~wrong
+    # A receiver is compared with itself: what it used on the right passes of the run.
+    usual = pl.col("satellites").filter(right).median().over("run_id")
+    passes = passes.with_columns(few=pl.col("satellites") <= criteria.satellites_share * usual)
     hour = pl.col("t").dt.strftime("%H").unique()
     hours = passes.filter(right).group_by(KEYS).agg(hours=hour.len(), hours_of_day=hour.sort().str.join(" "))
     return (

@@ -193,11 +193,11 @@ def _named(rows: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFra
         signs.setdefault(name, set()).add(sign)
     first_times: dict[tuple[int, bool], object] = {}
     for name, at, ahead, t in rows.select("netelement_id", "measure_m", "ahead", "t").iter_rows():
-        if (element := pieces.track.index.get(name)) is None or at is None:
+        if (piece := pieces.holding(name, at)) is None:
             continue
         ways = {sign * ahead > 0 for sign in signs.get(name, ())} if ahead in (1, -1) else set()
         for growing in ways or {True, False}:
-            first_times.setdefault((int(pieces.at(element, np.array([at]))[0]), growing), t)
+            first_times.setdefault((piece, growing), t)
     schema = {name: _OUTCOMES[name] for name in ("piece", "growing", "state", "t")}
     table = [(piece, growing, int(SpanState.WRONG_IN_USE), t) for (piece, growing), t in first_times.items()]
     return pl.DataFrame(table, schema=schema, orient="row")

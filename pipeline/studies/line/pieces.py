@@ -30,6 +30,12 @@ class Pieces:
         piece = begin + np.searchsorted(self.from_m[begin : last + 1], measure_m, side="right") - 1
         return np.clip(piece, begin, last).astype(np.int64)
 
+    def holding(self, netelement_id: str | None, measure_m: float | None) -> int | None:
+        """The piece at a place; None without one, or on an element of another survey."""
+        if netelement_id not in self.track.index or measure_m is None:
+            return None
+        return int(self.at(self.track.index[netelement_id], np.array([measure_m]))[0])
+
     @property
     def middle_m(self) -> Floats:
         middle: Floats = 0.5 * (self.from_m + self.to_m)

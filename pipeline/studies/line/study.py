@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 
 from pipeline.results.store import check_site, complete_runs, completed_runs, read_config, read_table
@@ -17,7 +16,6 @@ from pipeline.studies.line.proposals import LineEvidence, proposals
 from pipeline.studies.line.remarks import remarks
 from pipeline.studies.line.spans import EPOCH_COLUMNS, SpanState
 from pipeline.studies.tally import distinct
-from schemas.arrays import floats
 from schemas.config import Configuration
 from schemas.enums import Evidence
 from schemas.errors import InputError, UsageError
@@ -114,17 +112,10 @@ def passes_of_runs(
 
 
 def _undetected(passages: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
-    """Largest undetected error at balises, by piece; empty where these tables do not tell it."""
-    columns = [name for name in ("undetected_ahead_m", "undetected_behind_m") if name in passages.columns]
-    empty = pl.DataFrame(schema={"piece": pl.Int64, "largest_undetected_m": pl.Float64})
-    if not columns:
-        return empty
-    known = passages.filter(pl.col("netelement_id").is_in(list(pieces.track.index))).with_columns(
-        largest_undetected_m=pl.max_horizontal(pl.col(name).abs() for name in columns)
-    )
-    places = zip(known["netelement_id"].to_list(), floats(known, "measure_m").tolist(), strict=True)
-    piece = [int(pieces.at(pieces.track.index[name], np.array([at]))[0]) for name, at in places]
-    return known.with_columns(piece=pl.Series(piece, dtype=pl.Int64)).select(empty.columns).drop_nulls()
+    """Largest undetected error at balises, by piece; empty where it was not computed."""
+    largest_m = pl.max_horizontal(pl.col("undetected_ahead_m").abs(), pl.col("undetected_behind_m").abs())
+    piece = [pieces.holding(*place) for place in passages.select("netelement_id", "measure_m").iter_rows()]
+    return passages.select(piece=pl.Series(piece, dtype=pl.Int64), largest_undetected_m=largest_m).drop_nulls()
 
 
 def _known_points(points: pl.DataFrame | None, pieces: Pieces) -> pl.DataFrame:

@@ -1,81 +1,43 @@
-"""Known causes of a factor, a lag or a shift between two recorders; their figures are in `causes.toml`."""
+"""Known causes of a factor, a lag or a place that does not fit; the figures are in `causes.toml`."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
-from pipeline.studies.plausibility.check import KnownCause
-from pipeline.studies.plausibility.robust import Shift
+from pipeline.studies.plausibility.check import Cause
 from schemas.arrays import Floats
 from schemas.enums import MisfitCause
 
-_KNOWN: dict[str, Any] = tomllib.loads((files(__package__) / "causes.toml").read_text(encoding="utf-8"))
 # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; bad odometers are off by 3 %.
 _UNIT_SHARE = 0.045
 # Streams are late by so much beside what explains the lag of a clock.
 _CLOCK_NEAR_S = 2.2
-# A survey is in a national datum if its shift is so near to the datum's: transformations differ by some metres.
-_DATUM_NEAR_M = 12.0
-_DATUM_NEAR_SHARE = 0.12
+_YEAR_S = 31_556_952
 
 
-@dataclass(frozen=True)
-class Explained:
-    """Causes that explain a figure together, and the exact figure they stand for."""
-
-    causes: tuple[KnownCause, ...]
-    exact: float
+class _Fact(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-def explain_factor(factor: float, speed: bool) -> Explained | None:
-    """The unit that makes recorded values `factor` times what they should be; the nearest one."""
-    units: dict[str, float] = _KNOWN["speed_units" if speed else "way_units"]
-    name, exact = min(units.items(), key=lambda unit: abs(factor / unit[1] - 1.0))
-    # A unit so near to 1 that a bad odometer could be taken for it has to be met more exactly.
-    near = min(_UNIT_SHARE, abs(exact - 1.0) / 3.0)
-    return Explained((KnownCause(MisfitCause.UNIT, (name,)),), exact) if abs(factor / exact - 1.0) <= near else None
+class ClockStep(_Fact):
+    """Clocks are wrong by 1 to `most` times `step_s`; told in `unit`."""
+
+    code: MisfitCause
+    step_s: int
+    most: int
+    unit: str
+    unit_s: int
 
 
-def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> Explained | None:
-    """What makes two clocks differ by `lag_s`, known to within `precision_s`, at an instant; the simplest cause."""
-    size_s = abs(lag_s)
-    near_s = max(precision_s, _CLOCK_NEAR_S)
-    explained = next((cause for cause in _lags(size_s, t_ns) if abs(size_s - cause.exact) <= near_s), None)
-    return explained and Explained(explained.causes, float(np.copysign(explained.exact, lag_s)))
-
-
-def _lags(size_s: float, t_ns: int) -> Iterator[Explained]:
-    """Candidates near a lag, the simplest first: leap seconds, then steps of the clock without and with them."""
-    leap_s = leap_seconds(t_ns)
-    gps = KnownCause(MisfitCause.GPS_AS_UTC)
-    yield Explained((gps,), leap_s)
-    for extra_s in (0, leap_s, -leap_s):
-        for step in _KNOWN["clock_steps"]:
-            count = round((size_s - extra_s) / step["step_s"])
-            if 1 <= count <= step["most"]:
-                amount = f"{count * step['step_s'] / step['unit_s']:g} {step['unit']}"
-                cause = KnownCause(MisfitCause(step["code"]), (amount,))
-                yield Explained((cause, gps) if extra_s else (cause,), count * step["step_s"] + extra_s)
-
-
-def leap_seconds(t_ns: int) -> int:
-    """GPS time minus UTC at an instant [s]."""
-    year = 1970 + t_ns / 1e9 / 31_556_952
-    return next((leap for since, leap in _KNOWN["leap_seconds"].items() if year >= float(since)), 13)
-
-
-@dataclass(frozen=True)
-class CoordinateMistake:
+class CoordinateMistake(_Fact):
     """A way to write positions wrongly; `factors` and `exchanged` mend it, as `[[ingest.correct]]` can, but minutes."""
 
     code: MisfitCause
-    factors: Mapping[str, float] = field(default_factory=dict)
+    factors: dict[str, float] = {}
     exchanged: bool = False
     minutes: bool = False
 
@@ -93,37 +55,43 @@ def _from_minutes(value: Floats) -> Floats:
     return np.asarray(whole + (value - whole) * 100.0 / 60.0)
 
 
-COORDINATE_MISTAKES = tuple(
-    CoordinateMistake(**{**mistake, "code": MisfitCause(mistake["code"])}) for mistake in _KNOWN["coordinate_mistakes"]
-)
+class KnownCauses(_Fact):
+    """All of `causes.toml`: units as how many of them make a metre (per second)."""
+
+    speed_units: dict[str, float]
+    way_units: dict[str, float]
+    leap_seconds: dict[float, int]
+    clock_steps: tuple[ClockStep, ...]
+    coordinate_mistakes: tuple[CoordinateMistake, ...]
 
 
-@dataclass(frozen=True)
-class Datum(Shift):
-    """A national datum; the shift is that of a survey in it, read as WGS 84, from the positions here."""
-
-    name: str
-    epsg: int
-
-    def explains(self, shift: Shift, one_heading: bool) -> bool:
-        """Whether it is this shift; of a single heading only the part across it is known."""
-        apart_m = np.array([self.east_m - shift.east_m, self.north_m - shift.north_m])
-        across = np.array([shift.east_m, shift.north_m]) / shift.shift_m
-        off_m = abs(float(apart_m @ across)) if one_heading else self.off_m(shift)
-        return off_m < max(_DATUM_NEAR_M, _DATUM_NEAR_SHARE * shift.shift_m)
+KNOWN = KnownCauses.model_validate(tomllib.loads((files(__package__) / "causes.toml").read_text(encoding="utf-8")))
 
 
-def datums_at(latitude_deg: float, longitude_deg: float) -> Iterator[Datum]:
-    """The national datums in use around a place."""
-    import pyproj  # takes a tenth of a second, and hardly any run needs it
+def explain_factor(factor: float, speed: bool) -> tuple[Cause, float] | None:
+    """The unit that makes recorded values `factor` times what they should be, and its exact factor; the nearest one."""
+    units = KNOWN.speed_units if speed else KNOWN.way_units
+    name, exact = min(units.items(), key=lambda unit: abs(factor / unit[1] - 1.0))
+    # A unit so near to 1 that a bad odometer could be taken for it has to be met more exactly.
+    near = min(_UNIT_SHARE, abs(exact - 1.0) / 3.0)
+    return (Cause(MisfitCause.UNIT, (name,)), exact) if abs(factor / exact - 1.0) <= near else None
 
-    geod = pyproj.Geod(ellps="WGS84")
-    for name, code in _KNOWN["datums"].items():
-        area = pyproj.CRS.from_epsg(code).area_of_use
-        west, south, east, north = (181.0, 0.0, 0.0, 0.0) if area is None else area.bounds
-        if south <= latitude_deg <= north and west <= longitude_deg <= east:
-            turn = pyproj.Transformer.from_crs(code, 4326, always_xy=True)
-            longitude, latitude = turn.transform(longitude_deg, latitude_deg)
-            azimuth_deg, _, distance_m = geod.inv(longitude, latitude, longitude_deg, latitude_deg)
-            azimuth = np.radians(azimuth_deg)
-            yield Datum(float(distance_m * np.sin(azimuth)), float(distance_m * np.cos(azimuth)), name, code)
+
+def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> tuple[Cause, float] | None:
+    """What makes two clocks differ by `lag_s`, known to within `precision_s`, at an instant, and the exact lag."""
+    near_s = max(precision_s, _CLOCK_NEAR_S)
+    leap_s = leap_seconds(t_ns)
+    if abs(abs(lag_s) - leap_s) <= near_s:
+        return Cause(MisfitCause.GPS_AS_UTC), float(np.copysign(leap_s, lag_s))
+    for step in KNOWN.clock_steps:
+        count = round(abs(lag_s) / step.step_s)
+        size_s = count * step.step_s
+        if 1 <= count <= step.most and abs(abs(lag_s) - size_s) <= near_s:
+            return Cause(step.code, (f"{size_s / step.unit_s:g} {step.unit}",)), float(np.copysign(size_s, lag_s))
+    return None
+
+
+def leap_seconds(t_ns: int) -> int:
+    """GPS time minus UTC at an instant [s]."""
+    year = 1970 + t_ns / 1e9 / _YEAR_S
+    return next((leap_s for since, leap_s in KNOWN.leap_seconds.items() if year >= since), 13)

@@ -24,27 +24,16 @@ class FitState(StrEnum):
 
 
 @dataclass(frozen=True)
-class KnownCause:
-    """A known cause of a misfit, with the figures and names that its words take: a unit, a datum, an amount."""
+class Cause:
+    """Why two streams do not fit, or in which of the two the cause lies; `figures`: a unit, an amount, a stream."""
 
-    code: MisfitCause
-    figures: tuple[str | int, ...] = ()
-
-    @property
-    def words(self) -> str:
-        return CAUSES[self.code].format(*self.figures)
-
-
-@dataclass(frozen=True)
-class Whose:
-    """Where the cause of a misfit lies, with the streams that its words name."""
-
-    code: MisfitPlace
-    streams: tuple[str, ...] = ()
+    code: MisfitCause | MisfitPlace
+    figures: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
-        return MISFIT_PLACES[self.code].format(*self.streams)
+        sentence = MISFIT_PLACES[self.code] if isinstance(self.code, MisfitPlace) else CAUSES[self.code]
+        return sentence.format(*self.figures)
 
 
 @dataclass(frozen=True)
@@ -58,12 +47,11 @@ class Check:
     what: str
     state: FitState
     found: str
-    causes: tuple[KnownCause, ...] = ()
+    causes: tuple[Cause, ...] = ()
     lines: str = ""
     into: str = CONFIGURATION
     advice: str = ""
     of_evidence: bool = False
-    whose: Whose | None = None
 
     @property
     def sentence(self) -> str:
@@ -72,31 +60,22 @@ class Check:
     @property
     def cause(self) -> str:
         """Why it does not fit, and whose fault that is, in words."""
-        why = " and ".join(cause.words for cause in self.causes)
-        whose = "" if self.whose is None else self.whose.words
-        return ", ".join(filter(None, (why, whose)))
+        return ", ".join(cause.words for cause in self.causes)
 
 
 def misfit(
-    what: str,
-    finding: str,
-    *codes: MisfitCause,
-    lines: str = "",
-    into: str = CONFIGURATION,
-    advice: str = "",
-    of_evidence: bool = False,
+    what: str, found: str, *codes: MisfitCause, lines: str = "", into: str = CONFIGURATION, advice: str = ""
 ) -> Check:
     """A misfit of causes that need no figure."""
-    causes = tuple(map(KnownCause, codes))
-    return Check(what, FitState.MISFIT, finding, causes, lines, into, advice, of_evidence)
+    return Check(what, FitState.MISFIT, found, tuple(map(Cause, codes)), lines, into, advice)
 
 
 def not_checked(what: str, why: str) -> Check:
     return Check(what, FitState.NOT_CHECKED, why)
 
 
-def fits(what: str, finding: str) -> Check:
-    return Check(what, FitState.FITS, finding)
+def fits(what: str, found: str) -> Check:
+    return Check(what, FitState.FITS, found)
 
 
 def correction(
@@ -104,7 +83,6 @@ def correction(
     factors: Mapping[str, float] | None = None,
     shift_s: float = 0.0,
     exchange: tuple[str, str] | None = None,
-    shift_m: Mapping[str, float] | None = None,
     solution: str | None = None,
 ) -> str:
     """One `[[ingest.correct]]` table, which can be appended to any configuration file."""
@@ -117,7 +95,6 @@ def correction(
         lines.append(f"factors = {{ {', '.join(f'{name} = {_number(value)}' for name, value in factors.items())} }}")
     if shift_s:
         lines.append(f"shift_s = {_number(shift_s)}")
-    lines += [f"shift_{axis}_m = {_number(value)}" for axis, value in (shift_m or {}).items()]
     return "\n".join(lines) + "\n"
 
 

@@ -8,10 +8,9 @@ from pipeline.studies.plausibility.causes import explain_lag, leap_seconds
 from pipeline.studies.plausibility.check import (
     IN_VEHICLE_FILE,
     VEHICLE_FILE,
+    Cause,
     Check,
     FitState,
-    KnownCause,
-    Whose,
     correction,
     fits,
     misfit,
@@ -66,44 +65,41 @@ def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool
     if not lag.sure and size_s > max(config.lag_told_s, SIGNIFICANT_SIGMAS * lag.sigma_s):
         return not_checked(what, f"{lag.lag_s:+.2f} s, but not in all of the run: a lag, a slip or a drift")
     if not lag.sure or size_s <= config.lag_told_s:
-        sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
-        return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
+        return fits(what, f"{lag.lag_s:+.2f} s")
     later = "later" if lag.lag_s > 0 else "earlier"
-    finding = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {lag.name} are {later}"
-    if size_s <= config.lag_limit_s:
-        return _small(what, finding, lag, of.vehicle.gnss_latency_s)
-    return _large(what, finding, of, lag, of_gnss, known)
+    found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {lag.name} are {later}"
+    if size_s > config.lag_limit_s:
+        return _large(what, found, of, lag, of_gnss, known)
+    return _small(what, found, lag, of.vehicle.gnss_latency_s)
 
 
-def _large(what: str, finding: str, of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
+def _large(what: str, found: str, of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
     """A lag that no train can have; `known`: other recorders tell whose it is."""
     clock = of_gnss or lag
-    explained = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0))
-    exact_s = round(clock.lag_s if explained is None else explained.exact, 2)
-    causes = (KnownCause(MisfitCause.CONSTANT_LAG),) if explained is None else explained.causes
+    constant = Cause(MisfitCause.CONSTANT_LAG), round(clock.lag_s, 2)
+    cause, exact_s = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0)) or constant
     # GPS time is ahead of UTC, so where nobody else knows the stream with the later stamps holds it.
     leaps = abs(abs(lag.lag_s) - leap_seconds(of.epoch_ns)) < _SAME_CLOCK_S
     at_gnss = of_gnss is not None or (not known and leaps and lag.lag_s < 0)
     pair = ("GNSS", lag.name) if at_gnss else (lag.name, "GNSS")
-    whose = Whose(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
-    if not at_gnss:
-        return Check(what, FitState.IMPOSSIBLE, finding, causes, correction(lag.stream, shift_s=-exact_s), whose=whose)
-    streams = ("gnss",) if of.run.satellites is None else ("gnss", "satellites")
-    only = of.solution if len(of.run.solutions()) > 1 else None
-    lines = "".join(correction(stream, shift_s=exact_s, solution=only) for stream in streams)
-    return Check(what, FitState.IMPOSSIBLE, finding, causes, lines, whose=whose)
+    whose = Cause(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
+    lines = correction(lag.stream, shift_s=-exact_s)
+    if at_gnss:
+        streams = ("gnss",) if of.run.satellites is None else ("gnss", "satellites")
+        only = of.solution if len(of.run.solutions()) > 1 else None
+        lines = "".join(correction(stream, shift_s=exact_s, solution=only) for stream in streams)
+    return Check(what, FitState.IMPOSSIBLE, found, (cause, whose), lines)
 
 
-def _small(what: str, finding: str, lag: StreamLag, file_s: float | None) -> Check:
+def _small(what: str, found: str, lag: StreamLag, file_s: float | None) -> Check:
     """A lag that a train can have, and that costs availability all the same; `file_s`: latency of the vehicle file."""
     latency_s = round((file_s or 0.0) - lag.lag_s, 2)
     if lag.stream == "odometer" and latency_s >= 0.0:
         code = MisfitCause.LATENCY if file_s is None else MisfitCause.LATENCY_OF_FILE
         into = VEHICLE_FILE if file_s is None else IN_VEHICLE_FILE
         lines = f"gnss_latency_s = {latency_s}\ngnss_latency_sigma_s = {max(round(lag.sigma_s, 3), 0.02)}\n"
-        return misfit(what, finding, code, lines=lines, into=into)
-    code = MisfitCause.STAMPED_LATE if lag.lag_s > 0 else MisfitCause.STAMPED_EARLY
-    if lag.stream == "reference":
-        # The judge believes the reference: nobody should shift it to where the positions want it.
-        return misfit(what, finding, code, advice="Find out which clock is wrong before one is corrected.")
-    return misfit(what, finding, code, lines=correction(lag.stream, shift_s=-round(lag.lag_s, 2)))
+        return misfit(what, found, code, lines=lines, into=into)
+    # Nobody should shift a recorder, least of all one that the judge believes, to where the positions want it.
+    return misfit(
+        what, found, MisfitCause.CONSTANT_LAG, advice="Find out which clock is wrong before one is corrected."
+    )

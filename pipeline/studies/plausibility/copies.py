@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M
-from pipeline.studies.plausibility.check import Check, FitState, KnownCause
+from pipeline.studies.plausibility.check import Cause, Check, FitState
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.robust import LEAST
 from pipeline.studies.plausibility.shifts import fit_survey
@@ -19,6 +19,7 @@ from schemas.config import FixSigma
 from schemas.enums import Fix, MisfitCause
 
 _WHAT = "reference against the positions"
+_ADVICE = "Leave the reference out of the run, or record one with another, better instrument."
 _AXES = ("latitude_deg", "longitude_deg")
 # Fewer moving places in common tell nothing.
 _FEWEST = 3 * LEAST
@@ -46,15 +47,18 @@ def copy_check(of: Recording) -> Check | None:
     digit_m = digit_deg * np.radians(SEMI_MAJOR_AXIS_M) * np.array([1.0, np.cos(np.radians(positions[0, 0]))])
     # Of a normal error, so much lies within a digit on either side.
     chance = float(np.prod(np.minimum(1.0, 2.0 * digit_m / (np.sqrt(2.0 * np.pi) * sigma_m))))
-    if chance > of.config.copy_chance or _without_error(of, sigma_m):
+    if chance > of.config.copy_chance:
         return None
-    finding = (
+    if of.line is not None:
+        aside_m = fit_survey(of.gnss, of.line, of.config.shift_told_m).aside_m
+        if aside_m < _WITHOUT_ERROR * float(sigma_m.min()):
+            return None
+    found = (
         f"{equal.sum()} of {equal.size} places are those of the positions to the last digit ({digit_m[0]:.1g} m); an "
         f"independent one would be so near in {chance:.1g} of all cases"
     )
-    advice = "Leave the reference out of the run, or record one with another, better instrument."
-    cause = KnownCause(MisfitCause.COPY)
-    return Check(_WHAT, FitState.IMPOSSIBLE, finding, (cause,), advice=advice, of_evidence=True)
+    causes = (Cause(MisfitCause.COPY),)
+    return Check(_WHAT, FitState.IMPOSSIBLE, found, causes, advice=_ADVICE, of_evidence=True)
 
 
 def _at_same_stamps(of: Recording) -> tuple[Floats, Floats]:
@@ -77,12 +81,6 @@ def _digit_deg(degrees: Floats) -> float:
         digit for digit in reversed(_DIGITS_DEG) if np.abs(degrees / digit - np.rint(degrees / digit)).max() < 1e-3
     )
     return max(next(whole, 0.0), _LEAST_DEG)
-
-
-def _without_error(of: Recording, sigma_m: Floats) -> bool:
-    if of.line is None:
-        return False
-    return fit_survey(of.gnss, of.line, of.config.shift_told_m).aside_m < _WITHOUT_ERROR * float(sigma_m.min())
 
 
 def _sigma_m(fixes: pl.DataFrame) -> Floats:

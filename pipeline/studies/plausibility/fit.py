@@ -9,10 +9,16 @@ from pipeline.stages.prepare import PreparedRun
 from pipeline.studies.plausibility.check import Check, FitState, not_checked
 from pipeline.studies.plausibility.clocks import clock_checks
 from pipeline.studies.plausibility.odometer import odometer_checks
-from pipeline.studies.plausibility.places import read_stamp_checks, reads_lag, reference_checks, survey_checks
-from pipeline.studies.plausibility.recording import recording_of
+from pipeline.studies.plausibility.places import (
+    read_stamp_checks,
+    reads_lag,
+    reference_checks,
+    reference_elsewhere,
+    survey_checks,
+    written_check,
+)
+from pipeline.studies.plausibility.recording import Recording, recording_of
 from pipeline.studies.plausibility.velocity import velocity_checks
-from pipeline.studies.plausibility.written import reference_elsewhere, written_checks
 from schemas.config import PlausibilityConfig, Vehicle
 from schemas.enums import MisfitCause, Note
 from schemas.errors import InputError
@@ -44,7 +50,8 @@ class Fit:
     @property
     def codes(self) -> list[MisfitCause]:
         """Causes of what does not fit."""
-        return [cause.code for check in self.misfits for cause in check.causes]
+        causes = (cause for check in self.misfits for cause in check.causes)
+        return [cause.code for cause in causes if isinstance(cause.code, MisfitCause)]
 
     @property
     def notes(self) -> list[Remark]:
@@ -64,23 +71,27 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
     if of is None:
         return Fit((not_checked("positions", "hardly any is valid"),))
     # Positions that lie on another continent fit nothing else.
-    if written := written_checks(of):
-        return Fit(tuple(written))
-    checks = reference_elsewhere(of)
+    if written := written_check(of):
+        return Fit((written,))
+    return Fit(tuple(_checks(of)))
+
+
+def _checks(of: Recording) -> list[Check]:
+    """Places, then the velocity, then the clocks, which need all of them."""
+    run = of.run
     of_odometer, lags = odometer_checks(of)
-    beside_reference = False
-    if not checks and run.reference is not None and run.reference.height:
-        of_reference, checks, beside_reference = reference_checks(of)
+    checks = survey_checks(of, of.line) if of.line is not None else []
+    checks += of_odometer
+    if elsewhere := reference_elsewhere(of):
+        checks.append(elsewhere)
+    elif run.reference is not None and run.reference.height:
+        of_reference, places = reference_checks(of)
         lags.append(of_reference)
-    checks = [*of_odometer, *checks]
-    if run.balise_reads is not None and run.balise_reads.height and site is not None:
-        lags.append(reads_lag(of, run.balise_reads, site))
+        checks += places
+    if run.balise_reads is not None and run.balise_reads.height and of.site is not None:
+        lags.append(reads_lag(of, run.balise_reads, of.site))
         checks += read_stamp_checks(of, run.balise_reads)
-    if of.line is not None:
-        checks = [*survey_checks(of, of.line, beside_reference), *checks]
-    if of.fixes["vel_e_mps"].null_count() < of.fixes.height:
-        checks += velocity_checks(of.velocity, of.gnss, config)
-    return Fit((*checks, *clock_checks(of, lags)))
+    return [*checks, *velocity_checks(of), *clock_checks(of, lags)]
 
 
 def required_fit(prepared: PreparedRun, solution: str, vehicle: Vehicle) -> Fit:
@@ -119,4 +130,5 @@ def _inline(into: str, lines: str) -> str:
     if not tables:
         return f"{into[0].upper()}{into[1:]}: {'; '.join(filter(None, head.splitlines()))}"
     entries = [f"{{ {', '.join(filter(None, table.splitlines()))} }}" for table in tables]
-    return f"First line of the configuration file: ingest.correct = [{', '.join(entries)}]"
+    file = "the configuration file (in a project, [[convert.correct]] of this run in balise.toml)"
+    return f"First line of {file}: ingest.correct = [{', '.join(entries)}]"

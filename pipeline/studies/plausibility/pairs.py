@@ -1,7 +1,7 @@
 """Clock and scale of one counter against positions: robust against jumps, drifts, slips and stands.
 
 First the clocks: at which lag two records of one journey's speed agree, whatever their units; then scale and the rest
-of the lag, by the ways of windows.
+of the lag, by the ways of windows and the equation of `scale_lag`.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.stages.odometry.scale_lag import ScaleLag, scale_and_lag
 from pipeline.studies.plausibility.records import MOVING_MPS, SPEED_S, Places, Record
 from pipeline.studies.plausibility.robust import (
     LEAST,
     SIGNIFICANT_SIGMAS,
-    Regression,
     explains,
-    of_halves,
+    halves_of,
     regressed,
     steady,
     usual,
@@ -65,15 +65,15 @@ _SPARSE_S = 100.0
 class PairFit:
     """How a counter fits positions.
 
-    `factor`: counted units per metre, negative where the counter falls; `lag_s`: the counter's stamp of a moment minus
-    the GNSS's; sigmas of both (inf: not known). `halves`: factor and lag of the first and the second half alone.
-    `constant`: share of windows that agree on the factor, of all in which the positions move. `reason`: why the factor
+    `scale`: metres per counted unit, negative where the counter falls; `lag_s`: the counter's stamp of a moment minus
+    the GNSS's; sigmas of both (inf: not known). `halves`: scale and lag of the first and the second half alone.
+    `constant`: share of windows that agree on the scale, of all in which the positions move. `reason`: why the scale
     is not known; `stands`: the counter stands while the positions move.
     `shifted`: the lag is one of the clocks, by the whole journey's speed; `clock_reason`: why that showed nothing.
     """
 
-    factor: float = float("nan")
-    factor_sigma: float = float("inf")
+    scale: float = float("nan")
+    scale_sigma: float = float("inf")
     lag_s: float = 0.0
     lag_sigma_s: float = float("inf")
     halves: tuple[tuple[float, float], ...] = ()
@@ -92,23 +92,19 @@ class PairFit:
         return self.known and self.lag_sigma_s < _LAG_SIGMA_S
 
     @property
-    def scale(self) -> float:
-        """True distance over what is counted."""
-        return 1.0 / abs(self.factor)
-
-    @property
-    def scale_sigma(self) -> float:
-        return self.factor_sigma / self.factor**2
+    def factor(self) -> float:
+        """How many times the true distance is counted."""
+        return 1.0 / abs(self.scale)
 
     def other_lag(self, lag_s: float, least_s: float) -> bool:
         """Whether the lag differs from `lag_s` by more than `least_s` and than its noise, in both halves of the run."""
-        apart = np.array([self.lag_s, *(lag for _, lag in self.halves)]) - lag_s
-        return self.lag_known and _beyond(apart, max(least_s, SIGNIFICANT_SIGMAS * self.lag_sigma_s))
+        apart_s = np.array([self.lag_s, *(lag for _, lag in self.halves)]) - lag_s
+        return self.lag_known and _beyond(apart_s, max(least_s, SIGNIFICANT_SIGMAS * self.lag_sigma_s))
 
-    def other_factor(self, factor: float, least: float) -> bool:
-        """Whether the factor differs from this one by a larger share than `least`, in both halves of the run."""
-        apart = np.abs([self.factor, *(half for half, _ in self.halves)]) / abs(factor) - 1.0
-        return self.known and _beyond(apart, max(least, SIGNIFICANT_SIGMAS * self.factor_sigma / abs(self.factor)))
+    def other_scale(self, scale: float, least: float) -> bool:
+        """Whether the scale differs from this one by a larger share than `least`, in both halves of the run."""
+        apart = scale / np.abs([self.scale, *(half for half, _ in self.halves)]) - 1.0
+        return self.known and _beyond(apart, max(least, SIGNIFICANT_SIGMAS * self.scale_sigma / abs(self.scale)))
 
 
 def _beyond(apart: Floats, least: float) -> bool:
@@ -128,11 +124,7 @@ def fit_pair(gnss: Places, counter: Record) -> PairFit:
 
 
 def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
-    """Metres per unit, and its slope over the change of speed from begin to end of a window.
-
-    GNSS way = a counted + b change, for the counter is the less noisy one; a lag of the counter's stamps by `d` beyond
-    the assumed one is b = a d.
-    """
+    """Scale and lag by windows, once the clocks agree to within seconds."""
     begin_s, end_s = _common(gnss, counter, lag_s)
     if end_s - begin_s < 3.0 * _WINDOW_LEAST_S:
         return PairFit(reason="nothing in common")
@@ -142,27 +134,29 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
         reason = "the odometer stands while the positions move" if stands else "hardly any movement in common"
         return PairFit(reason=reason, stands=stands)
     sign = -1.0 if np.median(counted) < 0 else 1.0
-    size = np.abs(counted)
-    ratio = size / way
+    ratio = np.abs(counted) / way
     unit = float(np.median(ratio))
     off = np.abs(np.log(ratio / unit))
     # A counter that is reset seems to run so far that it would weigh more than all the rest.
     sane = off < np.log(2.0)
-    design = np.column_stack([size, np.sign(counted) * change])[sane, None, :] / unit
-    target = way[sane, None]
+    columns = (np.column_stack([counted, -change]) * np.sign(counted)[:, None])[sane]
+    way = way[sane]
+    robust = regressed(columns[:, None, :], way[:, None], _LEAST_SPREAD_M, start=(1.0 / unit, 0.0))
 
-    def solved(rows: slice) -> Regression:
-        return regressed(design[rows], target[rows], _LEAST_SPREAD_M, start=(1.0, 0.0))
+    def solved(part: slice) -> ScaleLag | None:
+        weighted = columns[part].T * robust.weight[part]
+        return scale_and_lag(weighted @ columns[part], weighted @ way[part], _OVERLAP * robust.spread, -lag_s)
 
-    fit = solved(slice(None))
-    scale, slope = (fit.estimate / unit).tolist()
-    sigma, slope_sigma = (_OVERLAP * fit.sigma / unit).tolist()
+    best = solved(slice(None))
+    if best is None:
+        return PairFit(reason="hardly any movement in common")
+    halves = [half for part in halves_of(way.size) if (half := solved(part)) is not None]
     return PairFit(
-        factor=sign / scale,
-        factor_sigma=sigma / scale**2,
-        lag_s=lag_s + slope / scale,
-        lag_sigma_s=slope_sigma / scale,
-        halves=tuple((sign * unit / half, lag_s + lag / half) for half, lag in of_halves(solved, len(target))),
+        scale=sign * best.scale,
+        scale_sigma=best.scale_sigma,
+        lag_s=-best.lag_s,
+        lag_sigma_s=best.lag_sigma_s,
+        halves=tuple((half.scale, -half.lag_s) for half in halves),
         constant=counts * float(np.mean(off < _WINDOW_AGREES)),
     )
 
@@ -188,38 +182,38 @@ def _windows(gnss: Places, counter: Record, begin_s: float, end_s: float, lag_s:
     return windows[:, counts], float(counts.mean()) if counts.size else 1.0
 
 
-def clock_lag(gnss: Places, counter: Record) -> tuple[float, str]:
+def clock_lag(gnss: Places, other: Record) -> tuple[float, str]:
     """The lag of the clocks that makes the speeds agree, 0 where they do as recorded; and why none is known.
 
-    A lag is the counter's stamp of a moment minus the GNSS's. A fault of one of the two leaves part of the journey that
+    A lag is the other's stamp of a moment minus the GNSS's. A fault of one of the two leaves part of the journey that
     agrees, and with it the right lag ahead of all others.
     """
-    as_recorded = _agreement(gnss, counter, 0.0, 0.0)
+    as_recorded = _agreement(gnss, other, 0.0, 0.0)
     if as_recorded >= _SPEEDS_AGREE:
         return 0.0, ""
-    possible_s, reason = _possible_lags(gnss, counter)
+    possible_s, reason = _possible_lags(gnss, other)
     if reason:
         return 0.0, reason
-    rated = sorted((_best_beside(gnss, counter, lag_s) for lag_s in possible_s), reverse=True)
-    rated = [lag for lag in rated if abs(lag[1]) > _SPEED_LAG_S]
+    rated = [_best_beside(gnss, other, lag_s) for lag_s in possible_s]
+    rated = sorted((lag for lag in rated if abs(lag[1]) > _SPEED_LAG_S), reverse=True)
     if not rated or not explains(rated[0][0], as_recorded):
         return 0.0, "" if explains(as_recorded, 0.0) else "no shift of the clocks makes the speeds agree"
     agreement, lag_s = rated[0]
-    if any(agreement - other < _LAG_RIVAL for other, other_s in rated if abs(other_s - lag_s) > _APART_S):
+    if any(agreement - rival < _LAG_RIVAL for rival, rival_s in rated if abs(rival_s - lag_s) > _APART_S):
         return 0.0, "several shifts of the clocks make the speeds agree"
     return lag_s, ""
 
 
-def _best_beside(gnss: Places, counter: Record, lag_s: float) -> tuple[float, float]:
+def _best_beside(gnss: Places, other: Record, lag_s: float) -> tuple[float, float]:
     """Best agreement of the speeds near a lag, and the lag."""
-    return max((_agreement(gnss, counter, near_s, _COMMON_SHARE), near_s) for near_s in (lag_s + _BESIDE_S).tolist())
+    return max((_agreement(gnss, other, near_s, _COMMON_SHARE), near_s) for near_s in (lag_s + _BESIDE_S).tolist())
 
 
-def _possible_lags(gnss: Places, counter: Record) -> tuple[list[float], str]:
+def _possible_lags(gnss: Places, other: Record) -> tuple[list[float], str]:
     """Lags at which both speeds look alike, to a second, best correlated first; and why there are none."""
     speeds: list[Floats] = []
     begins_s: list[float] = []
-    for record in (gnss, counter):
+    for record in (gnss, other):
         parts = np.split(record.t_s, np.flatnonzero(np.diff(record.t_s) > _PAUSE_S) + 1)
         part = max(parts, key=np.ptp)
         if np.ptp(part) > _SPARSE_S * part.size:
@@ -243,45 +237,38 @@ def _possible_lags(gnss: Places, counter: Record) -> tuple[list[float], str]:
 
 
 def _correlations(first: Floats, second: Floats) -> Floats:
-    """Correlation at every shift over what both know; 0 where that is too little.
-
-    Element k pairs `first[i]` with `second[i - k + n - 1]`, n the length of `second` (Padfield 2012, masked FFT).
-    """
-    count = first.size + second.size - 1
-    size = 1 << count.bit_length()
-
-    def sums(left: Floats, right: Floats) -> Floats:
-        return np.asarray(np.fft.irfft(np.fft.rfft(left, size) * np.fft.rfft(right[::-1], size), size)[:count])
+    """Correlation at every shift over what both know; 0 where that is too little (Padfield 2012, masked FFT)."""
+    from scipy.signal import correlate  # takes long to load, and hardly any run needs it
 
     known = [np.isfinite(values).astype(np.float64) for values in (first, second)]
     apart = [np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0) for values in (first, second)]
-    spread = sums(apart[0] ** 2, known[1]) * sums(known[0], apart[1] ** 2)
+    spread = correlate(apart[0] ** 2, known[1], method="fft") * correlate(known[0], apart[1] ** 2, method="fft")
     least = max(_COMMON_S, _COMMON_SHARE * min(known[0].sum(), known[1].sum()))
-    enough = (np.round(sums(*known)) >= least) & (spread > _SPEED_CHANGE**4)
-    return np.where(enough, sums(*apart) / np.sqrt(np.where(enough, spread, 1.0)), 0.0)
+    enough = (np.round(correlate(*known, method="fft")) >= least) & (spread > _SPEED_CHANGE**4)
+    return np.where(enough, correlate(*apart, method="fft") / np.sqrt(np.where(enough, spread, 1.0)), 0.0)
 
 
-def _common(gnss: Places, counter: Record, lag_s: float) -> tuple[float, float]:
+def _common(gnss: Places, other: Record, lag_s: float) -> tuple[float, float]:
     """Begin and end of what both records have in common at this lag, by the stamps of the GNSS [s]."""
-    return max(gnss.t_s[0], counter.t_s[0] - lag_s), min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
+    return max(gnss.t_s[0], other.t_s[0] - lag_s), min(gnss.t_s[-1], other.t_s[-1] - lag_s)
 
 
-def _agreement(gnss: Places, counter: Record, lag_s: float, least_overlap: float) -> float:
+def _agreement(gnss: Places, other: Record, lag_s: float, least_overlap: float) -> float:
     """Share of the moving time in which both speeds agree at this lag, times what of the shorter record they have in
     common then: a shift that cuts a fault off explains nothing. 0 where that is too little.
     """
-    begin_s, end_s = _common(gnss, counter, lag_s)
-    shorter_s = min(np.ptp(gnss.t_s), np.ptp(counter.t_s))
+    begin_s, end_s = _common(gnss, other, lag_s)
+    shorter_s = min(np.ptp(gnss.t_s), np.ptp(other.t_s))
     if end_s - begin_s < max(least_overlap * shorter_s, 20.0):
         return 0.0
     grid = np.linspace(begin_s, end_s, int(np.clip(end_s - begin_s, 20, 800)))
-    speeds = np.stack([gnss.speed(grid), np.abs(counter.speed(grid + lag_s))])
-    of_gnss, of_counter = speeds[:, np.isfinite(speeds).all(axis=0)]
-    moves = [speed > _SLOW_SHARE * usual(speed, 0.9) for speed in (of_gnss, of_counter)]
+    speeds = np.stack([gnss.speed(grid), np.abs(other.speed(grid + lag_s))])
+    of_gnss, of_other = speeds[:, np.isfinite(speeds).all(axis=0)]
+    moves = [speed > _SLOW_SHARE * usual(speed, 0.9) for speed in (of_gnss, of_other)]
     both = moves[0] & moves[1]
     if both.sum() < LEAST:
         return 0.0
-    factor = float(np.median(of_counter[both] / of_gnss[both]))
+    factor = float(np.median(of_other[both] / of_gnss[both]))
     bound = _ALIKE_SHARE * of_gnss + _ALIKE_USUAL * usual(of_gnss, 0.9)
-    alike = np.abs(of_counter / factor - of_gnss) < bound
+    alike = np.abs(of_other / factor - of_gnss) < bound
     return float(np.mean(alike[moves[0] | moves[1]])) * float(end_s - begin_s) / float(shorter_s)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import polars as pl
 
 from pipeline.studies.plausibility.pairs import PairFit, fit_pair
 from pipeline.studies.plausibility.records import Places, Record, counters_of, places_of, seconds_since
 from pipeline.studies.plausibility.shifts import SurveyLine, line_of
-from pipeline.studies.plausibility.velocity import VelocityFit, fit_velocity
 from schemas.arrays import Floats, times_ns
 from schemas.config import PlausibilityConfig, Vehicle
 from schemas.run import RunLog, Site
@@ -54,24 +52,8 @@ class Recording:
         """Each counter against the positions."""
         return {name: fit_pair(self.gnss, counter) for name, counter in self.counters.items()}
 
-    def by_reference(self, name: str) -> PairFit:
-        """A counter against the reference, which no drift of the GNSS is in."""
-        return fit_pair(self.reference, self.counters[name]) if self.reference else PairFit(reason="no reference")
-
-    @cached_property
-    def velocity(self) -> VelocityFit | None:
-        return fit_velocity(self.fixes, self.gnss, self.epoch_ns)
-
     def seconds(self, frame: pl.DataFrame) -> Floats:
         return seconds_since(self.epoch_ns, frame)
-
-    def placed(self, latitude_deg: Floats, longitude_deg: Floats) -> Recording | None:
-        """The same run with its fixes at other places; None where they are none on earth."""
-        if not np.nanmax(np.abs(latitude_deg)) <= 90.0:
-            return None
-        fixes = self.fixes.with_columns(latitude_deg=pl.Series(latitude_deg), longitude_deg=pl.Series(longitude_deg))
-        gnss = places_of(fixes, self.epoch_ns)
-        return None if gnss is None else replace(self, fixes=fixes, gnss=gnss)
 
 
 def recording_of(

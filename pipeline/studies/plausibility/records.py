@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.stages.track.geodesy import Points, earth_centred_m, points_of
+from pipeline.stages.track.geodesy import Points, points_of
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.enums import Fix
 
@@ -16,10 +16,11 @@ from schemas.enums import Fix
 SPEED_S = 4.0
 # Slower, positions that scatter by some metres may be of a train that stands.
 MOVING_MPS = 1.0
-# Pauses are bridged up to so many usual periods (loggers drop single rows), and never longer than a minute: instants
-# between rows are then no more than rows allow, whatever the span.
+# Pauses are bridged up to so many usual periods (loggers drop single rows), and never longer than a minute.
 _BRIDGED_PERIODS = 3.5
 _BRIDGED_S = 60.0
+# Two rows a second tell as much as ten.
+_ROW_S = 0.5
 # Fewer rows of a record tell nothing.
 _LEAST_ROWS = 10
 
@@ -45,20 +46,10 @@ class Record:
         return known
 
     def instants(self, step_s: float, begin_s: float = -np.inf, end_s: float = np.inf) -> Floats:
-        """Instants a step apart from the first row (or `begin_s`) on, those inside long pauses left out."""
+        """Instants a step apart from the first row (or `begin_s`) on, one per row at most: none inside long pauses."""
         origin_s = max(self.t_s[0], begin_s)
-        last_s = min(self.t_s[-1], end_s)
-        rows = self.t_s[(self.t_s >= origin_s - self.limit_s) & (self.t_s <= last_s + self.limit_s)]
-        if rows.size < 2 or last_s <= origin_s:
-            return np.zeros(0)
-        edges = np.flatnonzero(np.diff(rows) > self.limit_s)
-        firsts = rows[np.append(0, edges + 1)]
-        lasts = rows[np.append(edges, rows.size - 1)]
-        begins = np.floor((np.maximum(firsts, origin_s) - origin_s) / step_s).astype(np.int64)
-        ends = np.ceil((np.minimum(lasts, last_s) - origin_s) / step_s).astype(np.int64)
-        number = np.concatenate([np.arange(begin, end + 1) for begin, end in zip(begins, ends, strict=True)])
-        instants = origin_s + np.unique(number) * step_s
-        return np.asarray(instants[instants < last_s])
+        rows = self.t_s[(self.t_s >= origin_s) & (self.t_s < end_s)]
+        return np.asarray(origin_s + np.unique(np.floor((rows - origin_s) / step_s)) * step_s)
 
     def at(self, t_s: Floats) -> Floats:
         """Values by straight lines."""
@@ -81,20 +72,10 @@ class Record:
 
 @dataclass(frozen=True)
 class Places(Record):
-    """Positions over time, their coordinates at the stream's median height."""
+    """Positions over time, on the ellipsoid: ways at 1,000 m above it are longer by 2e-4; their heights beside."""
 
-    latitude_deg: Floats
-    longitude_deg: Floats
+    points: Points
     height_m: Floats
-
-    @cached_property
-    def points(self) -> Points:
-        return points_of(self.latitude_deg, self.longitude_deg)
-
-    @cached_property
-    def moving(self) -> Bools:
-        """Rows at which the train moves for certain."""
-        return self.moves(self.t_s)
 
     def moves(self, t_s: Floats) -> Bools:
         """Instants at which the train moves for certain."""
@@ -111,21 +92,16 @@ class Places(Record):
 
 def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
     """Valid positions of a cleaned stream; None where there are hardly any."""
-    latitude = floats(frame, "latitude_deg")
-    longitude = floats(frame, "longitude_deg")
-    valid = np.isfinite(latitude) & np.isfinite(longitude)
+    valid = pl.col("latitude_deg").is_finite() & pl.col("longitude_deg").is_finite()
     if "fix" in frame.columns:
-        valid &= (frame["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
+        valid &= pl.col("fix").cast(pl.String) != Fix.NONE.value
+    frame = frame.filter(valid)
     t_s = seconds_since(epoch_ns, frame)
-    rows = _thinned(t_s, np.flatnonzero(valid))
+    rows = _thinned(t_s)
     if rows.size < _LEAST_ROWS:
         return None
-    latitude = latitude[rows]
-    longitude = longitude[rows]
-    height = floats(frame, "height_m")[rows] if "height_m" in frame.columns else np.full(rows.size, np.nan)
-    level_m = float(np.nanmedian(height)) if np.isfinite(height).any() else 0.0
-    flat = np.full(rows.size, level_m if abs(level_m) < 9000.0 else 0.0)
-    return Places(t_s[rows], earth_centred_m(latitude, longitude, flat), latitude, longitude, height)
+    points = points_of(floats(frame, "latitude_deg")[rows], floats(frame, "longitude_deg")[rows])
+    return Places(t_s[rows], points.surface, points, floats(frame, "height_m")[rows])
 
 
 def counters_of(odometer: pl.DataFrame, epoch_ns: int) -> dict[str, Record]:
@@ -137,7 +113,7 @@ def counters_of(odometer: pl.DataFrame, epoch_ns: int) -> dict[str, Record]:
         way = floats(known, column)
         if name == "speed" and way.size:
             way = np.concatenate([[0.0], np.cumsum(0.5 * (way[1:] + way[:-1]) * np.diff(t_s))])
-        kept = _thinned(t_s, np.arange(way.size))
+        kept = _thinned(t_s)
         if kept.size >= _LEAST_ROWS:
             counters[name] = Record(t_s[kept], way[kept])
     return counters
@@ -148,11 +124,9 @@ def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
     return np.asarray((times_ns(frame) - epoch_ns) * 1e-9, dtype=np.float64)
 
 
-def _thinned(t_s: Floats, rows: Ints) -> Ints:
-    """Of these rows some two a second."""
-    t_s = t_s[rows]
-    if t_s.size < 2 or np.median(np.diff(t_s)) >= 0.45:
-        return rows
-    slot = np.floor((t_s - t_s[0]) / 0.5 + 1e-6)
-    kept: Ints = rows[np.diff(slot, prepend=-1.0) > 0]
-    return kept
+def _thinned(t_s: Floats) -> Ints:
+    """Of the rows some two a second."""
+    if t_s.size < 2 or np.median(np.diff(t_s)) >= 0.9 * _ROW_S:
+        return np.arange(t_s.size)
+    slot = np.floor((t_s - t_s[0]) / _ROW_S + 1e-6)
+    return np.flatnonzero(np.diff(slot, prepend=-1.0) > 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,36 +18,23 @@ SIGNIFICANT_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
-class Shift:
-    """How far one record lies from another [m]."""
-
-    east_m: float
-    north_m: float
-
-    @property
-    def shift_m(self) -> float:
-        return float(np.hypot(self.east_m, self.north_m))
-
-    @property
-    def towards(self) -> str:
-        """In words."""
-        east = "east" if self.east_m >= 0 else "west"
-        north = "north" if self.north_m >= 0 else "south"
-        return f"{abs(self.east_m):.0f} m {east}, {abs(self.north_m):.0f} m {north}"
-
-    def off_m(self, other: Shift) -> float:
-        """How far this shift is from another."""
-        return float(np.hypot(self.east_m - other.east_m, self.north_m - other.north_m))
-
-
-@dataclass(frozen=True)
 class Regression:
-    """`estimate` with `sigma` (inf: not known); `spread`: of what is left [m]; `whole`: all of it is known."""
+    """`estimate` with `sigma` (inf: not known); `weight` of each observation, `spread` of what is left [m].
+
+    `halves`: the estimates of the first and the second half of the run alone. `whole`: every part of the estimate is
+    known.
+    """
 
     estimate: Floats
     sigma: Floats
+    weight: Floats
     spread: float
+    halves: tuple[Floats, ...]
     whole: bool
+
+
+def halves_of(count: int) -> tuple[slice, slice]:
+    return slice(None, count // 2), slice(count // 2, None)
 
 
 def steady(whole: Floats, *halves: Floats) -> bool:
@@ -66,35 +52,33 @@ def regressed(
     """Robust regression; `design` (n, m, k), `target` (n, m): the m parts of one observation share a weight.
 
     `floor`: least spread of what is left. Directions with less than the share `least_known` of the information of the
-    best known one stay zero. `start`: an estimate to begin with, else that of least absolute deviations. Iteratively
-    reweighted least squares: the weight of an observation falls with what the last round left of it.
+    best known one stay zero. `start`: an estimate to begin with, else that of least absolute deviations.
     """
-    count, each = target.shape
-    equations = design.reshape(count * each, -1)
-    goal = target.ravel()
-    weight = np.ones(count)
-    left = np.zeros(count) if start is None else np.linalg.norm(target - design @ np.array(start), axis=1)
+    weight = np.ones(len(target))
+    left = np.zeros(len(target)) if start is None else np.linalg.norm(target - design @ np.array(start), axis=1)
     for number in range(_ROUNDS):
         spread = max(1.4826 * float(np.median(left)), floor)
         if start is None and number < _ROUNDS // 2:
             weight = floor / np.maximum(left, floor)
         else:
             weight = np.clip(1.0 - (left / (_BIWEIGHT * spread)) ** 2, 0.0, None) ** 2
-        weighted = (equations * np.repeat(weight, each)[:, None]).T
-        strengths, axes = np.linalg.eigh(weighted @ equations)
-        known = strengths > least_known * strengths[-1]
-        inverse = (axes[:, known] / strengths[known]) @ axes[:, known].T
-        estimate = inverse @ (weighted @ goal)
-        left = np.linalg.norm((goal - equations @ estimate).reshape(count, each), axis=1)
-    whole = bool(known.all())
-    sigma = spread * np.sqrt(np.diag(inverse)) if whole else np.full(len(estimate), np.inf)
-    return Regression(estimate, sigma, spread, whole)
+        estimate, variance = _solved(design, target, weight, least_known)
+        left = np.linalg.norm(target - design @ estimate, axis=1)
+    alone = (_solved(design[part], target[part], weight[part], least_known)[0] for part in halves_of(len(target)))
+    halves = tuple(alone) if len(target) >= 2 * LEAST else ()
+    whole = bool(np.isfinite(variance).all())
+    return Regression(estimate, spread * np.sqrt(variance), weight, spread, halves, whole)
 
 
-def of_halves(fit: Callable[[slice], Regression], count: int) -> list[Floats]:
-    """The estimates of the first and the second half of so many observations alone; none of too few."""
-    halves = (slice(count // 2), slice(count // 2, count))
-    return [fit(half).estimate for half in halves if half.stop - (half.start or 0) >= LEAST]
+def _solved(design: Floats, target: Floats, weight: Floats, least_known: float) -> tuple[Floats, Floats]:
+    """Weighted least squares, and the variance of each part at a spread of 1 (inf where a direction is not known)."""
+    weighted = design * weight[:, None, None]
+    normal = np.einsum("nmk,nml->kl", weighted, design)
+    strengths, axes = np.linalg.eigh(normal)
+    known = strengths > least_known * max(float(strengths[-1]), 1e-300)
+    inverse = (axes[:, known] / strengths[known]) @ axes[:, known].T
+    variance = np.diag(inverse) if known.all() else np.full(len(inverse), np.inf)
+    return inverse @ np.einsum("nmk,nm->k", weighted, target), variance
 
 
 def explains(share: float, before: float) -> bool:

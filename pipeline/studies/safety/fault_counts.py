@@ -40,22 +40,27 @@ def faults_of_pair(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
 
 def _beside(faults: pl.DataFrame, others: pl.DataFrame) -> pl.DataFrame:
     """`faults`, `common` where both they and one of the others at the same time are failures."""
-    spans = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(_OPEN_END_NS)).rows()
-    met = pl.Series([_overlaps(others, *span) for span in spans], dtype=pl.Boolean)
+    spans = _spans(faults).with_columns(pl.col("end").fill_null(_OPEN_END_NS)).rows()
+    failed = _spans(others.filter("failed"))
+    met = pl.Series([_any_meets(failed, *span) for span in spans], dtype=pl.Boolean)
     return faults.with_columns(common=pl.col("failed") & met)
 
 
-def _overlaps(faults: pl.DataFrame, begin_ns: int, last_ns: int) -> bool:
-    end = pl.col("t_end").to_physical()
-    meets = (pl.col("begin").to_physical() <= last_ns) & (end.is_null() | (end >= begin_ns))
-    return faults.filter(pl.col("failed") & meets).height > 0
+def _spans(faults: pl.DataFrame, begin: str = "begin") -> pl.DataFrame:
+    return faults.select(begin=pl.col(begin).to_physical(), end=pl.col("t_end").to_physical())
+
+
+def _any_meets(spans: pl.DataFrame, begin_ns: int, last_ns: int) -> bool:
+    """One of the spans, which may be open, lies at least in part between these instants."""
+    meets = (pl.col("begin") <= last_ns) & (pl.col("end").is_null() | (pl.col("end") >= begin_ns))
+    return spans.filter(meets).height > 0
 
 
 def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
     """Counts of `pipeline.studies.safety.tally`; those of common faults only where `faults` has `common`."""
     last = int(fails.t_ns[-1])
     kind = faults.schema["begin"]
-    ends = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(last)).rows()
+    ends = _spans(faults).with_columns(pl.col("end").fill_null(last)).rows()
     detected_ns = [_detected_ns(fails, *span) for span in ends]
     failed = pl.col("failed")
     missed = pl.col("missed")
@@ -116,8 +121,6 @@ def _of_side(alarm: AlarmEpisode, side: SolutionTables, config: HazardConfig) ->
 
 def _known_wrong(alarm: AlarmEpisode, side: SolutionTables) -> bool:
     """The replay found a fault at that time, or called an alarm then true."""
-    fault = side.faults.select(begin=pl.col("begin").to_physical(), end=pl.col("t_end").to_physical())
     true = side.alarms.filter(pl.col("verdict").cast(pl.String) == Verdict.TRUE.value)
-    spans = pl.concat([fault, true.select(begin=pl.col("t_start").to_physical(), end=pl.col("t_end").to_physical())])
-    meets = (pl.col("begin") <= alarm.end_ns) & (pl.col("end").is_null() | (pl.col("end") >= alarm.start_ns))
-    return spans.filter(meets).height > 0
+    spans = pl.concat([_spans(side.faults), _spans(true, "t_start")])
+    return _any_meets(spans, alarm.start_ns, alarm.end_ns)

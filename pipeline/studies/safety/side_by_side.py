@@ -66,9 +66,8 @@ def side_by_side(
     rows: list[Row] = []
     for name, channel in channels.items():
         one = solutions[name]
-        verdicts = _verdicts_in_table(channel.fails, one.alarms)
-        found = fault_counts(one.faults, channel.fails) | _alarms(channel, verdicts) | _working(channel)
-        rows.append({"architecture": REACTIVE, "solution": name, **found})
+        counts = _counts(one.faults, channel, _verdicts_in_table(channel.fails, one.alarms))
+        rows.append({"architecture": REACTIVE, "solution": name, **counts})
     for name, other in combinations(names, 2):
         pair = {"solution": name, "other": other}
         rows.append({"architecture": COMPOSITE, **pair, **_composite(solutions[name], solutions[other], config)})
@@ -127,8 +126,7 @@ def _composite(first: SolutionTables, second: SolutionTables, config: Configurat
     )
     channel = _channel(both.hstack(compared), (COMPARISON,), _evaluated(COMPARISON), config)
     verdicts = [verdict_of_both(alarm, (slower, faster), config.hazards) for alarm in channel.fails.alarms]
-    faults = fault_counts(faults_of_pair(slower.faults, faster.faults), channel.fails)
-    return faults | _alarms(channel, verdicts) | _working(channel)
+    return _counts(faults_of_pair(slower.faults, faster.faults), channel, verdicts)
 
 
 def _period_s(solution: SolutionTables) -> float:
@@ -162,30 +160,22 @@ def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, c
     return _Diagnosed(clock, fails, working, known, known & wrong, moving)
 
 
-def _alarms(channel: _Diagnosed, verdicts: list[Verdict]) -> Row:
-    return {
+def _counts(faults: pl.DataFrame, channel: _Diagnosed, verdicts: list[Verdict]) -> Row:
+    """What one kind of diagnosis made of the faults, its alarms, and of the time (`COUNTS`)."""
+    clock = channel.clock
+    up = uptime(clock.t_ns, channel.working, clock.limit_s)
+    # Time in work that a truth judged: what rates count (DOMAIN section 6).
+    judged_s = float(clock.held_s[channel.known & channel.working].sum())
+    return fault_counts(faults, channel.fails) | {
         "alarms": len(verdicts),
         "false_alarms": verdicts.count(Verdict.FALSE),
         "open_alarms": verdicts.count(Verdict.UNKNOWN),
-        "judged_s": _at_risk_s(channel),
-    }
-
-
-def _at_risk_s(channel: _Diagnosed) -> float:
-    """Time in work that a truth judged [s]: what rates count (DOMAIN section 6)."""
-    return float(channel.clock.held_s[channel.known & channel.working].sum())
-
-
-def _working(channel: _Diagnosed) -> Row:
-    clock = channel.clock
-    held = channel.clock.held_s
-    up = uptime(clock.t_ns, channel.working, clock.limit_s)
-    return {
-        "working_s": float(held[channel.working & channel.moving].sum()),
+        "judged_s": judged_s,
+        "working_s": float(clock.held_s[channel.working & channel.moving].sum()),
         "up_s": up.up_s,
         "losses": up.losses,
-        "truth_s": _at_risk_s(channel),
-        "wrong_s": float(held[channel.wrong & channel.working].sum()),
+        "truth_s": judged_s,
+        "wrong_s": float(clock.held_s[channel.wrong & channel.working].sum()),
     }
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.lds.relink import Held
-from pipeline.stages.monitors.bank import AxisRecord
+from pipeline.stages.monitors.bank import AxisBank
 from pipeline.stages.monitors.recursion import ewma_weight
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, UndetectedConfig, Vehicle
@@ -109,7 +109,7 @@ class Watched:
 
 
 def watched(
-    epochs: pl.DataFrame, bank: AxisRecord, held: tuple[Held, ...], vehicle: Vehicle, config: Configuration
+    epochs: pl.DataFrame, bank: AxisBank, held: tuple[Held, ...], vehicle: Vehicle, config: Configuration
 ) -> Watched:
     """What the bank watched of a solution; `epochs`: aligned, with `negated`; `held`: the re-links that held.
 
@@ -153,7 +153,7 @@ def watched(
     return _with_relinks(rows, held)
 
 
-def _thresholds(bank: AxisRecord, epoch: Ints, fastest_mps: float) -> Floats:
+def _thresholds(bank: AxisBank, epoch: Ints, fastest_mps: float) -> Floats:
     """Thresholds of raw and averages [m/s] as they were; infinite where there is nothing to compare.
 
     While the noise is not known, or too large, there is a value and no threshold: what the fastest fault can make of it

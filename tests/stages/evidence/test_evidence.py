@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.evidence import evidence_of
-from pipeline.stages.evidence.carrying import Counter, TrueAnchor
+from pipeline.stages.evidence.carrying import Counter, TrueAnchor, carried_forward
 from pipeline.stages.evidence.evidence import KINDS, _after_standing
 from pipeline.stages.evidence.gaps import Gap, GapSearch
 from pipeline.stages.odometry import Odometry, odometry_of
@@ -101,3 +101,14 @@ def test_nothing_is_carried_over_a_stand_of_the_odometer(
     from_begin = _after_standing(at_ns, Gap(begin, end, anchor(2, 0.0), None, []), stood)
     from_end = _after_standing(at_ns, Gap(begin, end, None, anchor(8, 0.0), []), stood)
     assert (from_begin.tolist(), from_end.tolist()) == (ahead, behind)
+
+
+def test_since_an_accepted_balise_nothing_is_carried_over_a_stand() -> None:
+    """10 m/s; accepted at 1 s, and again at 6 s; the wheel may have slid from 3 to 4 s. 5 m and 5 % of the way."""
+    accepted_ns, path_m = seconds(1, 6), np.array([10.0, 60.0])
+    stood = [(3 * NS_PER_S, 4 * NS_PER_S)]
+    at_ns = seconds(0, 2, 3, 5, 8)
+    counted = counting(np.arange(0.0, 110.0, 10.0))
+    low_m, high_m = carried_forward(accepted_ns, path_m, at_ns, counted, stood, Configuration())
+    assert low_m == pytest.approx([np.nan, 14.5, np.nan, np.nan, 74.0], nan_ok=True)
+    assert high_m == pytest.approx([np.nan, 25.5, np.nan, np.nan, 86.0], nan_ok=True)

@@ -26,7 +26,7 @@ from pipeline.stages.judge.episodes import (
     named_onset_ns,
 )
 from pipeline.stages.judge.failures import Course, Failure, Offers, find_failures, within_budget
-from pipeline.stages.judge.hazards import HazardRow, crossed_by, hazard_rows, instants, rate_mps, size_m
+from pipeline.stages.judge.hazards import HazardRow, _evidence, crossed_by, hazard_rows, instants, rate_mps, size_m
 from pipeline.stages.judge.in_use import lds_states, time_in_use
 from pipeline.stages.judge.judgement import (
     RIGHT,
@@ -619,6 +619,15 @@ def test_the_size_and_slope_of_a_hazard(
     assert size_m(row, drift) == pytest.approx(size)
     found = rate_mps(row, drift)
     assert found == (None if rate is None else pytest.approx(rate))
+
+
+@pytest.mark.parametrize(("first", "kind"), [("reference", Evidence.REFERENCE), (None, Evidence.BALISE)])
+def test_a_hazard_rests_on_what_judged_its_first_balise_else_on_its_first_position(
+    first: str | None, kind: Evidence
+) -> None:
+    offered = offers([2, 3], evidence=[first, "odometer"])
+    met = course(positions(range(5), evidence=["balise", *["odometer"] * 4]), offered=offered)
+    assert _evidence(HazardRow(Hazard.VB_SHIFT, EPISODE, None, [0, 1]), met) is kind
 
 
 def test_pulses_are_one_failure_and_a_calm_half_minute_ends_it() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.stages.lds import LdsResult
 from pipeline.stages.lds.crossings import balises_of, reads_of
-from pipeline.stages.lds.journey import journey_of
+from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.relink import Comparison, Relink
 from schemas.enums import BaliseKind, NotEvaluated
 from tests.stages.lds.scripted import (
@@ -42,7 +42,7 @@ def relink_of(offsets_m: list[float], tvb: list[int], lag_s: float, **columns: A
     odometer_m = steps(0.0, 20.0, 10)
     path_m = [x + offset_m for x, offset_m in zip(odometer_m, offsets_m, strict=True)]
     config = settings(anchor_lag_s=lag_s)
-    journey = journey_of(epochs_of(path_m, odometer_m, **columns), SCALE_SIGMA, config)
+    journey = Journey(epochs_of(path_m, odometer_m, **columns), SCALE_SIGMA, config)
     return Relink(journey, [k in tvb for k in range(10)], config), journey
 
 

@@ -11,6 +11,7 @@ from benchmarks.plausibility import applies
 from benchmarks.plausibility_trips import trip
 from benchmarks.plausibility_wrongs import WRONGS
 from pipeline.stages.clean.clean import clean
+from pipeline.stages.track.geodesy import points_of
 from pipeline.studies.plausibility.check import Check
 from pipeline.studies.plausibility.fit import fit_run
 from pipeline.studies.plausibility.pairs import clock_lag
@@ -77,7 +78,7 @@ def two_clocks(from_s: float) -> tuple[float, str]:
     way = np.cumsum(15.0 + 10.0 * np.sin(t_s / 19.1) + 3.0 * np.sin(t_s / 31.0))
     flat = np.zeros_like(way)
     at, known, counted = np.column_stack([way, flat, flat]), t_s >= from_s, t_s < 800.0
-    gnss = Places(t_s[known], at[known], flat[known], flat[known], flat[known])
+    gnss = Places(t_s[known], at[known], points_of(flat[known], flat[known]), flat[known])
     return clock_lag(gnss, Record(t_s[counted] + 18.0, way[counted]))
 
 

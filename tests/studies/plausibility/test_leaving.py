@@ -31,8 +31,7 @@ def test_a_run_of_which_four_fifths_leave_the_network_tells_no_shift(seed: int, 
     """Each of these was told a shift of 1 to 4 km."""
     places = journey(seed)
     found = against_survey(places, places[fifth * 120 : (fifth + 1) * 120])
-    assert not found.cause
-    assert not found.lines
+    assert not found.causes
 
 
 @pytest.mark.parametrize("seed", [0, 4, 6])
@@ -41,4 +40,3 @@ def test_a_run_beside_the_network_by_one_shift_is_told_it(seed: int) -> None:
     noise = np.random.default_rng(seed).normal(0.0, 2.0, places.shape)
     found = against_survey(places + noise, places - np.array([131.0, 68.0]))
     assert "the survey lies 131 m west, 68 m south of them" in found.found
-    assert "shift_east_m = -13" in found.lines
