@@ -132,12 +132,20 @@ class Odometry:
         scale = self.scale or 1.0
         scale_sigma = self.scale_sigma or 0.0
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
-        same = self.segment_at(begin_ns) == self.segment_at(end_ns)
-        recorded = np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
+        recorded = self._recorded_between(begin_ns, end_ns)
         moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))
         rows_m2 = self.row_sigma_m(self.seconds(begin_ns)) ** 2 + self.row_sigma_m(self.seconds(end_ns)) ** 2
         variance = scale**2 * (self.noise.white_m2_per_s * moving_s + rows_m2) + (scale_sigma * recorded) ** 2
         return OdometerWay(scale * recorded, variance)
+
+    def distance_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """The distance of `between` [m]."""
+        return np.asarray((self.scale or 1.0) * self._recorded_between(begin_ns, end_ns))
+
+    def _recorded_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
+        same = self.segment_at(begin_ns) == self.segment_at(end_ns)
+        return np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
 
     def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
         """Both ends of a step with the scale and latency in use at the later one."""
