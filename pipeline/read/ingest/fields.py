@@ -113,7 +113,10 @@ def may_follow(channel: Channel, path: str) -> bool:
     ]
     if channel.encoding == "protobuf":
         return _in_protobuf(definition_of(channel).DESCRIPTOR, named)
-    return channel.encoding == "cdr" and _in_ros(*definition_of(channel), named)
+    if channel.encoding != "cdr":
+        return False
+    definitions, kind = definition_of(channel)
+    return _in_ros(definitions, kind, named)
 
 
 def _in_protobuf(descriptor: Any, named: Sequence[tuple[str, bool]]) -> bool:
