@@ -32,6 +32,30 @@ def test_speed_alone_is_integrated_and_guessed_over_a_pause():
     assert odometry.known_at_s(np.array([0.7, 1.0, 3.0, 5.0])).tolist() == [True, True, False, True]
 
 
+@pytest.mark.parametrize(
+    ("before_mps", "after_mps", "pause_s", "way_m", "doubt_m"),
+    [
+        (0.0, 0.0, 45.0, 0.0, 0.0),
+        # From rest in a period of 0.5 s, half of which is sure.
+        (0.0, 0.8, 45.0, 0.2, 0.2),
+        (-0.8, 0.0, 45.0, -0.2, 0.2),
+        # It may have crept on: 0.2 m/s for 45 s.
+        (0.2, 0.6, 45.0, 0.2, 9.2),
+        # More than 0.3 + 1.8 x 0.5 m/s is not reached in a period; nor does a train stand at 0.4 m/s: mean speed.
+        (0.0, 1.3, 4.0, 2.6, 7.2),
+        (0.4, 0.4, 4.0, 1.6, 7.2),
+    ],
+)
+def test_a_logger_that_writes_nothing_at_a_stand_leaves_little_in_doubt(
+    before_mps, after_mps, pause_s, way_m, doubt_m
+) -> None:
+    t = [0.0, 0.5, 1.0, 1.5, 1.5 + pause_s, 2.0 + pause_s, 2.5 + pause_s]
+    odometry = odometry_from(odometer_of(t, speed_mps=[*[before_mps] * 4, *[after_mps] * 3]))
+    assert np.diff(odometry.segment).tolist() == [0, 0, 0, 1, 0, 0]
+    assert np.diff(odometry.distance_m)[3] == pytest.approx(way_m)
+    assert np.diff(odometry.slip_doubt_m) == pytest.approx([0.0, 0.0, 0.0, doubt_m, 0.0, 0.0])
+
+
 def test_a_cumulative_distance_carries_over_a_pause_but_not_inside_it():
     frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], distance_m=[0.0, 5.0, 10.0, 50.0, 55.0])
     odometry = odometry_from(frame)
