@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from schemas.run import RunLog
     from schemas.run import Site as Ground
 
+# By default the collector goes through all modules time and again while they are loaded. Set here and not in `main`,
+# because the workers of a campaign load this module as well.
+gc.set_threshold(50_000)
+
 Command = TypeVar("Command", bound=Callable[..., None])
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
@@ -910,8 +914,6 @@ def diff(
 
 def main() -> None:
     """Entry point of the program: turns whatever happens into one message and an exit status."""
-    # By default the collector goes through all modules time and again while they are loaded, and twice at the end.
-    gc.set_threshold(50_000)
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     status = _guarded(arguments, debug="--debug" in sys.argv[1:])
     gc.freeze()
