@@ -26,7 +26,7 @@ _BEFORE_READING = """
 import os, sys, time, cli
 import pipeline.campaign.worker as worker
 def stop(*given, **named):
-    print(len({'scipy', 'duckdb', 'rich', 'jinja2'} & set(sys.modules)), time.process_time(), flush=True)
+    print(len({'scipy', 'duckdb', 'rich', 'jinja2', 'pandas'} & set(sys.modules)), time.process_time(), flush=True)
     os._exit(0)
 worker.RecordedLog = stop
 cli._guarded(sys.argv[1:], False)

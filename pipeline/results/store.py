@@ -179,16 +179,12 @@ def _read_own(
 
 def _check_columns(table: str, run_id: str, recorded: Mapping[str, pl.DataType]) -> None:
     expected = dtypes(TABLES[table])
-    lost = [name for name in expected if name not in recorded]
-    unlike = [f"no {', '.join(lost)}"] if lost else []
-    unlike += [
-        f"{name} as {recorded[name]}, not {kind}" for name, kind in expected.items() if recorded.get(name, kind) != kind
-    ]
+    unlike = [name for name, kind in expected.items() if recorded.get(name) != kind]
     if unlike:
         raise UsageError(
             "was written by another build of the program",
             place=f"run {run_id}, table `{table}`",
-            found="; ".join(unlike),
+            found=f"{', '.join(unlike)} missing or of another type",
             expected=f"the columns of contract {CONTRACT_VERSION} as of this build",
             remedy="Repeat `balise replay` with the same --out: it replays this run again.",
         )

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import dataframely as dy
+import numpy as np
 import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.storage.parquet import metadata_of, parquet_bytes, read_parquet
+from pipeline.storage.parquet import GroupedFile, metadata_of, parquet_bytes
 from schemas.conform import meanings
 from schemas.tables import CONTRACT_VERSION
 
@@ -49,19 +51,27 @@ class FileDescription:
 
 
 def describe(content: bytes) -> FileDescription:
-    """What a Parquet file of this program or another says of itself. Raises `ParquetError`."""
-    frame = read_parquet(content)
+    """What a Parquet file of this program or another says of itself. Raises `ParquetError`.
+
+    Its first rows are read to see whether they are whole, but not all: equal rows take hardly any room in a file.
+    """
+    file = GroupedFile(io.BytesIO(content))
+    rows = np.cumsum([file.metadata.row_group(number).num_rows for number in range(file.metadata.num_row_groups)])
+    file.read(range(int(np.searchsorted(rows, _MOST_READ, side="right"))))
     fields = pq.read_schema(pa.BufferReader(content))
-    columns = [(name, _kind_text(kind), *_unit_and_meaning(fields.field(name))) for name, kind in frame.schema.items()]
+    columns = [
+        (name, _kind_text(kind), *_unit_and_meaning(fields.field(name))) for name, kind in file.columns().items()
+    ]
     names = ("column", "dtype", "unit", "meaning")
     table = pl.DataFrame(columns, schema=dict.fromkeys(names, pl.String), orient="row")
     # The encoded schema is for programs. What comes first says what the file is.
     notes = {key: value for key, value in metadata_of(content).items() if key != "ARROW:schema"}
     first = [key for key in _FIRST if key in notes]
     metadata = {key: notes[key] for key in [*first, *sorted(notes.keys() - first)]}
-    return FileDescription(frame.height, metadata, table)
+    return FileDescription(file.metadata.num_rows, metadata, table)
 
 
+_MOST_READ = 1_000_000  # rows
 _FIRST = tuple(f"{PREFIX}{key}" for key in ("table", "run_id", "contract", "software"))
 
 

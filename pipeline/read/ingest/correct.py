@@ -79,7 +79,10 @@ def recorded_corrections(run: RunLog, stream: Stream) -> dict[str, str]:
 
 
 def read_corrections(metadata: Mapping[str, str], stream: Stream, place: str) -> tuple[StreamCorrection, ...]:
-    """The corrections that a stream says it holds. Raises `InputError` where that cannot be understood."""
+    """The corrections that a stream says it holds.
+
+    Raises `InputError` where that cannot be understood, or is none that this program makes.
+    """
     text = metadata.get(RECORDED)
     if text is None:
         return ()
@@ -87,7 +90,7 @@ def read_corrections(metadata: Mapping[str, str], stream: Stream, place: str) ->
         held = settings_from({"correct": json.loads(text)}, IngestConfig, place).correct
     except (ValueError, RecursionError, BaliseError):
         held = ()
-    if not held or any(correction.stream != stream for correction in held):
+    if not held or any(made.stream != stream or not made.changes or unknown_columns(made) for made in held):
         raise InputError(
             f"does not say clearly how its {stream} was corrected",
             place=place,
@@ -105,7 +108,7 @@ def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -
         mended = mended.with_columns(pl.col(second).alias(first), pl.col(first).alias(second))
     mended = mended.with_columns(pl.col(name) * factor for name, factor in correction.factors.items())
     mended = _later(mended, correction.shift_s) if correction.shift_s else mended
-    if correction.shift_east_m or correction.shift_north_m or correction.shift_up_m:
+    if correction.moves:
         mended = _moved(mended, correction)
     if correction.solution is not None and "solution" in frame.columns:
         meant = pl.col("solution") == correction.solution
@@ -136,17 +139,21 @@ def _moved(frame: pl.DataFrame, correction: StreamCorrection) -> pl.DataFrame:
     return frame.with_columns(*columns, pl.col("height_m") + correction.shift_up_m)
 
 
+def unknown_columns(correction: StreamCorrection) -> list[str]:
+    """The columns that it names and that cannot be corrected: only numbers can be multiplied, only places be moved."""
+    names = [*correction.factors, *(correction.exchange or ()), *([*_PLACE, "height_m"] if correction.moves else [])]
+    return sorted(set(names) - set(_numbers(correction.stream)))
+
+
+def _numbers(stream: Stream) -> list[str]:
+    return [name for name, column in STREAM_SCHEMAS[stream].columns().items() if column.dtype == pl.Float64]
+
+
 def _refuse_unknown(correction: StreamCorrection) -> None:
-    """Only numbers can be multiplied, and only places be moved."""
-    contract = STREAM_SCHEMAS[correction.stream].columns()
-    numbers = [name for name, column in contract.items() if column.dtype == pl.Float64]
-    named = [*correction.factors, *(correction.exchange or ())]
-    moves = correction.shift_east_m or correction.shift_north_m or correction.shift_up_m
-    named += [*_PLACE, "height_m"] if moves else []
-    if unknown := sorted(set(named) - set(numbers)):
+    if unknown := unknown_columns(correction):
         raise ConfigError(
             "names columns that cannot be corrected",
             place=f"[[ingest.correct]] stream = {correction.stream!r}",
             found=", ".join(unknown),
-            expected="some of " + ", ".join(numbers),
+            expected="some of " + ", ".join(_numbers(correction.stream)),
         )

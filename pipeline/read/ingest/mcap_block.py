@@ -83,25 +83,20 @@ def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
 
 @dataclass(frozen=True)
 class Piece:
-    """Records side by side, as of one chunk, and the messages among them; `offset`: its place in the file."""
+    """Records side by side, as of one chunk, and where messages begin among them, with the heads of these.
+
+    `offset`: its place in the file.
+    """
 
     data: Bytes
     starts: Ints
-    opcodes: Bytes
-    channels: npt.NDArray[np.uint16]
-    lengths: Ints
-    log_times: Ints
+    heads: npt.NDArray[np.void]
     offset: int
 
 
 def _piece(data: Bytes, starts: Ints, offset: int) -> Piece:
-    if not len(starts):
-        return Piece(data, starts, data[:0], starts.astype(np.uint16), starts, starts, offset)
-    heads = stretches_of(data, starts, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
-    opcodes, channels, lengths, log_times = (
-        np.ascontiguousarray(heads[name]) for name in ("opcode", "channel", "length", "log_time")
-    )
-    return Piece(data, starts, opcodes, channels, lengths, log_times, offset)
+    heads = stretches_of(data, starts, MESSAGE_HEAD.itemsize).reshape(-1) if len(starts) else data[:0]
+    return Piece(data, starts, heads.view(MESSAGE_HEAD), offset)
 
 
 @dataclass
@@ -142,9 +137,9 @@ def piece_of_chunk(
 
 def _check_indexes(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> None:
     """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
-    order = np.argsort(piece.channels, kind="stable")
-    channels = piece.channels[order]
-    messages = np.column_stack([piece.log_times, piece.starts])[order]
+    order = np.argsort(piece.heads["channel"], kind="stable")
+    channels = piece.heads["channel"][order]
+    messages = np.column_stack([piece.heads["log_time"], piece.starts])[order]
     for channel, entries in indexes:
         first, end = np.searchsorted(channels, np.array([channel, channel + 1]))
         listed = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
@@ -161,12 +156,13 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> P
     if not len(starts) or starts[0] < 0 or starts[-1] > len(data) - MESSAGE_HEAD.itemsize:
         return None
     piece = _piece(data, starts, offset)
-    ends = starts + HEAD_SIZE + piece.lengths
-    tiled = ends[-1] == len(data) and (ends[:-1] == starts[1:]).all() and piece.lengths.min() >= _FIXED_FIELDS
+    lengths = np.ascontiguousarray(piece.heads["length"])
+    ends = starts + HEAD_SIZE + lengths
+    tiled = ends[-1] == len(data) and (ends[:-1] == starts[1:]).all() and lengths.min() >= _FIXED_FIELDS
     as_listed = (
-        (piece.opcodes == int(Opcode.MESSAGE)).all()
-        and (piece.channels == channels[order]).all()
-        and (piece.log_times == log_times[order]).all()
+        (piece.heads["opcode"] == int(Opcode.MESSAGE)).all()
+        and (piece.heads["channel"] == channels[order]).all()
+        and (piece.heads["log_time"] == log_times[order]).all()
     )
     return piece if as_listed and tiled else None
 
@@ -217,12 +213,13 @@ def _walked(content: Any, starts: array[int], offset: int) -> Piece:
 def block_of(pieces: list[Piece], before: int) -> Block:
     """The messages of neighbouring pieces, by channel; `before` is the size of the pieces before these."""
     whole = pieces[0] if len(pieces) == 1 else _together(pieces)
-    order = np.argsort(whole.channels, kind="stable")
-    channels = whole.channels[order]
+    order = np.argsort(whole.heads["channel"], kind="stable")
+    channels = whole.heads["channel"][order]
     starts = whole.starts + MESSAGE_HEAD.itemsize
-    lengths = whole.lengths - _FIXED_FIELDS
+    lengths = whole.heads["length"] - _FIXED_FIELDS
+    log_times = whole.heads["log_time"]
     return {
-        int(whole.channels[rows[0]]): Messages(whole.data, starts[rows], lengths[rows], whole.log_times[rows], before)
+        int(whole.heads["channel"][rows[0]]): Messages(whole.data, starts[rows], lengths[rows], log_times[rows], before)
         for rows in np.split(order, np.flatnonzero(channels[1:] != channels[:-1]) + 1)
         if len(rows)
     }
@@ -230,12 +227,6 @@ def block_of(pieces: list[Piece], before: int) -> Block:
 
 def _together(pieces: list[Piece]) -> Piece:
     bases = np.cumsum([0, *(len(piece.data) for piece in pieces[:-1])])
-    return Piece(
-        data=np.concatenate([piece.data for piece in pieces]),
-        starts=np.concatenate([piece.starts + base for piece, base in zip(pieces, bases, strict=True)]),
-        opcodes=np.concatenate([piece.opcodes for piece in pieces]),
-        channels=np.concatenate([piece.channels for piece in pieces]),
-        lengths=np.concatenate([piece.lengths for piece in pieces]),
-        log_times=np.concatenate([piece.log_times for piece in pieces]),
-        offset=pieces[0].offset,
-    )
+    data = np.concatenate([piece.data for piece in pieces])
+    starts = np.concatenate([piece.starts + base for piece, base in zip(pieces, bases, strict=True)])
+    return Piece(data, starts, np.concatenate([piece.heads for piece in pieces]), pieces[0].offset)

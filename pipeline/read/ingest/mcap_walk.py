@@ -36,7 +36,7 @@ _AFTER_THE_DATA = (
 )  # fmt: skip
 _ONLY_THERE = _AFTER_THE_DATA[2:]
 _KNOWN = int(max(Opcode))  # unknown records, of higher ones, are skipped, by specification
-_TOGETHER = 1024 * 1024  # chunks of up to so many bytes are taken at once
+_TOGETHER = 4 * 1024 * 1024  # chunks of up to so many bytes are taken at once
 _LEAST_PIECE = 8 * 1024  # what a piece that waits takes itself
 _LOOSE = 64 * 1024  # of a log without chunks read at once
 _FREE_RECORDS = 1 << 18  # records that the chunks of a log may hold beyond one per byte

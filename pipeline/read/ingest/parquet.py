@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
 
 import polars as pl
 
@@ -43,7 +42,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
             frames[stream] = conform(recorded, stream, str(file), breaches)
             held += read_corrections(notes_of(content), stream, str(file))
             unproved += [f"{stream}.parquet"] if without_checksums(content) else []
-            skipped += [f"{stream}.parquet: column {name}" for name in _others(recorded.columns, stream)]
+            skipped += [f"{stream}.parquet: column {name}" for name in recorded.columns if not _is_known(name, stream)]
     refuse(breaches)
     skipped += sorted(present - {f"{stream}.parquet" for stream in STREAMS})
     return RunLog(
@@ -70,12 +69,11 @@ def _read(
     if not content:
         breaches.append(InputError("is empty", place=place, found="0 bytes", expected="a Parquet file"))
         return None
-    contract = STREAM_SCHEMAS[stream].columns()
-    met: ColumnTypes = {}
+    others: list[str] = []
 
     def known(types: ColumnTypes) -> list[str]:
-        met.update(types)
-        return [name for name in types if name in contract]
+        others.extend(name for name in types if not _is_known(name, stream))
+        return [name for name in types if _is_known(name, stream)]
 
     try:
         refuse_too_many(rows_of(content), place, config)
@@ -85,10 +83,9 @@ def _read(
             InputError(f"cannot be read as Parquet ({error})", place=place, remedy="Record or copy the file again.")
         )
         return None
-    return frame.with_columns(pl.lit(None).alias(name) for name in _others(met, stream))
+    return frame.with_columns(pl.lit(None).alias(name) for name in others)
 
 
-def _others(columns: Iterable[str], stream: Stream) -> list[str]:
-    """Columns outside the contract, of which only the names are kept."""
-    known = STREAM_SCHEMAS[stream].columns()
-    return [name for name in columns if name not in known]
+def _is_known(column: str, stream: Stream) -> bool:
+    """Of other columns than the contract's only the names are kept."""
+    return column in STREAM_SCHEMAS[stream].columns()

@@ -26,11 +26,8 @@ def without_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps:
     placeholder = origin
     if rows.size > 2:
         places = points_of(latitude[rows], longitude[rows]).surface
-        centre = np.median(places, axis=0)
-        # Cheap first: a run without any far place, which is nearly every run, is done here.
-        if np.max(np.abs(places - centre)) > config.placeholder_far_m / np.sqrt(3.0):
-            placeholder = origin.copy()
-            placeholder[rows] = _far(times_ns(fixes)[rows], places, config, fastest_mps)
+        placeholder = origin.copy()
+        placeholder[rows] = _far(times_ns(fixes)[rows], places, config, fastest_mps)
     count = int(placeholder.sum())
     if not count:
         return fixes, 0

@@ -52,8 +52,15 @@ class Counter:
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
         """True distance between instants and its variance; NaN over a break."""
         counted = self.odometer.between(begin_ns, end_ns)
+        return OdometerWay(self._unbroken(begin_ns, end_ns, counted.distance_m), counted.variance_m2)
+
+    def distance_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """The distance of `between` alone, which takes half the time."""
+        return self._unbroken(begin_ns, end_ns, self.odometer.distance_between(begin_ns, end_ns))
+
+    def _unbroken(self, begin_ns: Ints | int, end_ns: Ints, distance_m: Floats) -> Floats:
         breaks = [np.searchsorted(self.breaks_ns, t_ns, side="right") for t_ns in (begin_ns, end_ns)]
-        return OdometerWay(np.where(breaks[0] == breaks[1], counted.distance_m, np.nan), counted.variance_m2)
+        return np.where(breaks[0] == breaks[1], distance_m, np.nan)
 
     def driven_m(self, since_ns: Ints | int, t_ns: Ints) -> Floats:
         """Way driven, turns included [m]."""
@@ -63,7 +70,7 @@ class Counter:
     def speed_mps(self, t_ns: Ints) -> Floats:
         """Speed over a second about each instant [m/s]; NaN where it did not count throughout."""
         half_ns = round(0.5 * self.odometer.config.speed_window_s * NS_PER_S)
-        return np.asarray(self.between(t_ns - half_ns, t_ns + half_ns).distance_m / (2 * half_ns / NS_PER_S))
+        return np.asarray(self.distance_m(t_ns - half_ns, t_ns + half_ns) / (2 * half_ns / NS_PER_S))
 
     def best_speed_mps(self, t_ns: Ints) -> Floats:
         """Speed over as much of that second as was recorded [m/s]; a best guess over a break."""
@@ -98,7 +105,7 @@ def _carried_from(
     counter: Counter, since_ns: Ints | int, at_m: Floats | float, t_ns: Ints, known_m: float, config: Configuration
 ) -> Interval:
     """Places at some instants, known to `known_m`, plus the distance since, +- (5 m + 5 %)."""
-    centre = at_m + counter.between(since_ns, t_ns).distance_m
+    centre = at_m + counter.distance_m(since_ns, t_ns)
     half = beside_m(counter.driven_m(since_ns, t_ns), known_m, config)
     return centre - half, centre + half
 

@@ -83,7 +83,7 @@ def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter)
     spreads = []
     for lag_s in lags_s.tolist():
         lag_ns = round(lag_s * NS_PER_S)
-        counted = counter.between(begin_ns - lag_ns, end_ns - lag_ns).distance_m
+        counted = counter.distance_m(begin_ns - lag_ns, end_ns - lag_ns)
         known = np.isfinite(counted)
         enough = known.sum() >= 0.5 * known.size and float(np.abs(counted[known]).sum()) > 0.0
         spreads.append(float(np.median(np.abs(way_m - counted)[known])) if enough else np.inf)
@@ -95,7 +95,7 @@ def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter)
 def _rest_of_lag(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter, lag_s: float) -> tuple[float, float]:
     """The remaining lag once `lag_s` is taken off, and its sigma [s], infinite where the ways cannot show it."""
     lag_ns = round(lag_s * NS_PER_S)
-    counted = counter.between(begin_ns - lag_ns, end_ns - lag_ns).distance_m
+    counted = counter.distance_m(begin_ns - lag_ns, end_ns - lag_ns)
     change = counter.speed_mps(end_ns - lag_ns) - counter.speed_mps(begin_ns - lag_ns)
     # Noise of the odometer would look like a lag. Where its recording begins or ends the speed is NaN, not a change.
     change = np.where(np.abs(change) <= counter.odometer.deadband_mps, 0.0, change)

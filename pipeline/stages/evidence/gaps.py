@@ -121,7 +121,7 @@ class GapSearch:
         if end.t_ns < begin.t_ns:
             return []
         end_ns = np.array([end.t_ns])
-        length_m = float(self.counter.between(begin.t_ns, end_ns).distance_m[0])
+        length_m = float(self.counter.distance_m(begin.t_ns, end_ns)[0])
         if np.isnan(length_m):
             return [Gap(begin.t_ns, end.t_ns, begin, None, []), Gap(begin.t_ns, end.t_ns, None, end, [])]
         way_m = self.counter.driven_m(begin.t_ns, end_ns)
@@ -198,7 +198,7 @@ class GapSearch:
 
     def _turned(self, gap: Gap, looks_ns: Ints) -> bool:
         """The train went back in the gap by more than the fixed error of the odometer."""
-        distance_m = self.counter.between(gap.anchors[0].t_ns, looks_ns).distance_m
+        distance_m = self.counter.distance_m(gap.anchors[0].t_ns, looks_ns)
         distance_m = distance_m[np.isfinite(distance_m)]
         # The largest fall behind the farthest place so far; a run without a turn has none in one of the two senses.
         senses = (distance_m, -distance_m)

@@ -132,12 +132,20 @@ class Odometry:
         scale = self.scale or 1.0
         scale_sigma = self.scale_sigma or 0.0
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
-        same = self.segment_at(begin_ns) == self.segment_at(end_ns)
-        recorded = np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
+        recorded = self._recorded_between(begin_ns, end_ns)
         moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))
         rows_m2 = self.row_sigma_m(self.seconds(begin_ns)) ** 2 + self.row_sigma_m(self.seconds(end_ns)) ** 2
         variance = scale**2 * (self.noise.white_m2_per_s * moving_s + rows_m2) + (scale_sigma * recorded) ** 2
         return OdometerWay(scale * recorded, variance)
+
+    def distance_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """The distance of `between` [m]."""
+        return np.asarray((self.scale or 1.0) * self._recorded_between(begin_ns, end_ns))
+
+    def _recorded_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
+        same = self.segment_at(begin_ns) == self.segment_at(end_ns)
+        return np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
 
     def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
         """Both ends of a step with the scale and latency in use at the later one."""
@@ -253,13 +261,15 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     slip = _slips(stream, align)
     silent = pause & ~counted
     lost = silent | slip[1:]
+    guessed = silent & ~unknown
+    guess_m, guess_doubt_m = _guessed_ways(way_m, dt_s, speed, period_s, config)
+    way_m = np.where(guessed, guess_m, way_m)
     distance_m = _sums(np.where(unknown, 0.0, way_m))
     segment = _sums(lost.astype(np.float64)).astype(np.int64)
     counter = _sums((silent & unknown).astype(np.float64)).astype(np.int64)
     doubt_m = _sums(
         _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
-        # Mean speed x dt over a pause, with acceleration and braking up to b.
-        + np.where(silent & ~unknown, 0.25 * align.braking_mps2 * dt_s**2, 0.0)
+        + np.where(guessed, guess_doubt_m, 0.0)
     )
     white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
     noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, config) if counted.any() else None
@@ -291,6 +301,24 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         bridged_m2=np.interp(t_s, row_s, _sums((bridged_m / _BOUND_SIGMAS) ** 2)) if bridged_m.any() else None,
         config=align,
     )
+
+
+def _guessed_ways(
+    way_m: Floats, dt_s: Floats, speed_mps: Floats, period_s: float, config: Configuration
+) -> tuple[Floats, Floats]:
+    """The way over a pause of speeds at each step, and by how much it may be off [m].
+
+    Mean speed x dt (`way_m`), with acceleration and braking up to b. But some loggers write nothing at a stand: where
+    the train stands at one row and at the other is no faster than it gets in a period, it drove for a period before and
+    after at most. Half of that is the way; it may have stood then, or gone on at the slower speed.
+    """
+    deadband_mps = config.matching.deadband_mps
+    braking_mps2 = config.align.braking_mps2
+    slower_mps, faster_mps = np.sort(np.abs([speed_mps[:-1], speed_mps[1:]]), axis=0)
+    stood = (slower_mps <= deadband_mps) & (faster_mps <= deadband_mps + braking_mps2 * period_s)
+    stand_m = 0.5 * period_s * (speed_mps[:-1] + speed_mps[1:])
+    stand_doubt_m = 0.5 * period_s * (slower_mps + faster_mps) + slower_mps * dt_s
+    return np.where(stood, stand_m, way_m), np.where(stood, stand_doubt_m, 0.25 * braking_mps2 * dt_s**2)
 
 
 def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: Configuration) -> Noise:

@@ -3,8 +3,8 @@
 way of the other = scale * way counted - scale * lag * change of speed,
 
 with ways and speeds counted at the stamps less an assumed lag, and `lag` what is left of it: linear in scale and scale
-* lag. The causal filter (`alignment.odometer_filter`) follows it from epoch to epoch, the fit of a run
-(`plausibility.pairs`) by windows without outliers; calibration weighs observations of whole runs and solves them here.
+* lag. The causal filter (`alignment.odometer_filter`) follows it from epoch to epoch. Calibration weighs observations
+of whole runs, the fit of a run (`plausibility.pairs`) windows without outliers; both solve it here.
 """
 
 from __future__ import annotations

@@ -41,11 +41,9 @@ _NO_NOISE = {f"noise_{axis}_m": (0.0, 0.0, 0.0, 0.0) for axis in AXES}
 
 @dataclass(frozen=True)
 class Calibration:
-    """`vehicle`: the vehicle file; `runs`: scale and latency run by run; `sigmas`: regression by monitor.
+    """The vehicle has no latency where the runs show none. `monitors`: the keys of `[monitors]` that were measured.
 
-    The vehicle has no latency where the runs show none. `monitors`: what was measured for `[monitors]` of the
-    configuration, by key; a key without a measurement is left out. `alarms`: by run the monitors that failed beyond its
-    noise: such a run is hardly without fault.
+    `alarms`: by run the monitors that failed beyond its noise: such a run is hardly without fault.
     """
 
     vehicle: Vehicle
@@ -63,8 +61,7 @@ class Calibration:
 class Observed:
     """What one run shows of its vehicle; `estimate` is None where GNSS and odometer could not be compared.
 
-    `noise_m`: fast noise by key of `[monitors]`. `epochs`: the columns that sigmas are regressed on, with this noise
-    given. `alarms`: monitors that failed beyond noise (`beyond_noise`).
+    `noise_m`: fast noise by key of `[monitors]`. `epochs`: the columns that sigmas are regressed on.
     """
 
     run_id: str
@@ -81,22 +78,21 @@ def calibrate(
     config: Configuration | None = None,
     solution: str = "primary",
 ) -> Calibration:
-    """Vehicle, fast noise and monitor sigmas from fault-free runs over one site.
+    """`vehicle` brings lever arms and heights; its scale and latency, and noise and sigmas, are measured anew.
 
-    `vehicle` brings lever arms and heights. Its scale and latency, and noise and sigmas of `config`, are measured anew.
-    Raises `InputError` where no run can be compared with an odometer.
+    Raises `InputError` where no run has the solution, or can be compared with an odometer.
     """
+    known = sorted({name for log in logs for name in log.solutions()})
+    if solution not in known:
+        remedy = "Name one of these with --solution."
+        raise InputError("no run has this solution", place=solution, found=", ".join(known), remedy=remedy)
     config = config or Configuration()
     base = vehicle or Vehicle()
-    _check_solution(logs, solution)
     return calibration_of([observe(log, site, base, config, solution) for log in told(logs)], base, config)
 
 
 def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> Observed:
-    """Scale and latency of a fault-free run, its fast noise, and what the monitors show with these.
-
-    Raises `InputError` where its streams do not fit each other.
-    """
+    """What a fault-free run shows; raises `InputError` where its streams do not fit each other."""
     prepared = prepare(log, site, vehicle, config, clock_advice)
     if solution not in prepared.run.solutions():
         return Observed(log.run_id, None, {}, None, ())
@@ -120,7 +116,7 @@ def _estimate(match: Match, odometry: Odometry, config: Configuration) -> RunEst
 def _monitored(
     match: Match, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
 ) -> tuple[dict[str, tuple[float, ...]], pl.DataFrame]:
-    """The fast noise that the bank measures, and what the monitors show with this noise given."""
+    """The fast noise that the bank measures, and the monitors with this noise given."""
     # Without the margin of a single run: the loudest of several counts.
     stated = _with_monitors(config, {**_AS_STATED, **dict.fromkeys(_NO_NOISE), "noise_doubt": 0.0})
     aligned = align(match.epochs, odometry, vehicle, stated)
@@ -137,10 +133,7 @@ def _alarms(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, so
 
 
 def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configuration) -> Calibration:
-    """Vehicle, noise and sigmas of all runs together.
-
-    `vehicle` and `config` as the runs were observed with. Raises `InputError` as `calibrate` does.
-    """
+    """All runs together, with the `vehicle` and `config` that they were observed with."""
     place = ", ".join(run.run_id for run in runs)
     estimates = [run.estimate for run in runs if run.estimate is not None]
     if not estimates:
@@ -168,17 +161,13 @@ def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configura
 
 
 def _loudest_noise_m(runs: Sequence[Observed]) -> dict[str, tuple[float, ...]]:
-    """By monitor the largest of all runs."""
     names = sorted({name for run in runs for name in run.noise_m})
     shown = {name: [run.noise_m[name] for run in runs if name in run.noise_m] for name in names}
     return {name: tuple(np.max(noises_m, axis=0).tolist()) for name, noises_m in shown.items()}
 
 
 def sigma_keys(sigmas: Sequence[SigmaFit], *, noisy: bool) -> dict[str, float]:
-    """Sigma of positions by the loudest monitor.
-
-    Noise is measured with a margin. Where it makes every monitor quieter than predicted, the stated sigma stands.
-    """
+    """Sigma of positions by the loudest monitor; noise has a margin: where all are quieter the stated sigma stands."""
     worst = worst_fit(sigmas)
     if worst is None:
         return {}
@@ -191,25 +180,15 @@ def _with_monitors(config: Configuration, keys: Mapping[str, object]) -> Configu
     return config.model_copy(update={"monitors": config.monitors.model_copy(update=dict(keys))})
 
 
-def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
-    known = sorted({name for log in logs for name in log.solutions()})
-    if solution not in known:
-        raise InputError(
-            "no run has this solution",
-            place=solution,
-            found=", ".join(known),
-            remedy="Name one of these with --solution.",
-        )
-
-
 def _vehicle(base: Vehicle, runs: Sequence[RunEstimate], latency_unknown_s: float) -> Vehicle:
     """The vehicle with what was measured.
 
     A latency more than half as uncertain as `latency_unknown_s`, with which learning in a run begins, is no
-    measurement: at constant speed nothing shows it. That of `base` stays.
+    measurement: at constant speed nothing shows it.
     """
-    scale = pooled(np.array([run.scale for run in runs]), np.array([run.scale_sigma for run in runs]))
-    latency = pooled(np.array([run.latency_s for run in runs]), np.array([run.latency_sigma_s for run in runs]))
+    figures = np.array([(run.scale, run.scale_sigma, run.latency_s, run.latency_sigma_s) for run in runs]).T
+    scale = pooled(figures[0], figures[1])
+    latency = pooled(figures[2], figures[3])
     measured = {"odometer_scale": scale.value, "odometer_scale_sigma": scale.sigma}
     if latency.sigma <= 0.5 * latency_unknown_s:
         measured |= {"gnss_latency_s": latency.value, "gnss_latency_sigma_s": latency.sigma}
@@ -217,7 +196,7 @@ def _vehicle(base: Vehicle, runs: Sequence[RunEstimate], latency_unknown_s: floa
 
 
 def _refuse_figures_of_no_train(vehicle: Vehicle, place: str, config: Configuration) -> None:
-    """Figures beyond what wheels and receivers can be off are another error, and a vehicle file would hide it."""
+    """Figures that no wheel or receiver has are another error, and a vehicle file would hide it."""
     scale = vehicle.odometer_scale or 1.0
     latency_s = vehicle.gnss_latency_s or 0.0
     most = config.plausibility.scale_limit

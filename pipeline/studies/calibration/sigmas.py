@@ -1,11 +1,7 @@
 """Sigmas of the monitors on fault-free runs, by regression (DIAG: thresholds vary with sigma of the position).
 
-The bank predicts each monitor's sigma from sigma_axis of its own axis (DIAG regresses all three axes on the
-along-track sigma; a receiver that states all three needs no such stand-in). Measured over predicted is
-
-    ratio(sigma_axis) = b + a / sigma_axis
-
-where the position's true sigma is a + b sigma_axis; a = 0, b = 1 says that receiver and model are right.
+Each by the sigma of its own axis (DIAG: all by the along-track one). Where the position's true sigma is
+a + b sigma_axis, measured over predicted is b + a / sigma_axis; a = 0, b = 1 says that receiver and model are right.
 """
 
 from __future__ import annotations
@@ -51,10 +47,9 @@ class SigmaFit:
 
 
 def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float, config: CalibrationConfig) -> list[SigmaFit]:
-    """One fit per monitor of the bank that was evaluated often enough; `runs`: epochs tables of fault-free runs.
+    """One fit per monitor of the bank that was evaluated often enough; `runs`: epochs tables; `factor`: k_T.
 
-    `factor` is k_T, by which thresholds exceed sigmas. Errors are jackknifed over runs, or over stretches of a
-    few runs, as epochs are correlated.
+    Errors are jackknifed over runs, or over stretches of a few runs, as epochs are correlated.
     """
     fits = []
     least = -(-config.left_out_pieces // max(len(runs), 1))
@@ -68,7 +63,7 @@ def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float, config: Calibrat
 
 
 def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, count: int) -> list[Floats]:
-    """Rows (sigma of the axis, value over predicted sigma) of evaluated epochs, in so many pieces for the jackknife."""
+    """Rows (sigma of the axis, value over predicted sigma), in so many pieces for the jackknife."""
     sigma = f"sigma_{axis}_m"
     chosen = run.filter(pl.col(f"{monitor}_state") != "not_evaluated").select(
         pl.col(sigma), (factor * pl.col(f"{monitor}_value") / pl.col(f"{monitor}_threshold")).alias("ratio")
@@ -115,9 +110,8 @@ def _fit(samples: Floats, config: CalibrationConfig) -> Floats:
 def velocity_sigma_mps(runs: Sequence[pl.DataFrame], config: Configuration) -> float | None:
     """Standard deviation of the GNSS velocity along the track [m/s] as monitor `along_doppler` shows it.
 
-    `runs`: epochs tables of fault-free runs, replayed with this configuration. What the odometer's noise, scale and
-    latency account for is taken off; more odometer noise than assumed is in it. None where the monitor was hardly
-    evaluated, or where what is left is below a tenth of what was assumed, which no such difference shows.
+    What the odometer is assumed to account for is taken off. None where the monitor was hardly evaluated, or where
+    less than a tenth of what was assumed is left, which no such difference shows.
     """
     value = pl.col("along_doppler_value")
     threshold = pl.col("along_doppler_threshold")
@@ -131,17 +125,16 @@ def velocity_sigma_mps(runs: Sequence[pl.DataFrame], config: Configuration) -> f
 
 
 def sigma_table(fits: Sequence[SigmaFit]) -> pl.DataFrame:
-    """The fits as a table; errors are null where one piece of data gives none."""
+    """Errors are null where one piece of data gives none."""
     kinds: dict[str, type[pl.DataType]] = {field.name: pl.Float64 for field in fields(SigmaFit)}
     table = pl.DataFrame([asdict(fit) for fit in fits], schema=kinds | {"monitor": pl.String, "epochs": pl.Int64})
     return table.with_columns(pl.selectors.float().fill_nan(None))
 
 
 def worst_fit(fits: Sequence[SigmaFit]) -> SigmaFit | None:
-    """The fit that the configuration should follow: the monitor that is proven to be the loudest.
+    """The monitor that is proven to be the loudest: one that is quieter than predicted costs detection only.
 
-    One that is quieter than predicted costs detection only, a louder one false alarms. Proven is what remains of
-    the ratio after two standard errors, as among twelve monitors one always looks loud by chance.
+    Proven is what remains of the ratio after two standard errors: among twelve one always looks loud by chance.
     """
     return max(fits, key=lambda fit: fit.ratio - 2.0 * float(np.nan_to_num(fit.ratio_error)), default=None)
 
@@ -149,9 +142,8 @@ def worst_fit(fits: Sequence[SigmaFit]) -> SigmaFit | None:
 def beyond_noise(epochs: pl.DataFrame, factor: float) -> tuple[str, ...]:
     """Monitors of a run, replayed without any noise, that fail by more than its noise; `factor` is k_T.
 
-    The raw monitor of an axis shows its noise; a drift hardly moves it, and of a step only one epoch in thousands is
-    large. So every monitor of the axis is held against k_T times its sigma, widened by what the raw one measured over
-    what was predicted. An average would be widened by the very fault that it sees. Linking knows no such noise.
+    The raw monitor of an axis shows its noise and hardly a drift or step. So every monitor of the axis is held against
+    its threshold, widened by the raw one's ratio: its own would be widened by the very fault that it sees.
     """
     failing: list[str] = []
     for axis in AXES:
@@ -162,5 +154,4 @@ def beyond_noise(epochs: pl.DataFrame, factor: float) -> tuple[str, ...]:
 
 
 def _ratios(epochs: pl.DataFrame, monitor: str) -> pl.Series:
-    """Value over threshold where the monitor was evaluated."""
     return (epochs[f"{monitor}_value"] / epochs[f"{monitor}_threshold"]).drop_nulls()

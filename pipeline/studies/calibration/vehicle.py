@@ -4,9 +4,8 @@ Along the path, GNSS position against odometer distance D is
 
     x(t) = offset + scale * D(t - latency) + correlated GNSS errors + random walk of the odometer
 
-and generalised least squares under the monitor bank's own error model (DIAG Table 1) gives scale and latency with
-a covariance that respects the correlation. Unlike the causal filter of a replay this looks at whole runs, which
-is right only because they are not the runs to be diagnosed.
+by generalised least squares under the monitor bank's error model (DIAG Table 1). Unlike the causal filter of a replay
+this looks at whole runs, which is right only because they are not the runs to be diagnosed.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ from schemas.config import CalibrationConfig
 # Numerics: points of one dense covariance, which takes time by their third power.
 _BLOCK_POINTS = 900
 _ITERATIONS = 4
-# Numerics: of what a run seems to tell of the latency, at least so much counts, so that its sigma stays finite. A sigma
-# a hundred times as large says nothing either way.
+# Numerics: of what a run seems to tell of the latency at least so much counts, so that its sigma stays finite.
 _LEAST_SHARE = 1e-4
 
 
@@ -62,11 +60,7 @@ def estimate_run(
     config: CalibrationConfig,
     latency_s: float = 0.0,
 ) -> RunEstimate | None:
-    """Scale and latency of one run, none where too little of it can be compared.
-
-    `odometry` must grow with the path. Generalised least squares, linear in the scale; in the latency by Gauss-Newton
-    steps from `latency_s`. A misfit above 1 widens the sigmas.
-    """
+    """None where too little can be compared; `odometry` grows with the path. Gauss-Newton steps from `latency_s`."""
     blocks = _blocks(seen, odometry, config)
     if not blocks:
         return None
@@ -127,15 +121,15 @@ def _covariance(
 
 
 def _factor(covariance: Floats) -> Floats:
-    """The lower triangle of Cholesky; made once, as it takes longer than all that is solved with it."""
+    """Lower triangle of Cholesky."""
     return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
 
 def _of_rows(odometry: Odometry, one_s: Floats, other_s: Floats) -> Floats:
     """Covariance of the noise of the odometer's rows between two sets of times [m^2] (`QuantisationNoise`).
 
-    A counter is off by the same while the train stands, so that many rows tell no more than one; after a share x of its
-    step the correlation of what it leaves out is 1 - 6 x + 6 x^2, by the first terms. Other noise is each row's own.
+    A counter is off by the same while the train stands: many rows tell no more than one. After a share x of its step
+    the correlation is 1 - 6 x + 6 x^2, by the first terms. Other noise is each row's own.
     """
     sigmas = [odometry.row_sigma_m(at_s) for at_s in (one_s, other_s)]
     ways = (one_s, other_s)
@@ -154,9 +148,9 @@ def _of_rows(odometry: Odometry, one_s: Floats, other_s: Floats) -> Floats:
 def _accumulate(
     blocks: list[Observations], factors: list[Floats], odometry: Odometry, latency_s: float
 ) -> tuple[Floats, Floats, float, int]:
-    """Normal equations of `scale_and_lag` over all blocks; the chi-square of the residuals, and its degrees of freedom.
+    """Normal equations of `scale_and_lag`, chi-square of the residuals, and its degrees of freedom.
 
-    Each block has an offset of its own, which is eliminated. `factors`: Cholesky factors of the blocks' covariances.
+    Each block has an offset of its own, which is eliminated.
     """
     normal = np.zeros((2, 2))
     right = np.zeros(2)
@@ -181,8 +175,8 @@ def _accumulate(
 def _chance_information(block: Observations, factor: Floats, odometry: Odometry) -> float:
     """What the odometer's noise alone, taken for changes of speed, seems to tell of the latency [1/s^2], on average.
 
-    The noise in a speed over 2 S seconds has covariance r (2 S - lag) / (2 S)^2, r the variance of its walk per second,
-    beside that of the rows at both ends.
+    In a speed over 2 S seconds it has covariance r (2 S - lag) / (2 S)^2, r the variance of its walk per second, beside
+    that of the rows at both ends.
     """
     span_s = 2.0 * odometry.config.latency_span_s
     lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
@@ -198,24 +192,21 @@ def _chance_information(block: Observations, factor: Floats, odometry: Odometry)
 
 
 def _widened(sigma_s: float, by_chance: float) -> float:
-    """Sigma of the latency without the information of chance: twice its mean, as chance often shows more than that."""
+    """Sigma without the information of chance: twice its mean, as chance often shows more than that."""
     information = 1.0 / sigma_s**2
     return float(1.0 / np.sqrt(max(information - 2.0 * by_chance, _LEAST_SHARE * information)))
 
 
 @dataclass(frozen=True)
 class Pooled:
-    """A value for the next run of the vehicle, and how far that run may lie from it."""
+    """Of the next run of the vehicle."""
 
     value: float
     sigma: float
 
 
 def pooled(values: Floats, sigmas: Floats) -> Pooled:
-    """Runs together (DerSimonian and Laird 1986): the sigma includes the scatter between runs.
-
-    Wheels wear and sensors drift, so a further run may differ by more than each run's own uncertainty.
-    """
+    """Runs together (DerSimonian and Laird 1986); the sigma includes their scatter: wheels wear and sensors drift."""
     weight = 1.0 / sigmas**2
     mean = float(weight @ values / weight.sum())
     scatter = float(weight @ (values - mean) ** 2)

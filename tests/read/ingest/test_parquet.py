@@ -10,6 +10,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from pipeline.read.ingest import read_run
+from pipeline.storage.described import noted_bytes
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
@@ -222,3 +223,27 @@ def test_decimals_and_half_floats_of_other_programs_are_numbers(tmp_path):
 def test_a_solution_without_a_name_is_the_default_one(tmp_path, names):
     log = read_run(folder(tmp_path, gnss=MINIMAL.with_columns(pl.Series("solution", names, dtype=pl.String))), CONFIG)
     assert log.gnss["solution"].to_list() == [name or "primary" for name in names]
+
+
+@pytest.mark.parametrize(
+    "noted",
+    [
+        "[]",
+        "shift",
+        '[{"stream": "gnss"}]',
+        '[{"stream": "odometer", "shift_s": 1.0}]',
+        '[{"stream": "gnss", "shift": 1.0}]',
+        '[{"stream": "gnss", "factors": {"latitude": 2.0}}]',
+        '[{"stream": "gnss", "exchange": ["latitude_deg", "fix"]}]',
+    ],
+)
+def test_noted_corrections_that_nobody_makes_are_refused(tmp_path, noted):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "gnss.parquet").write_bytes(noted_bytes(samples.gnss(), {"corrections": noted}))
+    with pytest.raises(InputError, match="does not say clearly how its gnss was corrected"):
+        read_run(folder)
+    (folder / "gnss.parquet").write_bytes(
+        noted_bytes(samples.gnss(), {"corrections": '[{"stream": "gnss", "shift_s": 1.0}]'})
+    )
+    assert [made.changes for made in read_run(folder).notes.corrections] == ["shift_s 1.0"]

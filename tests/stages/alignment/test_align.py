@@ -269,6 +269,26 @@ def test_a_leap_to_the_second_epoch_stops_the_learning():
     np.testing.assert_array_equal(ten_epochs(50.0), 0.01)
 
 
+@pytest.mark.parametrize(("beside_m", "goes_on"), [(0.0, True), (6.0, True), (-6.0, True), (9.0, False)])
+def test_after_an_alarm_learning_goes_on_within_the_bound_of_both_positions(beside_m, goes_on):
+    """Speeding up; 50 m off from 20 s to 30 s, then beside its place. Both sigmas are 1 m: 5.33 sqrt(2 + 0.1) = 7.7 m.
+
+    The scale is known, so learning shows in the latency; 30 s after the last failure and its echo it goes on.
+    """
+    t_s = np.arange(1.0, 120.0)
+    off_m = np.where(t_s < 20.0, 0.0, np.where(t_s < 30.0, 50.0, beside_m))
+    odometer_s = np.arange(0.0, 123.0, 0.5)
+    aligned = align_run(
+        epochs_of(t_s, 10.0 * t_s + 0.15 * t_s**2 + off_m),
+        odometer_of(odometer_s, distance_m=10.0 * odometer_s + 0.15 * odometer_s**2),
+        Vehicle(odometer_scale=1.0, odometer_scale_sigma=0.0),
+        KNOWN_NOISE,
+    )
+    latency_sigma_s = aligned["latency_sigma_s"].to_numpy()
+    assert np.ptp(latency_sigma_s[20:59]) == 0.0
+    assert (latency_sigma_s[-1] < latency_sigma_s[20]) == goes_on
+
+
 def test_slip_is_that_of_the_rows_about_an_epoch_inside_the_odometer():
     """Rows at 0, 1, ... 6 s, of which those at 2 s and at 6 s slip; epochs half a second later, two of them beyond."""
     odometer = odometer_of(np.arange(7.0), distance_m=10.0 * np.arange(7.0), slip=[k in (2, 6) for k in range(7)])

@@ -16,6 +16,7 @@ from pipeline.stages.epochs.clock import (
     met,
     nominal_period_s,
     outages_s,
+    share_of_time,
     trusted,
     uptime,
     usable,
@@ -33,6 +34,15 @@ def seconds(*t_s: float) -> Ints:
 def flags(word: str) -> Bools:
     """`+` where it holds."""
     return np.array([letter == "+" for letter in word], dtype=np.bool_)
+
+
+def test_a_share_of_time_is_at_most_one_also_by_rounding() -> None:
+    """Twenty times 0.1 s: without the epochs of no time between them the sum is rounded to a little more."""
+    held = np.ravel([[0.1, 0.0]] * 20)
+    assert held[held > 0.0].sum() > held.sum()
+    assert share_of_time(held, held > 0.0) == 1.0
+    assert share_of_time(held, np.arange(40) < 10) == pytest.approx(0.25)
+    assert share_of_time(held[:0], held[:0] > 0.0) is None
 
 
 # Once a second, and 5 s of nothing after the fourth.

@@ -39,7 +39,7 @@ from pipeline.stages.judge.judgement import (
     with_own_anchors,
 )
 from pipeline.stages.judge.jumps import Jump, find_jumps, steps_of
-from pipeline.stages.judge.passages import _true_times, _with_failures
+from pipeline.stages.judge.passages import _true_times, _with_failures, _within_gap
 from pipeline.stages.judge.travel import OdometerSteps, beyond_confidence, moving, travel_direction
 from pipeline.stages.judge.true_crossings import TrueCrossing, between_far_epochs, true_crossings
 from pipeline.stages.track.path import Place, RoutePath
@@ -677,6 +677,17 @@ def test_each_crossing_of_the_train_belongs_to_one_passage() -> None:
     assert {name: [round(left.t_ns / NS) for left in several] for name, several in crossings.items()} == {
         "V1": [], "V2": [20], "V3": [41], "V4": [],
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("t_s", "positioned"),
+    [(-0.5, False), (0.0, True), (1.5, True), (3.0, False), (5.5, False), (6.5, True), (7.0, True), (7.5, False)],
+)
+def test_a_crossing_is_positioned_between_two_positions_near_each_other(t_s: float, positioned: bool) -> None:
+    """Positions each second, but none between 2 s and 6 s."""
+    at_ns = np.array([0, 1, 2, 6, 7]) * NS
+    assert _within_gap(at_ns, np.array([ns(t_s)]), round(1.5 * NS)).tolist() == [positioned]
+    assert _within_gap(at_ns[:1], np.array([0]), round(1.5 * NS)).tolist() == [False]
 
 
 PASSAGES = [

@@ -12,7 +12,7 @@ import pytest
 from pipeline.stages.epochs.verdicts import DISABLED, NO_ODOMETER, NO_POSITION, NO_VALUE, verdicts
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.monitors.series import FIRST_EPOCH, NO_HEIGHT, OFF_TRACK
-from pipeline.stages.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor
+from pipeline.stages.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor, paired
 from schemas.config import Configuration, Vehicle, threshold_factor
 from schemas.tables import BANK_MONITORS
 from tests.stages.alignment.straight import NO_NOISE, Straight, align_run, epochs_of, odometer_of, run
@@ -208,6 +208,16 @@ def test_channels_are_compared_where_both_have_a_position():
     assert result["state"].to_list() == ["pass", "fail", "not_evaluated"]
     assert result["value"].to_list() == [0.0, -10.0, None]
     assert result["threshold"][0] == pytest.approx(FACTOR * np.sqrt(2.0))
+
+
+def test_a_channel_is_compared_with_this_solution_at_its_own_time():
+    """Once a second at 20 m/s, 3 s of nothing after 2 s; the channel at 1 s, 1.75 s, 3 s and 5.5 s."""
+    epochs = epochs_of(np.array([0.0, 1.0, 2.0, 5.0, 6.0]), 20.0 * np.array([0.0, 1.0, 2.0, 5.0, 6.0]))
+    channel = epochs_of(np.array([1.0, 1.75, 3.0, 5.5]), np.zeros(4))
+    found = paired(epochs, channel, CONFIG.lds)
+    # 3 s lies in the gap, and before 1 s there is no row.
+    assert found["path_m"].to_list() == [None, 20.0, 35.0, None, 110.0]
+    assert found["row_other"].to_list() == [None, 0, 1, None, 3]
 
 
 def test_a_single_monitor_without_value_or_threshold_is_no_pass():

@@ -74,6 +74,22 @@ def test_an_error_that_the_model_knows_is_taken_off_by_its_second_differences(ke
     assert without - beside == pytest.approx(0.25 * times * 0.01**2, rel=1e-6, abs=1e-12)
 
 
+def test_what_lasts_is_taken_off_as_it_is() -> None:
+    """2 mm to and fro, as of a latency: second differences of 8 mm, of which a fourth of the square is taken off."""
+    config = Configuration.model_validate({"monitors": {"noise_doubt": 0.0}})
+    way = (-1.0) ** np.arange(200)
+    without = series_of(0.01 * way)
+    lasting = replace(without, lasting_mps=np.diff(0.002 * way, prepend=0.002)[:, None])
+    noise_m2 = [meter_of(series, config).variance_m2(199, 200)[0, 0] for series in (without, lasting)]
+    assert noise_m2[0] - noise_m2[1] == pytest.approx(0.25 * 0.008**2)
+
+
+def test_the_noise_of_one_row_is_that_of_the_row_among_all() -> None:
+    meter = meter_of(series_of(0.01 * (-1.0) ** np.arange(90), 0.5))
+    single = np.concatenate([meter.variance_m2(row, row + 1) for row in range(90)])
+    np.testing.assert_array_equal(single, meter.variance_m2(0, 90))
+
+
 @pytest.mark.parametrize("period_s", [0.05, 0.1, 0.2, 0.25, 0.5, 1.0])
 def test_the_noise_is_known_after_30_s_at_every_rate(period_s: float) -> None:
     """`noise_first_s`: with a sample every second the first is at 1 s, and the 29th, of 29.6 s asked for, at 29 s."""

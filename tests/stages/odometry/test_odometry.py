@@ -24,12 +24,42 @@ def test_distance_is_interpolated_and_never_extrapolated():
     np.testing.assert_allclose(odometry.distance_at_s(at)[1:5], [0.0, 5.0, 20.0, 30.0])
 
 
+def test_rows_scatter_by_their_step_and_by_stamps_with_the_square_of_the_speed():
+    """20 cm at a stand, and 50 ms: 10 cm at 2 m/s, 20 cm at 4 m/s."""
+    noise = QuantisationNoise(still_m2=0.04, moving_s2=0.0025)
+    np.testing.assert_allclose(noise.variance_m2(np.array([0.0, 2.0, -4.0])), [0.04, 0.05, 0.08])
+
+
 def test_speed_alone_is_integrated_and_guessed_over_a_pause():
     frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], speed_mps=[10.0, 12.0, 10.0, 10.0, 10.0])
     odometry = odometry_from(frame)
     np.testing.assert_allclose(odometry.distance_m, [0.0, 5.5, 11.0, 51.0, 56.0])
     assert odometry.segment.tolist() == [0, 0, 0, 1, 1]
     assert odometry.known_at_s(np.array([0.7, 1.0, 3.0, 5.0])).tolist() == [True, True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("before_mps", "after_mps", "pause_s", "way_m", "doubt_m"),
+    [
+        (0.0, 0.0, 45.0, 0.0, 0.0),
+        # From rest in a period of 0.5 s, half of which is sure.
+        (0.0, 0.8, 45.0, 0.2, 0.2),
+        (-0.8, 0.0, 45.0, -0.2, 0.2),
+        # It may have crept on: 0.2 m/s for 45 s.
+        (0.2, 0.6, 45.0, 0.2, 9.2),
+        # More than 0.3 + 1.8 x 0.5 m/s is not reached in a period; nor does a train stand at 0.4 m/s: mean speed.
+        (0.0, 1.3, 4.0, 2.6, 7.2),
+        (0.4, 0.4, 4.0, 1.6, 7.2),
+    ],
+)
+def test_a_logger_that_writes_nothing_at_a_stand_leaves_little_in_doubt(
+    before_mps, after_mps, pause_s, way_m, doubt_m
+) -> None:
+    t = [0.0, 0.5, 1.0, 1.5, 1.5 + pause_s, 2.0 + pause_s, 2.5 + pause_s]
+    odometry = odometry_from(odometer_of(t, speed_mps=[*[before_mps] * 4, *[after_mps] * 3]))
+    assert np.diff(odometry.segment).tolist() == [0, 0, 0, 1, 0, 0]
+    assert np.diff(odometry.distance_m)[3] == pytest.approx(way_m)
+    assert np.diff(odometry.slip_doubt_m) == pytest.approx([0.0, 0.0, 0.0, doubt_m, 0.0, 0.0])
 
 
 def test_a_cumulative_distance_carries_over_a_pause_but_not_inside_it():
@@ -178,6 +208,14 @@ def test_two_wrong_rows_are_no_resets() -> None:
     """The rows at 4 and 5 s are 60 and 30 m short: the ways over them sum up to what the train drives."""
     reads = 20.0 * np.arange(12.0) - 60.0 * (np.arange(12) == 4) - 30.0 * (np.arange(12) == 5)
     assert odometry_from(odometer_of(np.arange(12.0), distance_m=reads)).leaps_ns == ()
+
+
+def test_a_wrong_row_at_a_stand_is_no_reset() -> None:
+    """41 m too far at 3 s; moves of some metres from 11 s on are like that of 41 m, but for as long a time."""
+    reads = [0.0, 0.0, 0.0, 41.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 3.0, 5.0, 9.0, 13.0, 19.0]
+    odometry = odometry_from(odometer_of(np.arange(17.0), distance_m=reads))
+    assert odometry.leaps_ns == ()
+    assert odometry.segment.tolist() == [0] * 17
 
 
 def test_a_bridged_reset_has_its_own_noise() -> None:

@@ -153,8 +153,6 @@ def test_a_coarse_counter_raises_no_alarm_and_hides_no_leap(step_m):
     healthy = replay(coarse(run), site, VEHICLE)
     assert healthy.runs["alarms"].item() == 0
     assert healthy.passages["status"].unique().to_list() == ["accepted"]
-    assert "the odometer's rows scatter by" in healthy.runs["notes"].item()
-    assert "scatter" not in (replay(run, site, VEHICLE).runs["notes"].item() or "")
     hides_no_fault(coarse)
 
 
@@ -172,7 +170,6 @@ def test_a_counter_too_coarse_for_the_failure_limit_hides_no_drift(rate_mps):
     seen_s = (fails["t"][0] - tables.epochs["t"][0]).total_seconds() - 90.0
     assert rate_mps * seen_s < 20.0
     assert tables.runs["unsafe_accepted"].item() == 0
-    assert "scatter by more than 2.7 m" in tables.runs["notes"].item()
 
 
 def test_no_more_noise_enters_than_leaves_the_failure_limit_seen():

@@ -7,8 +7,8 @@ import pyproj
 import pytest
 
 from pipeline.stages.track.geodesy import moved_deg
-from pipeline.stages.track.network import site_network
-from pipeline.stages.track.survey import end_places, track_of
+from pipeline.stages.track.network import network_of, site_network
+from pipeline.stages.track.survey import end_places, in_pieces, track_of
 from tests.stages.matching.builders import line, site
 
 GEOD = pyproj.Geod(ellps="WGS84")
@@ -40,6 +40,18 @@ def test_ends_are_those_of_each_element() -> None:
     )
     assert end_places(track)[:, 0] == pytest.approx(track.surface[[0, 3]])
     assert end_places(track)[:, 1] == pytest.approx(track.surface[[2, 4]])
+
+
+def test_pieces_of_an_element_follow_each_other_both_ways() -> None:
+    """a, then b that turns back on itself and so comes in two pieces: 2 and 3, 4 and 5; c follows the second."""
+    bend = np.array([[100.0, 0.0], [200.0, 0.0], [200.0, 50.0], [100.0, 50.0], [100.0, 100.0]])
+    elements = {"a": line((0.0, 0.0), (100.0, 0.0)), "b": bend, "c": line((100.0, 100.0), (300.0, 100.0))}
+    place = site(elements, [("a", 1, "b", 0, "both"), ("b", 1, "c", 0, "both")])
+    track = in_pieces(track_of(place.track))
+    assert track.ids == ("a", "b", "b", "c")
+    network = network_of(track, place.links)
+    onward = [[edge.to for edge in network.successors[oriented]] for oriented in range(8)]
+    assert onward == [[2], [], [4], [1], [6], [3], [], [5]]
 
 
 def test_ways_on_are_those_of_one_end_of_one_element() -> None:

@@ -86,6 +86,12 @@ def test_from_the_fix_to_the_return_and_on() -> None:
     assert found[100] == pytest.approx(grown, rel=1e-4)
 
 
+def test_a_latency_learned_late_counts_at_the_anchor_and_at_the_row() -> None:
+    """Half a metre at each: the fix as an anchor, and the row that is held to it."""
+    late = replace(rows(), learned_late_m=np.full(ROWS, 0.5))
+    assert largest(returns(), watched=late)[35] == pytest.approx(AT_FIX_M + bound_m(30) + 0.5 + 0.5, rel=1e-4)
+
+
 def test_without_a_return_it_is_the_unnoticed_error() -> None:
     found = largest(None)
     assert np.isnan(found[: FIRST + 1]).all()

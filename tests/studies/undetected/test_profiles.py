@@ -59,6 +59,9 @@ def test_there_is_no_profile_where_nothing_watched() -> None:
     with pytest.raises(UsageError, match="epoch 0"):
         profile_at(ride, 0, False)
     found = profile_at(ride, 60, False)
+    # The fault grows since the last balise read before its epoch.
+    epoch_t = run.gnss["t"][60]
+    assert found.t.to_list() == [run.balise_reads.filter(pl.col("t") < epoch_t)["t"].max(), epoch_t]
     behind = profile_at(ride, 60, True)
     assert found.fault["size_m"][-1] == pytest.approx(found.error_m)
     assert behind.fault["size_m"][-1] == pytest.approx(-behind.error_m)
