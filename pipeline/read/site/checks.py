@@ -84,7 +84,7 @@ def drop_repeated_points(file: str, frame: pl.DataFrame, breaches: list[str]) ->
 
 def relations_to_nowhere(track: SurveyedTrack, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
     """The relations between elements that there are; of each other one a finding."""
-    ids = list(track.ids)
+    ids = pl.Series(track.ids, dtype=pl.String).implode()
     known = links["netelement_a"].is_in(ids) & links["netelement_b"].is_in(ids)
     findings = [
         Finding("warning", "links", f"relation {row[0]} - {row[2]} is not used: it names an element not in the track")
@@ -150,17 +150,20 @@ def outward(track: SurveyedTrack) -> np.ndarray:
     start = track.first[:-1]
     stop = track.first[1:]
     directions = np.zeros((len(track.ids), 2, 3))
-    for position, end in ((0, start), (1, stop - 1)):
-        away_m = np.linalg.norm(surface - np.repeat(surface[end], stop - start, axis=0), axis=1)
+    for position, end, other_end, step in ((0, start, stop - 1, 1), (1, stop - 1, start, -1)):
         # Single vertices may lie a centimetre apart. A shorter element points to its vertex farthest away.
-        far = np.flatnonzero(away_m >= SAMPLE_SPACING_M)
-        row = np.searchsorted(far, start) if position == 0 else np.searchsorted(far, stop) - 1
-        inside = np.append(far, -1)[row]
-        for element in np.flatnonzero((inside < start) | (inside >= stop)).tolist():
-            part = away_m[track.vertices(element)]
-            nearest_to_end = part if position == 0 else part[::-1]
-            steps = int(np.argmax(nearest_to_end))
-            inside[element] = end[element] + (steps if position == 0 else -steps)
+        inside = end + step
+        near = np.arange(len(end))
+        while len(near):
+            away_m = np.linalg.norm(surface[inside[near]] - surface[end[near]], axis=1)
+            near = near[away_m < SAMPLE_SPACING_M]
+            at_other_end = inside[near] == other_end[near]
+            for element in near[at_other_end].tolist():
+                part = surface[track.vertices(element)]
+                away_m = np.linalg.norm(part - surface[end[element]], axis=1)[::step]
+                inside[element] = end[element] + step * int(np.argmax(away_m))
+            near = near[~at_other_end]
+            inside[near] += step
         directions[:, position] = surface[inside] - surface[end]
     return directions
 
@@ -274,9 +277,10 @@ def _pairs_within(places: Floats, reach_m: float) -> npt.NDArray[np.int64]:
     number = number[order]
     pairs = []
     for step in _HALF_OF_THE_NEIGHBOURS:
-        neighbour = number + (step[0] * across + step[1]) * above + step[2]
-        low = np.searchsorted(number, neighbour, side="left") if any(step) else np.arange(len(number)) + 1
-        counts = np.maximum(np.searchsorted(number, neighbour, side="right") - low, 0)
+        # The cells below and above a neighbour have the numbers before and after it.
+        neighbour = number + (step[0] * across + step[1]) * above
+        low = np.searchsorted(number, neighbour - 1, side="left") if any(step) else np.arange(len(number)) + 1
+        counts = np.maximum(np.searchsorted(number, neighbour + 1, side="right") - low, 0)
         first = np.repeat(np.arange(len(number)), counts)
         second = np.repeat(low, counts) + np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
         pairs.append(order[np.column_stack([first, second])])
@@ -285,8 +289,8 @@ def _pairs_within(places: Floats, reach_m: float) -> npt.NDArray[np.int64]:
     return every[near]
 
 
-# Of two neighbouring cells one comes first.
-_HALF_OF_THE_NEIGHBOURS = [step for step in itertools.product((-1, 0, 1), repeat=3) if step >= (0, 0, 0)]
+# Of two neighbouring columns of cells one comes first.
+_HALF_OF_THE_NEIGHBOURS = [step for step in itertools.product((-1, 0, 1), repeat=2) if step >= (0, 0)]
 
 
 def _nearly_met(places: Floats, inward: Floats, free: np.ndarray, config: SiteConfig) -> list[tuple[int, int, float]]:

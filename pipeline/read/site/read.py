@@ -15,7 +15,7 @@ from pipeline.read.site.geojson import GeoJsonNetwork, read_network
 from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
 from pipeline.stages.track.network import surveyed
-from pipeline.stages.track.survey import SurveyedTrack, track_of
+from pipeline.stages.track.survey import SurveyedTrack, by_element, track_of
 from pipeline.storage.address import is_geojson, join, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.storage.parquet import without_checksums
@@ -143,13 +143,13 @@ def _read_track(
         raw = network.track if network else None
     else:
         raw = _load(files, "track", breaches)
-    frame = typed_table(_in_degrees(raw), "track", breaches) if raw is not None else None
+    frame = typed_table(_named_by_contract(raw), "track", breaches) if raw is not None else None
     if raw is None or frame is None:
         return None, network, []
     if frame.is_empty():
         breaches.append(f"{raw.file}: has no points of net elements")
         return None, network, []
-    frame = _by_element(to_wgs84(raw, frame, config, breaches))
+    frame = by_element(to_wgs84(raw, frame, config, breaches))
     frame, notes = drop_repeated_points(raw.file, frame, breaches)
     if network and network.ignored:
         text = f"{network.ignored} features are not used: they are neither net element nor relation"
@@ -167,8 +167,8 @@ def _read_links(files: dict[str, bytes], network: GeoJsonNetwork | None, breache
     return typed_table(raw, "links", breaches)
 
 
-def _in_degrees(raw: RawTable) -> RawTable:
-    """Plane coordinates under the names of the contract; `to_wgs84` makes degrees of them."""
+def _named_by_contract(raw: RawTable) -> RawTable:
+    """Plane coordinates `x_m`, `y_m` under the names of the contract; `to_wgs84` makes degrees of them later."""
     names = {"x_m": "longitude_deg", "y_m": "latitude_deg"}
     given = {old: new for old, new in names.items() if old in raw.frame.columns}
     if any(new in raw.frame.columns for new in given.values()):
@@ -221,15 +221,6 @@ def _beyond_deg(area: Any, longitude_deg: float, latitude_deg: float) -> float:
         return 0.0
     along = max(area.west - longitude_deg, longitude_deg - area.east)
     return float(max(along, area.south - latitude_deg, latitude_deg - area.north, 0.0))
-
-
-def _by_element(frame: pl.DataFrame) -> pl.DataFrame:
-    """Points element by element, in the order in which elements come up first."""
-    name = frame["netelement_id"]
-    if name.rle_id()[-1] + 1 == name.n_unique():
-        return frame
-    ordered = frame.with_columns(_first=pl.int_range(pl.len()).min().over("netelement_id"))
-    return ordered.sort("_first", maintain_order=True).drop("_first")
 
 
 def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> tuple[pl.DataFrame, SurveyedTrack]:

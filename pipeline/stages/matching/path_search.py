@@ -80,7 +80,7 @@ def _trellis(
     candidates = wide.take(np.flatnonzero(kept), len(rows)).renumbered(judged)
     steps = steps_of(fixes, rows[judged], way)
     candidates = with_tracks_aside(candidates, fixes, believed, steps, network, where, config)
-    survey_sigma_m = network.survey_sigmas_m(config.survey_sigma_default_m)[candidates.vertex]
+    survey_sigma_m = network.survey_sigmas_m(config.survey_sigma_default_m, candidates.vertex)
     like = likelihood_of(fixes, steps, candidates, survey_sigma_m, config)
     like = like.with_pins(_pins(steps, pinned, candidates))
     return trellis_of(network, steps, candidates, survey_sigma_m, like, config)

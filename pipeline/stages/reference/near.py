@@ -69,19 +69,20 @@ def near_elements(points: Points, sigma_m: Floats, network: Network, factor: flo
     element_of = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
     surface = track.surface
     starts = np.flatnonzero(element_of[1:] == element_of[:-1])
-    survey_sigma_m = network.survey_sigmas_m(unstated_m)
-    reach_m = factor * np.hypot(sigma_m, survey_sigma_m[starts].max(initial=0.0))
     if len(points):
-        box = box_about(points.surface, float(reach_m.max()))
+        # Chords are looked at only where the run may be near, however far aside they might lie.
+        most_m = float(np.hypot(sigma_m, network.most_survey_sigma_m(unstated_m)).max())
+        box = box_about(points.surface, factor * most_m)
         starts = starts[box.touched_by(surface[starts], surface[starts + 1])]
+    survey_sigma_m = network.survey_sigmas_m(unstated_m, starts)
+    reach_m = factor * np.hypot(sigma_m, survey_sigma_m.max(initial=0.0))
     line = Polyline(surface[starts], surface[starts + 1])
-    segment_sigma_m = survey_sigma_m[starts]
     sample, segment = _candidates(points, line, reach_m)
     feet = on_segments(points.take(sample), line, segment)
     fraction = np.clip(feet.fraction, 0.0, 1.0)
     low_m = track.measure_m[starts[segment]]
     high_m = track.measure_m[starts[segment] + 1]
-    within = feet.distance_m <= factor * np.hypot(sigma_m[sample], segment_sigma_m[segment])
+    within = feet.distance_m <= factor * np.hypot(sigma_m[sample], survey_sigma_m[segment])
     element = element_of[starts[segment]]
     order = np.lexsort((feet.distance_m, sample, element))
     order = order[within[order]]
@@ -96,7 +97,7 @@ def near_elements(points: Points, sigma_m: Floats, network: Network, factor: flo
         element=element[pairs],
         distance_m=feet.distance_m[pairs],
         measure_m=(low_m + fraction * (high_m - low_m))[pairs],
-        survey_sigma_m=segment_sigma_m[segment][pairs],
+        survey_sigma_m=survey_sigma_m[segment][pairs],
         first=np.searchsorted(element[pairs], np.arange(len(track.ids) + 1)),
         any_near=any_near,
         track=track,

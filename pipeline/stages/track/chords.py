@@ -7,10 +7,12 @@ on the mean two thirds of that. Half of it counts as sigma: twice its variance i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from pipeline.stages.track.geodesy import sines
+from pipeline.stages.track.geodesy import sines, steps_m
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Floats, Ints
 
@@ -20,54 +22,83 @@ _LEAST_M = 0.02
 _LONGEST_M = 2000.0
 
 
-def chord_sigmas_m(track: SurveyedTrack, here: Ints, there: Ints) -> Floats:
-    """Sigma of the distance between chord and curve [m] for the segment that begins at each vertex.
+@dataclass
+class Chords:
+    """How far the chords of a track lie aside: of what is asked for, not of a whole network, and each once.
 
     `here`, `there`: oriented elements, each with one that follows it. It follows from the shape alone: points on a
     chord and borders of net elements change nothing.
     """
-    length_m, heading_rad = _segments(track)
-    first = track.first[:-1]
-    last = track.first[1:] - 2
-    enter = np.column_stack([heading_rad[first, 0], heading_rad[last, 1] + np.pi]).ravel()
-    leave = np.column_stack([heading_rad[last, 1], heading_rad[first, 0] + np.pi]).ravel()
-    onward, onward_turn_rad = _straightest(leave, enter, here, there)
-    chains = _chains(onward.tolist())
-    # Points of all chains one after the other: a vertex each, and one at the end of each chain.
-    vertex, against, ends = _points(track, chains)
-    begin = heading_rad[vertex, against] + np.pi * against
-    end = heading_rad[vertex, 1 - against] + np.pi * against
-    turn_rad = _wrapped(begin - np.roll(end, 1))
-    turn_rad[np.append(0, ends[:-1] + 1)] = onward_turn_rad[[chain[0] ^ 1 for chain in chains]]
-    turn_rad[ends] = onward_turn_rad[[chain[-1] for chain in chains]]
-    step_m = length_m[vertex]
-    step_m[ends] = 3.0 * _ONE_POINT_M
-    way_m = np.append(0.0, np.cumsum(step_m)[:-1])
-    sigma_m = _sigmas_m(way_m, turn_rad, ends)
-    out = np.zeros(len(length_m))
-    inside = np.ones(len(vertex), dtype=np.bool_)
-    inside[ends] = False
-    out[vertex[inside]] = sigma_m[inside]
-    return out
+
+    track: SurveyedTrack
+    here: Ints
+    there: Ints
+
+    def sigmas_m(self, vertex: Ints) -> Floats:
+        """Sigma of the distance between chord and curve [m] for the segments that begin at some vertices."""
+        unknown = vertex[np.isnan(self._known_m[vertex])]
+        for element in np.unique(np.searchsorted(self.track.first, unknown, side="right") - 1).tolist():
+            if np.isnan(self._known_m[self.track.first[element]]):
+                self._look_at(_chain_through(element, self._after))
+        return self._known_m[vertex]
+
+    @cached_property
+    def most_m(self) -> float:
+        """No sigma of the track is larger: of a chord as long as they get, with half a turn."""
+        step_m = steps_m(self.track.surface)
+        step_m[self.track.first[1:-1] - 1] = 0.0
+        return float(_LONGEST_M + step_m.max()) * np.pi / 16.0
+
+    @cached_property
+    def _known_m(self) -> Floats:
+        return np.full(len(self.track.measure_m), np.nan)
+
+    @cached_property
+    def _onward(self) -> tuple[Ints, Floats]:
+        """The successor that each oriented element goes on to with the least turn, and that turn; -1 without one."""
+        first = self.track.first[:-1]
+        last = self.track.first[1:] - 2
+        _, first_rad = _segments(self.track, first)
+        _, last_rad = _segments(self.track, last)
+        enter_rad = np.column_stack([first_rad[:, 0], last_rad[:, 1] + np.pi]).ravel()
+        leave_rad = np.column_stack([last_rad[:, 1], first_rad[:, 0] + np.pi]).ravel()
+        return _straightest(leave_rad, enter_rad, self.here, self.there)
+
+    @cached_property
+    def _after(self) -> Ints:
+        """The oriented element that is the straightest way on from each, if that is the straightest way back too."""
+        onward, _ = self._onward
+        back = onward[onward ^ 1] == np.arange(len(onward)) ^ 1
+        return np.where((onward >= 0) & back, onward, -1)
+
+    def _look_at(self, chain: list[int]) -> None:
+        """Work out the segments of a chain of elements."""
+        vertex, against = _vertices(self.track, chain)
+        length_m, heading_rad = _segments(self.track, vertex)
+        row = np.arange(len(vertex))
+        begin_rad = heading_rad[row, against] + np.pi * against
+        end_rad = heading_rad[row, 1 - against] + np.pi * against
+        _, onward_rad = self._onward
+        inner_rad = _wrapped(begin_rad[1:] - end_rad[:-1])
+        turn_rad = np.concatenate([onward_rad[[chain[0] ^ 1]], inner_rad, onward_rad[[chain[-1]]]])
+        self._known_m[vertex] = _sigmas_m(np.append(0.0, np.cumsum(length_m)), turn_rad)
 
 
-def _segments(track: SurveyedTrack) -> tuple[Floats, Floats]:
+def _segments(track: SurveyedTrack, vertex: Ints) -> tuple[Floats, Floats]:
     """Length [m] of the segment that begins at each vertex, and its heading [rad] as seen from its start and end."""
-    along = np.diff(track.surface, axis=0, append=track.surface[-1:])
+    along = track.surface[vertex + 1] - track.surface[vertex]
     x_m, y_m, z_m = along.T
-    sin_lat, cos_lat, sin_lon, cos_lon = sines(track.latitude_deg, track.longitude_deg)
     headings = []
-    for _ in range(2):
-        # As seen from a vertex: the way along its unit vectors east and north (`geodesy.points_of`).
+    for seen_from in (vertex, vertex + 1):
+        sin_lat, cos_lat, sin_lon, cos_lon = sines(track.latitude_deg[seen_from], track.longitude_deg[seen_from])
+        # The way along the unit vectors east and north there (`geodesy.points_of`).
         east_m = x_m * -sin_lon + y_m * cos_lon
         north_m = x_m * (-sin_lat * cos_lon) + y_m * (-sin_lat * sin_lon) + z_m * cos_lat
         headings.append(np.arctan2(east_m, north_m))
-        sin_lat, cos_lat, sin_lon, cos_lon = (np.roll(of, -1) for of in (sin_lat, cos_lat, sin_lon, cos_lon))
     return np.linalg.norm(along, axis=1), np.column_stack(headings)
 
 
 def _straightest(leave_rad: Floats, enter_rad: Floats, here: Ints, there: Ints) -> tuple[Ints, Floats]:
-    """The successor that each oriented element goes on to with the least turn, and that turn; -1 without one."""
     turns_rad = _wrapped(enter_rad[there] - leave_rad[here])
     order = np.lexsort((np.abs(turns_rad), here))
     least = order[np.diff(here[order], prepend=-1) > 0]
@@ -78,66 +109,54 @@ def _straightest(leave_rad: Floats, enter_rad: Floats, here: Ints, there: Ints) 
     return onward, turn_rad
 
 
-def _chains(onward: Sequence[int]) -> list[list[int]]:
-    """Oriented elements of which each is the straightest way on from the one before, there and back."""
-    after = [to if to >= 0 and onward[to ^ 1] == oriented ^ 1 else -1 for oriented, to in enumerate(onward)]
-    chains: list[list[int]] = []
-    left = dict.fromkeys(range(0, len(onward), 2))
-    while left:
-        start = oriented = next(iter(left))
-        while after[oriented ^ 1] not in (-1, start ^ 1):
-            oriented = after[oriented ^ 1] ^ 1
-        chain = [oriented]
-        while after[chain[-1]] not in (-1, oriented):
-            chain.append(after[chain[-1]])
-        for member in chain:
-            del left[member & ~1]
-        chains.append(chain)
-    return chains
+def _chain_through(element: int, after: Ints) -> list[int]:
+    """Oriented elements of which each goes straight on from the one before: the same whichever of them is asked for."""
+    return _chain(2 * min(oriented // 2 for oriented in _chain(2 * element, after)), after)
 
 
-def _points(track: SurveyedTrack, chains: Sequence[Sequence[int]]) -> tuple[Ints, Ints, Ints]:
-    """Vertices at which the segments of chains begin, whether they are run against their measure, ends of chains."""
-    oriented = np.concatenate([np.array(chain) for chain in chains])
-    lengths = np.cumsum([len(chain) for chain in chains])
-    element = oriented // 2
-    against = oriented % 2
-    counts = np.diff(track.first)[element] - 1
-    counts[lengths - 1] += 1
-    member = np.repeat(np.arange(len(oriented)), counts)
-    number = np.arange(len(member)) - np.repeat(np.cumsum(counts) - counts, counts)
-    # The last point of a chain stands for its end, at the vertex before.
-    number = np.minimum(number, (np.diff(track.first)[element] - 2)[member])
-    ahead = track.first[element][member] + number
-    back = track.first[element + 1][member] - 2 - number
-    vertex = np.where(against[member] == 1, back, ahead)
-    return vertex, against[member], np.cumsum(counts)[lengths - 1] - 1
+def _chain(start: int, after: Ints) -> list[int]:
+    """A ring ends with `start`."""
+    first = start
+    while (before := int(after[first ^ 1])) not in (-1, start ^ 1):
+        first = before ^ 1
+    chain = [first]
+    while (onward := int(after[chain[-1]])) not in (-1, first):
+        chain.append(onward)
+    return chain
 
 
-def _sigmas_m(way_m: Floats, turn_rad: Floats, ends: Ints) -> Floats:
-    """Of the segment behind each point the largest sigma of all chords that it may be a part of.
+def _vertices(track: SurveyedTrack, chain: Sequence[int]) -> tuple[Ints, Ints]:
+    """Vertices at which the segments of a chain begin, and whether they are run against their measure (0 or 1)."""
+    parts = []
+    for oriented in chain:
+        part = np.arange(track.first[oriented // 2], track.first[oriented // 2 + 1] - 1)
+        parts.append(part[::-1] if oriented % 2 else part)
+    return np.concatenate(parts), np.repeat(np.array(chain) % 2, [len(part) for part in parts])
+
+
+def _sigmas_m(way_m: Floats, turn_rad: Floats) -> Floats:
+    """Of each segment between points of a chain the largest sigma of all chords that it may be a part of.
 
     A chord spans 1, 2, ... `points` segments. Its turn is the geometric mean of the turns at its ends (0 with a
     straight at one of them) less the turn within it. At the end of the survey the turn is unknown and counts as 0.
     """
     bend_rad = _turn_about(way_m, turn_rad)
-    inside_rad = np.abs(turn_rad)
-    inside_rad[ends] = np.pi * _LONGEST_M  # no chord goes on from one chain to the next
-    inside_rad = np.cumsum(inside_rad)
-    out = np.zeros(len(way_m))
-    begin = np.delete(np.arange(len(way_m)), ends)
+    inside_rad = np.cumsum(np.abs(turn_rad))
+    last = len(way_m) - 1
+    out = np.zeros(last)
+    begin = np.arange(last)
     points = 0
     while len(begin):
         points += 1
         end = begin + points
         length_m = way_m[end] - way_m[begin]
         turn = np.sqrt(bend_rad[begin] * bend_rad[end]) - (inside_rad[end - 1] - inside_rad[begin])
-        sigma_m = length_m * turn / 16.0
+        sigma_m = length_m * np.minimum(turn, np.pi) / 16.0
         for row in np.flatnonzero(sigma_m > _LEAST_M).tolist():
             chord = slice(int(begin[row]), int(end[row]))
             out[chord] = np.maximum(out[chord], sigma_m[row])
         sharpest = np.sqrt(bend_rad[begin] * bend_rad.max())
-        longer = (sharpest > inside_rad[end] - inside_rad[begin]) & (length_m < _LONGEST_M)
+        longer = (end < last) & (sharpest > inside_rad[end] - inside_rad[begin]) & (length_m < _LONGEST_M)
         begin = begin[longer & (sharpest * _LONGEST_M / 8.0 > _LEAST_M)]
     return out
 

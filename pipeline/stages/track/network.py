@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.stages.track.chords import chord_sigmas_m
+from pipeline.stages.track.chords import Chords
 from pipeline.stages.track.leg import Visit
 from pipeline.stages.track.once import Once
 from pipeline.stages.track.survey import (
@@ -100,23 +100,31 @@ class Network:
 
     def unsearched(self) -> Network:
         """The same network without what was looked for in it: no run's answers may depend on runs before it."""
-        self.segment_sigmas_m  # noqa: B018  worked out once, for all copies
+        self.chords  # noqa: B018  one for all copies: what it knows of a chain does not depend on who asked
         again = copy.copy(self)
         again._known = {}
         return again
 
     @cached_property
-    def segment_sigmas_m(self) -> Floats:
-        """Sigma of the distance between chord and curve for the segment that begins at each vertex [m]."""
-        return chord_sigmas_m(self.track, self.successors.here, self.successors.to)
+    def chords(self) -> Chords:
+        return Chords(self.track, self.successors.here, self.successors.to)
 
-    def survey_sigmas_m(self, unstated_m: float) -> Floats:
-        """Sigma of the survey across the segment that begins at each vertex [m]: of its points, and of its chords.
+    def survey_sigmas_m(self, unstated_m: float, vertex: Ints) -> Floats:
+        """Sigma of the survey across the segments that begin at some vertices [m]: of its points, and of its chords.
 
         `unstated_m`: of points without one.
         """
-        stated_m = np.where(np.isfinite(self.track.sigma_m), self.track.sigma_m, unstated_m)
-        return np.asarray(np.hypot(np.maximum(stated_m, np.append(stated_m[1:], 0.0)), self.segment_sigmas_m))
+        points_m = np.fmax(*(self._stated_m(at, unstated_m) for at in (vertex, vertex + 1)))
+        return np.asarray(np.hypot(points_m, self.chords.sigmas_m(vertex)))
+
+    def most_survey_sigma_m(self, unstated_m: float) -> float:
+        """No segment's sigma is larger [m]."""
+        stated_m = np.fmax.reduce(self.track.sigma_m, initial=unstated_m)
+        return float(np.hypot(stated_m, self.chords.most_m))
+
+    def _stated_m(self, vertex: Ints, unstated_m: float) -> Floats:
+        stated_m = self.track.sigma_m[vertex]
+        return np.where(np.isfinite(stated_m), stated_m, unstated_m)
 
     @cached_property
     def connected(self) -> Ints:

@@ -64,8 +64,10 @@ class SurveyedTrack:
     def geometric_m(self) -> Floats:
         """Distance of each vertex from the first of its element, along the element [m]: 3-D where it has heights."""
         places = self.surface
-        if not np.isnan(self.height_m).all():
-            places = earth_centred_m(self.latitude_deg, self.longitude_deg, np.nan_to_num(self.height_m))
+        known = np.flatnonzero(np.isfinite(self.height_m))
+        if len(known):
+            places = places.copy()
+            places[known] = earth_centred_m(self.latitude_deg[known], self.longitude_deg[known], self.height_m[known])
         step_m = steps_m(places)
         measure_m = np.zeros(len(self.latitude_deg))
         points = np.diff(self.first)
@@ -130,15 +132,24 @@ class SurveyedTrack:
 
 def track_of(frame: pl.DataFrame) -> SurveyedTrack:
     """The track of a site's `track` table; points of an element stay in their order."""
-    names = frame["netelement_id"].unique(maintain_order=True)
-    index = {name: number for number, name in enumerate(names.to_list())}
-    codes = frame["netelement_id"].cast(pl.Enum(names)).to_physical().cast(pl.Int64).to_numpy()
-    order = np.argsort(codes, kind="stable")
-    first = np.searchsorted(codes[order], np.arange(len(index) + 1))
-    columns = {name: floats(frame, name)[order] for name in _NUMBERS}
+    frame = by_element(frame)
+    runs = frame["netelement_id"].rle().struct
+    names = tuple(runs.field("value").to_list())
+    first = np.append(0, np.cumsum(ints(runs.field("len"))))
+    columns = {name: floats(frame, name) for name in _NUMBERS}
     columns["height_m"] = _all_or_none(columns["height_m"], first)
     length_m = columns["measure_m"][first[1:] - 1] - columns["measure_m"][first[:-1]]
-    return SurveyedTrack(ids=tuple(index), index=index, first=first, length_m=length_m, **columns)
+    index = {name: number for number, name in enumerate(names)}
+    return SurveyedTrack(ids=names, index=index, first=first, length_m=length_m, **columns)
+
+
+def by_element(frame: pl.DataFrame) -> pl.DataFrame:
+    """Points element by element, in the order in which elements come up first."""
+    name = frame["netelement_id"]
+    if (runs := name.rle().struct.field("value")).n_unique() == len(runs):
+        return frame
+    ordered = frame.with_columns(_first=pl.int_range(pl.len()).min().over("netelement_id"))
+    return ordered.sort("_first", maintain_order=True).drop("_first")
 
 
 @dataclass(frozen=True)

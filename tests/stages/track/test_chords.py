@@ -26,7 +26,8 @@ def sigmas_m(points: Floats) -> list[float]:
 
 
 def _sigmas_m(network: Network) -> Floats:
-    return np.sqrt(np.maximum(network.survey_sigmas_m(1.0) ** 2 - 0.3**2, 0.0))
+    vertices = np.arange(len(network.track.measure_m) - 1)
+    return np.sqrt(np.maximum(network.survey_sigmas_m(1.0, vertices) ** 2 - 0.3**2, 0.0))
 
 
 @pytest.mark.parametrize(("step_rad", "expected_m"), [(0.2, 1.25), (0.1, 0.3125), (0.04, 0.05)])
