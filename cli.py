@@ -111,19 +111,18 @@ ConfigFile = Annotated[Path | None, _file("--config", help="Configuration file (
 RouteFiles = Annotated[Path | None, _file("--route", help="Known route: a file, or a folder with RUN.csv or .parquet.")]
 Solution = Annotated[str, Option(help="Solution of the runs.")]
 Jobs = Annotated[
-    int, Option(min=0, callback=lambda jobs: jobs or os.cpu_count() or 1, help="So many at once; 0: one per core.")
+    int,
+    Option(min=0, callback=lambda jobs: jobs or os.cpu_count() or 1, help="Parallel processes; 0: one per core."),
 ]
 Day = Annotated[
     datetime | None,
     Option("--date", formats=["%Y-%m-%d"], callback=lambda at: at and at.date(), help="Day (UTC) of NMEA logs."),
 ]
 Balises = Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")]
-AcceptAll = Annotated[bool, Option("--accept-corrections", help="Accept what is proposed.")]
+AcceptAll = Annotated[bool, Option("--accept-corrections", help="Accept the proposed corrections.")]
 ProjectFile = Annotated[Path | None, _file("--project", help="Project: its folder or file; default: balise.toml here.")]
-OfProject = Annotated[
-    Path | None, _file("--project", help="Take what is not given from this project; default: balise.toml here.")
-]
-Force = Annotated[bool, Option("--force", help="Replace what is there.")]
+OfProject = Annotated[Path | None, _file("--project", help="Project for options not given; default: balise.toml here.")]
+Force = Annotated[bool, Option("--force", help="Overwrite existing files.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no tables; errors only.")]
 Json = Annotated[bool, Option("--json", help="Print the answer as JSON (docs/json.md), progress on standard error.")]
 
@@ -160,7 +159,7 @@ def replay(
     undetected: Annotated[bool, Option("--undetected", help="Also the largest error no monitor would notice.")] = False,
     calibrate: Annotated[list[str] | None, Option(metavar="RUNS|auto", help=_CALIBRATE)] = None,
     fail_on: Annotated[
-        Literal["unsafe", "unproven"] | None, Option(help="Exit status 1 also for this verdict, and for worse ones.")
+        Literal["unsafe", "unproven"] | None, Option(help="Exit status 1 also for this verdict or a worse one.")
     ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -239,7 +238,7 @@ def trial(
     to: Annotated[Path, _file("--to", "--out", help="Folder of the project.")],
     track: Annotated[list[Path] | None, _file(help="The line: maps (GPX, GeoJSON, ...), points, or a site.")] = None,
     balises: Balises = None,
-    reference: Annotated[list[Path] | None, _file(help="Of the logs, one whose positions are the truth.")] = None,
+    reference: Annotated[list[Path] | None, _file(help="Log whose positions are the reference.")] = None,
     date: Day = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
@@ -247,7 +246,7 @@ def trial(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Write a project for raw logs: which stream each feeds, which are of one ride, what has to be corrected."""
+    """Write a project for raw logs: the stream that each log feeds, the logs of each ride, the corrections needed."""
     from pipeline.project.trial import Wanted
 
     if not track:
@@ -269,7 +268,7 @@ def init(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Write a project for what lies in a folder: logs, runs, a survey or a site, balises, settings; or an empty one."""
+    """Write a project from the contents of a folder: logs, runs, survey or site, balises, settings; or an empty one."""
     from pipeline.project.init import wanted_in
 
     _write_project(wanted_in(folder), folder, accept_corrections, force, as_json)
@@ -304,13 +303,13 @@ def _write_project(wanted: Wanted, folder: Path, accept: bool, force: bool, as_j
 @_command("balise run", "balise run --project week12 --jobs 4")
 def run(
     project: ProjectFile = None,
-    jobs: Annotated[int | None, Option(min=0, help="So many at once; default: as the project says.")] = None,
-    force: Annotated[bool, Option("--force", help="Make everything again, whatever is there.")] = False,
+    jobs: Annotated[int | None, Option(min=0, help="Parallel processes; default: the project's.")] = None,
+    force: Annotated[bool, Option("--force", help="Repeat every step, even where nothing changed.")] = False,
     prune: Annotated[bool, Option("--prune", help="Remove results of runs that the project does not name.")] = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Bring a project up to date: convert, site, calibrate, replay, report; only what changed is done again."""
+    """Bring a project up to date: convert, site, calibrate, replay, report; only what changed is run again."""
     from datasets.recordings import recordings
     from pipeline.campaign import Interrupted
     from pipeline.project.opened import open_project
@@ -381,7 +380,7 @@ def demo(
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
+    """Write a synthetic trial with faults, replay it, and compare the hazards found with the faults injected."""
     from datasets.demo import demo as run_demo
 
     result = run_demo(out, seed, None if quiet else _say)
@@ -498,7 +497,7 @@ def inspect(
     as_json: Json = False,
     project: OfProject = None,
 ) -> None:
-    """Describe a log, a site or a result, and list what needs attention."""
+    """Describe a log, a site or a result, and list problems that need attention."""
     from pipeline.show.kinds import kind_at
 
     kind_at(path)  # what is mistyped is said before anything is loaded
@@ -515,7 +514,7 @@ def inject(
     run: Run,
     out: Annotated[Path, _file(help=_NEW_RUN)],
     fault: Annotated[Path | None, _place(help="Fault file (TOML).")] = None,
-    fault_option: Annotated[Path | None, _file("--fault", help="The fault file, if it is not the second word.")] = None,
+    fault_option: Annotated[Path | None, _file("--fault", help="Fault file, if not the second argument.")] = None,
     site: Annotated[str | None, Option(help="Site, for faults along its track.")] = None,
     config: ConfigFile = None,
     as_json: Json = False,
@@ -541,7 +540,7 @@ def undetected(
     solution: Solution = "primary",
     balise: Annotated[str | None, Option(help="Place: where the run passes this balise; default: its end.")] = None,
     at_s: Annotated[float | None, Option(help="Place: this many seconds after the first epoch.")] = None,
-    behind: Annotated[bool, Option("--behind", help="An error behind the train instead of ahead.")] = False,
+    behind: Annotated[bool, Option("--behind", help="Error to the rear of the train instead of ahead.")] = False,
     as_json: Json = False,
 ) -> None:
     """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
@@ -562,10 +561,10 @@ def undetected(
 )
 def convert(
     logs: Annotated[list[Path], _place(help=_LOGS)],
-    out: Annotated[Path, _file("--out", "--to", help=_NEW_RUN + " To one that exists, streams are added.")],
+    out: Annotated[Path, _file("--out", "--to", help=_NEW_RUN + " If it exists, streams are added to it.")],
     config: ConfigFile = None,
     solution: Annotated[str | None, Option(help="Name of the receiver in the run, where it has several.")] = None,
-    stream: Annotated[Literal["gnss", "reference"], Option(help="What the positions are for.")] = "gnss",
+    stream: Annotated[Literal["gnss", "reference"], Option(help="Positions under test, or a reference.")] = "gnss",
     date: Day = None,
     force: Force = False,
     as_json: Json = False,
@@ -592,11 +591,11 @@ def make_a_site(
     balises: Balises = None,
     direction: Annotated[
         Literal["both", "ahead", "back"],
-        Option(help="Of balises `every` so far: valid for trains away from the survey's start, back to it, or both."),
+        Option(help="Balises of `every` are valid for trains away from the survey's start, back to it, or both."),
     ] = "both",
-    epsg: Annotated[int | None, Option(help="Of x and y in tables that do not say.")] = None,
+    epsg: Annotated[int | None, Option(help="EPSG code of x and y where a table names none.")] = None,
     join: Annotated[
-        float | None, Option(help="Ends of lines within so many metres meet (`survey.same_place_m`).")
+        float | None, Option(help="Join line ends up to so many metres apart (`survey.same_place_m`).")
     ] = None,
     flat: Annotated[bool, Option("--flat", help="Leave heights out.")] = False,
     vehicle: VehicleFile = None,
@@ -604,7 +603,7 @@ def make_a_site(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Make a site of a survey of the line: net elements, links, balises, and a page to look at."""
+    """Make a site from a survey of the line: net elements, links, balises, and a page to check it."""
     from pipeline.make.survey.make import make_site, wish_of, write_made
     from pipeline.read.site.describe import elements_table
     from pipeline.show.inspection import findings_table
@@ -755,9 +754,11 @@ def sql(
 def report(
     out: ResultFolder,
     site: Annotated[str | None, Option(help="Site, for plans of the track.")] = None,
-    jobs: Annotated[int, Option(min=0, help="Pages at the same time; 0: one per core if there are many.")] = 0,
+    jobs: Annotated[int, Option(min=0, help="Parallel processes; 0: one per core if there are many pages.")] = 0,
     run: Annotated[str | None, Option(help="Write the page of this run alone.")] = None,
-    most: Annotated[int, Option("--pages", min=0, help="No pages of runs unasked where there are more runs.")] = 1000,
+    most: Annotated[
+        int, Option("--pages", min=0, help="Above so many runs, write pages of runs only with --run.")
+    ] = 1000,
     quiet: Quiet = False,
     as_json: Json = False,
     project: OfProject = None,
@@ -826,7 +827,7 @@ def export(
     as_json: Json = False,
     project: OfProject = None,
 ) -> None:
-    """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or for maps."""
+    """Export one run with its results to MCAP viewers (Foxglove, Lichtblick, Rerun) or maps."""
     from pipeline.show.export import export_run
 
     recorded = _log(log, _configuration(config), True) if log else None
@@ -874,13 +875,13 @@ def verify(
 @_command("balise compact week12", "balise compact s3://trial/week12 --runs-per-file 5000")
 def compact(
     out: Result,
-    runs_per_file: Annotated[int, Option(min=1, help="Runs of one file at most; long runs are fewer.")] = 2000,
-    undo: Annotated[bool, Option("--undo", help="Give each run files of its own again, with the same bytes.")] = False,
+    runs_per_file: Annotated[int, Option(min=1, help="Most runs in one file; fewer if runs are long.")] = 2000,
+    undo: Annotated[bool, Option("--undo", help="Split into one file per run and table again, byte for byte.")] = False,
     jobs: Jobs = 0,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Put the tables of many runs into few files. Every command reads both forms, also mixed."""
+    """Merge the tables of many runs into few files. Every command reads both forms, also mixed."""
     from pipeline.campaign import compact as packing
 
     with _telling("runs", quiet):

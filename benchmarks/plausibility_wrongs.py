@@ -180,11 +180,11 @@ def _velocities() -> list[Wrong]:
         Wrong(
             "velocity: axes", ("east and north are exchanged",), exchanged(_G, "vel_e_mps", "vel_n_mps"), needs=needs
         ),
-        Wrong("velocity: east", ("east of the wrong sign",), scaled(_G, vel_e_mps=-1.0), needs=needs),
-        Wrong("velocity: north", ("north of the wrong sign",), scaled(_G, vel_n_mps=-1.0), needs=needs),
+        Wrong("velocity: east", ("east with the wrong sign",), scaled(_G, vel_e_mps=-1.0), needs=needs),
+        Wrong("velocity: north", ("north with the wrong sign",), scaled(_G, vel_n_mps=-1.0), needs=needs),
         Wrong(
             "velocity: both",
-            ("east and north of the wrong sign",),
+            ("east and north with the wrong sign",),
             scaled(_G, vel_e_mps=-1.0, vel_n_mps=-1.0),
             needs=needs,
         ),
@@ -310,7 +310,7 @@ def _counters() -> list[Wrong]:
     return [
         Wrong("speed backwards", ("sign of the odometer", "backwards"), scaled(_O, speed_mps=-1.0), needs=both),
         Wrong("distance backwards", ("sign of the odometer", "backwards"), scaled(_O, distance_m=-1.0), needs=both),
-        Wrong("counter without sign", ("reverses", "without sign"), unsigned, fails=False, needs=("reverses",)),
+        Wrong("counter without sign", ("reverses", "unsigned"), unsigned, fails=False, needs=("reverses",)),
     ]
 
 

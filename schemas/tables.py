@@ -147,7 +147,7 @@ class Passages(dy.Schema):
     undetected_behind_m = real("m", "the same behind it; null as all of these where not computed", min=0)
     undetected_ahead_in_use_m = real(
         "m",
-        "largest fault ahead still in use, alarms or not; null where unbounded, as up to the first fix after a TVB",
+        "largest fault ahead still in use that began after the last fix, alarms or not; null where nothing bounds it",
         min=0,
     )
     undetected_behind_in_use_m = real("m", "the same behind it", min=0)
@@ -241,7 +241,7 @@ class _EpochsAfterMonitors(dy.Schema):
     undetected_behind_m = real("m", "the same behind it; both null where not computed", min=0)
     undetected_ahead_in_use_m = real(
         "m",
-        "largest fault ahead still in use, alarms or not; null where unbounded, as up to the first fix after a TVB",
+        "largest fault ahead still in use that began after the last fix, alarms or not; null where nothing bounds it",
         min=0,
     )
     undetected_behind_in_use_m = real("m", "the same behind it", min=0)

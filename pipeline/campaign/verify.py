@@ -42,16 +42,16 @@ class NotCompared(StrEnum):
     """What of a result could not be made again, and so was compared with nothing."""
 
     CATALOGUE = "catalogue"
-    """Tables that this build cannot read, or that do not agree themselves."""
+    """What is kept of runs whose tables this build cannot read, or that do not agree themselves."""
     CAMPAIGN_TABLES = "campaign_tables"
     """The same, or runs made by another build of the program."""
     PACKS = "packs"
     """Rows of packed runs of which this build makes other files than the build that wrote them."""
 
 
-_COPIES = (NotCompared.CATALOGUE, NotCompared.CAMPAIGN_TABLES)
+_DERIVED = (NotCompared.CATALOGUE, NotCompared.CAMPAIGN_TABLES)
 _NOT_COMPARED = {
-    NotCompared.CATALOGUE: "the copies in .catalogue",
+    NotCompared.CATALOGUE: "the outcomes kept in .catalogue",
     NotCompared.CAMPAIGN_TABLES: "the tables in campaign/, which the build that made them can make again",
     NotCompared.PACKS: "rows of packed runs with their markers, which the build that made them can compare",
 }
@@ -97,7 +97,7 @@ def verify(out: Address) -> Verification:
         tell(min(first + _RUNS_AT_ONCE, len(runs)), len(runs))
     known = {*manifest["files"], *again["files"], *_OWN_FILES}
     problems += [(name, "there", "not in the manifest") for name in _other_files(out, {*there, *named}, known)]
-    not_compared = _COPIES + ((NotCompared.PACKS,) if packs.listed(out) else ())
+    not_compared = _DERIVED + ((NotCompared.PACKS,) if packs.listed(out) else ())
     if not problems:
         problems, not_compared = _made_again(out, {run["software_digest"] for run in there.values()})
         of_packs, unlike = _unpacked(out, there)
@@ -255,7 +255,7 @@ def _made_again(out: Address, software: set[str]) -> tuple[list[Problem], tuple[
         tables = store.small_tables(out)
     except UsageError:
         # What another build of the program wrote only that build can read.
-        return [], _COPIES
+        return [], _DERIVED
     problems = list(_outcomes(out, tables))
     config = store.read_config(out)
     if config is None or software != {software_digest()}:

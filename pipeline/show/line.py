@@ -16,7 +16,7 @@ from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import page, pairs, script_json, section, tiles
 from pipeline.storage import write_bytes
 from pipeline.studies.line import LineResult, site_balises
-from schemas.arrays import floats
+from schemas.arrays import Floats, floats
 from schemas.config import to_toml
 from schemas.line import LineBalises, LineDirection, LinePieces, LineProposals, PieceClass
 from schemas.version import SOFTWARE
@@ -48,27 +48,34 @@ def write_line(result: LineResult, to: Path) -> list[Path]:
 
 def line_geojson(result: LineResult) -> str:
     """Pieces as lines and proposed balises as points (RFC 7946)."""
-    line = result.line
-    pieces = result.line.pieces
-    steps = np.linspace(0.0, 1.0, 6)
-    measures = pieces.from_m[:, None] + (pieces.to_m - pieces.from_m)[:, None] * steps
-    ground = ground_of(
-        line.site.track, pl.Series(np.repeat(pieces.names, steps.size), dtype=pl.String), measures.ravel()
-    )
-    places = (
-        np.round(np.column_stack([ground.longitude_deg, ground.latitude_deg]), 8).reshape(-1, steps.size, 2).tolist()
-    )
-    features = [
-        _feature("LineString", places[row["piece"]], {"kind": "piece", **row})
-        for row in result.pieces.iter_rows(named=True)
-    ]
-    at = ground_of(line.site.track, result.balises["netelement_id"], floats(result.balises, "measure_m"))
-    spots = np.round(np.column_stack([at.longitude_deg, at.latitude_deg]), 8).tolist()
-    features += [
-        _feature("Point", spot, {**row, "kind": "balise", "kind_of_balise": row["kind"]})
-        for spot, row in zip(spots, result.balises.iter_rows(named=True), strict=True)
-    ]
+    features = _piece_features(result) + _balise_features(result)
     return json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), allow_nan=False)
+
+
+def _piece_features(result: LineResult) -> list[dict[str, object]]:
+    """A line of six points for each row of pieces; one piece has a row per direction."""
+    pieces = result.line.pieces
+    shares = np.linspace(0.0, 1.0, 6)
+    measures = pieces.from_m[:, None] + (pieces.to_m - pieces.from_m)[:, None] * shares
+    elements = pl.Series(np.repeat(pieces.names, shares.size), dtype=pl.String)
+    lines = _coordinates(result, elements, measures.ravel()).reshape(-1, shares.size, 2).tolist()
+    rows = result.pieces.iter_rows(named=True)
+    return [_feature("LineString", lines[row["piece"]], {"kind": "piece", **row}) for row in rows]
+
+
+def _balise_features(result: LineResult) -> list[dict[str, object]]:
+    balises = result.balises
+    points = _coordinates(result, balises["netelement_id"], floats(balises, "measure_m")).tolist()
+    return [
+        _feature("Point", point, {**row, "kind": "balise", "kind_of_balise": row["kind"]})
+        for point, row in zip(points, balises.iter_rows(named=True), strict=True)
+    ]
+
+
+def _coordinates(result: LineResult, elements: pl.Series, measures_m: Floats) -> Floats:
+    """Longitude and latitude of places on the track, to about a millimetre [deg]; shape (places, 2)."""
+    ground = ground_of(result.line.site.track, elements, measures_m)
+    return np.column_stack([ground.longitude_deg, ground.latitude_deg]).round(8)
 
 
 def _feature(kind: str, coordinates: list[object], properties: dict[str, object]) -> dict[str, object]:

@@ -253,7 +253,7 @@ def show_summary(
         pages = "" if has_pages else f"; `balise report {out}` writes pages of them"
         print(f"Tables are in {out}{pages}.")
         for line in remedy_lines(summary, out=out, **places):
-            print(f"To mend {line}")
+            print(f"Remedy for {line}")
 
 
 def summary_answer(summary: CampaignSummary, out: str) -> dict[str, object]:

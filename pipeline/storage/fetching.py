@@ -133,7 +133,7 @@ def content_of(address: Address) -> bytes | None:
         return read_many([str(address)]).get(str(address))
     try:
         return Path(address).read_bytes()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
         raise OutputError(f"cannot be read: {error.strerror}", place=str(address)) from None

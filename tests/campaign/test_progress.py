@@ -188,10 +188,10 @@ def test_each_remedy_stands_once_with_its_command_and_the_worst_run() -> None:
         CampaignSummary(2, tuple(runs), 1.0), site="line9", out="week", options=" --config c.toml"
     )
     assert lines == [
-        "2 of 2 runs: name the track that the train took: "
+        "2 of 2 runs: give the route that the train took: "
         "`balise replay logs/a.mcap --site line9 --out week --config c.toml --route ROUTES` "
         "(--write-route ROUTES writes what was found)",
-        "1 of 2 runs: measure the odometer on two or more other fault-free runs of this vehicle: "
+        "1 of 2 runs: calibrate the odometer on two or more other fault-free runs of this vehicle: "
         "`balise replay logs/a.mcap --site line9 --out week --config c.toml --calibrate 'OTHER_RUNS/*'`",
     ]
 

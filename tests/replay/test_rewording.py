@@ -84,7 +84,7 @@ def of_enums() -> Iterator[dict[Any, str]]:
 
 
 # What was looked for once: none of it, and all of it, in every message.
-LOOKED_FOR = "faults were injected, the rest lost to: 3% no fix, a roll-over of the GPS week, in feet, in the survey"
+LOOKED_FOR = "faults were injected, the rest lost to: 3% no fix, a GPS week rollover, in feet, in the survey"
 
 
 def gibberish(chance: random.Random) -> str:

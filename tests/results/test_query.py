@@ -101,8 +101,11 @@ def test_tables_and_columns_are_listed(out: Path) -> None:
 
 
 def test_not_a_result(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="holds no complete run"):
-        run_sql(tmp_path, "SELECT 1")
+    file = tmp_path / "notes.txt"
+    file.write_text("no folder\n")
+    for named in (tmp_path, file, tmp_path / "nowhere"):
+        with pytest.raises(UsageError, match="holds no complete run"):
+            run_sql(named, "SELECT 1")
 
 
 def test_a_result_of_another_build_is_named(out: Path, tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
-"""What the schema of a channel says, and which fields its first message has."""
+"""What the schema of a channel says, and which fields its messages have."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -10,7 +10,7 @@ from google.protobuf.message import DecodeError
 from mcap.records import Schema as McapSchema
 
 from pipeline.read.ingest.json_columns import parse_json
-from pipeline.read.ingest.layout import UndecodableError, undecodable
+from pipeline.read.ingest.layout import UndecodableError, parse_path, undecodable
 from pipeline.read.ingest.mcap_block import Messages
 from pipeline.read.ingest.mcap_records import Channel, Schema
 from pipeline.read.ingest.ros_message import Definition, DefinitionError, RosWalk, parse_definitions, short_name
@@ -18,6 +18,8 @@ from schemas.errors import InputError
 
 _LARGEST_LIST = 64  # elements of a list that are offered one by one
 _DEEPEST = 12
+_SAMPLED = 64  # messages of JSON, which may leave out any field
+_SAMPLED_BYTES = 1 << 20
 
 
 # A schema takes as long to parse as ten thousand messages to decode, and the logs of a campaign share theirs.
@@ -76,11 +78,18 @@ def definition_of(channel: Channel) -> Any:
 
 
 def fields_of(channel: Channel, messages: Messages) -> dict[str, str]:
-    """Field paths of the first message with their kind: `int`, `float`, `text`, `flag`, `null`."""
-    try:
-        return dict(_fields(channel, messages.payload(0)))
-    except UndecodableError as error:
-        raise undecodable(channel, messages.log_time[0], error) from None
+    """Field paths of the first message, of JSON those of the first ones, with their kind: `int`, `float`, `text`,
+    `flag`, `null`.
+    """
+    met: dict[str, str] = {}
+    few = int((messages.length[:_SAMPLED].cumsum() < _SAMPLED_BYTES).sum()) if channel.encoding == "json" else 1
+    for row in range(max(few, 1)):
+        try:
+            found = dict(_fields(channel, messages.payload(row)))
+        except UndecodableError as error:
+            raise undecodable(channel, messages.log_time[row], error) from None
+        met |= {path: kind for path, kind in found.items() if met.get(path, "null") == "null"}
+    return met
 
 
 def _fields(channel: Channel, payload: bytes) -> Iterator[tuple[str, str]]:
@@ -93,6 +102,41 @@ def _fields(channel: Channel, payload: bytes) -> Iterator[tuple[str, str]]:
         return _leaves(definition.FromString(payload), "", 0)
     except DecodeError as error:
         raise UndecodableError(f"not the protobuf message of its schema: {error}") from None
+
+
+def may_follow(channel: Channel, path: str) -> bool:
+    """Whether the schema knows a field that the first message lacks, as it does the elements of arrays."""
+    steps = parse_path(path)
+    followers = [*steps[1:], ""]
+    named = [
+        (step, isinstance(after, int)) for step, after in zip(steps, followers, strict=True) if isinstance(step, str)
+    ]
+    if channel.encoding == "protobuf":
+        return _in_protobuf(definition_of(channel).DESCRIPTOR, named)
+    if channel.encoding != "cdr":
+        return False
+    definitions, kind = definition_of(channel)
+    return _in_ros(definitions, kind, named)
+
+
+def _in_protobuf(descriptor: Any, named: Sequence[tuple[str, bool]]) -> bool:
+    """`named`: the names of a path, and whether an index stands behind each."""
+    for name, indexed in named:
+        field = descriptor.fields_by_name.get(name) if descriptor is not None else None
+        if field is None or field.is_repeated != indexed:
+            return False
+        descriptor = field.message_type
+    return descriptor is None
+
+
+def _in_ros(definitions: Mapping[str, Definition], kind: str, named: Sequence[tuple[str, bool]]) -> bool:
+    for name, indexed in named:
+        member = next((member for member in definitions.get(kind, ()) if member.name == name), None)
+        # Elements of an array of fixed size are in every message.
+        if member is None or member.count != (0 if indexed else None):
+            return False
+        kind = member.type
+    return kind not in definitions
 
 
 def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, str]]:

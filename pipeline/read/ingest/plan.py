@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.read.ingest.conform import DEFAULTS, refuse
-from pipeline.read.ingest.fields import definition_of
+from pipeline.read.ingest.fields import definition_of, may_follow
 from pipeline.read.ingest.mapping import mapped_recipe, mappings_of
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.recipe import Recipe
@@ -107,7 +107,8 @@ def _source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None
     for name, expression in recipe.columns.items():
         absent = [path for path in recipe.fields_of(name) if not _is_there(sample, recipe, path)]
         wanted = mapping is not None and name in mapping.fields
-        if not absent or (not closed and contract[name].nullable):
+        optional = not closed and (contract[name].nullable or name in DEFAULTS)
+        if optional or all(_may_follow(sample, recipe, path) for path in absent):
             columns[name] = expression
             if absent and (wanted or (name in _POSITION and not recipe.own)):
                 doubtful[name] = absent[0]
@@ -133,12 +134,13 @@ def _without_presence(channel: Channel, columns: Iterable[str]) -> tuple[str, ..
 
 
 def _is_there(sample: Sample, recipe: Recipe, path: str) -> bool:
+    return path in sample.fields or f"{recipe.rows}[0].{path}" in sample.fields
+
+
+def _may_follow(sample: Sample, recipe: Recipe, path: str) -> bool:
+    """A field of later messages: the first says nothing about the elements of an array that is empty in it."""
     in_element = f"{recipe.rows}[0].{path}"
-    # An array that happens to be empty in the first message says nothing about its elements.
-    return path in sample.fields or (
-        bool(recipe.rows)
-        and (in_element in sample.fields or not any(name.startswith(recipe.rows + "[") for name in sample.fields))
-    )
+    return may_follow(sample.channel, path) or (bool(recipe.rows) and may_follow(sample.channel, in_element))
 
 
 def missing_field(channel: Channel, fields: Iterable[str], column: str, absent: Sequence[str]) -> InputError:

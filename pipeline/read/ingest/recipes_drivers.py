@@ -203,4 +203,5 @@ BY_SCHEMA: dict[str, tuple[Recipe, ...]] = {
     "ublox_msgs/msg/NavSAT": (_nav_sat({}, "sv", (pl.col("flags") & 8) == 8, {}),),
     "novatel_oem7_msgs/msg/BESTPOS": (_bestpos(),),
     "gps_msgs/msg/GPSFix": (_gps_fix(),),
+    "gps_common/msg/GPSFix": (_gps_fix(),),  # its name in ROS 1
 }

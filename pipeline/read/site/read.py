@@ -143,7 +143,7 @@ def _read_track(
         raw = network.track if network else None
     else:
         raw = _load(files, "track", breaches)
-    frame = typed_table(_in_degrees(raw), "track", breaches) if raw is not None else None
+    frame = typed_table(_named_by_contract(raw), "track", breaches) if raw is not None else None
     if raw is None or frame is None:
         return None, network, []
     if frame.is_empty():
@@ -167,8 +167,8 @@ def _read_links(files: dict[str, bytes], network: GeoJsonNetwork | None, breache
     return typed_table(raw, "links", breaches)
 
 
-def _in_degrees(raw: RawTable) -> RawTable:
-    """Plane coordinates under the names of the contract; `to_wgs84` makes degrees of them."""
+def _named_by_contract(raw: RawTable) -> RawTable:
+    """Plane coordinates `x_m`, `y_m` under the names of the contract; `to_wgs84` makes degrees of them later."""
     names = {"x_m": "longitude_deg", "y_m": "latitude_deg"}
     given = {old: new for old, new in names.items() if old in raw.frame.columns}
     if any(new in raw.frame.columns for new in given.values()):

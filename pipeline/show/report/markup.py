@@ -202,11 +202,17 @@ def _th(head: tuple[str, str], numeric: bool, beyond: bool) -> str:
 
 
 def _td(item: Cell, numeric: bool, beyond: bool) -> str:
-    order = item.order
-    key = "" if order is None else f' data-order="{escape(repr(order) if isinstance(order, float) else order)}"'
-    shape = "number" if numeric else "long" if len(item.text) > _LONG else ""
-    classes = _classes(shape, item.tone, "more" * beyond)
-    return f"<td{key}{classes}>{item.html if item.html is not None else escape(item.text)}</td>"
+    wide = not numeric and len(item.text) > _LONG
+    classes = _classes("number" * numeric, "long" * wide, item.tone, "more" * beyond)
+    content = escape(item.text) if item.html is None else item.html
+    return f"<td{_sort_key(item.order)}{classes}>{content}</td>"
+
+
+def _sort_key(order: float | str | None) -> str:
+    if order is None:
+        return ""
+    key = repr(order) if isinstance(order, float) else order
+    return f' data-order="{escape(key)}"'
 
 
 def _classes(*names: str) -> str:

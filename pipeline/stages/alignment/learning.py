@@ -51,6 +51,7 @@ def learn(
 class _Learner:
     """Runs the filter along the run, once the noise is known, and freezes it under alarm of the along-track monitors.
 
+    A row is an epoch with a usable position and a known odometer distance; `_rows` has its place among all epochs.
     From the first failing epoch on the estimates stand still until the rule of recovery holds: a lasting fault must not
     be learned as scale, nor an offset with which the position comes back (`ScaleLatencyFilter.resume`).
     """
@@ -101,59 +102,62 @@ class _Learner:
             self._meter = NoiseMeter(series, moving, config.monitors.noise_along_m, config)
 
     def run(self, prior: Estimates) -> None:
-        """Learn until an alarm, hold, learn on; fills `learned`."""
-        position = self._meter.known_from() if self._rows.size else 0
-        if position >= self._rows.size:
+        """Learn from the first row with known noise until an alarm, hold until recovery, learn on; fills `learned`."""
+        row = self._meter.known_from() if self._rows.size else 0
+        if row >= self._rows.size:
             return
-        # What the file gives is not learned.
+        state = self._filter.start(self._to_learn(prior), *self._observation(row))
+        while row < self._rows.size:
+            state, alarm = self._learn_until_alarm(state, row)
+            if alarm >= self._rows.size:
+                break
+            self._meter.freeze(alarm)
+            row, unsettled_m2 = self._hold(float(estimates_of(state.joint).scale_sigma), alarm)
+            self._meter.restart(row)
+            if row < self._rows.size:
+                state = self._filter.restart(state, *self._observation(row), unsettled_m2)
+
+    def _to_learn(self, prior: Estimates) -> Estimates:
+        """The prior without uncertainty in what the vehicle file gives, so that it is not learned."""
         if self._vehicle.odometer_scale is not None:
             prior = prior._replace(scale_sigma=np.zeros(()))
         if self._vehicle.gnss_latency_s is not None:
             prior = prior._replace(latency_sigma_s=np.zeros(()))
-        state = self._filter.start(prior, *self._observation(position))
-        while position < self._rows.size:
-            state, alarm = self._learn_until_alarm(state, position)
-            if alarm >= self._rows.size:
-                break
-            self._meter.freeze(alarm)
-            position, unsettled_m2 = self._hold(float(estimates_of(state.joint).scale_sigma), alarm)
-            self._meter.restart(position)
-            if position < self._rows.size:
-                state = self._filter.restart(state, *self._observation(position), unsettled_m2)
+        return prior
 
-    def _observation(self, position: int) -> tuple[float, float]:
-        return float(self._t_s[position]), float(self._path_m[position])
+    def _observation(self, row: int) -> tuple[float, float]:
+        return float(self._t_s[row]), float(self._path_m[row])
 
     def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
-        """The state in use at the first failing epoch, and its position."""
+        """The state in use at the first failing row, and this row."""
         bank: AxisState | None = None
         use_from = np.array([begin])
         joints = state.joint[None]
-        position = begin
+        row = begin
         block = FIRST_BLOCK
-        while position < self._rows.size:
-            end = min(position + block, self._rows.size)
-            current = _in_use(use_from, position)
-            state, new_from, new_joints = self._updates(state, position, end)
+        while row < self._rows.size:
+            end = min(row + block, self._rows.size)
+            current = _in_use(use_from, row)
+            state, new_from, new_joints = self._updates(state, row, end)
             use_from = np.concatenate([use_from[current:], new_from])
             joints = np.concatenate([joints[current:], new_joints])
-            self._put(np.maximum(use_from, position), joints)
-            series = self._series(position, end, begin)
-            value, sigma, bank = run_axis(series, self._alphas, bank, self._meter.variance_m2(position, end))
+            self._put(np.maximum(use_from, row), joints)
+            series = self._series(row, end, begin)
+            value, sigma, bank = run_axis(series, self._alphas, bank, self._meter.variance_m2(row, end))
             beyond = ~(np.abs(value) <= self._factor * sigma)  # what cannot be compared is no pass
             failing = np.flatnonzero(beyond.any(axis=1) & ~series.fresh)
             if failing.size:
-                alarm = position + int(failing[0])
+                alarm = row + int(failing[0])
                 held = joints[_in_use(use_from, alarm)]
                 self._put(np.array([alarm]), held[None])
                 # The block's last state may lie behind the alarm: what it has to settle is not carried over.
                 return FilterState(held, self._times[alarm], state.origin_m), alarm
-            position = end
+            row = end
             block = min(2 * block, BLOCK)
-        return state, position
+        return state, row
 
     def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Ints, Floats]:
-        """The filter over positions [begin, end): its last state, first use of each joint state, joint states."""
+        """The filter over rows [begin, end): its last state, first use of each joint state, joint states."""
         due = self._due(state.t_s, begin, end)
         before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
         broken = (self._segment[before] != self._segment[due]) | (self._breaks[before] != self._breaks[due])
@@ -171,34 +175,34 @@ class _Learner:
         use_from = np.searchsorted(self._t_s, self._t_s[due] + self._config.align.latency_span_s)
         return state, np.maximum(use_from, due + 1), joints
 
-    def _beyond_break(self, state: FilterState, before: int, position: int) -> FilterState:
+    def _beyond_break(self, state: FilterState, before: int, row: int) -> FilterState:
         """Where the odometer lost its distance the offset begins anew: nothing shows whether the position moved."""
-        if self._segment[before] == self._segment[position]:
-            observed = *self._observation(position), float(self._sigma_m[position]), self._jitter_s
+        if self._segment[before] == self._segment[row]:
+            observed = *self._observation(row), float(self._sigma_m[row]), self._jitter_s
             return self._filter.resume(state, *observed, self._limit_m)
-        away = self._outages[before] != self._outages[position]
-        return self._filter.restart(state, *self._observation(position), self._limit_m**2 if away else 0.0)
+        away = self._outages[before] != self._outages[row]
+        return self._filter.restart(state, *self._observation(row), self._limit_m**2 if away else 0.0)
 
     def _due(self, last_s: float, begin: int, end: int) -> Ints:
-        """Positions of the updates: a filter period apart."""
+        """Rows of the updates: a filter period apart."""
         period_s = self._config.align.filter_period_s * (1.0 - 1e-6)
         due: list[int] = []
-        position = self._next(last_s + period_s, begin)
-        while position < end:
-            due.append(position)
-            position = self._next(self._times[position] + period_s, position + 1)
+        row = self._next(last_s + period_s, begin)
+        while row < end:
+            due.append(row)
+            row = self._next(self._times[row] + period_s, row + 1)
         return np.array(due, dtype=np.int64)
 
     def _put(self, use_from: Ints, joints: Floats) -> None:
-        """Fill the estimates in use, each from its position on."""
-        epochs = np.append(self._rows, self._learned.scale.size)  # a position past the last is past all epochs
+        """Fill the estimates in use, each from its row on."""
+        epochs = np.append(self._rows, self._learned.scale.size)  # a row past the last is past all epochs
         self._learned.put(epochs[use_from], estimates_of(joints))
 
     def _next(self, t_s: float, at_least: int) -> int:
         return max(at_least, bisect_left(self._times, t_s))
 
     def _series(self, begin: int, end: int, restart: int) -> AxisSeries:
-        """Increments of these positions; the one at `restart` has none before it."""
+        """Increments of rows [begin, end); the one at `restart` has none before it."""
         part = slice(max(begin - 1, restart), end)
         in_use = self._learned.at(self._rows[part])
         at_s = self._t_s[part] - in_use.latency_s
@@ -226,38 +230,38 @@ class _Learner:
         return np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config))
 
     def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:
-        """Position from which learning goes on after the alarm, and what the offset has still to settle by [m^2].
+        """Row from which learning goes on after the alarm, and what the offset has still to settle by [m^2].
 
         That is where GNSS minus odometer is back within the recovery bound, `recovery_s` after the last failure; else
-        the number of positions.
+        the number of rows.
         """
-        begin = position = alarm - 1  # the first position of all cannot fail
+        begin = row = alarm - 1  # the first row of all cannot fail
         bank: AxisState | None = None
         away_m = np.zeros(1)
         failed_s = np.full(1, -np.inf)
         block = FIRST_BLOCK
-        while position < self._rows.size:
-            end = min(position + block, self._rows.size)
-            t_s = self._t_s[position:end]
-            series = self._series(position, end, begin)
-            noise_m2 = self._meter.variance_m2(position, end)[:, :2]
+        while row < self._rows.size:
+            end = min(row + block, self._rows.size)
+            t_s = self._t_s[row:end]
+            series = self._series(row, end, begin)
+            noise_m2 = self._meter.variance_m2(row, end)[:, :2]
             value, sigma, bank = run_axis(series, self._alphas[:1], bank, noise_m2)
             failing = ~(np.abs(value) <= self._factor * sigma).all(axis=1)
-            failing |= np.arange(position, end) <= begin + 1
+            failing |= np.arange(row, end) <= begin + 1
             failed_s = np.maximum.accumulate(np.where(failing, t_s, failed_s[-1]))
             away_m = away_m[-1] + np.cumsum(series.rate_mps * series.dt_s)
-            variance_m2 = self._drift_m2(begin, position, end, scale_sigma)
+            variance_m2 = self._drift_m2(begin, row, end, scale_sigma)
             near = np.abs(away_m) <= self._rule.bound_m(variance_m2)
             back = np.flatnonzero(near & self._rule.is_quiet(t_s - failed_s))
             if back.size:
                 first = int(back[0])
-                return position + first, float(away_m[first] ** 2 + variance_m2[first])
-            position = end
+                return row + first, float(away_m[first] ** 2 + variance_m2[first])
+            row = end
             block = min(2 * block, BLOCK)
         return self._rows.size, 0.0
 
     def _drift_m2(self, anchor: int, begin: int, end: int, scale_sigma: float) -> Floats:
-        """What GNSS minus odometer moves by from the anchor to these positions without a fault [m^2]."""
+        """What GNSS minus odometer moves by from the anchor to rows [begin, end) without a fault [m^2]."""
         sigma_m = self._sigma_m
         t_ns = self._t_ns
         way_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
@@ -273,5 +277,5 @@ def _gaps_before(at_s: Floats, t_s: Floats, gap_s: float) -> Ints:
     return np.searchsorted(ends, at_s, side="right")
 
 
-def _in_use(use_from: Ints, position: int) -> int:
-    return int(np.searchsorted(use_from, position, side="right")) - 1
+def _in_use(use_from: Ints, row: int) -> int:
+    return int(np.searchsorted(use_from, row, side="right")) - 1

@@ -59,13 +59,17 @@ Source = tuple[Floats, Floats]
 
 
 def errors_of(sigma_m: Floats, dt_s: Floats, beside: Sequence[Source], config: MonitorConfig) -> dict[str, Floats]:
-    """The error fields of a series: Gauss-Markov errors of positions of this sigma, and what stands beside them.
+    """The error fields of a series: four Gauss-Markov errors of positions of this sigma, and those `beside` them.
 
-    In Fortran order: the recursions go along the rows.
+    Error j of a share of the variance has sigma_j = sqrt(share_j) sigma and 1 - phi_j = 1 - exp(-dt / tau_j) (DIAG
+    Table 1). Transposed into Fortran order, as the recursions go along the rows.
     """
-    shares, taus_s = error_model(config)
-    model = [(np.sqrt(share) * sigma_m, -np.expm1(-dt_s / tau_s)) for share, tau_s in zip(shares, taus_s, strict=True)]
-    sigmas, decorrelations = (np.vstack(parts).T for parts in zip(*model, *beside, strict=True))
+    sources = [
+        (np.sqrt(share) * sigma_m, -np.expm1(-dt_s / tau_s)) for share, tau_s in zip(*error_model(config), strict=True)
+    ]
+    sources += beside
+    sigmas = np.vstack([sigma for sigma, _ in sources]).T
+    decorrelations = np.vstack([lost for _, lost in sources]).T
     before = before_steps(sigmas, decorrelations, config.sigma_step_factor)
     return {"sigma_m": sigmas, "sigma_before_m": before, "decorrelation": decorrelations}
 

@@ -47,7 +47,9 @@ class AxisBank:
         self._alphas = np.array(config.monitors.ewma_alphas)
         self.enabled = np.array([f"{axis.name}_{scale}" not in config.monitors.disabled for scale in SCALES])
         shape = epochs, len(SCALES)
-        self.value, self.threshold, self.noise_m = (np.full(shape, np.nan, order="F") for _ in range(3))
+        self.value = np.full(shape, np.nan, order="F")
+        self.threshold = np.full(shape, np.nan, order="F")
+        self.noise_m = np.full(shape, np.nan, order="F")
         self.state = np.full(shape, NOT_EVALUATED, dtype=np.int8, order="F")
         self.begins = np.zeros(epochs, dtype=np.bool_)
         self.noise_known = np.ones(epochs, dtype=np.bool_)
@@ -56,6 +58,7 @@ class AxisBank:
         self._begin_at(0, None, BLOCK)
 
     def _begin_at(self, row: int, state: AxisState | None, block: int) -> None:
+        """Evaluate from this row on, at first so many at once; state None: a restart."""
         self._done = row
         self._state = state
         self._block = block

@@ -31,30 +31,36 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame
     """
     t_ns = times_ns(epochs)
     t_s = (t_ns - t_ns[0]) * 1e-9
-    velocity = floats(epochs, "velocity_along_mps")
-    usable = np.isfinite(velocity) & epochs["odometer_reason"].is_null().to_numpy() & epochs["fix_valid"].to_numpy()
-    first, span = _window(t_s, usable, epochs["odometer_segment"].to_numpy(), config)
-    total = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity, np.nan)))])[:-1]
-    by_doppler = (total - total[first]) / span
-    odometer = floats(epochs, "odometer_m")
-    by_odometer = (odometer - odometer[first]) / span
-    speed = np.abs(floats(epochs, "speed_mps"))
-    change = np.abs(velocity - velocity[first])
+    velocity_mps = floats(epochs, "velocity_along_mps")
+    no_odometer = epochs["odometer_reason"]
+    usable = np.isfinite(velocity_mps) & no_odometer.is_null().to_numpy() & epochs["fix_valid"].to_numpy()
+    first, span_s = _window(t_s, usable, epochs["odometer_segment"].to_numpy(), config)
+    doppler_m = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity_mps, np.nan)))])[:-1]
+    odometer_m = floats(epochs, "odometer_m")
+    value_mps = (doppler_m - doppler_m[first]) / span_s - (odometer_m - odometer_m[first]) / span_s
+    sigma_mps = _doppler_sigma(epochs, span_s, velocity_mps - velocity_mps[first], config)
+    reasons = first_reason(
+        (~np.isfinite(velocity_mps), NO_VELOCITY),
+        (no_odometer.is_not_null(), no_odometer),
+        (~epochs["fix_valid"], NO_POSITION),
+        (~np.isfinite(span_s), FIRST_EPOCH),
+    )
+    return verdicts(value_mps, config.monitors.threshold_factor * sigma_mps, reasons)
+
+
+def _doppler_sigma(epochs: pl.DataFrame, span_s: Floats, change_mps: Floats, config: Configuration) -> Floats:
+    """Sigma of Doppler minus odometer speed over `span_s`, in which the velocity changed by `change_mps` [m/s]."""
+    speed_mps = np.abs(floats(epochs, "speed_mps"))
+    # At a change of speed dv a late stamp of T compares other moments: dv T / span.
+    late_s = floats(epochs, "latency_sigma_s") + np.abs(floats(epochs, "latency_s"))
     variance = (
         config.monitors.doppler_sigma_mps**2
-        + floats(epochs, "odometer_white_m2_per_s") / span
-        + 2.0 * (floats(epochs, "odometer_rows_m") / span) ** 2
-        + (floats(epochs, "scale_sigma") * speed) ** 2
-        + ((floats(epochs, "latency_sigma_s") + np.abs(floats(epochs, "latency_s"))) * change / span) ** 2
+        + floats(epochs, "odometer_white_m2_per_s") / span_s
+        + 2.0 * (floats(epochs, "odometer_rows_m") / span_s) ** 2  # one row at each end
+        + (floats(epochs, "scale_sigma") * speed_mps) ** 2
+        + (late_s * np.abs(change_mps) / span_s) ** 2
     )
-    unknown = epochs["odometer_reason"]
-    reasons = first_reason(
-        (~np.isfinite(velocity), NO_VELOCITY),
-        (unknown.is_not_null(), unknown),
-        (~epochs["fix_valid"], NO_POSITION),
-        (~np.isfinite(span), FIRST_EPOCH),
-    )
-    return verdicts(by_doppler - by_odometer, config.monitors.threshold_factor * np.sqrt(variance), reasons)
+    return np.sqrt(variance)
 
 
 def channel_monitor(

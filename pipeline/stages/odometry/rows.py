@@ -130,7 +130,11 @@ def _counts_on(moves: _Moves, back: int, t_s: Floats, distance_m: Floats, config
     """
     begin = int(moves.first[back])
     before_m = moves.way_m[back - 1]
-    for after in range(back + 1, min(back + 1 + config.reset_moves, moves.way_m.size)):
+    both_s = t_s[moves.last[back]] - t_s[moves.first[back - 1]]
+    # Where it undoes the move before, that was to a wrong row: none but the very next move shows a reset.
+    undone = abs(before_m + moves.way_m[back]) <= _turned_m(both_s, config)
+    reach = 1 if undone else config.reset_moves
+    for after in range(back + 1, min(back + 1 + reach, moves.way_m.size)):
         end = int(moves.last[after - 1])
         most_m = _turned_m(t_s[end] - t_s[begin], config)
         if moves.way_m[after] * before_m > 0.0 and abs(moves.way_m[after] - before_m) <= most_m:

@@ -44,6 +44,12 @@ class Arrangement(NamedTuple):
         turned: Floats = ordered * np.array([self.east, self.north])
         return turned
 
+    def correction(self, factor: float) -> str:
+        """The lines of configuration that undo this arrangement and scale all axes."""
+        axes = (self.east * factor, self.north * factor, factor)
+        changed = {name: value for name, value in zip(_COLUMNS, axes, strict=True) if value != 1.0}
+        return correction("gnss", changed, exchange=_COLUMNS[:2] if self.exchanged else None)
+
     @property
     def causes(self) -> tuple[Cause, ...]:
         signs = [name for name, sign in (("east", self.east), ("north", self.north)) if sign < 0]
@@ -76,6 +82,7 @@ def velocity_checks(of: Recording) -> list[Check]:
 
 
 def _horizontal(recorded: Floats, moved: Floats, of: Recording) -> Check:
+    """Axes and signs first, by the arrangement that leaves least; then the unit, by the ratio of the speeds."""
     speed = np.linalg.norm(moved, axis=1)
     ratio = float(np.median(np.linalg.norm(recorded, axis=1) / speed))
 
@@ -87,22 +94,25 @@ def _horizontal(recorded: Floats, moved: Floats, of: Recording) -> Check:
     best = min(_OTHERS, key=misses)
     off = misses(_AS_RECORDED)
     turned = off > _TURNED and misses(best) <= min(_EXPLAINED * off, _VELOCITY_SHARE)
+    elsewhere = f"they point elsewhere, by {off:.0%} of the speed"
     if off > _VELOCITY_SHARE and not turned:
-        return misfit(_WHAT, f"they point elsewhere, by {off:.0%} of the speed", MisfitCause.VELOCITY_FRAME)
+        return misfit(_WHAT, elsewhere, MisfitCause.VELOCITY_FRAME)
     if turned and off <= _VELOCITY_SHARE:
-        return Check(_WHAT, FitState.MISFIT, f"they point elsewhere, by {off:.0%} of the speed", best.causes)
-    arrangement = best if turned else _AS_RECORDED
+        return Check(_WHAT, FitState.MISFIT, elsewhere, best.causes)
+    return _magnitude(ratio, best if turned else _AS_RECORDED, of.config.scale_limit)
+
+
+def _magnitude(ratio: float, arrangement: Arrangement, limit: float) -> Check:
+    """The recorded speed over that of the positions: it fits, or a known unit explains it."""
     words = f"the recorded speed is {ratio:.4g} times that of the positions"
-    limit = of.config.scale_limit
     explained = explain_factor(ratio, True) if abs(ratio - 1.0) > limit else None
-    if explained is None and not turned:
+    if explained is None and arrangement == _AS_RECORDED:
         return fits(_WHAT, words) if abs(ratio - 1.0) <= 1.5 * limit else misfit(_WHAT, words)
-    factor = 1.0 if explained is None else 1.0 / explained[1]
-    factors = zip(_COLUMNS, (arrangement.east * factor, arrangement.north * factor, factor), strict=True)
-    exchange = (_COLUMNS[0], _COLUMNS[1]) if arrangement.exchanged else None
-    lines = correction("gnss", {name: value for name, value in factors if value != 1.0}, exchange=exchange)
-    causes = arrangement.causes if explained is None else (explained[0], *arrangement.causes)
-    return Check(_WHAT, FitState.IMPOSSIBLE, words, causes, lines)
+    if explained is None:
+        return Check(_WHAT, FitState.IMPOSSIBLE, words, arrangement.causes, arrangement.correction(1.0))
+    cause, unit = explained
+    causes = (cause, *arrangement.causes)
+    return Check(_WHAT, FitState.IMPOSSIBLE, words, causes, arrangement.correction(1.0 / unit))
 
 
 def _vertical(up_mps: Floats, begin_s: Floats, of: Recording) -> list[Check]:

@@ -94,14 +94,18 @@ class Watched:
         return Watched(**part)
 
     def since(self, start: int, end: int, fix_s: float = -np.inf) -> Watched:
-        """The rows from `start` to `end` for a fault that began after `fix_s`, an instant before the second of them."""
+        """The rows from `start` to `end` for a fault that began after `fix_s`, an instant before the second of them.
+
+        Of the first increment only the time after `fix_s` has a fault: |y - u| <= df / way with that share of df.
+        """
         window = self.between(start, end + 1)
         if window.rows < 2 or fix_s <= window.t_s[0]:
             return window
         fastest = window.fastest_m.copy()
         least = window.least_mps.copy()
         most = window.most_mps.copy()
-        fastest[1] *= (window.t_s[1] - fix_s) / (window.t_s[1] - window.t_s[0])
+        share_after_fix = (window.t_s[1] - fix_s) / (window.t_s[1] - window.t_s[0])
+        fastest[1] *= share_after_fix
         change_mps = fastest[1] / window.way_s[1]
         least[1] = max(least[1], window.rate_mps[1] - change_mps)
         most[1] = min(most[1], window.rate_mps[1] + change_mps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import math
 import zipfile
 from binascii import crc32
 from datetime import date
@@ -73,7 +74,10 @@ def test_novatel_binary_and_a_bag_of_the_same_driver():
     assert row["height_m"] == pytest.approx(height - 17.0)
     bag = convert([SAMPLES / "novatel_bestpos.bag"], "r")
     counts = dict(bag.run.gnss.group_by("solution").len().iter_rows())
-    assert counts == {"gps_fix": 12, "novatel_oem7_bestpos": 5}
+    assert counts == {"gps_fix": 12, "gps_gps": 12, "novatel_oem7_bestpos": 5}
+    fix = bag.run.gnss.filter(pl.col("solution") == "gps_gps").row(1, named=True)
+    assert (fix["latitude_deg"], fix["cov_ee_m2"], fix["satellites"]) == (51.15043782363468, 2.8443395919580894, 16)
+    assert fix["vel_n_mps"] == pytest.approx(0.007631993453452976 * math.cos(math.radians(16.69849344695877)))
     assert bag.run.gnss["latitude_deg"].to_numpy() == pytest.approx(latitude, abs=1e-4)
 
 

@@ -15,6 +15,8 @@ from mcap_ros2._dynamic import serialize_dynamic
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.describe import describe_log
 from pipeline.read.ingest.timescale import utc_from_gps
+from pipeline.show.export.messages import descriptor, message_class
+from pipeline.show.export.position_messages import LOCATION_FIELDS, LOCATION_FIX
 from pipeline.stages.clean.clean import clean
 from schemas.config import IngestConfig, settings_from
 from schemas.errors import ConfigError, InputError
@@ -129,6 +131,51 @@ def test_own_topics_without_own_schema(tmp_path):
     path = json_log(tmp_path, {"/gnss": [message], "/odometer": [{"t": 5, "distance_m": 3}]}, schema="whatever")
     assert (row(path)["t"], row(path)["latitude_deg"], row(path)["solution"]) == (5_000_000_007, 50.0, "x")
     assert read_run(path, IngestConfig()).odometer["distance_m"].to_list() == [3.0]
+
+
+def test_what_the_first_message_lacks_is_read_of_the_others(tmp_path):
+    place = {"latitude_deg": 50.0, "longitude_deg": 4.0, "fix": "sbas"}
+    full = {"t": {"sec": 6, "nsec": 0}, **place, "solution": "b", "hpl_m": 7.5, "satellites": 9}
+    path = json_log(tmp_path, {"/gnss": [{"t": {"sec": 5, "nsec": 0}, **place}, full]}, schema="balise.Gnss")
+    columns = ("t", "solution", "hpl_m", "satellites")
+    assert [row(path)[name] for name in columns] == [5_000_000_000, "primary", None, None]
+    assert [row(path, index=1)[name] for name in columns] == [6_000_000_000, "b", 7.5, 9]
+    path = json_log(tmp_path, {"/gnss": [{**place, "t": None}, full]}, schema="balise.Gnss")
+    with pytest.raises(InputError, match="column t: has missing values; found null in row 0"):  # not the log time
+        read_run(path, IngestConfig())
+
+
+def test_a_covariance_that_the_first_messages_lack(tmp_path):
+    kind = message_class(LOCATION_FIX, LOCATION_FIELDS)
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    schema = writer.register_schema(LOCATION_FIX, "protobuf", descriptor(LOCATION_FIX, LOCATION_FIELDS))
+    channel = writer.register_channel("/fix", "protobuf", schema)
+    for number, covariance in enumerate(([], [4.0], [float(place) for place in range(9)])):
+        message = kind(latitude=50.0, longitude=4.0, position_covariance=covariance, position_covariance_type=3)
+        message.timestamp.seconds = 5 + number
+        writer.add_message(channel, STAMP_NS + number, message.SerializeToString(), STAMP_NS)
+    writer.finish()
+    gnss = read_run(samples.save(tmp_path, stream.getvalue()), IngestConfig()).gnss
+    assert gnss["cov_ee_m2"].to_list() == [None, 4.0, 0.0]
+    assert gnss["cov_nu_m2"].to_list() == [None, None, 5.0]
+
+
+def test_elements_of_a_sequence_that_the_first_message_lacks(tmp_path):
+    definition = "float64 lat\nfloat64 lon\nfloat64[] sigma\nfloat64[2] rest\n"
+    messages = [{"lat": 50.5, "lon": 4.5, "sigma": sigma, "rest": [1.0, 2.0]} for sigma in ([], [0.1, 0.2])]
+    path = ros_log(tmp_path, ("/acme", "acme/msg/Fix", definition, messages))
+    fields = {"latitude_deg": "lat", "longitude_deg": "lon"}
+    mapped = config(gnss={"topic": "/acme", "fields": fields | {"hpl_m": "sigma[1]", "vpl_m": "rest[0]"}})
+    assert [(row(path, mapped, index)["hpl_m"], row(path, mapped, index)["vpl_m"]) for index in (0, 1)] == [
+        (None, 1.0),
+        (0.2, 1.0),
+    ]
+    for absent in ("sigma", "sigma[1].x", "rest", "rest[2]", "lat[0]"):
+        wrong = config(gnss={"topic": "/acme", "fields": fields | {"hpl_m": absent}})
+        with pytest.raises(InputError, match="has no field"):
+            read_run(path, wrong)
 
 
 def test_mistakes_in_the_configuration(tmp_path):

@@ -86,7 +86,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (
             "runs/good.html",
             "safe",
-            "every acceptance right, every position failure within the time allowed; no fault was met.",
+            "every acceptance right, every position failure within the time allowed; no fault occurred.",
         ),
         ("runs/bad.html", "unsafe", "VB_JUMP_1B: VB2 accepted 500.0 m early; no monitor saw it."),
         ("runs/lost.html", "failed", "gnss.parquet: column t: not in order."),

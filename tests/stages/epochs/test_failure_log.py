@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
 import pytest
 
 from pipeline.stages.epochs.clock import share_of_time
-from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog
+from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog, failure_log
+from schemas.arrays import NS_PER_S
 
 ALARMS = (AlarmEpisode(1, 2, 10, 20, ("raw", "slow"), 2.0), AlarmEpisode(4, 4, 40, 40, ("fast",), 1.5))
 LOG = FailureLog(
@@ -54,3 +56,25 @@ def test_shares_of_less_than_a_second_and_of_no_time() -> None:
     where = np.array([True, False])
     assert share_of_time(np.array([0.1, 0.3]), where) == pytest.approx(0.25)
     assert share_of_time(np.zeros(2), where) is None
+
+
+def test_fails_less_than_the_recovery_time_apart_are_one_alarm() -> None:
+    """Fails at 1 s, 2 s and 31 s, one alarm; at 61 s, 30 s later, and 62 s another: 1.5 and 3 times the threshold."""
+    t_s = [0, 1, 2, 31, 40, 61, 62, 70]
+    failing = [False, True, True, True, False, True, True, False]
+    epochs = pl.DataFrame(
+        {
+            "t": pl.Series(t_s, dtype=pl.Int64) * NS_PER_S,
+            "negated": [False] * 8,
+            "along_raw_state": ["fail" if fails else "pass" for fails in failing],
+            "along_raw_value": [0.0, 2.0, -3.0, 2.0, 1.0, 2.0, 6.0, 9.0],
+            "along_raw_threshold": [2.0] * 8,
+        }
+    ).with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
+    log = failure_log(epochs, recovery_s=30.0)
+    assert log.failing.tolist() == [1, 2, 3, 5, 6]
+    assert log.first_monitor == ("along_raw",) * 5
+    assert log.alarms == (
+        AlarmEpisode(1, 3, NS_PER_S, 31 * NS_PER_S, ("along_raw",), 1.5),
+        AlarmEpisode(5, 6, 61 * NS_PER_S, 62 * NS_PER_S, ("along_raw",), 3.0),
+    )

@@ -210,6 +210,14 @@ def test_two_wrong_rows_are_no_resets() -> None:
     assert odometry_from(odometer_of(np.arange(12.0), distance_m=reads)).leaps_ns == ()
 
 
+def test_a_wrong_row_at_a_stand_is_no_reset() -> None:
+    """41 m too far at 3 s; moves of some metres from 11 s on are like that of 41 m, but for as long a time."""
+    reads = [0.0, 0.0, 0.0, 41.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 3.0, 5.0, 9.0, 13.0, 19.0]
+    odometry = odometry_from(odometer_of(np.arange(17.0), distance_m=reads))
+    assert odometry.leaps_ns == ()
+    assert odometry.segment.tolist() == [0] * 17
+
+
 def test_a_bridged_reset_has_its_own_noise() -> None:
     """At 1 Hz: 1.8 / 4 + 1.8 x 1.5 / 2 = 1.8 m at most, 0.6 m one sigma, beside 0.05 m a second."""
     t = np.arange(20.0)

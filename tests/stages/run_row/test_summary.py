@@ -108,8 +108,8 @@ def test_what_the_evidence_cannot_see_is_said() -> None:
     assert (found["vehicle"], found["odometer_contradicted"]) == ("learned", 2)
     assert "never that it was right" in found["notes"]
     assert found["remedies"] == ["vehicle_file", "reference"]
-    assert "`balise convert REFERENCE --out RUN --stream reference`" in found["notes"]
-    assert "does not fit 2 gaps" in found["notes"]
+    assert "`balise convert --stream reference`" in found["notes"]
+    assert "disagrees with 2 distances" in found["notes"]
     assert "no odometer scale in a vehicle file" in found["notes"]
 
 

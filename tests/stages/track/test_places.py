@@ -42,6 +42,18 @@ def test_ends_are_those_of_each_element() -> None:
     assert end_places(track)[:, 1] == pytest.approx(track.surface[[2, 4]])
 
 
+@pytest.mark.parametrize(
+    ("name", "measure_m", "element"),
+    [("a", 0.0, 0), ("b", 30.0, 1), ("b", 40.0, 1), ("b", 42.0, None), ("b", -2.0, None), ("c", 1.0, None)],
+)
+def test_an_element_is_found_by_its_name_if_it_holds_the_measure(
+    name: str, measure_m: float, element: int | None
+) -> None:
+    """a has 100 m, b 40 m; c is not there."""
+    track = track_of(site({"a": line((0.0, 0.0), (100.0, 0.0)), "b": line((0.0, 9.0), (40.0, 9.0))}).track)
+    assert track.element_at(name, measure_m) == element
+
+
 def test_pieces_of_an_element_follow_each_other_both_ways() -> None:
     """a, then b that turns back on itself and so comes in two pieces: 2 and 3, 4 and 5; c follows the second."""
     bend = np.array([[100.0, 0.0], [200.0, 0.0], [200.0, 50.0], [100.0, 50.0], [100.0, 100.0]])

@@ -164,7 +164,7 @@ def test_one_journey_counts_once() -> None:
     kept, said = distinct(runs)
     assert kept["run_id"].to_list() == ["b", "c"]
     assert [text.partition(" runs ")[0] for text in said] == ["1", "1"]
-    assert "begin and end with another one" in said[0]
+    assert "begin and end together with another run" in said[0]
     assert "overlap in time" in said[1]
     once, said = distinct(kept.filter(pl.col("run_id") != "c"))
     assert (once["run_id"].to_list(), said) == (["b"], [])
