@@ -89,6 +89,16 @@ def test_stamps_that_scatter_weigh_with_the_speed(seed):
     assert found.still_m2 < 0.1**2
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_speeds_near_each_other_show_the_noise_of_stamps_too(seed):
+    """10 and 21 m/s: the sum of their squares for the difference would make 20 ms 16 ms."""
+    true_s = np.arange(0.0, 500.0, 0.05)
+    distance_m = np.where(true_s < 250.0, 10.0 * true_s, 2500.0 + 21.0 * (true_s - 250.0))
+    stamps = true_s + np.random.default_rng(seed).uniform(-0.02, 0.02, true_s.size)
+    found = noise_of(stamps, distance_m)
+    assert np.sqrt(found.moving_s2) == pytest.approx(0.04 / np.sqrt(12.0), rel=0.1)
+
+
 def test_noise_of_the_reading_and_of_the_stamps_are_told_apart():
     """0.3 m whatever the speed, and 20 ms: 0.2 m at 10 m/s, 0.6 m at 30 m/s."""
     t = np.arange(0.0, 500.0, 0.05)
