@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import multiprocessing
 import os
@@ -34,10 +35,12 @@ class MemoryKiller:
 
     def look(self, under_way: Sequence[tuple[str, float]]) -> None:
         for worker in multiprocessing.active_children():
-            status = Path(f"/proc/{worker.pid}/status").read_text(encoding="ascii")
-            resident = status.partition("VmRSS:")[2].split()
-            if worker.pid is not None and resident and int(resident[0]) / 1024 > _LARGE_MB:
-                os.kill(worker.pid, signal.SIGKILL)
+            # A worker may end between the list and the look at it.
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+                status = Path(f"/proc/{worker.pid}/status").read_text(encoding="ascii")
+                resident = status.partition("VmRSS:")[2].split()
+                if worker.pid is not None and resident and int(resident[0]) / 1024 > _LARGE_MB:
+                    os.kill(worker.pid, signal.SIGKILL)
 
     def lost(self, run_id: str, attempt: int) -> None: ...
 
