@@ -88,7 +88,8 @@ def _here(value: Any) -> Any:
     return value
 
 
-_place, _file = partial(Argument, callback=_here), partial(Option, callback=_here)
+_place = partial(Argument, callback=_here)
+_file = partial(Option, callback=_here)
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
 _LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; archives of these."
 

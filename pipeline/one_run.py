@@ -67,7 +67,7 @@ def ride_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration,
 def _compared_with(prepared: PreparedRun) -> Matches:
     """The match of the solution that the channel monitor compares with, the only one that is kept over all solutions.
 
-    None where that solution does not fit the run or lies on no track: then it has a failed row of its own.
+    Empty where that solution does not fit the run or lies on no track: then it has a failed row of its own.
     """
     channel = prepared.config.monitors.channel_reference
     if channel not in prepared.run.solutions():

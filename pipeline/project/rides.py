@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from pipeline.make.receivers.unpack import is_packed
 from pipeline.project.looking import SeenLog
 
 # Recorders begin a new file every hour or every so many megabytes, and lose a few seconds between two at most.
 _NEXT_FILE_S = 60.0
-# Packed logs are named as what is in them.
-_PACKED = (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz")
 
 
 @dataclass
@@ -78,8 +77,8 @@ def _tested(ride: Ride) -> list[SeenLog]:
 
 
 def stem_of(path: Path) -> str:
-    """The name of a log without its suffixes of packing and of kind."""
-    while path.suffix.lower() in _PACKED and path.stem:
+    """The name of a log without its suffixes of packing and of kind: packed logs are named as what is in them."""
+    while is_packed(path) and path.stem:
         path = path.with_suffix("")
     return path.name if path.is_dir() else path.stem
 

@@ -30,7 +30,7 @@ def unpacked(log: Path, config: IngestConfig) -> Iterator[list[Path]]:
 
     A folder is one log (a bag of ROS 2), in an archive as well. Errors name the archive, not where it was unpacked.
     """
-    if not _is_packed(log):
+    if not is_packed(log):
         yield [log]
         return
     with TemporaryDirectory() as folder:
@@ -54,7 +54,7 @@ def _all_logs(log: Path, place: Path, budget: Budget) -> list[Path]:
         ) from None
 
 
-def _is_packed(path: Path) -> bool:
+def is_packed(path: Path) -> bool:
     return path.suffix.lower() in _UNPACKERS
 
 
@@ -125,7 +125,7 @@ def _logs(path: Path, deeper: int, budget: Budget) -> Iterator[Path]:
     """The logs at a place of an archive; what the makers of archives leave in them is none."""
     if path.name.startswith((".", "__MACOSX")):
         return
-    if _is_packed(path) and path.is_file():
+    if is_packed(path) and path.is_file():
         if not deeper:
             raise OSError(f"{path.name} is packed too often")
         inner = path.with_name(path.name + ".unpacked")

@@ -1,0 +1,24 @@
+"""What the judge hands on has the columns that `schemas.stages` names."""
+
+from __future__ import annotations
+
+from pipeline.one_run import ride_alone
+from pipeline.stages.judge.case import Case
+from pipeline.stages.judge.judge import judge
+from schemas.config import Configuration
+from schemas.conform import dtypes
+from schemas.stages import JudgedEpochs, JudgedOffers
+from tests.replay.journeys import VEHICLE, journey
+
+
+def test_judged_epochs_and_offers_have_their_columns() -> None:
+    """Epochs keep the columns of the stages before the judge too."""
+    run, site = journey()
+    ride = ride_alone(run, site, VEHICLE, Configuration(), "primary")
+    prepared = ride.prepared
+    case = Case(ride.solution, prepared.evidence(), ride.odometry, prepared.vehicle, prepared.config, run.reference)
+    judged = judge(case)
+    expected = dtypes(JudgedEpochs)
+    assert dict(judged.epochs.select(list(expected)).schema) == expected
+    assert judged.offers.height > 0
+    assert dict(judged.offers.schema) == dtypes(JudgedOffers)
