@@ -521,6 +521,8 @@ class UndetectedConfig(Settings):
     spacing_step_s: Positive = 60.0
     # ... and at more of them until it is known to this share: never too large, by so much too small at most.
     spacing_close_share: Annotated[Number, Field(gt=0, lt=1)] = 0.1
+    # ... but at none nearer than this: no line has physical balises so close, and each epoch takes milliseconds.
+    spacing_resolution_s: NonNegative = 10.0
     # A test of the position itself is looked back at over so long: until then the bank has learned as much.
     look_back_s: Positive = 60.0
     # A monitor holds a bound if it pays for this share of it at least.

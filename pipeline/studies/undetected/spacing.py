@@ -17,7 +17,7 @@ from pipeline.studies.undetected.splits import growth_with, splits_of
 from pipeline.studies.undetected.stretch import stretch_after
 from pipeline.studies.undetected.watched import Watched
 from schemas.arrays import Floats
-from schemas.config import Configuration
+from schemas.config import Configuration, UndetectedConfig
 
 
 def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tuple[Spacing, Floats]:
@@ -33,31 +33,54 @@ def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tupl
     errors = partial(largest_errors, config=config.undetected, grow=grow, after=splits_after(rows, config.undetected))
     search = partial(_first_beyond, both, errors=errors, limit_m=config.hazards.failure_limit_m, ahead_s=step_s)
     starts = np.unique(np.searchsorted(rows.t_s, np.arange(rows.t_s[0], rows.t_s[-1], step_s))).tolist()
-    first_beyond = {start: search(start) for start in starts if start + 1 < rows.rows}
-    close = 1.0 - config.undetected.spacing_close_share
-    ways, times = (_shortest(first_beyond, place, close, search) for place in (way_m, rows.t_s))
+    first_beyond = _first_rows_beyond([start for start in starts if start + 1 < rows.rows], rows.rows, search)
+    shortest = partial(_shortest, first_beyond, rows.t_s, config=config.undetected, search=search)
+    ways, times = (shortest(place) for place in (way_m, rows.t_s))
     reached = sum(row < rows.rows for row in first_beyond.values())
     return Spacing(ways, times, len(first_beyond), reached), _before(first_beyond, way_m)
 
 
-def _shortest(first_beyond: dict[int, int], place: Floats, close: float, search: Callable[[int], int]) -> float | None:
-    """The shortest way (or time) from any row to the last one within the limit; `found`: first row beyond, by start.
+def _first_rows_beyond(starts: list[int], rows: int, search: Callable[[int], int]) -> dict[int, int]:
+    """By start; where the run does not reach the limit from one, it does so from no later one."""
+    found: dict[int, int] = {}
+    reached = True
+    for start in starts:
+        found[start] = search(start) if reached else rows
+        reached = found[start] < rows
+    return found
+
+
+def _shortest(
+    first_beyond: dict[int, int], t_s: Floats, place: Floats, config: UndetectedConfig, search: Callable[[int], int]
+) -> float | None:
+    """The shortest way (or time) from any row to the last one within the limit; `first_beyond`: first row beyond.
 
     From between two starts it is no shorter than from the second one to where the first reaches the limit. More starts
-    are tried until the two agree to the share `close`.
+    are tried until the two agree to `spacing_close_share`, or lie within `spacing_resolution_s`; where the limit is
+    reached as soon as that, it is 0.
     """
+    close = 1.0 - config.spacing_close_share
     while True:
         starts = sorted(first_beyond)
-        if any(row < place.size and place[row - 1] <= place[start] for start, row in first_beyond.items()):
+        if any(_at_once(start, first_beyond[start], t_s, place, config) for start in starts):
             return 0.0
         pairs = zip(starts, [*starts[1:], place.size - 1], strict=True)
         sure = [(float(place[first_beyond[before] - 1] - place[after]), before, after) for before, after in pairs]
         least, before, after = min((item for item in sure if first_beyond[item[1]] < place.size), default=(None, 0, 0))
         if least is None:
             return None
-        if after <= before + 1 or least >= close * (place[first_beyond[before] - 1] - place[before]):
+        near = after <= before + 1 or t_s[after] - t_s[before] <= config.spacing_resolution_s
+        if near or least >= close * (place[first_beyond[before] - 1] - place[before]):
             return max(least, 0.0)
         first_beyond[(before + after) // 2] = search((before + after) // 2)
+
+
+def _at_once(start: int, beyond: int, t_s: Floats, place: Floats, config: UndetectedConfig) -> bool:
+    """Whether the limit is reached too soon after a start, or too near, for any spacing to be given."""
+    if beyond == place.size:
+        return False
+    last = beyond - 1
+    return bool(place[last] <= place[start] or t_s[last] - t_s[start] <= config.spacing_resolution_s)
 
 
 def _before(first_beyond: dict[int, int], way_m: Floats) -> Floats:

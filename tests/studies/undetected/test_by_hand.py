@@ -21,9 +21,10 @@ from tests.studies.undetected.test_errors import constant
 WAY_M = 30.0 * np.arange(10)
 
 
-def settings(limit_m: float) -> Configuration:
+def settings(limit_m: float, resolution_s: float = 0.0) -> Configuration:
     limits = {"failure_limit_m": limit_m, "jump_limit_m": limit_m}
-    return Configuration.model_validate({"hazards": limits, "undetected": {"spacing_step_s": 3.0}})
+    undetected = {"spacing_step_s": 3.0, "spacing_resolution_s": resolution_s}
+    return Configuration.model_validate({"hazards": limits, "undetected": undetected})
 
 
 @pytest.mark.parametrize(
@@ -33,7 +34,8 @@ def settings(limit_m: float) -> Configuration:
         (0.4, 0.0, 3),
         # Within the limit for three rows, 90 m; a balise just before the next row has 30 m less.
         (0.525, 60.0, None),
-        (0.7, None, 3),
+        # What the first start keeps to the end, the later ones keep too.
+        (0.7, None, 1),
     ],
 )
 def test_balises_may_be_as_far_apart_as_the_error_stays_within_the_limit(
@@ -51,6 +53,22 @@ def test_balises_may_be_as_far_apart_as_the_error_stays_within_the_limit(
     assert found.way_m == (None if spacing_m is None else pytest.approx(spacing_m))
     # 0 m cannot become less: only the first starts are tried.
     assert starts is None or len(searched) == starts
+
+
+@pytest.mark.parametrize(
+    ("resolution_s", "spacing_m"),
+    [
+        # Every start keeps three rows: a balise before each row has 60 m.
+        (0.9, 60.0),
+        # Starts two rows apart are near enough: from the second to where the first reaches the limit is one row.
+        (2.0, 30.0),
+        # The limit is reached within the resolution itself.
+        (3.0, 0.0),
+    ],
+)
+def test_starts_lie_no_nearer_than_the_resolution(resolution_s: float, spacing_m: float) -> None:
+    found, _ = largest_spacing(watched(constant(10, 0.01, 0.02)), WAY_M, settings(0.525, resolution_s))
+    assert found.way_m == pytest.approx(spacing_m)
 
 
 def test_relinks_bound_the_fault_by_what_they_measured() -> None:

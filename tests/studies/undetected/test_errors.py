@@ -131,7 +131,7 @@ def test_starts_that_were_not_tried_leave_no_shorter_spacing() -> None:
     limit_m, way_m = 8.0, 10.0 * seen.t_s
     settings = {
         "hazards": {"failure_limit_m": limit_m, "jump_limit_m": limit_m},
-        "undetected": {"spacing_step_s": 50.0},
+        "undetected": {"spacing_step_s": 50.0, "spacing_resolution_s": 0.0},
     }
     found, before_m = largest_spacing(seen, way_m, Configuration.model_validate(settings))
     ways, grow = [], partial(growth_with, splits=splits_anywhere(seen))
