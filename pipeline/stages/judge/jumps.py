@@ -36,7 +36,7 @@ def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: int, co
     at_ns = times_ns(positions, "at")
     counted_m = np.full(max(at_ns.size - 1, 0), np.nan)
     if odometry is not None:
-        counted_m = odometry.distance_between(at_ns[:-1], at_ns[1:])
+        counted_m = odometry.steps_m(at_ns)
     places = floats(positions, "path_m"), floats(positions, "reference_m")
     steps = steps_of(times_ns(positions), *places, counted_m, gap_ns)
     return find_jumps(steps, ints(positions["direction"]), config)

@@ -33,7 +33,7 @@ def odometer_steps(case: Case) -> OdometerSteps:
     if odometry is None:
         return OdometerSteps(*np.zeros((2, at_ns.size), dtype=np.bool_))
     moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
-    counts = _to_the_next(np.isfinite(odometry.distance_between(at_ns[:-1], at_ns[1:])), at_ns.size)
+    counts = _to_the_next(np.isfinite(odometry.steps_m(at_ns)), at_ns.size)
     path_m = floats(case.solution.epochs, "path_m")
     stood: list[Span] = []
     for first, last in spans_of(counts & ~moves):

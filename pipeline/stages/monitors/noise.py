@@ -196,6 +196,11 @@ class _Sampler:
         self._piece = np.cumsum(series.fresh | unknown)  # the same number for rows joined by increments
         self._offset_m = np.cumsum(np.where(series.border | unknown, 0.0, series.rate_mps) * series.dt_s)
         self._white_m2 = np.cumsum(series.white_m2)
+        # Of sources with a correlation of their own: sum of dt / tau.
+        self._ages = [
+            (source, -np.cumsum(np.log1p(-np.minimum(series.decorrelation[:, source], 1.0 - 1e-12))))
+            for source in range(error_model(config)[1].size, series.sigma_m.shape[1])
+        ]
         self._lasting_m = [np.cumsum(rate_mps * series.dt_s) for rate_mps in series.lasting_mps.T if rate_mps.any()]
 
     def over(self, lag_s: float) -> _SecondDifferences:
@@ -241,8 +246,7 @@ class _Sampler:
         """
         series = self._series
         model_m2 = _smooth_m2(series, rows.last, lag_s, self._config)
-        for source in range(error_model(self._config)[1].size, series.sigma_m.shape[1]):
-            age = -np.cumsum(np.log1p(-np.minimum(series.decorrelation[:, source], 1.0 - 1e-12)))  # sum of dt / tau
+        for source, age in self._ages:
             later = np.exp(age[rows.middle] - age[rows.last])
             earlier = np.exp(age[rows.oldest] - age[rows.middle])
             variance_m2 = series.sigma_m[rows.last, source] ** 2
@@ -268,7 +272,7 @@ def _stated_m2(series: AxisSeries, row: Ints, config: MonitorConfig) -> Floats:
 
 def _model_at_m2(series: AxisSeries, row: Ints, lag_s: float, config: MonitorConfig) -> Floats:
     """Of second differences: smooth errors, and the odometer's walk [m^2]."""
-    return _smooth_m2(series, row, lag_s, config) + 2.0 * lag_s * (series.white_m2 / series.dt_s)[row]
+    return _smooth_m2(series, row, lag_s, config) + 2.0 * lag_s * (series.white_m2[row] / series.dt_s[row])
 
 
 def _smooth_m2(series: AxisSeries, row: Ints, lag_s: float, config: MonitorConfig) -> Floats:

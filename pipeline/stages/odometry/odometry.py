@@ -96,9 +96,7 @@ class Odometry:
 
     def slips_at_s(self, t_s: Floats) -> Bools:
         """By the sample before or after."""
-        before, after = self._around(t_s)
-        slips: Bools = self.slip[before] | self.slip[after]
-        return slips
+        return self._slips_between(*self._around(t_s))
 
     def counter_at_s(self, t_s: Floats) -> Ints:
         counter: Ints = self.counter[self._sample_at(t_s)]
@@ -142,6 +140,12 @@ class Odometry:
         """The distance of `between` [m]."""
         return np.asarray((self.scale or 1.0) * self._recorded_between(begin_ns, end_ns))
 
+    def steps_m(self, t_ns: Ints) -> Floats:
+        """The distance of `between` from each instant to the next [m], shape (n - 1,)."""
+        segment = self.segment_at(t_ns)
+        step_m = np.diff(self.distance_at(t_ns))
+        return np.asarray((self.scale or 1.0) * np.where(segment[:-1] == segment[1:], step_m, np.nan))
+
     def _recorded_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
         same = self.segment_at(begin_ns) == self.segment_at(end_ns)
@@ -179,7 +183,7 @@ class Odometry:
         before, after = self._around(t_s)
         paused = (before != after) & self.pause[np.minimum(before, self.pause.size - 1)]
         inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
-        known: Bools = inside & ~paused & ~self.slips_at_s(t_s)
+        known: Bools = inside & ~paused & ~self._slips_between(before, after)
         return known
 
     def segment_at_s(self, t_s: Floats) -> Ints:
@@ -216,6 +220,10 @@ class Odometry:
     def _sample_at(self, t_s: Floats) -> Ints:
         index: Ints = np.searchsorted(self.t_s, t_s, side="right") - 1
         return index.clip(0, self.t_s.size - 1)
+
+    def _slips_between(self, before: Ints, after: Ints) -> Bools:
+        slips: Bools = self.slip[before] | self.slip[after]
+        return slips
 
     def _around(self, t_s: Floats) -> tuple[Ints, Ints]:
         after = np.searchsorted(self.t_s, t_s, side="left").clip(0, self.t_s.size - 1)
