@@ -13,6 +13,7 @@ from datasets.motion import Motion
 from datasets.scenario import OdometerSpec
 from schemas.arrays import Floats
 from schemas.conform import conform
+from schemas.enums import Origin
 from schemas.inputs import Odometer
 
 
@@ -67,5 +68,6 @@ def _table(spec: OdometerSpec, t_ns: npt.NDArray[np.int64], distance_m: Floats, 
         speed_mps=pl.Series(spec.polarity * speed_mps) if spec.speed else nothing,
         sigma_speed_mps=pl.lit(spec.speed_sigma_mps) if spec.speed else nothing,
         slip=pl.lit(None, pl.Boolean),
+        origin=pl.lit(Origin.WHEEL.value, pl.Enum(Origin)),
     )
     return conform(table, Odometer)

@@ -135,6 +135,8 @@ def _results(
         "duplicates": counts.duplicates,
         "out_of_order": counts.out_of_order,
         "odometer_contradicted": evidence.contradicted,
+        "odometer_origin": None,
+        "odometer_follows": None,
         "ambiguous_stretches": ride.match.ambiguous.height,
         **ride.at_the_end(),
         **ride.bank.white_noise(),

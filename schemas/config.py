@@ -14,7 +14,7 @@ import tomli_w
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from schemas.breaches import told
-from schemas.enums import Fix
+from schemas.enums import Fix, Origin
 from schemas.errors import BaliseError, ConfigError, listed
 from schemas.tables import MONITORS
 
@@ -47,6 +47,7 @@ class StreamMapping(Settings):
     factors: dict[str, float] = {}
     constants: dict[str, str | float | bool] = {}
     fix_codes: dict[str, Fix] = {}
+    origin: Origin | None = None
     time: str = Field(default="auto", pattern=r"^(auto|log|publish|field:.+)$")
     time_scale: Literal["utc", "gps"] = "utc"
     time_epoch: Literal["unix", "gps", "excel"] = "unix"
@@ -506,6 +507,16 @@ class HazardConfig(Settings):
     service_level: str = "lpv200"
 
 
+class EvidenceConfig(Settings):
+    """What the evidence may take for granted (DOMAIN section 5.0)."""
+
+    # The survey holds every track that the train may have used: no position can tell, somebody has to say so.
+    survey_complete: bool = False
+    # Axes of neighbouring tracks lie 3.5 m apart and more on old lines (4.0 m on new ones), less a survey's rounding;
+    # many trams run closer: smaller there.
+    track_spacing_m: Positive = 3.4
+
+
 class UndetectedConfig(Settings):
     """The largest error that no monitor would have noticed (DOMAIN section 5.6)."""
 
@@ -670,6 +681,7 @@ class Configuration(Settings):
     lds: LdsConfig = LdsConfig()
     hazards: HazardConfig = HazardConfig()
     safety: SafetyConfig = SafetyConfig()
+    evidence: EvidenceConfig = EvidenceConfig()
     undetected: UndetectedConfig = UndetectedConfig()
     site: SiteConfig = SiteConfig()
     survey: SurveyConfig = SurveyConfig()
@@ -708,6 +720,11 @@ class Vehicle(Settings):
     odometer_scale_sigma: Annotated[Number, Field(ge=0, lt=1)] | None = None
     gnss_latency_s: Annotated[Number, Field(ge=-10, le=10)] | None = None
     gnss_latency_sigma_s: Annotated[Number, Field(ge=0, le=10)] | None = None
+    # Of odometers whose stream does not say it (DOMAIN section 5.0).
+    odometer_origin: Origin | None = None
+    # Declared lags of these recorders: their stamps are so much later than what they stamp.
+    reference_latency_s: Annotated[Number, Field(ge=-60, le=60)] = 0.0
+    reads_latency_s: Annotated[Number, Field(ge=-60, le=60)] = 0.0
 
 
 S = TypeVar("S", bound=Settings)

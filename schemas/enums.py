@@ -15,6 +15,22 @@ class Fix(StrEnum):
     ESTIMATED = "estimated"
 
 
+class Origin(StrEnum):
+    """Where the figures of an odometer come from (DOMAIN section 5.0). Declared, never guessed."""
+
+    WHEEL = "wheel"
+    RADAR = "radar"
+    INERTIAL = "inertial"
+    GNSS = "gnss"
+    FUSED = "fused"
+    UNKNOWN = "unknown"
+
+    @property
+    def independent(self) -> bool:
+        """Free of the GNSS by its declaration; one that follows the positions all the same is found by the replay."""
+        return self in (Origin.WHEEL, Origin.RADAR, Origin.INERTIAL)
+
+
 class Navigability(StrEnum):
     AB = "AB"
     BA = "BA"
@@ -116,6 +132,11 @@ class Reason(StrEnum):
     NOT_DIAGNOSED = "not_diagnosed"
     NOTHING_ACCEPTED = "nothing_accepted"
     EVIDENCE_DISPUTED = "evidence_disputed"
+    EVIDENCE_CONTRADICTED = "evidence_contradicted"
+    ODOMETER_ORIGIN_UNKNOWN = "odometer_origin_unknown"
+    ODOMETER_FOLLOWS_GNSS = "odometer_follows_gnss"
+    TRACK_ASSUMED = "track_assumed"
+    SIGMA_DOUBTFUL = "sigma_doubtful"
     INPUT_DOUBTFUL = "input_doubtful"
     CLOCK_ASSUMED = "clock_assumed"
 
@@ -131,8 +152,11 @@ class Remedy(StrEnum):
     ROUTE = "route"
     CLOCK = "clock"
     ODOMETER = "odometer"
+    ODOMETER_ORIGIN = "odometer_origin"
     FASTER_LOG = "faster_log"
     SURVEY_SIGMA = "survey_sigma"
+    REFERENCE_SIGMA = "reference_sigma"
+    SURVEY_COMPLETE = "survey_complete"
 
 
 class LostTo(StrEnum):

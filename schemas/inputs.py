@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataframely as dy
 
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import AreaType, BaliseDirection, BaliseKind, Fix, Navigability, Reaction
+from schemas.enums import AreaType, BaliseDirection, BaliseKind, Fix, Navigability, Origin, Reaction
 from schemas.run import Stream
 
 
@@ -43,6 +43,7 @@ class Odometer(dy.Schema):
     speed_mps = real("m/s", "signed speed")
     sigma_speed_mps = real("m/s", "standard deviation of the speed", min=0)
     slip = flag("the odometer reports slip or slide", nullable=True)
+    origin = one_of(Origin, "where its figures come from, as declared; null: unknown", nullable=True)
 
     @dy.rule()
     def distance_or_speed(cls):  # type: ignore[no-untyped-def]  # noqa: N805

@@ -21,6 +21,7 @@ from schemas.enums import (
     LostTo,
     MisfitCause,
     MonitorState,
+    Origin,
     PassageStatus,
     Reaction,
     Reason,
@@ -282,6 +283,10 @@ class Runs(dy.Schema):
     status = one_of(RunStatus, "ok, partial (damaged input read up to the damage) or failed")
     error = text("what went wrong", nullable=True)
     vehicle = one_of(VehicleFigures, "where odometer scale and latency come from", nullable=True)
+    odometer_origin = one_of(Origin, "where the odometer of the LDS comes from, as declared", nullable=True)
+    odometer_follows = real(
+        "1", "how closely the odometer follows the positions (V): below the limit it is made of them; null: not tested"
+    )
     share_unknown = real("1", "share of moving time in use that could not be checked", min=0, max=1)
     odometer_contradicted = count("gaps between anchors that the odometer does not close (with a vehicle file)")
     t_start = instant("first epoch", nullable=True)

@@ -74,8 +74,11 @@ def remedies(
         Remedy.ROUTE: costs(LostTo.TRACK_AMBIGUOUS),
         Remedy.CLOCK: bool(reasons & {Reason.CLOCK_ASSUMED, Reason.EVIDENCE_DISPUTED}),
         Remedy.ODOMETER: run["vehicle"] == VehicleFigures.NONE or costs(LostTo.NO_ODOMETER),
+        Remedy.ODOMETER_ORIGIN: bool(reasons & {Reason.ODOMETER_ORIGIN_UNKNOWN}),
         Remedy.FASTER_LOG: _too_slow(run, config),
         Remedy.SURVEY_SIGMA: costs(LostTo.TRACK_AMBIGUOUS) and not survey_stated,
+        Remedy.REFERENCE_SIGMA: False,
+        Remedy.SURVEY_COMPLETE: Reason.TRACK_ASSUMED in reasons,
     }
     return [remedy for remedy in Remedy if table[remedy]]
 

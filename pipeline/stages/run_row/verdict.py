@@ -15,7 +15,16 @@ Failure = tuple[float, float, str]
 """Hazardous time [s], the same with what is unknown, and the worst judgement of the VBs accepted meanwhile."""
 
 _UNSAFE = {Reason.ACCEPTED_WRONG, Reason.FAILURE_BEYOND_BUDGET, Reason.HAZARDOUS_SUM}
-_LASTING = (Reason.EVIDENCE_DISPUTED, Reason.INPUT_DOUBTFUL, Reason.CLOCK_ASSUMED)
+_LASTING = (
+    Reason.EVIDENCE_DISPUTED,
+    Reason.EVIDENCE_CONTRADICTED,
+    Reason.ODOMETER_ORIGIN_UNKNOWN,
+    Reason.ODOMETER_FOLLOWS_GNSS,
+    Reason.TRACK_ASSUMED,
+    Reason.SIGMA_DOUBTFUL,
+    Reason.INPUT_DOUBTFUL,
+    Reason.CLOCK_ASSUMED,
+)
 """Reasons that no count of a `runs` row holds: they stand among its `reasons` from the beginning."""
 
 DECISIVE = (
