@@ -41,7 +41,24 @@ def mapped_recipe(base: Recipe | None, fields: Mapping[str, str], stream: Stream
         types[paths["fix"]], columns["fix"] = _coded(fields.get(paths["fix"]), paths["fix"], mapping)
     columns |= {name: _constant(stream, mapping, name, contract[name]) for name in mapping.constants}
     columns |= {name: columns[name] * factor for name, factor in mapping.factors.items() if name in columns}
+    if mapping.origin is not None:
+        columns["origin"] = _origin(stream, mapping, columns.get("origin"), fields)
     return replace(base, columns=columns, types=types)
+
+
+def _origin(stream: Stream, mapping: StreamMapping, recorded: pl.Expr | None, fields: Mapping[str, str]) -> pl.Expr:
+    """Where an odometer comes from: what its rows say, else what the mapping declares (DOMAIN section 5.0)."""
+    if stream != "odometer":
+        raise ConfigError(
+            "declares an origin, which only an odometer has",
+            place=f"[ingest.{stream}] topic {mapping.topic}",
+            found=f'origin = "{mapping.origin}"',
+            remedy="Leave the line out, or write it under [ingest.odometer].",
+        )
+    declared = pl.lit(mapping.origin.value, dtype=pl.String)
+    if recorded is None or not set(recorded.meta.root_names()) <= set(fields):
+        return declared
+    return pl.coalesce(recorded.cast(pl.String), declared)
 
 
 def _refuse_unknown_columns(stream: Stream, mapping: StreamMapping, contract: Mapping[str, dy.Column]) -> None:
@@ -84,4 +101,4 @@ def _constant(stream: Stream, mapping: StreamMapping, name: str, column: dy.Colu
             found=repr(value),
             expected=", ".join(words) if words is not None else str(column.dtype),
         )
-    return pl.lit(value, dtype=FIX_TYPE if words is not None else column.dtype)
+    return pl.lit(value, dtype=column.dtype)

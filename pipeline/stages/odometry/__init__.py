@@ -3,9 +3,9 @@
 In: the cleaned odometer stream, vehicle file, configuration. Out: one `Odometry`, handed to every stage.
 Touches no file, and knows no position: only the sign against the path is set from one (`polarity`).
 
-From one row to the next: `rows`. Over all rows: `odometry`, over slip by another one: `over_slip`. What is movement and
-what noise of the rows: `driven`, `quantisation`, `written_steps`. Shared with calibration: `scale_lag`; with the LDS
-and alignment: `recovery`, when a position may return after an alarm.
+Where it comes from, as declared: `origin`. From one row to the next: `rows`. Over all rows: `odometry`, over slip by
+another one: `over_slip`. What is movement and what noise of the rows: `driven`, `quantisation`, `written_steps`. Shared
+with calibration: `scale_lag`; with the LDS and alignment: `recovery`, when a position may return after an alarm.
 """
 
 from pipeline.stages.odometry.odometry import OdometerWay, Odometry, odometry_of

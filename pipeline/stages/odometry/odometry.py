@@ -10,10 +10,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
+from pipeline.stages.odometry.origin import declared_origin
 from pipeline.stages.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
 from pipeline.stages.odometry.rows import filled_in, leaps, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
+from schemas.enums import Origin
 
 # The bound of a bridged way holds for an emergency brake right after as hard acceleration: a Gaussian error comes as
 # far in 3 of 1000 cases.
@@ -52,7 +54,7 @@ class Odometry:
     lost before a sample; `counter`: the same, over slip and pauses between speeds, where the way is known to
     `slip_doubt_m`, a sum. `pause[i]`: between samples i and i+1 nothing is interpolated. `scale`: true over recorded
     distance, None without its sigma. `leaps_ns`: rows to which the counter leaps; `bridged_m2`: variance over bridged
-    ones, a sum.
+    ones, a sum. `origin`: as declared; `follows_gnss`: found to be made of the positions all the same.
     """
 
     epoch_ns: int
@@ -71,6 +73,13 @@ class Odometry:
     scale_sigma: float | None = None
     leaps_ns: tuple[int, ...] = ()
     bridged_m2: Floats | None = None
+    origin: Origin = Origin.UNKNOWN
+    follows_gnss: bool = False
+
+    @property
+    def independent(self) -> bool:
+        """Declared to be free of the GNSS, and not found to be made of its positions (DOMAIN section 5.0)."""
+        return self.origin.independent and not self.follows_gnss
 
     @property
     def begin_ns(self) -> int:
@@ -308,6 +317,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         leaps_ns=_leaps_ns(stream, align),
         bridged_m2=np.interp(t_s, row_s, _sums((bridged_m / _BOUND_SIGMAS) ** 2)) if bridged_m.any() else None,
         config=align,
+        origin=declared_origin(stream, vehicle),
     )
 
 

@@ -448,3 +448,30 @@ def test_described_stamps_are_counted_as_the_replay_counts_them(tmp_path):
     assert (found.duplicates, found.out_of_order, found.rows) == (1, 3, mixed.height)
     (counts,) = clean(read_run(folder, IngestConfig()))[1].solutions.values()
     assert (counts.duplicates, counts.out_of_order) == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("messages", "lines", "expected"),
+    [
+        ([{"v": 1.0}, {"v": 2.0}], {"origin": "wheel"}, ["wheel", "wheel"]),
+        ([{"v": 1.0}, {"v": 2.0}], {}, [None, None]),
+        # What a row says of itself stands before the mapping.
+        ([{"v": 1.0, "from": "gnss"}, {"v": 2.0}], {"origin": "wheel", "named": "from"}, ["gnss", "wheel"]),
+    ],
+)
+def test_an_origin_is_that_of_the_rows_else_that_of_the_mapping(tmp_path, messages, lines, expected):
+    places = [{"lat": 50.0, "lon": 14.0}, {"lat": 50.0, "lon": 14.0}]
+    log = json_log(tmp_path, {"/gps": places, "/tacho": messages})
+    fields = {"speed_mps": "v"} | ({"origin": lines.pop("named")} if "named" in lines else {})
+    mapping = {"topic": "/tacho", "fields": fields, "time": "log", **lines}
+    gnss = {"topic": "/gps", "fields": {"latitude_deg": "lat", "longitude_deg": "lon"}, "time": "log"}
+    run = read_run(log, config(gnss=[gnss], odometer=[mapping]))
+    assert run.odometer is not None
+    assert run.odometer["origin"].to_list() == expected
+
+
+def test_only_an_odometer_has_an_origin(tmp_path):
+    log = json_log(tmp_path, {"/gps": [{"lat": 50.0, "lon": 14.0}]})
+    gnss = {"topic": "/gps", "fields": {"latitude_deg": "lat", "longitude_deg": "lon"}, "origin": "gnss"}
+    with pytest.raises(ConfigError, match="which only an odometer has"):
+        read_run(log, config(gnss=[gnss | {"time": "log"}]))
