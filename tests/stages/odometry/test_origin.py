@@ -19,7 +19,7 @@ def rows(*origins: str | None, column: bool = True) -> pl.DataFrame:
             "slip": [None] * len(origins),
             "origin": list(origins),
         },
-        schema_overrides={"sigma_speed_mps": pl.Float64, "slip": pl.Boolean, "origin": pl.Enum(list(Origin))},
+        schema_overrides={"sigma_speed_mps": pl.Float64, "slip": pl.Boolean, "origin": pl.Enum(Origin)},
     ).with_columns(t=pl.col("t").cast(pl.Datetime("ns", "UTC")))
     return frame if column else frame.drop("origin")
 
