@@ -128,6 +128,7 @@ def _results(
     prepared = ride.prepared
     run = prepared.run
     counts = prepared.counts.solutions[ride.solution.name]
+    odometry = prepared.odometry
     columns = {
         "vehicle": prepared.figures_from,
         "faults_injected": run.faults is not None and run.faults.height > 0,
@@ -135,8 +136,8 @@ def _results(
         "duplicates": counts.duplicates,
         "out_of_order": counts.out_of_order,
         "odometer_contradicted": evidence.contradicted,
-        "odometer_origin": None,
-        "odometer_follows": None,
+        "odometer_origin": None if odometry is None else odometry.origin,
+        "odometer_follows": prepared.follows_of(ride.solution.name).ratio,
         "ambiguous_stretches": ride.match.ambiguous.height,
         **ride.at_the_end(),
         **ride.bank.white_noise(),
@@ -144,6 +145,8 @@ def _results(
     }
     # What stands against a verdict whatever was judged (DOMAIN section 5.4).
     against = {
+        Reason.ODOMETER_ORIGIN_UNKNOWN: odometry is not None and not odometry.origin.independent,
+        Reason.ODOMETER_FOLLOWS_GNSS: odometry is not None and odometry.follows_gnss,
         Reason.EVIDENCE_DISPUTED: evidence.disputed > 0,
         Reason.INPUT_DOUBTFUL: bool(fit.unproving or counts.contradicting),
         Reason.CLOCK_ASSUMED: evidence.clock_assumed,

@@ -515,6 +515,19 @@ class EvidenceConfig(Settings):
     # Axes of neighbouring tracks lie 3.5 m apart and more on old lines (4.0 m on new ones), less a survey's rounding;
     # many trams run closer: smaller there.
     track_spacing_m: Positive = 3.4
+    # An odometer of which the positions predict the steps to this part of what it or they leave unexplained alone is
+    # made of them (V of DOMAIN section 5.0); independent ones stay above by own simulation (`benchmarks/follows.py`).
+    follows_limit: Annotated[Number, Field(gt=0, lt=1)] = 0.25
+    # Fewer steps show nothing: a prediction fits 73 numbers to them.
+    follows_steps_least: Annotated[int, Field(ge=200)] = 300
+    # More, spread over the run, cost more time than they add: the figure is a quantile.
+    follows_steps_most: Annotated[int, Field(ge=200)] = 2000
+    # At stands of so much together steps of 1 s are correlated; slower than this, by both recorders, is a stand.
+    follows_stand_s: Positive = 20.0
+    follows_stand_mps: Positive = 0.1
+    # A correlation is found beyond this, and beyond so many of its sigmas: 3e-7 for two independent recorders.
+    follows_correlation: Annotated[Number, Field(gt=0, lt=1)] = 0.3
+    follows_sigmas: Positive = 5.0
 
 
 class UndetectedConfig(Settings):

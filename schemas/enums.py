@@ -346,6 +346,7 @@ class NotEvaluated(StrEnum):
 
     DISABLED = "disabled by configuration"
     NO_ODOMETER = "no odometer"
+    ODOMETER_OF_GNSS = "odometer not free of the GNSS"
     BEYOND_SPAN = "outside the odometer's time span"
     INTERRUPTED = "odometer interrupted or slipping"
     NOISE_UNKNOWN = "noise not yet known"

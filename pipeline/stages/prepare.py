@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import polars as pl
 
@@ -10,6 +11,7 @@ from pipeline.stages.clean import CleanCounts
 from pipeline.stages.clean.clean import ClockAdvice, clean, no_advice, of_the_journey
 from pipeline.stages.clean.journey import require_one_journey, require_two_times
 from pipeline.stages.evidence import TrainEvidence, evidence_of
+from pipeline.stages.follows import NOT_TESTED, Follows, follows_positions
 from pipeline.stages.matching import Match, match
 from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of
 from pipeline.stages.provenance import Provenance, provenance
@@ -23,7 +25,8 @@ from schemas.run import RunLog, Site
 @dataclass(frozen=True)
 class PreparedRun:
     """`recorded`: in order of time; `run`: without streams of another day. `odometers`: each as it counted, the one of
-    the LDS first; `odometry`: that one, by the others where it slips.
+    the LDS first; `odometry`: that one, by other independent ones where it slips. `follows`: whether the odometer of
+    the LDS is made of the positions, by solution.
     """
 
     recorded: RunLog
@@ -34,6 +37,7 @@ class PreparedRun:
     counts: CleanCounts
     odometers: tuple[Odometry, ...]
     odometry: Odometry | None
+    follows: Mapping[str, Follows] = field(default_factory=dict)
     # Made anew with every run, so that `replace` cannot hand on those of another.
     _fixes: dict[str, pl.DataFrame] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -68,6 +72,10 @@ class PreparedRun:
         balises = self.site.balises
         return evidence_of(reference, reads, balises, self.odometers, network, self.vehicle, self.config)
 
+    def follows_of(self, solution: str) -> Follows:
+        """Whether the odometer of the LDS is made of the positions of this solution."""
+        return self.follows.get(solution, NOT_TESTED)
+
     @property
     def provenance(self) -> Provenance:
         return provenance(self.run, self.site, self.vehicle, self.config)
@@ -87,9 +95,25 @@ def prepare(
     """`clock_advice` helps where the recorders' times do not meet."""
     recorded, counts = clean(run, config, clock_advice)
     journey = of_the_journey(recorded)
-    odometry = odometry_of(journey.odometer, vehicle, config)
-    # Scale and latency of the vehicle file are of the odometer that the LDS uses.
-    others = [odometry_of(stream, Vehicle(), config) for stream in journey.other_odometers]
-    odometers = tuple(odometer for odometer in (odometry, *others) if odometer is not None)
-    counted = None if odometry is None else counted_over_slip(odometry, odometers[1:], config.align)
-    return PreparedRun(recorded, journey, site, vehicle, config, counts, odometers, counted)
+    sensors = () if journey.odometer is None else (journey.odometer, *journey.other_odometers)
+    found = [_follows(sensor, journey, config) for sensor in sensors]
+    odometers = tuple(
+        # Scale, latency and origin of the vehicle file are of the odometer that the LDS uses.
+        replace(odometer, follows_gnss=any(one.found(config.evidence) for one in found[number].values()))
+        for number, sensor in enumerate(sensors)
+        if (odometer := odometry_of(sensor, Vehicle() if number else vehicle, config)) is not None
+    )
+    used = odometers[0] if odometers and sensors[0].height >= 2 else None
+    # Another one takes part in what the LDS uses only where it is free of the positions.
+    others = [odometer for odometer in odometers[1:] if odometer.independent]
+    counted = None if used is None else counted_over_slip(used, others, config.align)
+    follows = found[0] if found else {}
+    return PreparedRun(recorded, journey, site, vehicle, config, counts, odometers, counted, follows)
+
+
+def _follows(sensor: pl.DataFrame, run: RunLog, config: Configuration) -> dict[str, Follows]:
+    """Whether one odometer is made of the positions of each solution."""
+    return {
+        str(name): follows_positions(sensor, fixes, config)
+        for (name,), fixes in run.gnss.partition_by("solution", as_dict=True).items()
+    }

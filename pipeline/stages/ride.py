@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.stages.alignment.align import align, odometer_at
+from pipeline.stages.epochs.verdicts import without_passes
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.case import Case, Solution
 from pipeline.stages.judge.epochs import direction_by_evidence
@@ -21,6 +22,10 @@ from pipeline.stages.monitors.single import NO_OTHER_SOLUTION, WITHOUT_MEMORY, S
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun
 from schemas.enums import NotEvaluated
+
+
+_AGAINST_ODOMETER = ("along_doppler", "link_distance")
+"""Monitors beside the bank that hold the GNSS against the odometer."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +61,18 @@ def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], 
         # A balise valid in one direction means that of the train, not of one step of the positions (DOMAIN section 4).
         aligned = aligned.with_columns(_direction(prepared, solution, aligned, matched, evidence))
     channel = _other_solution(prepared, solution, aligned, matches)
+    # What is made of the positions cannot say that they are right (DOMAIN section 5.0).
+    blind_along = NotEvaluated.ODOMETER_OF_GNSS if odometry is not None and odometry.of_gnss else None
     singles = _without_memory(prepared, solution, aligned, channel)
-    bank = MonitorBank(aligned, singles, config)
+    bank = MonitorBank(aligned, singles, config, blind_along)
     balises = matched.path.balises(prepared.site.balises)
     reads = _reads_on_odometer(prepared.run.balise_reads, aligned, odometry)
     scale_sigma = None if odometry is None else odometry.scale_sigma
     lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)
     monitored = pl.concat([aligned, lds.epochs.drop("t"), pl.DataFrame(bank.columns())], how="horizontal")
+    if blind_along is not None:
+        for name in _AGAINST_ODOMETER:
+            monitored = monitored.with_columns(without_passes(name, monitored, blind_along))
     fixes = prepared.fixes(solution)
     replayed = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, matched.path)
     return Ride(prepared, replayed, matched, aligned, odometry, channel, singles, bank, lds)

@@ -51,6 +51,19 @@ def verdicts(value: Floats, threshold: Floats, reasons: pl.Series, state: States
     )
 
 
+def without_passes(name: str, frame: pl.DataFrame, reason: str) -> list[pl.Series]:
+    """The columns of a monitor that can find a fault, but not say that there is none."""
+    state = pl.col(f"{name}_state")
+    void = (state == STATES[PASS]).fill_null(False)
+    kept = [pl.when(~void).then(f"{name}_{part}").alias(f"{name}_{part}") for part in ("value", "threshold")]
+    unknown = pl.lit(STATES[NOT_EVALUATED], dtype=frame.schema[f"{name}_state"])
+    return frame.select(
+        *kept,
+        pl.when(void).then(unknown).otherwise(state).alias(f"{name}_state"),
+        pl.when(void).then(pl.lit(reason)).otherwise(f"{name}_reason").alias(f"{name}_reason"),
+    ).get_columns()
+
+
 def no_verdicts(epochs: int, reason: str) -> pl.DataFrame:
     """Of a monitor that has nothing to look at in the whole run."""
     nothing = np.full(epochs, np.nan)

@@ -11,6 +11,7 @@ from pipeline.stages.epochs.verdicts import (
     DISABLED,
     FAIL,
     NOT_EVALUATED,
+    PASS,
     first_reason,
     no_verdicts,
     of_monitor,
@@ -23,7 +24,7 @@ from pipeline.stages.monitors.recursion import AxisState
 from pipeline.stages.monitors.series import FIRST_EPOCH, Axis, axes_of
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
-from schemas.enums import MonitorState
+from schemas.enums import MonitorState, NotEvaluated
 from schemas.tables import SCALES
 
 NOISE_UNKNOWN = "noise not yet known"
@@ -37,11 +38,13 @@ class AxisBank:
 
     `series`: its increments, `fresh` where a restart was too. `value`, `threshold`, `noise_m` (fast noise in the
     thresholds): per epoch and monitor (raw, then the EWMAs), NaN where there is none. `noise_known`: no failure can
-    hide in it; true where the axis has no row. `enabled`: which of the monitors are.
+    hide in it; true where the axis has no row. `enabled`: which of the monitors are. `blind`: why none of them can say
+    that all is well, None where they can.
     """
 
-    def __init__(self, axis: Axis, epochs: int, config: Configuration) -> None:
+    def __init__(self, axis: Axis, epochs: int, config: Configuration, blind: NotEvaluated | None = None) -> None:
         self.axis = axis
+        self._blind = blind
         self.series = axis.series
         self._config = config
         self._alphas = np.array(config.monitors.ewma_alphas)
@@ -82,7 +85,11 @@ class AxisBank:
         # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
         known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self.enabled.any(), axis=1)
         judged = present & known[:, None]
-        self.state[part.epoch] = states_of(value, threshold, judged)
+        state = states_of(value, threshold, judged)
+        if self._blind is not None:
+            state[state == PASS] = NOT_EVALUATED
+            judged &= state == FAIL
+        self.state[part.epoch] = state
         self.value[part.epoch] = np.where(present, value, np.nan)
         self.threshold[part.epoch] = np.where(judged, threshold, np.nan)
         self.noise_m[part.epoch] = noise_m
@@ -122,7 +129,10 @@ class AxisBank:
         unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
         too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
         of_noise = first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
-        reasons = self.axis.reasons.fill_null(of_noise).fill_null(FIRST_EPOCH)
+        reasons = self.axis.reasons.fill_null(of_noise)
+        if self._blind is not None:
+            reasons = reasons.fill_null(first_reason((np.isfinite(self.value).any(axis=1), self._blind)))
+        reasons = reasons.fill_null(FIRST_EPOCH)
         columns: list[pl.Series] = []
         for index, scale in enumerate(SCALES):
             why = reasons if self.enabled[index] else self.axis.reasons.fill_null(DISABLED)
@@ -136,14 +146,24 @@ class MonitorBank:
 
     Epochs are rows of the solution's epochs. Answers for an epoch may change with `freeze` or `restart` at or before
     it, never through later ones. `single`: monitors without memory. `watched`: epochs with a row along the track. A
-    fail of any monitor is an alarm.
+    fail of any monitor is an alarm. `blind_along`: why those along the track cannot say that all is well, if they
+    cannot: an odometer made of the positions agrees with them whatever they say (DOMAIN section 5.0).
     """
 
-    def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration):
+    def __init__(
+        self,
+        epochs: pl.DataFrame,
+        single: dict[str, pl.DataFrame],
+        config: Configuration,
+        blind_along: NotEvaluated | None = None,
+    ):
         self._count = epochs.height
         disabled = config.monitors.disabled
         self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in config.monitors.ewma_alphas)])
-        self._axes = tuple(AxisBank(axis, self._count, config) for axis in axes_of(epochs, config))
+        self._axes = tuple(
+            AxisBank(axis, self._count, config, blind_along if axis.name == "along" else None)
+            for axis in axes_of(epochs, config)
+        )
         along, across, _ = self._axes
         # In a run without an odometer the axis across the track has to say where the bank begins.
         self._begins = (along if along.series.epoch.size else across).begins

@@ -82,6 +82,11 @@ class Odometry:
         return self.origin.independent and not self.follows_gnss
 
     @property
+    def of_gnss(self) -> bool:
+        """Made of what it should check, by its declaration or by what was found."""
+        return self.follows_gnss or self.origin in (Origin.GNSS, Origin.FUSED)
+
+    @property
     def begin_ns(self) -> int:
         return self.epoch_ns
 

@@ -13,7 +13,7 @@ from pipeline.stages.epochs.clock import may_move, met, reaction_of
 from pipeline.stages.run_row.lost_time import LostTime
 from schemas.arrays import floats
 from schemas.config import Configuration
-from schemas.enums import TRUTH, Judgement, LostTo, Reason, Remedy, RunVerdict, VehicleFigures
+from schemas.enums import TRUTH, Judgement, LostTo, Origin, Reason, Remedy, RunVerdict, VehicleFigures
 from schemas.tables import BANK_MONITORS
 
 FAST = tuple(name for name in BANK_MONITORS if name.endswith(("_raw", "_ewma_0p1")))
@@ -65,6 +65,8 @@ def remedies(
     calibrate = (noisy or loud) and not config.calibration.runs
     # What calibrates the noise measures the odometer too.
     without_scale = run["vehicle"] == VehicleFigures.LEARNED and not calibrate
+    # Nobody can declare it to be something else.
+    of_gnss = run["odometer_origin"] in (Origin.GNSS, Origin.FUSED) or Reason.ODOMETER_FOLLOWS_GNSS in reasons
     table = {
         Remedy.CALIBRATE: calibrate,
         Remedy.VEHICLE_FILE: without_scale and (costs(LostTo.RELINK) or unproven),
@@ -73,8 +75,8 @@ def remedies(
         Remedy.READS_CLOSER: missing and truth and unknown.between,
         Remedy.ROUTE: costs(LostTo.TRACK_AMBIGUOUS),
         Remedy.CLOCK: bool(reasons & {Reason.CLOCK_ASSUMED, Reason.EVIDENCE_DISPUTED}),
-        Remedy.ODOMETER: run["vehicle"] == VehicleFigures.NONE or costs(LostTo.NO_ODOMETER),
-        Remedy.ODOMETER_ORIGIN: bool(reasons & {Reason.ODOMETER_ORIGIN_UNKNOWN}),
+        Remedy.ODOMETER: run["vehicle"] == VehicleFigures.NONE or of_gnss or costs(LostTo.NO_ODOMETER),
+        Remedy.ODOMETER_ORIGIN: Reason.ODOMETER_ORIGIN_UNKNOWN in reasons and not of_gnss,
         Remedy.FASTER_LOG: _too_slow(run, config),
         Remedy.SURVEY_SIGMA: costs(LostTo.TRACK_AMBIGUOUS) and not survey_stated,
         Remedy.REFERENCE_SIGMA: False,
