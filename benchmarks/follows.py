@@ -199,41 +199,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", type=int, default=2000, help="independent odometers")
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args(arguments)
-    config = Configuration().evidence
     per_family = -(-given.runs // (len(RECEIVERS) * len(INDEPENDENT)))
     accused = 0
     for receiver in RECEIVERS:
         for kind in INDEPENDENT:
-            found = [
-                tried(given.seed * 1_000_003 + n * 97 + hash_of(receiver, kind), receiver, kind)
-                for n in range(per_family)
-            ]
-            ratios = [one.ratio for one in found if one.ratio is not None]
-            wrong = sum(one.found(config) for one in found)
-            accused += wrong
-            least = min(ratios, default=float("nan"))
-            stands = sum(one.at_stands for one in found)
-            print(
-                f"{receiver:8} {kind:8} {wrong:3d} of {len(found)} accused ({stands} at stands), {len(ratios)} tested, least V {least:.2f}"
-            )
-    share = 1.0
+            accused += said(receiver, kind, family(given.seed, receiver, kind, per_family))
+    shares = []
     for kind in COPIES:
-        found = [
-            tried(given.seed * 1_000_003 + n * 97 + hash_of("sbas", kind), "sbas", kind)
-            for n in range(max(per_family, 40))
-        ]
-        tested = [one for one in found if one.ratio is not None]
-        share = min(share, sum(one.found(config) for one in tested) / len(tested))
-        median = float(np.median([one.ratio for one in tested if one.ratio is not None]))
-        print(
-            f"sbas     {kind:12} found {sum(one.found(config) for one in tested)} of {len(tested)} tested of {len(found)}, median V {median:.2f}"
-        )
+        found = [one for one in family(given.seed, "sbas", kind, max(per_family, 40)) if one.ratio is not None]
+        shares.append(said("sbas", kind, found) / len(found))
     print(f"an hour at 10 Hz: {cost_s() * 1e3:.0f} ms")
-    return int(accused > 0 or share < 0.95)
+    return int(accused > 0 or min(shares) < 0.95)
 
 
-def hash_of(receiver: str, kind: str) -> int:
-    return RECEIVERS.index(receiver) * 17 + (*INDEPENDENT, *COPIES).index(kind) * 31
+def family(seed: int, receiver: str, kind: str, runs: int) -> list[Follows]:
+    first = 1_000_003 * seed + 17 * RECEIVERS.index(receiver) + 31 * (*INDEPENDENT, *COPIES).index(kind)
+    return [tried(first + 97 * number, receiver, kind) for number in range(runs)]
+
+
+def said(receiver: str, kind: str, found: Sequence[Follows]) -> int:
+    """Prints one family; how many of it are found."""
+    copies = sum(one.found(Configuration().evidence) for one in found)
+    ratios = [one.ratio for one in found if one.ratio is not None]
+    least, median = (float(np.quantile(ratios, part)) if ratios else float("nan") for part in (0.0, 0.5))
+    stands = sum(one.at_stands for one in found)
+    words = f"{copies} of {len(found)} found ({stands} at stands), {len(ratios)} with a V, least {least:.2f}"
+    print(f"{receiver:8} {kind:12} {words}, median {median:.2f}", flush=True)
+    return copies
 
 
 if __name__ == "__main__":

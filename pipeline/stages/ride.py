@@ -23,7 +23,6 @@ from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun
 from schemas.enums import NotEvaluated
 
-
 _AGAINST_ODOMETER = ("along_doppler", "link_distance")
 """Monitors beside the bank that hold the GNSS against the odometer."""
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.stages.follows.steps import Steps, common_steps
 from pipeline.stages.follows.stands import correlated_at_stands
+from pipeline.stages.follows.steps import Steps, common_steps
 from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, EvidenceConfig
 
@@ -53,7 +53,7 @@ def follows_positions(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Confi
 
 
 def _ratio(steps: Steps, config: EvidenceConfig) -> float | None:
-    """V: what the positions leave unexplained of an odometer's step, over the least of what each series leaves alone."""
+    """V: what the positions leave unexplained of an odometer's step, over the least that a series leaves alone."""
     rows = _spread(_in_motion(steps), config.follows_steps_most)
     if rows.size < config.follows_steps_least:
         return None

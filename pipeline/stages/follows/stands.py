@@ -14,7 +14,7 @@ _EDGE_S = 5.0
 
 
 def correlated_at_stands(steps: Steps, config: EvidenceConfig) -> bool:
-    """r > `follows_correlation` and r sqrt(t / 2 s) > `follows_sigmas` of the steps of all stands together.
+    """Whether steps of all stands together have r > `follows_correlation` and r sqrt(t / 2 s) > `follows_sigmas`.
 
     A step of a differenced position shares its middle with the next one: two seconds are one independent step.
     """

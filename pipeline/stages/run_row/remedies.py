@@ -66,7 +66,7 @@ def remedies(
     # What calibrates the noise measures the odometer too.
     without_scale = run["vehicle"] == VehicleFigures.LEARNED and not calibrate
     # Nobody can declare it to be something else.
-    of_gnss = run["odometer_origin"] in (Origin.GNSS, Origin.FUSED) or Reason.ODOMETER_FOLLOWS_GNSS in reasons
+    of_gnss = run.get("odometer_origin") in (Origin.GNSS, Origin.FUSED) or Reason.ODOMETER_FOLLOWS_GNSS in reasons
     table = {
         Remedy.CALIBRATE: calibrate,
         Remedy.VEHICLE_FILE: without_scale and (costs(LostTo.RELINK) or unproven),
