@@ -7,11 +7,14 @@ import numpy as np
 import polars as pl
 
 from schemas.conform import conform
+from schemas.enums import Origin
 from schemas.stages import Failures
 from schemas.tables import Alarms, Epochs, Hazards, Passages
 
 _DEFAULTS: dict[type, Any] = {dy.Bool: False, dy.String: "x", dy.List: [], dy.Int64: 0, dy.Float64: 0.0}
 NS = 1_000_000_000
+# Where the odometers of tests come from, unless a test is about that.
+WHEEL = pl.lit(Origin.WHEEL.value, dtype=pl.Enum(Origin)).alias("origin")
 # Where a test says no more, a failure began when it surely had begun.
 _SURE = (("t_failure", ""), ("time_since_failure", "_s"))
 

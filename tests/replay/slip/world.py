@@ -15,6 +15,7 @@ from pyproj import Geod
 from schemas.config import Vehicle
 from schemas.inputs import BaliseReads, Gnss, Links, Odometer, Reference
 from schemas.run import RunLog, Site
+from tests.tables import WHEEL
 
 Floats = npt.NDArray[np.float64]
 
@@ -188,7 +189,7 @@ def _odometer(rng: np.random.Generator, t_s: Floats, true_m: Floats, slip: Slip 
             "sigma_speed_mps": pl.Series(sigma if sigma is not None else [None] * t_s.size, dtype=pl.Float64),
             "slip": said,
         }
-    )
+    ).with_columns(WHEEL)
     return Odometer.validate(frame, cast=True)
 
 

@@ -12,6 +12,7 @@ from pipeline.stages.odometry import odometry_of
 from pipeline.stages.odometry.polarity import polarity
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
+from tests.tables import WHEEL
 
 SHARES = (0.083, 0.014, 0.150, 0.752)
 TAUS_S = (360.0, 1800.0, 3600.0, 100.0)
@@ -112,7 +113,7 @@ def odometer_of(t_s, distance_m=None, speed_mps=None, slip=None):
             "sigma_speed_mps": pl.Series(nothing, dtype=pl.Float64),
             "slip": pl.Series(nothing if slip is None else slip, dtype=pl.Boolean),
         }
-    )
+    ).with_columns(WHEEL)
 
 
 def odometry_from(odometer, vehicle=None, config=None):

@@ -20,6 +20,7 @@ from schemas.config import Configuration, Vehicle
 from schemas.run import Site
 from tests.stages.matching.builders import line, site
 from tests.stages.matching.ladder import degrees
+from tests.tables import WHEEL
 
 START_NS = 1_700_000_000_000_000_000
 RATE_HZ = 100.0
@@ -86,7 +87,7 @@ def odometer(ride: Ride, rng: np.random.Generator, lost_m: Floats | None = None,
     lost = 0.0 if lost_m is None else np.interp(t_s, ride.t_s, lost_m)
     nothing = pl.lit(None, dtype=pl.Float64)
     frame = pl.DataFrame([stamps(t_s), pl.Series("distance_m", ride.at(t_s) - ride.from_m + walk - lost)])
-    return frame.with_columns(speed_mps=nothing, sigma_speed_mps=nothing, slip=pl.lit(None, dtype=pl.Boolean))
+    return frame.with_columns(WHEEL, speed_mps=nothing, sigma_speed_mps=nothing, slip=pl.lit(None, dtype=pl.Boolean))
 
 
 def balises(ground: Site, every_m: float = 500.0) -> Site:

@@ -11,6 +11,7 @@ from schemas.inputs import BaliseReads, Gnss, Odometer, Reference
 from tests.stages.judge.faults import Fault, Slip
 from tests.stages.judge.ground import Balise, Floats, Ground, Route, geodetic
 from tests.stages.judge.ride import Ride
+from tests.tables import WHEEL
 
 START_NS = 1_772_352_000_000_000_000  # 2026-03-01T08:00:00Z
 CUT = 2.5  # every random error of the evidence ends here [sigma], so that none is beyond 3 sigma by chance
@@ -185,7 +186,7 @@ def odometer(rng: np.random.Generator, ride: Ride, of: Counter) -> pl.DataFrame:
             "sigma_speed_mps": [None] * len(time),
             "slip": flags,
         }
-    )
+    ).with_columns(WHEEL)
     return Odometer.validate(frame.filter(pl.Series(~silent)), cast=True)
 
 

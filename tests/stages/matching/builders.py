@@ -15,6 +15,7 @@ from schemas.conform import conform
 from schemas.inputs import Links, Track
 from schemas.run import Site
 from tests.stages.matching.ladder import degrees
+from tests.tables import WHEEL
 
 Link = tuple[str, int, str, int, str]
 
@@ -84,6 +85,7 @@ def odometer(distance_m: Floats, rate_hz: float = 1.0) -> pl.DataFrame:
         pl.Series("speed_mps", np.gradient(distance) * rate_hz),
         pl.lit(None, dtype=pl.Float64).alias("sigma_speed_mps"),
         pl.lit(None, dtype=pl.Boolean).alias("slip"),
+        WHEEL,
     )
 
 

@@ -12,6 +12,7 @@ from schemas.conform import conform
 from schemas.enums import Fix
 from schemas.inputs import Links, Track
 from schemas.run import Site
+from tests.tables import WHEEL
 
 ORIGIN_DEG = (50.0, 14.0)
 SPACING_M = 4.0
@@ -86,7 +87,7 @@ def journey(seed: int, sigma_m: float = 1.0, tau_s: float = 100.0, rate_hz: floa
     )
     odometer = pl.DataFrame({"t": time, "distance_m": 1.004 * (x - x[0]), "speed_mps": np.full(len(x), 20.08)})
     blank = [pl.lit(None, dtype=pl.Float64).alias("sigma_speed_mps"), pl.lit(None, dtype=pl.Boolean).alias("slip")]
-    return Journey(fixes, odometer.with_columns(blank), y, ROUTES[route])
+    return Journey(fixes, odometer.with_columns(*blank, WHEEL), y, ROUTES[route])
 
 
 def gauss_markov(rng: np.random.Generator, count: int, step_s: float, sigma_m: float, tau_s: float) -> Floats:
