@@ -273,7 +273,7 @@ def _odometer(
     }
     series = [pl.Series(name, values[rows]).fill_nan(None) for name, values in columns.items()]
     slip = pl.lit(None, dtype=pl.Boolean).alias("slip")
-    return pl.DataFrame([_stamps(begin_ns, t_s[rows]), *series]).with_columns(slip)
+    return pl.DataFrame([_stamps(begin_ns, t_s[rows]), *series]).with_columns(slip, origin=pl.lit("wheel"))
 
 
 def _reference(rng: np.random.Generator, line: _Line, t_s: Floats, way: Floats, begin_ns: int) -> pl.DataFrame:

@@ -172,6 +172,7 @@ def _odometer(dice: np.random.Generator, end_s: float) -> pl.DataFrame:
     walk_m = np.cumsum(dice.normal(0.0, 0.05 * np.sqrt(0.2), t_s.size))
     scale = 1.0 + dice.normal(0.0, SCALE_SIGMA)
     frame = pl.DataFrame({"t": _instants(t_s), "distance_m": scale * SPEED_MPS * t_s + walk_m, "speed_mps": SPEED_MPS})
+    frame = frame.with_columns(origin=pl.lit("wheel"))
     return _stream(frame, Odometer)
 
 

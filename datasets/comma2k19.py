@@ -16,7 +16,7 @@ from datasets.to_contract import conformed, table_of, virtual_balises
 from pipeline.read.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
 from pipeline.stages.track.geodesy import distances_m, points_of
 from schemas.arrays import NS_PER_S, Floats
-from schemas.enums import Fix
+from schemas.enums import Fix, Origin
 from schemas.errors import InputError
 from schemas.inputs import Links, Track
 from schemas.run import RunLog, Site
@@ -148,7 +148,10 @@ def _odometer(segment: Path, offset_s: float) -> pl.DataFrame | None:
     if not known.any():
         return None
     speed = np.nanmean(wheels_mps[known], axis=1)
-    return conformed(pl.DataFrame({"t": _stamps(t_s[known] + offset_s), "speed_mps": speed}), "odometer", segment)
+    frame = pl.DataFrame({"t": _stamps(t_s[known] + offset_s), "speed_mps": speed}).with_columns(
+        origin=pl.lit(Origin.WHEEL.value, pl.Enum(Origin))
+    )
+    return conformed(frame, "odometer", segment)
 
 
 def _site(places: dict[str, Floats], balises_at_m: Sequence[float]) -> Site:

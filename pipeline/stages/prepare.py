@@ -18,8 +18,10 @@ from pipeline.stages.provenance import Provenance, provenance
 from pipeline.stages.reference import reference_stretches
 from pipeline.stages.track.network import network_in_pieces, site_network
 from schemas.config import Configuration, Vehicle
-from schemas.enums import VehicleFigures
+from schemas.enums import Remedy, VehicleFigures
+from schemas.errors import InputError
 from schemas.run import RunLog, Site
+from schemas.words import remedy_words
 
 
 @dataclass(frozen=True)
@@ -117,3 +119,22 @@ def _follows(sensor: pl.DataFrame, run: RunLog, config: Configuration) -> dict[s
         str(name): follows_positions(sensor, fixes, config)
         for (name,), fixes in run.gnss.partition_by("solution", as_dict=True).items()
     }
+
+
+def require_independent_odometer(prepared: PreparedRun) -> None:
+    """Refuse a run that would be measured against positions (DOMAIN section 5.0)."""
+    odometry = prepared.odometry
+    if odometry is not None and odometry.independent:
+        return
+    raise InputError(
+        "has no odometer that is declared to be free of the GNSS",
+        place=f"{prepared.run.run_id}: odometer, column origin",
+        found="no odometer" if odometry is None else _origin_words(odometry),
+        expected="origin wheel, radar or inertial",
+        remedy=remedy_words(Remedy.ODOMETER if odometry is None or odometry.of_gnss else Remedy.ODOMETER_ORIGIN),
+    )
+
+
+def _origin_words(odometry: Odometry) -> str:
+    follows = ", but it follows the positions" if odometry.follows_gnss else ""
+    return f"{odometry.origin}{follows}"

@@ -15,6 +15,7 @@ from pipeline.stages.epochs.clock import Clock, met, unambiguous
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.judge import Judged, judge
+from pipeline.stages.prepare import require_independent_odometer
 from pipeline.stages.ride import Ride
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, Vehicle
@@ -137,7 +138,10 @@ def _with_quiet(reason: Ints, t_ns: Ints, quiet_s: float) -> Ints:
 
 
 def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution: str) -> Baseline:
-    """Replay and judge the run as it is. Raises `InputError` where faults were injected, or it cannot be replayed."""
+    """Replay and judge the run as it is.
+
+    Raises `InputError` where faults were injected, its odometer is not independent, or it cannot be replayed.
+    """
     if run.faults is not None and run.faults.height:
         raise InputError(
             "holds injected faults already",
@@ -146,6 +150,9 @@ def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution:
             expected="a run as it was recorded",
         )
     ride = ride_alone(run, site, vehicle, bank.config, solution)
+    if ride.odometry is not None:
+        # Along the track the experiment would measure how well the positions agree with themselves.
+        require_independent_odometer(ride.prepared)
     evidence = ride.prepared.evidence()
     judged = _judged(ride, evidence)
     return Baseline(run, site, bank, ride, evidence, judged.epochs, judged.alarms, Recording(run, site))

@@ -17,7 +17,7 @@ from pipeline.stages.monitors.axis import error_model
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.monitors.single import doppler_monitor
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.prepare import prepare
+from pipeline.stages.prepare import prepare, require_independent_odometer
 from pipeline.studies.calibration.sigmas import (
     COMPARED,
     SigmaFit,
@@ -92,10 +92,11 @@ def calibrate(
 
 
 def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> Observed:
-    """What a fault-free run shows; raises `InputError` where its streams do not fit each other."""
+    """What a fault-free run shows; `InputError` where its streams do not fit, or no odometer is independent of them."""
     prepared = prepare(log, site, vehicle, config, clock_advice)
     if solution not in prepared.run.solutions():
         return Observed(log.run_id, None, {}, None, ())
+    require_independent_odometer(prepared)
     # A run with a wrong unit or clock would teach its error to every other run.
     required_fit(prepared, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m))
     match = prepared.match(solution)

@@ -16,6 +16,7 @@ from pipeline.studies.calibration.calibrate import Calibration, Observed, calibr
 from pipeline.studies.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
 from pipeline.studies.calibration.vehicle import RunEstimate
 from schemas.config import CalibrationConfig, Configuration, MonitorConfig, Vehicle
+from schemas.enums import Origin
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
@@ -172,8 +173,19 @@ def test_where_no_velocity_was_recorded_nothing_is_said_of_it(fault_free: tuple[
 
 def test_runs_without_odometer_are_refused(fault_free: tuple[list[RunLog], Site]) -> None:
     logs, site = fault_free
-    with pytest.raises(InputError, match="no run gives"):
+    with pytest.raises(InputError, match="no odometer that is declared to be free of the GNSS; found no odometer"):
         calibrate([logs[0].with_streams(odometer=None)], site)
+
+
+@pytest.mark.parametrize(("origin", "said"), [(None, "declare where"), ("gnss", "record an odo")])
+def test_runs_whose_odometer_may_be_made_of_the_positions_are_refused(
+    fault_free: tuple[list[RunLog], Site], origin: str | None, said: str
+) -> None:
+    logs, site = fault_free
+    assert logs[0].odometer is not None
+    odometer = logs[0].odometer.with_columns(origin=pl.lit(origin, dtype=pl.Enum(Origin)))
+    with pytest.raises(InputError, match=rf"free of the GNSS; found {origin or 'unknown'}.*{said}"):
+        calibrate([logs[0].with_streams(odometer=odometer)], site)
 
 
 def test_the_solution_is_the_one_named(fault_free: tuple[list[RunLog], Site], result: Calibration) -> None:
