@@ -135,3 +135,11 @@ def test_without_an_odometer_there_is_no_origin() -> None:
     found = row(replay(run.with_streams(odometer=None), site, VEHICLE))
     assert (found["odometer_origin"], found["odometer_follows"]) == (None, None)
     assert "odometer_origin_unknown" not in found["reasons"]
+
+
+@pytest.mark.parametrize(("origin", "told"), [(Origin.WHEEL, True), (None, False), (Origin.GNSS, False)])
+def test_only_an_independent_odometer_tells_motion(origin: Origin | None, told: bool) -> None:
+    run, site = journey(gnss=GNSS, motion=MOTION)
+    tables = replay(said(run, origin).with_streams(reference=None), site, VEHICLE)
+    assert tables.epochs["moving"].is_not_null().any() is told
+    assert (row(tables)["availability"] is not None) is told

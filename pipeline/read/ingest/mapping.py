@@ -49,20 +49,22 @@ def mapped_recipe(base: Recipe | None, fields: Mapping[str, str], stream: Stream
         # The message can be nothing else, whatever the mapping declares.
         columns["origin"] = pl.lit(Origin.GNSS.value, dtype=pl.String)
     elif mapping.origin is not None:
-        columns["origin"] = _origin(stream, mapping, columns.get("origin"), fields)
+        columns["origin"] = _origin(stream, mapping, mapping.origin, columns.get("origin"), fields)
     return replace(base, columns=columns, types=types)
 
 
-def _origin(stream: Stream, mapping: StreamMapping, recorded: pl.Expr | None, fields: Mapping[str, str]) -> pl.Expr:
+def _origin(
+    stream: Stream, mapping: StreamMapping, origin: Origin, recorded: pl.Expr | None, fields: Mapping[str, str]
+) -> pl.Expr:
     """Where an odometer comes from: what its rows say, else what the mapping declares (DOMAIN section 5.0)."""
     if stream != "odometer":
         raise ConfigError(
             "declares an origin, which only an odometer has",
             place=f"[ingest.{stream}] topic {mapping.topic}",
-            found=f'origin = "{mapping.origin}"',
+            found=f'origin = "{origin}"',
             remedy="Leave the line out, or write it under [ingest.odometer].",
         )
-    declared = pl.lit(mapping.origin.value, dtype=pl.String)
+    declared = pl.lit(origin.value, dtype=pl.String)
     if recorded is None or not set(recorded.meta.root_names()) <= set(fields):
         return declared
     return pl.coalesce(recorded.cast(pl.String), declared)

@@ -32,8 +32,12 @@ class FitReport:
         """For programs: what keeps the run from being replayed, every check, and the lines that mend it."""
         mending = self.tables.get("Lines that mend it")
         mends = [] if mending is None else mending["toml"].to_list()
-        fit, odometers = (self.tables.get(name, []) for name in ("Fit", ODOMETERS))
-        return {"problems": list(self.problems), "fit": fit, "odometers": odometers, "mends": mends}
+        return {
+            "problems": list(self.problems),
+            "fit": self.tables.get("Fit", []),
+            "odometers": self.tables.get(ODOMETERS, []),
+            "mends": mends,
+        }
 
     def of_odometers(self) -> Sequence[str]:
         """What is to be said of odometers that are not declared to be independent, or are not."""
