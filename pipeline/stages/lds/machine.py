@@ -220,7 +220,7 @@ class LocationSystem:
     def _has_initialised(self, epoch: int) -> bool:
         """Consistent for `init_s`: a TVB may arise between two VBs (SR)."""
         t_ns = self._t_ns[epoch]
-        if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns:
+        if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns[epoch]:
             self._consistent_since_ns = t_ns
         self._consistent_at_ns = t_ns
         if t_ns - self._consistent_since_ns < self._config.lds.init_s * NS_PER_S:

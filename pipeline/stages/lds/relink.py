@@ -176,7 +176,7 @@ class Recovery:
         usable = bool(self._journey.usable[epoch])
         observed = evaluated if self._journey.has_odometer else usable
         if observed:
-            if t_ns - self._observed_at_ns > self._journey.gap_ns:
+            if t_ns - self._observed_at_ns > self._journey.gap_ns[epoch]:
                 self._failed_at_ns = t_ns
             self._observed_at_ns = t_ns
         if failing or self._bank.fast_failed(epoch):
