@@ -49,6 +49,12 @@ class Journey:
         return np.array([refusal is None for refusal in self.refusal], dtype=bool)
 
     @cached_property
+    def comparable(self) -> Bools:
+        """Usable, and with an odometer and a sigma to compare with."""
+        known: Bools = np.isfinite(self.odometer_m) & np.isfinite(self.sigma_m)
+        return self.usable & known
+
+    @cached_property
     def ambiguous(self) -> Bools:
         return np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in self.refusal], dtype=bool)
 
