@@ -125,6 +125,8 @@ class LocationSystem:
             self._initialise_anew(epoch)
         self.balises.turn(epoch)
         for read in self.balises.read(epoch):
+            if read.t_ns > self._t_ns[epoch]:
+                continue  # behind the last epoch: the position was no longer there to learn of it
             self._relink.note_read(read)
             if self._relink.is_held(epoch):
                 self.distance.hold_to(epoch, *self._relink.held_m(epoch))
