@@ -85,14 +85,16 @@ def errors(rng: Rng, kind: str, size: int, step_s: float) -> Floats:
     white = rng.standard_normal((size, 3))
     up = np.array([1.0, 1.0, rng.uniform(1.2, 2.0)])
     if kind == "rtk":
-        return (rng.uniform(0.005, 0.02) * smooth + rng.uniform(0.001, 0.006) * white) * up
+        return np.asarray((rng.uniform(0.005, 0.02) * smooth + rng.uniform(0.001, 0.006) * white) * up)
     if kind == "sbas":
-        return (rng.uniform(0.3, 1.0) * smooth + rng.uniform(0.01, 0.1) * white) * up
+        return np.asarray((rng.uniform(0.3, 1.0) * smooth + rng.uniform(0.01, 0.1) * white) * up)
     if kind == "student":
-        return (rng.uniform(0.3, 1.0) * smooth + rng.uniform(0.02, 0.1) * rng.standard_t(3, (size, 3))) * up
+        tails = rng.standard_t(3, (size, 3))
+        return np.asarray((rng.uniform(0.3, 1.0) * smooth + rng.uniform(0.02, 0.1) * tails) * up)
     burst = np.repeat(rng.random(size // 50 + 1) < 0.15, 50)[:size, None]
     fast = np.column_stack([_correlated(rng, size, rng.uniform(3.0, 15.0), step_s) for _ in range(3)])
-    return (rng.uniform(1.0, 3.0) * smooth + np.where(burst, 4.0, 0.5) * fast + rng.uniform(0.05, 0.3) * white) * up
+    bursts = np.where(burst, 4.0, 0.5) * fast
+    return np.asarray((rng.uniform(1.0, 3.0) * smooth + bursts + rng.uniform(0.05, 0.3) * white) * up)
 
 
 def fixes_of(rng: Rng, truth: Journey, kind: str, rate_hz: float) -> tuple[pl.DataFrame, Floats, Floats]:

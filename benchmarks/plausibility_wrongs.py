@@ -281,8 +281,12 @@ def _places() -> list[Wrong]:
 def _vehicles() -> list[Wrong]:
     def file(scale_by: float, latency_s: float) -> Callable[[float, float], Vehicle]:
         def vehicle(scale: float, latency: float) -> Vehicle:
-            given = {"odometer_scale": scale_by / scale, "gnss_latency_s": latency + latency_s}
-            return Vehicle(**given, odometer_scale_sigma=2e-4, gnss_latency_sigma_s=0.02)
+            return Vehicle(
+                odometer_scale=scale_by / scale,
+                odometer_scale_sigma=2e-4,
+                gnss_latency_s=latency + latency_s,
+                gnss_latency_sigma_s=0.02,
+            )
 
         return vehicle
 

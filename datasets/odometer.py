@@ -68,6 +68,6 @@ def _table(spec: OdometerSpec, t_ns: npt.NDArray[np.int64], distance_m: Floats, 
         speed_mps=pl.Series(spec.polarity * speed_mps) if spec.speed else nothing,
         sigma_speed_mps=pl.lit(spec.speed_sigma_mps) if spec.speed else nothing,
         slip=pl.lit(None, pl.Boolean),
-        origin=pl.lit(Origin.WHEEL.value, pl.Enum(Origin)),
+        origin=pl.lit(spec.origin.value, pl.Enum(Origin)),
     )
     return conform(table, Odometer)

@@ -21,7 +21,7 @@ from schemas.config import (
     read_toml,
     settings_from,
 )
-from schemas.enums import BaliseDirection, BaliseKind, Fix, Reaction
+from schemas.enums import BaliseDirection, BaliseKind, Fix, Origin, Reaction
 
 Constellation = Literal["gps", "galileo"]
 LogKind = Literal["parquet", "json", "protobuf", "cdr"]
@@ -144,7 +144,8 @@ class GnssSpec(Settings):
 class OdometerSpec(Settings):
     """Wheel sensor: white noise on increments of 0.05 m per root second (DIAG Table 1), none at standstill.
 
-    `scale` is true distance over odometer distance; `polarity` -1 counts down when running ahead.
+    `scale` is true distance over odometer distance; `polarity` -1 counts down when running ahead; `origin`: what the
+    stream declares.
     """
 
     rate_hz: Annotated[float, Field(ge=1, le=200)] = 50.0
@@ -154,6 +155,7 @@ class OdometerSpec(Settings):
     speed: bool = True
     distance: bool = True
     speed_sigma_mps: NonNegative = 0.02
+    origin: Origin = Origin.WHEEL
 
 
 class ReferenceSpec(Settings):

@@ -519,12 +519,14 @@ class EvidenceConfig(Settings):
     follows_steps_least: Annotated[int, Field(ge=200)] = 300
     # More, spread over the run, cost more time than they add: the figure is a quantile.
     follows_steps_most: Annotated[int, Field(ge=200)] = 2000
-    # At stands of so much together steps of 1 s are correlated; slower than this, by both recorders, is a stand.
+    # At stands of so much together steps of 1 s are correlated; slower than this, by the positions, is a stand.
     follows_stand_s: Positive = 20.0
     follows_stand_mps: Positive = 0.1
     # A correlation is found beyond this, and beyond so many of its sigmas: 3e-7 for two independent recorders.
     follows_correlation: Annotated[Number, Field(gt=0, lt=1)] = 0.3
     follows_sigmas: Positive = 5.0
+    # Over so much of the way a reference is held against its track by the median: some hundred samples at 10 Hz.
+    survey_window_m: Positive = 200.0
 
 
 class UndetectedConfig(Settings):

@@ -16,7 +16,7 @@ from importlib.resources import files
 from string import Formatter
 from typing import Any, TypeVar
 
-from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, NotShown, Reason, Remedy
+from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, NotShown, Reason, Remedy, RunVerdict
 
 Code = TypeVar("Code", bound=StrEnum)
 BETWEEN = "; "
@@ -132,11 +132,23 @@ def part_words(run: Mapping[str, Any]) -> str:
 
 
 def beside_words(run: Mapping[str, Any]) -> str:
-    """What stands beside every verdict: balises accepted of those on the path, availability, proof margin."""
+    """What stands beside every verdict: balises accepted of those on the path, availability, proof margin; and beside
+    a safe one what it rests on by declaration alone.
+
+    `run`: a `runs` row, or figures of several runs with `odometer_origins`, those of the safe ones.
+    """
     share, margin_m = run["availability"], run["proof_margin_m"]
     accepted = say("verdicts", "accepted", run["balises_accepted"], run["balises_on_path"])
     available = say("verdicts", "no_motion") if share is None else say("verdicts", "available", share)
-    return ", ".join([accepted, available, *([] if margin_m is None else [say("verdicts", "margin", margin_m)])])
+    margin = [] if margin_m is None else [say("verdicts", "margin", margin_m)]
+    return ", ".join([accepted, available, *margin, *_provided(run)])
+
+
+def _provided(run: Mapping[str, Any]) -> list[str]:
+    """No statistic of a run tells every odometer of the GNSS from a wheel (DOMAIN section 5.0)."""
+    own = [run["odometer_origin"]] if run.get("verdict") == RunVerdict.SAFE and run["odometer_origin"] else []
+    named = [say("origins", origin) for origin in run.get("odometer_origins", own)]
+    return [say("verdicts", "provided", " or ".join(named))] if named else []
 
 
 def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
@@ -92,13 +92,16 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     site = _site(base)
     entries = []
     ready = []
+    of_odometers: dict[str, Sequence[str]] = {}
     for ride in rides:
-        proposal, entry = _checked(ride, base, site, recordings, wanted.day, accept)
+        proposal, entry, report = _checked(ride, base, site, recordings, wanted.day, accept)
+        of_odometers[ride.run_id] = report.of_odometers()
         drafted.proposals += [proposal] if proposal else []
         if ride.is_ready and proposal is None:
             ready.append(named_from(ride.logs[0].path, folder))
         else:
             entries.append(entry)
+    drafted.remarks += _of_all(of_odometers)
     own = {"convert": tuple(entries), "replay": ReplayEntry(runs=tuple(ready))}
     own["unread"] = tuple(named_from(path, folder) for path in unread)
     drafted.opened = Opened(base.file, base.project.model_copy(update=own))
@@ -241,8 +244,10 @@ def _entry(ride: Ride, folder: Path, day: date | None) -> ConvertEntry:
 
 def _checked(
     ride: Ride, base: Opened, site: Site | None, recordings: Recordings, day: date | None, accept: Accept
-) -> tuple[Proposal | None, ConvertEntry]:
-    """What mends a ride whose streams do not fit each other, and the ride with it where that is accepted."""
+) -> tuple[Proposal | None, ConvertEntry, FitReport]:
+    """What mends a ride whose streams do not fit each other, the ride with it where that is accepted, and how it fits
+    then.
+    """
     config = base.given_config()
     vehicle = base.given_vehicle()
     entry = _entry(ride, base.folder, day)
@@ -266,10 +271,19 @@ def _checked(
         corrections += fresh
         run = corrected_further(run, fresh)
     if not corrections:
-        return None, entry
+        return None, entry, report
     accepted = accept(ride.run_id, found, corrections)
     proposal = Proposal(ride.run_id, tuple(found), tuple(corrections), accepted)
-    return proposal, entry.model_copy(update={"correct": tuple(corrections)}) if accepted else entry
+    return proposal, entry.model_copy(update={"correct": tuple(corrections)}) if accepted else entry, report
+
+
+def _of_all(said: Mapping[str, Sequence[str]]) -> list[str]:
+    """The same sentence of many runs once."""
+    runs: dict[str, list[str]] = {}
+    for run_id, sentences in said.items():
+        for sentence in sentences:
+            runs.setdefault(sentence, []).append(run_id)
+    return [f"{', '.join(ids) if len(ids) < len(said) else 'all runs'}: {text}" for text, ids in runs.items()]
 
 
 def correction_lines(corrections: Sequence[StreamCorrection]) -> list[str]:

@@ -17,6 +17,7 @@ BESIDE = {
     "availability": pl.Float64,
     "proof_margin_m": pl.Float64,
     "held_s": pl.Float64,
+    "odometer_origin": pl.String,
 }
 """Figures of a run that stand beside its verdict."""
 UnderWay = Sequence[tuple[str, float]]
@@ -53,6 +54,7 @@ class RunOutcome:
     availability: float | None = None
     proof_margin_m: float | None = None
     held_s: float | None = None
+    odometer_origin: str | None = None
     remedies: tuple[str, ...] = ()
     lost: str = ""
 
@@ -74,8 +76,9 @@ class CampaignSummary:
 
     def beside(self) -> dict[str, Any]:
         """The figures beside the verdict over all runs that have one; nothing where none has."""
-        rows = [{name: getattr(outcome, name) for name in BESIDE} for outcome in self.outcomes if outcome.held_s]
-        return dict(figures_beside(pl.DataFrame(rows, schema=BESIDE))) if rows else {}
+        names = {**BESIDE, "verdict": pl.String}
+        rows = [{name: getattr(outcome, name) for name in names} for outcome in self.outcomes if outcome.held_s]
+        return dict(figures_beside(pl.DataFrame(rows, schema=names))) if rows else {}
 
     def count(self, status: RunStatus) -> int:
         return sum(outcome.status == status for outcome in self.outcomes)

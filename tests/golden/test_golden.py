@@ -61,7 +61,12 @@ def with_radar(run: RunLog, scenario: Scenario) -> RunLog:
     at_s = (wheel["t"] - wheel["t"][0]).dt.total_nanoseconds() / 1e9
     speed = wheel["speed_mps"].rolling_median(51, center=True, min_samples=1)
     way = (speed * at_s.diff().fill_null(0.0)).cum_sum()
-    radar = wheel.with_columns(sensor=pl.lit("radar"), speed_mps=0.998 * speed, distance_m=0.998 * way)
+    radar = wheel.with_columns(
+        sensor=pl.lit("radar"),
+        origin=pl.lit("radar", wheel.schema["origin"]),
+        speed_mps=0.998 * speed,
+        distance_m=0.998 * way,
+    )
     both = with_reads(run, scenario)
     sensors = pl.concat([wheel, radar.gather_every(5)]).sort("t", maintain_order=True)
     assert both.balise_reads is not None

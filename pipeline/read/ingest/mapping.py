@@ -12,10 +12,13 @@ import polars as pl
 from pipeline.read.ingest.recipe import FIX_TYPE, Recipe
 from pipeline.read.ingest.recipes import recorded_type
 from schemas.config import IngestConfig, StreamMapping
-from schemas.enums import Fix
+from schemas.enums import Fix, Origin
 from schemas.errors import ConfigError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import Stream
+
+# Topics on which drivers of receivers publish the velocity that these computed, as a twist (nmea_navsat_driver, ublox).
+_VELOCITIES = ("fix_velocity",)
 
 
 def mappings_of(config: IngestConfig, stream: Stream) -> tuple[StreamMapping, ...]:
@@ -29,6 +32,7 @@ def mapped_recipe(base: Recipe | None, fields: Mapping[str, str], stream: Stream
 
     `fields`: those of the first message, with their kinds.
     """
+    of_receiver = (base is not None and base.stream == "gnss") or mapping.topic.rpartition("/")[2] in _VELOCITIES
     if base is None or base.stream != stream:
         fix = {"fix": pl.lit(Fix.AUTONOMOUS.value, dtype=FIX_TYPE)} if stream == "gnss" else {}
         base = Recipe(stream=stream, columns=fix, stamps={})
@@ -41,21 +45,26 @@ def mapped_recipe(base: Recipe | None, fields: Mapping[str, str], stream: Stream
         types[paths["fix"]], columns["fix"] = _coded(fields.get(paths["fix"]), paths["fix"], mapping)
     columns |= {name: _constant(stream, mapping, name, contract[name]) for name in mapping.constants}
     columns |= {name: columns[name] * factor for name, factor in mapping.factors.items() if name in columns}
-    if mapping.origin is not None:
-        columns["origin"] = _origin(stream, mapping, columns.get("origin"), fields)
+    if stream == "odometer" and of_receiver:
+        # The message can be nothing else, whatever the mapping declares.
+        columns["origin"] = pl.lit(Origin.GNSS.value, dtype=pl.String)
+    elif mapping.origin is not None:
+        columns["origin"] = _origin(stream, mapping, mapping.origin, columns.get("origin"), fields)
     return replace(base, columns=columns, types=types)
 
 
-def _origin(stream: Stream, mapping: StreamMapping, recorded: pl.Expr | None, fields: Mapping[str, str]) -> pl.Expr:
+def _origin(
+    stream: Stream, mapping: StreamMapping, origin: Origin, recorded: pl.Expr | None, fields: Mapping[str, str]
+) -> pl.Expr:
     """Where an odometer comes from: what its rows say, else what the mapping declares (DOMAIN section 5.0)."""
     if stream != "odometer":
         raise ConfigError(
             "declares an origin, which only an odometer has",
             place=f"[ingest.{stream}] topic {mapping.topic}",
-            found=f'origin = "{mapping.origin}"',
+            found=f'origin = "{origin}"',
             remedy="Leave the line out, or write it under [ingest.odometer].",
         )
-    declared = pl.lit(mapping.origin.value, dtype=pl.String)
+    declared = pl.lit(origin.value, dtype=pl.String)
     if recorded is None or not set(recorded.meta.root_names()) <= set(fields):
         return declared
     return pl.coalesce(recorded.cast(pl.String), declared)

@@ -62,7 +62,9 @@ def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
 
 
 def figures_beside(runs: pl.DataFrame) -> Mapping[str, Any]:
-    """The figures beside a campaign's verdict: sums, availability by time, and the least margin."""
+    """The figures beside a campaign's verdict: sums, availability by time, the least margin, and where the odometers
+    of its safe runs come from by their declarations.
+    """
     weight_s = pl.col("held_s").filter(pl.col("availability").is_not_null()).sum()
     available = (pl.col("availability") * pl.col("held_s")).sum() / weight_s
     figures = runs.select(
@@ -70,4 +72,5 @@ def figures_beside(runs: pl.DataFrame) -> Mapping[str, Any]:
         pl.col("proof_margin_m").min(),
         availability=pl.when(weight_s > 0.0).then(available),
     )
-    return figures.row(0, named=True)
+    declared = runs.filter(pl.col("verdict") == RunVerdict.SAFE.value)["odometer_origin"].cast(pl.String).drop_nulls()
+    return {**figures.row(0, named=True), "odometer_origins": declared.unique().sort().to_list()}

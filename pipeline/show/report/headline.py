@@ -13,7 +13,7 @@ from pipeline.results.figures.head import figures_beside, head_of, run_verdicts,
 from pipeline.show.report.columns import Row
 from pipeline.show.report.markup import Cell, cell, number, table
 from pipeline.show.report.words import WORDS, plural, some_of
-from schemas.enums import Reason, RunVerdict
+from schemas.enums import Origin, Reason, RunVerdict
 from schemas.run import RunTables
 from schemas.words import beside_words, part_words, reason_words, say, unnoticed_words
 
@@ -127,6 +127,7 @@ def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -
         "Date": _span(first),
         "Line": _line(first, tables.epochs),
         "Train": _TRAINS.get(first["vehicle"], "not known"),
+        "Odometer": _odometer(first),
         "Receivers": ", ".join(
             f"{row['solution']} {number(row['gnss_rate_hz'])} Hz" for row in rows if row["solution"]
         ),
@@ -138,6 +139,15 @@ def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -
         "Digest of the log": metadata.get("log_digest", ""),
     }
     return [(name, value) for name, value in lines.items() if value]
+
+
+def _odometer(row: Row) -> str:
+    """Where it comes from, and that this is a declaration; nothing without one."""
+    origin = row["odometer_origin"]
+    if origin is None:
+        return ""
+    declared = origin != Origin.UNKNOWN
+    return say("origins", "declared" if declared else "undeclared", say("origins", origin))
 
 
 def _span(row: Row) -> str:

@@ -78,7 +78,7 @@ def _in_motion(steps: Steps) -> Ints:
     count = np.concatenate([[0], np.cumsum(good)])
     rows = np.arange(_OTHERS, good.size - _OTHERS)
     whole = count[rows + _OTHERS + 1] - count[rows - _OTHERS] == 2 * _OTHERS + 1
-    return rows[whole]
+    return np.asarray(rows[whole])
 
 
 def _spread(rows: Ints, most: int) -> Ints:
@@ -87,7 +87,7 @@ def _spread(rows: Ints, most: int) -> Ints:
 
 def _around(steps_m: Floats, rows: Ints, reach: int) -> Floats:
     """The steps from `reach` before to `reach` after each row, shape (rows, 2 reach + 1)."""
-    return steps_m[rows[:, None] + np.arange(-reach, reach + 1)]
+    return np.asarray(steps_m[rows[:, None] + np.arange(-reach, reach + 1)])
 
 
 def _neighbours(steps_m: Floats, rows: Ints, reach: int) -> Floats:
@@ -102,7 +102,7 @@ def _unexplained(wanted_m: Floats, by_m: Floats) -> Floats:
     # Ridge of rounding: steps of one speed are all alike.
     normal = columns.T @ columns + count * _LEAST_M**2 * np.eye(fitted)
     weights = np.linalg.solve(normal, columns.T @ wanted)
-    return np.abs(wanted - columns @ weights) * np.sqrt(count / (count - fitted - 1.0))
+    return np.asarray(np.abs(wanted - columns @ weights) * np.sqrt(count / (count - fitted - 1.0)))
 
 
 def _sigma_m(residuals_m: Floats, part: float, of_normal: float) -> float:

@@ -29,11 +29,11 @@ def correlated_at_stands(steps: Steps, config: EvidenceConfig) -> bool:
 
 
 def _standing(steps: Steps, config: EvidenceConfig) -> Bools:
-    """Within stands, away from their ends, by odometer and positions both."""
+    """Within stands, away from their ends, by the positions: an odometer of their steps without sign never stands."""
     reach = max(1, round(_EDGE_S / steps.period_s))
     least_m = config.follows_stand_mps * 2.0 * _EDGE_S
     still = steps.unbroken & ~steps.moving
-    for moved_m in (steps.odometer_m, steps.along_m, steps.across_m):
+    for moved_m in (steps.along_m, steps.across_m):
         still &= np.abs(around_sum(moved_m, reach)) <= least_m
     inside: Bools = around_sum(still.astype(np.float64), reach) > 2 * reach + 0.5
     return inside

@@ -84,7 +84,7 @@ def _counted(odometer: pl.DataFrame, epoch_ns: int) -> tuple[Floats, Floats] | N
     """Times [s] and distances [m] of a sensor: counted, or its speeds summed up where it hardly counts."""
     distance_m = floats(odometer, "distance_m")
     speed_mps = floats(odometer, "speed_mps")
-    t_s = (times_ns(odometer) - epoch_ns) * 1e-9
+    t_s = _since_s(odometer, epoch_ns)
     known = np.isfinite(distance_m)
     if 2 * np.count_nonzero(known) >= np.count_nonzero(np.isfinite(speed_mps)):
         return (t_s[known], distance_m[known]) if np.count_nonzero(known) >= _FEWEST else None
@@ -98,14 +98,18 @@ def _counted(odometer: pl.DataFrame, epoch_ns: int) -> tuple[Floats, Floats] | N
 def _placed(fixes: pl.DataFrame, epoch_ns: int) -> tuple[Floats, tuple[Floats, Floats, Floats]] | None:
     """Times [s] of valid positions, and east, north, up [m] from the first of them, for differences of near ones."""
     valid = fixes["latitude_deg"].is_finite() & fixes["longitude_deg"].is_finite() & (fixes["fix"] != Fix.NONE.value)
-    valid = valid.fill_null(False).to_numpy()
-    if np.count_nonzero(valid) < _FEWEST:
+    rows = np.flatnonzero(valid.fill_null(False).to_numpy())
+    if rows.size < _FEWEST:
         return None
-    latitude, longitude = (np.radians(floats(fixes, f"{axis}_deg")[valid]) for axis in ("latitude", "longitude"))
+    latitude, longitude = (np.radians(floats(fixes, f"{axis}_deg")[rows]) for axis in ("latitude", "longitude"))
     meridian_m, normal_m = curvature_radii_m(latitude)
     north_m = _sums(np.diff(latitude) * meridian_m[1:])
     east_m = _sums(np.diff(longitude) * (normal_m * np.cos(latitude))[1:])
-    return (times_ns(fixes)[valid] - epoch_ns) * 1e-9, (east_m, north_m, floats(fixes, "height_m")[valid])
+    return _since_s(fixes, epoch_ns)[rows], (east_m, north_m, floats(fixes, "height_m")[rows])
+
+
+def _since_s(frame: pl.DataFrame, epoch_ns: int) -> Floats:
+    return np.asarray((times_ns(frame) - epoch_ns) * 1e-9, dtype=np.float64)
 
 
 def _without_pause(t_s: Floats, recorded_s: Floats, longest_s: float) -> Bools:

@@ -27,10 +27,11 @@ class OdometerSteps:
 
 
 def odometer_steps(case: Case) -> OdometerSteps:
-    """What the odometer says of the steps between the epochs; without one, nothing."""
+    """What the odometer says of the steps between the epochs; without one, or of unknown origin, nothing of motion."""
     at_ns = case.instants_of_epochs()
     odometry = case.odometry
-    if odometry is None:
+    # One that may be made of the positions tells no motion (DOMAIN section 5.0).
+    if odometry is None or not odometry.independent:
         return OdometerSteps(*np.zeros((2, at_ns.size), dtype=np.bool_))
     moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
     counts = _to_the_next(np.isfinite(odometry.steps_m(at_ns)), at_ns.size)
@@ -41,7 +42,9 @@ def odometer_steps(case: Case) -> OdometerSteps:
         places_m = path_m[rows][np.isfinite(path_m[rows])]
         if np.abs(places_m - places_m[:1]).max(initial=0.0) > case.config.hazards.failure_limit_m:
             stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
-    return OdometerSteps(moves, counts, tuple(stood))
+    # What may be made of the positions tells no motion (DOMAIN section 5.0), but it may contradict them.
+    told = odometry.independent
+    return OdometerSteps(moves & told, counts & told, tuple(stood))
 
 
 def travel_direction(

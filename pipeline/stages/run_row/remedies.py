@@ -47,7 +47,10 @@ def unknown_parts(epochs: pl.DataFrame, config: Configuration) -> Unknown:
 def remedies(
     run: Mapping[str, Any], lost: LostTime, unknown: Unknown, survey_stated: bool, config: Configuration
 ) -> list[Remedy]:
-    """What would mend this run, in the order of the enum; `survey_stated`: the survey states its sigma."""
+    """What would mend this run, in the order of the enum, a missing declaration first.
+
+    `survey_stated`: the survey states its sigma.
+    """
     unproven = run["verdict"] == RunVerdict.UNPROVEN
     reasons = frozenset(run.get("reasons") or ())
     missing = unproven and bool(reasons & _LACKING)
@@ -67,9 +70,11 @@ def remedies(
     without_scale = run["vehicle"] == VehicleFigures.LEARNED and not calibrate
     # Nobody can declare it to be something else.
     of_gnss = run.get("odometer_origin") in (Origin.GNSS, Origin.FUSED) or Reason.ODOMETER_FOLLOWS_GNSS in reasons
+    # Calibration refuses an odometer that may be made of the positions.
+    independent = not reasons & {Reason.ODOMETER_ORIGIN_UNKNOWN, Reason.ODOMETER_FOLLOWS_GNSS}
     table = {
-        Remedy.CALIBRATE: calibrate,
-        Remedy.VEHICLE_FILE: without_scale and (costs(LostTo.RELINK) or unproven),
+        Remedy.CALIBRATE: calibrate and independent,
+        Remedy.VEHICLE_FILE: without_scale and independent and (costs(LostTo.RELINK) or unproven),
         Remedy.REFERENCE: missing and not truth,
         Remedy.READS_AT_ENDS: missing and truth and unknown.at_ends,
         Remedy.READS_CLOSER: missing and truth and unknown.between,
@@ -82,7 +87,8 @@ def remedies(
         Remedy.REFERENCE_SIGMA: False,
         Remedy.SURVEY_COMPLETE: Reason.TRACK_ASSUMED in reasons,
     }
-    return [remedy for remedy in Remedy if table[remedy]]
+    # The line that declares an odometer comes first: nothing else helps as long as it is not there.
+    return sorted((remedy for remedy in Remedy if table[remedy]), key=lambda one: one is not Remedy.ODOMETER_ORIGIN)
 
 
 def _too_slow(run: Mapping[str, Any], config: Configuration) -> bool:

@@ -19,6 +19,7 @@ from pipeline.studies.plausibility.places import (
 )
 from pipeline.studies.plausibility.recording import Recording, recording_of
 from pipeline.studies.plausibility.velocity import velocity_checks
+from pipeline.studies.plausibility.witnesses import follows_check
 from schemas.config import PlausibilityConfig, Vehicle
 from schemas.enums import MisfitCause, Note
 from schemas.errors import InputError
@@ -94,6 +95,10 @@ def _checks(of: Recording) -> list[Check]:
     return [*checks, *velocity_checks(of), *clock_checks(of, lags)]
 
 
+def with_checks(fit: Fit, checks: Sequence[Check]) -> Fit:
+    return Fit((*fit.checks, *checks))
+
+
 def required_fit(prepared: PreparedRun, solution: str, vehicle: Vehicle) -> Fit:
     """The fit of a solution; raises `InputError` where it has no journey, or no train can have driven it (unless the
     configuration lets that pass).
@@ -101,6 +106,9 @@ def required_fit(prepared: PreparedRun, solution: str, vehicle: Vehicle) -> Fit:
     prepared.fixes(solution)
     config = prepared.config
     fit = fit_run(prepared.recorded, solution, vehicle, config.plausibility, prepared.site)
+    if prepared.odometry is not None:
+        sensor = config.lds.odometer_sensor
+        fit = with_checks(fit, [follows_check(sensor, prepared.follows_of(solution), config.evidence)])
     impossible = fit.impossible
     if not impossible or config.ingest.plausibility == "warn":
         return fit

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import polars as pl
@@ -10,10 +10,14 @@ import polars as pl
 from pipeline.stages.clean.clean import CleanCounts, clean
 from pipeline.stages.clean.journey import require_one_journey
 from pipeline.studies.plausibility.check import FitState
-from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run, lines_of
+from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run, lines_of, with_checks
+from pipeline.studies.plausibility.witnesses import follows_checks, origins_table, undeclared
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site, Stream
+
+ODOMETERS = "Odometers"
+"""Title of the table that says where each odometer comes from."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,16 @@ class FitReport:
         """For programs: what keeps the run from being replayed, every check, and the lines that mend it."""
         mending = self.tables.get("Lines that mend it")
         mends = [] if mending is None else mending["toml"].to_list()
-        return {"problems": list(self.problems), "fit": self.tables.get("Fit", []), "mends": mends}
+        return {
+            "problems": list(self.problems),
+            "fit": self.tables.get("Fit", []),
+            "odometers": self.tables.get(ODOMETERS, []),
+            "mends": mends,
+        }
+
+    def of_odometers(self) -> Sequence[str]:
+        """What is to be said of odometers that are not declared to be independent, or are not."""
+        return undeclared(self.tables[ODOMETERS]) if ODOMETERS in self.tables else []
 
     def lines(self) -> list[str]:
         """The same as plain lines, without what fits or could not be checked."""
@@ -39,6 +52,7 @@ class FitReport:
                 f"does not fit: {row['check']}: {row['found']} {row['cause']}".rstrip()
                 for row in misfits.iter_rows(named=True)
             ]
+        lines += self.of_odometers()
         if "Lines that mend it" in self.tables:
             lines += self.tables["Lines that mend it"]["toml"].to_list()
         return lines
@@ -65,8 +79,11 @@ def fit_report(
         except InputError as error:
             problems += (str(error),)
         else:
-            fits[name] = fit_run(cleaned, name, vehicle or Vehicle(), config.plausibility, site)
+            fit = fit_run(cleaned, name, vehicle or Vehicle(), config.plausibility, site)
+            fits[name] = with_checks(fit, follows_checks(cleaned, name, config))
     tables = {"Fit": _checks(fits, counts)}
+    if (origins := origins_table(cleaned, vehicle or Vehicle(), config)).height:
+        tables[ODOMETERS] = origins
     mending: dict[str, str] = {}
     for fit in fits.values():
         for into, lines in lines_of(fit.misfits).items():

@@ -470,6 +470,16 @@ def test_an_origin_is_that_of_the_rows_else_that_of_the_mapping(tmp_path, messag
     assert run.odometer["origin"].to_list() == expected
 
 
+@pytest.mark.parametrize("topic", ["/fix_velocity", "/gps/fix_velocity"])
+def test_the_velocity_of_a_receiver_is_of_the_gnss_whatever_is_declared(tmp_path, topic):
+    log = json_log(tmp_path, {"/gps": [{"lat": 50.0, "lon": 14.0}], topic: [{"v": 1.0}]})
+    mapping = {"topic": topic, "fields": {"speed_mps": "v"}, "time": "log", "origin": "wheel"}
+    gnss = {"topic": "/gps", "fields": {"latitude_deg": "lat", "longitude_deg": "lon"}, "time": "log"}
+    run = read_run(log, config(gnss=[gnss], odometer=[mapping]))
+    assert run.odometer is not None
+    assert run.odometer["origin"].to_list() == ["gnss"]
+
+
 def test_only_an_odometer_has_an_origin(tmp_path):
     log = json_log(tmp_path, {"/gps": [{"lat": 50.0, "lon": 14.0}]})
     gnss = {"topic": "/gps", "fields": {"latitude_deg": "lat", "longitude_deg": "lon"}, "origin": "gnss"}
