@@ -463,9 +463,6 @@ class LdsConfig(Settings):
     starts_of_mission: tuple[AwareDatetime, ...] = ()
     # Off: a negated position never returns (DOMAIN section 4).
     relink: bool = True
-    # A slow drift has moved the TVBs of the minutes before its alarm already: 9 m at 0.05 m/s in 180 s. With noise
-    # measured in the run it is found later: by 300 s 5 of 30 drifts of 0.01 to 0.1 m/s came back, by 450 s one.
-    anchor_lag_s: NonNegative = 450.0
 
 
 class HazardConfig(Settings):
