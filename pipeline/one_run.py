@@ -147,7 +147,9 @@ def _results(
     against = {
         Reason.ODOMETER_ORIGIN_UNKNOWN: odometry is not None and not odometry.origin.independent,
         Reason.ODOMETER_FOLLOWS_GNSS: odometry is not None and odometry.follows_gnss,
-        Reason.EVIDENCE_DISPUTED: evidence.disputed > 0,
+        Reason.EVIDENCE_DISPUTED: evidence.disputed > 0 or evidence.parted,
+        Reason.EVIDENCE_CONTRADICTED: evidence.doubted > 0,
+        Reason.TRACK_ASSUMED: _track_assumed(judged),
         Reason.INPUT_DOUBTFUL: bool(fit.unproving or counts.contradicting),
         Reason.CLOCK_ASSUMED: evidence.clock_assumed,
     }
@@ -161,6 +163,12 @@ def _results(
         reasons=[reason for reason, applies in against.items() if applies],
         anchored_ns=evidence.anchored_ns,
     )
+
+
+def _track_assumed(judged: Judged) -> bool:
+    """Positions in use or accepted balises would be right if the survey held the train's track."""
+    used = judged.epochs.select((pl.col("in_use") & pl.col("track_assumed")).any()).item()
+    return bool(used or judged.offers.select((pl.col("accepted") & pl.col("track_assumed")).any()).item())
 
 
 def _failed(prepared: PreparedRun, solution: str, error: InputError) -> Tables:

@@ -528,6 +528,8 @@ class EvidenceConfig(Settings):
     # A correlation is found beyond this, and beyond so many of its sigmas: 3e-7 for two independent recorders.
     follows_correlation: Annotated[Number, Field(gt=0, lt=1)] = 0.3
     follows_sigmas: Positive = 5.0
+    # Over so much of the way a reference is held against its track by the median: some hundred samples at 10 Hz.
+    survey_window_m: Positive = 200.0
 
 
 class UndetectedConfig(Settings):

@@ -125,6 +125,7 @@ class JudgedEpochs(dy.Schema):
     error_along_m = real("m", "error where reference or reads give it to `known_error_m`")
     evidence = one_of(Evidence, "what the judgement rests on; null where nothing is known", nullable=True)
     wrong_track = flag("judged wrong for its net element, wherever along it")
+    track_assumed = flag("right if the survey holds the train's track, which nothing shows")
     train_m = real("m", "path position of the train where reference or reads give it to `known_error_m`")
     reference_m = real("m", "the same where the reference gives it")
     unambiguous = flag("the track of the position was not in doubt by what the train knew then")
@@ -159,6 +160,7 @@ class JudgedOffers(dy.Schema):
     error_high_m = real("m", "largest error in the direction of travel that the evidence leaves")
     evidence = one_of(Evidence, "what the judgement rests on; null where nothing is known", nullable=True)
     wrong_track = flag("judged wrong for its net element, wherever along it")
+    track_assumed = flag("right if the survey holds the train's track, which nothing shows")
     proof_margin_m = real("m", "by how much the evidence may be wrong before what is right is no longer", min=0)
 
 

@@ -11,6 +11,7 @@ from pipeline.stages.clean import CleanCounts
 from pipeline.stages.clean.clean import ClockAdvice, clean, no_advice, of_the_journey
 from pipeline.stages.clean.journey import require_one_journey, require_two_times
 from pipeline.stages.evidence import TrainEvidence, evidence_of
+from pipeline.stages.evidence.recorders import on_time, without_frozen
 from pipeline.stages.follows import NOT_TESTED, Follows, follows_positions
 from pipeline.stages.matching import Match, match
 from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of
@@ -69,8 +70,10 @@ class PreparedRun:
         """What is known of where the train was; knows of no solution."""
         network = site_network(self.site)
         pieces = network_in_pieces(self.site)
-        reference = reference_stretches(self.run.reference, pieces, network.track.index, self.config)
-        reads = self.run.balise_reads
+        recorded = on_time(self.run.reference, self.vehicle.reference_latency_s)
+        moving = without_frozen(recorded, self.odometers, self.config.hazards)
+        reference = reference_stretches(moving, pieces, network.track.index, self.config)
+        reads = on_time(self.run.balise_reads, self.vehicle.reads_latency_s)
         balises = self.site.balises
         return evidence_of(reference, reads, balises, self.odometers, network, self.vehicle, self.config)
 

@@ -20,13 +20,17 @@ Interval = tuple[Floats, Floats]
 
 @dataclass(frozen=True)
 class TrueAnchor:
-    """At an instant the train was at one of `places`; `clock_m`: what the clock may add [m]."""
+    """At an instant the train was at one of `places`; `clock_m`: what the clock may add [m].
+
+    `proved`: it shows that the track is one of the survey (DOMAIN section 5.0).
+    """
 
     t_ns: int
     places: tuple[Place, ...]
     sigma_m: float
     kind: Evidence
     clock_m: float = 0.0
+    proved: bool = True
 
 
 @dataclass(frozen=True)

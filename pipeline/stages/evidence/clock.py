@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,24 +10,34 @@ from pipeline.stages.evidence.carrying import Counter
 from schemas.arrays import NS_PER_S, Floats, Ints
 from schemas.config import HazardConfig
 
-# Numerics: range and step of the search for a coarse lag [s]; rounds of the regression after it.
-_FARTHEST_S = 30.0
-_STEP_S = 0.5
-_ROUNDS = 4
-# Least number of ways for a lag, and for a coarse lag of seconds.
+# Numerics: range and step of the search for a coarse lag [s], and of the one about what the regression finds.
+_FARTHEST_S, _STEP_S = 30.0, 0.5
+_ABOUT_S, _FINE_S = 2.0, 0.1
+_ROUNDS = 6
+# Least number of ways for a lag, and for one of more than a second.
 _FEWEST, _FEWEST_FAR = 6, 12
+_NEAR_S = 1.0
+# The ways of nine in ten differ by less: where most are driven at one speed, half of them show no lag.
+_SHARE = 0.9
 # A lag of seconds leaves less than this share of what the ways differ by as recorded.
-_EXPLAINS = 0.5
+_EXPLAINS = 0.7
 # Outliers, in robust standard deviations: slip, or a step of the reference.
 _USUAL = 4.0
+# A lag of less than so many of its sigmas may be none.
+_SHOWN_SIGMAS = 2.0
 
 
 @dataclass(frozen=True)
 class RecorderLag:
-    """Stamp of a moment by the recorder minus that by the odometer [s]; an infinite sigma: not known."""
+    """Stamp of a moment by the recorder minus that by the odometer [s]; an infinite sigma: not known.
+
+    `scale`: way of the recorder over that of the odometer, found with the lag.
+    """
 
     lag_s: float = 0.0
     sigma_s: float = float("inf")
+    scale: float = 1.0
+    scale_sigma: float = float("inf")
 
 
 @dataclass(frozen=True)
@@ -39,80 +49,105 @@ class RecorderClock:
     assumed: bool = False
 
 
-def clock_of(lag: RecorderLag, vehicle_file: bool, config: HazardConfig) -> RecorderClock:
-    """DOMAIN section 5.1: delta = k sigma on the odometer's clock with a vehicle file, else |lag| + k sigma.
+def clock_of(lag: RecorderLag, config: HazardConfig) -> RecorderClock:
+    """DOMAIN section 5.1: the hull of no lag and the measured one, each +- k sigma.
 
-    `vehicle_file`: it gives the latency of the GNSS against the odometer, whose clock the judge uses then.
+    A measured lag belongs to nobody: odometer and GNSS may share it, or the recorder has it.
     """
     noise_s = config.evidence_factor * lag.sigma_s
-    measured = noise_s <= config.evidence_clock_s
-    if measured and vehicle_file:
-        return RecorderClock(lag.lag_s, noise_s)
-    if measured or abs(lag.lag_s) > noise_s:
-        return RecorderClock(0.0, abs(lag.lag_s) + noise_s)
-    return RecorderClock(0.0, config.evidence_clock_s, assumed=True)
+    if abs(lag.lag_s) < _SHOWN_SIGMAS * lag.sigma_s and noise_s > config.evidence_clock_s:
+        return RecorderClock(0.0, config.evidence_clock_s, assumed=True)
+    return RecorderClock(0.5 * lag.lag_s, 0.5 * abs(lag.lag_s) + noise_s)
 
 
 def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter | None) -> RecorderLag:
     """The lag of a recorder by the ways `way_m` that it saw between its stamps, positive as the odometer counts up.
 
-    way = scale * counted - lag * change of speed, by least squares without outliers; sigma is that of the fit, or half
-    the difference between the two halves of the run if that is larger.
+    way = scale * counted - lag * change of speed, by least squares without outliers, begun at the best of a search over
+    +- 30 s and again at the best about what it finds; sigma is that of the fit, or half the difference between the two
+    halves of the run if that is larger.
     """
     if counter is None or begin_ns.size < _FEWEST:
         return RecorderLag()
-    coarse_s = _coarse_lag_s(begin_ns, end_ns, way_m, counter) if begin_ns.size >= _FEWEST_FAR else 0.0
-    lag_s = coarse_s
-    sigma_s = np.inf
-    for _ in range(_ROUNDS):
-        rest_s, sigma_s = _rest_of_lag(begin_ns, end_ns, way_m, counter, lag_s)
-        if not np.isfinite(sigma_s) or abs(lag_s + rest_s - coarse_s) > 2.0 * _STEP_S + 3.0 * sigma_s:
-            return RecorderLag()
-        lag_s += rest_s
+    ways = _Ways(begin_ns, end_ns, way_m, counter)
+    coarse_s = ways.best_s(0.0, _FARTHEST_S, _STEP_S, _EXPLAINS) if begin_ns.size >= _FEWEST_FAR else 0.0
+    lag = ways.converged(coarse_s)
+    if np.isfinite(lag.sigma_s):
+        lag = ways.converged(ways.best_s(lag.lag_s, _ABOUT_S, _FINE_S, 1.0))
+    if not np.isfinite(lag.sigma_s) or (begin_ns.size < _FEWEST_FAR and abs(lag.lag_s) > _NEAR_S):
+        return RecorderLag()
     half = begin_ns.size // 2
     parts = (slice(None, half), slice(half, None))
-    halves = [_rest_of_lag(begin_ns[part], end_ns[part], way_m[part], counter, lag_s) for part in parts]
-    if max(half_sigma_s for _, half_sigma_s in halves) < 3.0 * sigma_s:
-        sigma_s = max(sigma_s, 0.5 * abs(halves[0][0] - halves[1][0]))
-    return RecorderLag(float(lag_s), float(sigma_s))
+    halves = [ways.of(part).rest(lag.lag_s) for part in parts]
+    if max(part.sigma_s for part in halves) < 3.0 * lag.sigma_s:
+        return replace(lag, sigma_s=max(lag.sigma_s, 0.5 * abs(halves[0].lag_s - halves[1].lag_s)))
+    return lag
 
 
-def _coarse_lag_s(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter) -> float:
-    """The lag with the least median difference of the ways; 0 where it does not halve that without a lag."""
-    lags_s = np.arange(-_FARTHEST_S, _FARTHEST_S + _STEP_S, _STEP_S)
-    spreads = []
-    for lag_s in lags_s.tolist():
+@dataclass(frozen=True)
+class _Ways:
+    """Ways that a recorder saw between its stamps, and the odometer that counted them too."""
+
+    begin_ns: Ints
+    end_ns: Ints
+    way_m: Floats
+    counter: Counter
+
+    def of(self, part: slice) -> _Ways:
+        return _Ways(self.begin_ns[part], self.end_ns[part], self.way_m[part], self.counter)
+
+    def counted_m(self, lag_s: float) -> Floats:
         lag_ns = round(lag_s * NS_PER_S)
-        counted = counter.distance_m(begin_ns - lag_ns, end_ns - lag_ns)
+        return self.counter.distance_m(self.begin_ns - lag_ns, self.end_ns - lag_ns)
+
+    def best_s(self, about_s: float, farthest_s: float, step_s: float, explains: float) -> float:
+        """The lag that leaves nine in ten ways the least difference; `about_s` where it leaves no smaller share."""
+        offsets = np.arange(-round(farthest_s / step_s), round(farthest_s / step_s) + 1)
+        lags_s = about_s + step_s * offsets
+        spreads = np.array([self._spread_m(lag_s) for lag_s in lags_s.tolist()])
+        best = int(np.argmin(spreads))
+        return float(lags_s[best]) if spreads[best] < explains * spreads[offsets.size // 2] else about_s
+
+    def _spread_m(self, lag_s: float) -> float:
+        counted = self.counted_m(lag_s)
         known = np.isfinite(counted)
-        enough = known.sum() >= 0.5 * known.size and float(np.abs(counted[known]).sum()) > 0.0
-        spreads.append(float(np.median(np.abs(way_m - counted)[known])) if enough else np.inf)
-    none = spreads[lags_s.size // 2]
-    best = int(np.argmin(spreads))
-    return float(lags_s[best]) if spreads[best] < _EXPLAINS * none else 0.0
+        if known.sum() < 0.5 * known.size or float(np.abs(counted[known]).sum()) == 0.0:
+            return float("inf")
+        return float(np.quantile(np.abs(self.way_m - counted)[known], _SHARE))
 
+    def converged(self, lag_s: float) -> RecorderLag:
+        """The regression from here until it stays; not known where it does not."""
+        for _ in range(_ROUNDS):
+            rest = self.rest(lag_s)
+            if not np.isfinite(rest.sigma_s) or abs(lag_s + rest.lag_s) > _FARTHEST_S:
+                return RecorderLag()
+            lag_s += rest.lag_s
+            if abs(rest.lag_s) <= 0.1 * rest.sigma_s:
+                return replace(rest, lag_s=lag_s)
+        return replace(rest, lag_s=lag_s, sigma_s=max(rest.sigma_s, abs(rest.lag_s)))
 
-def _rest_of_lag(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter, lag_s: float) -> tuple[float, float]:
-    """The remaining lag once `lag_s` is taken off, and its sigma [s], infinite where the ways cannot show it."""
-    lag_ns = round(lag_s * NS_PER_S)
-    counted = counter.distance_m(begin_ns - lag_ns, end_ns - lag_ns)
-    change = counter.speed_mps(end_ns - lag_ns) - counter.speed_mps(begin_ns - lag_ns)
-    # Noise of the odometer would look like a lag. Where its recording begins or ends the speed is NaN, not a change.
-    change = np.where(np.abs(change) <= counter.odometer.deadband_mps, 0.0, change)
-    design = np.column_stack([counted, -change])
-    used = np.isfinite(design).all(axis=1)
-    estimate = np.array([1.0, 0.0])
-    sigma = np.inf
-    for _ in range(_ROUNDS):
-        normal = design[used].T @ design[used]
-        singular = np.linalg.det(normal) <= 1e-9 * max(float(np.prod(np.diag(normal))), 1e-9)
-        if used.sum() < _FEWEST or singular:
-            return 0.0, np.inf
-        estimate = np.linalg.solve(normal, design[used].T @ way_m[used])
-        residual = way_m - design @ estimate
-        spread = float(np.std(residual[used]) * np.sqrt(used.sum() / (used.sum() - 2.0)))
-        sigma = spread * float(np.sqrt(np.linalg.inv(normal)[1, 1]))
-        # 1.4826 MAD is the sigma of normal residuals, whatever a few outliers do.
-        robust = 1.4826 * float(np.median(np.abs(residual[np.isfinite(residual)])))
-        used = np.isfinite(residual) & (np.abs(residual) <= _USUAL * robust + 1e-6)
-    return float(estimate[1]), float(sigma)
+    def rest(self, lag_s: float) -> RecorderLag:
+        """The remaining lag once `lag_s` is taken off; an infinite sigma where the ways cannot show it."""
+        lag_ns = round(lag_s * NS_PER_S)
+        counted = self.counted_m(lag_s)
+        change = self.counter.speed_mps(self.end_ns - lag_ns) - self.counter.speed_mps(self.begin_ns - lag_ns)
+        # Noise of the odometer would look like a lag. Where its recording begins or ends the speed is NaN, no change.
+        change = np.where(np.abs(change) <= self.counter.odometer.deadband_mps, 0.0, change)
+        design = np.column_stack([counted, -change])
+        used = np.isfinite(design).all(axis=1)
+        for _ in range(_ROUNDS):
+            normal = design[used].T @ design[used]
+            singular = np.linalg.det(normal) <= 1e-9 * max(float(np.prod(np.diag(normal))), 1e-9)
+            if used.sum() < _FEWEST or singular:
+                return RecorderLag()
+            estimate = np.linalg.solve(normal, design[used].T @ self.way_m[used])
+            residual = self.way_m - design @ estimate
+            spread = float(np.std(residual[used]) * np.sqrt(used.sum() / (used.sum() - 2.0)))
+            sigmas = spread * np.sqrt(np.diag(np.linalg.inv(normal)))
+            # 1.4826 MAD is the sigma of normal residuals, whatever a few outliers do.
+            robust = 1.4826 * float(np.median(np.abs(residual[np.isfinite(residual)])))
+            kept = np.isfinite(residual) & (np.abs(residual) <= _USUAL * robust + 1e-6)
+            if np.array_equal(kept, used):
+                break
+            used = kept
+        return RecorderLag(float(estimate[1]), float(sigmas[1]), float(estimate[0]), float(sigmas[0]))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import polars as pl
@@ -13,6 +14,7 @@ from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
 from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried
 from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, clock_of, lag_of
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
+from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
@@ -20,10 +22,14 @@ from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Evidence as Kind
+from schemas.enums import Origin
 
 KINDS = tuple(Kind)
 NOTHING = -1
 Span = tuple[int, int]
+
+# Numerics: ways over which two odometers are compared [s].
+_PARTED_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,11 @@ class Alternative:
         """At some of its instants only."""
         return Alternative(self.rows[kept], self.route, self.low_m[kept], self.high_m[kept])
 
+    def loosened(self, slack_m: Floats) -> Alternative:
+        """By so much more at each instant, on both sides."""
+        slack_m = slack_m[self.rows]
+        return Alternative(self.rows, self.route, self.low_m - slack_m, self.high_m + slack_m)
+
     def widened(self, factor: float) -> Alternative:
         half_m = 0.5 * factor * (self.high_m - self.low_m)
         return Alternative(self.rows, self.route, self.middle_m - half_m, self.middle_m + half_m)
@@ -52,11 +63,23 @@ class Alternative:
 class EvidenceSet:
     """Evidence at instants: where there are several alternatives the train was on one of them.
 
-    `kind`: number in `KINDS`, -1 where nothing is known.
+    `kind`: number in `KINDS`, -1 where nothing is known. `proves`: by witnesses that are independent of the GNSS;
+    `on_survey`: and that show that the track is one of the survey (DOMAIN section 5.0).
     """
 
     kind: Ints
     alternatives: tuple[Alternative, ...]
+    proves: Bools
+    on_survey: Bools
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What the sources of evidence write per instant, as in `EvidenceSet`."""
+
+    kind: Ints
+    proves: Bools
+    on_survey: Bools
 
 
 @dataclass(frozen=True)
@@ -65,7 +88,9 @@ class TrainEvidence:
 
     `silent`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends of
     the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
-    odometer carries nothing from one side.
+    odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
+    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that every independent
+    odometer contradicts.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -77,6 +102,9 @@ class TrainEvidence:
     network: Network
     config: Configuration
     stood: tuple[Span, ...] = ()
+    stands: tuple[Stand, ...] = ()
+    parted: bool = False
+    doubted: int = 0
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
@@ -101,9 +129,10 @@ class TrainEvidence:
         anywhere = np.ones(t_ns.size, dtype=np.bool_)
         factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
         kind = np.full(t_ns.size, NOTHING)
-        by_reference = [there.widened(factor) for there in self._covered(t_ns, anywhere, kind)]
+        shown = _Shown(kind, *np.zeros((2, t_ns.size), dtype=np.bool_))
+        by_reference = [there.widened(factor) for there in self._covered(t_ns, anywhere, shown)]
         # Outside the time of the reference there is nothing to exclude.
-        by_reads = [there.widened(factor) for there in self._carried(self.by_reads, t_ns, kind != NOTHING, kind)]
+        by_reads = [there.widened(factor) for there in self._carried(self.by_reads, t_ns, kind != NOTHING, shown)]
         return int(common(by_reference, by_reads, t_ns.size)[1].size)
 
     @property
@@ -119,31 +148,55 @@ class TrainEvidence:
         return (min(times), max(times)) if times else None
 
     def at(self, t_ns: Ints) -> EvidenceSet:
-        """Evidence at these instants; nothing is carried from one side over a stand of the odometer (`stood`)."""
+        """Evidence at these instants; nothing is carried from one side over a stand of the odometer (`stood`).
+
+        Up to a second after a recording that ended in a stand the train is taken to stand on.
+        """
+        held_ns, slack_m = still_standing(t_ns, self.stands, self.config)
+        found = self._at(held_ns)
+        widened = tuple(there.loosened(slack_m) for there in found.alternatives)
+        return replace(found, alternatives=widened) if slack_m.any() else found
+
+    def _at(self, t_ns: Ints) -> EvidenceSet:
         kind = np.full(t_ns.size, NOTHING)
+        proves, on_survey = np.zeros((2, t_ns.size), dtype=np.bool_)
+        shown = _Shown(kind, proves, on_survey)
         heard = ~within_spans(t_ns, self.silent)
-        alternatives = self._covered(t_ns, heard, kind)
-        alternatives += self._carried(self.carried, t_ns, heard & (kind == NOTHING), kind)
-        if self.stretches and self.by_reads:
-            of_reads = np.full(t_ns.size, NOTHING)
+        alternatives = self._covered(t_ns, heard, shown)
+        alternatives += self._carried(self.carried, t_ns, heard & (kind == NOTHING), shown)
+        if self.stretches and self.by_reads and self.by_reads[0].counter.odometer.independent:
+            of_reads = _Shown(np.full(t_ns.size, NOTHING), *np.zeros((2, t_ns.size), dtype=np.bool_))
             by_reads = self._carried(self.by_reads, t_ns, heard, of_reads)
             alternatives, _ = common(alternatives, by_reads, t_ns.size)
-            kind = np.where(kind == NOTHING, of_reads, kind)
-        return EvidenceSet(kind, tuple(alternatives))
+            kind = np.where(kind == NOTHING, of_reads.kind, kind)
+            proves |= of_reads.proves
+            on_survey |= of_reads.on_survey
+        complete = self.config.evidence.survey_complete
+        return EvidenceSet(kind, tuple(alternatives), proves, on_survey | (complete & (kind != NOTHING)))
 
-    def _covered(self, t_ns: Ints, heard: Bools, kind: Ints) -> list[Alternative]:
-        """By the reference; writes into `kind` where it speaks."""
+    def _covered(self, t_ns: Ints, heard: Bools, shown: _Shown) -> list[Alternative]:
+        """By the reference; writes into `shown` where it speaks."""
         alternatives: list[Alternative] = []
         for stretch in self.stretches:
-            rows = np.flatnonzero((t_ns >= stretch.t_ns[0]) & (t_ns <= stretch.t_ns[-1]) & heard)
+            first_ns = stretch.t_ns[0]
+            last_ns = stretch.t_ns[-1]
+            reached = (t_ns >= first_ns - stretch.clock_ns) & (t_ns <= last_ns + stretch.clock_ns)
+            rows = np.flatnonzero(reached & heard & (shown.kind == NOTHING))
+            shown.proves[rows] = True
+            at_ns = np.clip(t_ns[rows], first_ns, last_ns)
+            shown.on_survey[rows] = stretch.proved_at(at_ns)
             for path in stretch.paths:
-                for there in _on_path(stretch, path, rows, t_ns[rows], self.config.hazards.evidence_factor):
+                for there in _on_path(stretch, path, rows, at_ns, self.config.hazards.evidence_factor):
                     alternatives.append(there)
-                    kind[there.rows] = KINDS.index(Kind.REFERENCE)
+                    shown.kind[there.rows] = KINDS.index(Kind.REFERENCE)
         return alternatives
 
-    def _carried(self, sources: Sequence[Carried], t_ns: Ints, wanted: Bools, kind: Ints) -> list[Alternative]:
-        """By each odometer, from the anchors of its gaps: the train was where one of them says; writes into `kind`."""
+    def _carried(self, sources: Sequence[Carried], t_ns: Ints, wanted: Bools, shown: _Shown) -> list[Alternative]:
+        """By each odometer, from the anchors of its gaps: the train was where one of them says.
+
+        Writes into `shown`. Between two anchors of one surveyed way that the odometer closes the train was on that way;
+        a read itself needs no odometer.
+        """
         alternatives: list[Alternative] = []
         for source in sources:
             open_rows = wanted.copy()
@@ -158,7 +211,10 @@ class TrainEvidence:
                     alternatives.append(there)
                     open_rows[there.rows] = False
                     by_read = any(anchor.kind is Kind.BALISE for anchor in gap.anchors)
-                    kind[there.rows] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
+                    shown.kind[there.rows] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
+                    at_anchor = np.isin(t_ns[there.rows], [anchor.t_ns for anchor in gap.anchors if anchor.proved])
+                    shown.proves[there.rows] = source.counter.odometer.independent | at_anchor
+                    shown.on_survey[there.rows] = gap.on_survey(self.network) | at_anchor
         return alternatives
 
     def _interval(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints) -> Interval:
@@ -250,39 +306,79 @@ def evidence_of(
 ) -> TrainEvidence:
     """Everything that is known of where the train was, except from GNSS.
 
-    `reference`: as from `reference_stretches`; `odometers`: that of the LDS first.
+    `reference`: as from `reference_stretches`; `odometers`: that of the LDS first. Where any is independent, the others
+    confirm nothing and narrow nothing; where none is, what they carry proves nothing.
     """
     hazards = config.hazards
-    by_file = vehicle.gnss_latency_s is not None
-    counters = [Counter.of(odometer) for odometer in odometers]
+    independent = [odometer for odometer in odometers if odometer.independent]
+    counters = [Counter.of(odometer) for odometer in independent or odometers]
+    # An odometer that may be made of the positions measures no clock, and contradicts no reference.
+    witnesses = counters if independent else []
     main = counters[0] if counters else None
+    clock_main = witnesses[0] if witnesses else None
     least_m = config.matching.orientation_distance_m
-    sides = [anchors.sided(stretch, main, least_m) for stretch in reference[0]]
+    stretches, silent = reference
+    sides = [anchors.sided(stretch, main, least_m) for stretch in stretches]
     facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
     turned = any(min(side.with_m, side.against_m) >= least_m for side in sides)
     searches = [GapSearch(counter, network, config, facing, turned) for counter in counters]
-    of_reference = clock_of(anchors.reference_lag(sides, main), by_file, hazards)
-    recorded = anchors.read_anchors(reads, balises, network.track, hazards)
-    lag_of_reads = RecorderLag() if main is None else _lag_of_reads(searches[0].carried(_points(recorded)))
-    of_reads = clock_of(lag_of_reads, by_file, hazards)
-    clocked = [] if main is None else anchors.on_clock(recorded, of_reads, main)
-    ahead_m = vehicle.gnss_antenna_ahead_m
-    stretches = tuple(anchors.known_stretch(side, of_reference, counters, clocked, ahead_m, config) for side in sides)
-    apart = anchors.outside(clocked, stretches)
+    lag_of_reference = anchors.reference_lag(sides, clock_main)
+    of_reference = clock_of(lag_of_reference, hazards)
+    held_against = anchors.Witnesses.of(witnesses, lag_of_reference, not turned, config)
+    read = anchors.read_anchors(reads, balises, network.track, hazards)
+    lag_of_reads = RecorderLag() if clock_main is None else _lag_of_reads(searches[0].carried(_points(read)))
+    of_reads = clock_of(lag_of_reads, hazards)
+    clocked = [] if main is None else anchors.on_clock(read, of_reads, main)
+    recorded, unclosed = _known_stretches(sides, of_reference, held_against, clocked, searches, vehicle, config)
+    known = tuple(part for stretch in recorded for part in stretch.trusted())
+    unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
+    apart = anchors.outside(clocked, known)
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return TrainEvidence(
-        stretches=stretches,
-        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in reference[1]),
-        carried=tuple(
-            search.carried([*(stretch.ends(search.counter) for stretch in stretches), *_points(apart)])
-            for search in searches
-        ),
-        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if stretches else (),
+        stretches=known,
+        silent=(*((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent), *unsure),
+        carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
+        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if known else (),
         reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
-        clocks=(of_reference,) * bool(stretches) + (of_reads,) * bool(apart),
+        clocks=(of_reference,) * bool(known) + (of_reads,) * bool(apart),
         network=network,
         config=config,
+        stands=final_stands([stretch.reference for stretch in known], independent, config),
+        parted=_parted(odometers, config),
+        doubted=unclosed + sum(stretch.levels.doubts for stretch in recorded),
     )
+
+
+def _known_stretches(
+    sides: Sequence[anchors.Sided],
+    clock: RecorderClock,
+    witnesses: anchors.Witnesses,
+    reads: Sequence[TrueAnchor],
+    searches: Sequence[GapSearch],
+    vehicle: Vehicle,
+    config: Configuration,
+) -> tuple[list[KnownStretch], int]:
+    """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
+    ahead_m = vehicle.gnss_antenna_ahead_m
+    known = [anchors.known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
+    if not witnesses.counters:
+        return known, 0
+    search = searches[0]
+    order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
+    borders = [known[number].ends(search.counter) for number in order]
+    steps_m = [search.misclosure_m(before[1], after[0]) for before, after in pairwise(borders)]
+    levels = [known[number].levels for number in order]
+    if len(known) < 2 or not (any(steps_m) or any(of.doubts for of in levels)):
+        return known, 0
+    for number, beyond in zip(order, anchors.levels_beyond(levels, steps_m), strict=True):
+        known[number] = anchors.known_stretch(sides[number], clock, witnesses, reads, ahead_m, config, beyond)
+    return known, sum(map(bool, steps_m))
+
+
+def _borders(
+    stretches: Sequence[KnownStretch], counter: Counter, reads: Sequence[TrueAnchor]
+) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    return [*(stretch.ends(counter) for stretch in stretches), *_points(reads)]
 
 
 def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
@@ -290,7 +386,23 @@ def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
 
 
 def _lag_of_reads(source: Carried) -> RecorderLag:
-    """The clock of the reads against the odometer's, by the ways between reads that one closed chain leaves."""
-    ways = [(gap.begin_ns, gap.end_ns, way.apart_m) for gap in source.gaps for way in gap.alone]
+    """The clock of the reads against the odometer's, by the ways between reads, whether they close or not."""
+    ways = [(gap.begin_ns, gap.end_ns, apart_m) for gap in source.gaps for apart_m in gap.only_length_m]
     begins, ends, lengths = zip(*ways, strict=True) if ways else ((), (), ())
     return lag_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(lengths, np.float64), source.counter)
+
+
+def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
+    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a way."""
+    independent = [odometer for odometer in odometers if odometer.independent]
+    others = [odometer for odometer in odometers if odometer.origin is Origin.UNKNOWN and not odometer.follows_gnss]
+    for other in others:
+        for witness in independent:
+            begin_ns = max(other.begin_ns, witness.begin_ns)
+            end_ns = min(other.end_ns, witness.end_ns)
+            at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
+            ways = [np.abs(odometer.distance_between(at_ns[:-1], at_ns[1:])) for odometer in (other, witness)]
+            allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
+            if (np.abs(ways[0] - ways[1]) > allowed_m).any():
+                return True
+    return False

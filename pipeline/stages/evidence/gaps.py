@@ -60,6 +60,18 @@ class Gap:
         return self.closed[:1] if len(lengths) == 1 and len(self.anchors) == 2 else []
 
     @property
+    def only_length_m(self) -> list[float]:
+        """The length of the ways between two anchors, whether the odometer closes it or not; nothing if several."""
+        lengths = {round(way.apart_m, 2) for way in self.ways or []}
+        return [self.ways[0].apart_m] if self.ways and len(lengths) == 1 and len(self.anchors) == 2 else []
+
+    def on_survey(self, network: Network) -> bool:
+        """Both anchors are on surveyed track, and one way without a branch that the odometer closes joins them."""
+        if len(self.anchors) != 2 or len(self.closed) != 1 or len(self.ways or []) != 1:
+            return False
+        return all(anchor.proved for anchor in self.anchors) and not _branches_inside(self.closed[0].chain, network)
+
+    @property
     def unreachable(self) -> bool:
         """No train can have passed its two anchors one after the other: one of the two is wrong."""
         return len(self.anchors) == 2 and self.ways == []
@@ -135,6 +147,14 @@ class GapSearch:
             ends = (begin, end)
             ways = [replace(way, closed=closes(self.counter, ends, way.apart_m, self.config)) for way in ways]
         return [Gap(begin.t_ns, end.t_ns, begin, end, ways)]
+
+    def misclosure_m(self, begin: TrueAnchor, end: TrueAnchor) -> float:
+        """How much farther apart the anchors are than the odometer counted [m]; 0 where a way closes, or none leads."""
+        gaps = self._between(begin, end)
+        if len(gaps) != 1 or not gaps[0].ways or gaps[0].closed:
+            return 0.0
+        counted_m = float(self.counter.distance_m(begin.t_ns, np.array([end.t_ns]))[0])
+        return min((way.apart_m - counted_m for way in gaps[0].ways), key=abs)
 
     def _ways_of_length(
         self, first: TrueAnchor, second: TrueAnchor, length_m: float, slack_m: float
@@ -245,3 +265,9 @@ def _without_contradicted(gaps: list[Gap]) -> list[Gap]:
         return bool(anchors & wrong) or (len(anchors) == 1 and bool(anchors & (joined - closed)))
 
     return [replace(gap, ways=None) if doubtful(gap) and not gap.unreachable else gap for gap in gaps]
+
+
+def _branches_inside(chain: Chain, network: Network) -> bool:
+    """Another track begins or ends where two elements of the chain join."""
+    joints = [*chain.oriented[:-1], *(oriented ^ 1 for oriented in chain.oriented[1:])]
+    return any(len(network.successors[side]) > 1 for side in joints)

@@ -94,7 +94,7 @@ def positions_of(epochs: pl.DataFrame) -> pl.DataFrame:
 
 _POSITION_COLUMNS = (
     *("t", "leg", "path_m", "sigma_along_m", "epoch", "at", "direction", "judgement", "error_low_m", "error_high_m"),
-    *("evidence", "wrong_track", "used_s", "wrong_s", "train_m", "reference_m"),
+    *("evidence", "wrong_track", "track_assumed", "used_s", "wrong_s", "train_m", "reference_m"),
 )
 
 

@@ -51,6 +51,7 @@ class Judgements:
     """Per instant: judgement (number in `JUDGEMENTS`), interval of the error along the track [m], kind of evidence.
 
     Errors are along growing path until `turned`. `wrong_track`: wrong for its net element, wherever along it.
+    `track_assumed`: right if the survey holds the train's track, which nothing shows.
     """
 
     code: Ints
@@ -58,6 +59,7 @@ class Judgements:
     high_m: Floats
     kind: Ints
     wrong_track: Bools
+    track_assumed: Bools
 
     @classmethod
     def of(cls, frame: pl.DataFrame) -> Judgements:
@@ -68,6 +70,7 @@ class Judgements:
             high_m=floats(frame, "error_high_m"),
             kind=ints(frame["evidence"].to_physical(), NOTHING),
             wrong_track=flags(frame, "wrong_track"),
+            track_assumed=flags(frame, "track_assumed"),
         )
 
     def columns(self) -> list[pl.Series]:
@@ -79,6 +82,7 @@ class Judgements:
             pl.Series("error_high_m", self.high_m, nan_to_null=True),
             kinds.gather(np.where(self.kind == NOTHING, len(KINDS), self.kind)),
             pl.Series("wrong_track", self.wrong_track),
+            pl.Series("track_assumed", self.track_assumed),
         ]
 
     def turned(self, direction: Ints) -> Judgements:
@@ -173,12 +177,15 @@ def judge_positions(
         high_m[rows] = np.fmax(high_m[rows], most_m)
     wrong = judged & (ahead | behind)
     compared = judged & np.isfinite(low_m)
+    # What rests on a witness that may be made of the positions proves nothing (DOMAIN section 5.0).
+    right &= judged & evidence.proves & ~wrong
     return Judgements(
-        code=np.where(wrong, WRONG, np.where(judged & right, RIGHT, UNKNOWN)),
+        code=np.where(wrong, WRONG, np.where(right & evidence.on_survey, RIGHT, UNKNOWN)),
         low_m=np.where(compared, low_m, np.nan),
         high_m=np.where(compared, high_m, np.nan),
         kind=np.where(judged, evidence.kind, NOTHING),
         wrong_track=wrong & elsewhere,
+        track_assumed=right & ~evidence.on_survey,
     )
 
 
@@ -254,4 +261,5 @@ def with_own_anchors(
         high_m=np.where(rows, high_m, judged.high_m),
         kind=np.where(rows, ODOMETER, judged.kind),
         wrong_track=judged.wrong_track,
+        track_assumed=judged.track_assumed,
     )

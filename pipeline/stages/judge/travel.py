@@ -30,7 +30,8 @@ def odometer_steps(case: Case) -> OdometerSteps:
     """What the odometer says of the steps between the epochs; without one, or of unknown origin, nothing of motion."""
     at_ns = case.instants_of_epochs()
     odometry = case.odometry
-    if odometry is None:
+    # One that may be made of the positions tells no motion (DOMAIN section 5.0).
+    if odometry is None or not odometry.independent:
         return OdometerSteps(*np.zeros((2, at_ns.size), dtype=np.bool_))
     moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
     counts = _to_the_next(np.isfinite(odometry.steps_m(at_ns)), at_ns.size)

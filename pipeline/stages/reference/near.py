@@ -39,6 +39,13 @@ class Near:
     any_near: Bools
     track: SurveyedTrack
 
+    def placed(self, factor: float, sigma_m: Floats) -> Bools:
+        """Samples with an element within `factor` roots."""
+        close = self.distance_m <= factor * np.hypot(sigma_m[self.sample], self.survey_sigma_m)
+        placed = np.zeros(self.any_near.size, dtype=np.bool_)
+        placed[self.sample[close]] = True
+        return placed
+
     def of(self, element: int, begin: int, end: int) -> slice:
         """The pairs of an element with samples from `begin` to `end`."""
         of_element = slice(int(self.first[element]), int(self.first[element + 1]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import dist
 
@@ -31,11 +31,21 @@ _FARTHEST_M = 600.0
 
 @dataclass(frozen=True)
 class ReferencePath:
-    """One way that the samples of a stretch may have taken: per sample its leg and the coordinate on it [m]."""
+    """One way that the samples of a stretch may have taken: per sample its leg and the coordinate on it [m].
+
+    `aside_m`: distance of the sample from the track; `root_m`: sigma of that, of sample and survey together.
+    """
 
     leg: Ints
     at_m: Floats
     legs: tuple[RoutePath, ...]
+    aside_m: Floats
+    root_m: Floats
+
+    def part(self, rows: slice) -> ReferencePath:
+        """Of some samples."""
+        arrays = {name: getattr(self, name)[rows] for name in ("leg", "at_m", "aside_m", "root_m")}
+        return replace(self, **arrays)
 
 
 @dataclass(frozen=True)
@@ -63,8 +73,11 @@ def reference_stretches(
     sigma_m = reference["sigma_m"].fill_null(hazards.reference_sigma_m).to_numpy()
     points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))
     # A sample beyond k_T roots of every track is no sample of the track.
-    near = near_elements(points, sigma_m, network, config.align.sure_sigmas, hazards.survey_sigma_m)
-    placed = np.flatnonzero(near.any_near & ~off_the_survey(points, sigma_m, near, network, hazards))
+    # A track whose samples lie a little farther at some steps is still asked for: its median decides.
+    near = near_elements(points, sigma_m, network, 2.0 * config.align.sure_sigmas, hazards.survey_sigma_m)
+    placed = np.flatnonzero(
+        near.placed(config.align.sure_sigmas, sigma_m) & ~off_the_survey(points, sigma_m, near, network, hazards)
+    )
     search = _Search(points, sigma_m, near, network, numbers, config)
     stretches: list[ReferenceStretch] = []
     covered = np.zeros(t_ns.size, dtype=np.bool_)
@@ -239,6 +252,7 @@ class _Search:
         nearest_m = np.full(count, np.inf)
         at_m = np.full(count, np.nan)
         leg = np.full(count, -1)
+        survey_m = np.zeros(count)
         legs, placed = _legs(stays, self.network)
         for stay, (number, entry_m) in zip(stays, placed, strict=True):
             element = stay.oriented // 2
@@ -254,11 +268,13 @@ class _Search:
             nearest_m[sample] = near.distance_m[pairs][nearer]
             leg[sample] = number
             at_m[sample] = entry_m + along_m
+            survey_m[sample] = near.survey_sigma_m[pairs][nearer]
         on_way = np.flatnonzero(leg >= 0)
         samples = np.arange(count)
         leg = leg[on_way[np.maximum(np.searchsorted(on_way, samples, side="right") - 1, 0)]]
         routes = tuple(chain.route(self.network, self.numbers) for chain in legs)
-        return ReferencePath(leg, np.interp(samples, on_way, at_m[on_way]), routes)
+        root_m = np.hypot(self.sigma_m[part.begin : part.end + 1], survey_m)
+        return ReferencePath(leg, np.interp(samples, on_way, at_m[on_way]), routes, nearest_m, root_m)
 
 
 def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:

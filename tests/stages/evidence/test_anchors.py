@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.stages.evidence.anchors import Sided, known_stretch, reference_lag, sided
+from pipeline.stages.evidence.anchors import Sided, Witnesses, known_stretch, reference_lag, sided
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
 from pipeline.stages.evidence.clock import RecorderClock, RecorderLag
 from pipeline.stages.odometry import odometry_of
@@ -29,8 +29,13 @@ def ns(t_s: Floats) -> Ints:
 def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch:
     """Samples to 0.1 m along element 4, which is 10 km long and entered at 0 m."""
     route = RoutePath(np.array([4]), np.array([forward]), np.zeros(1), np.zeros(1), np.array([10_000.0]))
-    path = ReferencePath(np.zeros(t_s.size, dtype=np.int64), at_m, (route,))
+    path = ReferencePath(np.zeros(t_s.size, dtype=np.int64), at_m, (route,), np.zeros(t_s.size), np.full(t_s.size, 0.1))
     return ReferenceStretch(ns(t_s), np.full(t_s.size, 0.1), (path,))
+
+
+def against(*counters: Counter) -> Witnesses:
+    """These odometers on the reference's clock, their scale within 5 %."""
+    return Witnesses.of(counters, RecorderLag(), True, CONFIG)
 
 
 def counter(at_m: Floats, rate_hz: float) -> Counter:
@@ -71,8 +76,7 @@ def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     assert found.lag_s == pytest.approx(0.4, abs=0.03)
     assert found.sigma_s < 0.05
     cut = late.t_ns <= 60 * NS_PER_S
-    path = replace(late.paths[0], leg=late.paths[0].leg[cut], at_m=late.paths[0].at_m[cut])
-    few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (path,))
+    few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (late.paths[0].part(slice(int(cut.sum()))),))
     assert reference_lag([Sided(few, 1, 1.0, 0.0)], counted) == RecorderLag()
 
 
@@ -80,18 +84,23 @@ def test_a_clock_counts_by_the_greatest_speed_that_it_leaves_possible() -> None:
     """t^2 metres: 2 t m/s at each sample over a second about it, 2 (t + 0.5) half a second later."""
     t_s = np.arange(0.0, 10.25, 0.25)
     clock = replace(SURE, shift_s=3.0, delta_s=0.5)
-    found = known_stretch(Sided(stretch(t_s + 3.0, t_s**2), 1, 1.0, 0.0), clock, [], [], 0.0, CONFIG)
+    found = known_stretch(Sided(stretch(t_s + 3.0, t_s**2), 1, 1.0, 0.0), clock, against(), [], 0.0, CONFIG)
     assert found.t_ns.tolist() == ns(t_s).tolist()
     assert found.clock_m[4:36] == pytest.approx(0.5 * 2.0 * (t_s[4:36] + 0.5))
     assert found.clock_m[0] == pytest.approx(0.5 * 1.0)  # at 0.5 s; before the first sample nothing moved faster
 
 
 @pytest.mark.parametrize(
-    ("read_s", "read_m", "closed"),
-    [(12.0, 120.0, True), (12.0, 124.0, False), (4.0, 40.0, False), (19.5, 195.0, True), (25.0, 250.0, False)],
+    ("read_s", "read_m", "behind_m", "ahead_m"),
+    [
+        (12.0, 120.0, 0.0, 30.0),  # the level after the step is right: the one before may be 30 m behind the train
+        (12.0, 124.0, 30.0, 30.0),  # 4 m off: confirms nothing
+        (4.0, 40.0, 30.0, 0.0),  # the level before is right: after it the train may be 30 m behind the reference
+        (25.0, 250.0, 30.0, 30.0),  # after the stretch
+    ],
 )
-def test_a_step_is_open_until_a_read_confirms_where_the_reference_is(
-    read_s: float, read_m: float, closed: bool
+def test_a_step_leaves_both_sides_open_where_no_read_confirms(
+    read_s: float, read_m: float, behind_m: float, ahead_m: float
 ) -> None:
     """10 m/s; at 9 s the reference steps 30 m ahead of the odometer. Reads are true to 3 sqrt(1^2 + 0.1^2) = 3.01 m."""
     t_s = np.arange(0.0, 20.5, 0.5)
@@ -99,11 +108,9 @@ def test_a_step_is_open_until_a_read_confirms_where_the_reference_is(
     step_m = np.where(t_s >= 9.0, 30.0, 0.0)
     ahead = step_m[-1] if read_s > 9.0 else 0.0
     read = TrueAnchor(round(read_s * NS_PER_S), (Place(4, read_m + ahead),), 1.0, Evidence.BALISE)
-    found = known_stretch(Sided(stretch(t_s, 10.0 * t_s + step_m), 1, 1.0, 0.0), SURE, [counted], [read], 0.0, CONFIG)
+    side = Sided(stretch(t_s, 10.0 * t_s + step_m), 1, 1.0, 0.0)
+    found = known_stretch(side, SURE, against(counted), [read], 0.0, CONFIG)
     (path,) = found.paths
     assert np.flatnonzero(path.step_m).tolist() == [17]
-    open_m = path.at_m - path.low_m
-    assert open_m[:18].tolist() == [0.0] * 18
-    assert open_m[18:23] == pytest.approx(30.0)
-    assert open_m[-1] == pytest.approx(0.0 if closed else 30.0)
-    assert path.high_m == pytest.approx(path.at_m)
+    assert (path.at_m - path.low_m).tolist() == pytest.approx([0.0] * 18 + [behind_m] * 23)
+    assert (path.high_m - path.at_m).tolist() == pytest.approx([ahead_m] * 18 + [0.0] * 23)

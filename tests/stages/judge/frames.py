@@ -29,7 +29,8 @@ def positions(t_s: Sequence[float], error_m: Sequence[float] | float = 0.0, half
     nanoseconds = [round(t * NS) for t in t_s]
     values: dict[str, Any] = {
         "epoch": list(range(size)), "t": nanoseconds, "at": nanoseconds, "direction": 1, "judgement": judgement,
-        "error_low_m": error - half_m, "error_high_m": error + half_m, "evidence": "reference", "wrong_track": False,
+        "error_low_m": error - half_m, "error_high_m": error + half_m, "evidence": "reference",
+        "wrong_track": False, "track_assumed": False,
         "path_m": 10.0 * np.array(t_s) + error, "sigma_along_m": 1.0, "leg": 0, "used_s": step_s,
     } | columns  # fmt: skip
     values.setdefault("wrong_s", np.where([word == "wrong" for word in values["judgement"]], values["used_s"], 0.0))
@@ -46,7 +47,7 @@ def offers(epochs: Sequence[int], **columns: Any) -> pl.DataFrame:
         "crossing_id": list(range(size)), "balise_id": [f"V{k}" for k in range(size)], "epoch": list(epochs),
         "t": [k * NS for k in epochs], "path_m": [10.0 * k for k in epochs], "virtual": True, "offered": True,
         "accepted": True, "beyond_window": False, "judgement": "right", "error_low_m": -1.0, "error_high_m": 1.0,
-        "evidence": "reference", "wrong_track": False,
+        "evidence": "reference", "wrong_track": False, "track_assumed": False,
     } | columns  # fmt: skip
     return _frame(size, values, dtypes(JudgedOffers))
 

@@ -54,6 +54,11 @@ EPISODE = Episode(
 DEG_PER_M = np.degrees(1.0 / 6378137.0)  # east along the equator
 
 
+def proving(kind: Any, alternatives: Sequence[Alternative]) -> EvidenceSet:
+    """Evidence by independent witnesses on a survey that is complete."""
+    return EvidenceSet(kind, tuple(alternatives), *np.ones((2, kind.size), dtype=np.bool_))
+
+
 def seconds(*t_s: float) -> Any:
     return np.array([round(t * NS) for t in t_s], dtype=np.int64)
 
@@ -165,7 +170,7 @@ def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of()
             ([3, 4, 5], after, [106.0, 114.0, 122.0]),
         )
     )
-    evidence = EvidenceSet(np.zeros(6, dtype=np.int64), alternatives)
+    evidence = proving(np.zeros(6, dtype=np.int64), alternatives)
     places = {"V1": Place(1, 2.0), "V2": Place(1, 60.0)}
     config = Configuration(lds=LdsConfig(rearm_m=3.0))
     found = true_crossings(seconds(0, 1, 2, 3, 4, 5), evidence, places, config)
@@ -179,7 +184,7 @@ def test_a_balise_is_passed_where_the_whole_interval_passes_it(half_m: float, la
     at_m = np.arange(5.0, last_m + 1.0, 10.0)
     route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
     rows = np.arange(at_m.size)
-    evidence = EvidenceSet(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - half_m, at_m + half_m),))
+    evidence = proving(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - half_m, at_m + half_m),))
     found = true_crossings(rows * NS, evidence, {"V": Place(0, 100.0)}, Configuration())
     # 95 m at 9 s, 105 m at 10 s; it is far enough beyond only where the run goes on.
     assert found == {"V": [TrueCrossing(round(9.5 * NS), 1, half_m > 5.0)] * crossings}
@@ -192,7 +197,7 @@ def test_a_train_that_turns_at_a_balise_has_not_surely_passed_it(turn_m: float, 
     at_m = np.concatenate([there_m, there_m[::-1]])
     rows = np.arange(at_m.size)
     route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
-    evidence = EvidenceSet(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - 40.0, at_m + 40.0),))
+    evidence = proving(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - 40.0, at_m + 40.0),))
     found = true_crossings(rows * NS, evidence, {"V": Place(0, 100.0)}, Configuration())
     assert [crossing.t_ns / NS for crossing in found["V"]] == passed_s
     assert [crossing.sense for crossing in found["V"]] == [1, -1][: len(passed_s)]
@@ -205,7 +210,7 @@ def test_a_train_that_stands_on_a_balise_and_goes_on_has_passed_it_once(half_m: 
     at_m = np.concatenate([np.arange(5.0, 100.0, 10.0), wavering_m, np.arange(105.0, 196.0, 10.0)])
     rows = np.arange(at_m.size)
     route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 200.0)))
-    evidence = EvidenceSet(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - half_m, at_m + half_m),))
+    evidence = proving(np.zeros(rows.size, np.int64), (Alternative(rows, route, at_m - half_m, at_m + half_m),))
     (found,) = true_crossings(rows * NS, evidence, {"V": Place(0, 100.0)}, Configuration())["V"]
     assert (found.sense, found.clear) == (1, True)
 
@@ -238,7 +243,7 @@ def test_what_an_episode_hit() -> None:
     epoch = [1, 2, 3, 4, 5, 6, 7, 8, 3, 4]
     offered = offers(
         epoch, judgement=code, error_low_m=least_m, error_high_m=least_m + 2.0,
-        offered=[k != 2 for k in range(10)], wrong_track=[number == 7 for number in epoch],
+        offered=[k != 2 for k in range(10)], track_assumed=False, wrong_track=[number == 7 for number in epoch],
     )  # fmt: skip
     met = course(positions(range(10)), offered=offered)
     found = hazard_rows([replace(EPISODE, onset=2, end=8)], met)
@@ -263,7 +268,7 @@ def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
     middle_m, size_m = np.array([before_m, 0.0]), np.array([0.0, after_m])
     low_m = np.where(np.arange(2) == 0, middle_m, size_m)
     kind, track = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=bool)
-    judged = Judgements(np.array([WRONG, code]), low_m, low_m, kind, track)
+    judged = Judgements(np.array([WRONG, code]), low_m, low_m, kind, track, np.zeros(2, dtype=bool))
     judged_course = replace(course(positions(range(2))), judged=judged)
     assert bool(_is_back(judged_course, Jump(1, 1, step_m))) is back
 
@@ -360,7 +365,7 @@ def test_each_alternative_is_weighed_however_few_instants_it_tells_of() -> None:
     route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
     told = [Alternative(np.array(rows), route, np.array(low), np.array(low) + 2.0) for rows, low in (
         ([0, 1, 2, 3], [49.0] * 4), ([2], [89.0]), ([3], [89.0]))]  # fmt: skip
-    evidence = EvidenceSet(np.full(4, KINDS.index(Evidence.BALISE)), tuple(told))
+    evidence = proving(np.full(4, KINDS.index(Evidence.BALISE)), tuple(told))
     found = judge_positions(placed([50.0, 80.0, 50.0, np.nan]), evidence, [route], HazardConfig())
     assert found.code.tolist() == [RIGHT, WRONG, UNKNOWN, UNKNOWN]
     assert found.low_m == pytest.approx([-1.0, 29.0, -41.0, np.nan], nan_ok=True)
@@ -374,7 +379,7 @@ def test_the_odometer_since_a_balise_shows_only_what_was_wrong() -> None:
     nothing, balise = NOTHING, KINDS.index(Evidence.BALISE)
     before = np.array([nothing, nothing, balise, nothing, nothing, nothing])
     unknown = np.full(6, np.nan)
-    judged = Judgements(np.full(6, UNKNOWN), unknown, unknown, before, np.zeros(6, dtype=bool))
+    judged = Judgements(np.full(6, UNKNOWN), unknown, unknown, before, *np.zeros((2, 6), dtype=bool))
     low_m = np.array([90.0, 90.0, 90.0, 90.0, np.nan, 100.0])
     found = with_own_anchors(judged, given, (low_m, low_m + 10.0), HazardConfig())
     assert found.code.tolist() == [UNKNOWN, WRONG, UNKNOWN, UNKNOWN, UNKNOWN, WRONG]
@@ -468,7 +473,9 @@ def along(error_m: Any, half_m: float, kind: Evidence) -> Judgements:
     """Errors along growing path."""
     size = len(error_m)
     number, track = np.full(size, KINDS.index(kind)), np.zeros(size, dtype=bool)
-    return Judgements(np.full(size, RIGHT), error_m - half_m, error_m + half_m, number, track)
+    return Judgements(
+        np.full(size, RIGHT), error_m - half_m, error_m + half_m, number, track, np.zeros(size, dtype=bool)
+    )
 
 
 def test_without_an_odometer_the_train_turns_where_its_own_place_does() -> None:
@@ -505,7 +512,7 @@ def test_what_an_interval_of_errors_says() -> None:
     """From 4 m late to 6 m early; from 2 to 4 m early; from 9 to 5 m late, by the odometer alone."""
     kinds = np.array([KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER)])
     low_m, high_m = np.array([-4.0, 2.0, -9.0]), np.array([6.0, 4.0, -5.0])
-    judged = Judgements(np.full(3, UNKNOWN), low_m, high_m, kinds, np.zeros(3, dtype=bool))
+    judged = Judgements(np.full(3, UNKNOWN), low_m, high_m, kinds, *np.zeros((2, 3), dtype=bool))
     assert judged.middle_m.tolist() == [1.0, 3.0, -7.0]
     assert judged.half_m.tolist() == [5.0, 1.0, 2.0]
     assert judged.least_m.tolist() == [0.0, 2.0, 5.0]
@@ -526,7 +533,7 @@ def test_where_the_evidence_ends_the_position_is_held_to_it_by_its_own_path(onwa
     at_m, leg, sure = np.array([110.0]), np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool)
     given = MatchedPositions(np.array([1]), at_m - 100.0, leg, at_m, sure)
     told = Alternative(np.array([0]), route(onward), np.array([95.0]), np.array([97.0]))
-    evidence = EvidenceSet(np.array([KINDS.index(Evidence.BALISE)]), (told,))
+    evidence = proving(np.array([KINDS.index(Evidence.BALISE)]), (told,))
     found = judge_positions(given, evidence, [route([0, 1])], HazardConfig())
     assert found.code.tolist() == [code]
     assert found.wrong_track.tolist() == [code == WRONG]
