@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.stages.matching.path_set import Node, PathSet, unbranched_groups
+from pipeline.stages.paths.path_set import Node, PathSet, unbranched_groups
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import MatchingConfig

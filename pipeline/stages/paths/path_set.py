@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.stages.matching.candidates import Candidates, candidates_of, search_about
-from pipeline.stages.matching.path_tests import PathTests
-from pipeline.stages.track.geodesy import Points
+from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
+from pipeline.stages.paths.path_steps import PathSteps
+from pipeline.stages.paths.path_tests import PathTests
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
@@ -28,35 +28,6 @@ _DETOUR_M = 50.0
 _OPEN_M = 10.0
 # A longer step is a gap: the train may have taken any way meanwhile [s].
 _GAP_S = 3.5
-# Steps on each side with which one is compared before it counts.
-_NEIGHBOURS = 3
-
-
-@dataclass(frozen=True)
-class PathSteps:
-    """Means of a second of positions, shapes (n,); `points` (n, 3).
-
-    `begin_s`, `end_s`: times of its first and last position; `sigma_m` of the position across; `way_m`: since the step
-    before, the larger of odometer and positions; `counted`: it moved by a metre, and is no outlier; `along_m`: position
-    along the track minus an independent odometer, NaN without one; `pinned`: element of a balise read then, else -1.
-    """
-
-    begin_s: Floats
-    end_s: Floats
-    points: Points
-    sigma_m: Floats
-    way_m: Floats
-    counted: Bools
-    along_m: Floats
-    pinned: Ints
-
-    def __len__(self) -> int:
-        return len(self.end_s)
-
-    @cached_property
-    def period_s(self) -> float:
-        """Usual time from one to the next, a second at least [s]."""
-        return max(float(np.median(np.diff(self.end_s))), 1.0) if len(self.end_s) > 1 else 1.0
 
 
 @dataclass
@@ -127,12 +98,29 @@ class PathSet:
             here = [node for node in here if node.end > step] + new
             yield here
 
+    def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
+        """Per step the net elements that no rejection rules out, each with the largest p-value of a path over it.
 
-def path_set(steps: PathSteps, network: Network, bias_m: float, config: MatchingConfig) -> PathSet:
+        In hindsight, or by what was known `delay_s` before the end of each step. Empty: off the network.
+        """
+        sets = self.to_the_end() if delay_s is None else self.living(delay_s)
+        found: list[dict[int, float]] = []
+        for nodes in sets:
+            best: dict[int, float] = {}
+            for node in nodes:
+                best[node.element] = max(best.get(node.element, 0.0), min(node.p, 1.0))
+            found.append(best)
+        return found
+
+
+def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, config: MatchingConfig) -> PathSet:
     """Every path that begins near the first positions and goes on over navigable relations, until it is refuted.
 
-    `bias_m`: sigma of the offset across that lasts the run; 0 for a reference. Without a position near the network the
-    set is empty.
+    `steps`: of positions (`path_steps`), of a solution or of a reference; `bias_m`: sigma of the offset across that
+    lasts the run, 0 for a reference; `alpha`: level of all tests of a path together in 600 s; `network`: with elements
+    that turn round in pieces (`network_in_pieces`), as `Node.element` counts them. Of the result `living` gives the set
+    of each step by what was known then, `to_the_end` in hindsight, both with the least p-value of each path, and
+    `elements` the same by net element. Without a position near the network the set is empty: off the survey.
     """
     search = search_about(steps.points.surface, network, config.reach_m)
     candidates = candidates_of(steps.points, network, search, config.reach_m)
@@ -140,7 +128,7 @@ def path_set(steps: PathSteps, network: Network, bias_m: float, config: Matching
     groups = unbranched_groups(network)
     # Where no other track comes near in the whole run there is nothing to tell apart.
     alone = np.unique(groups[candidates.element]).size <= 1
-    tests = PathTests.of_run(steps, config.paths_alpha, bias_m, config.paths_alike_m, alone)
+    tests = PathTests.of_run(steps, alpha, bias_m, config.paths_alike_m, alone)
     return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
 
 
@@ -159,21 +147,6 @@ def unbranched_groups(network: Network) -> Ints:
             first, second = sorted((root(oriented // 2), root(onward[0].to // 2)))
             group[second] = first
     return np.array([root(element) for element in range(network.count)])
-
-
-def outliers(points: Points, sigma_m: Floats) -> Bools:
-    """Steps far from the middle of their neighbours: reflections follow no model of errors."""
-    count = len(points)
-    reach = _NEIGHBOURS
-    if count <= 2 * reach:
-        return np.zeros(count, dtype=np.bool_)
-    around = sliding_window_view(points.surface, 2 * reach + 1, axis=0)
-    middles = [0.5 * (around[:, :, reach - k] + around[:, :, reach + k]) for k in range(1, reach + 1)]
-    middle = np.median(np.stack(middles), axis=0)
-    far = np.zeros(count, dtype=np.bool_)
-    away_m = np.linalg.norm(points.surface[reach:-reach] - middle, axis=1)
-    far[reach:-reach] = away_m > 4.0 * sigma_m[reach:-reach] + 3.0
-    return far
 
 
 @dataclass

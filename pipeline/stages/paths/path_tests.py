@@ -7,14 +7,12 @@ receiver. Tested are movements over several windows, the offset, and the lasting
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.stages.paths.path_steps import PathSteps
 from schemas.arrays import Bools, Floats, Ints
-
-if TYPE_CHECKING:
-    from pipeline.stages.matching.path_set import PathSteps
 
 # Windows of the movements, and of the offset [s].
 WINDOWS_S = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0)
