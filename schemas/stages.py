@@ -136,6 +136,7 @@ class JudgedEpochs(dy.Schema):
     in_use = flag("fix valid, unambiguous, confident, not negated, not withheld")
     used_s = real("s", "time in use that the epoch stands for", nullable=False, min=0)
     wrong_s = real("s", "the same where it was wrong", nullable=False, min=0)
+    natural_s = real("s", "of it what no injected fault of GNSS explains", nullable=False, min=0)
     counted_s = real("s", "time that the epoch stands for in shares of time", nullable=False, min=0)
     lds_state = one_of(
         LdsState, "state of the reactive LDS; null where it needs a truth that is missing", nullable=True
@@ -170,6 +171,7 @@ class Failures(dy.Schema):
     t_start = instant("first position that may belong to it")
     t_end = instant("first position that no longer does")
     hazardous_s = real("s", "time judged wrong in use, over the whole failure", nullable=False, min=0)
+    natural_s = real("s", "of it what no injected fault of GNSS explains", nullable=False, min=0)
     hazardous_may_s = real("s", "the same with the time that is unknown", nullable=False, min=0)
     accepted = one_of(Judgement, "worst judgement of the virtual balises accepted in it; right where none was")
     within_budget = flag("hazardous time within the budget; null where it cannot be said", nullable=True)

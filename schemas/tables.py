@@ -348,6 +348,7 @@ class Runs(dy.Schema):
     time_since_failure_may_max_s = real("s", "largest T_dsf that the evidence leaves")
     hazardous_max_s = real("s", "longest hazardous time of a failure, whether it hit a VB or not")
     hazardous_s = real("s", "hazardous time of all failures", min=0)
+    hazardous_natural_s = real("s", "of it what no injected fault of GNSS explains: eq. 7 is of nature's", min=0)
     unknown_in_use_s = real("s", "longest unknown moving time in use; stretches near each other taken together", min=0)
     share_undiagnosed = real("1", "share of the moving time in use without diagnosis (P3)", min=0, max=1)
     alarms = count("alarm episodes")

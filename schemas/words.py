@@ -115,7 +115,7 @@ def reason_words(run: Mapping[str, Any]) -> str:
     figures = {
         **{name: run[name] for name in ("unsafe_accepted", "unproven_accepted", "failures_beyond_budget")},
         "failures_undecided": undecided,
-        **{name: f"{run[name] or 0.0:.3g}" for name in ("hazardous_s", "unknown_in_use_s")},
+        **{name: f"{run[name] or 0.0:.3g}" for name in ("hazardous_natural_s", "unknown_in_use_s")},
         "share_undiagnosed": f"{run['share_undiagnosed'] or 0.0:.1%}",
     }
     reasons = [REASONS[Reason(reason)].format(**figures) for reason in run["reasons"] or ()]

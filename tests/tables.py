@@ -94,6 +94,7 @@ def alarms(height: int = 0, **columns: Any) -> pl.DataFrame:
 def failures(height: int = 0, **columns: Any) -> pl.DataFrame:
     plain: dict[str, Any] = {
         "hazardous_s": 0.0,
+        "natural_s": columns.get("hazardous_s", 0.0),
         "hazardous_may_s": columns.get("hazardous_s", 0.0),
         "accepted": "right",
     }

@@ -243,15 +243,15 @@ def test_positions_without_diagnosis_prove_nothing():
 
 
 @pytest.mark.parametrize("gap_s", [0.3, 0.5, 0.9])
-def test_a_gap_before_a_fault_counts_as_one_period(gap_s: float):
-    """40 m ahead behind a gap at 60 s, found at its first epoch, negated one later: 0.2 s wrong in use."""
+def test_a_fault_behind_a_gap_may_be_as_old_as_the_gap(gap_s: float):
+    """40 m ahead behind a gap at 60 s, found at its first epoch, negated one later: since 59.9 s wrong in use."""
     kept = pl.Series((TIME_S < 60.0) | (60.0 + gap_s <= TIME_S))
     log = gnss(40.0 * (TIME_S >= 60.0)).filter(kept)
     log = RunLog("gap", log, odometer=counted(WAY_M - 200.0), reference=reference())
     tables = replay(log, SITE, KNOWN)
-    assert row(tables)["failure_hazardous_s"] == [pytest.approx(0.2, abs=0.01)]
-    assert row(tables)["failures_within_budget"] == 1
-    assert row(tables)["verdict"] != "unsafe"
+    assert row(tables)["failure_hazardous_s"] == [pytest.approx(gap_s + 0.2, abs=0.01)]
+    assert row(tables)["failures_within_budget"] == (1 if gap_s == 0.3 else 0)
+    assert (row(tables)["verdict"] == "unsafe") == (gap_s > 0.3)
 
 
 @pytest.mark.parametrize(("rate_mps", "seen_s"), [(0.5, 110.0), (3.0, 50.1)])
@@ -273,14 +273,14 @@ def test_a_drift_has_its_time_from_failure_to_detection(rate_mps: float, seen_s:
 
 @pytest.mark.parametrize("driven", [True, False], ids=["odometer", "no_odometer"])
 def test_the_share_of_p1_is_the_hazardous_time(driven: bool):
-    """Two faults with gaps around them."""
+    """Two faults; of the gap of 5 s in the first no more counts than of a step of a second."""
     kept = pl.Series(~((TIME_S > 70.0) & (TIME_S < 75.0)))
     wrong = 50.0 * ((TIME_S > 60.0) & (TIME_S < 80.0)) + 30.0 * (TIME_S > 110.0)
     odometer = {"odometer": counted(WAY_M - 200.0)} if driven else {}
     tables = replay(RunLog("p1", gnss(wrong).filter(kept), reference=reference(), **odometer), SITE, KNOWN)
     share, held_s, hazardous_s = of(tables, "share_p1", "held_s", "hazardous_s")
     assert share * held_s == pytest.approx(hazardous_s)
-    assert hazardous_s == pytest.approx(0.2 * 2 if driven else 45.0 + 5.0, abs=0.5)
+    assert hazardous_s == pytest.approx(0.2 * 2 if driven else 50.0 - 5.0 + 1.0, abs=0.5)
 
 
 def test_a_part_between_the_anchors_has_its_own_verdict():

@@ -11,7 +11,7 @@ from datasets.experiment.recorded.baseline import Baseline
 from datasets.experiment.recorded.draw import Onset
 from datasets.experiment.recorded.injection import Injected
 from datasets.experiment.tables import Row
-from pipeline.stages.epochs.clock import met, nominal_period_s, reaction_of, unambiguous
+from pipeline.stages.epochs.clock import met, reactions_ns, unambiguous
 from pipeline.stages.judge.in_use import time_in_use
 from pipeline.stages.judge.judgement import RIGHT, UNKNOWN, WRONG
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of, times_ns
@@ -52,8 +52,8 @@ def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
     failure_ns, may_ns = _failure(watch)
     use = time_in_use(watch.epochs, watch.code, base.config)
     in_use = flags(use, "in_use") & after
-    delay_ns = round(reaction_of(nominal_period_s(watch.t_ns) or 0.0, base.config) * NS_PER_S)
-    stopped_from = np.inf if noticed_ns is None else noticed_ns + delay_ns
+    delays_ns = reactions_ns(watch.t_ns, watch.t_ns, base.config)
+    stopped_from = np.inf if noticed_ns is None else noticed_ns + int(delays_ns[alarm.argmax()])
     unnoticed = after if noticed_ns is None else after & (watch.t_ns < noticed_ns)
     return {
         **_what(onset, found),

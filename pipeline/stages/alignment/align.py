@@ -7,6 +7,7 @@ import polars as pl
 
 from pipeline.stages.alignment.learning import learn
 from pipeline.stages.alignment.odometer_filter import Estimates, stamp_jitter_s
+from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER, first_reason
 from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.odometry.driven import hysteresis_m, with_hysteresis
@@ -31,9 +32,10 @@ def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, 
     # A position that has jumped aside is still compared: that is how the monitors see the jump.
     along_m = unrolled(positions, flags(positions, "near_track"))
     positions = positions.with_columns(pl.Series("along_m", along_m, nan_to_null=True))
-    jitter_s = stamp_jitter_s(odometry.seconds(times_ns(positions)), config.align.clock_periods)
+    t_ns = times_ns(positions)
+    jitter_s = stamp_jitter_s(odometry.seconds(t_ns), periods_before_s(t_ns), config.align.clock_periods)
     in_use = learn(positions, flags(positions, "on_track"), jitter_s, odometry, vehicle, config)
-    return positions.with_columns(_columns(times_ns(positions), jitter_s, odometry, in_use, config))
+    return positions.with_columns(_columns(t_ns, jitter_s, odometry, in_use, config))
 
 
 def _sigmas(config: MonitorConfig) -> list[pl.Expr]:
@@ -84,7 +86,7 @@ def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometry: Odometry) -> 
 
 
 def _columns(
-    t_ns: Ints, jitter_s: float, odometry: Odometry, in_use: Estimates, config: Configuration
+    t_ns: Ints, jitter_s: Floats, odometry: Odometry, in_use: Estimates, config: Configuration
 ) -> list[pl.Series]:
     """Each read at the epoch less the latency in use there."""
     at = odometry.seconds(t_ns) - in_use.latency_s
@@ -110,7 +112,7 @@ def _columns(
         pl.Series("odometer_slips", odometry.slips_at_s(at) & inside),
         pl.Series("odometer_counter", odometry.counter_at_s(at)),
         pl.Series("slip_doubt_m", odometry.slip_doubt_at_s(at)),
-        pl.Series("stamp_jitter_s", np.full(known.size, jitter_s)),
+        pl.Series("stamp_jitter_s", jitter_s),
         pl.Series("odometer_white_m2_per_s", odometry.white_m2_per_s_at(at)),
         pl.Series("odometer_rows_m", rows_m),
         pl.Series("odometer_period_s", np.full(known.size, odometry.period_s)),
@@ -124,9 +126,9 @@ def _columns(
 
 
 def _direction(speed_mps: Floats, deadband_mps: float) -> pl.Series:
-    """+1 or -1 along growing path, held inside the dead band."""
+    """+1 or -1 along growing path, held inside the dead band; the path grows the way that the run begins."""
     moving = np.where(np.abs(np.nan_to_num(speed_mps)) > deadband_mps, np.sign(np.nan_to_num(speed_mps)), 0.0)
-    signs = pl.Series(moving).replace(0.0, None).forward_fill().backward_fill().fill_null(1.0)
+    signs = pl.Series(moving).replace(0.0, None).forward_fill().fill_null(1.0)
     return signs.cast(pl.Int8)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.alignment.odometer_filter import Estimates, FilterState, ScaleLatencyFilter, estimates_of, prior_of
-from pipeline.stages.epochs.clock import gap_limit_s
+from pipeline.stages.epochs.clock import gap_limits_s, periods_before_s
 from pipeline.stages.monitors.axis import (
     BLOCK,
     FIRST_BLOCK,
@@ -30,11 +30,16 @@ from schemas.config import Configuration, Vehicle
 
 
 def learn(
-    positions: pl.DataFrame, usable: Bools, jitter_s: float, odometry: Odometry, vehicle: Vehicle, config: Configuration
+    positions: pl.DataFrame,
+    usable: Bools,
+    jitter_s: Floats,
+    odometry: Odometry,
+    vehicle: Vehicle,
+    config: Configuration,
 ) -> Estimates:
     """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only.
 
-    `positions`: `t, along_m, calibrated_along_m, digits_along_m`.
+    `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `jitter_s`: of their stamps.
     """
     prior = prior_of(vehicle, config.align)
     learned = prior.over(positions.height)
@@ -60,7 +65,7 @@ class _Learner:
         self,
         positions: pl.DataFrame,
         usable: Bools,
-        jitter_s: float,
+        jitter_s: Floats,
         odometry: Odometry,
         vehicle: Vehicle,
         config: Configuration,
@@ -70,7 +75,6 @@ class _Learner:
         self._odometry = odometry
         self._vehicle = vehicle
         self._learned = learned
-        self._jitter_s = jitter_s
         self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
         self._alphas = np.array(config.monitors.ewma_alphas)
         self._factor = config.monitors.threshold_factor
@@ -90,10 +94,11 @@ class _Learner:
         self._segment = odometry.segment_at_s(self._t_s)
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
-        period_s = float(np.median(np.diff(t_s)))
-        gap_s = gap_limit_s(period_s, config.align.gap_reset_s) + config.align.scattered_gap_sigmas * jitter_s
-        self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
-        self._outages = _gaps_before(self._t_s, t_s[usable], gap_s)
+        self._jitter_s = jitter_s[self._rows]
+        scattered_s = config.align.scattered_gap_sigmas * jitter_s
+        gap_s = gap_limits_s(periods_before_s(t_ns), config.align.gap_reset_s) + scattered_s
+        self._breaks = _gaps_before(self._t_s, self._t_s, gap_s[self._rows])
+        self._outages = _gaps_before(self._t_s, t_s[usable], gap_s[usable])
         if self._rows.size:
             way_m = odometry.travelled_at(self._t_ns)
             deadband_mps = config.matching.deadband_mps
@@ -169,7 +174,7 @@ class _Learner:
                 state = self._beyond_break(state, int(before[first]), int(due[first]))
             part = due[first:last]
             observed = self._t_s[part], self._path_m[part], self._sigma_m[part]
-            joints[first:last] = self._filter.run(state, *observed, self._jitter_s)
+            joints[first:last] = self._filter.run(state, *observed, self._jitter_s[part])
             state = self._filter.after(state, joints[last - 1], float(self._t_s[part[-1]]))
         # An update reads the odometer up to `latency_span_s` after its epoch: causal is its use from then on.
         use_from = np.searchsorted(self._t_s, self._t_s[due] + self._config.align.latency_span_s)
@@ -178,7 +183,7 @@ class _Learner:
     def _beyond_break(self, state: FilterState, before: int, row: int) -> FilterState:
         """Where the odometer lost its distance the offset begins anew: nothing shows whether the position moved."""
         if self._segment[before] == self._segment[row]:
-            observed = *self._observation(row), float(self._sigma_m[row]), self._jitter_s
+            observed = *self._observation(row), float(self._sigma_m[row]), float(self._jitter_s[row])
             return self._filter.resume(state, *observed, self._limit_m)
         away = self._outages[before] != self._outages[row]
         return self._filter.restart(state, *self._observation(row), self._limit_m**2 if away else 0.0)
@@ -213,7 +218,7 @@ class _Learner:
             segment=self._odometry.segment_at_s(at_s),
             sigma_m=self._calibrated_m[part],
             digits_m=self._digits_m[part],
-            jitter_s=self._jitter_s,
+            jitter_s=self._jitter_s[part],
             scale_sigma=in_use.scale_sigma,
             latency_sigma_s=in_use.latency_sigma_s,
             white_m2_per_s=self._odometry.white_m2_per_s_at(at_s),
@@ -271,9 +276,9 @@ class _Learner:
         return self._rule.variance_m2(positions_m2, elapsed_s, np.cumsum(way_m), max(scale_sigma, sigma_scale))
 
 
-def _gaps_before(at_s: Floats, t_s: Floats, gap_s: float) -> Ints:
-    """How many gaps in the times `t_s` have ended at each of `at_s`."""
-    ends = t_s[1:][np.diff(t_s) > gap_s]
+def _gaps_before(at_s: Floats, t_s: Floats, gap_s: Floats) -> Ints:
+    """How many gaps in the times `t_s` have ended at each of `at_s`; `gap_s`: the longest step to each that is none."""
+    ends = t_s[1:][np.diff(t_s) > gap_s[1:]]
     return np.searchsorted(ends, at_s, side="right")
 
 

@@ -47,17 +47,18 @@ class Estimates(NamedTuple):
             column[begins[0] :] = np.repeat(value, lengths)
 
 
-def stamp_jitter_s(t_s: Floats, clock_periods: float) -> float:
-    """Standard deviation of stamps about a regular clock [s]; steps over more than `clock_periods` are left out.
+def stamp_jitter_s(t_s: Floats, period_s: Floats, clock_periods: float) -> Floats:
+    """Standard deviation of the stamps so far about a regular clock [s], at each of them.
 
+    `period_s`: at each stamp as known before it, 0 where it is not. Steps over more than `clock_periods` are left out.
     A recorder that stamps on receipt scatters them: ten milliseconds are 0.4 m at 40 m/s.
     """
-    dt = np.diff(t_s)
-    period = float(np.median(dt))
-    periods = np.round(dt / period)
-    regular = (periods >= 1) & (periods <= clock_periods)
-    away = (dt - periods * period)[regular]
-    return float(np.sqrt(np.mean(away**2) / 2.0)) if away.size else 0.0
+    dt_s = np.diff(t_s, prepend=t_s[:1])
+    known = period_s > 0.0
+    periods = np.round(np.divide(dt_s, period_s, out=np.zeros(t_s.size), where=known))
+    regular = known & (periods >= 1) & (periods <= clock_periods)
+    away_s = np.where(regular, dt_s - periods * period_s, 0.0)
+    return np.asarray(np.sqrt(np.cumsum(away_s**2) / (2.0 * np.maximum(np.cumsum(regular), 1))))
 
 
 _OFFSET = 0
@@ -136,7 +137,7 @@ class ScaleLatencyFilter:
     def after(self, state: FilterState, joint: Floats, t_s: float) -> FilterState:
         return state._replace(joint=joint, t_s=t_s, unsettled_m2=self._unsettled_m2(state, t_s))
 
-    def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: float) -> Floats:
+    def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: Floats) -> Floats:
         """The joint state after each of these epochs, (epochs, states, states + 1)."""
         joints = np.empty((t_s.size, *state.joint.shape))
         times_s = t_s.tolist()
@@ -147,13 +148,14 @@ class ScaleLatencyFilter:
         settled_m2 = (bridged_m2 - np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
         white_m2 = (self.config.white_share * sigma_m**2).tolist()
         before = state.joint
-        epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, steps_ns, settled_m2, strict=True)
-        for joint, row, now_s, place_m, noise_m2, step_ns, walked_m2 in epochs:
+        scatter_s = jitter_s.tolist()
+        epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, scatter_s, steps_ns, settled_m2, strict=True)
+        for joint, row, now_s, place_m, noise_m2, stamp_s, step_ns, walked_m2 in epochs:
             self._predict(before, step_ns, walked_m2, joint)
             seen, speed_mps = self._seen(joint, row, now_s, place_m, state.origin_m)
             spread = seen[:-1]
             # Kalman update of covariance and mean at once: minus gain times (H P, predicted minus observed).
-            variance_m2 = row.dot(spread).item() + noise_m2 + self._scatter_m2(jitter_s, speed_mps)
+            variance_m2 = row.dot(spread).item() + noise_m2 + self._scatter_m2(stamp_s, speed_mps)
             joint -= (spread / variance_m2)[:, None] * seen
             before = joint
         return joints

@@ -19,6 +19,8 @@ Time = TypeVar("Time", float, pl.Expr)
 
 # CONTRACT section 3, `outages`: what is longer lacks an epoch.
 GAP_PERIODS = 1.5
+# DOMAIN section 4: of so many steps before an epoch the median is the period of the log as known then.
+_PERIOD_STEPS = 100
 
 
 @dataclass(frozen=True)
@@ -90,19 +92,40 @@ def position_ns(epochs: pl.DataFrame) -> Ints:
     return times_ns(epochs.filter(pl.col("path_m").is_not_null()))
 
 
+def periods_before_s(t_ns: Ints) -> Floats:
+    """Per epoch the median of the last 100 steps before its own [s]; 0 where there is none."""
+    medians = pl.Series(np.diff(t_ns), dtype=pl.Float64).rolling_median(_PERIOD_STEPS, min_samples=1).to_numpy()
+    return np.concatenate([[0.0, 0.0], medians[:-1]])[: t_ns.size] / NS_PER_S
+
+
+def crossing_gaps_ns(t_ns: Ints, lds: LdsConfig) -> Ints:
+    """Longest step to each epoch over which a movement is interpolated [ns], as known before it (DOMAIN section 4)."""
+    longest_s = np.maximum(GAP_PERIODS * periods_before_s(t_ns), lds.crossing_gap_s)
+    return np.round(longest_s * NS_PER_S).astype(np.int64)
+
+
 def reaction_of(period_s: Time, config: Configuration) -> Time | float:
     """Time from detection to negation [s]: as configured, else one period of the positions."""
     return period_s if config.hazards.reaction_s is None else config.hazards.reaction_s
 
 
-def crossing_gap_ns(t_ns: Ints, lds: LdsConfig) -> int:
-    """Longest time between epochs over which a movement is interpolated [ns] (DOMAIN section 4)."""
-    return round(max(GAP_PERIODS * (nominal_period_s(t_ns) or 0.0), lds.crossing_gap_s) * NS_PER_S)
+def reactions_ns(detected_ns: Ints, position_ns: Ints, config: Configuration) -> Ints:
+    """Time from each detection to negation [ns]: as configured, else to the next position, over a gap its limit."""
+    if config.hazards.reaction_s is not None or position_ns.size == 0:
+        return np.full(detected_ns.size, round((config.hazards.reaction_s or 0.0) * NS_PER_S))
+    after = np.searchsorted(position_ns, detected_ns, side="right").clip(max=position_ns.size - 1)
+    waits_ns = np.where(position_ns[after] > detected_ns, position_ns[after] - detected_ns, NS_PER_S)
+    return np.minimum(waits_ns, crossing_gaps_ns(position_ns, config.lds)[after])
 
 
 def gap_limit_s(period_s: float | None, gap_reset_s: float) -> float:
     """Longest distance of epochs [s] that is not yet a gap (CONTRACT section 3, `outages`)."""
-    return min(gap_reset_s, max(GAP_PERIODS * (period_s or 0.0), 1.0))
+    return float(gap_limits_s(np.array(period_s or 0.0), gap_reset_s))
+
+
+def gap_limits_s(period_s: Floats, gap_reset_s: float) -> Floats:
+    """The same for the period at each epoch."""
+    return np.minimum(gap_reset_s, np.maximum(GAP_PERIODS * period_s, 1.0))
 
 
 def outages_s(t_ns: Ints, usable: Bools, limit_s: float) -> Floats:

@@ -11,6 +11,7 @@ from pipeline.stages.evidence.evidence import within_spans
 from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.cross_errors import cross_errors
 from pipeline.stages.judge.in_use import lds_states, time_in_use
+from pipeline.stages.judge.injected import under_injection
 from pipeline.stages.judge.judgement import REFERENCE, Judgements, MatchedPositions, judge_positions, judgements_of
 from pipeline.stages.judge.travel import OdometerSteps, beyond_confidence, moving, travel_direction
 from schemas.arrays import Ints, flags, floats, ints, times_ns
@@ -34,6 +35,7 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
     wrong_count = beyond_confidence(times_ns(epochs), odometer_m, train_m, along.half_m, accepted_ns, config.lds)
     undiagnosed = flags(epochs, "diagnosis_faulty") | wrong_count
     use = time_in_use(epochs, along.code, config)
+    injected = under_injection(times_ns(epochs), case.faults, config.lds.recovery_s)
     return epochs.drop("direction").with_columns(
         pl.Series("epoch", np.arange(epochs.height)),
         pl.Series("at", at_ns).cast(pl.Datetime("ns", "UTC")),
@@ -43,6 +45,7 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
         pl.Series("error_along_m", judged.known_m(config.hazards.known_error_m), nan_to_null=True),
         *cross_errors(case, floats(epochs, "heading_deg")),
         *use,
+        (use["wrong_s"] * ~pl.Series(injected)).alias("natural_s"),
         lds_states(epochs, along.code, flags(use, "in_use"), undiagnosed),
         pl.Series("train_m", train_m, nan_to_null=True),
         pl.Series("reference_m", reference_m, nan_to_null=True),

@@ -94,7 +94,7 @@ def positions_of(epochs: pl.DataFrame) -> pl.DataFrame:
 
 _POSITION_COLUMNS = (
     *("t", "leg", "path_m", "sigma_along_m", "epoch", "at", "direction", "judgement", "error_low_m", "error_high_m"),
-    *("evidence", "wrong_track", "track_assumed", "used_s", "wrong_s", "train_m", "reference_m"),
+    *("evidence", "wrong_track", "track_assumed", "used_s", "wrong_s", "natural_s", "train_m", "reference_m"),
 )
 
 
@@ -135,13 +135,17 @@ def _quiet(judged: Judgements, sigma_m: Floats, config: HazardConfig) -> Bools:
 
 @dataclass(frozen=True)
 class Failure:
-    """Positions `begin` to `end` (the first after it), those judged wrong in use `first` to `last`; for how long."""
+    """Positions `begin` to `end` (the first after it), those judged wrong in use `first` to `last`; for how long.
+
+    `natural_s`: what no injected fault of GNSS explains of `hazardous_s`.
+    """
 
     begin: int
     first: int
     last: int
     end: int
     hazardous_s: float
+    natural_s: float
     hazardous_may_s: float
     accepted: Judgement
     within_budget: bool | None
@@ -166,13 +170,13 @@ def find_failures(course: Course) -> list[Failure]:
 
 def failure_at(course: Course, begin: int, end: int, wrong: Ints) -> Failure:
     """Positions `begin` to `end` as a failure; `wrong`: those judged wrong in use, maybe none."""
-    hazardous_s = float(floats(course.positions, "wrong_s")[wrong].sum())
+    hazardous_s, natural_s = (float(floats(course.positions, name)[wrong].sum()) for name in ("wrong_s", "natural_s"))
     may_be_wrong = ~course.judged.is_right[begin:end]
     may_s = float(floats(course.positions, "used_s")[begin:end][may_be_wrong].sum())
     accepted = course.offers.worst_accepted(begin, end)
     within = within_budget(hazardous_s, may_s, accepted, course.config.budget_s)
     first, last = (int(wrong[0]), int(wrong[-1])) if wrong.size else (begin, end)
-    return Failure(begin, first, last, end, hazardous_s, may_s, accepted, within)
+    return Failure(begin, first, last, end, hazardous_s, natural_s, may_s, accepted, within)
 
 
 def failures_within(epochs: pl.DataFrame, offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:

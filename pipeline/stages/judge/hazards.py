@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import nominal_period_s, reaction_of
+from pipeline.stages.epochs.clock import reactions_ns
 from pipeline.stages.evidence.evidence import KINDS
 from pipeline.stages.judge.alarms import suspect_of
 from pipeline.stages.judge.case import Case
@@ -192,14 +192,13 @@ def instants(row: HazardRow, course: Course) -> Row:
     episode = row.episode
     detected_ns = episode.detection.t_ns
     failed_ns = None if episode.failed is None else int(course.t_ns[episode.failed])
-    reaction_ns = round(reaction_of(nominal_period_s(course.t_ns) or 0.0, course.config) * NS_PER_S)
     return {
         "t_onset": episode.onset_ns,
         "t_hazard": t_hazard_ns(row, course),
         "t_failure": failed_ns,
         "t_failure_may": episode.may_ns,
         "t_detected": detected_ns,
-        "t_negated": None if detected_ns is None else detected_ns + reaction_ns,
+        "t_negated": None if detected_ns is None else _negated_ns(detected_ns, course),
         "t_end": episode.end_ns,
         "monitor": episode.detection.monitor,
         "detected": detected_ns is not None,
@@ -208,6 +207,10 @@ def instants(row: HazardRow, course: Course) -> Row:
         "time_since_failure_s": _seconds(failed_ns, detected_ns),
         "time_since_failure_may_s": _seconds(episode.may_ns, detected_ns),
     }
+
+
+def _negated_ns(detected_ns: int, course: Course) -> int:
+    return detected_ns + int(reactions_ns(np.array([detected_ns]), course.t_ns, course.config)[0])
 
 
 def _seconds(begin_ns: int | None, end_ns: int | None) -> float | None:

@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gap_ns, met, nominal_period_s, reaction_of, trusted
+from pipeline.stages.epochs.clock import (
+    crossing_gaps_ns,
+    met,
+    nominal_period_s,
+    periods_before_s,
+    reactions_ns,
+    trusted,
+)
 from pipeline.stages.judge.judgement import RIGHT, WRONG
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, runs_of, times_ns
 from schemas.config import Configuration
@@ -20,39 +27,34 @@ _LEAST_S = 0.5 / NS_PER_S
 def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.DataFrame:
     """Per epoch `in_use`, and the time before it that it accounts for [s] (DOMAIN section 5.3).
 
-    `wrong_s`: of a position wrong in use, all time since the position before where that was wrong in use too, else one
-    nominal period at most. `used_s`: the same for wrong or unknown; for right positions, the time since the position
-    before, of a gap one period. `counted_s`: for shares of time, `wrong_s` where there is any. An epoch without a
-    position accounts for time only in a gap.
+    `used_s`: of a position in use all time since the position before, up to the longest step that is no gap; `wrong_s`:
+    of it where the position was wrong. `counted_s`: for shares of time, `wrong_s` where there is any. An epoch without
+    a position accounts for time only in a gap.
     """
     known = met(epochs, pl.col("path_m").is_not_null())
     steps = _StepTimes.of(epochs, known, config)
     usable = met(epochs.filter(known), trusted(config) & ~pl.col("withheld"))
-    in_use = usable & (steps.left_s(steps.alone_s) > _LEAST_S)
-    right = code[known] == RIGHT
-    wrong_s, used_s = np.zeros((2, known.size))
-    wrong_s[known] = steps.lasting_s(in_use & (code[known] == WRONG))
-    used_s[known] = np.where(in_use & right, steps.left_s(steps.near_s), steps.lasting_s(in_use & ~right))
-    in_use_of_all = known.copy()
-    in_use_of_all[known] = in_use
-    counted_s = np.where(wrong_s > 0.0, wrong_s, _counted_s(times_ns(epochs), known, steps))
-    return pl.DataFrame({"in_use": in_use_of_all, "used_s": used_s, "wrong_s": wrong_s, "counted_s": counted_s})
+    in_use = np.zeros(known.size, dtype=np.bool_)
+    in_use[known] = usable & (steps.left_s(steps.alone_s) > _LEAST_S)
+    used_s = np.zeros(known.size)
+    used_s[known] = np.where(in_use[known], steps.left_s(steps.near_s), 0.0)
+    wrong_s = np.where(code == WRONG, used_s, 0.0)
+    counted_s = np.where(wrong_s > 0.0, wrong_s, _counted_s(times_ns(epochs), known, steps, config))
+    return pl.DataFrame({"in_use": in_use, "used_s": used_s, "wrong_s": wrong_s, "counted_s": counted_s})
 
 
 @dataclass(frozen=True)
 class _StepTimes:
-    """The time from the position before to each, ending at `end_s`.
+    """The time from the position before to each, ending at `end_s`; `is_gap`: longer than a movement is interpolated.
 
-    `step_s`: whole; `near_s`: one period where it is a gap; `alone_s`: one period at most. `blocked_s`: total time
-    negated up to each of `edge_s`, the begins and ends of the negations; linear between them.
+    `near_s`: up to the longest step that is no gap (the fault may be that old); `alone_s`: up to one period.
+    `blocked_s`: total time negated up to each of `edge_s`, the begins and ends of the negations; linear between them.
     """
 
     end_s: Floats
-    step_s: Floats
     near_s: Floats
     alone_s: Floats
-    period_s: float
-    gap_s: float
+    is_gap: Bools
     edge_s: Floats
     blocked_s: Floats
 
@@ -61,15 +63,16 @@ class _StepTimes:
         all_ns = times_ns(epochs)
         t_ns = all_ns[known]
         all_s = (all_ns - all_ns[:1]) / NS_PER_S
-        period_s = nominal_period_s(t_ns) or 0.0
-        gap_s = crossing_gap_ns(t_ns, config.lds) / NS_PER_S
-        step_s = np.diff(all_s[known], prepend=all_s[known][:1] - period_s)
-        alone_s = np.minimum(step_s, period_s)
-        near_s = np.where(step_s <= gap_s, step_s, alone_s)
-        delay_s = reaction_of(period_s, config)
-        negated = _negated_spans(all_s, flags(epochs, "negated"), flags(epochs, "withheld"), delay_s)
+        # Before the first position there is none: it accounts for one period of the run, as far as that is known.
+        step_s = np.diff(all_s[known], prepend=all_s[known][:1] - (nominal_period_s(t_ns) or 0.0))
+        gap_s = crossing_gaps_ns(t_ns, config.lds) / NS_PER_S
+        period_s = periods_before_s(t_ns)
+        near_s = np.minimum(step_s, gap_s)
+        alone_s = np.where(period_s > 0.0, np.minimum(near_s, period_s), near_s)
+        reaction_s = reactions_ns(all_ns, t_ns, config) / NS_PER_S
+        negated = _negated_spans(all_s, flags(epochs, "negated"), flags(epochs, "withheld"), reaction_s)
         blocked_s = np.cumsum(np.diff(negated, axis=1, prepend=negated[:, :1]).ravel())
-        return cls(all_s[known], step_s, near_s, alone_s, period_s, gap_s, negated.ravel(), blocked_s)
+        return cls(all_s[known], near_s, alone_s, step_s > gap_s, negated.ravel(), blocked_s)
 
     def left_s(self, length_s: Floats) -> Floats:
         """This much time before each position, less the negated part of it."""
@@ -79,32 +82,26 @@ class _StepTimes:
         left_s = length_s - (until_s - since_s)
         return np.where(left_s > _LEAST_S, left_s, 0.0)
 
-    def lasting_s(self, member: Bools) -> Floats:
-        """Time of the members: whole since the position before where that is a member too."""
-        member_before = np.concatenate([[False], member[:-1]])[: member.size]
-        return np.where(member, self.left_s(np.where(member_before, self.step_s, self.alone_s)), 0.0)
 
-
-def _negated_spans(t_s: Floats, negated: Bools, withheld: Bools, delay_s: float) -> Floats:
-    """Begin and end of each negation [s]: from `delay_s` after it, or at once where already withheld, to the return."""
+def _negated_spans(t_s: Floats, negated: Bools, withheld: Bools, reaction_s: Floats) -> Floats:
+    """Begin and end of each negation [s]: a reaction after it, or at once where already withheld, to the return."""
     firsts, lasts = runs_of(negated)
     until_s = np.append(t_s, t_s[-1:])[lasts + 1]
-    from_s = t_s[firsts] + np.where(withheld[firsts], 0.0, delay_s)
+    from_s = t_s[firsts] + np.where(withheld[firsts], 0.0, reaction_s[firsts])
     return np.column_stack([np.minimum(from_s, until_s), until_s])
 
 
-def _counted_s(t_ns: Ints, known: Bools, steps: _StepTimes) -> Floats:
-    """Time since the epoch before [s], of a gap one period.
+def _counted_s(t_ns: Ints, known: Bools, steps: _StepTimes, config: Configuration) -> Floats:
+    """Time since the epoch before [s], of a gap no more than a movement is interpolated over.
 
     Of epochs between two near positions the later position accounts for all, the others for none.
     """
-    since_s = np.diff(t_ns, prepend=t_ns[:1] - round(steps.period_s * NS_PER_S)) / NS_PER_S
-    since_s = np.where(since_s <= max(steps.gap_s, steps.period_s), since_s, steps.period_s)
+    longest_s = crossing_gaps_ns(t_ns, config.lds) / NS_PER_S
+    since_s = np.minimum(np.diff(t_ns, prepend=t_ns[:1]) / NS_PER_S, longest_s)
     rows = np.flatnonzero(known)
     after = np.searchsorted(rows, np.arange(t_ns.size))
-    near = np.append(steps.step_s <= steps.gap_s, False)
-    since_s[(after > 0) & near[after]] = 0.0
-    since_s[rows] = steps.near_s
+    since_s[(after > 0) & np.append(~steps.is_gap, False)[after]] = 0.0
+    since_s[rows] = np.where(steps.is_gap, since_s[rows], steps.near_s)
     return since_s
 
 

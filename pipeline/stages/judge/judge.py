@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gap_ns
+from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.epochs.failure_log import failure_log
 from pipeline.stages.evidence.evidence import within_spans
 from pipeline.stages.judge.alarms import alarms_table
@@ -47,7 +47,7 @@ def judge(case: Case) -> Judged:
     epochs = judged_epochs(case, steps)
     offers = judged_offers(case, epochs)
     positions = positions_of(epochs)
-    gap_ns = crossing_gap_ns(times_ns(positions), config.lds)
+    gap_ns = crossing_gaps_ns(times_ns(positions), config.lds)
     course = course_of(positions, offers, jumps_of(positions, case.odometry, gap_ns, config.hazards), config)
     failures = find_failures(course)
     log = failure_log(case.solution.epochs, config.lds.recovery_s)

@@ -31,7 +31,7 @@ class Jump(NamedTuple):
     step_m: float
 
 
-def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: int, config: HazardConfig) -> list[Jump]:
+def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: Ints, config: HazardConfig) -> list[Jump]:
     """All jumps of the positions, in order of time; numbers are rows of `positions`."""
     at_ns = times_ns(positions, "at")
     counted_m = np.full(max(at_ns.size - 1, 0), np.nan)
@@ -42,11 +42,11 @@ def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: int, co
     return find_jumps(steps, ints(positions["direction"]), config)
 
 
-def steps_of(t_ns: Ints, path_m: Floats, reference_m: Floats, counted_m: Floats, gap_ns: int) -> PositionChanges:
+def steps_of(t_ns: Ints, path_m: Floats, reference_m: Floats, counted_m: Floats, gap_ns: Ints) -> PositionChanges:
     """`reference_m`: path position by the reference, NaN elsewhere; there the odometer's steps `counted_m` serve."""
     by_reference_m = np.diff(path_m - reference_m)
     change_m = np.where(np.isfinite(by_reference_m), by_reference_m, np.diff(path_m) - counted_m)
-    linked = np.isfinite(change_m) & (np.diff(t_ns) <= gap_ns)
+    linked = np.isfinite(change_m) & (np.diff(t_ns) <= gap_ns[1:])
     excess_m = np.concatenate([[0.0], np.cumsum(np.where(linked, change_m, 0.0))])
     return PositionChanges(t_ns, excess_m[: t_ns.size], np.concatenate([[False], linked])[: t_ns.size])
 

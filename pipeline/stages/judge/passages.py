@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gap_ns, met
+from pipeline.stages.epochs.clock import crossing_gaps_ns, met
 from pipeline.stages.evidence.evidence import NOTHING, Span, within_spans
 from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.hazards import HazardRow
@@ -16,6 +16,7 @@ from pipeline.stages.judge.judgement import Judgements
 from pipeline.stages.judge.travel import speed_at
 from pipeline.stages.judge.true_crossings import Crossings, TrueCrossing, crossings_of
 from schemas.arrays import Bools, Ints, ints, times_ns
+from schemas.config import LdsConfig
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
 from schemas.tables import Passages
 
@@ -28,18 +29,17 @@ def passages_table(
     `epochs`, `offers`: judged; `undetected`: from each fault's onset to its detection.
     """
     stamps = times_ns(epochs.filter(pl.col("path_m").is_not_null()))
-    gap_ns = crossing_gap_ns(stamps, case.config.lds)
     crossings = crossings_of(case)
     known = case.solution.passages.with_columns(_true_times(case.solution.passages, crossings))
-    passages = _with_unoffered(known, case, crossings, stamps, gap_ns)
+    passages = _with_unoffered(known, case, crossings, stamps)
     t_true = passages["t_true"]
     accepted = (pl.col("status") == PassageStatus.ACCEPTED.value) & (pl.col("kind") == BaliseKind.VIRTUAL.value)
     offered_ns = ints(passages["t_offered"].dt.timestamp("ns"))
     frame = passages.with_columns(
         pl.col("t_true").cast(pl.Datetime("ns", "UTC")),
         *_of_offers(passages, offers, rows),
-        _speeds(passages, t_true, epochs, gap_ns),
-        _positioned=pl.Series(_within_gap(stamps, ints(t_true), gap_ns)) & t_true.is_not_null(),
+        _speeds(passages, t_true, epochs, case.config.lds),
+        _positioned=pl.Series(_within_gap(stamps, ints(t_true), case.config.lds)) & t_true.is_not_null(),
         suspect_after_the_fact=pl.Series(met(passages, accepted) & within_spans(offered_ns, undetected)),
     )
     return _with_failures(frame).select(Passages.column_names())
@@ -91,20 +91,20 @@ def _true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
     return pl.Series("t_true", times, dtype=pl.Int64)
 
 
-def _within_gap(stamps: Ints, t_ns: Ints, gap_ns: int) -> Bools:
+def _within_gap(stamps: Ints, t_ns: Ints, lds: LdsConfig) -> Bools:
     """Positions on both sides of each instant, no farther apart than a crossing is interpolated over."""
     if stamps.size < 2:
         return np.zeros(t_ns.size, dtype=np.bool_)
     after = np.searchsorted(stamps, t_ns).clip(1, stamps.size - 1)
     inside = (t_ns >= stamps[0]) & (t_ns <= stamps[-1])
-    return np.asarray(inside & (stamps[after] - stamps[after - 1] <= gap_ns))
+    return np.asarray(inside & (stamps[after] - stamps[after - 1] <= crossing_gaps_ns(stamps, lds)[after]))
 
 
-def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, gap_ns: int) -> pl.Series:
+def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, lds: LdsConfig) -> pl.Series:
     """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
     at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
     stamps = times_ns(epochs.filter(pl.col("speed_mps").is_not_null()))
-    known = at.is_not_null().to_numpy() & _within_gap(stamps, ints(at), gap_ns)
+    known = at.is_not_null().to_numpy() & _within_gap(stamps, ints(at), lds)
     return pl.Series("speed_mps", np.where(known, speed_at(epochs, ints(at)), np.nan), nan_to_null=True)
 
 
@@ -129,9 +129,7 @@ def _first_of(first: pl.Expr, word: FailureMode | Cause, second: pl.Expr, other:
     return pl.when(first).then(pl.lit(word.value)).when(second).then(pl.lit(other.value)).otherwise(pl.lit("none"))
 
 
-def _with_unoffered(
-    passages: pl.DataFrame, case: Case, crossings: Crossings, stamps: Ints, gap_ns: int
-) -> pl.DataFrame:
+def _with_unoffered(passages: pl.DataFrame, case: Case, crossings: Crossings, stamps: Ints) -> pl.DataFrame:
     """Adds a passage for each true crossing of a virtual balise without one: the LDS, misled by the position, has none.
 
     `crossings`: those that belong to no passage; `stamps`: of valid positions.
@@ -145,7 +143,8 @@ def _with_unoffered(
     ]
     if not missed:
         return passages
-    positioned = _within_gap(stamps, np.array([crossing.t_ns for _, crossing in missed]), gap_ns).tolist()
+    times = np.array([crossing.t_ns for _, crossing in missed])
+    positioned = _within_gap(stamps, times, case.config.lds).tolist()
     rows = [_unoffered(*pair, case.solution.name, seen) for pair, seen in zip(missed, positioned, strict=True)]
     added = pl.DataFrame(rows, schema=passages.schema)
     when = pl.coalesce("t_offered", "t_reckoned")

@@ -19,8 +19,8 @@ columns of the epochs, crossings, passages. Touches no file, and knows of no tru
 - The linking distance monitor allows 5 m + 5 % and the noise of both positions at k_T: 5 m alone would alarm on sound
   receivers.
 - What nothing watched for a while (an outage, noise, lost or guessed distance) re-links: the window is too wide to see
-  what came of it. Where it has moved, the linking distance monitor fails; where nothing can be said, the position is
-  negated without an alarm until a telegram.
+  what came of it. Where it has moved, the linking distance monitor fails; where nothing can be said, the position stays
+  withheld until a telegram, without an alarm.
 - A start of mission (`lds.starts_of_mission`) forgets LRVB, linking and anchor.
 - Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
 """

@@ -120,13 +120,8 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing
             begin, end = int(before[step]), int(after[step])
             passed = _in_order(on_leg, int(passed_before[step]), int(passed_after[step]))
             crossings += [_crossing(journey, balise, begin, end, sense) for balise, sense in passed]
-    return [crossing for crossing in crossings if _is_valid(crossing, journey)]
-
-
-def _is_valid(crossing: Crossing, journey: Journey) -> bool:
-    """Valid in the train's direction, as known then and as it was: in the metres after a turn in neither."""
-    as_it_was = journey.direction_at(crossing.t_ns)
-    return crossing.balise.is_valid(crossing.direction) and crossing.balise.is_valid(as_it_was)
+    # Valid in the direction as known then: in the first metres after a turn that is still the old one.
+    return [crossing for crossing in crossings if crossing.balise.is_valid(crossing.direction)]
 
 
 def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tuple[Balise, int]]:
@@ -138,7 +133,7 @@ def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tu
 
 
 def _crossing(journey: Journey, balise: Balise, before: int, epoch: int, sense: int) -> Crossing:
-    near = bool(journey.t_ns[epoch] - journey.t_ns[before] <= journey.gap_ns)
+    near = bool(journey.t_ns[epoch] - journey.t_ns[before] <= journey.gap_ns[epoch])
     share = 1.0
     t_ns = journey.t_ns
     path_m = journey.path_m
@@ -170,20 +165,19 @@ def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
     return sorted(crossings, key=lambda crossing: (crossing.t_ns, crossing.epoch, crossing.balise.kind.value))
 
 
-def crossing_rows(crossings: Sequence[Crossing], journey: Journey) -> pl.DataFrame:
-    rows = [_row(number, crossing, journey) for number, crossing in enumerate(crossings)]
+def crossing_rows(crossings: Sequence[Crossing]) -> pl.DataFrame:
+    rows = [_row(number, crossing) for number, crossing in enumerate(crossings)]
     return pl.DataFrame(rows, schema=dtypes(Crossings))
 
 
-def _row(number: int, crossing: Crossing, journey: Journey) -> dict[str, object]:
-    offer = ("before", "epoch", "sense", "odometer_m", "offered")
+def _row(number: int, crossing: Crossing) -> dict[str, object]:
+    offer = ("before", "epoch", "sense", "direction", "odometer_m", "offered")
     return {
         "crossing_id": number,
         **{name: getattr(crossing, name) for name in offer},
         **{name: getattr(crossing.balise, name) for name in ("leg", *PLACE)},
         "kind": crossing.balise.kind.value,
         "t": crossing.t_ns,
-        "direction": journey.direction_at(crossing.t_ns),
         "status": crossing.status and crossing.status.value,
     }
 
@@ -230,6 +224,6 @@ def _read(
         sense=direction,
         direction=direction,
         odometer_m=odometer_m,
-        travelled_m=float(journey.travelled_m[epoch]) - since_m * int(journey.travel[max(epoch - 1, 0)]),
+        travelled_m=float(journey.travelled_m[epoch]) - abs(since_m),
         confidence_m=None,
     )

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import confident, crossing_gap_ns, met, unambiguous
+from pipeline.stages.epochs.clock import confident, crossing_gaps_ns, met, unambiguous
 from pipeline.stages.odometry.driven import turns_of
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig
@@ -18,9 +18,9 @@ class Journey:
     """Epochs in order of time; NaN is not known. Names are those of `schemas.stages.Aligned`, but:
 
     `refusal`: why a detection here would not count, None where it would. `direction` of travel (+1/-1 along growing
-    path) as known at that epoch; `travel`: as it was in the step to the next epoch (for labels only). `segment`:
-    changes where the odometer lost its distance; `counter`: the same, over slip and guessed pauses. `blind`: no
-    position for longer than a crossing is interpolated over.
+    path) as known at that epoch. `segment`: changes where the odometer lost its distance; `counter`: the same, over
+    slip and guessed pauses. `gap_ns`: the longest step to the epoch that a crossing is interpolated over; `blind`: no
+    position for longer.
     """
 
     def __init__(self, epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> None:
@@ -39,14 +39,20 @@ class Journey:
         self.counter: Ints = epochs["odometer_counter"].to_numpy().astype(np.int64)
         self.slip_doubt_m = floats(epochs, "slip_doubt_m")
         self.scale_sigma = scale_sigma
-        self.direction, self.travel = _directions(self.odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
+        self.direction = _direction(self.odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
         self.travelled_m = floats(epochs, "travelled_m")
-        self.gap_ns = crossing_gap_ns(self.t_ns, config.lds)
+        self.gap_ns = crossing_gaps_ns(self.t_ns, config.lds)
         self.blind = _blind(self.t_ns, self.positioned, self.gap_ns)
 
     @cached_property
     def usable(self) -> Bools:
         return np.array([refusal is None for refusal in self.refusal], dtype=bool)
+
+    @cached_property
+    def comparable(self) -> Bools:
+        """Usable, and with an odometer and a sigma to compare with."""
+        known: Bools = np.isfinite(self.odometer_m) & np.isfinite(self.sigma_m)
+        return self.usable & known
 
     @cached_property
     def ambiguous(self) -> Bools:
@@ -65,12 +71,9 @@ class Journey:
         unplaced = self.placed_nowhere[epochs].any()
         return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
 
-    def direction_at(self, t_ns: int) -> int:
-        return int(self.travel[max(int(np.searchsorted(self.t_ns, t_ns)) - 1, 0)])
 
-
-def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
-    """Epochs more than `gap_ns` after the last position, and all before the first one."""
+def _blind(t_ns: Ints, positioned: Bools, gap_ns: Ints) -> Bools:
+    """Epochs longer than a crossing is interpolated over after the last position, and all before the first one."""
     last_ns = np.maximum.accumulate(np.where(positioned, t_ns, np.iinfo(np.int64).min))
     first = np.argmax(positioned) if positioned.any() else t_ns.size
     blind: Bools = t_ns - np.maximum(last_ns, t_ns[0] - gap_ns) > gap_ns
@@ -87,21 +90,19 @@ def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) ->
     return list(refusals)
 
 
-def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[Ints, Ints]:
-    """Direction of travel along growing path, as known at each epoch and as it was.
+def _direction(odometer_m: Floats, matched: pl.Series, turn_m: float) -> Ints:
+    """Direction of travel along growing path, as known at each epoch.
 
     With an odometer the train has turned once it came back by `turn_m`: a wheel's jitter at a stand is no turn.
     """
     if not np.isfinite(odometer_m).any():
         held = matched.replace(0, None).fill_null(strategy="forward").fill_null(1)
-        direction = held.to_numpy().astype(np.int64)
-        return direction, direction
+        return held.to_numpy().astype(np.int64)
     known = np.flatnonzero(np.isfinite(odometer_m))
-    direction, travel = np.ones((2, odometer_m.size), dtype=np.int64)
-    for turned_at, seen_at, sense in turns_of(odometer_m[known], turn_m):
+    direction = np.ones(odometer_m.size, dtype=np.int64)
+    for _, seen_at, sense in turns_of(odometer_m[known], turn_m):
         direction[known[seen_at] :] = sense
-        travel[known[turned_at] :] = sense
-    return direction, travel
+    return direction
 
 
 def turning_epochs(journey: Journey) -> frozenset[int]:

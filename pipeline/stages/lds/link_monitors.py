@@ -95,9 +95,6 @@ class LinkDistance:
         self._since_return[:, epoch : epoch + moved_m.size] = moved_m, bound_m
         self._done = epoch
 
-    def is_possible(self, epoch: int) -> bool:
-        return bool(self._possible[epoch])
-
     def can_measure(self, epoch: int) -> bool:
         """The odometer's distance is known from the anchor on."""
         segment = self._journey.segment
@@ -140,7 +137,7 @@ class LinkDistance:
 
     def hold_against(self, comparison: Comparison, epoch: int) -> None:
         """The verdict of a re-link joins that of the bounds at `epoch`, whose fail remains."""
-        if self.fails(epoch):
+        if not self._possible[epoch] or self.fails(epoch):
             return
         self._value[epoch] = comparison.moved_m
         self._threshold[epoch] = comparison.bound_m

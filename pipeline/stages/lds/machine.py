@@ -5,7 +5,7 @@ A position is *withheld* where the diagnosis cannot stand behind it (DOMAIN sect
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Sequence
 from enum import Enum, auto
 
@@ -26,19 +26,15 @@ class Use(Enum):
 
     | from | when | to |
     |---|---|---|
-    | in use | the odometer reports slip, and something was validated | slipped |
-    | in use | nothing watched it (`unwatched_epochs`), or the noise hides what it does | unseen |
-    | unseen | a usable position, watched again within `gap_reset_s`, or it re-links | in use |
-    | unseen | it has moved (an alarm), or nothing can be said of that | negated |
-    | slipped | it re-links | in use |
-    | any but negated | a monitor fails | negated |
+    | in use | after a validation: the odometer reports slip, or nothing watched (an outage, noise) | withheld |
+    | withheld | a usable position re-links | in use |
+    | any but negated | a monitor fails; without slip the re-link too, where the position has moved | negated |
     | negated | `recovery_s` without a fast failure, and it re-links | in use |
     | any | a start of mission; in negated also recovery where nothing was validated before | in use |
     """
 
     IN_USE = auto()
-    UNSEEN = auto()
-    SLIPPED = auto()
+    WITHHELD = auto()
     NEGATED = auto()
 
 
@@ -71,15 +67,13 @@ class LocationSystem:
         self._way_m = journey.odometer_m * journey.direction
         self._unwatched = unwatched_epochs(journey, bank.watched, config.align.gap_reset_s)
         self._bridged_ns = round(config.align.gap_reset_s * NS_PER_S)
-        self._memory_ns = round(NS_PER_S / min(config.monitors.ewma_alphas))
         self._missions = mission_epochs(journey, config.lds)
         self._events = sorted({*self.balises.events, *self._unwatched, *self._missions, *odometer_epochs(journey)})
         self._relink = Relink(journey, self.tvb, config)
         self._use = Use.IN_USE
-        self._slipped_at = 0  # the epoch at which slip began
-        self._unseen_ns = 0  # since when the position is unseen
+        self._slipped = False  # withheld for slip
+        self._hidden_ns: int | None = None  # since when noise hides the position
         self._recovery = Recovery(journey, bank, config)
-        self._hold_to_ns: int | None = None  # since the first return after an alarm of the bank
         self._validated = False  # a VB or a TVB
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
         self._consistent_since_ns: int | None = None
@@ -106,7 +100,7 @@ class LocationSystem:
 
         Uneventful is a position in use, in a begun chain, up to the next event, alarm or end of a window.
         """
-        if self._use is not Use.IN_USE or self._withheld_for(epoch) is not None:
+        if self._use is not Use.IN_USE or self._withheld_for(epoch) is not None or self._hidden_ns is not None:
             return epoch
         if self.balises.disarmed or self._chain_from is None or epoch <= self._chain_from:
             return epoch
@@ -128,12 +122,14 @@ class LocationSystem:
     def _step(self, epoch: int) -> None:
         if epoch in self._missions:
             self._relink.begin_mission(epoch)
-            self._hold_to_ns = None
             self._initialise_anew(epoch)
         self.balises.turn(epoch)
         for read in self.balises.read(epoch):
+            if read.t_ns > self._t_ns[epoch]:
+                continue  # behind the last epoch: the position was no longer there to learn of it
             self._relink.note_read(read)
-            self._hold(epoch)
+            if self._relink.is_held(epoch):
+                self.distance.hold_to(epoch, *self._relink.held_m(epoch))
         bank_failed = self._bank.failed(epoch)
         self._watch(epoch)
         self.withheld_for[epoch] = self._withheld_for(epoch)
@@ -158,46 +154,49 @@ class LocationSystem:
             return LostTo.NOISE
         if self._journey.slips[epoch]:
             return LostTo.SLIP
-        return LostTo.RELINK if self._use is Use.SLIPPED or self._bank.begins_at(epoch) else None
+        return LostTo.RELINK if self._use is Use.WITHHELD or self._bank.begins_at(epoch) else None
 
     def _watch(self, epoch: int) -> None:
-        """Leave or re-enter use: slip, noise that hides the position, outages, and the return from them."""
-        if self._journey.slips[epoch]:
+        """Leave use for slip, noise that hides the position, or an outage; come back where the position re-links."""
+        slips = bool(self._journey.slips[epoch])
+        if slips:
             self._consistent_since_ns = None
-            if self._use in (Use.IN_USE, Use.UNSEEN) and self._validated:
-                self._use = Use.SLIPPED
-                self._slipped_at = epoch
-        elif self._use is Use.SLIPPED:
-            self._relink_after_slip(epoch)
-        if self._use is Use.IN_USE and not self._bank.noise_known_at(epoch):
-            self._use = Use.UNSEEN
-            self._unseen_ns = self._t_ns[epoch]
-        if self._use in (Use.IN_USE, Use.UNSEEN) and epoch in self._unwatched:
-            self._use = Use.UNSEEN
-            self._unseen_ns = self._t_ns[epoch] - self._bridged_ns - 1
-        if self._use is Use.UNSEEN and self._bank.noise_known_at(epoch) and self._can_return(epoch):
-            self._relink_unseen(epoch)
+        unwatched = self._was_hidden(epoch) or epoch in self._unwatched
+        if self._validated and self._use is not Use.NEGATED:
+            if slips and not (self._use is Use.WITHHELD and self._slipped):
+                self._withhold(epoch, slipped=True)
+            elif unwatched and self._use is Use.IN_USE:
+                self._withhold(epoch, slipped=False)
+        if self._use is Use.WITHHELD and not slips and self._can_return(epoch):
+            self._return_unsuspected(epoch)
+
+    def _was_hidden(self, epoch: int) -> bool:
+        """Noise hid what the position did, for longer than the bank bridges, until this epoch."""
+        if not self._bank.noise_known_at(epoch):
+            self._hidden_ns = self._t_ns[epoch] if self._hidden_ns is None else self._hidden_ns
+            return False
+        since_ns, self._hidden_ns = self._hidden_ns, None
+        return since_ns is not None and self._t_ns[epoch] - since_ns > self._bridged_ns
+
+    def _withhold(self, epoch: int, slipped: bool) -> None:
+        self._relink.withhold(epoch, suspected=slipped)
+        self._slipped = slipped
+        self._use = Use.WITHHELD
 
     def _can_return(self, epoch: int) -> bool:
-        return self.distance.is_possible(epoch) and bool(self._journey.usable[epoch])
+        """A usable position that the odometer can be compared with, and whose noise is known."""
+        return bool(self._journey.comparable[epoch]) and self._bank.noise_known_at(epoch)
 
-    def _relink_after_slip(self, epoch: int) -> None:
-        # Several slips would each let a held position go on by as much as one may.
-        anchor = (
-            self._relink.anchor_at(epoch) if self._is_held(epoch) else self._relink.anchor_before_slip(self._slipped_at)
-        )
-        if self._can_return(epoch) and self._relink.compare(epoch, anchor).holds:
+    def _return_unsuspected(self, epoch: int) -> None:
+        comparison = self._relink.compare(epoch)
+        if comparison.holds:
             self._use = Use.IN_USE
-            self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
-
-    def _relink_unseen(self, epoch: int) -> None:
-        """It re-links, or is negated."""
-        self._use = Use.IN_USE
-        if self._validated and self._t_ns[epoch] - self._unseen_ns > self._bridged_ns:
-            comparison = self._relink.compare(epoch, self._relink.anchor_at(epoch))
+            self._hold(epoch)
+            if self._slipped:
+                self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
+        if not self._slipped:
+            # That it has moved is an alarm, unless the odometer itself is in doubt.
             self.distance.hold_against(comparison, epoch)
-            if comparison.reason is not None:
-                self._negate(epoch)
 
     def _accept(self, crossing: Crossing, epoch: int) -> None:
         """It is the LRVB and begins the chain of TVBs."""
@@ -220,7 +219,7 @@ class LocationSystem:
     def _has_initialised(self, epoch: int) -> bool:
         """Consistent for `init_s`: a TVB may arise between two VBs (SR)."""
         t_ns = self._t_ns[epoch]
-        if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns:
+        if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns[epoch]:
             self._consistent_since_ns = t_ns
         self._consistent_at_ns = t_ns
         if t_ns - self._consistent_since_ns < self._config.lds.init_s * NS_PER_S:
@@ -230,10 +229,7 @@ class LocationSystem:
         return True
 
     def _negate(self, epoch: int) -> None:
-        # Slow averages that fail alone show a drift as old as their memory; after a jump they fail too, but it is new.
-        self._relink.note_alarm(epoch, 0.0 if self._bank.fast_failed(epoch) else self._bank.failing_memory_s(epoch))
-        if self._bank.failed(epoch):
-            self._hold_to_ns = None
+        self._relink.withhold(epoch, suspected=True)
         self._bank.freeze(epoch)
         self._use = Use.NEGATED
         self._recovery.begin(epoch)
@@ -248,27 +244,17 @@ class LocationSystem:
         if not self._validated:
             self._initialise_anew(epoch)
             return
-        anchor = self._relink.anchor_at(epoch)
-        if anchor is None or not self._relink.compare(epoch, anchor).holds:
+        if not self._relink.compare(epoch).holds:
             self.withheld_for[epoch] = LostTo.RELINK
             return
         self._return(epoch)
-        # The restarted bank cannot see a slow drift go on until its slowest average is full: the anchor stays for it.
-        if self._hold_to_ns is None:
-            self._hold_to_ns = self._t_ns[epoch] + self._memory_ns
         self._hold(epoch)
         self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
 
-    def _is_held(self, epoch: int) -> bool:
-        return self._hold_to_ns is not None and self._t_ns[epoch] <= self._hold_to_ns
-
     def _hold(self, epoch: int) -> None:
-        """From here on to the anchor of the re-link, or to the telegram that renewed it."""
-        anchor = self._relink.anchor_at(epoch)
-        if self._hold_to_ns is None or anchor is None:
-            return
-        end = max(bisect_right(self._t_ns, self._hold_to_ns), epoch)
-        self.distance.hold_to(epoch, *self._relink.moved_m(anchor, epoch, end))
+        """From a return on the distance since the anchor counts, while the slow averages cannot see a drift go on."""
+        self._relink.hold(epoch)
+        self.distance.hold_to(epoch, *self._relink.held_m(epoch))
 
     def _initialise_anew(self, epoch: int) -> None:
         """A start of mission, or a fault before anything was validated."""

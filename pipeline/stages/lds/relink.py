@@ -1,13 +1,12 @@
 """The re-link: is GNSS minus odometer what it was at the anchor? (DOMAIN section 4)
 
-After an alarm the anchor is a TVB well before it, for a slow drift has moved the last one already; a return does not
-move it, only a telegram does. After slip that the odometer reports no fault is suspected: the anchor is the last TVB
-before it, but the first one while a position is held to that. What the odometer may have miscounted widens the bound,
-up to half the failure limit; if that is more, only a telegram re-links.
+What the odometer may have miscounted widens the bound, up to half the failure limit; if that is more, only a telegram
+re-links.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import isfinite
 from typing import NamedTuple
@@ -75,51 +74,62 @@ class Held(NamedTuple):
 
 
 class Relink:
-    """The anchor of one solution, and the comparison with it. `tvb`: flags of the epochs so far."""
+    """The one way back: what the position is compared with, and how. `tvb`: flags of the epochs so far.
+
+    The anchor is fixed where the position is withheld. After an alarm, or slip that the odometer reports, it is the
+    last telegram, else the first TVB of the mission: a slow drift has moved every later one. After time that nothing
+    watched it is the last TVB before. A later return does not move it: from a return on the position is held to it
+    until the slowest average of the restarted bank is full.
+    """
 
     def __init__(self, journey: Journey, tvb: list[bool], config: Configuration) -> None:
         self._journey = journey
         self._tvb = tvb
         self._config = config
         self._rule = RecoveryRule(config)
-        self._fixed: Anchor | None = None  # by an alarm or a telegram
-        self._alarmed = False
-        self._mission_from = 0
+        self._memory_ns = round(NS_PER_S / min(config.monitors.ewma_alphas))
         self.held: list[Held] = []
+        self.begin_mission(0)
 
     def begin_mission(self, epoch: int) -> None:
-        self._fixed = None
-        self._alarmed = False
         self._mission_from = epoch
+        self._read: Anchor | None = None
+        self._anchor: Anchor | None = None
+        self._suspected = False
+        self._hold_to_ns: int | None = None
 
     def note_read(self, read: Crossing) -> None:
-        self._fixed = Anchor.at_crossing(self._journey, read, self._config.hazards.balise_read_sigma_m) or self._fixed
+        anchor = Anchor.at_crossing(self._journey, read, self._config.hazards.balise_read_sigma_m)
+        if anchor is not None:
+            self._read = self._anchor = anchor
 
-    def note_alarm(self, epoch: int, memory_s: float = 0.0) -> None:
-        """The first alarm with an anchor before it fixes that. `memory_s`: the drift may be so old."""
-        self._fixed = self.anchor_at(epoch, memory_s)
-        self._alarmed = self._fixed is not None
+    def withhold(self, epoch: int, suspected: bool) -> None:
+        """Fix the anchor; `suspected`: by an alarm or slip, else nothing watched the position."""
+        waits = self._hold_to_ns is None
+        if suspected or not (self._suspected and (waits or self.is_held(epoch))):
+            tvb = self._first_tvb(epoch) if suspected else self._last_tvb(epoch)
+            kept = self._read is not None and (suspected or tvb is None or self._read.t_ns >= tvb.t_ns)
+            self._anchor = self._read if kept else tvb
+            self._suspected = suspected
+        self._hold_to_ns = None
 
-    def anchor_at(self, epoch: int, least_s: float = 0.0) -> Anchor | None:
-        """Before the first alarm: the last TVB `anchor_lag_s` before `epoch`, else the first TVB, or a later read."""
-        lag_s = max(self._config.lds.anchor_lag_s, least_s)
-        return self._fixed if self._alarmed else self._last_validated(epoch, lag_s)
+    def hold(self, epoch: int) -> None:
+        """The position returns: from here on it is held to the anchor."""
+        self._hold_to_ns = int(self._journey.t_ns[epoch]) + self._memory_ns
 
-    def anchor_before_slip(self, epoch: int) -> Anchor | None:
-        """The last TVB before slip that began at `epoch`, or a later telegram."""
-        return self._last_validated(epoch, 0.0)
+    def is_held(self, epoch: int) -> bool:
+        return self._hold_to_ns is not None and int(self._journey.t_ns[epoch]) <= self._hold_to_ns
 
-    def _last_validated(self, epoch: int, lag_s: float) -> Anchor | None:
-        """The last TVB `lag_s` before `epoch`, else the first of the mission; or a later telegram."""
-        tvbs = self._mission_from + np.flatnonzero(self._tvb[self._mission_from : epoch])
-        if not tvbs.size:
-            return self._fixed
-        old_ns = int(self._journey.t_ns[epoch]) - round(lag_s * NS_PER_S)
-        last_old = int(np.searchsorted(self._journey.t_ns[tvbs], old_ns, side="right")) - 1
-        tvb = Anchor.at_epoch(self._journey, int(tvbs[max(last_old, 0)]))
-        return tvb if self._fixed is None or tvb.t_ns > self._fixed.t_ns else self._fixed
+    def held_m(self, epoch: int) -> tuple[Floats, Floats]:
+        """What the position moved since the anchor and may have [m], at each epoch of the hold from this one on."""
+        assert self._hold_to_ns is not None
+        assert self._anchor is not None
+        end = int(np.searchsorted(self._journey.t_ns, self._hold_to_ns, side="right"))
+        return self._moved_m(self._anchor, epoch, max(end, epoch))
 
-    def compare(self, epoch: int, anchor: Anchor | None) -> Comparison:
+    def compare(self, epoch: int) -> Comparison:
+        """Is GNSS minus odometer at this epoch what it was at the anchor?"""
+        anchor = self._anchor
         if not self._config.lds.relink:
             return Comparison(reason=NotEvaluated.RELINK_OFF)
         if anchor is None:
@@ -132,13 +142,13 @@ class Relink:
         if doubt_m > self._rule.most_m:
             # Slip at each start counts too much each time, and would soon explain any fault.
             return Comparison(reason=NotEvaluated.RELINK_SLIPPED)
-        moved_m, bound_m = (float(values[0]) for values in self.moved_m(anchor, epoch, epoch + 1))
+        moved_m, bound_m = (float(values[0]) for values in self._moved_m(anchor, epoch, epoch + 1))
         comparison = Comparison(moved_m, bound_m)
         if comparison.holds:
             self.held.append(Held(epoch, None if anchor.is_read else anchor.epoch, moved_m, bound_m + doubt_m))
         return comparison
 
-    def moved_m(self, anchor: Anchor, epoch: int, end: int) -> tuple[Floats, Floats]:
+    def _moved_m(self, anchor: Anchor, epoch: int, end: int) -> tuple[Floats, Floats]:
         """How far GNSS minus odometer moved since the anchor at these epochs, and how far it may have [m].
 
         NaN where the odometer lost its distance, or may have miscounted too much through slip.
@@ -153,6 +163,17 @@ class Relink:
         doubt_m = journey.slip_doubt_m[at] - journey.slip_doubt_m[anchor.epoch]
         known = (journey.counter[at] == journey.counter[anchor.epoch]) & (doubt_m <= self._rule.most_m)
         return np.where(known, moved_m, np.nan), np.minimum(self._rule.most_m, bound_m + doubt_m)
+
+    def _first_tvb(self, epoch: int) -> Anchor | None:
+        return self._at_tvb(range(self._mission_from, epoch))
+
+    def _last_tvb(self, epoch: int) -> Anchor | None:
+        return self._at_tvb(range(epoch - 1, self._mission_from - 1, -1))
+
+    def _at_tvb(self, epochs: Iterable[int]) -> Anchor | None:
+        """At the first of these epochs that is a TVB, where the odometer is known."""
+        found = next((k for k in epochs if self._tvb[k] and self._journey.comparable[k]), None)
+        return None if found is None else Anchor.at_epoch(self._journey, found)
 
 
 class Recovery:
@@ -176,7 +197,7 @@ class Recovery:
         usable = bool(self._journey.usable[epoch])
         observed = evaluated if self._journey.has_odometer else usable
         if observed:
-            if t_ns - self._observed_at_ns > self._journey.gap_ns:
+            if t_ns - self._observed_at_ns > self._journey.gap_ns[epoch]:
                 self._failed_at_ns = t_ns
             self._observed_at_ns = t_ns
         if failing or self._bank.fast_failed(epoch):

@@ -70,7 +70,7 @@ def run_lds(
     passages = system.balises.virtual.passages + system.balises.physical.passages
     return LdsResult(
         epochs=epoch_columns(epochs["t"], system, journey, config.lds),
-        crossings=crossing_rows(crossings, journey),
+        crossings=crossing_rows(crossings),
         passages=passage_rows(passages, crossings, journey, solution),
         unknown_reads=unknown,
         held=tuple(system.held),
@@ -174,12 +174,11 @@ def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str)
     balise = passage.balise
     window = passage.window
     crossing = passage.crossing
-    direction = journey.direction_at(passage.t_ns)
     return {
         "solution": solution,
         **{name: getattr(balise, name) for name in PLACE},
         "kind": balise.kind.value,
-        "direction": (Direction.GROWING if direction > 0 else Direction.FALLING).value,
+        "direction": (Direction.GROWING if passage.direction > 0 else Direction.FALLING).value,
         "status": passage.status.value,
         "t_offered": crossing and crossing.t_ns,
         "window_open_m": window and window.open_m,

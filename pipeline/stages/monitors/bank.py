@@ -159,7 +159,6 @@ class MonitorBank:
     ):
         self._count = epochs.height
         disabled = config.monitors.disabled
-        self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in config.monitors.ewma_alphas)])
         self._axes = tuple(
             AxisBank(axis, self._count, config, blind_along if axis.name == "along" else None)
             for axis in axes_of(epochs, config)
@@ -204,12 +203,6 @@ class MonitorBank:
         """
         self._look(epoch)
         return bool(self._fast[epoch])
-
-    def failing_memory_s(self, epoch: int) -> float:
-        """Memory of the slowest failing average [s]: its fault may be that old."""
-        self._look(epoch)
-        failing = np.any([axis.state[epoch] == FAIL for axis in self._axes], axis=0)
-        return float(np.max(self._memories_s * failing))
 
     def along_evaluated(self, epoch: int) -> bool:
         """`along_raw` has a verdict; an average alone says nothing of a step."""

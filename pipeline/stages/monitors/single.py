@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gap_ns
+from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
 from pipeline.stages.monitors.pseudorange import pseudorange_monitor
 from pipeline.stages.monitors.series import FIRST_EPOCH
@@ -114,14 +114,17 @@ def on_path_of(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> p
 
     Each solution has its own matched path, which may begin elsewhere or in the other direction. On a net element that
     both are on at one time the measure says how far apart they are; elsewhere the paths stand to each other as they did
-    before (at the beginning: as they will).
+    before, at the beginning in no known way.
     """
-    mine = _with_sense(epochs)
+    gaps = pl.Series("valid_ns", crossing_gaps_ns(times_ns(epochs), lds))
+    mine = _with_sense(epochs).with_columns(gaps, at_ns=pl.col("t_ns"))
     theirs = _with_sense(channel).with_row_index("row")
-    pairs = theirs.join_asof(
-        mine, on="t_ns", strategy="nearest", tolerance=crossing_gap_ns(times_ns(epochs), lds), suffix="_mine"
+    pairs = theirs.join_asof(mine, on="t_ns", strategy="backward", suffix="_mine")
+    together = (
+        (pl.col("t_ns") - pl.col("at_ns") <= pl.col("valid_ns"))
+        & (pl.col("netelement_id") == pl.col("netelement_id_mine"))
+        & (pl.col("sense") * pl.col("sense_mine") != 0)
     )
-    together = (pl.col("netelement_id") == pl.col("netelement_id_mine")) & (pl.col("sense") * pl.col("sense_mine") != 0)
     turned = pl.col("sense") * pl.col("sense_mine")
     here_m = pl.col("path_m_mine") + pl.col("sense_mine") * (pl.col("measure_m") - pl.col("measure_m_mine"))
     placed = (
@@ -130,7 +133,7 @@ def on_path_of(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> p
             turned=pl.when("together").then("turned"),
             start_m=pl.when("together").then(pl.col("here_m") - pl.col("turned") * pl.col("path_m")),
         )
-        .with_columns(pl.col("turned", "start_m").forward_fill().backward_fill())
+        .with_columns(pl.col("turned", "start_m").forward_fill())
         .select("row", path_m=pl.col("start_m") + pl.col("turned") * pl.col("path_m"))
     )
     return channel.with_columns(placed.sort("row")["path_m"])
@@ -139,14 +142,14 @@ def on_path_of(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> p
 def paired(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
     """For each epoch: `row_other`, the last row of `channel` since the epoch before, and this solution's `path_m` then.
 
-    That is the epoch's own, or between this epoch and the one before, if no more than `crossing_gap_s` apart; else
+    That is the epoch's own, or between this epoch and the one before, if a movement is interpolated over that; else
     null.
     """
     stamps = channel.select(t_other=_stamp()).with_row_index("row_other")
-    mine = epochs.select("path_m", t_ns=_stamp())
+    mine = epochs.select("path_m", t_ns=_stamp(), gap_ns=pl.Series(crossing_gaps_ns(times_ns(epochs), lds)))
     since = pl.col("t_ns") - pl.col("t_ns").shift(1)
     early = pl.col("t_ns") - pl.col("t_other")
-    between = (early < since) & (since <= crossing_gap_ns(times_ns(epochs), lds))
+    between = (early < since) & (since <= pl.col("gap_ns"))
     way = (pl.col("path_m") - pl.col("path_m").shift(1)) * (early / since)
     return (
         mine.join_asof(stamps, left_on="t_ns", right_on="t_other", strategy="backward")
@@ -160,11 +163,11 @@ def _stamp() -> pl.Expr:
 
 
 def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
-    """Places with `sense`: +1 where the path runs with the measure, -1 against it; 0 where a visit does not show."""
-    path, measure = (pl.col(name) - pl.col(name).mean().over("visit") for name in ("path_m", "measure_m"))
+    """Places with `sense`: +1 where the path runs with the measure, -1 against it; 0 where a visit has not shown it."""
+    path, measure = (pl.col(name).diff().over("visit") for name in ("path_m", "measure_m"))
     placed = epochs.select(*_PLACE, t_ns=_stamp(), visit=pl.col("netelement_id").rle_id())
-    placed = placed.with_columns(moved=path * measure)
-    return placed.select("t_ns", *_PLACE, sense=pl.col("moved").sum().over("visit").sign().cast(pl.Int8))
+    moved = (path * measure).fill_null(0.0).cum_sum().over("visit")
+    return placed.select("t_ns", *_PLACE, sense=moved.sign().cast(pl.Int8))
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
 
 from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig
@@ -82,9 +83,9 @@ def driven_or_left_m(distance_m: Floats, moving: Bools) -> Floats:
     lengths = np.diff(first, append=moving.size)
     span = np.repeat(np.arange(first.size), lengths)  # of steps that all move, or all stand
     away_m = np.abs(distance_m[1:] - np.repeat(distance_m[first], lengths))
-    # Running maximum within each span: an offset that grows from span to span keeps one from reaching into the next.
-    offset_m = (away_m.max() + 1.0) * span
-    farthest_m = np.maximum.accumulate(away_m + offset_m) - offset_m
+    # By polars: an offset for each span would round by what the log holds later.
+    spans = pl.DataFrame({"away_m": away_m, "span": span})
+    farthest_m = spans.select(pl.col("away_m").cum_max().over("span")).to_series().to_numpy()
     begins = np.zeros(moving.size, dtype=np.bool_)
     begins[first] = True
     left_m = np.where(begins, farthest_m, np.diff(farthest_m, prepend=0.0))

@@ -173,6 +173,7 @@ def failure_counts(failures: pl.DataFrame) -> Row:
         **_counted(failures, counts),
         "hazardous_max_s": failures["hazardous_s"].max(),
         "hazardous_s": failures["hazardous_s"].sum(),
+        "hazardous_natural_s": failures["natural_s"].sum(),
         **{f"failure_{name}": failures[name].to_list() for name in ("hazardous_s", "hazardous_may_s", "accepted")},
     }
 

@@ -56,7 +56,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     row = (
         _identity(results)
         | _decisive(epochs, judged.passages, judged.failures, config)
-        | ({} if judged.evidence else {"hazardous_s": None})
+        | ({} if judged.evidence else {"hazardous_s": None, "hazardous_natural_s": None})
         | lost.columns()
         | _extent(epochs, clock)
         | figures.positions(epochs, clock, config)

@@ -30,7 +30,7 @@ _LASTING = (
 DECISIVE = (
     *("unsafe_accepted", "unproven_accepted", "balises_accepted", "unknown_in_use_s", "share_undiagnosed"),
     *("failure_hazardous_s", "failure_hazardous_may_s", "failure_accepted"),
-    *("hazardous_s", "duration_s", "faults_injected", "reasons"),
+    *("hazardous_natural_s", "duration_s", "reasons"),
 )
 """Columns of `runs` that the reasons are read from."""
 
@@ -54,12 +54,11 @@ def reasons_of(run: Row, allowed_s: float, undiagnosed_share: float) -> list[Rea
     failures = failures_in(run)
     within, beyond = level_counts(failures, allowed_s)
     hours_begun = max(1, math.ceil((run["duration_s"] or 0.0) / 3600.0))
-    too_long = (run["hazardous_s"] or 0.0) > allowed_s * hours_begun
     applies = {
         Reason.ACCEPTED_WRONG: run["unsafe_accepted"] > 0,
         Reason.FAILURE_BEYOND_BUDGET: beyond > 0,
         # Eq. 7 is of nature's failures: how many were injected is nobody's rate.
-        Reason.HAZARDOUS_SUM: too_long and not run["faults_injected"],
+        Reason.HAZARDOUS_SUM: (run["hazardous_natural_s"] or 0.0) > allowed_s * hours_begun,
         Reason.ACCEPTED_UNKNOWN: run["unproven_accepted"] > 0,
         Reason.BUDGET_UNKNOWN: within + beyond < len(failures),
         Reason.UNKNOWN_IN_USE: (run["unknown_in_use_s"] or 0.0) > allowed_s,

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.results.places import train_path_m
-from pipeline.stages.epochs.clock import confident, crossing_gap_ns, met, unambiguous, usable
+from pipeline.stages.epochs.clock import confident, crossing_gaps_ns, met, unambiguous, usable
 from schemas.arrays import Bools, Ints, flags, floats, times_ns
 from schemas.config import Configuration
 
@@ -80,7 +80,7 @@ def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Con
     here = placed[:-1]
     there = placed[1:]
     state = np.maximum(states[here], states[there])
-    silent = (t_ns[there] - t_ns[here] > crossing_gap_ns(t_ns, config.lds)) & (there == here + 1)
+    silent = (t_ns[there] - t_ns[here] > crossing_gaps_ns(t_ns, config.lds)[there]) & (there == here + 1)
     between = np.flatnonzero(there > here + 1)
     state[silent] = SpanState.OUTAGE
     for row in between:

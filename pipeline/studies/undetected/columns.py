@@ -8,7 +8,7 @@ import dataframely as dy
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gap_ns
+from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.ride import Ride
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
@@ -178,7 +178,8 @@ def rows_of_passages(ride: Ride, rows: Watched) -> Ints:
     read_ns = ints(seen["t_offered"].dt.timestamp("ns"))
     stamps = t_ns[rows.epoch]
     before = np.searchsorted(stamps, read_ns, side="right") - 1
-    near = (before >= 0) & (read_ns - stamps[before.clip(0)] <= crossing_gap_ns(t_ns, ride.prepared.config.lds))
+    longest_ns = crossing_gaps_ns(t_ns, ride.prepared.config.lds)[rows.epoch]
+    near = (before >= 0) & (read_ns - stamps[before.clip(0)] <= longest_ns[before.clip(0)])
     physical = (seen["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
     return np.where(physical, np.where(near, before, NO_ROW), offered)
 

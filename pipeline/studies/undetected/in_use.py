@@ -8,9 +8,10 @@ held to the anchor; from there on it grows by what the restarted bank lets pass,
     held to anchor A     f(k) <= U(A) + b(A, k) - (x(k) - x(A))          x: GNSS minus odometer as recorded
     after, since h       f(k) <= f(h) + sum over (h, k] of way_s (y - u), |averages| <= thresholds
 
-The anchor is the fix, or a TVB `anchor_lag_s` before the alarm; which one, and when the alarm came, is open: the
-largest counts. Before anything was validated there is no anchor: the LDS forgets a fault that is noticed there and
-initialises anew with it. So nothing is bounded from a start of mission to the first fix after the first TVB.
+The anchor is the fix (a telegram; the first TVB is taken to be no worse than that), or after an outage beyond
+`gap_reset_s` a TVB before it; which one, and when the alarm came, is open: the largest counts. Before anything was
+validated there is no anchor: the LDS forgets a fault that is noticed there and initialises anew with it. So nothing is
+bounded from a start of mission to the first fix after the first TVB.
 """
 
 from __future__ import annotations
@@ -112,34 +113,34 @@ class _Window:
 
     def largest_m(self, unnoticed_m: Floats) -> Floats:
         """The largest error at each row; NaN once the distance was lost."""
-        recovery_s = self.config.lds.recovery_s
-        held_m = self._held_m(unnoticed_m, recovery_s)
+        held_m = self._held_m(unnoticed_m, 0.0)
         hold_s = _LAST_TENTH / min(self.config.monitors.ewma_alphas)
         if "link_distance" in self.config.monitors.disabled:
             hold_s = 0.0
-        ended_m = self._held_m(unnoticed_m, recovery_s + hold_s)
+        ended_m = self._held_m(unnoticed_m, hold_s)
         most_m = np.maximum(unnoticed_m, np.maximum(held_m, self._after_m(ended_m)))
         unknown = self.returns.counter != self.returns.counter[0]
         return np.where(unknown | np.isinf(most_m), np.nan, most_m)
 
-    def _held_m(self, unnoticed_m: Floats, delay_s: float) -> Floats:
-        """The largest error at each row while it is held to an anchor whose alarm may be over for so long."""
+    def _held_m(self, unnoticed_m: Floats, since_s: float) -> Floats:
+        """The largest error at each row while it is held to an anchor, for so long since its return."""
         reach_m = unnoticed_m + self.sign * self.returns.offset_m + self.seen.learned_late_m
-        anchors_m = self._anchors_m(reach_m, delay_s)
+        anchors_m = self._anchors_m(reach_m, since_s)
         held_m: Floats = anchors_m + self._bound_m() - self.sign * self.returns.offset_m + self.seen.learned_late_m
         return held_m
 
-    def _anchors_m(self, reach_m: Floats, delay_s: float) -> Floats:
+    def _anchors_m(self, reach_m: Floats, since_s: float) -> Floats:
         """The largest U(A) + x(A) of these anchors at each row."""
         t_s = self.seen.t_s
         of_tvb = np.where(self.validated, reach_m, -np.inf)
-        old = np.searchsorted(t_s, t_s - self.config.lds.anchor_lag_s - delay_s, side="right") - 1
-        lagged_m = np.where(old >= 0, np.fmax.accumulate(of_tvb)[old], -np.inf)
+        old = np.searchsorted(t_s, t_s - self.config.align.gap_reset_s - since_s, side="right") - 1
+        before_m = np.where(old >= 0, np.fmax.accumulate(of_tvb)[old], -np.inf)
         # The position's own error at the fix is not known.
         read_m = self.config.hazards.balise_read_sigma_m
         spread_m = self.config.monitors.threshold_factor * float(np.hypot(self.returns.sigma_m[0], read_m))
         fix_m = float(reach_m[0]) + spread_m
-        return np.maximum(lagged_m, np.where(t_s - t_s[0] >= delay_s, fix_m, -np.inf))
+        delay_s = self.config.lds.recovery_s + since_s
+        return np.maximum(before_m, np.where(t_s - t_s[0] >= delay_s, fix_m, -np.inf))
 
     def _bound_m(self) -> Floats:
         """The widest bound of a re-link at each row: with the anchor at the first row, and the largest sigma since."""

@@ -11,6 +11,7 @@ from polars.testing import assert_frame_equal
 
 from pipeline.stages.alignment.align import BEYOND_SPAN, align, odometer_at, speed_of_positions
 from pipeline.stages.alignment.odometer_filter import stamp_jitter_s
+from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.odometry.odometry import Noise
@@ -302,11 +303,17 @@ def test_slip_is_that_of_the_rows_about_an_epoch_inside_the_odometer():
     ("t_s", "clock_periods", "jitter_s"),
     [
         ([0.0, 1.0, 2.0, 3.0, 4.0], 3.0, 0.0),
-        ([0.0, 1.02, 2.0, 3.02, 4.0, 5.0], 3.0, np.sqrt(4 * 0.02**2 / 5 / 2)),  # five steps, four of them 20 ms off
-        ([0.0, 1.0, 2.0, 3.0, 5.1], 3.0, np.sqrt(0.1**2 / 4 / 2)),  # of two periods, 0.1 s late
+        # Of the period known before each, here the first step of 1.02 s and means of 1.02 s and 0.98 s.
+        ([0.0, 1.02, 2.0, 3.02, 4.0], 3.0, np.sqrt((0.04**2 + 0.02**2 + 0.04**2) / 3 / 2)),
+        ([0.0, 1.0, 2.0, 3.0, 5.1], 3.0, np.sqrt(0.1**2 / 3 / 2)),  # of two periods, 0.1 s late
         ([0.0, 1.0, 2.0, 3.0, 8.1], 3.0, 0.0),  # of five: the clock may have started anew
         ([0.0, 1.0, 101.0], 1.0, 0.0),  # no step is of one period: nothing shows how the stamps scatter
     ],
 )
 def test_stamps_scatter_by_how_far_their_steps_are_off_whole_periods(t_s, clock_periods, jitter_s):
-    assert stamp_jitter_s(np.array(t_s), clock_periods) == pytest.approx(jitter_s, abs=1e-12)
+    stamps_s = np.array(t_s)
+    period_s = periods_before_s(np.round(1e9 * stamps_s).astype(np.int64))
+    found_s = stamp_jitter_s(stamps_s, period_s, clock_periods)
+    assert found_s[-1] == pytest.approx(jitter_s, abs=1e-12)
+    for rows in range(1, stamps_s.size):
+        assert (stamp_jitter_s(stamps_s[:rows], period_s[:rows], clock_periods) == found_s[:rows]).all()

@@ -181,7 +181,7 @@ def filter_at_rest():
     at_s = np.arange(20.0, 320.0)
     path_m = odometry.distance_at_s(at_s)
     state = learner.start(prior_of(Vehicle(), CONFIG.align), 20.0, float(path_m[0]))
-    joints = learner.run(state, at_s, path_m, np.ones(at_s.size), 0.0)
+    joints = learner.run(state, at_s, path_m, np.ones(at_s.size), np.zeros(at_s.size))
     return learner, learner.after(state, joints[-1], float(at_s[-1])), odometry
 
 
@@ -199,7 +199,9 @@ def resumed_from(learner, state, gap_s, beside_m, jitter_s=0.0):
 def seen_at(learner, state, beside_m, sigma_m=1.0):
     """The joint state once the position at the state's own time is learned from."""
     at_s = np.array([state.t_s])
-    return learner.run(state, at_s, learner.odometry.distance_at_s(at_s) + beside_m, np.full(1, sigma_m), 0.0)[-1]
+    return learner.run(state, at_s, learner.odometry.distance_at_s(at_s) + beside_m, np.full(1, sigma_m), np.zeros(1))[
+        -1
+    ]
 
 
 def test_stamps_that_scatter_tell_less_of_a_move():

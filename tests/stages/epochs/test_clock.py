@@ -9,13 +9,15 @@ import pytest
 from pipeline.stages.epochs.clock import (
     Clock,
     availability,
-    crossing_gap_ns,
+    crossing_gaps_ns,
     gap_limit_s,
     held_s,
     least_belief,
     met,
     nominal_period_s,
     outages_s,
+    periods_before_s,
+    reactions_ns,
     share_of_time,
     trusted,
     uptime,
@@ -103,9 +105,32 @@ def test_a_gap_is_longer_than_a_second_and_a_half_period(period_s: float | None,
     assert gap_limit_s(period_s, CONFIG.align.gap_reset_s) == limit_s
 
 
-@pytest.mark.parametrize(("t_ns", "gap_s"), [(T_NS, 2.0), (3 * T_NS, 4.5), (T_NS[:1], 2.0)])
-def test_a_movement_is_interpolated_over_one_period_and_a_half_or_as_configured(t_ns: Ints, gap_s: float) -> None:
-    assert crossing_gap_ns(t_ns, LdsConfig(crossing_gap_s=2.0)) == round(gap_s * NS_PER_S)
+def test_a_movement_is_interpolated_over_one_and_a_half_periods_as_known_before_or_as_configured() -> None:
+    """Every 3 s, and 15 s of nothing after the fourth; before the first step no period is known."""
+    gaps_ns = crossing_gaps_ns(3 * T_NS, LdsConfig(crossing_gap_s=2.0))
+    assert (gaps_ns / NS_PER_S).tolist() == [2.0, 2.0, 4.5, 4.5, 4.5, 4.5, 4.5]
+    assert crossing_gaps_ns(T_NS[:1], LdsConfig(crossing_gap_s=2.0)).tolist() == [2 * NS_PER_S]
+
+
+def test_the_period_of_a_log_is_the_median_of_the_last_100_steps_before() -> None:
+    """200 epochs at 10 Hz, then at 1 Hz: the 50th of the slow steps is the first behind which the median is theirs."""
+    t_ns = seconds(*np.cumsum([0.0, *[0.1] * 199, *[1.0] * 60]))
+    periods_s = periods_before_s(t_ns)
+    assert periods_s[:2].tolist() == [0.0, 0.0]
+    assert periods_s[2:250] == pytest.approx(0.1)
+    assert periods_s[250] == pytest.approx(0.55)
+    assert periods_s[251:] == pytest.approx(1.0)
+    # What comes later changes nothing.
+    assert periods_before_s(t_ns[:230]).tolist() == periods_s[:230].tolist()
+    assert periods_before_s(t_ns[:0]).tolist() == []
+
+
+def test_a_negation_takes_until_the_next_position() -> None:
+    """At 3 s the next one comes in 5 s: no longer than a step that is no gap; behind the last one there is none."""
+    found = reactions_ns(T_NS[[1, 3, 6]], T_NS, CONFIG) / NS_PER_S
+    assert found.tolist() == [1.0, 1.5, 1.0]
+    fixed = CONFIG.model_copy(update={"hazards": CONFIG.hazards.model_copy(update={"reaction_s": 0.25})})
+    assert (reactions_ns(T_NS, T_NS, fixed) / NS_PER_S).tolist() == [0.25] * 7
 
 
 POSITIONS = pl.DataFrame(

@@ -34,6 +34,7 @@ def positions(t_s: Sequence[float], error_m: Sequence[float] | float = 0.0, half
         "path_m": 10.0 * np.array(t_s) + error, "sigma_along_m": 1.0, "leg": 0, "used_s": step_s,
     } | columns  # fmt: skip
     values.setdefault("wrong_s", np.where([word == "wrong" for word in values["judgement"]], values["used_s"], 0.0))
+    values.setdefault("natural_s", values["wrong_s"])
     for name in ("train_m", "reference_m"):
         values.setdefault(name, 10.0 * np.array(t_s))
     recorded = {"t": pl.Datetime("ns", "UTC"), "path_m": pl.Float64, "sigma_along_m": pl.Float64, "leg": pl.Int32}

@@ -28,6 +28,7 @@ from pipeline.stages.judge.episodes import (
 from pipeline.stages.judge.failures import Course, Failure, Offers, find_failures, within_budget
 from pipeline.stages.judge.hazards import HazardRow, _evidence, crossed_by, hazard_rows, instants, rate_mps, size_m
 from pipeline.stages.judge.in_use import lds_states, time_in_use
+from pipeline.stages.judge.injected import under_injection
 from pipeline.stages.judge.judgement import (
     RIGHT,
     UNKNOWN,
@@ -49,7 +50,7 @@ from tests.stages.judge.frames import NS, course, offers, positions
 
 EPISODE = Episode(
     mark=0, onset=0, end=1, begin_ns=0, onset_ns=0, end_ns=1, step=None, jump_back=None, failed=None, may_ns=None,
-    detection=Detection(), failure=Failure(0, 0, 0, 1, 0.0, 0.0, Judgement.RIGHT, True),
+    detection=Detection(), failure=Failure(0, 0, 0, 1, 0.0, 0.0, 0.0, Judgement.RIGHT, True),
 )  # fmt: skip
 DEG_PER_M = np.degrees(1.0 / 6378137.0)  # east along the equator
 
@@ -408,21 +409,51 @@ def test_a_position_is_in_use_since_the_one_before_it_until_it_is_negated() -> N
     t_s = [0, 1, 2, 7, 8, 9, 10, 11, 12, 13]
     given = {"confidence_m": [5.0] * 9 + [500.0], "negated": [t in (9, 10, 11) for t in t_s]}
     found = used(t_s, RIGHT, **given)
-    # Each second counts for the position at its end; of the gap one period, for nothing was in use in it.
-    assert found["used_s"].to_list() == [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    # Each second counts for the position at its end; of the gap no more than a step that is none, however wrong.
+    in_use_s = [1.0, 1.0, 1.0, 1.5, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    assert found["used_s"].to_list() == in_use_s
     assert found["in_use"].to_list() == [True] * 7 + [False] * 3
-    assert found["counted_s"].to_list() == [1.0] * 10
-    assert used(t_s, WRONG, **given)["wrong_s"].to_list() == [1.0, 1.0, 1.0, 5.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    assert found["counted_s"].to_list() == [1.0] * 3 + [1.5] + [1.0] * 6
+    assert used(t_s, WRONG, **given)["wrong_s"].to_list() == in_use_s
     assert used([0.0], WRONG)["wrong_s"].to_list() == [0.0]
 
 
-def test_a_wrong_position_after_a_gap_counts_one_period_and_an_unknown_one_too() -> None:
-    """At 10 Hz with 0.9 s of gap: right before it, wrong behind it; then unknown and wrong, 0.9 s later."""
+def test_a_wrong_position_counts_whole_since_the_one_before_it_and_an_unknown_one_too() -> None:
+    """At 10 Hz with 0.9 s of nothing: right before it, wrong behind it; then unknown and wrong, 0.9 s later."""
     t_s = [0.0, 0.1, 1.0, 1.1, 2.0, 2.1, 2.2]
     found = used(t_s, [RIGHT, RIGHT, WRONG, WRONG, UNKNOWN, WRONG, WRONG])
-    assert found["wrong_s"].to_numpy() == pytest.approx([0.0, 0.0, 0.1, 0.1, 0.0, 0.1, 0.1])
-    # What may be wrong counts whole since what was wrong or may have been.
-    assert found["used_s"].to_numpy() == pytest.approx([0.1, 0.1, 0.1, 0.1, 0.9, 0.1, 0.1])
+    assert found["wrong_s"].to_numpy() == pytest.approx([0.0, 0.0, 0.9, 0.1, 0.0, 0.1, 0.1])
+    assert found["used_s"].to_numpy() == pytest.approx([0.1, 0.1, 0.9, 0.1, 0.9, 0.1, 0.1])
+
+
+def test_a_stretch_of_a_slower_log_hides_no_second() -> None:
+    """10 Hz, then 1 Hz: wrong at the first slow epoch, which raises the alarm; negated at the next one."""
+    t_s = [*np.arange(200) / 10.0, 20.9, 21.9, 22.9]
+    code, size = np.full(203, RIGHT), 203
+    code[200:] = WRONG
+    found = used(t_s, code.tolist(), negated=[row >= 200 for row in range(size)])
+    assert found["wrong_s"].to_numpy()[199:] == pytest.approx([0.0, 1.0, 1.0, 0.0])
+    assert found["in_use"].to_list()[199:] == [True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("target", "end_s", "under"),
+    [
+        ("along", 20.0, "--++++---"),  # to 50 s: 30 s of recovery
+        ("G08", None, "--+++++++"),
+        ("satellites", 40.0, "--++++++-"),
+        ("odometer", 20.0, "---------"),
+        ("door", None, "---------"),
+    ],
+)
+def test_only_an_injected_fault_of_gnss_is_not_natures(target: str, end_s: float | None, under: str) -> None:
+    """Every 10 s; the fault begins at 20 s."""
+    stamps = [pl.Series([None if t is None else ns(t)], dtype=pl.Int64) for t in (20.0, end_s)]
+    begin, end = (stamp.cast(pl.Datetime("ns", "UTC")) for stamp in stamps)
+    faults = pl.DataFrame({"t_start": begin, "t_end": end, "target": [target]})
+    found = under_injection(seconds(*range(0, 90, 10)), faults, recovery_s=30.0).tolist()
+    assert found == [letter == "+" for letter in under]
+    assert not under_injection(seconds(20.0), None, 30.0).any()
 
 
 def test_a_withheld_position_is_not_in_use_nor_what_follows_upon_its_alarm() -> None:
@@ -438,8 +469,10 @@ def test_rows_without_a_position_stand_for_no_time_between_near_positions() -> N
     t_s = 0.5 * np.arange(15)
     path_m = [1.0 if t in (0.0, 1.0, 2.0, 7.0) else None for t in t_s]
     found = used(t_s, RIGHT, path_m=path_m)
-    assert found["used_s"].to_numpy() == pytest.approx([float(p is not None) for p in path_m])
-    assert found["counted_s"].sum() == pytest.approx(3 * 1.0 + 9 * 0.5 + 1.0)
+    positions_s = [time for time in found["used_s"] if time > 0.0]
+    assert positions_s == pytest.approx([1.0, 1.0, 1.0, 1.5])
+    assert found["used_s"].to_numpy()[np.equal(path_m, None)].sum() == 0.0
+    assert found["counted_s"].sum() == pytest.approx(3 * 1.0 + 10 * 0.5)
 
 
 @pytest.mark.parametrize(
@@ -558,7 +591,7 @@ def test_a_jump_is_what_gathers_within_a_second(
     train_m, t_ns = 10.0 * np.arange(10), seconds(*(0.5 * np.arange(10)))
     unknown = np.full(10, np.nan)
     told = (unknown, np.full(9, 10.0)) if by_odometer else (train_m, unknown[:9])
-    steps = steps_of(t_ns, train_m + error_m, *told, round(gap_s * NS))
+    steps = steps_of(t_ns, train_m + error_m, *told, np.full(10, round(gap_s * NS)))
     found = find_jumps(steps, np.full(10, direction), HazardConfig())
     assert [(one.first, one.last, one.step_m) for one in found] == jumps
 
@@ -693,7 +726,7 @@ def test_each_crossing_of_the_train_belongs_to_one_passage() -> None:
 def test_a_crossing_is_positioned_between_two_positions_near_each_other(t_s: float, positioned: bool) -> None:
     """Positions each second, but none between 2 s and 6 s."""
     at_ns = np.array([0, 1, 2, 6, 7]) * NS
-    assert _within_gap(at_ns, np.array([ns(t_s)]), round(1.5 * NS)).tolist() == [positioned]
+    assert _within_gap(at_ns, np.array([ns(t_s)]), LdsConfig()).tolist() == [positioned]
     assert _within_gap(at_ns[:1], np.array([0]), round(1.5 * NS)).tolist() == [False]
 
 

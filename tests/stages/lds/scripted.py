@@ -19,8 +19,7 @@ INSTANT = pl.Datetime("ns", "UTC")
 class ScriptedBank:
     """Fails at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart.
 
-    `blind`: no verdict along the track; `unknown`: the noise is not known; `begins`: begins anew by itself; `memory_s`:
-    of the average that fails.
+    `blind`: no verdict along the track; `unknown`: the noise is not known; `begins`: begins anew by itself.
     """
 
     def __init__(
@@ -31,14 +30,13 @@ class ScriptedBank:
         blind: Iterable[int] = (),
         unknown: Iterable[int] = (),
         begins: Iterable[int] = (),
-        memory_s: float = 0.0,
     ) -> None:
         self.fails, self.rings, self.blind = set(fails), set(rings), set(blind)
         self.fast = self.fails if fast is None else set(fast)
         self.begins = set(begins)
         self.started = 0
         self.frozen: list[int] = []
-        self.unknown, self.memory_s = set(unknown), memory_s
+        self.unknown = set(unknown)
         self.restarted: list[int] = []
         self.watched = np.zeros(0, dtype=np.int64)
 
@@ -54,9 +52,6 @@ class ScriptedBank:
 
     def fast_failed(self, epoch: int) -> bool:
         return epoch in self.fast
-
-    def failing_memory_s(self, epoch: int) -> float:
-        return self.memory_s if epoch in self.fails else 0.0
 
     def along_evaluated(self, epoch: int) -> bool:
         return epoch > self.started and epoch not in self.blind

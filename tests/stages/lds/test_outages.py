@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from benchmarks.relink import Journey, Outcome, is_fast, journey, lds_of, outcome, ramp
+from benchmarks.relink import Journey, Outcome, journey, lds_of, outcome, ramp
 from pipeline.stages.lds import LdsResult
 from schemas.config import Configuration, LdsConfig, Vehicle
 
@@ -45,7 +45,7 @@ def test_without_a_vehicle_file_a_long_outage_ends_the_use_of_the_position(gap_s
         _, lds = lds_of(tunnel(4, gap_s, offset_m), CONFIG, Vehicle())
         used = gap_s == 40 and offset_m == 0.0
         assert (accepted_after(lds) > 0) == used
-        assert lds.epochs["negated"][-1] is not used
+        assert (lds.epochs["negated"][-1] or lds.epochs["withheld"][-1]) is not used
 
 
 def test_slow_drifts_after_a_return() -> None:
@@ -55,16 +55,15 @@ def test_slow_drifts_after_a_return() -> None:
         return [outcome(ramp(seed, 1.0 + seed % 2), Configuration(lds=config)) for seed in range(drifts)]
 
     assert not any(one.returned for one in outcomes(LdsConfig(relink=False), 6))
-    rule = LdsConfig()
-    by_rule = outcomes(rule, 16)
-    assert sum(one.negated for one in by_rule if is_fast(one, rule)) >= 10
+    by_rule = outcomes(LdsConfig(), 16)
+    assert sum(one.negated for one in by_rule) >= 12
     assert any(one.returned for one in by_rule)
     assert max(one.beyond_s for one in by_rule) == 0.0
 
 
 @pytest.mark.parametrize("seed", [32, 1036, 1052, 2009, 2012])
 def test_a_drift_found_late_does_not_come_back(seed: int) -> None:
-    """0.029 to 0.037 m/s: with an anchor 300 s before the alarm all are in use again beyond 20 m, for 335 s or more."""
+    """0.029 to 0.037 m/s: by an anchor 300 s before the alarm all are in use again beyond 20 m, for 335 s or more."""
     found = outcome(ramp(seed, 1.0 + seed % 2), CONFIG)
     assert found.negated
     assert found.beyond_s == 0.0

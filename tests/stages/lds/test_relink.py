@@ -11,7 +11,7 @@ import pytest
 from pipeline.stages.lds import LdsResult
 from pipeline.stages.lds.crossings import balises_of, reads_of
 from pipeline.stages.lds.journey import Journey
-from pipeline.stages.lds.relink import Comparison, Relink
+from pipeline.stages.lds.relink import Relink
 from schemas.enums import BaliseKind, NotEvaluated
 from tests.stages.lds.scripted import (
     K_T,
@@ -27,95 +27,100 @@ from tests.stages.lds.scripted import (
     steps,
 )
 
-
-def compared(relink: Relink, k: int) -> Comparison:
-    return relink.compare(k, relink.anchor_at(k))
-
-
 V1 = {"V1": 110.0}
 V1_P1 = {"V1": 110.0, "P1": 1410.0}
 KINDS = ["virtual", "physical"]
 
 
-def relink_of(offsets_m: list[float], tvb: list[int], lag_s: float, **columns: Any) -> tuple[Relink, Any]:
+def relink_of(offsets_m: list[float], tvb: list[int], **columns: Any) -> tuple[Relink, Any]:
     """Ten epochs whose position is `offsets_m` ahead of the odometer; `tvb`: epochs that are TVBs."""
     odometer_m = steps(0.0, 20.0, 10)
     path_m = [x + offset_m for x, offset_m in zip(odometer_m, offsets_m, strict=True)]
-    config = settings(anchor_lag_s=lag_s)
-    journey = Journey(epochs_of(path_m, odometer_m, **columns), SCALE_SIGMA, config)
-    return Relink(journey, [k in tvb for k in range(10)], config), journey
+    journey = Journey(epochs_of(path_m, odometer_m, **columns), SCALE_SIGMA, settings())
+    return Relink(journey, [k in tvb for k in range(10)], settings()), journey
+
+
+def moved_m(relink: Relink, epoch: int) -> float | None:
+    """Against the anchor in force; None without one."""
+    comparison = relink.compare(epoch)
+    return comparison.moved_m if comparison.reason is None else None
 
 
 # The anchor, by tables of ten rows
 
 
-def test_the_anchor_is_the_last_tvb_that_is_old_enough_else_the_first() -> None:
-    """TVBs at 2, 3, 5, 6 and 8 s, lag 3 s."""
-    relink, _ = relink_of([0.0] * 10, [2, 3, 5, 6, 8], 3.0)
-    expected = [None, None, None, 2, 2, 2, 3, 3, 5, 6]
-    anchors = [relink.anchor_at(k) for k in range(10)]
-    assert [anchor and anchor.epoch for anchor in anchors] == expected
+@pytest.mark.parametrize(
+    ("epoch", "suspected", "anchor"),
+    [(9, True, 2), (9, False, 8), (8, False, 6), (6, False, 5), (3, True, 2), (2, True, None), (2, False, None)],
+)
+def test_the_anchor_is_the_first_tvb_where_the_position_is_suspected_else_the_last_before(
+    epoch: int, suspected: bool, anchor: int | None
+) -> None:
+    """TVBs at 2, 3, 5, 6 and 8 s; at each second the position is a metre farther ahead."""
+    relink, _ = relink_of([float(k) for k in range(10)], [2, 3, 5, 6, 8])
+    relink.withhold(epoch, suspected)
+    assert moved_m(relink, 9) == (None if anchor is None else 9.0 - anchor)
 
 
-def test_the_first_alarm_fixes_the_anchor_and_later_alarms_do_not_move_it() -> None:
-    relink, _ = relink_of([float(k) for k in range(10)], list(range(1, 10)), 3.0)
-    for k, epoch in [(0, None), (4, 1), (5, 2), (6, 2), (9, 2)]:
-        if k in (5, 9):
-            relink.note_alarm(k)
-        anchor = relink.anchor_at(k)
-        assert (anchor and anchor.epoch) == epoch
-    # At 9 s the position is 9 m ahead of the odometer, at the anchor it was 2 m.
-    found = compared(relink, 9)
-    assert found.moved_m == pytest.approx(7.0)
-    assert found.holds
+def test_a_later_return_does_not_move_the_anchor_of_an_alarm() -> None:
+    """Alarm at 3 s, return at 5 s; what nothing watched before 8 s is held to the same anchor, as is a second alarm."""
+    relink, _ = relink_of([float(k) for k in range(10)], [2, 5, 6, 7])
+    relink.withhold(3, suspected=True)
+    relink.hold(5)
+    for suspected in (False, True, False):
+        relink.withhold(8, suspected)
+        assert moved_m(relink, 9) == 7.0
+    # After an outage alone the next one has its own.
+    relink, _ = relink_of([float(k) for k in range(10)], [2, 5, 6, 7])
+    relink.withhold(4, suspected=False)
+    assert moved_m(relink, 9) == 7.0
+    relink.hold(5)
+    relink.withhold(8, suspected=False)
+    assert moved_m(relink, 9) == 2.0
 
 
-def test_an_alarm_without_an_anchor_fixes_none() -> None:
-    relink, _ = relink_of([0.0] * 10, [4, 5, 6, 7, 8, 9], 0.0)
-    relink.note_alarm(2)
-    assert relink.anchor_at(2) is None
-    relink.note_alarm(6)
-    anchors = [relink.anchor_at(k) for k in (6, 9)]
-    assert [anchor and anchor.epoch for anchor in anchors] == [5, 5]
+def test_a_start_of_mission_forgets_what_was_before() -> None:
+    relink, _ = relink_of([0.0] * 10, [2, 7])
+    relink.begin_mission(5)
+    relink.withhold(6, suspected=True)
+    assert moved_m(relink, 9) is None
+    relink.withhold(9, suspected=True)
+    assert moved_m(relink, 9) == 0.0
 
 
-def test_only_a_telegram_renews_the_anchor() -> None:
+@pytest.mark.parametrize("suspected", [True, False])
+def test_a_telegram_is_the_anchor_from_then_on(suspected: bool) -> None:
     """The balise at 100 m is read at 5.5 s, where the odometer is at 110 m: GNSS minus odometer should be -10 m."""
-    relink, journey = relink_of([-12.0] * 10, list(range(10)), 3.0)
-    relink.note_alarm(4)
-    assert compared(relink, 6).moved_m == pytest.approx(0.0)
+    relink, journey = relink_of([-12.0] * 10, [0, 1, 2, 3])
+    relink.withhold(4, suspected)
+    assert moved_m(relink, 6) == pytest.approx(0.0)
     physical = balises_of(balises_at({"P1": 100.0}, kind="physical"), BaliseKind.PHYSICAL)
     [read], _ = reads_of(reads_at([(5.5, "P1")]).with_columns(odometer_m=110.0), physical, journey)
     relink.note_read(read)
-    found = compared(relink, 9)
-    assert found.moved_m == pytest.approx(-2.0)
-    # 3.5 s and 70 m since the telegram: sigma 1 m of the position and 1 m of the read.
-    assert found.bound_m == pytest.approx(K_T * sqrt(2.0 + 0.05**2 * 3.5 + (1e-4 * 70.0) ** 2))
-    relink.note_alarm(9)
-    anchor = relink.anchor_at(9)
-    assert anchor is not None
-    assert (anchor.is_read, anchor.epoch) == (True, 6)
+    for _ in range(2):
+        found = relink.compare(9)
+        assert found.moved_m == pytest.approx(-2.0)
+        # 3.5 s and 70 m since the telegram: sigma 1 m of the position and 1 m of the read.
+        assert found.bound_m == pytest.approx(K_T * sqrt(2.0 + 0.05**2 * 3.5 + (1e-4 * 70.0) ** 2))
+        relink.withhold(9, suspected=True)
 
 
-def test_before_any_alarm_the_later_of_telegram_and_tvb_is_the_anchor() -> None:
-    relink, journey = relink_of([0.0] * 10, list(range(10)), 3.0)
-    physical = balises_of(balises_at({"P1": 30.0}, kind="physical"), BaliseKind.PHYSICAL)
+@pytest.mark.parametrize(("suspected", "moved"), [(True, -2.0), (False, 0.0)])
+def test_after_an_outage_a_tvb_after_the_telegram_is_the_anchor(suspected: bool, moved: float) -> None:
+    relink, journey = relink_of([-12.0] * 10, list(range(10)))
+    physical = balises_of(balises_at({"P1": 20.0}, kind="physical"), BaliseKind.PHYSICAL)
     [read], _ = reads_of(reads_at([(1.5, "P1")]).with_columns(odometer_m=30.0), physical, journey)
     relink.note_read(read)
-    anchors = [relink.anchor_at(k) for k in (3, 4, 5, 9)]
-    assert [anchor and (anchor.is_read, anchor.epoch) for anchor in anchors] == [
-        (True, 2),
-        (True, 2),
-        (False, 2),
-        (False, 6),
-    ]
+    relink.withhold(8, suspected)
+    assert moved_m(relink, 9) == pytest.approx(moved)
 
 
 def test_the_bound_adds_the_variances_of_both_positions() -> None:
     """Sigma 0.5 m at the anchor (2 s) and 1.2 m now (9 s), 140 m later."""
-    relink, _ = relink_of([0.0] * 10, [2], 3.0, position_sigma_m=[0.5] * 5 + [1.2] * 5)
+    relink, _ = relink_of([0.0] * 10, [2], position_sigma_m=[0.5] * 5 + [1.2] * 5)
+    relink.withhold(9, suspected=True)
     expected = K_T * sqrt(0.25 + 1.44 + 0.05**2 * 7.0 + (1e-4 * 140.0) ** 2)
-    assert compared(relink, 9).bound_m == pytest.approx(expected)
+    assert relink.compare(9).bound_m == pytest.approx(expected)
 
 
 # Returns
@@ -196,16 +201,12 @@ def test_at_a_configured_start_of_mission_the_lds_begins_anew() -> None:
     assert result.epochs["lrvb_id"][59:61].to_list() == ["V1", None]
 
 
-@pytest.mark.parametrize(("memory_s", "again"), [(0.0, 630), (1000.0, None)])
-def test_the_anchor_is_as_old_as_the_average_that_fails(memory_s: float, again: int | None) -> None:
-    """0.02 m/s from 50 s on, found at 600 s with 11 m: at 150 s it was 2 m, at the first TVB (7 s) none.
-
-    At 630 s it is 11.6 m: 9.6 m from the anchor of 450 s, within the bound of 10 m, and too far from the first TVB.
-    """
+def test_the_anchor_is_the_first_tvb_however_old() -> None:
+    """0.02 m/s from 50 s on, found at 600 s with 11 m: at 630 s 11.6 m from the first TVB, 9.6 m from that at 150 s."""
     odometer_m = steps(0.0, 20.0, 640)
     path_m = [x + 0.02 * max(k - 50, 0) for k, x in enumerate(odometer_m)]
-    result = run(epochs_of(path_m, odometer_m), balises_at(V1), ScriptedBank([600], fast=[], memory_s=memory_s))
-    assert negations(result)[0] == (600, again)
+    result = run(epochs_of(path_m, odometer_m), balises_at(V1), ScriptedBank([600], fast=[]))
+    assert negations(result) == [(600, None)]
 
 
 # Held after a return, for the memory of the slowest average
@@ -250,8 +251,8 @@ def outage(gap_s: float, offset_m: float, **settings: Any) -> LdsResult:
 
 @pytest.mark.parametrize("gap_s", [70.0, 90.0, 300.0])
 def test_a_position_after_an_outage_has_to_re_link(gap_s: float) -> None:
-    # The first TVB is at 7 s, less than `anchor_lag_s` before the end of the longest outage.
-    waited_s = gap_s + 13.0
+    # The last TVB is at 20 s.
+    waited_s = gap_s
     way_m = 20.0 * waited_s
     bound_m = min(10.0, K_T * sqrt(2.0 + 0.05**2 * waited_s + (1e-4 * way_m) ** 2))
     for offset_m, state in ((0.0, "pass"), (bound_m - 0.01, "pass"), (-bound_m - 0.01, "fail"), (30.0, "fail")):
@@ -285,7 +286,8 @@ def test_what_cannot_re_link_after_an_outage_is_not_used_and_raises_no_alarm(
     result = outage(90.0, 0.0, **settings)
     row = result.epochs.row(BEFORE, named=True)
     assert (row["link_distance_state"], row["link_distance_reason"]) == ("not_evaluated", reason)
-    assert negations(result) == [(BEFORE, None)]
+    assert negations(result) == []
+    assert set(result.epochs["withheld_for"][BEFORE:]) == {"relink"}
     assert not result.epochs["alarm"].any()
     assert not result.epochs["tvb"][BEFORE:].any()
 
@@ -294,7 +296,8 @@ def test_a_telegram_after_an_outage_returns_the_position_without_a_vehicle_file(
     # P1 is read at 145.5 s, 35 s after the outage.
     balises = balises_at({"V1": 110.0, "P1": 2910.0}, kind=KINDS)
     result = outage(90.0, 0.0, balises=balises, reads=reads_at([(145.5, "P1")]), scale_sigma=None)
-    assert negations(result) == [(BEFORE, BEFORE + 36)]
+    withheld = result.epochs["withheld_for"].is_not_null().to_list()
+    assert withheld[BEFORE:] == [k < BEFORE + 36 for k in range(BEFORE, len(withheld))]
 
 
 def test_a_place_in_doubt_for_minutes_is_no_outage() -> None:
@@ -329,13 +332,25 @@ def test_noise_without_a_vehicle_file_ends_the_use_as_an_outage_does() -> None:
         ScriptedBank(unknown=range(BEFORE, end)),
         scale_sigma=None,
     )
-    assert negations(result) == [(end, None)]
+    assert set(result.epochs["withheld_for"][end:]) == {"relink"}
     assert result.epochs["link_distance_reason"][end] == NotEvaluated.RELINK_NO_VEHICLE
 
 
-def test_without_the_monitor_there_is_no_test_after_an_outage() -> None:
-    result = outage(90.0, 40.0, disabled=["link_distance"])
+@pytest.mark.parametrize(("offset_m", "withheld"), [(40.0, {"relink"}), (0.0, {None})])
+def test_without_the_monitor_the_re_link_decides_without_an_alarm(offset_m: float, withheld: set[str | None]) -> None:
+    result = outage(90.0, offset_m, disabled=["link_distance"])
     assert negations(result) == []
+    assert set(result.epochs["withheld_for"][BEFORE:]) == withheld
+
+
+@pytest.mark.parametrize(("drift_mps", "again"), [(0.3, True), (0.0, False)])
+def test_a_position_is_held_after_an_outage_too(drift_mps: float, again: bool) -> None:
+    """Back at 110 s on its place, then a drift that no average sees: 28 s later 8.2 m off the last TVB."""
+    t_s = [*map(float, range(BEFORE)), *(110.0 + k for k in range(60))]
+    odometer_m = [20.0 * t for t in t_s]
+    path_m = [x + drift_mps * max(t - 110.0, 0.0) for t, x in zip(t_s, odometer_m, strict=True)]
+    result = run(epochs_of(path_m, odometer_m, t_s), balises_at(V1), ScriptedBank())
+    assert [first - BEFORE for first, _ in negations(result)] == ([28] if again else [])
 
 
 @pytest.mark.parametrize(("read_s", "moved_m"), [(26.0, 0.0), (17.0, 180.0)])
