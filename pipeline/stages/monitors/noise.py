@@ -77,6 +77,31 @@ class NoiseMeter:
         by_lag = self._by_lag(renewals)
         return np.asarray(np.take_along_axis(by_lag[self._renewal[begin:end] - renewals[0]], columns, axis=1))
 
+    def stated_excess_m2(self) -> Floats:
+        """What the lags of 10 and 100 s that are ready show beyond the stated sigma, row by row [m^2], causally.
+
+        0 until one is ready; s_L^2 - S_L is four times M without its doubt.
+        """
+        renewals, of_row = np.unique(self._renewal, return_inverse=True)
+        shown_m2 = np.zeros((1, renewals.size))
+        for index, samples in enumerate(self._samples):
+            if self._lags_s[index] in self._memories_s[1:]:
+                end, ready = self._until(index, renewals)
+                ends, window = np.unique(end, return_inverse=True)
+                found_m2 = samples.looked_back(self._entering[index], ends)[0][window]
+                shown_m2 = np.vstack([shown_m2, np.where(ready, found_m2, 0.0)])
+        excess_m2 = excess_of(OF_WALK * shown_m2, np.zeros(1), self._config.stated_excess_share)
+        return np.asarray(excess_m2[of_row.ravel()])
+
+    def _until(self, index: int, renewals: Ints) -> tuple[Ints, Bools]:
+        """How many samples of a lag count at each renewal, and whether they are enough."""
+        samples = self._samples[index]
+        before = np.searchsorted(samples.renewal[self._entering[index]], renewals)
+        # The latest samples wait: a drift, whose onset shows in samples for 2 L, must not raise its own thresholds.
+        waiting = round(self._config.noise_wait_spans * samples.span)
+        end = np.maximum(before - waiting, np.minimum(before, samples.ready))
+        return end, end >= samples.ready
+
     def _by_lag(self, renewals: Ints) -> Floats:
         """M of every lag (columns) at these renewals (rows): measured, or expected from the shorter lags until it is.
 
@@ -108,11 +133,7 @@ class NoiseMeter:
         """M of one lag by the samples before each renewal (first row `row`), and whether they were enough."""
         samples = self._samples[index]
         entering = self._entering[index]
-        before = np.searchsorted(samples.renewal[entering], renewals)
-        # The latest samples wait: a drift, whose onset shows in samples for 2 L, must not raise its own thresholds.
-        waiting = round(self._config.noise_wait_spans * samples.span)
-        end = np.maximum(before - waiting, np.minimum(before, samples.ready))
-        ready = end >= samples.ready
+        end, ready = self._until(index, renewals)
         if not ready.any():
             return np.zeros(end.size), ready
         ends, window = np.unique(end, return_inverse=True)
@@ -254,6 +275,15 @@ class _Sampler:
         for lasting_m in self._lasting_m:
             model_m2 += rows.second_difference(lasting_m) ** 2
         return np.asarray(model_m2 + self._white_m2[rows.last] - self._white_m2[rows.oldest])
+
+
+def excess_of(shown_m2: Floats, model_m2: Floats, share: float) -> Floats:
+    """Variance to add to the stated one: share x max(0, s_L^2 - S_L), the largest over the lags (DOMAIN section 3).
+
+    `shown_m2` (lags, ...): s_L^2, 0 while a lag is not ready; `model_m2`: S_L, of a shape that fits it; `share`:
+    `monitors.stated_excess_share`.
+    """
+    return np.asarray(share * np.maximum(shown_m2 - model_m2, 0.0).max(axis=0))
 
 
 def _lags_s(period_s: float, memories_s: Floats) -> list[float]:
