@@ -28,7 +28,6 @@ from pipeline.stages.odometry.recovery import RecoveryRule
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, Vehicle
 
-
 Hold = tuple[int, int]
 """From the epoch of an alarm along the track to that of recovery (past the last one if there is none): nothing is
 learned.

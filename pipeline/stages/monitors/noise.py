@@ -83,15 +83,18 @@ class NoiseMeter:
         0 until one is ready; s_L^2 - S_L is four times M without its doubt.
         """
         renewals, of_row = np.unique(self._renewal, return_inverse=True)
-        shown_m2 = np.zeros((1, renewals.size))
+        row = np.searchsorted(self._renewal, renewals)
+        excess_m2 = np.zeros(renewals.size)
         for index, samples in enumerate(self._samples):
             if self._lags_s[index] in self._memories_s[1:]:
                 end, ready = self._until(index, renewals)
                 ends, window = np.unique(end, return_inverse=True)
-                found_m2 = samples.looked_back(self._entering[index], ends)[0][window]
-                shown_m2 = np.vstack([shown_m2, np.where(ready, found_m2, 0.0)])
-        excess_m2 = excess_of(OF_WALK * shown_m2, np.zeros(1), self._config.stated_excess_share)
-        return np.asarray(excess_m2[of_row.ravel()])
+                found_m2, error, _ = samples.looked_back(self._entering[index], ends)
+                model_m2 = _model_at_m2(self._series, row, self._lags_s[index], self._config)
+                shown_m2 = model_m2 + OF_WALK * found_m2[window]
+                lag_m2 = excess_of(shown_m2, model_m2, error[window], self._config)
+                excess_m2 = np.maximum(excess_m2, np.where(ready, lag_m2, 0.0))
+        return np.asarray(excess_m2[of_row])
 
     def _until(self, index: int, renewals: Ints) -> tuple[Ints, Bools]:
         """How many samples of a lag count at each renewal, and whether they are enough."""
@@ -277,13 +280,13 @@ class _Sampler:
         return np.asarray(model_m2 + self._white_m2[rows.last] - self._white_m2[rows.oldest])
 
 
-def excess_of(shown_m2: Floats, model_m2: Floats, share: float) -> Floats:
-    """Variance to add to the stated one: share x max(0, s_L^2 - S_L), the largest over the lags (DOMAIN section 3).
+def excess_of(shown_m2: Floats, model_m2: Floats, error: Floats, config: MonitorConfig) -> Floats:
+    """Variance that second differences over one lag add to the stated one (DOMAIN section 3) [m^2].
 
-    `shown_m2` (lags, ...): s_L^2, 0 while a lag is not ready; `model_m2`: S_L, of a shape that fits it; `share`:
-    `monitors.stated_excess_share`.
+    `shown_m2`: s_L^2; `model_m2`: S_L; `error`: relative standard error of s_L^2, sqrt(2 / stretches of 2 L seen).
     """
-    return np.asarray(share * np.maximum(shown_m2 - model_m2, 0.0).max(axis=0))
+    beyond_m2 = shown_m2 - model_m2 * (1.0 + config.stated_excess_errors * error)
+    return np.asarray(config.stated_excess_share * np.maximum(beyond_m2, 0.0))
 
 
 def _lags_s(period_s: float, memories_s: Floats) -> list[float]:
