@@ -30,6 +30,7 @@ MODULES = (
     "line",
     "undetected",
     "recorded",
+    "follows",
 )
 
 

@@ -194,8 +194,25 @@ class MatchingConfig(Settings):
     # The truth may be so many times the stated sigma: of a receiver's own, and of a table's by kind of fix.
     sigma_doubt: Annotated[Number, Field(ge=1)] = 2.0
     table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
-    # DOMAIN section 2: a probability of 0.99 has to be right in 99 of 100 runs.
+    # DOMAIN section 2: a confidence of 0.99 has to be right in 99 of 100 runs. One track left of the set has it.
     ambiguity_probability: Probability = 0.99
+    # Level of the nine tests of a path together, in 600 s: measured, the true path is rejected in 1 % or less.
+    paths_alpha: Probability = 0.05
+    # So long the test of a position waits for those after it, which say whether it is an outlier.
+    paths_delay_s: NonNegative = 3.0
+    # An empty set begins anew within the first minute: the first positions of a receiver settle.
+    paths_anew_s: NonNegative = 60.0
+    # Later it begins anew where the mean over so long lies beside the track as it did before, within so many sigmas.
+    paths_level_s: Positive = 8.0
+    paths_back_sigmas: Positive = 1.0
+    # Two paths to one element with residuals as near each other as this cannot be told apart.
+    paths_alike_m: NonNegative = 0.1
+    # Past an open end a path goes on within so many sigmas and 10 m.
+    paths_open_sigmas: Positive = 3.0
+    # Of a place near a branch nobody knows on which side it is, within so many sigmas along the track.
+    paths_border_sigmas: NonNegative = 3.0
+    # More hypotheses than any run had (14 in the prototype's): beyond them nothing is claimed.
+    paths_limit: Annotated[int, Field(strict=True, gt=0)] = 5000
     # Where tracks part or cross they are beside each other for less: that is told of no site.
     parallel_least_m: NonNegative = 100.0
     # Noise of 0.35 m/s across the track at the slowest speed that counts.

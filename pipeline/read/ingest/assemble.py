@@ -135,7 +135,7 @@ def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
         for name in names
         if name in _NEVER_ZERO and name not in silent
     ]
-    text = [pl.col(name).replace("", None) for name in DEFAULTS if name in source.implicit]
+    text = [pl.col(name).replace("", None) for name in (*DEFAULTS, "origin") if name in source.implicit]
     return frame.with_columns(*empty, *zero, *text)
 
 

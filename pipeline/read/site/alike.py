@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.lds.windows import DEFAULTS, minimal_spacing_m, window_m
-from pipeline.stages.matching.candidates import candidates_of, search_about
+from pipeline.stages.paths.candidates import candidates_of, search_about
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Network, network_of, surveyed
 from pipeline.stages.track.path import valid_along_measure

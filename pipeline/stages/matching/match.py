@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.stages.matching.doubt import Posterior, rivals_of
-from pipeline.stages.matching.epochs import epoch_frame
+from pipeline.stages.matching.claims import Possible, best_elements, claims, doubtful_stretches
+from pipeline.stages.matching.epochs import Assignment, epoch_frame
 from pipeline.stages.matching.fixes import Fixes, digit_noise, fixes_of
 from pipeline.stages.matching.path_search import find_path
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import polarity
+from pipeline.stages.paths.path_set import PathSet, path_set
+from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.track.network import network_in_pieces
 from pipeline.stages.track.path import TravelledPath
 from pipeline.stages.track.survey import SurveyedTrack
@@ -26,19 +28,15 @@ from schemas.run import Site
 class Match:
     """Epochs on the path, the path, and when it was in doubt.
 
-    `posterior`: elements that are possible at the steps of the search. `odometer_sign`: of the recorded odometer
+    `possible`: elements that no position refutes, in hindsight. `odometer_sign`: of the recorded odometer
     against growing path, set here and nowhere else.
     """
 
     epochs: pl.DataFrame
     path: TravelledPath
     ambiguous: pl.DataFrame
-    posterior: Posterior
+    possible: Possible
     odometer_sign: int
-
-    def rivals(self, limit: float, index: dict[str, int]) -> tuple[Ints, Ints]:
-        """Epochs and net elements (numbers by `index`) whose posterior reaches `limit` there, the path's own too."""
-        return rivals_of(self.posterior, self.epochs, self.path, index, limit)
 
 
 def match(
@@ -61,7 +59,22 @@ def match(
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
     network = network_in_pieces(site).unsearched()
     pinned = pins_of(arrays, site, network.track, balise_reads)
-    path, assignment, ambiguous, posterior = find_path(arrays, odometry, network, pinned, config)
+    rows = np.flatnonzero(arrays.valid)
+    steps = path_steps(
+        arrays.t_ns[rows],
+        arrays.points.take(rows),
+        np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2))[rows],
+        way=None if odometry is None else odometry.distance_between,
+        independent=odometry is not None and odometry.independent,
+        pinned=_pins_of_positions(pinned, rows),
+    )
+    found = path_set(steps, network, config.cross_bias_sigma_m, config.paths_alpha, config)
+    path, assignment = find_path(arrays, odometry, network, shown_elements(arrays, found, pinned), config)
+    element = elements_of(arrays, path, assignment)
+    claimed = claims(found, arrays.t_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
+    assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
+    limit = config.ambiguity_probability
+    ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, pinned >= 0, network, limit)
     epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
     if sign < 0 and vehicle.gnss_antenna_ahead_m:
@@ -70,7 +83,35 @@ def match(
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)
     epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg"), config.digits_least_m))
-    return Match(epochs, path, ambiguous, posterior, sign)
+    return Match(epochs, path, ambiguous, claimed.possible, sign)
+
+
+def shown_elements(fixes: Fixes, found: PathSet, pinned: Ints) -> Ints:
+    """Per epoch the element that the path shown has to be on: of the best path of the set, and of reads; else -1."""
+    best = best_elements(found)
+    if not best.size:
+        return pinned
+    step = np.clip(np.searchsorted(found.steps.end_s, fixes.t_s, side="left"), 0, best.size - 1)
+    near = [best[np.clip(step + beside, 0, best.size - 1)] for beside in (-1, 0, 1)]
+    # Where it goes over from one element to the next, positions say when.
+    inside = (near[0] == near[1]) & (near[1] == near[2])
+    return np.where(pinned >= 0, pinned, np.where(inside & fixes.valid, near[1], -1))
+
+
+def elements_of(fixes: Fixes, path: TravelledPath, assignment: Assignment) -> Ints:
+    """The net element of each epoch on the path, -1 without a position."""
+    feet = path.feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
+    place_m, _ = path.places(assignment.leg, feet, fixes.height_m)
+    element, _ = path.locate_index(assignment.leg, place_m)
+    return np.where(fixes.valid & np.isfinite(place_m), element, -1)
+
+
+def _pins_of_positions(pinned: Ints, rows: Ints) -> Ints:
+    """The element of each read at the position that it belongs to: the last one not after its epoch."""
+    pins = np.full(rows.size, -1, dtype=np.int64)
+    read = np.flatnonzero(pinned >= 0)
+    pins[np.maximum(np.searchsorted(rows, read, side="right") - 1, 0)] = pinned[read]
+    return pins
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: MatchingConfig) -> int:

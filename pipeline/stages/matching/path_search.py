@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import polars as pl
 
-from pipeline.stages.matching.candidates import Candidates, Search, candidates_of, merged, overtaken, search_about
 from pipeline.stages.matching.decode import Decoded, aligned, decode, legs_of, positions_m
-from pipeline.stages.matching.doubt import Doubt, Posterior, doubt_of, posterior_of, stretches
 from pipeline.stages.matching.epochs import Assignment
 from pipeline.stages.matching.fixes import Fixes
 from pipeline.stages.matching.likelihood import likelihood_of
@@ -16,6 +13,7 @@ from pipeline.stages.matching.steps import Steps, Travelled, believable, spaced,
 from pipeline.stages.matching.trellis import Trellis, trellis_of
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import grows_with
+from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, merged, overtaken, search_about
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import TravelledPath
@@ -34,10 +32,10 @@ def find_path(
     network: Network,
     pinned: Ints,
     config: MatchingConfig,
-) -> tuple[TravelledPath, Assignment, pl.DataFrame, Posterior]:
-    """The path, each epoch's leg and probabilities, the stretches of doubt, and what else is possible.
+) -> tuple[TravelledPath, Assignment]:
+    """The path shown, and each epoch's leg on it.
 
-    `pinned` holds per epoch the element that a balise read proves, -1 without one.
+    `pinned` holds per epoch the element that it has to be on, -1 for any.
     """
     way = travelled(fixes, odometry)
     believed = believable(fixes, fixes.valid, way, config)
@@ -50,10 +48,7 @@ def find_path(
         decoded = decoded.turned(network, range(len(decoded.chains)))
         legs = legs_of(trellis, decoded)
         at_m = positions_m(decoded, legs)
-    doubt = doubt_of(trellis, beliefs, legs, decoded.leg, at_m)
-    path = TravelledPath(network.track, tuple(legs))
-    assignment = _assign(fixes, trellis.steps, decoded, at_m, doubt)
-    return path, assignment, stretches(fixes, trellis, beliefs, doubt, pinned, config), posterior_of(trellis, beliefs)
+    return TravelledPath(network.track, tuple(legs)), _assign(fixes, trellis.steps, decoded, at_m)
 
 
 def _trellis(
@@ -110,8 +105,8 @@ def _pins(steps: Steps, pinned: Ints, candidates: Candidates) -> Bools:
     return np.asarray((proved >= 0) & (candidates.element != proved))
 
 
-def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: Doubt) -> Assignment:
-    """Every epoch by the step before it: its probabilities, and its place moved on towards the next step.
+def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats) -> Assignment:
+    """Every epoch by the step before it: its place moved on towards the next step.
 
     Between the steps of two legs an epoch belongs to the later one.
     """
@@ -127,7 +122,8 @@ def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: D
     elapsed = np.clip(fixes.t_s - begin_s, 0.0, np.maximum(end_s - begin_s, 0.0))
     share = np.divide(elapsed, end_s - begin_s, out=np.zeros(len(fixes)), where=end_s > begin_s)
     moved_m = np.where(decoded.leg[last] == decoded.leg[following], at_m[following] - at_m[last], 0.0)
-    return Assignment(leg, at_m[last] + share * moved_m, doubt.posterior[last], doubt.gate[last])
+    unknown = np.full(len(fixes), np.nan)
+    return Assignment(leg, at_m[last] + share * moved_m, unknown, unknown)
 
 
 def with_tracks_aside(

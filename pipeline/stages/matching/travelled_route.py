@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import least_belief
-from pipeline.stages.matching.doubt import Posterior
+from pipeline.stages.matching.claims import Possible
 from pipeline.stages.matching.match import Match
 from pipeline.stages.track.leg import Leg, segments_at
 from pipeline.stages.track.survey import SurveyedTrack
@@ -85,16 +85,16 @@ def _rivals(match: Match, rows: Ints, least: float) -> str:
     """Elements off the path that are possible at some of these epochs."""
     if len(rows) == 0:
         return ""
-    highest = _highest(match.posterior, int(rows[0]), int(rows[-1]))
+    highest = _highest(match.possible, int(rows[0]), int(rows[-1]))
     ids = match.path.track.ids
     on_path = set(match.path.elements())
     order = sorted((-probability, ids[element]) for element, probability in highest.items())
     return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in on_path)
 
 
-def _highest(posterior: Posterior, first: int, last: int) -> dict[int, float]:
+def _highest(posterior: Possible, first: int, last: int) -> dict[int, float]:
     """The highest probability of each element at the steps from one epoch to another."""
     begin, end = np.searchsorted(posterior.epoch, [first, last + 1])
     part = slice(int(posterior.first[max(int(begin) - 1, 0)]), int(posterior.first[int(end)]))
-    possible = pl.DataFrame({"element": posterior.element[part], "probability": posterior.probability[part]})
+    possible = pl.DataFrame({"element": posterior.element[part], "probability": posterior.confidence[part]})
     return dict(possible.group_by("element").agg(pl.col("probability").max()).iter_rows())

@@ -78,9 +78,9 @@ class Chords:
         row = np.arange(len(vertex))
         begin_rad = heading_rad[row, against] + np.pi * against
         end_rad = heading_rad[row, 1 - against] + np.pi * against
-        _, onward_rad = self._onward
         inner_rad = _wrapped(begin_rad[1:] - end_rad[:-1])
-        turn_rad = np.concatenate([onward_rad[[chain[0] ^ 1]], inner_rad, onward_rad[[chain[-1]]]])
+        # A chain ends at a switch whose other branch is straighter: that turn is the switch's, not the track's.
+        turn_rad = np.concatenate([[0.0], inner_rad, [0.0]])
         self._known_m[vertex] = _sigmas_m(np.append(0.0, np.cumsum(length_m)), turn_rad)
 
 

@@ -112,6 +112,10 @@ def test_runs_that_cannot_be_used(bench: Bench, journey: Journey) -> None:
     slips = '[[faults]]\nkind = "slip"\nrates_mps = [0.5]\nduration_s = 20.0\n'
     with pytest.raises(BaliseError, match="no run has an odometer"):
         bench.run("per_cell = 1\n" + slips + RAMPS, run=journey.run.with_streams(odometer=None))
+    assert journey.run.odometer is not None
+    unsaid = journey.run.odometer.with_columns(origin=pl.lit(None, journey.run.odometer.schema["origin"]))
+    with pytest.raises(BaliseError, match="no odometer that is declared to be free of the GNSS; found unknown"):
+        bench.run(RAMPS, run=journey.run.with_streams(odometer=unsaid))
 
 
 def test_a_copy_of_a_run_is_no_further_pass(bench: Bench) -> None:

@@ -1,0 +1,376 @@
+"""The set of paths through the network that the positions do not reject (Neyman 1937: a confidence set, no posterior).
+
+Every path goes on until its residuals across the track refute it; a track is claimed where one is left. If the tests
+overbound, the true path is rejected in at most alpha per 600 s, in any network, however it is cut (DOMAIN section 2).
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
+from pipeline.stages.paths.path_steps import PathSteps
+from pipeline.stages.paths.path_tests import PathTests
+from pipeline.stages.track.network import Network
+from schemas.arrays import Bools, Floats, Ints
+from schemas.config import MatchingConfig
+
+# DOMAIN section 2: over gaps every way of at most so many times the distance, and so much more [m].
+_DETOUR = 1.2
+_DETOUR_M = 50.0
+# Behind an open end a path goes on for so much more than the noise [m].
+_OPEN_M = 10.0
+# A longer step is a gap: the train may have taken any way meanwhile [s].
+_GAP_S = 3.5
+
+
+@dataclass
+class Node:
+    """One hypothesis while it is on one net element, oriented as its path began.
+
+    Covers the steps from `begin` on, before `end`; `rejected`: the step at which its residuals refuted it, a large
+    number if none did; `residual_m` of its whole path, NaN before its begin; `p`: least p-value of its tests so far.
+    """
+
+    oriented: int
+    begin: int
+    residual_m: Floats
+    survey_m: Floats
+    heading_rad: Floats
+    parent: Node | None = None
+    p: float = 1.0
+    end: int = 0
+    rejected: int = 2**62
+    left_m: Floats = field(default_factory=lambda: np.zeros(0))
+    followed: bool = False
+
+    @property
+    def element(self) -> int:
+        return self.oriented // 2
+
+
+@dataclass(frozen=True)
+class PathSet:
+    """All hypotheses of a run with what became of each; `groups`: lines without a branch, per net element.
+
+    `overflow`: step from which on there were more hypotheses than are followed; nothing is claimed after it.
+    """
+
+    nodes: tuple[Node, ...]
+    steps: PathSteps
+    groups: Ints
+    network: Network
+    candidates: Candidates
+    overflow: int
+
+    def living(self, delay_s: float) -> Iterator[list[Node]]:
+        """Per step the hypotheses that nothing up to `delay_s` before its end refuted."""
+        known = np.searchsorted(self.steps.end_s, self.steps.end_s - delay_s, side="right") - 1
+        begins: list[list[Node]] = [[] for _ in range(len(self.steps))]
+        for node in self.nodes:
+            begins[node.begin].append(node)
+        here: list[Node] = []
+        for step, new in enumerate(begins):
+            here = [node for node in here if node.end > step] + [node for node in new if node.end > step]
+            yield [node for node in here if node.rejected > known[step]]
+
+    def to_the_end(self) -> Iterator[list[Node]]:
+        """Per step the hypotheses that live to the last step, or through one that does."""
+        lives: set[int] = set()
+        for node in self.nodes:
+            if node.rejected >= len(self.steps) and node.end >= len(self.steps):
+                at: Node | None = node
+                while at is not None and id(at) not in lives:
+                    lives.add(id(at))
+                    at = at.parent
+        begins: list[list[Node]] = [[] for _ in range(len(self.steps))]
+        for node in self.nodes:
+            if id(node) in lives:
+                begins[node.begin].append(node)
+        here: list[Node] = []
+        for step, new in enumerate(begins):
+            here = [node for node in here if node.end > step] + new
+            yield here
+
+    def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
+        """Per step the net elements that no rejection rules out, each with the largest p-value of a path over it.
+
+        In hindsight, or by what was known `delay_s` before the end of each step. Empty: off the network.
+        """
+        sets = self.to_the_end() if delay_s is None else self.living(delay_s)
+        found: list[dict[int, float]] = []
+        for nodes in sets:
+            best: dict[int, float] = {}
+            for node in nodes:
+                best[node.element] = max(best.get(node.element, 0.0), min(node.p, 1.0))
+            found.append(best)
+        return found
+
+
+def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, config: MatchingConfig) -> PathSet:
+    """Every path that begins near the first positions and goes on over navigable relations, until it is refuted.
+
+    `steps`: of positions (`path_steps`), of a solution or of a reference; `bias_m`: sigma of the offset across that
+    lasts the run, 0 for a reference; `alpha`: level of all tests of a path together in 600 s; `network`: with elements
+    that turn round in pieces (`network_in_pieces`), as `Node.element` counts them. Of the result `living` gives the set
+    of each step by what was known then, `to_the_end` in hindsight, both with the least p-value of each path, and
+    `elements` the same by net element. Without a position near the network the set is empty: off the survey.
+    """
+    search = search_about(steps.points.surface, network, config.reach_m)
+    candidates = candidates_of(steps.points, network, search, config.reach_m)
+    survey_m = network.survey_sigmas_m(config.survey_sigma_default_m, candidates.vertex)
+    groups = unbranched_groups(network)
+    # Where no other track comes near in the whole run there is nothing to tell apart.
+    alone = np.unique(groups[candidates.element]).size <= 1
+    tests = PathTests.of_run(steps, alpha, bias_m, config.paths_alike_m, alone)
+    return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
+
+
+def unbranched_groups(network: Network) -> Ints:
+    """Per net element the number of the line without a branch that it belongs to, however it is cut."""
+    group = np.arange(network.count)
+
+    def root(element: int) -> int:
+        while group[element] != element:
+            element = int(group[element])
+        return element
+
+    for oriented in range(2 * network.count):
+        onward = network.successors[oriented]
+        if len(onward) == 1 and len(network.successors[onward[0].to ^ 1]) == 1:
+            first, second = sorted((root(oriented // 2), root(onward[0].to // 2)))
+            group[second] = first
+    return np.array([root(element) for element in range(network.count)])
+
+
+@dataclass
+class _Growth:
+    """The paths while they grow, the earliest step first."""
+
+    steps: PathSteps
+    network: Network
+    tests: PathTests
+    candidates: Candidates
+    survey_m: Floats
+    groups: Ints
+    config: MatchingConfig
+
+    def __post_init__(self) -> None:
+        # Rows of the candidates of each net element, in order of steps.
+        self._order = np.lexsort((self.candidates.step, self.candidates.element))
+        self._first = np.searchsorted(self.candidates.element[self._order], np.arange(self.network.count + 1))
+        self._gap = np.concatenate([[False], np.diff(self.steps.end_s) > _GAP_S])
+        self._queue: list[tuple[int, int, Node]] = []
+        self._made: list[Node] = []
+        self._by_element: dict[int, list[Node]] = {}
+
+    def grown(self) -> PathSet:
+        count = len(self.steps)
+        overflow = count
+        start = self._start(0)
+        while self._queue or start < count:
+            if not self._queue:
+                start = self._start(start)
+                continue
+            _, _, node = heapq.heappop(self._queue)
+            if len(self._made) > self.config.paths_limit:
+                overflow = node.begin
+                break
+            for child in self._follow(node):
+                self._push(child)
+            start = max(start, self._next_start(node))
+        return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow)
+
+    def _next_start(self, node: Node) -> int:
+        """Where the set begins anew once it is empty: at once in the first minute, later where it came back."""
+        count = len(self.steps)
+        died = node.rejected
+        if died >= count or not self._made:
+            return count
+        if self.steps.end_s[died] - self.steps.begin_s[self._made[0].begin] <= self.config.paths_anew_s:
+            return died + 1
+        return self._came_back(node, died)
+
+    def _came_back(self, node: Node, died: int) -> int:
+        """The first step after a rejection at which the positions lie beside the track as they did before it.
+
+        A movement of equal size leads back: a start anew by itself would claim the surveyed track from a siding that
+        the survey lacks. Beside the nearest element then, as long as positions lie within reach of one.
+        """
+        steps = self.steps
+        known = np.flatnonzero(np.isfinite(node.residual_m[:died]) & steps.counted[:died])
+        before = known[steps.end_s[known] <= steps.end_s[died] - self.config.paths_level_s]
+        before = before[steps.end_s[before] > steps.end_s[died] - 3.0 * self.config.paths_level_s]
+        if not before.size:
+            return len(steps)
+        level_m = float(np.mean(node.residual_m[before]))
+        beside_m = self._nearest_m[died:]
+        window = max(1, round(self.config.paths_level_s / steps.period_s))
+        if beside_m.size < window:
+            return len(steps)
+        means_m = sliding_window_view(beside_m, window).mean(axis=1)
+        root_m = np.hypot(steps.sigma_m[died:], float(np.nanmedian(node.survey_m[before])))[window - 1 :]
+        signs = (level_m, -level_m)  # the nearest element may run the other way
+        off_m = np.minimum(*(np.abs(means_m - sign) for sign in signs))
+        back = np.flatnonzero(np.nan_to_num(off_m, nan=np.inf) <= self.config.paths_back_sigmas * root_m)
+        return int(died + back[0] + window) if back.size else len(steps)
+
+    @cached_property
+    def _nearest_m(self) -> Floats:
+        """Per step the offset from the nearest element, NaN where none is within reach [m]."""
+        nearest_m = np.full(len(self.steps), np.nan)
+        order = np.lexsort((self.candidates.distance_m, self.candidates.step))
+        first = order[np.unique(self.candidates.step[order], return_index=True)[1]]
+        nearest_m[self.candidates.step[first]] = self.candidates.offset_m[first]
+        return nearest_m
+
+    def _start(self, step: int) -> int:
+        """Begin with every element near the first step that has one; returns the step to go on from."""
+        count = len(self.steps)
+        while step < count:
+            rows = slice(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
+            numbers = np.arange(rows.start, rows.stop)[self.candidates.past[rows] == 0]
+            if not numbers.size:
+                numbers = np.arange(rows.start, rows.stop)
+            if numbers.size:
+                for row in numbers.tolist():
+                    nothing = np.full(count, np.nan)
+                    node = Node(2 * int(self.candidates.element[row]), step, nothing, nothing.copy(), nothing.copy())
+                    self._push(node)
+                return count
+            step += 1
+        return count
+
+    def _push(self, node: Node) -> None:
+        same = self._by_element.setdefault(node.oriented, [])
+        for other in same:
+            covers = other.begin <= node.begin and (not other.followed or other.end > node.begin)
+            if covers and other.rejected >= node.rejected and self._alike(other, node):
+                # Their tests cannot differ by more than the bounds allow for (rule 8).
+                other.p = max(other.p, node.p)
+                return
+        same.append(node)
+        self._made.append(node)
+        heapq.heappush(self._queue, (node.begin, len(self._made), node))
+
+    def _alike(self, one: Node, other: Node) -> bool:
+        """Two paths that lead to one element with the same residuals as far back as any test looks."""
+        last = other.begin
+        first = int(np.searchsorted(self.steps.end_s, self.steps.end_s[last] - self.tests.longest_s))
+        apart = one.residual_m[first:last] - other.residual_m[first:last]
+        known = np.isfinite(one.residual_m[first:last]) == np.isfinite(other.residual_m[first:last])
+        return bool(known.all()) and bool(np.nanmax(np.abs(apart), initial=0.0) <= self.config.paths_alike_m)
+
+    def _follow(self, node: Node) -> list[Node]:
+        """Along its element up to where it leaves it or is refuted for long enough; returns what it goes on as."""
+        candidates = self.candidates
+        count = len(self.steps)
+        of_element = self._order[self._first[node.element] : self._first[node.element + 1]]
+        rows = of_element[np.searchsorted(candidates.step[of_element], node.begin) :]
+        step = candidates.step[rows]
+        # Steps without a pause or a candidate missing among them, and inside the element.
+        run = np.arange(node.begin, node.begin + rows.size) == step
+        run &= ~self._gap[np.minimum(step, count - 1)] | (step == node.begin)
+        run &= self._inside(rows)
+        stays = int(rows.size if run.all() else np.argmin(run))
+        rows = rows[:stays]
+        node.followed = True
+        node.end = node.begin + stays
+        if stays:
+            sense = 1.0 - 2.0 * (node.oriented % 2)
+            part = slice(node.begin, node.end)
+            node.residual_m[part] = sense * candidates.offset_m[rows]
+            node.survey_m[part] = self.survey_m[rows]
+            node.heading_rad[part] = candidates.heading_rad[rows] + np.pi * (node.oriented % 2)
+            ends_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
+            node.left_m = ends_m
+            node.rejected = min(node.rejected, self._unread(node))
+            verdict = self.tests.of(self.steps, node.residual_m, node.survey_m, node.heading_rad, node.begin, node.end)
+            node.p = min(node.p, verdict.p)
+            node.rejected = min(node.rejected, verdict.rejected)
+        if node.rejected < count:
+            # Refuted: live it counts for as long as that is not known yet.
+            known = int(np.searchsorted(self.steps.end_s, self.steps.end_s[node.rejected] + self.config.paths_delay_s))
+            node.end = min(node.end, known + 1)
+            if node.end <= known and node.end < count:
+                return self._onward(node)
+            return []
+        return self._onward(node) if node.end < count else []
+
+    def _unread(self, node: Node) -> int:
+        """The first step of the node at which a balise was read that is on no element that joins its own."""
+        for step in (node.begin + np.flatnonzero(self.steps.pinned[node.begin : node.end] >= 0)).tolist():
+            element = int(self.steps.pinned[step])
+            sides = ((2 * node.element + a, 2 * element + b) for a in (0, 1) for b in (0, 1))
+            if element != node.element and not any(self.network.linked(*pair) for pair in sides):
+                return int(step)
+        return 2**62
+
+    def _inside(self, rows: Ints) -> Bools:
+        """Places on the element; past an end as far as noise, and the survey of the next element, may lead."""
+        candidates = self.candidates
+        past = candidates.past[rows]
+        sigma_m = np.hypot(self.steps.sigma_m[candidates.step[rows]], self.survey_m[rows])
+        near = candidates.beyond_m[rows] <= self.config.paths_open_sigmas * sigma_m + _OPEN_M
+        inside: Bools = (past == 0) | near
+        return inside
+
+    def _onward(self, node: Node) -> list[Node]:
+        """What the path may go on as at the first step that is not on its element any more."""
+        step = node.end
+        if step >= len(self.steps):
+            return []
+        candidates = self.candidates
+        rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
+        inside = rows[self._inside(rows)]
+        way_m = _DETOUR * float(self.steps.way_m[step]) + _DETOUR_M
+        reached: dict[int, int] = {}
+        for leaving in (node.oriented, node.oriented ^ 1):
+            for to, reach in self.network.reach(leaving, way_m).items():
+                allowed = min(reach.barred_forward, reach.barred_backward) == 0
+                if allowed and reach.distance_m <= way_m:
+                    reached.setdefault(to // 2, to if leaving == node.oriented else to ^ 1)
+        children = [
+            self._child(node, reached[int(candidates.element[row])], step)
+            for row in inside.tolist()
+            if int(candidates.element[row]) in reached and int(candidates.element[row]) != node.element
+        ]
+        own = [row for row in rows.tolist() if int(candidates.element[row]) == node.element]
+        if own and (not children or self._inside(np.array(own))[0]):
+            # Between two elements, or over a pause on the same one: it stays.
+            children.append(self._child(node, node.oriented, step))
+        return self._kept(node, children, step)
+
+    def _kept(self, node: Node, children: list[Node], step: int) -> list[Node]:
+        """A child that only stays on the element past its end would be asked again at every step: it waits there."""
+        candidates = self.candidates
+        if not children:
+            node.rejected = min(node.rejected, step)
+            return []
+        if len(children) == 1 and children[0].oriented == node.oriented:
+            rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
+            (row,) = rows[candidates.element[rows] == node.element][:1].tolist()
+            sigma_m = float(np.hypot(self.steps.sigma_m[step], self.survey_m[row]))
+            if candidates.beyond_m[row] > self.config.paths_open_sigmas * sigma_m + _OPEN_M:
+                node.rejected = min(node.rejected, step)
+                return []
+            child = children[0]
+            sense = 1.0 - 2.0 * (node.oriented % 2)
+            child.residual_m[step] = sense * candidates.offset_m[row]
+            child.survey_m[step] = self.survey_m[row]
+            child.heading_rad[step] = child.heading_rad[step - 1]
+            if not self._inside(np.array([row]))[0]:
+                child.begin = step + 1
+                node.end = step + 1
+                return [child] if child.begin < len(self.steps) else []
+        return children
+
+    def _child(self, node: Node, oriented: int, step: int) -> Node:
+        copies = (node.residual_m.copy(), node.survey_m.copy(), node.heading_rad.copy())
+        return Node(oriented, step, *copies, parent=node, p=node.p, rejected=node.rejected)
