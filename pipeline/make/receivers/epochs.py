@@ -85,10 +85,10 @@ class Gathered:
         """
         epoch = self._latest.get(key)
         recent = epoch is not None and len(self.epochs) - epoch.number <= _LATEST_MESSAGE
-        if epoch is not None and recent and place is not None and epoch.place is not None:
-            if place.differs(epoch.place):
-                self.disputed.append((epoch.place, place))
-                recent = False
+        told = None if epoch is None or not recent else epoch.place
+        if told is not None and place is not None and place.differs(told):
+            self.disputed.append((told, place))
+            recent = False
         if epoch is None or not recent or (place is None and epoch.positions.get(position, content) != content):
             epoch = self._latest[key] = Epoch(key, len(self.epochs))
             self.epochs.append(epoch)
