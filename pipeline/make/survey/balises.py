@@ -16,7 +16,7 @@ from pipeline.make.survey.sources import content_of_survey
 from pipeline.make.survey.tables import placed_table
 from pipeline.read.ingest.guesses import BALISE_KINDS, BALISE_LIST, first, word_of
 from pipeline.read.site.tables import RawTable, typed_table
-from pipeline.stages.matching.candidates import candidates_of, segments_of
+from pipeline.stages.paths.candidates import candidates_of, segments_of
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import network_of
 from pipeline.stages.track.survey import SurveyedTrack, track_of

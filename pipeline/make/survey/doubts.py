@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.make.survey.network import SurveyNetwork
 from pipeline.make.survey.pieces import LinePiece, kilometre_spans
-from pipeline.stages.matching.candidates import candidates_of, segments_of
+from pipeline.stages.paths.candidates import candidates_of, segments_of
 from pipeline.stages.track.geodesy import points_of, way_m
 from pipeline.stages.track.network import Network, network_of
 from pipeline.stages.track.segments import SAMPLE_SPACING_M

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.stages.matching.candidates import Candidates
 from pipeline.stages.matching.fixes import Fixes
 from pipeline.stages.matching.steps import Steps
+from pipeline.stages.paths.candidates import Candidates
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 

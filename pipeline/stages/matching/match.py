@@ -11,20 +11,17 @@ from pipeline.stages.matching.claims import Possible, best_elements, claims, dou
 from pipeline.stages.matching.epochs import Assignment, epoch_frame
 from pipeline.stages.matching.fixes import Fixes, digit_noise, fixes_of
 from pipeline.stages.matching.path_search import find_path
-from pipeline.stages.matching.path_set import PathSet, PathSteps, outliers, path_set
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import polarity
-from pipeline.stages.track.geodesy import Points
+from pipeline.stages.paths.path_set import PathSet, path_set
+from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.track.network import network_in_pieces
 from pipeline.stages.track.path import TravelledPath
 from pipeline.stages.track.survey import SurveyedTrack
-from schemas.arrays import Floats, Ints, floats, ints, times_ns
+from schemas.arrays import Ints, floats, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import Site
-
-# The direction of the way is that over so many steps before.
-_HEADING_STEPS = 5
 
 
 @dataclass(frozen=True)
@@ -62,13 +59,21 @@ def match(
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
     network = network_in_pieces(site).unsearched()
     pinned = pins_of(arrays, site, network.track, balise_reads)
-    found = path_set(path_steps(arrays, odometry, pinned), network, config.cross_bias_sigma_m, config)
+    rows = np.flatnonzero(arrays.valid)
+    steps = path_steps(
+        arrays.t_ns[rows],
+        arrays.points.take(rows),
+        np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2))[rows],
+        way=None if odometry is None else odometry.distance_between,
+        independent=odometry is not None and odometry.independent,
+        pinned=_pins_of_positions(pinned, rows),
+    )
+    found = path_set(steps, network, config.cross_bias_sigma_m, config.paths_alpha, config)
     path, assignment = find_path(arrays, odometry, network, shown_elements(arrays, found, pinned), config)
     element = elements_of(arrays, path, assignment)
     claimed = claims(found, arrays.t_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
     assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
-    limit = config.ambiguity_probability
-    ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, pinned >= 0, network, limit)
+    ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, pinned >= 0, network)
     epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
     if sign < 0 and vehicle.gnss_antenna_ahead_m:
@@ -100,57 +105,12 @@ def elements_of(fixes: Fixes, path: TravelledPath, assignment: Assignment) -> In
     return np.where(fixes.valid & np.isfinite(place_m), element, -1)
 
 
-def path_steps(fixes: Fixes, odometry: Odometry | None, pinned: Ints) -> PathSteps:
-    """Means of a second of positions; slower logs: single epochs."""
-    rows = np.flatnonzero(fixes.valid)
-    second = np.floor(fixes.t_s[rows] + 1e-6).astype(np.int64)
-    first = np.flatnonzero(np.diff(second, prepend=second[0] - 1))
-    size = np.diff(first, append=rows.size)
-
-    def mean(values: Floats) -> Floats:
-        return np.asarray(np.add.reduceat(values[rows], first, axis=0).T / size).T
-
-    points = Points(*(mean(vectors) for vectors in (fixes.points.surface, fixes.points.east, fixes.points.north)))
-    sigma_m = np.sqrt(mean(0.5 * (fixes.cov_ee_m2 + fixes.cov_nn_m2)))
-    begin_s = fixes.t_s[rows[first]]
-    end_s = fixes.t_s[rows[first + size - 1]]
-    chord_m = np.linalg.norm(np.diff(points.surface, axis=0, prepend=points.surface[:1]), axis=1)
-    middle_ns = np.round(mean(fixes.t_ns.astype(np.float64) - float(fixes.t_ns[0]))).astype(np.int64) + fixes.t_ns[0]
-    counted_m = np.full(len(points), np.nan)
-    if odometry is not None:
-        counted_m[1:] = odometry.distance_between(middle_ns[:-1], middle_ns[1:])
-    way_m = np.where(np.isfinite(counted_m), np.maximum(np.abs(counted_m), chord_m), chord_m)
-    moves_m = np.where(np.isfinite(counted_m), np.abs(counted_m), chord_m)
-    counted = np.diff(np.floor(np.cumsum(moves_m)), prepend=-1.0) > 0
-    pins = np.full(len(points), -1, dtype=np.int64)
+def _pins_of_positions(pinned: Ints, rows: Ints) -> Ints:
+    """The element of each read at the position that it belongs to: the last one not after its epoch."""
+    pins = np.full(rows.size, -1, dtype=np.int64)
     read = np.flatnonzero(pinned >= 0)
-    at = np.searchsorted(rows[first], read, side="right") - 1
-    pins[np.maximum(at, 0)] = pinned[read]
-    return PathSteps(
-        begin_s=begin_s,
-        end_s=end_s,
-        points=points,
-        sigma_m=sigma_m,
-        way_m=way_m,
-        counted=counted & ~outliers(points, sigma_m),
-        along_m=_along_m(points, counted_m, odometry),
-        pinned=pins,
-    )
-
-
-def _along_m(points: Points, counted_m: Floats, odometry: Odometry | None) -> Floats:
-    """Position along the way minus an independent odometer [m]; NaN without one, and where it does not count."""
-    nothing = np.full(len(points), np.nan)
-    if odometry is None or not odometry.independent or len(points) < _HEADING_STEPS:
-        return nothing
-    surface = points.surface
-    rows = np.arange(len(points))
-    # The direction of the way, by positions before: the same for every path.
-    ahead = surface - surface[np.maximum(rows - _HEADING_STEPS, 0)]
-    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-6)
-    moved_m = np.einsum("ij,ij->i", np.diff(surface, axis=0, prepend=surface[:1]), ahead)
-    apart_m = np.where(np.isfinite(counted_m), moved_m - np.abs(counted_m), 0.0)
-    return np.where(np.isfinite(counted_m), np.cumsum(apart_m), np.nan)
+    pins[np.maximum(np.searchsorted(rows, read, side="right") - 1, 0)] = pinned[read]
+    return pins
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: MatchingConfig) -> int:

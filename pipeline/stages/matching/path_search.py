@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.stages.matching.candidates import Candidates, Search, candidates_of, merged, overtaken, search_about
 from pipeline.stages.matching.decode import Decoded, aligned, decode, legs_of, positions_m
 from pipeline.stages.matching.epochs import Assignment
 from pipeline.stages.matching.fixes import Fixes
@@ -14,6 +13,7 @@ from pipeline.stages.matching.steps import Steps, Travelled, believable, spaced,
 from pipeline.stages.matching.trellis import Trellis, trellis_of
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import grows_with
+from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, merged, overtaken, search_about
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import TravelledPath

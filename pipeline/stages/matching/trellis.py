@@ -9,11 +9,11 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.stages.matching.candidates import Candidates
 from pipeline.stages.matching.innovations import Innovations, innovations_of, movements_m
 from pipeline.stages.matching.likelihood import Likelihood, Terms, initial_terms, step_terms
 from pipeline.stages.matching.moves import StepDistances, distance_scores, move_scores
 from pipeline.stages.matching.steps import Steps
+from pipeline.stages.paths.candidates import Candidates
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.stages.matching.candidates import Candidates, overtaken
+from pipeline.stages.paths.candidates import Candidates, overtaken
 from tests.stages.evidence.test_chains import line
 
 # On element a (100 m) and on b, which begins where a ends: metres from the start, and metres past which end.

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.matching.candidates import candidates_of, search_about, segments_of
+from pipeline.stages.paths.candidates import candidates_of, search_about, segments_of
 from pipeline.stages.track.chords import _straightest, _wrapped
 from pipeline.stages.track.geodesy import distances_m, points_of
 from pipeline.stages.track.network import _ways, connected_parts, network_of

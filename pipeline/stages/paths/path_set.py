@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.stages.matching.candidates import Candidates, candidates_of, search_about
-from pipeline.stages.matching.path_tests import PathTests
-from pipeline.stages.track.geodesy import Points
+from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
+from pipeline.stages.paths.path_steps import PathSteps
+from pipeline.stages.paths.path_tests import PathTests
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
@@ -26,37 +26,10 @@ _DETOUR = 1.2
 _DETOUR_M = 50.0
 # Behind an open end a path goes on for so much more than the noise [m].
 _OPEN_M = 10.0
+# Before a position is on the element that it goes over to, it may lie so far before its end [m].
+_LATE_M = 10.0
 # A longer step is a gap: the train may have taken any way meanwhile [s].
 _GAP_S = 3.5
-# Steps on each side with which one is compared before it counts.
-_NEIGHBOURS = 3
-
-
-@dataclass(frozen=True)
-class PathSteps:
-    """Means of a second of positions, shapes (n,); `points` (n, 3).
-
-    `begin_s`, `end_s`: times of its first and last position; `sigma_m` of the position across; `way_m`: since the step
-    before, the larger of odometer and positions; `counted`: it moved by a metre, and is no outlier; `along_m`: position
-    along the track minus an independent odometer, NaN without one; `pinned`: element of a balise read then, else -1.
-    """
-
-    begin_s: Floats
-    end_s: Floats
-    points: Points
-    sigma_m: Floats
-    way_m: Floats
-    counted: Bools
-    along_m: Floats
-    pinned: Ints
-
-    def __len__(self) -> int:
-        return len(self.end_s)
-
-    @cached_property
-    def period_s(self) -> float:
-        """Usual time from one to the next, a second at least [s]."""
-        return max(float(np.median(np.diff(self.end_s))), 1.0) if len(self.end_s) > 1 else 1.0
 
 
 @dataclass
@@ -76,8 +49,10 @@ class Node:
     p: float = 1.0
     end: int = 0
     rejected: int = 2**62
+    barred: int = 2**62
     left_m: Floats = field(default_factory=lambda: np.zeros(0))
     followed: bool = False
+    stretch: int = 0
 
     @property
     def element(self) -> int:
@@ -107,32 +82,57 @@ class PathSet:
         here: list[Node] = []
         for step, new in enumerate(begins):
             here = [node for node in here if node.end > step] + [node for node in new if node.end > step]
-            yield [node for node in here if node.rejected > known[step]]
+            yield [node for node in here if node.rejected > known[step] and node.barred > step]
+
+    def survivors(self) -> list[Node]:
+        """Those that live to the last step; of a stretch that ends off the network, those that were refuted last."""
+        count = len(self.steps)
+        found: list[Node] = []
+        for stretch in {node.stretch for node in self.nodes}:
+            nodes = [node for node in self.nodes if node.stretch == stretch]
+            alive = [node for node in nodes if node.rejected >= count and node.end >= count]
+            latest = max(node.rejected for node in nodes)
+            found += alive or [node for node in nodes if node.rejected == latest]
+        return found
 
     def to_the_end(self) -> Iterator[list[Node]]:
-        """Per step the hypotheses that live to the last step, or through one that does."""
+        """Per step the hypotheses that live to the end of their stretch, or through one that does."""
         lives: set[int] = set()
-        for node in self.nodes:
-            if node.rejected >= len(self.steps) and node.end >= len(self.steps):
-                at: Node | None = node
-                while at is not None and id(at) not in lives:
-                    lives.add(id(at))
-                    at = at.parent
         begins: list[list[Node]] = [[] for _ in range(len(self.steps))]
-        for node in self.nodes:
-            if id(node) in lives:
-                begins[node.begin].append(node)
+        for node in self.survivors():
+            at: Node | None = node
+            while at is not None and id(at) not in lives:
+                lives.add(id(at))
+                begins[at.begin].append(at)
+                at = at.parent
         here: list[Node] = []
         for step, new in enumerate(begins):
-            here = [node for node in here if node.end > step] + new
+            here = [node for node in (*here, *new) if min(node.end, node.rejected) > step]
             yield here
 
+    def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
+        """Per step the net elements that no rejection rules out, each with the largest p-value of a path over it.
 
-def path_set(steps: PathSteps, network: Network, bias_m: float, config: MatchingConfig) -> PathSet:
+        In hindsight, or by what was known `delay_s` before the end of each step. Empty: off the network.
+        """
+        sets = self.to_the_end() if delay_s is None else self.living(delay_s)
+        found: list[dict[int, float]] = []
+        for nodes in sets:
+            best: dict[int, float] = {}
+            for node in nodes:
+                best[node.element] = max(best.get(node.element, 0.0), min(node.p, 1.0))
+            found.append(best)
+        return found
+
+
+def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, config: MatchingConfig) -> PathSet:
     """Every path that begins near the first positions and goes on over navigable relations, until it is refuted.
 
-    `bias_m`: sigma of the offset across that lasts the run; 0 for a reference. Without a position near the network the
-    set is empty.
+    `steps`: of positions (`path_steps`), of a solution or of a reference; `bias_m`: sigma of the offset across that
+    lasts the run, 0 for a reference; `alpha`: level of all tests of a path together in 600 s; `network`: with elements
+    that turn round in pieces (`network_in_pieces`), as `Node.element` counts them. Of the result `living` gives the set
+    of each step by what was known then, `to_the_end` in hindsight, both with the least p-value of each path, and
+    `elements` the same by net element. Without a position near the network the set is empty: off the survey.
     """
     search = search_about(steps.points.surface, network, config.reach_m)
     candidates = candidates_of(steps.points, network, search, config.reach_m)
@@ -140,7 +140,7 @@ def path_set(steps: PathSteps, network: Network, bias_m: float, config: Matching
     groups = unbranched_groups(network)
     # Where no other track comes near in the whole run there is nothing to tell apart.
     alone = np.unique(groups[candidates.element]).size <= 1
-    tests = PathTests.of_run(steps, config.paths_alpha, bias_m, config.paths_alike_m, alone)
+    tests = PathTests.of_run(steps, alpha, bias_m, config.paths_alike_m, alone)
     return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
 
 
@@ -159,21 +159,6 @@ def unbranched_groups(network: Network) -> Ints:
             first, second = sorted((root(oriented // 2), root(onward[0].to // 2)))
             group[second] = first
     return np.array([root(element) for element in range(network.count)])
-
-
-def outliers(points: Points, sigma_m: Floats) -> Bools:
-    """Steps far from the middle of their neighbours: reflections follow no model of errors."""
-    count = len(points)
-    reach = _NEIGHBOURS
-    if count <= 2 * reach:
-        return np.zeros(count, dtype=np.bool_)
-    around = sliding_window_view(points.surface, 2 * reach + 1, axis=0)
-    middles = [0.5 * (around[:, :, reach - k] + around[:, :, reach + k]) for k in range(1, reach + 1)]
-    middle = np.median(np.stack(middles), axis=0)
-    far = np.zeros(count, dtype=np.bool_)
-    away_m = np.linalg.norm(points.surface[reach:-reach] - middle, axis=1)
-    far[reach:-reach] = away_m > 4.0 * sigma_m[reach:-reach] + 3.0
-    return far
 
 
 @dataclass
@@ -200,29 +185,34 @@ class _Growth:
     def grown(self) -> PathSet:
         count = len(self.steps)
         overflow = count
-        start = self._start(0)
-        while self._queue or start < count:
-            if not self._queue:
-                start = self._start(start)
-                continue
-            _, _, node = heapq.heappop(self._queue)
-            if len(self._made) > self.config.paths_limit:
-                overflow = node.begin
-                break
-            for child in self._follow(node):
-                self._push(child)
-            start = max(start, self._next_start(node))
+        start = self._begin(0)
+        while start < count:
+            first = len(self._made)
+            self._push_all(start)
+            while self._queue:
+                _, _, node = heapq.heappop(self._queue)
+                if len(self._made) > self.config.paths_limit:
+                    overflow = min(overflow, node.begin)
+                    self._queue.clear()
+                    break
+                for child in self._follow(node):
+                    self._push(child)
+            start = count if overflow < count else self._anew(self._made[first:])
         return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow)
 
-    def _next_start(self, node: Node) -> int:
-        """Where the set begins anew once it is empty: at once in the first minute, later where it came back."""
+    def _anew(self, nodes: list[Node]) -> int:
+        """Where the set begins anew once these are all refuted: at once in the first minute, later where it came back.
+
+        The number of steps where one of them lives to the end, or nothing leads back.
+        """
         count = len(self.steps)
-        died = node.rejected
-        if died >= count or not self._made:
+        last = max(nodes, key=lambda node: min(node.rejected, node.end if node.end >= count else node.rejected))
+        died = last.rejected
+        if died >= count:
             return count
         if self.steps.end_s[died] - self.steps.begin_s[self._made[0].begin] <= self.config.paths_anew_s:
-            return died + 1
-        return self._came_back(node, died)
+            return self._begin(died + 1)
+        return self._begin(self._came_back(last, died))
 
     def _came_back(self, node: Node, died: int) -> int:
         """The first step after a rejection at which the positions lie beside the track as they did before it.
@@ -257,22 +247,18 @@ class _Growth:
         nearest_m[self.candidates.step[first]] = self.candidates.offset_m[first]
         return nearest_m
 
-    def _start(self, step: int) -> int:
-        """Begin with every element near the first step that has one; returns the step to go on from."""
-        count = len(self.steps)
-        while step < count:
-            rows = slice(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
-            numbers = np.arange(rows.start, rows.stop)[self.candidates.past[rows] == 0]
-            if not numbers.size:
-                numbers = np.arange(rows.start, rows.stop)
-            if numbers.size:
-                for row in numbers.tolist():
-                    nothing = np.full(count, np.nan)
-                    node = Node(2 * int(self.candidates.element[row]), step, nothing, nothing.copy(), nothing.copy())
-                    self._push(node)
-                return count
-            step += 1
-        return count
+    def _begin(self, step: int) -> int:
+        """The first step from this one on that has an element within reach, else the number of steps."""
+        near = np.flatnonzero(np.diff(self.candidates.first[step:]) > 0) if step < len(self.steps) else np.zeros(0)
+        return step + int(near[0]) if near.size else len(self.steps)
+
+    def _push_all(self, step: int) -> None:
+        """Begin with every element near a step; far past an end only where it is near no other."""
+        rows = np.arange(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
+        numbers = rows[self._inside(rows) | (self.candidates.beyond_m[rows] <= _LATE_M)]
+        for row in (numbers if numbers.size else rows).tolist():
+            unknown = (np.full(len(self.steps), np.nan) for _ in range(3))
+            self._push(Node(2 * int(self.candidates.element[row]), step, *unknown, stretch=step))
 
     def _push(self, node: Node) -> None:
         same = self._by_element.setdefault(node.oriented, [])
@@ -304,7 +290,12 @@ class _Growth:
         # Steps without a pause or a candidate missing among them, and inside the element.
         run = np.arange(node.begin, node.begin + rows.size) == step
         run &= ~self._gap[np.minimum(step, count - 1)] | (step == node.begin)
-        run &= self._inside(rows)
+        inside = self._inside(rows)
+        # Not yet on it, by the noise along the track or of an offset at a bend: it came in over that end.
+        late = np.logical_and.accumulate(inside | (candidates.beyond_m[rows] <= _LATE_M)) & ~np.logical_or.accumulate(
+            inside
+        )
+        run &= inside | late
         stays = int(rows.size if run.all() else np.argmin(run))
         rows = rows[:stays]
         node.followed = True
@@ -317,7 +308,8 @@ class _Growth:
             node.heading_rad[part] = candidates.heading_rad[rows] + np.pi * (node.oriented % 2)
             ends_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
             node.left_m = ends_m
-            node.rejected = min(node.rejected, self._unread(node))
+            node.barred = min(node.barred, self._unread(node))
+            node.rejected = min(node.rejected, node.barred)
             verdict = self.tests.of(self.steps, node.residual_m, node.survey_m, node.heading_rad, node.begin, node.end)
             node.p = min(node.p, verdict.p)
             node.rejected = min(node.rejected, verdict.rejected)
@@ -340,13 +332,12 @@ class _Growth:
         return 2**62
 
     def _inside(self, rows: Ints) -> Bools:
-        """Places on the element; past an open end as far as the noise may lead."""
+        """Places on the element; past an end as far as noise, and the survey of the next element, may lead."""
         candidates = self.candidates
         past = candidates.past[rows]
-        linked = np.where(past < 0, candidates.linked_start[rows], candidates.linked_end[rows])
         sigma_m = np.hypot(self.steps.sigma_m[candidates.step[rows]], self.survey_m[rows])
         near = candidates.beyond_m[rows] <= self.config.paths_open_sigmas * sigma_m + _OPEN_M
-        inside: Bools = (past == 0) | (~linked & near)
+        inside: Bools = (past == 0) | near
         return inside
 
     def _onward(self, node: Node) -> list[Node]:
@@ -356,7 +347,7 @@ class _Growth:
             return []
         candidates = self.candidates
         rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
-        inside = rows[self._inside(rows)]
+        inside = rows[self._inside(rows) | (candidates.beyond_m[rows] <= _LATE_M)]
         way_m = _DETOUR * float(self.steps.way_m[step]) + _DETOUR_M
         reached: dict[int, int] = {}
         for leaving in (node.oriented, node.oriented ^ 1):
@@ -401,4 +392,5 @@ class _Growth:
 
     def _child(self, node: Node, oriented: int, step: int) -> Node:
         copies = (node.residual_m.copy(), node.survey_m.copy(), node.heading_rad.copy())
-        return Node(oriented, step, *copies, parent=node, p=node.p, rejected=node.rejected)
+        end = {"rejected": node.rejected, "barred": node.barred}
+        return Node(oriented, step, *copies, parent=node, p=node.p, stretch=node.stretch, **end)
