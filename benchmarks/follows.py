@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ import polars as pl
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
-from benchmarks.results import Figure
+from benchmarks.results import Figure, processor_s
 from pipeline.stages.follows import Follows, follows_positions
 from schemas.config import Configuration
 
@@ -185,17 +184,12 @@ def tried(seed: int, receiver: str, kind: str, minutes: float | None = None) -> 
 
 
 def cost_s(seed: int = 0) -> float:
-    """An hour at 10 Hz of both."""
+    """An hour at 10 Hz of both, processor time."""
     rng = np.random.default_rng(seed)
     truth = journey(rng, 3600.0)
     fixes, t_s, _ = fixes_of(rng, truth, "sbas", 10.0)
     odometer = independent(rng, truth, "pulses", t_s)
-    took = []
-    for _ in range(5):
-        begin = time.perf_counter()
-        follows_positions(odometer, fixes, Configuration())
-        took.append(time.perf_counter() - begin)
-    return float(np.median(took))
+    return processor_s(5, lambda: follows_positions(odometer, fixes, Configuration()))
 
 
 def measure(out: Path | None = None, runs: int = 2000, seed: int = 1) -> list[Figure]:

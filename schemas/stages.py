@@ -8,6 +8,9 @@ import polars as pl
 from schemas.columns import flag, instant, one_of, real, text
 from schemas.enums import BaliseKind, Evidence, Judgement, LdsState, PassageStatus, SigmaSource
 
+# Confidence where one track is left of the set of those that the positions do not reject (DOMAIN section 2).
+ONE_TRACK_LEFT = 0.99
+
 
 class Positions(dy.Schema):
     """One row per GNSS epoch of a solution, in order of time: the position on the track network, by matching.
@@ -26,8 +29,8 @@ class Positions(dy.Schema):
     vertical_m = real("m", "position above the track; null without a height in position or survey")
     on_track = flag("a net element of the path is within what the position's errors allow")
     near_track = flag("a net element of the path is within `reach_m`: the monitors can compare the position with it")
-    path_probability = real("1", "posterior of the path by the whole run (forward-backward)", min=0, max=1)
-    gate_probability = real("1", "posterior of the path by what came before (forward): for detection", min=0, max=1)
+    path_probability = real("1", "confidence in the track in hindsight: 0.99 where one is left, 1 alone", min=0, max=1)
+    gate_probability = real("1", "the same by what was known then; null off the network", min=0, max=1)
     heading_deg = real("deg", "azimuth of growing path at the GNSS antenna, clockwise from north")
     slope = real("1", "rise over run of growing path")
     curvature_per_m = real("1/m", "curvature of the track, positive to the left")

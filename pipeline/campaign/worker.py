@@ -151,7 +151,7 @@ def _write_travelled_route(job: RunJob, run: RunLog, site: Site) -> None:
 
     prepared = prepare(run, site, job.vehicle, job.config)
     match = prepared.match(prepared.run.main_solution())
-    route = travelled_route(match, job.config.matching.ambiguity_probability)
+    route = travelled_route(match)
     storage.write_bytes(job.write_route, route.write_csv().encode())
 
 

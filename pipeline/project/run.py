@@ -227,7 +227,7 @@ def wish_for(opened: Opened, entry: TrackEntry) -> Wish:
     if balises is not None and not balises.startswith("every"):
         balises = opened.place(balises)
     surveys = [Path(opened.place(named)) for named in entry.survey]
-    return wish_of(surveys, balises, entry.epsg, entry.join_m, entry.flat, entry.direction)
+    return wish_of(surveys, balises, entry.epsg, entry.join_m, entry.flat, entry.direction, entry.id_field)
 
 
 def _calibrate(steps: _Steps) -> None:

@@ -91,7 +91,6 @@ class Baseline:
 
     def left_out(self, quiet_s: float) -> Ints:
         """Per epoch the reason (number in `LeftOut`) why no fault begins there, -1 where one may."""
-        config = self.config
         after_gap = np.diff(self.t_ns, prepend=self.t_ns[:1]) > self.clock.limit_s * NS_PER_S
         # Without an odometer there is no TVB at all: a position in use has to do.
         validated = flags(self.epochs, "in_use" if self.ride.odometry is None else "tvb")
@@ -102,7 +101,7 @@ class Baseline:
         for why, where in (
             (LeftOut.NOT_RIGHT, doubtful),
             (LeftOut.NO_TVB, ~validated | after_gap),
-            (LeftOut.AMBIGUOUS, ~met(self.epochs, unambiguous(config)) & floats_known(self.epochs, "path_m")),
+            (LeftOut.AMBIGUOUS, ~met(self.epochs, unambiguous()) & floats_known(self.epochs, "path_m")),
             (LeftOut.ALARM, self.alarming),
         ):
             reason[where] = _REASONS.index(why)

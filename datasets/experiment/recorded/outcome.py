@@ -95,7 +95,7 @@ def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
     with np.errstate(invalid="ignore"):
         code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
         code[(low_m > limit_m) | (high_m < -limit_m)] = WRONG
-    code[astray & met(epochs, unambiguous(base.config))] = WRONG
+    code[astray & met(epochs, unambiguous())] = WRONG
     was_right = (own_low_m >= -limit_m) & (own_high_m <= limit_m)
     doubtful = (code == UNKNOWN) & np.isfinite(moved_m) & (was_right | (np.abs(moved_m) > limit_m))
     return Watch(epochs, t_ns, moved_m, low_m, high_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))

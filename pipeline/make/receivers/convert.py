@@ -279,6 +279,7 @@ def _read(content: bytes, log: Path, date: date | None) -> Gatherings:
     for frame in frames(content, lambda: dropped.update(["damaged message"])):
         if frame.protocol in gathered:
             _decode(frame, gathered[frame.protocol])
+    nmea.require_one_receiver(gathered[Protocol.NMEA], log)
     nmea.settle_days(gathered[Protocol.NMEA], date)
     novatel.settle_source(gathered[Protocol.NOVATEL])
     settled = {protocol: epochs.settled() for protocol, epochs in gathered.items()}

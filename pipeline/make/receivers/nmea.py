@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from datetime import UTC, date, datetime, time
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.make.receivers.epochs import Epoch, Gathered
+from pipeline.make.receivers.epochs import Epoch, Gathered, Place
 from pipeline.read.ingest.guesses import UNITS
 from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
+from schemas.errors import InputError
 
 # 9 is of NovAtel's receivers; 7 and 8 are typed in or simulated.
 _FIXES = {
@@ -28,6 +30,11 @@ _SBAS_PRNS = range(120, 159)
 _SBAS_NUMBERS = range(33, 65)
 _NUMBER_TO_PRN = 87
 _DAY_NS = 86_400 * NS_PER_S
+# So many times with two places may be of a clock that went back, or of joined logs.
+_FEW_DISPUTED = 2
+# Sentences of one stretch of recording are closer than this.
+_GOES_ON_NS = 10 * NS_PER_S
+_FEW_SHARE = 0.01
 
 
 def parse(raw: bytes) -> Any:
@@ -44,7 +51,8 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
     if not isinstance(message.time, time):
         gathered.drop("time not valid")
         return
-    epoch = gathered.at(message.time, message.identity if message.msgID in _POSITIONS else "", raw)
+    place = _place_of(message)
+    epoch = gathered.at(message.time, message.msgID if place else "", raw, place)
     # Before its first position a receiver tells a date of its own making.
     if message.msgID == "RMC" and isinstance(message.date, date) and (message.status == "A" or message.lat != ""):
         epoch.t_ns = _time_ns(message.date, message.time)
@@ -52,6 +60,42 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
         epoch.t_ns = _time_ns(day, message.time)
     if message.msgID in _DECODERS:
         _DECODERS[message.msgID](epoch, message)
+
+
+def require_one_receiver(gathered: Gathered, log: Path) -> None:
+    """Refuse a log in which sentences tell different places of one time: nothing is merged of two receivers.
+
+    Raises `InputError`. Several places of one talker within a second that the stamps do not divide are of one receiver,
+    with stamps coarser than its rate.
+    """
+    coarse = all(epoch.key.microsecond == 0 for epoch in gathered.epochs)
+    disputed = [pair for pair in gathered.disputed if not coarse or pair[0].talker != pair[1].talker]
+    if len(disputed) <= max(_FEW_DISPUTED, _FEW_SHARE * len(gathered.epochs)):
+        return
+    talkers = sorted({place.talker for pair in disputed for place in pair})
+    first, second = disputed[0]
+    raise InputError(
+        "holds the positions of two receivers",
+        place=str(log),
+        found=f"{len(disputed)} times with two places, at first {first.latitude_deg:.6f}, {first.longitude_deg:.6f} "
+        f"({first.talker}) and {second.latitude_deg:.6f}, {second.longitude_deg:.6f} ({second.talker})",
+        expected="sentences of one receiver",
+        remedy=(
+            f"Put the sentences of each talker ({', '.join(talkers)}) in a file of its own, and convert each with its "
+            "--solution."
+            if len(talkers) > 1
+            else "Record each receiver in a file of its own, and convert each with its --solution."
+        ),
+    )
+
+
+def _place_of(message: Any) -> Place | None:
+    """Where a position sentence puts the receiver; none without a fix."""
+    if message.msgID not in _POSITIONS or not isinstance(message.lat, float) or not isinstance(message.lon, float):
+        return None
+    if message.msgID == "GGA" and not int(message.quality or 0):
+        return None
+    return Place(message.lat, message.lon, str(message.talker))
 
 
 def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
@@ -75,6 +119,25 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
         for known, epoch in pairwise(gathered.epochs[::way]):
             if epoch.t_ns is None and known.t_ns is not None:
                 epoch.t_ns = _beside(known.t_ns, epoch.key, way)
+    gathered.drop("date that turned at another moment than midnight, put right", _with_days_in_order(gathered.epochs))
+
+
+def _with_days_in_order(epochs: list[Epoch]) -> int:
+    """Put each date on the day nearest the epoch before, where the time of day goes on and the date does not.
+
+    Receivers turn the date of some sentences a second late. Returns how many were a day off.
+    """
+    moved = 0
+    for before, epoch in pairwise(epochs):
+        if before.t_ns is None or epoch.t_ns is None:
+            continue
+        for days in (1, -1):
+            t_ns = epoch.t_ns + days * _DAY_NS
+            if abs(t_ns - before.t_ns) <= _GOES_ON_NS < abs(epoch.t_ns - before.t_ns):
+                epoch.t_ns = t_ns
+                moved += 1
+                break
+    return moved
 
 
 def _beside(known_ns: int, moment: time, way: int) -> int:
@@ -114,6 +177,8 @@ def _put(epoch: Epoch, m: Any, fix: Fix) -> None:
     if fix is Fix.DIFFERENTIAL and prn in _SBAS_PRNS:
         fix = Fix.SBAS
         epoch.gnss |= {"sbas_prn": prn, "sbas_age_s": m.diffAge if isinstance(m.diffAge, float) else None}
+    if fix is Fix.NONE and epoch.gnss.get("fix", Fix.NONE.value) != Fix.NONE.value:
+        return  # a receiver without a fix refuses nobody else's
     epoch.gnss |= {"fix": fix.value, "satellites": int(m.numSV) if m.numSV != "" else None}
     if fix is Fix.NONE or m.lat == "" or m.lon == "":
         return

@@ -10,6 +10,7 @@ import polars as pl
 
 from pipeline.stages.lds.windows import DEFAULTS, minimal_spacing_m, window_m
 from pipeline.stages.paths.candidates import candidates_of, search_about
+from pipeline.stages.paths.path_tests import told_by_a_switch_m, told_by_offset_m
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Network, network_of, surveyed
 from pipeline.stages.track.path import valid_along_measure
@@ -127,8 +128,8 @@ class _ParallelStretch:
 def parallel_findings(site: Site, config: MatchingConfig) -> list[Finding]:
     """One warning per pair of elements and stretch; nothing where a route is given.
 
-    The bias of the run and the survey alone decide here, as for a receiver without any noise: a run right on its own
-    track claims 1 / (1 + exp(-d² / 2V)) for tracks d apart, V the sum of both variances.
+    The bias of the run and the survey alone decide here, as for a receiver without any noise: offsets tell tracks apart
+    that lie farther apart than the bound of a lasting offset, a switch taken those beyond the bound of a movement.
     """
     if site.route is not None:
         return []
@@ -140,12 +141,6 @@ def parallel_findings(site: Site, config: MatchingConfig) -> list[Finding]:
     ]
 
 
-def most_claimed(apart_m: float, survey_m: float, config: MatchingConfig) -> float:
-    """What a run right on one of two tracks claims for it at most, by positions alone."""
-    variance_m2 = config.cross_bias_sigma_m**2 + survey_m**2
-    return float(1.0 / (1.0 + np.exp(-(apart_m**2) / (2.0 * variance_m2))))
-
-
 def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelStretch]:
     """Per pair of elements the parts of the first that lie too near the second."""
     track = network.track
@@ -153,8 +148,8 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelSt
     element = along.element
     measure_m = along.measure_m
     survey_m = _survey_m(track, config)
-    odds = np.log(config.ambiguity_probability / (1.0 - config.ambiguity_probability))
-    limit_m = np.sqrt(2.0 * odds * (config.cross_bias_sigma_m**2 + survey_m**2))
+    by_offset_m = told_by_offset_m(survey_m, config.paths_alpha, config.cross_bias_sigma_m)
+    limit_m = np.fmax(by_offset_m, told_by_a_switch_m(survey_m, config.paths_alpha, config.paths_alike_m))
     points = points_of(along.latitude_deg, along.longitude_deg)
     reach_m = float(limit_m.max())
     near_track = candidates_of(points, network, search_about(points.surface, network, reach_m), reach_m)
@@ -181,10 +176,16 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelSt
 def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: MatchingConfig) -> Finding:
     name = network.track.ids[stretch.element]
     parallel = network.track.ids[stretch.other]
-    claim = most_claimed(stretch.apart_m, float(_survey_m(network.track, config)[stretch.element]), config)
+    survey_m = _survey_m(network.track, config)[stretch.element]
+    needed_m = float(told_by_a_switch_m(survey_m, config.paths_alpha, config.paths_alike_m))
+    by_a_switch = (
+        f"a switch taken tells them apart at a survey of {survey_m:.2g} m"
+        if stretch.apart_m > needed_m
+        else f"nor does a switch taken at a survey of {survey_m:.2g} m, which takes {needed_m:.1f} m"
+    )
     text = (
-        f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {parallel} lies {stretch.apart_m:.1f} m beside it; positions "
-        f"alone give one of them a probability of {claim:.2f} at most, so that virtual balises there are ambiguous"
+        f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {parallel} lies {stretch.apart_m:.1f} m beside it; offsets "
+        f"alone do not tell them apart, so that virtual balises there are ambiguous; {by_a_switch}"
     )
     return Finding("warning", f"element {name}", text, _remedy(site, network, stretch))
 

@@ -13,6 +13,7 @@ from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import link, section
 from pipeline.show.report.words import some_of
 from pipeline.stages.epochs.clock import least_belief
+from schemas.stages import ONE_TRACK_LEFT
 
 _NOTE = (
     "This is the path that the positions were matched to, with how sure it was at the time "
@@ -28,7 +29,7 @@ _TURNED = (
 )
 
 
-def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
+def found_route(epochs: pl.DataFrame) -> pl.DataFrame | None:
     """Net elements in the order of growing path, from one solution's epochs; None where the train turned over switches.
 
     `doubtful`: the track was, at the time or in hindsight; the least probabilities of both stand beside it.
@@ -56,16 +57,16 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
             "path_probability",
             "t_start",
             "t_end",
-            doubtful=(pl.col("belief") < sure).fill_null(value=True),
+            doubtful=(pl.col("belief") < ONE_TRACK_LEFT).fill_null(value=True),
         )
     )
 
 
-def route_section(identity: str, run_id: str, epochs: pl.DataFrame, sure: float) -> str:
+def route_section(identity: str, run_id: str, epochs: pl.DataFrame) -> str:
     """The route with its doubtful stretches, and a file of it to take away; nothing without matched positions."""
     if epochs["path_m"].null_count() == epochs.height:
         return ""
-    route = found_route(epochs, sure)
+    route = found_route(epochs)
     if route is None:
         return section(identity, "Route found", f"<p>{_TURNED}</p>")
     doubtful = route.filter("doubtful")["netelement_id"].to_list()

@@ -223,7 +223,7 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
         part("passages", "Passages", rows("passages", in_order, passages, _PASSAGES, Passages, {"status": _status})),
         part("levels", "Service levels", rows("levels", ALLOWED, levels, (), CampaignLevels)),
         part("alarms", "Alarms", rows("alarms", "Alarm episodes", alarms, _ALARMS, Alarms)),
-        route_section(f"route-{key}", tables.run_id, epochs, made.config.matching.ambiguity_probability),
+        route_section(f"route-{key}", tables.run_id, epochs),
         part("all", "All figures", figures(f"table-all-{key}", "All figures of the run", known, Runs)),
     ]
     return f'<div class="solution" id="{key}" data-solution="{escape(name)}">' + "\n".join(parts) + "</div>"

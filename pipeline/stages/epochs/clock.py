@@ -14,6 +14,7 @@ import polars as pl
 
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
 from schemas.config import Configuration, LdsConfig
+from schemas.stages import ONE_TRACK_LEFT
 
 Time = TypeVar("Time", float, pl.Expr)
 
@@ -59,15 +60,15 @@ def usable() -> pl.Expr:
     return pl.col("path_m").is_not_null() & pl.col("on_track")
 
 
-def unambiguous(config: Configuration) -> pl.Expr:
-    """The track of the position is not in doubt by what the train knew then."""
-    return pl.col("gate_probability") >= config.matching.ambiguity_probability
+def unambiguous() -> pl.Expr:
+    """One track is left for the position by what the train knew then."""
+    return pl.col("gate_probability") >= ONE_TRACK_LEFT
 
 
 def least_belief() -> pl.Expr:
-    """Probability of the track, at the time or in hindsight, whichever is less.
+    """Confidence in the track, at the time or in hindsight, whichever is less.
 
-    The track is doubtful where this is below `matching.ambiguity_probability`.
+    The track is doubtful where this is below `ONE_TRACK_LEFT`.
     """
     return pl.min_horizontal("gate_probability", "path_probability")
 
@@ -79,7 +80,7 @@ def confident(config: Configuration) -> pl.Expr:
 
 def trusted(config: Configuration) -> pl.Expr:
     """An epoch whose position is valid, confident and unambiguous (CONTRACT section 3, `mtbf_h`)."""
-    return usable() & confident(config) & unambiguous(config)
+    return usable() & confident(config) & unambiguous()
 
 
 def nominal_period_s(t_ns: Ints) -> float | None:

@@ -22,7 +22,7 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
     epochs = case.solution.epochs
     config = case.config
     at_ns = case.instants_of_epochs()
-    positions = MatchedPositions.of(case, epochs, met(epochs, unambiguous(config)))
+    positions = MatchedPositions.of(case, epochs, met(epochs, unambiguous()))
     evidence = case.evidence.at(at_ns)
     along = judgements_of(case, positions, at_ns, evidence)
     direction = _direction(case, positions, at_ns, along)
@@ -67,7 +67,7 @@ def _direction(case: Case, positions: MatchedPositions, at_ns: Ints, along: Judg
 def direction_by_evidence(case: Case) -> pl.Series:
     """Direction of travel of a run without an odometer, before anything is judged: `epochs` as they are aligned."""
     at_ns = case.instants_of_epochs()
-    positions = MatchedPositions.of(case, case.solution.epochs, met(case.solution.epochs, unambiguous(case.config)))
+    positions = MatchedPositions.of(case, case.solution.epochs, met(case.solution.epochs, unambiguous()))
     along = judge_positions(positions, case.evidence.at(at_ns), case.legs(), case.config.hazards)
     return _direction(case, positions, at_ns, along)
 

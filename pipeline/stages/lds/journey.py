@@ -85,7 +85,7 @@ def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) ->
     """Ambiguity before confidence; null is never taken as good."""
     refusals = np.full(positioned.size, None)
     refusals[~met(epochs, confident(config))] = PassageStatus.REJECTED_CONFIDENCE
-    refusals[~met(epochs, unambiguous(config))] = PassageStatus.REJECTED_AMBIGUOUS
+    refusals[~met(epochs, unambiguous())] = PassageStatus.REJECTED_AMBIGUOUS
     refusals[~positioned] = PassageStatus.NOT_AVAILABLE
     return list(refusals)
 

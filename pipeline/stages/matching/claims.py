@@ -14,9 +14,10 @@ from pipeline.stages.paths.path_set import Node, PathSet, unbranched_groups
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import MatchingConfig
+from schemas.stages import ONE_TRACK_LEFT
 
-ALONE, ONE_LEFT, MOST_IN_DOUBT = 1.0, 0.99, 0.95
-"""No other track within reach; one track left of the set; more are left."""
+# No other track within reach; more than one left of the set.
+ALONE, MOST_IN_DOUBT = 1.0, 0.95
 
 
 # What ended a stretch of doubt: a balise read, a switch taken, positions (tracks that part, offsets), or nothing.
@@ -91,7 +92,7 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
     gate = _confidence(live, np.maximum(before, 0), group, carried_m, alone)
     gate[(before < 0) | (before >= found.overflow)] = 0.0
     to_the_end = list(found.to_the_end())
-    later = _confidence(_left(found, to_the_end), about, group, np.zeros(t_s.size), alone)
+    later = _hindsight(_left(found, to_the_end), about, group, alone)
     rival = _rivals(found, living, to_the_end, group, np.maximum(before, 0), about)
     epoch = np.minimum(np.searchsorted(t_s, steps.begin_s), t_s.size - 1)
     return Claims(gate, later, rival, _possible(found, to_the_end, epoch))
@@ -114,15 +115,13 @@ def best_elements(found: PathSet) -> Ints:
     return elements
 
 
-def doubtful_stretches(
-    claimed: Claims, t_ns: Ints, element: Ints, read: Bools, network: Network, limit: float
-) -> pl.DataFrame:
+def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, network: Network) -> pl.DataFrame:
     """Stretches where the path is doubtful at the time, or in hindsight; `read`: epochs at which a balise was read."""
     least = np.fmin(np.nan_to_num(claimed.live), np.nan_to_num(claimed.hindsight))
     ids = network.track.ids
     groups = unbranched_groups(network)
     rows = []
-    for begin, last in spans_of((least < limit) & (element >= 0)):
+    for begin, last in spans_of((least < ONE_TRACK_LEFT) & (element >= 0)):
         part = slice(begin, last + 1)
         worst = begin + int(np.argmin(least[part]))
         rival = int(claimed.rival[worst])
@@ -159,7 +158,7 @@ def _possible(found: PathSet, sets: list[list[Node]], epoch: Ints) -> Possible:
         lines = {int(found.groups[node.element]) for node in nodes}
         for element in sorted({node.element for node in nodes}):
             elements.append(element)
-            confidences.append(ONE_LEFT if len(lines) == 1 else MOST_IN_DOUBT / len(lines))
+            confidences.append(ONE_TRACK_LEFT if len(lines) == 1 else MOST_IN_DOUBT / len(lines))
         first.append(len(elements))
     return Possible(epoch, np.array(first), np.array(elements, dtype=np.int64), np.array(confidences))
 
@@ -187,12 +186,21 @@ def _left(found: PathSet, sets: list[list[Node]]) -> _Left:
 def _confidence(left: _Left, step: Ints, group: Ints, carried_m: Floats, alone: Floats) -> Floats:
     """Of each epoch in its line, with the step that speaks for it."""
     one = (left.group[step] == group) & (group >= 0) & (carried_m < left.branch_m[step])
-    confidence = np.where(one, np.where(alone[step] > 0, ALONE, ONE_LEFT), np.nan)
+    confidence = np.where(one, np.where(alone[step] > 0, ALONE, ONE_TRACK_LEFT), np.nan)
     for row in np.flatnonzero(~one & (left.group[step] != -1)).tolist():
         others = [p for line, p in left.rivals[int(step[row])].items() if line != group[row]]
         # Near a branch the rivals are those behind it: nothing is known of them yet.
         confidence[row] = min(MOST_IN_DOUBT, 1.0 - max(others, default=0.5))
     return confidence
+
+
+def _hindsight(left: _Left, step: Ints, group: Ints, alone: Floats) -> Floats:
+    """By paths that live to the end; where one goes over from a line to the next, positions say when."""
+    confidence = _confidence(left, step, group, np.zeros(step.size), alone)
+    beside = [np.clip(step + by, 0, left.group.size - 1) for by in (-1, 0, 1)]
+    one = np.logical_and.reduce([left.group[row] >= 0 for row in beside])
+    one &= np.logical_or.reduce([left.group[row] == group for row in beside])
+    return np.where(one & (confidence < ONE_TRACK_LEFT), ONE_TRACK_LEFT, confidence)
 
 
 def _alone(found: PathSet) -> Floats:

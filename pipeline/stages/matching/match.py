@@ -73,8 +73,7 @@ def match(
     element = elements_of(arrays, path, assignment)
     claimed = claims(found, arrays.t_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
     assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
-    limit = config.ambiguity_probability
-    ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, pinned >= 0, network, limit)
+    ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, pinned >= 0, network)
     epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
     if sign < 0 and vehicle.gnss_antenna_ahead_m:

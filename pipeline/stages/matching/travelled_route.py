@@ -11,6 +11,7 @@ from pipeline.stages.matching.match import Match
 from pipeline.stages.track.leg import Leg, segments_at
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Ints, floats
+from schemas.stages import ONE_TRACK_LEFT
 
 ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "netelement_id": pl.String,
@@ -26,7 +27,7 @@ ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
 }
 
 
-def travelled_route(match: Match, sure: float) -> pl.DataFrame:
+def travelled_route(match: Match) -> pl.DataFrame:
     """One row per net element in the order of growing path, leg by leg: the route, and what of it is in doubt.
 
     `doubtful`: the track was, at the time or in hindsight (the least probabilities of both stand beside it), or no
@@ -36,7 +37,7 @@ def travelled_route(match: Match, sure: float) -> pl.DataFrame:
     """
     leg = match.epochs["leg"].fill_null(-1).to_numpy()
     rows = [
-        _row(match, number, one, visits, leg == number, sure)
+        _row(match, number, one, visits, leg == number)
         for number, one in enumerate(match.path.legs)
         for visits in _passages(match.path.track, one)
     ]
@@ -58,7 +59,7 @@ def _passages(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
     return passages
 
 
-def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, sure: float) -> tuple[object, ...]:
+def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools) -> tuple[object, ...]:
     path_m = floats(match.epochs, "path_m")
     segment, _ = segments_at(leg, np.nan_to_num(path_m))
     known = match.epochs["path_probability"].is_not_null().to_numpy()
@@ -71,10 +72,10 @@ def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, 
         match.path.track.ids[first_visit.element],
         "AB" if first_visit.forward else "BA",
         number,
-        least is None or least < sure,
+        least is None or least < ONE_TRACK_LEFT,
         epochs["gate_probability"].min(),
         epochs["path_probability"].min(),
-        _rivals(match, inside, 1.0 - sure),
+        _rivals(match, inside, 1.0 - ONE_TRACK_LEFT),
         float(np.median(floats(match.epochs, "cross_track_m")[inside])) if len(inside) else None,
         times[int(inside[0])] if len(inside) else None,
         times[int(inside[-1])] if len(inside) else None,

@@ -113,7 +113,7 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _TrackFrame:
     survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
     survey_m = np.hypot(np.maximum(survey_m, config.matching.offset_floor_m), np.nan_to_num(chord_m))
     matched = flags(epochs, "on_track") & np.isfinite(cross_m) & np.isfinite(heading)
-    sure = met(epochs, unambiguous(config))
+    sure = met(epochs, unambiguous())
     known = np.isfinite(vertical_m)
     left = np.stack([-np.cos(angle), np.sin(angle), zero], axis=-1)
     offset = cross_m[:, None] * left + np.where(known, vertical_m, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])

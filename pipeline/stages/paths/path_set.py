@@ -26,6 +26,8 @@ _DETOUR = 1.2
 _DETOUR_M = 50.0
 # Behind an open end a path goes on for so much more than the noise [m].
 _OPEN_M = 10.0
+# Before a position is on the element that it goes over to, it may lie so far before its end [m].
+_LATE_M = 10.0
 # A longer step is a gap: the train may have taken any way meanwhile [s].
 _GAP_S = 3.5
 
@@ -47,8 +49,10 @@ class Node:
     p: float = 1.0
     end: int = 0
     rejected: int = 2**62
+    barred: int = 2**62
     left_m: Floats = field(default_factory=lambda: np.zeros(0))
     followed: bool = False
+    stretch: int = 0
 
     @property
     def element(self) -> int:
@@ -78,24 +82,32 @@ class PathSet:
         here: list[Node] = []
         for step, new in enumerate(begins):
             here = [node for node in here if node.end > step] + [node for node in new if node.end > step]
-            yield [node for node in here if node.rejected > known[step]]
+            yield [node for node in here if node.rejected > known[step] and node.barred > step]
+
+    def survivors(self) -> list[Node]:
+        """Those that live to the last step; of a stretch that ends off the network, those that were refuted last."""
+        count = len(self.steps)
+        found: list[Node] = []
+        for stretch in {node.stretch for node in self.nodes}:
+            nodes = [node for node in self.nodes if node.stretch == stretch]
+            alive = [node for node in nodes if node.rejected >= count and node.end >= count]
+            latest = max(node.rejected for node in nodes)
+            found += alive or [node for node in nodes if node.rejected == latest]
+        return found
 
     def to_the_end(self) -> Iterator[list[Node]]:
-        """Per step the hypotheses that live to the last step, or through one that does."""
+        """Per step the hypotheses that live to the end of their stretch, or through one that does."""
         lives: set[int] = set()
-        for node in self.nodes:
-            if node.rejected >= len(self.steps) and node.end >= len(self.steps):
-                at: Node | None = node
-                while at is not None and id(at) not in lives:
-                    lives.add(id(at))
-                    at = at.parent
         begins: list[list[Node]] = [[] for _ in range(len(self.steps))]
-        for node in self.nodes:
-            if id(node) in lives:
-                begins[node.begin].append(node)
+        for node in self.survivors():
+            at: Node | None = node
+            while at is not None and id(at) not in lives:
+                lives.add(id(at))
+                begins[at.begin].append(at)
+                at = at.parent
         here: list[Node] = []
         for step, new in enumerate(begins):
-            here = [node for node in here if node.end > step] + new
+            here = [node for node in (*here, *new) if min(node.end, node.rejected) > step]
             yield here
 
     def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
@@ -173,29 +185,34 @@ class _Growth:
     def grown(self) -> PathSet:
         count = len(self.steps)
         overflow = count
-        start = self._start(0)
-        while self._queue or start < count:
-            if not self._queue:
-                start = self._start(start)
-                continue
-            _, _, node = heapq.heappop(self._queue)
-            if len(self._made) > self.config.paths_limit:
-                overflow = node.begin
-                break
-            for child in self._follow(node):
-                self._push(child)
-            start = max(start, self._next_start(node))
+        start = self._begin(0)
+        while start < count:
+            first = len(self._made)
+            self._push_all(start)
+            while self._queue:
+                _, _, node = heapq.heappop(self._queue)
+                if len(self._made) > self.config.paths_limit:
+                    overflow = min(overflow, node.begin)
+                    self._queue.clear()
+                    break
+                for child in self._follow(node):
+                    self._push(child)
+            start = count if overflow < count else self._anew(self._made[first:])
         return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow)
 
-    def _next_start(self, node: Node) -> int:
-        """Where the set begins anew once it is empty: at once in the first minute, later where it came back."""
+    def _anew(self, nodes: list[Node]) -> int:
+        """Where the set begins anew once these are all refuted: at once in the first minute, later where it came back.
+
+        The number of steps where one of them lives to the end, or nothing leads back.
+        """
         count = len(self.steps)
-        died = node.rejected
-        if died >= count or not self._made:
+        last = max(nodes, key=lambda node: min(node.rejected, node.end if node.end >= count else node.rejected))
+        died = last.rejected
+        if died >= count:
             return count
         if self.steps.end_s[died] - self.steps.begin_s[self._made[0].begin] <= self.config.paths_anew_s:
-            return died + 1
-        return self._came_back(node, died)
+            return self._begin(died + 1)
+        return self._begin(self._came_back(last, died))
 
     def _came_back(self, node: Node, died: int) -> int:
         """The first step after a rejection at which the positions lie beside the track as they did before it.
@@ -230,22 +247,18 @@ class _Growth:
         nearest_m[self.candidates.step[first]] = self.candidates.offset_m[first]
         return nearest_m
 
-    def _start(self, step: int) -> int:
-        """Begin with every element near the first step that has one; returns the step to go on from."""
-        count = len(self.steps)
-        while step < count:
-            rows = slice(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
-            numbers = np.arange(rows.start, rows.stop)[self.candidates.past[rows] == 0]
-            if not numbers.size:
-                numbers = np.arange(rows.start, rows.stop)
-            if numbers.size:
-                for row in numbers.tolist():
-                    nothing = np.full(count, np.nan)
-                    node = Node(2 * int(self.candidates.element[row]), step, nothing, nothing.copy(), nothing.copy())
-                    self._push(node)
-                return count
-            step += 1
-        return count
+    def _begin(self, step: int) -> int:
+        """The first step from this one on that has an element within reach, else the number of steps."""
+        near = np.flatnonzero(np.diff(self.candidates.first[step:]) > 0) if step < len(self.steps) else np.zeros(0)
+        return step + int(near[0]) if near.size else len(self.steps)
+
+    def _push_all(self, step: int) -> None:
+        """Begin with every element near a step; far past an end only where it is near no other."""
+        rows = np.arange(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
+        numbers = rows[self._inside(rows) | (self.candidates.beyond_m[rows] <= _LATE_M)]
+        for row in (numbers if numbers.size else rows).tolist():
+            unknown = (np.full(len(self.steps), np.nan) for _ in range(3))
+            self._push(Node(2 * int(self.candidates.element[row]), step, *unknown, stretch=step))
 
     def _push(self, node: Node) -> None:
         same = self._by_element.setdefault(node.oriented, [])
@@ -277,7 +290,12 @@ class _Growth:
         # Steps without a pause or a candidate missing among them, and inside the element.
         run = np.arange(node.begin, node.begin + rows.size) == step
         run &= ~self._gap[np.minimum(step, count - 1)] | (step == node.begin)
-        run &= self._inside(rows)
+        inside = self._inside(rows)
+        # Not yet on it, by the noise along the track or of an offset at a bend: it came in over that end.
+        late = np.logical_and.accumulate(inside | (candidates.beyond_m[rows] <= _LATE_M)) & ~np.logical_or.accumulate(
+            inside
+        )
+        run &= inside | late
         stays = int(rows.size if run.all() else np.argmin(run))
         rows = rows[:stays]
         node.followed = True
@@ -290,7 +308,8 @@ class _Growth:
             node.heading_rad[part] = candidates.heading_rad[rows] + np.pi * (node.oriented % 2)
             ends_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
             node.left_m = ends_m
-            node.rejected = min(node.rejected, self._unread(node))
+            node.barred = min(node.barred, self._unread(node))
+            node.rejected = min(node.rejected, node.barred)
             verdict = self.tests.of(self.steps, node.residual_m, node.survey_m, node.heading_rad, node.begin, node.end)
             node.p = min(node.p, verdict.p)
             node.rejected = min(node.rejected, verdict.rejected)
@@ -328,7 +347,7 @@ class _Growth:
             return []
         candidates = self.candidates
         rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
-        inside = rows[self._inside(rows)]
+        inside = rows[self._inside(rows) | (candidates.beyond_m[rows] <= _LATE_M)]
         way_m = _DETOUR * float(self.steps.way_m[step]) + _DETOUR_M
         reached: dict[int, int] = {}
         for leaving in (node.oriented, node.oriented ^ 1):
@@ -373,4 +392,5 @@ class _Growth:
 
     def _child(self, node: Node, oriented: int, step: int) -> Node:
         copies = (node.residual_m.copy(), node.survey_m.copy(), node.heading_rad.copy())
-        return Node(oriented, step, *copies, parent=node, p=node.p, rejected=node.rejected)
+        end = {"rejected": node.rejected, "barred": node.barred}
+        return Node(oriented, step, *copies, parent=node, p=node.p, stretch=node.stretch, **end)

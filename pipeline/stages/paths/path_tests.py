@@ -93,9 +93,7 @@ class PathTests:
         return found
 
     def _limit(self, looks: float) -> tuple[float, float]:
-        from scipy.special import ndtri
-
-        return float(-ndtri(self.alpha / (9.0 * looks * 2.0))), looks
+        return _size(self.alpha, looks), looks
 
     def _movement(self, steps: PathSteps, sums: _Sums, heading_rad: Floats, at: Ints, window_s: float) -> Floats:
         """Mean of the last window less that of the window before the last but one."""
@@ -185,6 +183,23 @@ class _Sums:
 
     def sigma2(self, begin: Ints, end: Ints) -> Floats:
         return self._mean(self.sigmas2, begin, end)
+
+
+def told_by_a_switch_m(survey_m: Floats, alpha: float, merged_m: float) -> Floats:
+    """How far apart tracks have to be for a movement from one to the other to be seen, with exact positions [m]."""
+    return np.asarray(_size(alpha, _LOOKED_S / WINDOWS_S[0]) * np.sqrt(2.0) * survey_m + 2.0 * merged_m)
+
+
+def told_by_offset_m(survey_m: Floats, alpha: float, bias_m: float) -> Floats:
+    """How far apart tracks have to be for a lasting offset to tell them apart, with exact positions [m]."""
+    return np.asarray(_size(alpha, _LASTING_LOOKS) * np.hypot(bias_m, survey_m))
+
+
+def _size(alpha: float, looks: float) -> float:
+    """Limit of a test in sigmas: the level is shared by nine tests, each with so many looks."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(alpha / (9.0 * looks * 2.0)))
 
 
 def _tail(z: float) -> float:

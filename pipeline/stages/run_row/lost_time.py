@@ -82,7 +82,7 @@ def _causes(epochs: pl.DataFrame, gap: Bools, t_ns: Ints, config: Configuration)
     return {
         LostTo.NO_POSITION: gap | ~met(epochs, usable()),
         LostTo.CONFIDENCE: ~met(epochs, confident(config)),
-        LostTo.TRACK_AMBIGUOUS: ~met(epochs, unambiguous(config)),
+        LostTo.TRACK_AMBIGUOUS: ~met(epochs, unambiguous()),
         LostTo.NOISE: noise,
         LostTo.SLIP: slip,
         LostTo.RELINK: relink | (negated & ~alarmed),

@@ -20,6 +20,9 @@ from schemas.arrays import Floats, Ints
 _ONE_POINT_M = 1.0
 _LEAST_M = 0.02
 _LONGEST_M = 2000.0
+# A chord with points on it, as of a line drawn by hand and cut evenly afterwards, is no longer than this [m]: a
+# straight between two switches is no chord of a curve.
+_LONGEST_CUT_M = 150.0
 
 
 @dataclass
@@ -152,11 +155,13 @@ def _sigmas_m(way_m: Floats, turn_rad: Floats) -> Floats:
         length_m = way_m[end] - way_m[begin]
         turn = np.sqrt(bend_rad[begin] * bend_rad[end]) - (inside_rad[end - 1] - inside_rad[begin])
         sigma_m = length_m * np.minimum(turn, np.pi) / 16.0
+        if points > 1:
+            sigma_m = np.where(length_m <= _LONGEST_CUT_M, sigma_m, 0.0)
         for row in np.flatnonzero(sigma_m > _LEAST_M).tolist():
             chord = slice(int(begin[row]), int(end[row]))
             out[chord] = np.maximum(out[chord], sigma_m[row])
         sharpest = np.sqrt(bend_rad[begin] * bend_rad.max())
-        longer = (end < last) & (sharpest > inside_rad[end] - inside_rad[begin]) & (length_m < _LONGEST_M)
+        longer = (end < last) & (sharpest > inside_rad[end] - inside_rad[begin]) & (length_m < _LONGEST_CUT_M)
         begin = begin[longer & (sharpest * _LONGEST_M / 8.0 > _LEAST_M)]
     return out
 

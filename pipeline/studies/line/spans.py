@@ -47,7 +47,7 @@ def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configurati
         (wrong & ~np.isfinite(floats(epochs, "error_low_m")), SpanState.WRONG_TRACK),
         (wrong, SpanState.WRONG),
         (~met(epochs, usable() & pl.col("confidence_m").is_not_null()), SpanState.OUTAGE),
-        (~met(epochs, unambiguous(config)), SpanState.AMBIGUOUS),
+        (~met(epochs, unambiguous()), SpanState.AMBIGUOUS),
         (~met(epochs, confident(config)), SpanState.CONFIDENCE),
         (starts, SpanState.ALARM),
         (~in_use, SpanState.AFTER_ALARM),

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.read.site.alike import most_claimed, parallel_findings
+from pipeline.read.site.alike import parallel_findings
 from schemas.config import MatchingConfig
 from tests.stages.matching.builders import line, matched, run, site
 from tests.stages.matching.ladder import ladder
@@ -19,16 +19,18 @@ def found(spacing_m: float, **options: float) -> list[str]:
     return [f"{one.place}: {one.message}" for one in parallel_findings(place, MatchingConfig())]
 
 
-def test_double_track_is_named_once_with_its_extent_and_what_a_run_can_claim() -> None:
+def test_double_track_is_named_once_with_its_extent_and_what_tells_it_apart() -> None:
     (text,) = found(4.0)
     assert text.startswith("element a: 0 to 2000 m: b lies 4.0 m beside it")
-    # 4.0² / (2 · 1.5²) = 3.556; 1 / (1 + e^-3.556) = 0.972.
-    assert "a probability of 0.97 at most" in text
+    assert "a switch taken tells them apart at a survey of 0.02 m" in text
+    # 4.19 · √2 · 1 m, and 0.2 m for paths that merge.
+    (text,) = found(4.0, sigma_m=1.0)
+    assert "nor does a switch taken at a survey of 1 m, which takes 6.1 m" in text
 
 
-@pytest.mark.parametrize(("spacing_m", "named"), [(3.4, True), (4.5, True), (4.6, False), (20.0, False)])
+@pytest.mark.parametrize(("spacing_m", "named"), [(3.4, True), (4.6, True), (4.75, False), (20.0, False)])
 def test_tracks_far_enough_apart_are_not(spacing_m: float, named: bool) -> None:
-    """1.5 · sqrt(2 ln 99) = 4.55 m."""
+    """3.11 · 1.5 m = 4.67 m."""
     assert bool(found(spacing_m)) == named
 
 
@@ -63,8 +65,9 @@ def test_how_long_tracks_have_to_be_beside_each_other_is_configuration() -> None
     assert parallel_findings(place, MatchingConfig(parallel_least_m=2100.0)) == []
 
 
-def test_no_run_right_on_its_track_claims_more_than_that() -> None:
+@pytest.mark.parametrize(("spacing_m", "claimed"), [(4.5, False), (6.5, True)])
+def test_a_run_right_on_its_track_claims_it_where_nothing_is_found(spacing_m: float, claimed: bool) -> None:
     x = np.arange(0.0, 2000.0, 10.0)
-    place = site({"a": line((0, 0), (2000, 0)), "b": line((0, 4), (2000, 4))})
+    place = site({"a": line((0, 0), (2000, 0)), "b": line((0, spacing_m), (2000, spacing_m))})
     claim = matched(run(x, 0.0 * x, sigma_m=0.02), place).epochs["path_probability"].max()
-    assert claim == pytest.approx(most_claimed(4.0, 0.02, MatchingConfig()), abs=0.03)
+    assert (claim == 0.99) == claimed

@@ -128,17 +128,17 @@ def test_the_found_route_can_be_taken_away(out: Path, site: Site, replayed: dict
     doubted = known.with_columns(
         path_probability=pl.when(pl.col("netelement_id") == "NE2").then(0.9).otherwise(pl.col("path_probability"))
     )
-    found = found_route(doubted, 0.99)
+    found = found_route(doubted)
     assert found is not None
     assert found.filter("doubtful")["netelement_id"].to_list() == ["NE2"]
     live = known.with_columns(
         gate_probability=pl.when(pl.col("netelement_id") == "NE3").then(0.9).otherwise(pl.col("gate_probability"))
     )
-    at_the_time = found_route(live, 0.99)
+    at_the_time = found_route(live)
     assert at_the_time is not None
     assert at_the_time.filter("doubtful")["netelement_id"].to_list() == ["NE3"]
     back = doubted.filter(pl.col("netelement_id") == "NE1").with_columns(path_m=pl.col("path_m") + 30_000.0)
-    assert found_route(pl.concat([doubted, back]), 0.99) is None
+    assert found_route(pl.concat([doubted, back])) is None
 
 
 def test_every_epoch_of_a_short_run_is_there(out: Path, replayed: dict[str, RunTables]) -> None:

@@ -45,7 +45,7 @@ def test_a_constant_offset_is_one_observation() -> None:
 def test_tracks_far_apart_are_told() -> None:
     x = 10.0 * np.arange(100.0)
     found = matched(run(x, np.full(100, 2.0)), site({"a": line((0, 0), (1000, 0)), "b": line((0, 20), (1000, 20))}))
-    assert found.epochs["path_probability"].min() > 0.999
+    assert found.epochs["path_probability"].min() >= 0.99
 
 
 def test_the_bias_shown_on_one_element_counts_on_the_next() -> None:

@@ -40,7 +40,7 @@ def on_disk(folder: Path, *names: str) -> tuple[Path, list[str]]:
 
 
 def test_the_route_says_what_is_in_doubt_and_with_what() -> None:
-    route = travelled_route(matched(run(X_M, np.full(len(X_M), 1.9)), DOUBLE, odometer(X_M)), 0.99)
+    route = travelled_route(matched(run(X_M, np.full(len(X_M), 1.9)), DOUBLE, odometer(X_M)))
     assert route.select("netelement_id", "direction", "doubtful").rows() == [("a", "AB", True), ("b", "AB", True)]
     assert all(rivals.startswith("c 0.4") for rivals in route["rivals"])
     assert route["t_end"][0] < route["t_start"][1]
@@ -52,7 +52,7 @@ def test_a_ring_of_one_element_is_a_passage_per_lap() -> None:
     place = site({"r": np.column_stack([300 * np.sin(angle), 300 * np.cos(angle)])}, [("r", 1, "r", 0, "both")])
     distance = np.concatenate([np.arange(100.0, 4712.0, 10.0), np.arange(4712.0, 4612.0, -10.0)])
     angle = -distance / 300.0
-    route = travelled_route(matched(run(299 * np.sin(angle), 299 * np.cos(angle)), place, odometer(distance)), 0.99)
+    route = travelled_route(matched(run(299 * np.sin(angle), 299 * np.cos(angle)), place, odometer(distance)))
     rows = route.select("netelement_id", "direction", "doubtful", pl.col("cross_bias_m").round(1)).rows()
     assert rows == [("r", "BA", False, 1.0)] * 3
     assert route["t_start"].is_sorted()
@@ -63,9 +63,9 @@ def test_the_route_is_doubtful_wherever_the_live_belief_was() -> None:
     distance = np.arange(300.0, 1500.0, 15.0)
     x, y = along(branch("d"), distance)
     found = matched(run(x, y), site(SWITCH, SWITCH_LINKS), odometer(distance))
-    route = travelled_route(found, 0.99)
+    route = travelled_route(found)
     assert route.select("netelement_id", "direction", "doubtful").rows() == [("s", "AB", False), ("d", "AB", True)]
-    assert route["path_probability"].min() > 0.99
+    assert route["path_probability"].min() >= 0.99
     assert route["gate_probability"].to_list() == [
         found.epochs.filter(netelement_id=name)["gate_probability"].min() for name in ("s", "d")
     ]
@@ -73,7 +73,7 @@ def test_the_route_is_doubtful_wherever_the_live_belief_was() -> None:
 
 def test_the_route_of_a_run_without_doubt_is_marked_nowhere() -> None:
     place = site({"a": line((0, 0), (1000, 0)), "b": line((1000, 0), (3000, 0))}, [("a", 1, "b", 0, "both")])
-    route = travelled_route(matched(run(X_M, np.full(len(X_M), 1.9)), place, odometer(X_M)), 0.99)
+    route = travelled_route(matched(run(X_M, np.full(len(X_M), 1.9)), place, odometer(X_M)))
     assert route["doubtful"].to_list() == [False, False]
 
 
@@ -121,7 +121,7 @@ def test_a_run_that_turned_back_over_a_switch_takes_its_own_route_again(tmp_path
     )
     first = matched(fixes, place, odometer(distance - distance[0]))
     file = tmp_path / "shunter.csv"
-    travelled_route(first, 0.99).write_csv(file)
+    travelled_route(first).write_csv(file)
     known = with_route(place, file, SiteConfig())
     assert isinstance(known, Site)
     again = matched(fixes, known, odometer(distance - distance[0]))

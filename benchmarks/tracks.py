@@ -1,0 +1,240 @@
+"""Are claims of a track right, whatever the network? `python -m benchmarks.tracks [--runs N] [--seed S] [--family F]`.
+
+Families of TRACKS: ladder yards, crossovers, one-sided turnouts, loops, throats, flyovers, junctions; surveys of 0.3 to
+2 m, exact, aside per track or per element; receivers of four Gauss-Markov processes (DIAG Table 1). The truth is known;
+nothing here uses the program's geometry. A claim is right or wrong where tracks are more than 1.5 m apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from benchmarks.calibration import degrees, fixes_at, noise, odometer_at
+from benchmarks.results import Figure
+from benchmarks.topologies import (
+    World,
+    apart_m,
+    bridge,
+    draw,
+    drive,
+    ladder,
+    measures,
+    one_sided,
+    passing_loop,
+    ring,
+    shuttle,
+    station,
+    yard,
+)
+from pipeline.stages.matching import match
+from pipeline.stages.odometry import odometry_of
+from schemas.arrays import floats
+from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
+from schemas.conform import conform
+from schemas.inputs import Links, Track
+from schemas.run import Site
+
+SURE = 0.99
+# Of claims so long at most one in a hundred may be wrong [s]; tracks nearer than this are one [m].
+CLAIM_S, ONE_TRACK_M = 5.0, 1.5
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one run: seconds claimed and claimed wrongly, live and in hindsight; share of seconds claimed; seconds."""
+
+    live_s: float
+    live_wrong_s: float
+    later_s: float
+    later_wrong_s: float
+    total_s: float
+
+
+def ladder_yard(rng: np.random.Generator) -> World:
+    """Tracks 4.5 m apart between ladders of straight pieces; the train takes one of them."""
+    world = World()
+    count, apart = int(rng.integers(3, 7)), rng.uniform(4.2, 5.0)
+    piece = rng.uniform(40.0, 80.0)
+    world.elements["in"] = straight((-900.0, 0.0), (0.0, 0.0))
+    at = [(k * piece, k * apart) for k in range(count)]
+    length = 2.0 * count * piece + rng.uniform(400.0, 1200.0)
+    back = [(length - k * piece, k * apart) for k in range(count)]
+    world.elements["out"] = straight(back[0], (length + 900.0, 0.0))
+    for k in range(count):
+        world.elements[f"t{k}"] = straight(at[k], back[k])
+        if k + 1 < count:
+            world.elements[f"p{k}"] = straight(at[k], at[k + 1])
+            world.elements[f"q{k}"] = straight(back[k + 1], back[k])
+    for k in range(count):
+        before, after = ("in", "out") if k == 0 else (f"p{k - 1}", f"q{k - 1}")
+        world.link(before, 1, f"t{k}", 0)
+        world.link(f"t{k}", 1, after, 0)
+        if k + 1 < count:
+            world.link(before, 1, f"p{k}", 0)
+            world.link(f"q{k}", 1, after, 0)
+    # The last track goes on from the last piece of the ladder.
+    own = int(rng.integers(count))
+    world.through("in", *(f"p{k}" for k in range(own)), f"t{own}", *(f"q{k}" for k in reversed(range(own))), "out")
+    return world
+
+
+def crossovers(rng: np.random.Generator) -> World:
+    """Two tracks, crossovers between them; the train takes none, or one of them."""
+    world, apart = World(), rng.uniform(3.8, 5.0)
+    starts = np.sort(rng.uniform(600.0, 3400.0, int(rng.integers(1, 4))))
+    starts = starts[np.diff(starts, prepend=-1e9) > 250.0]
+    reach = apart * rng.uniform(10.0, 20.0)
+    facing = rng.random(starts.size) < 0.5
+    for track, y in (("a", 0.0), ("b", apart)):
+        leads = [x if (track == "a") == bool(up) else x + reach for x, up in zip(starts, facing, strict=True)]
+        ends = [0.0, *leads, 4200.0]
+        for k in range(len(ends) - 1):
+            world.elements[f"{track}{k}"] = straight((ends[k], y), (ends[k + 1], y))
+            if k:
+                world.link(f"{track}{k - 1}", 1, f"{track}{k}", 0)
+    for k, (x, up) in enumerate(zip(starts, facing, strict=True)):
+        one, other, y0, y1 = ("a", "b", 0.0, apart) if up else ("b", "a", apart, 0.0)
+        world.elements[f"x{k}"] = straight((x, y0), (x + reach, y1))
+        world.link(f"{one}{k}", 1, f"x{k}", 0)
+        world.link(f"x{k}", 1, f"{other}{k + 1}", 0)
+    own = str(rng.choice(["a", "b"]))
+    names = [f"{own}0"]
+    taken = rng.random() < 0.4
+    for k, up in enumerate(facing):
+        if taken and (own == "a") == bool(up):
+            own, taken = "b" if own == "a" else "a", False
+            names.append(f"x{k}")
+        names.append(f"{own}{k + 1}")
+    world.through(*names)
+    return world
+
+
+def junction(rng: np.random.Generator) -> World:
+    """A line that parts at 1:10 to 1:40, its branch beside it or away."""
+    world = World()
+    world.elements["s"] = draw((-1200, 0, 0, 0), (1200.0, 0.0))
+    world.elements["m"] = draw((0, 0, 0, 0), (1800.0, 0.0))
+    angle, apart = 1.0 / rng.uniform(10.0, 40.0), rng.uniform(4.2, 6.0)
+    bend = 120.0
+    if rng.random() < 0.5:
+        out = max(apart / np.sin(angle) - bend, 5.0)
+        points = draw((0, 0, 0, 0), (bend, angle), (out, 0.0), (bend, -angle), (1700.0 - 2 * bend - out, 0.0))
+    else:
+        points = draw((0, 0, 0, 0), (bend, angle), (1500.0, 0.0))
+    world.elements["d"] = points
+    world.link("s", 1, "m", 0)
+    world.link("s", 1, "d", 0)
+    world.through("s", str(rng.choice(["m", "d"])))
+    return world
+
+
+def straight(begin: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
+    count = max(2, round(float(np.hypot(end[0] - begin[0], end[1] - begin[1])) / 10.0) + 1)
+    return np.column_stack([np.linspace(begin, end, count), np.zeros(count)])
+
+
+FAMILIES: dict[str, Callable[[np.random.Generator], World]] = {
+    "ladder yard": ladder_yard,
+    "crossovers": crossovers,
+    "one-sided turnouts": one_sided,
+    "ladder beside a track": ladder,
+    "passing loop": passing_loop,
+    "throat": station,
+    "flyover": bridge,
+    "junction": junction,
+    "ring": ring,
+    "shuttle": shuttle,
+    "zig-zag": yard,
+}
+
+
+def site_of(world: World, survey_m: float, law: str, rng: np.random.Generator) -> Site:
+    """The survey: exact, all aside by one error, or each element by its own across it."""
+    frames = []
+    common = rng.normal() * survey_m
+    for name, points in world.elements.items():
+        aside_m = {"exact": 0.0, "track": common, "element": rng.normal() * survey_m}[law]
+        heading = np.arctan2(*np.gradient(points[:, :2], axis=0).T[::-1])
+        x, y = points[:, 0] - aside_m * np.sin(heading), points[:, 1] + aside_m * np.cos(heading)
+        latitude, longitude = degrees(x, y)
+        columns = {"measure_m": measures(points), "latitude_deg": latitude, "longitude_deg": longitude}
+        frames.append(
+            pl.DataFrame({"netelement_id": [name] * len(points), **columns, "height_m": points[:, 2] + 300.0})
+        )
+    relations = pl.DataFrame(world.links, schema=list(Links.columns()), orient="row")
+    frame = pl.concat(frames).with_columns(sigma_m=pl.lit(survey_m))
+    return Site(conform(frame, Track), conform(relations, Links))
+
+
+def outcome(family: str, seed: int) -> Outcome:
+    """One world by chance, and what is claimed on a ride."""
+    rng = np.random.default_rng([seed, list(FAMILIES).index(family)])
+    world = FAMILIES[family](rng)
+    survey_m = float(rng.choice([0.3, 0.5, 1.0, 2.0]))
+    law = str(rng.choice(["exact", "track", "element"]))
+    sigma_m, rate_hz = float(rng.choice([0.3, 1.0, 2.5])), float(rng.choice([1.0, 1.0, 1.0, 10.0]))
+    truth = drive(world, rng, rate_hz)
+    count = len(truth.t_s)
+    error = np.column_stack([noise(rng, count, 1.0 / rate_hz, sigma_m) for _ in range(3)])
+    place = truth.place + error * [1.0, 1.0, 1.5]
+    heading = np.arctan2(*np.gradient(truth.place[:, :2], axis=0).T[::-1])
+    bias_m = 1.5 * rng.normal()
+    place[:, 0] -= bias_m * np.sin(heading)
+    place[:, 1] += bias_m * np.cos(heading)
+    fixes = fixes_at(place[:, 0], place[:, 1], truth.t_s, sigma_m)
+    fixes = fixes.with_columns(height_m=pl.Series(place[:, 2] + 300.0 + rng.normal()))
+    vehicle = Vehicle.model_validate({"odometer_origin": str(rng.choice(["wheel", "unknown"]))})
+    way = odometer_at(truth.t_s, truth.way_m * (1.0 + 0.003 * rng.normal()))
+    odometry = odometry_of(way, vehicle, Configuration())
+    epochs = match(fixes, odometry, site_of(world, survey_m, law, rng), vehicle, MatchingConfig(), FixSigma()).epochs
+    names = epochs["netelement_id"].fill_null("").to_numpy()
+    wrong = (names != truth.element) & (names != "")
+    live = np.nan_to_num(floats(epochs, "gate_probability")) >= SURE
+    later = np.nan_to_num(floats(epochs, "path_probability")) >= SURE
+    for row in np.flatnonzero(wrong & (live | later)).tolist():
+        wrong[row] = apart_m(world, names[row], truth.place[row]) > ONE_TRACK_M
+    seconds = (np.count_nonzero(one) / rate_hz for one in (live, live & wrong, later, later & wrong))
+    return Outcome(*seconds, count / rate_hz)
+
+
+def figures(runs: int, seed: int, families: list[str]) -> list[Figure]:
+    """Per family: runs with claims and wrong ones of 5 s or more, at most one in a hundred; share of time claimed."""
+    out = []
+    for name in families:
+        found = [outcome(name, seed * 100_000 + number) for number in range(runs)]
+        for title, claimed, wrong in (("live", "live_s", "live_wrong_s"), ("hindsight", "later_s", "later_wrong_s")):
+            claims = sum(getattr(one, claimed) >= CLAIM_S for one in found)
+            wrongs = sum(getattr(one, wrong) >= CLAIM_S for one in found)
+            short = sum(0.0 < getattr(one, wrong) < CLAIM_S for one in found)
+            share = sum(getattr(one, claimed) for one in found) / sum(one.total_s for one in found)
+            out += [
+                Figure(f"{name}, {title}: wrong of {claims} claims", float(wrongs), "", 0.01 * claims),
+                Figure(f"{name}, {title}: wrong for less than 5 s", float(short), ""),
+                Figure(f"{name}, {title}: share of time claimed", share, ""),
+            ]
+    return out
+
+
+def measure(out: Path) -> list[Figure]:
+    """All figures over 300 runs of each; nothing is written."""
+    return figures(300, 1, list(FAMILIES))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--family", choices=FAMILIES, action="append", help="these families only")
+    options = parser.parse_args()
+    for figure in figures(options.runs, options.seed, options.family or list(FAMILIES)):
+        print(f"{figure.name:<60} {figure.value:8.3f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
