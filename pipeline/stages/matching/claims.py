@@ -148,7 +148,8 @@ def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:
 def _left(found: PathSet, spans: list[Span]) -> _Left:
     """What the sets come to, the likeliest path first."""
     count = len(found.steps)
-    beyond_m = branches_beyond_m(found.network)
+    ends = {2 * node.element + side for node, *_ in spans for side in (0, 1)}
+    beyond_m = branches_beyond_m(found.network, ends)
     line = np.full((count, 2), -1)
     element = np.full((count, 2), -1)
     p = np.zeros((count, 2))
@@ -162,7 +163,8 @@ def _left(found: PathSet, spans: list[Span]) -> _Left:
             free = rows[line[rows, place] < 0]
             line[free, place], element[free, place], p[free, place] = own, node.element, min(node.p, 1.0)
             rows = rows[line[rows, place] != own]
-        ends_m = node.left_m[: end - begin] + beyond_m[[2 * node.element + 1, 2 * node.element]]
+        beyond = [beyond_m[2 * node.element + 1], beyond_m[2 * node.element]]
+        ends_m = node.left_m[: end - begin] + beyond
         part = slice(begin, begin + len(ends_m))
         branch_m[part] = np.minimum(branch_m[part], ends_m.min(axis=1))
     group = np.where(line[:, 1] < 0, line[:, 0], -2)
@@ -197,24 +199,24 @@ def _alone(found: PathSet) -> Floats:
     return (np.bincount(pairs[:, 0], minlength=len(found.steps)) == 1).astype(np.float64)
 
 
-def branches_beyond_m(network: Network) -> Floats:
+def branches_beyond_m(network: Network, wanted: set[int]) -> dict[int, float]:
     """Per oriented element the way beyond its exit to the next branch of tracks [m], infinite to an open end."""
-    beyond = np.full(2 * network.count, np.nan)
-    for start in range(2 * network.count):
+    beyond: dict[int, float] = {}
+    for start in sorted(wanted):
         chain: list[int] = []
+        on_chain: set[int] = set()
         oriented = start
-        while np.isnan(beyond[oriented]) and oriented not in chain:
-            chain.append(oriented)
+        while oriented not in beyond and oriented not in on_chain:
             onward = network.successors[oriented]
             if len(onward) != 1 or len(network.successors[onward[0].to ^ 1]) != 1:
-                beyond[oriented] = 0.0 if len(onward) else np.inf
+                beyond[oriented] = 0.0 if onward else np.inf
                 break
+            chain.append(oriented)
+            on_chain.add(oriented)
             oriented = onward[0].to
-        if np.isnan(beyond[oriented]):
-            beyond[oriented] = np.inf  # a ring without a branch
-        for at, ahead in zip(chain[-2::-1], chain[:0:-1], strict=True):
-            if np.isnan(beyond[at]):
-                beyond[at] = network.length_m(ahead) + beyond[ahead]
-        if chain and np.isnan(beyond[chain[-1]]):
-            beyond[chain[-1]] = network.length_m(oriented) + beyond[oriented]
+        # A ring without a branch has none.
+        ahead_m = beyond.get(oriented, np.inf)
+        for at in reversed(chain):
+            ahead_m += network.length_m(network.successors[at][0].to)
+            beyond[at] = ahead_m
     return beyond

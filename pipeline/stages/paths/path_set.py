@@ -92,7 +92,7 @@ class PathSet:
         ]
 
     def survivors(self) -> list[Node]:
-        """Those that live to the last step; of a stretch that ends off the network, those refuted in its last minute."""
+        """Those that live to the last step; of one that ends off the network, those refuted in its last minute."""
         count = len(self.steps)
         found: list[Node] = []
         for stretch in {node.stretch for node in self.nodes}:
@@ -148,19 +148,16 @@ def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, co
 
 def unbranched_groups(network: Network) -> Ints:
     """Per net element the number of the line without a branch that it belongs to, however it is cut."""
-    group = np.arange(network.count)
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
 
-    def root(element: int) -> int:
-        while group[element] != element:
-            element = int(group[element])
-        return element
-
-    for oriented in range(2 * network.count):
-        onward = network.successors[oriented]
-        if len(onward) == 1 and len(network.successors[onward[0].to ^ 1]) == 1:
-            first, second = sorted((root(oriented // 2), root(onward[0].to // 2)))
-            group[second] = first
-    return np.array([root(element) for element in range(network.count)])
+    ways = network.successors
+    alone = np.diff(ways.first) == 1
+    joined = alone[ways.here] & alone[ways.to ^ 1]
+    pairs = (ways.here[joined] // 2, ways.to[joined] // 2)
+    size = (network.count, network.count)
+    _, group = connected_components(coo_array((np.ones(len(pairs[0])), pairs), shape=size), directed=False)
+    return np.asarray(group, dtype=np.int64)
 
 
 @dataclass
