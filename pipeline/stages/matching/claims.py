@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.stages.paths.path_set import Node, PathSet, unbranched_groups
+from pipeline.stages.paths.path_set import PathSet, Span, unbranched_groups
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import MatchingConfig
@@ -61,11 +61,21 @@ class Claims:
 
 @dataclass(frozen=True)
 class _Left:
-    """Per step what is left of a set: line (-1: none, -2: several), largest p of each line, way to a branch."""
+    """Per step what is left of a set: line (-1: none, -2: several), the two likeliest lines, way to a branch [m].
+
+    `line`, `element`, `p`: of the two lines with the largest p-values, shapes (n, 2), -1 and 0 without one.
+    """
 
     group: Ints
-    rivals: list[dict[int, float]]
+    line: Ints
+    element: Ints
+    p: Floats
     branch_m: Floats
+
+    def rival(self, step: Ints, group: Ints) -> tuple[Ints, Floats]:
+        """The likeliest element off the line of each epoch, -1 for none, and its p-value."""
+        other = np.where(self.line[step, 0] != group, 0, 1)
+        return self.element[step, other], self.p[step, other]
 
 
 def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: MatchingConfig) -> Claims:
@@ -87,32 +97,18 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
     carried_m = 1.2 * speed_mps[np.maximum(before, 0)] * since_s + config.paths_border_sigmas * np.nan_to_num(sigma_m)
     group = np.where(element >= 0, found.groups[np.maximum(element, 0)], -1)
     alone = _alone(found)
-    living = list(found.living(config.paths_delay_s))
-    live = _left(found, living)
-    gate = _confidence(live, np.maximum(before, 0), group, carried_m, alone)
+    live = _left(found, found.living(config.paths_delay_s))
+    at = np.maximum(before, 0)
+    gate = _confidence(live, at, group, carried_m, alone)
     gate[(before < 0) | (before >= found.overflow)] = 0.0
-    to_the_end = list(found.to_the_end())
-    later = _hindsight(_left(found, to_the_end), about, group, alone)
-    rival = _rivals(found, living, to_the_end, group, np.maximum(before, 0), about)
+    spans = found.to_the_end()
+    left = _left(found, spans)
+    later = _hindsight(left, about, group, alone)
+    now, p_now = live.rival(at, group)
+    then, p_then = left.rival(about, group)
+    rival = np.where((now >= 0) & (p_now >= p_then), now, then)
     epoch = np.minimum(np.searchsorted(t_s, steps.begin_s), t_s.size - 1)
-    return Claims(gate, later, rival, _possible(found, to_the_end, epoch))
-
-
-def best_elements(found: PathSet) -> Ints:
-    """Per step the net element of the path with the least squared residuals among those that live to the end.
-
-    -1 where no path lives so long: then the positions refute every path of the survey.
-    """
-    count = len(found.steps)
-    elements = np.full(count, -1, dtype=np.int64)
-    last = [node for node in found.nodes if node.rejected >= count and node.end >= count]
-    if not last:
-        return elements
-    at: Node | None = min(last, key=lambda node: (float(np.nansum(node.residual_m**2)), node.oriented))
-    while at is not None:
-        elements[at.begin : at.end] = np.where(elements[at.begin : at.end] < 0, at.element, elements[at.begin : at.end])
-        at = at.parent
-    return elements
+    return Claims(gate, later, rival, _possible(found, spans, epoch))
 
 
 def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, network: Network) -> pl.DataFrame:
@@ -138,60 +134,53 @@ def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, 
     return pl.DataFrame(rows, schema=AMBIGUOUS_COLUMNS, orient="row")
 
 
-def _rivals(
-    found: PathSet, living: list[list[Node]], to_the_end: list[list[Node]], group: Ints, before: Ints, about: Ints
-) -> Ints:
-    """Per epoch the element off its line with the largest p, of what is left live or in hindsight; -1 for none."""
-    rival = np.full(group.size, -1, dtype=np.int64)
-    for row, (line, live, later) in enumerate(zip(group.tolist(), before.tolist(), about.tolist(), strict=True)):
-        nodes = [node for node in (*living[live], *to_the_end[later]) if found.groups[node.element] != line]
-        if nodes:
-            rival[row] = max(nodes, key=lambda node: node.p).element
-    return rival
+def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:
+    count = len(found.steps)
+    elements = found.network.count
+    keys = [np.arange(begin, end) * elements + node.element for node, begin, end in spans]
+    step, element = np.divmod(np.unique(np.concatenate([*keys, np.zeros(0, dtype=np.int64)])), elements)
+    lines = np.unique(step * elements + found.groups[element]) // elements
+    number = np.bincount(lines, minlength=count)[step]
+    confidence = np.where(number == 1, ONE_TRACK_LEFT, MOST_IN_DOUBT / np.maximum(number, 1))
+    return Possible(epoch, np.searchsorted(step, np.arange(count + 1)), element, confidence)
 
 
-def _possible(found: PathSet, sets: list[list[Node]], epoch: Ints) -> Possible:
-    elements: list[int] = []
-    confidences: list[float] = []
-    first = [0]
-    for nodes in sets:
-        lines = {int(found.groups[node.element]) for node in nodes}
-        for element in sorted({node.element for node in nodes}):
-            elements.append(element)
-            confidences.append(ONE_TRACK_LEFT if len(lines) == 1 else MOST_IN_DOUBT / len(lines))
-        first.append(len(elements))
-    return Possible(epoch, np.array(first), np.array(elements, dtype=np.int64), np.array(confidences))
-
-
-def _left(found: PathSet, sets: list[list[Node]]) -> _Left:
-    """What the sets come to, step by step."""
-    beyond_m = branches_beyond_m(found.network)
-    group = np.full(len(sets), -1, dtype=np.int64)
-    branch_m = np.full(len(sets), np.inf)
-    rivals: list[dict[int, float]] = []
-    for step, nodes in enumerate(sets):
-        here: dict[int, float] = {}
-        for node in nodes:
-            line = int(found.groups[node.element])
-            here[line] = max(here.get(line, 0.0), min(node.p, 1.0))
-            row = step - node.begin
-            if 0 <= row < len(node.left_m):
-                ends_m = node.left_m[row] + beyond_m[[2 * node.element + 1, 2 * node.element]]
-                branch_m[step] = min(branch_m[step], float(ends_m.min()))
-        rivals.append(here)
-        group[step] = -1 if not here else next(iter(here)) if len(here) == 1 else -2
-    return _Left(group, rivals, branch_m)
+def _left(found: PathSet, spans: list[Span]) -> _Left:
+    """What the sets come to, the likeliest path first."""
+    count = len(found.steps)
+    ends = {2 * node.element + side for node, *_ in spans for side in (0, 1)}
+    beyond_m = branches_beyond_m(found.network, ends)
+    line = np.full((count, 2), -1)
+    element = np.full((count, 2), -1)
+    p = np.zeros((count, 2))
+    branch_m = np.full(count, np.inf)
+    for node, begin, end in sorted(spans, key=lambda span: -span.node.p):
+        if end <= begin:
+            continue
+        own = int(found.groups[node.element])
+        rows = np.arange(begin, end)
+        for place in (0, 1):
+            free = rows[line[rows, place] < 0]
+            line[free, place], element[free, place], p[free, place] = own, node.element, min(node.p, 1.0)
+            rows = rows[line[rows, place] != own]
+        beyond = [beyond_m[2 * node.element + 1], beyond_m[2 * node.element]]
+        ends_m = node.left_m[: end - begin] + beyond
+        part = slice(begin, begin + len(ends_m))
+        branch_m[part] = np.minimum(branch_m[part], ends_m.min(axis=1))
+    group = np.where(line[:, 1] < 0, line[:, 0], -2)
+    return _Left(group, line, element, p, branch_m)
 
 
 def _confidence(left: _Left, step: Ints, group: Ints, carried_m: Floats, alone: Floats) -> Floats:
-    """Of each epoch in its line, with the step that speaks for it."""
+    """Of each epoch in its line, with the step that speaks for it; NaN off the network.
+
+    Near a branch the rivals are those behind it: nothing is known of them yet.
+    """
     one = (left.group[step] == group) & (group >= 0) & (carried_m < left.branch_m[step])
-    confidence = np.where(one, np.where(alone[step] > 0, ALONE, ONE_TRACK_LEFT), np.nan)
-    for row in np.flatnonzero(~one & (left.group[step] != -1)).tolist():
-        others = [p for line, p in left.rivals[int(step[row])].items() if line != group[row]]
-        # Near a branch the rivals are those behind it: nothing is known of them yet.
-        confidence[row] = min(MOST_IN_DOUBT, 1.0 - max(others, default=0.5))
-    return confidence
+    rival, p = left.rival(step, group)
+    doubted = np.minimum(MOST_IN_DOUBT, 1.0 - np.where(rival >= 0, p, 0.5))
+    claimed = np.where(alone[step] > 0, ALONE, ONE_TRACK_LEFT)
+    return np.where(one, claimed, np.where(left.group[step] == -1, np.nan, doubted))
 
 
 def _hindsight(left: _Left, step: Ints, group: Ints, alone: Floats) -> Floats:
@@ -210,24 +199,24 @@ def _alone(found: PathSet) -> Floats:
     return (np.bincount(pairs[:, 0], minlength=len(found.steps)) == 1).astype(np.float64)
 
 
-def branches_beyond_m(network: Network) -> Floats:
+def branches_beyond_m(network: Network, wanted: set[int]) -> dict[int, float]:
     """Per oriented element the way beyond its exit to the next branch of tracks [m], infinite to an open end."""
-    beyond = np.full(2 * network.count, np.nan)
-    for start in range(2 * network.count):
+    beyond: dict[int, float] = {}
+    for start in sorted(wanted):
         chain: list[int] = []
+        on_chain: set[int] = set()
         oriented = start
-        while np.isnan(beyond[oriented]) and oriented not in chain:
-            chain.append(oriented)
+        while oriented not in beyond and oriented not in on_chain:
             onward = network.successors[oriented]
             if len(onward) != 1 or len(network.successors[onward[0].to ^ 1]) != 1:
-                beyond[oriented] = 0.0 if len(onward) else np.inf
+                beyond[oriented] = 0.0 if onward else np.inf
                 break
+            chain.append(oriented)
+            on_chain.add(oriented)
             oriented = onward[0].to
-        if np.isnan(beyond[oriented]):
-            beyond[oriented] = np.inf  # a ring without a branch
-        for at, ahead in zip(chain[-2::-1], chain[:0:-1], strict=True):
-            if np.isnan(beyond[at]):
-                beyond[at] = network.length_m(ahead) + beyond[ahead]
-        if chain and np.isnan(beyond[chain[-1]]):
-            beyond[chain[-1]] = network.length_m(oriented) + beyond[oriented]
+        # A ring without a branch has none.
+        ahead_m = beyond.get(oriented, np.inf)
+        for at in reversed(chain):
+            ahead_m += network.length_m(network.successors[at][0].to)
+            beyond[at] = ahead_m
     return beyond

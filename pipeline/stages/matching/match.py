@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.stages.matching.claims import Possible, best_elements, claims, doubtful_stretches
+from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches
 from pipeline.stages.matching.epochs import Assignment, epoch_frame
 from pipeline.stages.matching.fixes import Fixes, digit_noise, fixes_of
 from pipeline.stages.matching.path_search import find_path
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import polarity
-from pipeline.stages.paths.path_set import PathSet, path_set
+from pipeline.stages.paths.path_set import path_set
 from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.track.network import network_in_pieces
 from pipeline.stages.track.path import TravelledPath
@@ -69,7 +69,7 @@ def match(
         pinned=_pins_of_positions(pinned, rows),
     )
     found = path_set(steps, network, config.cross_bias_sigma_m, config.paths_alpha, config)
-    path, assignment = find_path(arrays, odometry, network, shown_elements(arrays, found, pinned), config)
+    path, assignment = find_path(arrays, odometry, network, pinned, found, config)
     element = elements_of(arrays, path, assignment)
     claimed = claims(found, arrays.t_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
     assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
@@ -83,18 +83,6 @@ def match(
         epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)
     epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg"), config.digits_least_m))
     return Match(epochs, path, ambiguous, claimed.possible, sign)
-
-
-def shown_elements(fixes: Fixes, found: PathSet, pinned: Ints) -> Ints:
-    """Per epoch the element that the path shown has to be on: of the best path of the set, and of reads; else -1."""
-    best = best_elements(found)
-    if not best.size:
-        return pinned
-    step = np.clip(np.searchsorted(found.steps.end_s, fixes.t_s, side="left"), 0, best.size - 1)
-    near = [best[np.clip(step + beside, 0, best.size - 1)] for beside in (-1, 0, 1)]
-    # Where it goes over from one element to the next, positions say when.
-    inside = (near[0] == near[1]) & (near[1] == near[2])
-    return np.where(pinned >= 0, pinned, np.where(inside & fixes.valid, near[1], -1))
 
 
 def elements_of(fixes: Fixes, path: TravelledPath, assignment: Assignment) -> Ints:

@@ -14,6 +14,7 @@ from pipeline.stages.matching.trellis import Trellis, trellis_of
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import grows_with
 from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, merged, overtaken, search_about
+from pipeline.stages.paths.path_set import PathSet
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import TravelledPath
@@ -31,15 +32,16 @@ def find_path(
     odometry: Odometry | None,
     network: Network,
     pinned: Ints,
+    found: PathSet,
     config: MatchingConfig,
 ) -> tuple[TravelledPath, Assignment]:
-    """The path shown, and each epoch's leg on it.
+    """The path shown, the likeliest of those of the set, and each epoch's leg on it.
 
-    `pinned` holds per epoch the element that it has to be on, -1 for any.
+    `pinned` holds per epoch the element of a balise read then, -1 without one.
     """
     way = travelled(fixes, odometry)
     believed = believable(fixes, fixes.valid, way, config)
-    trellis = _trellis(fixes, believed, way, network, pinned, config)
+    trellis = _trellis(fixes, believed, way, network, pinned, found, config)
     beliefs = search(trellis)
     decoded = aligned(trellis, decode(trellis, beliefs.best))
     legs = legs_of(trellis, decoded)
@@ -52,7 +54,13 @@ def find_path(
 
 
 def _trellis(
-    fixes: Fixes, believed: Ints, way: Travelled, network: Network, pinned: Ints, config: MatchingConfig
+    fixes: Fixes,
+    believed: Ints,
+    way: Travelled,
+    network: Network,
+    pinned: Ints,
+    found: PathSet,
+    config: MatchingConfig,
 ) -> Trellis:
     """Steps among the believed epochs with their candidates; steps without any are left out.
 
@@ -77,7 +85,7 @@ def _trellis(
     candidates = with_tracks_aside(candidates, fixes, believed, steps, network, where, config)
     survey_sigma_m = network.survey_sigmas_m(config.survey_sigma_default_m, candidates.vertex)
     like = likelihood_of(fixes, steps, candidates, survey_sigma_m, config)
-    like = like.with_pins(_pins(steps, pinned, candidates))
+    like = like.with_pins(_pins(steps, pinned, candidates) | _refuted(fixes, steps, candidates, found))
     return trellis_of(network, steps, candidates, survey_sigma_m, like, config)
 
 
@@ -103,6 +111,21 @@ def _pins(steps: Steps, pinned: Ints, candidates: Candidates) -> Bools:
     proved_at[np.minimum(index, len(steps) - 1)] = pinned[pinned >= 0]
     proved = proved_at[candidates.step]
     return np.asarray((proved >= 0) & (candidates.element != proved))
+
+
+def _refuted(fixes: Fixes, steps: Steps, candidates: Candidates, found: PathSet) -> Bools:
+    """Candidates on an element that the whole run refutes; none where every path is refuted."""
+    count = len(found.steps)
+    elements = found.network.count
+    spans = [(node.element, max(begin - 1, 0), min(end + 1, count)) for node, begin, end in found.to_the_end()]
+    keys = [np.arange(begin, end) * elements + element for element, begin, end in spans]
+    possible = np.unique(np.concatenate([*keys, np.zeros(0, dtype=np.int64)]))
+    known = np.zeros(count, dtype=np.bool_)
+    for _, begin, end in found.to_the_end():
+        known[begin:end] = True
+    at = np.minimum(np.searchsorted(found.steps.end_s, fixes.t_s[steps.epoch], side="left"), count - 1)
+    step = at[candidates.step]
+    return np.asarray(known[step] & ~np.isin(step * elements + candidates.element, possible))
 
 
 def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats) -> Assignment:

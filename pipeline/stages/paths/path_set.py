@@ -7,9 +7,9 @@ overbound, the true path is rejected in at most alpha per 600 s, in any network,
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -28,6 +28,8 @@ _DETOUR_M = 50.0
 _OPEN_M = 10.0
 # Before a position is on the element that it goes over to, it may lie so far before its end [m].
 _LATE_M = 10.0
+# Where a stretch ends off the network, paths refuted in its last seconds are equal [s].
+_LAST_S = 60.0
 # A longer step is a gap: the train may have taken any way meanwhile [s].
 _GAP_S = 3.5
 
@@ -59,6 +61,14 @@ class Node:
         return self.oriented // 2
 
 
+class Span(NamedTuple):
+    """A hypothesis at the steps from `begin` on, before `end`."""
+
+    node: Node
+    begin: int
+    end: int
+
+
 @dataclass(frozen=True)
 class PathSet:
     """All hypotheses of a run with what became of each; `groups`: lines without a branch, per net element.
@@ -73,55 +83,47 @@ class PathSet:
     candidates: Candidates
     overflow: int
 
-    def living(self, delay_s: float) -> Iterator[list[Node]]:
-        """Per step the hypotheses that nothing up to `delay_s` before its end refuted."""
+    def living(self, delay_s: float) -> list[Span]:
+        """The hypotheses, each over the steps at which nothing up to `delay_s` before their end had refuted it."""
         known = np.searchsorted(self.steps.end_s, self.steps.end_s - delay_s, side="right") - 1
-        begins: list[list[Node]] = [[] for _ in range(len(self.steps))]
-        for node in self.nodes:
-            begins[node.begin].append(node)
-        here: list[Node] = []
-        for step, new in enumerate(begins):
-            here = [node for node in here if node.end > step] + [node for node in new if node.end > step]
-            yield [node for node in here if node.rejected > known[step] and node.barred > step]
+        return [
+            Span(node, node.begin, min(node.end, node.barred, int(np.searchsorted(known, node.rejected))))
+            for node in self.nodes
+        ]
 
     def survivors(self) -> list[Node]:
-        """Those that live to the last step; of a stretch that ends off the network, those that were refuted last."""
+        """Those that live to the last step; of one that ends off the network, those refuted in its last minute."""
         count = len(self.steps)
         found: list[Node] = []
         for stretch in {node.stretch for node in self.nodes}:
             nodes = [node for node in self.nodes if node.stretch == stretch]
             alive = [node for node in nodes if node.rejected >= count and node.end >= count]
-            latest = max(node.rejected for node in nodes)
-            found += alive or [node for node in nodes if node.rejected == latest]
+            refuted = [node for node in nodes if node.rejected < count]
+            if not alive and refuted:
+                latest_s = self.steps.end_s[max(node.rejected for node in refuted)]
+                alive = [node for node in refuted if self.steps.end_s[node.rejected] >= latest_s - _LAST_S]
+            found += alive
         return found
 
-    def to_the_end(self) -> Iterator[list[Node]]:
-        """Per step the hypotheses that live to the end of their stretch, or through one that does."""
-        lives: set[int] = set()
-        begins: list[list[Node]] = [[] for _ in range(len(self.steps))]
+    def to_the_end(self) -> list[Span]:
+        """The hypotheses that live to the end of their stretch, or through one that does."""
+        lives: dict[int, Node] = {}
         for node in self.survivors():
             at: Node | None = node
             while at is not None and id(at) not in lives:
-                lives.add(id(at))
-                begins[at.begin].append(at)
+                lives[id(at)] = at
                 at = at.parent
-        here: list[Node] = []
-        for step, new in enumerate(begins):
-            here = [node for node in (*here, *new) if min(node.end, node.rejected) > step]
-            yield here
+        return [Span(node, node.begin, min(node.end, node.rejected)) for node in lives.values()]
 
     def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
         """Per step the net elements that no rejection rules out, each with the largest p-value of a path over it.
 
         In hindsight, or by what was known `delay_s` before the end of each step. Empty: off the network.
         """
-        sets = self.to_the_end() if delay_s is None else self.living(delay_s)
-        found: list[dict[int, float]] = []
-        for nodes in sets:
-            best: dict[int, float] = {}
-            for node in nodes:
+        found: list[dict[int, float]] = [{} for _ in range(len(self.steps))]
+        for node, begin, end in self.to_the_end() if delay_s is None else self.living(delay_s):
+            for best in found[begin:end]:
                 best[node.element] = max(best.get(node.element, 0.0), min(node.p, 1.0))
-            found.append(best)
         return found
 
 
@@ -146,19 +148,16 @@ def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, co
 
 def unbranched_groups(network: Network) -> Ints:
     """Per net element the number of the line without a branch that it belongs to, however it is cut."""
-    group = np.arange(network.count)
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
 
-    def root(element: int) -> int:
-        while group[element] != element:
-            element = int(group[element])
-        return element
-
-    for oriented in range(2 * network.count):
-        onward = network.successors[oriented]
-        if len(onward) == 1 and len(network.successors[onward[0].to ^ 1]) == 1:
-            first, second = sorted((root(oriented // 2), root(onward[0].to // 2)))
-            group[second] = first
-    return np.array([root(element) for element in range(network.count)])
+    ways = network.successors
+    alone = np.diff(ways.first) == 1
+    joined = alone[ways.here] & alone[ways.to ^ 1]
+    pairs = (ways.here[joined] // 2, ways.to[joined] // 2)
+    size = (network.count, network.count)
+    _, group = connected_components(coo_array((np.ones(len(pairs[0])), pairs), shape=size), directed=False)
+    return np.asarray(group, dtype=np.int64)
 
 
 @dataclass
@@ -206,10 +205,13 @@ class _Growth:
         The number of steps where one of them lives to the end, or nothing leads back.
         """
         count = len(self.steps)
-        last = max(nodes, key=lambda node: min(node.rejected, node.end if node.end >= count else node.rejected))
-        died = last.rejected
-        if died >= count:
+        if any(node.rejected >= count and node.end >= count for node in nodes):
             return count
+        refuted = [node for node in nodes if node.rejected < count]
+        if not refuted:
+            return count
+        last = max(refuted, key=lambda node: node.rejected)
+        died = last.rejected
         if self.steps.end_s[died] - self.steps.begin_s[self._made[0].begin] <= self.config.paths_anew_s:
             return self._begin(died + 1)
         return self._begin(self._came_back(last, died))
@@ -248,15 +250,28 @@ class _Growth:
         return nearest_m
 
     def _begin(self, step: int) -> int:
-        """The first step from this one on that has an element within reach, else the number of steps."""
-        near = np.flatnonzero(np.diff(self.candidates.first[step:]) > 0) if step < len(self.steps) else np.zeros(0)
-        return step + int(near[0]) if near.size else len(self.steps)
+        """The first step from this one on with an element that its offset does not refute, else the number of steps."""
+        after = self._first_steps[np.searchsorted(self._first_steps, step) :]
+        return int(after[0]) if after.size else len(self.steps)
+
+    @cached_property
+    def _near(self) -> Bools:
+        """Candidates that a path may begin with: as near as the test of the offset allows."""
+        candidates = self.candidates
+        limit_m = self.tests.offset_m(self.steps.sigma_m[candidates.step], self.survey_m)
+        near: Bools = (np.abs(candidates.offset_m) <= limit_m) & (
+            self._inside(np.arange(len(candidates.step))) | (candidates.beyond_m <= _LATE_M)
+        )
+        return near
+
+    @cached_property
+    def _first_steps(self) -> Ints:
+        return np.unique(self.candidates.step[self._near])
 
     def _push_all(self, step: int) -> None:
-        """Begin with every element near a step; far past an end only where it is near no other."""
+        """Begin with every element near a step."""
         rows = np.arange(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
-        numbers = rows[self._inside(rows) | (self.candidates.beyond_m[rows] <= _LATE_M)]
-        for row in (numbers if numbers.size else rows).tolist():
+        for row in rows[self._near[rows]].tolist():
             unknown = (np.full(len(self.steps), np.nan) for _ in range(3))
             self._push(Node(2 * int(self.candidates.element[row]), step, *unknown, stretch=step))
 

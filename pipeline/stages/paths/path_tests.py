@@ -42,6 +42,7 @@ class PathTests:
     """The tests at one level; `bias_m`: sigma of b; `merged_m`: by so much merged paths may differ.
 
     `measured_m2`: per window the variance of a movement along the track so far, NaN where it is not known yet.
+    `windows`: per window the steps at which those that end at a step begin (`_windows`).
     """
 
     alpha: float
@@ -49,12 +50,19 @@ class PathTests:
     merged_m: float
     offset_only: bool
     measured_m2: dict[float, Floats]
+    windows: dict[float, tuple[Ints, Ints, Ints]]
 
     @classmethod
     def of_run(cls, steps: PathSteps, alpha: float, bias_m: float, merged_m: float, offset_only: bool) -> PathTests:
         """Tests of the paths of a run; `offset_only`: no other track is near, so nothing has to be told apart."""
         measured = {window_s: _measured_m2(steps, window_s) for window_s in WINDOWS_S if window_s <= _MEASURED_S}
-        return cls(alpha, bias_m, merged_m, offset_only, measured)
+        windows = {window_s: _windows(steps.end_s, window_s) for window_s in WINDOWS_S}
+        return cls(alpha, bias_m, merged_m, offset_only, measured, windows)
+
+    def offset_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
+        """How far beside its track a single step may lie [m]."""
+        limit = _size(self.alpha, _LOOKED_S / OFFSET_S)
+        return np.asarray(limit * np.sqrt(self.bias_m**2 + survey_m**2 + sigma_m**2))
 
     @property
     def longest_s(self) -> float:
@@ -97,10 +105,7 @@ class PathTests:
 
     def _movement(self, steps: PathSteps, sums: _Sums, heading_rad: Floats, at: Ints, window_s: float) -> Floats:
         """Mean of the last window less that of the window before the last but one."""
-        t_s = steps.end_s
-        late = np.searchsorted(t_s, t_s[at] - window_s, side="right")
-        early_end = np.searchsorted(t_s, t_s[at] - 2.0 * window_s, side="right")
-        early = np.searchsorted(t_s, t_s[at] - 3.0 * window_s, side="right")
+        late, early_end, early = (begin[at] for begin in self.windows[window_s])
         whole = _WHOLE * window_s / steps.period_s
         usable = (sums.count(late, at + 1) >= whole) & (sums.count(early, early_end) >= whole)
         moved_m = sums.residual(late, at + 1) - sums.residual(early, early_end)
@@ -225,6 +230,12 @@ def _greatest_share(window_s: float, tau_s: float) -> float:
     return _SHARES[key]
 
 
+def _windows(t_s: Floats, window_s: float) -> tuple[Ints, Ints, Ints]:
+    """Of the last window the first step, of the window before the last but one the step after it, and its first."""
+    late, early_end, early = (np.searchsorted(t_s, t_s - k * window_s, side="right") for k in (1.0, 2.0, 3.0))
+    return late, early_end, early
+
+
 def _measured_m2(steps: PathSteps, window_s: float) -> Floats:
     """Variance of the same movement along the track against an independent odometer, from the steps before [m2].
 
@@ -233,11 +244,8 @@ def _measured_m2(steps: PathSteps, window_s: float) -> Floats:
     known = np.isfinite(steps.along_m) & steps.counted
     if not known.any():
         return np.full(len(steps), np.nan)
-    t_s = steps.end_s
     rows = np.arange(len(steps))
-    late = np.searchsorted(t_s, t_s - window_s, side="right")
-    early_end = np.searchsorted(t_s, t_s - 2.0 * window_s, side="right")
-    early = np.searchsorted(t_s, t_s - 3.0 * window_s, side="right")
+    late, early_end, early = _windows(steps.end_s, window_s)
     counts = np.concatenate([[0], np.cumsum(known)])
     sums = np.concatenate([[0.0], np.cumsum(np.where(known, steps.along_m, 0.0))])
     late_count = counts[rows + 1] - counts[late]
