@@ -49,7 +49,7 @@ def convert_logs(
     """
     settings = given or Configuration()
     recording = known_recording(logs[0]) if len(logs) == 1 and given is None else None
-    found = gather(logs, settings.ingest, day) if recording is None else recording.gathered()
+    found = gather(logs, settings.ingest, day, purpose.solution) if recording is None else recording.gathered()
     if to.is_file() or (to / "gnss.parquet").is_file():
         run = read_run(to, IngestConfig(), with_digest=False)
         converted = extended(run, to, found, purpose, settings.fix_sigma, force, settings.ingest.correct)

@@ -245,6 +245,7 @@ class Note(StrEnum):
     BALISES_OFF = "balises_off"
     FAR_OFF = "far_off"
     PLACEHOLDERS = "placeholders"
+    HELD = "held"
     CONTRADICTING = "contradicting"
     SPANS_DIFFER = "spans_differ"
     ODOMETER_LEAPS = "odometer_leaps"

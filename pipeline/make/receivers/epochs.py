@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import dataframely as dy
 import polars as pl
@@ -21,21 +21,8 @@ from schemas.run import Stream
 # A message may come so many epochs after its own, as many as a receiver at 20 Hz makes in over a second; with a later
 # one another epoch of the same key begins. Numerics of the reading, which has no configuration.
 _LATEST_MESSAGE = 32
-# Sentences with four decimals of a minute round by 8e-7 degrees.
-_SAME_PLACE_DEG = 2e-6
-
-
-class Place(NamedTuple):
-    """Where a sentence puts the receiver [deg], and who says so (the talker of NMEA)."""
-
-    latitude_deg: float
-    longitude_deg: float
-    talker: str
-
-    def differs(self, other: Place) -> bool:
-        """By more than the digits that sentences of one receiver round to."""
-        away_deg = max(abs(self.latitude_deg - other.latitude_deg), abs(self.longitude_deg - other.longitude_deg))
-        return away_deg > _SAME_PLACE_DEG
+# Epochs of one key so near to each other are of two receivers, or of stamps that are coarser than the rate.
+_BESIDE = 4
 
 
 @dataclass
@@ -47,8 +34,8 @@ class Epoch:
     t_ns: int | None = None
     gnss: dict[str, Any] = field(default_factory=dict)
     satellites: list[dict[str, Any]] = field(default_factory=list)
+    unresolved: bool = False  # the receiver does not know its whole seconds of UTC yet
     positions: dict[str, bytes] = field(default_factory=dict)
-    place: Place | None = None
     _ranks: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -65,38 +52,44 @@ class Epoch:
 
 @dataclass
 class Gathered:
-    """Epochs in order of first sight; counts of what could not be used, by reason.
-
-    `disputed`: places that sentences told differently of one time.
-    """
+    """Epochs in order of first sight; counts of what could not be used, by reason."""
 
     epochs: list[Epoch] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
-    disputed: list[tuple[Place, Place]] = field(default_factory=list)
+    twins: list[tuple[Epoch, Epoch]] = field(default_factory=list)  # neighbours of one key with different positions
     _latest: dict[Hashable, Epoch] = field(default_factory=dict)
 
-    def at(self, key: Hashable, position: str = "", content: bytes = b"", place: Place | None = None) -> Epoch:
+    def at(self, key: Hashable, position: str = "", content: bytes = b"") -> Epoch:
         """The epoch of this key that a message belongs to.
 
         `position`: name of the message where it is one that tells a position, with its `content`. Another one than the
         epoch already has is of another epoch with the same key, and so is what comes long after: a clock went back,
-        logs were joined, or stamps are coarser than the rate. They are neither mixed nor lost. `place`: of NMEA, where
-        another one is of another epoch too, whatever sentence tells it.
+        logs were joined, or stamps are coarser than the rate. They are neither mixed nor lost.
         """
         epoch = self._latest.get(key)
-        recent = epoch is not None and len(self.epochs) - epoch.number <= _LATEST_MESSAGE
-        told = None if epoch is None or not recent else epoch.place
-        if told is not None and place is not None and place.differs(told):
-            self.disputed.append((told, place))
-            recent = False
-        if epoch is None or not recent or (place is None and epoch.positions.get(position, content) != content):
+        if (
+            epoch is None
+            or epoch.positions.get(position, content) != content
+            or len(self.epochs) - epoch.number > _LATEST_MESSAGE
+        ):
+            earlier = epoch
             epoch = self._latest[key] = Epoch(key, len(self.epochs))
             self.epochs.append(epoch)
+            if earlier is not None and epoch.number - earlier.number <= _BESIDE:
+                self.twins.append((earlier, epoch))
         if position:
             epoch.positions[position] = content
-        if place is not None:
-            epoch.place = place
         return epoch
+
+    @property
+    def rivals(self) -> frozenset[str]:
+        """Names of several receivers whose positions the log holds; none where one receiver is known."""
+        return frozenset()
+
+    @property
+    def widest_m(self) -> float:
+        """How far apart their positions are at most."""
+        return 0.0
 
     def drop(self, reason: str, count: int = 1) -> None:
         if count:

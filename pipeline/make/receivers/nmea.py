@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, time
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.make.receivers.epochs import Epoch, Gathered, Place
+from pipeline.make.receivers.epochs import Epoch, Gathered
+from pipeline.make.receivers.rivals import Said, Talkers
 from pipeline.read.ingest.guesses import UNITS
 from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
-from schemas.errors import InputError
 
 # 9 is of NovAtel's receivers; 7 and 8 are typed in or simulated.
 _FIXES = {
@@ -30,11 +30,7 @@ _SBAS_PRNS = range(120, 159)
 _SBAS_NUMBERS = range(33, 65)
 _NUMBER_TO_PRN = 87
 _DAY_NS = 86_400 * NS_PER_S
-# So many times with two places may be of a clock that went back, or of joined logs.
-_FEW_DISPUTED = 2
-# Sentences of one stretch of recording are closer than this.
-_GOES_ON_NS = 10 * NS_PER_S
-_FEW_SHARE = 0.01
+_STEP_NS = 60 * NS_PER_S  # of a log that goes on
 
 
 def parse(raw: bytes) -> Any:
@@ -48,11 +44,19 @@ def parse(raw: bytes) -> Any:
 
 def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
     """Add what this sentence says to its epoch, whose key is the time of day; most tell no more of the time."""
+    assert isinstance(gathered, Sentences)
+    if message.talker in gathered.left_out:
+        gathered.drop("sentence of another talker")
+        return
+    if message.msgID == "DTM":
+        gathered.datums[message.talker] = _datum(message)
+        return
     if not isinstance(message.time, time):
         gathered.drop("time not valid")
         return
-    place = _place_of(message)
-    epoch = gathered.at(message.time, message.msgID if place else "", raw, place)
+    if message.msgID in _POSITIONS and not _belongs(gathered, message, raw):
+        return
+    epoch = gathered.at(message.time, message.identity if message.msgID in _POSITIONS else "", raw)
     # Before its first position a receiver tells a date of its own making.
     if message.msgID == "RMC" and isinstance(message.date, date) and (message.status == "A" or message.lat != ""):
         epoch.t_ns = _time_ns(message.date, message.time)
@@ -62,40 +66,62 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
         _DECODERS[message.msgID](epoch, message)
 
 
-def require_one_receiver(gathered: Gathered, log: Path) -> None:
-    """Refuse a log in which sentences tell different places of one time: nothing is merged of two receivers.
+@dataclass
+class Sentences(Gathered):
+    """Epochs of NMEA, and who talks: `left_out` are talkers of receivers that are not meant; `datums` by talker."""
 
-    Raises `InputError`. Several places of one talker within a second that the stamps do not divide are of one receiver,
-    with stamps coarser than its rate.
-    """
-    coarse = all(epoch.key.microsecond == 0 for epoch in gathered.epochs)
-    disputed = [pair for pair in gathered.disputed if not coarse or pair[0].talker != pair[1].talker]
-    if len(disputed) <= max(_FEW_DISPUTED, _FEW_SHARE * len(gathered.epochs)):
-        return
-    talkers = sorted({place.talker for pair in disputed for place in pair})
-    first, second = disputed[0]
-    raise InputError(
-        "holds the positions of two receivers",
-        place=str(log),
-        found=f"{len(disputed)} times with two places, at first {first.latitude_deg:.6f}, {first.longitude_deg:.6f} "
-        f"({first.talker}) and {second.latitude_deg:.6f}, {second.longitude_deg:.6f} ({second.talker})",
-        expected="sentences of one receiver",
-        remedy=(
-            f"Put the sentences of each talker ({', '.join(talkers)}) in a file of its own, and convert each with its "
-            "--solution."
-            if len(talkers) > 1
-            else "Record each receiver in a file of its own, and convert each with its --solution."
-        ),
-    )
+    left_out: frozenset[str] = frozenset()
+    talkers: Talkers = field(default_factory=Talkers)
+    datums: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def rivals(self) -> frozenset[str]:
+        return self.talkers.rivals
+
+    @property
+    def widest_m(self) -> float:
+        return self.talkers.widest_m
 
 
-def _place_of(message: Any) -> Place | None:
-    """Where a position sentence puts the receiver; none without a fix."""
-    if message.msgID not in _POSITIONS or not isinstance(message.lat, float) or not isinstance(message.lon, float):
-        return None
-    if message.msgID == "GGA" and not int(message.quality or 0):
-        return None
-    return Place(message.lat, message.lon, str(message.talker))
+def _datum(m: Any) -> str:
+    """Of DTM: its code, where positions are not those of WGS 84."""
+    code = str(m.datum).strip().upper()
+    shifted = any(isinstance(value, float | int) and value for value in (m.latOfset, m.lonOfset))
+    return "" if code in ("", "W84") and not shifted else code or "999"
+
+
+def _belongs(gathered: Sentences, m: Any, raw: bytes) -> bool:
+    """Whether a position is of WGS 84 (or named for what it nearly is), and of the receiver of its epoch."""
+    datum = gathered.datums.get(m.talker) or ""
+    if datum in _NEAR_WGS84 or (datum and "89" in datum):
+        gathered.drop(f"position in {datum} (kept: decimetres from WGS 84)")
+    elif datum:
+        gathered.drop(f"position in another datum than WGS 84 ({datum})")
+        return False
+    said = Said(m.talker, None)
+    if m.lat != "" and m.lon != "" and _has_fix(m):
+        said = Said(m.talker, (float(m.lat), float(m.lon)), _digit_m(raw))
+    before = gathered.talkers.latest(m.time)
+    if not gathered.talkers.taken(m.time, said):
+        reason = "no fix beside the position of another talker" if said.place is None else "position of another talker"
+        gathered.drop(reason)
+        return False
+    if before is not None and before.talker != m.talker and before.place is None and said.place is not None:
+        gathered.at(m.time).gnss.clear()
+    return True
+
+
+def _has_fix(m: Any) -> bool:
+    if m.msgID == "RMC":
+        return bool(m.status == "A")
+    kind = _FIXES.get(int(m.quality or 0), Fix.NONE) if m.msgID == "GGA" else None
+    return kind is not Fix.NONE if m.msgID == "GGA" else any(mode in str(m.posMode) for mode in _MODES)
+
+
+def _digit_m(raw: bytes) -> float:
+    """The last digit of the minutes of the latitude, as a length: a minute is 1852 m."""
+    field_of = {b"GGA": 2, b"GNS": 2, b"RMC": 3}[raw[3:6]]
+    return float(1852.0 * 10.0 ** -len(raw.split(b",")[field_of].partition(b".")[2]))
 
 
 def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
@@ -105,6 +131,7 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
     the first date may be that of a receiver just switched on, whose clock is not set yet: it is dropped.
     """
     epochs = gathered.epochs
+    gathered.drop("date that turned late or early at midnight (put right)", _turned_dates(epochs))
     first = next((number for number, epoch in enumerate(epochs) if epoch.t_ns is not None), None)
     if first is None and first_day is not None and epochs:
         first = 0
@@ -119,25 +146,28 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
         for known, epoch in pairwise(gathered.epochs[::way]):
             if epoch.t_ns is None and known.t_ns is not None:
                 epoch.t_ns = _beside(known.t_ns, epoch.key, way)
-    gathered.drop("date that turned at another moment than midnight, put right", _with_days_in_order(gathered.epochs))
 
 
-def _with_days_in_order(epochs: list[Epoch]) -> int:
-    """Put each date on the day nearest the epoch before, where the time of day goes on and the date does not.
+def _turned_dates(epochs: list[Epoch]) -> int:
+    """Put dates that turn beside midnight on the day of their neighbours; how many.
 
-    Receivers turn the date of some sentences a second late. Returns how many were a day off.
+    Seen by time that goes back by a day within one step: so does no clock. The dates are wrong until time goes on by a
+    day within one step, or from such a step before on.
     """
-    moved = 0
-    for before, epoch in pairwise(epochs):
-        if before.t_ns is None or epoch.t_ns is None:
-            continue
-        for days in (1, -1):
-            t_ns = epoch.t_ns + days * _DAY_NS
-            if abs(t_ns - before.t_ns) <= _GOES_ON_NS < abs(epoch.t_ns - before.t_ns):
-                epoch.t_ns = t_ns
-                moved += 1
-                break
-    return moved
+    dated = [epoch for epoch in epochs if epoch.t_ns is not None]
+    steps = np.diff([epoch.t_ns or 0 for epoch in dated])
+    back = np.flatnonzero(np.abs(steps + _DAY_NS) <= _STEP_NS) + 1
+    forth = np.flatnonzero(np.abs(steps - _DAY_NS) <= _STEP_NS) + 1
+    turned = 0
+    for at in back.tolist():
+        until = next((end for end in forth.tolist() if end > at), None)
+        since = next((begin for begin in forth[::-1].tolist() if begin < at), None)
+        early = since is not None and at - since <= (len(dated) if until is None else until) - at
+        begin, end = (since or 0, at) if early else (at, len(dated) if until is None else until)
+        for epoch in dated[begin:end]:
+            epoch.t_ns = (epoch.t_ns or 0) + (-_DAY_NS if early else _DAY_NS)
+        turned += end - begin
+    return turned
 
 
 def _beside(known_ns: int, moment: time, way: int) -> int:
@@ -177,8 +207,6 @@ def _put(epoch: Epoch, m: Any, fix: Fix) -> None:
     if fix is Fix.DIFFERENTIAL and prn in _SBAS_PRNS:
         fix = Fix.SBAS
         epoch.gnss |= {"sbas_prn": prn, "sbas_age_s": m.diffAge if isinstance(m.diffAge, float) else None}
-    if fix is Fix.NONE and epoch.gnss.get("fix", Fix.NONE.value) != Fix.NONE.value:
-        return  # a receiver without a fix refuses nobody else's
     epoch.gnss |= {"fix": fix.value, "satellites": int(m.numSV) if m.numSV != "" else None}
     if fix is Fix.NONE or m.lat == "" or m.lon == "":
         return
@@ -216,7 +244,8 @@ def _correlation(m: Any) -> dict[str, float]:
 
 
 _POSITIONS = ("GGA", "GNS", "RMC")
-_WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA")
+_WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA", b"DTM")
+_NEAR_WGS84 = ("P90", "ETR")
 _DECODERS = {
     "GGA": _position,
     "GNS": _position_of_systems,
