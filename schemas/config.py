@@ -540,6 +540,14 @@ class EvidenceConfig(Settings):
     # An odometer of which the positions predict the steps to this part of what it or they leave unexplained alone is
     # made of them (V of DOMAIN section 5.0); independent ones stay above by own simulation (`benchmarks/follows.py`).
     follows_limit: Annotated[Number, Field(gt=0, lt=1)] = 0.25
+    # A stated sigma is refuted where the evidence shows errors beyond `lds.ci_factor` of it in more than this part of
+    # so many epochs at least; it is too large where none of them reaches this part of it (DOMAIN section 3). Shown is
+    # what is left of an error without this part of what the evidence leaves possible, which is 5 m and 5 % between
+    # reads: healthy odometers and reads err by less than 1 m and 1 %, RTK must not be blamed for them.
+    sigma_refuted_share: Probability = 0.01
+    sigma_evidence_part: Annotated[Number, Field(ge=0, le=1)] = 0.2
+    sigma_epochs_least: Annotated[int, Field(ge=1)] = 300
+    sigma_too_large: Annotated[Number, Field(gt=1)] = 5.0
     # Fewer steps show nothing: a prediction fits 73 numbers to them.
     follows_steps_least: Annotated[int, Field(ge=200)] = 300
     # More, spread over the run, cost more time than they add: the figure is a quantile.
