@@ -624,6 +624,8 @@ class SiteConfig(Settings):
     near_ends_m: Positive = 5.0
     facing_m: Positive = 300.0
     facing_cosine: Probability = 0.94
+    # A corner into an element of less than half a metre is a finding from so much on: no track turns so, points do.
+    kink_deg: Positive = 20.0
     # A declared length is that of the geometry within this share: 3-D against 2-D on a grade of 4 %.
     length_share: Probability = 1e-3
     # Straight lines between points leave the curve by this: a quarter of the survey's own sigma.
