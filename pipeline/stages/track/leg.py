@@ -25,9 +25,9 @@ from schemas.arrays import Bools, Floats, Ints
 # noise of surveys and positions and the shortest loop of a railway gives the same passage.
 HINT_WINDOW_M = 100.0
 SAME_PLACE_M = 10.0
-# A chord of less than GAP_COUNTS_M has the direction of the line over so much to both sides: scatter of 5 cm bends one of
-# 9 cm by 30 degrees, and a position 1 m aside would stand still there and then jump. Geometry again: 5 cm over it is 1
-# degree, and a curve of 300 m leaves a chord of twice as much by 1 cm.
+# A chord of less than GAP_COUNTS_M has the direction of the line over so much to both sides: scatter of 5 cm bends one
+# of 9 cm by 30 degrees, and a position 1 m aside would stand still there and then jump. Geometry again: 5 cm over it is
+# 1 degree, and a curve of 300 m leaves a chord of twice as much by 1 cm.
 BASELINE_M = 2.5
 
 

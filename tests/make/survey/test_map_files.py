@@ -121,5 +121,5 @@ def test_an_attribute_names_the_lines(tmp_path: Path, suffix: str) -> None:
     path = write(tmp_path / f"line{suffix}", [line_wkb(belgian())])
     (piece,) = read_surveys([path], None, Vehicle(), Configuration(), "railway").pieces
     assert piece.name == "rail"
-    with pytest.raises(SiteError, match="no such attribute.*name, railway"):
+    with pytest.raises(SiteError, match=r"no such attribute.*name, railway"):
         read_surveys([path], None, Vehicle(), Configuration(), "track_id")
