@@ -540,6 +540,14 @@ class EvidenceConfig(Settings):
     # An odometer of which the positions predict the steps to this part of what it or they leave unexplained alone is
     # made of them (V of DOMAIN section 5.0); independent ones stay above by own simulation (`benchmarks/follows.py`).
     follows_limit: Annotated[Number, Field(gt=0, lt=1)] = 0.25
+    # A stated sigma is refuted where the evidence shows errors beyond `lds.ci_factor` of it in more than this part of
+    # so many epochs at least; it is too large where none of them reaches this part of it (DOMAIN section 3). Shown is
+    # what is left of an error without this part of what the evidence leaves possible, which is 5 m and 5 % between
+    # reads: healthy odometers and reads err by less than 1 m and 1 %, RTK must not be blamed for them.
+    sigma_refuted_share: Probability = 0.01
+    sigma_evidence_part: Annotated[Number, Field(ge=0, le=1)] = 0.2
+    sigma_epochs_least: Annotated[int, Field(ge=1)] = 300
+    sigma_too_large: Annotated[Number, Field(gt=1)] = 5.0
     # Fewer steps show nothing: a prediction fits 73 numbers to them.
     follows_steps_least: Annotated[int, Field(ge=200)] = 300
     # More, spread over the run, cost more time than they add: the figure is a quantile.
@@ -616,6 +624,8 @@ class SiteConfig(Settings):
     near_ends_m: Positive = 5.0
     facing_m: Positive = 300.0
     facing_cosine: Probability = 0.94
+    # A corner into an element of less than half a metre is a finding from so much on: no track turns so, points do.
+    kink_deg: Positive = 20.0
     # A declared length is that of the geometry within this share: 3-D against 2-D on a grade of 4 %.
     length_share: Probability = 1e-3
     # Straight lines between points leave the curve by this: a quarter of the survey's own sigma.

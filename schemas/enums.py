@@ -205,6 +205,11 @@ class MisfitCause(StrEnum):
     BOTH_SIGNS = "both_signs"
     RADIANS = "radians"
     MINUTES = "minutes"
+    SIGMA_TOO_SMALL = "sigma_too_small"
+    SIGMA_TOO_LARGE = "sigma_too_large"
+    SIGMA_UNIT = "sigma_unit"
+    SIGMA_FOR_VARIANCE = "sigma_for_variance"
+    VARIANCE_FOR_SIGMA = "variance_for_sigma"
 
 
 class MisfitPlace(StrEnum):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.read.site.checks import drop_repeated_points, remarks
+from pipeline.read.site.checks import drop_repeated_points, drop_scattered_points, remarks
 from pipeline.read.site.geojson import AXES_IN_DOUBT, AXES_REMEDY, GeoJsonNetwork, read_network
 from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
@@ -151,6 +151,8 @@ def _read_track(
         return None, network, []
     frame = by_element(to_wgs84(raw, frame, config, breaches))
     frame, notes = drop_repeated_points(raw.file, frame, breaches)
+    frame, scattered = drop_scattered_points(raw.file, frame)
+    notes += scattered
     if network and network.latitude_first:
         notes.append(Finding("warning", f"{raw.file}: crs", AXES_IN_DOUBT, AXES_REMEDY))
     if network and network.ignored:
