@@ -12,14 +12,10 @@ import polars as pl
 from pipeline.stages.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
 from pipeline.stages.odometry.origin import declared_origin
 from pipeline.stages.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
-from pipeline.stages.odometry.rows import filled_in, leaps, ways_between
+from pipeline.stages.odometry.rows import filled_in, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
-
-# The bound of a bridged way holds for an emergency brake right after as hard acceleration: a Gaussian error comes as
-# far in 3 of 1000 cases.
-_BOUND_SIGMAS = 3.0
 
 
 class OdometerWay(NamedTuple):
@@ -277,7 +273,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     dt_s = np.diff(t_s)
     period_s = float(np.median(dt_s))
     limit_s = max(align.odometer_gap_s, align.odometer_gap_periods * period_s)
-    way_m, counted, bridged_m = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
+    way_m, counted, bridged_m, _, resets = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
     unknown = np.isnan(way_m)
     pause = unknown | (dt_s > limit_s)
     slip = _slips(stream, align)
@@ -319,8 +315,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         period_s=period_s,
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
-        leaps_ns=_leaps_ns(stream, align),
-        bridged_m2=np.interp(t_s, row_s, _sums((bridged_m / _BOUND_SIGMAS) ** 2)) if bridged_m.any() else None,
+        leaps_ns=tuple(t_ns[list(resets)].tolist()),
+        bridged_m2=np.interp(t_s, row_s, _sums(bridged_m**2)) if bridged_m.any() else None,
         config=align,
         origin=declared_origin(stream, vehicle),
     )
@@ -371,12 +367,6 @@ def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, c
 def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
     declared = stream["sigma_speed_mps"].median()
     return float(declared) ** 2 * period_s if isinstance(declared, float) else 0.0
-
-
-def _leaps_ns(stream: pl.DataFrame, config: AlignConfig) -> tuple[int, ...]:
-    t_ns = times_ns(stream)
-    leap = leaps((t_ns - t_ns[0]) / NS_PER_S, floats(stream, "distance_m"), config)
-    return tuple(t_ns[1:][leap].tolist())
 
 
 def _sums(steps: Floats) -> Floats:
