@@ -21,13 +21,13 @@ _BOUND_SIGMAS = 3.0
 class Ways(NamedTuple):
     """Per step: way [m], NaN where not known; whether it is of the recorded distance; sigma over a bridged reset [m].
 
-    `runs`: where the count may be off, by how much; `resets`: the rows to which it was set.
+    `odd`: where the count may be off; `resets`: the rows to which it was set.
     """
 
     way_m: Floats
     counted: Bools
     bridged_m: Floats
-    runs: tuple[OddRun, ...] = ()
+    odd: Bools
     resets: tuple[int, ...] = ()
 
 
@@ -49,9 +49,11 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
     way_m = np.where(np.isnan(recorded), driven, recorded)
     unknown = np.isnan(way_m)
     places = tuple(run.last for run in resets)
-    doubtful = (*runs.odd, *runs.near)
+    odd = np.zeros_like(leap)
+    for run in (*runs.odd, *runs.near):
+        odd[run.first : run.last] = True
     if not unknown.any():
-        return Ways(way_m, ~np.isnan(recorded), np.zeros(way_m.size), doubtful, places)
+        return Ways(way_m, ~np.isnan(recorded), np.zeros(way_m.size), odd, places)
     # Rows by turns: fill the gaps of either column between its own rows, then decide again.
     carried_m = _carried(t_s, distance_m, limit_s)
     recorded = np.where(unknown & ~leap, np.diff(carried_m), recorded)
@@ -61,7 +63,7 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
     bridged_m = np.zeros(way_m.size)
     for run in resets:
         _bridge(run, t_s, way_m, bridged_m, config)
-    return Ways(way_m, counted, bridged_m, doubtful, places)
+    return Ways(way_m, counted, bridged_m, odd, places)
 
 
 def _bridge(run: OddRun, t_s: Floats, way_m: Floats, sigma_m: Floats, config: AlignConfig) -> None:
