@@ -186,9 +186,11 @@ def _stalls(counted: _Counted, config: AlignConfig) -> Bools:
     sums = _Sums.of(t_s, distance_m, np.zeros_like(repeats))
     for begin, last in spans_of(repeats):
         end = last + 1
-        if end >= t_s.size - 1:
-            continue
         time_s = float(t_s[end] - t_s[begin])
+        about_s = beside_s(time_s, config)
+        # Less beside it may be a single count.
+        if t_s[begin] - about_s < t_s[0] or t_s[end] + about_s > t_s[-1]:
+            continue
         beside = sums.beside(t_s, begin, end, config)
         missing_m = abs(beside.mean_mps) * time_s - driven_within_m(time_s, config, beside.about_s)
         tolerance_m = config.leap_m + 2.0 * counted.counts_m + config.sure_sigmas * float(counted.scatter_m[end - 1])
