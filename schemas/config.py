@@ -286,13 +286,18 @@ class AlignConfig(Settings):
     # drop single rows at any rate.
     odometer_gap_s: Positive = 1.0
     odometer_gap_periods: Positive = 2.5
-    # A counter that grows faster was reset, overflowed or is wrong: the speed record is 160 m/s. Rows that are stamped
-    # in bunches seem to gain some metres in no time.
+    # No train is faster: the speed record is 160 m/s.
     fastest_mps: Positive = 200.0
+    # Neighbouring steps of a counter differ by no more than braking and acceleration allow, the rows' own scatter, two
+    # counts and this: the odometer's fixed error (SUBSET-041 5.3.1.1). Rows stamped in bunches gain some metres in no
+    # time.
+    leap_m: NonNegative = 5.0
     bunched_stamps_m: NonNegative = 20.0
-    reset_back_m: NonNegative = 5.0
-    # A recorder that restarts may set it back at several rows one after the other.
-    reset_moves: Annotated[int, Field(strict=True, gt=0)] = 4
+    # With fewer steps between two such places the counter was reset or wrong there: recorders that restart may set it
+    # back at several rows one after the other.
+    leap_steps: Annotated[int, Field(strict=True, gt=1)] = 4
+    # Smaller leaps than `leap_m` stay counted, but are in doubt from here on: a tenth of the fixed error.
+    near_leap_m: NonNegative = 0.5
     # Over a reset between two rows the speed about it counts where braking x dt^2 / 4 is no more than this, as at 1 Hz:
     # a tenth of the odometer's fixed error.
     reset_doubt_m: NonNegative = 0.5
