@@ -39,7 +39,7 @@ def test_a_velocity_of_another_receiver_is_not_merged(converted) -> None:
     """A GGA of one and an RMC of the other, 55 m beside it."""
     messages = [message for k in range(20) for message in (position(0.1 * k), motion(0.1 * k, 0.03, "GN"))]
     with pytest.raises(InputError, match="two receivers"):
-        converted(*messages)
+        converted(motion(0.0), *messages)
 
 
 def test_a_receiver_without_a_fix_refuses_nobody_elses(converted) -> None:
