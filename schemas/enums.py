@@ -194,6 +194,7 @@ class MisfitCause(StrEnum):
     VELOCITY_FRAME = "velocity_frame"
     VELOCITY_DOWN = "velocity_down"
     GPS_AS_UTC = "gps_as_utc"
+    LEAP_SECONDS = "leap_seconds"
     TIME_ZONE = "time_zone"
     GPS_WEEK = "gps_week"
     WRONG_DAY = "wrong_day"

@@ -11,6 +11,6 @@ Touches files. Damaged messages are counted and left out, never guessed.
 """
 
 from pipeline.make.receivers.adding import Purpose
-from pipeline.make.receivers.convert import Converted, Gatherings, as_run, convert, extended, gather
+from pipeline.make.receivers.convert import Converted, Gatherings, as_run, convert, extended, gather, said_of
 
-__all__ = ["Converted", "Gatherings", "Purpose", "as_run", "convert", "extended", "gather"]
+__all__ = ["Converted", "Gatherings", "Purpose", "as_run", "convert", "extended", "gather", "said_of"]

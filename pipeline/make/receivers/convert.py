@@ -189,6 +189,11 @@ class UnknownError(InputError):
     """A file without a message of a known receiver."""
 
 
+def said_of(reason: str) -> str:
+    """What became of the records of a reason: some are told and used all the same."""
+    return "noted" if re.search(r"\((kept|put right)", reason) else "not used"
+
+
 def _reasons(dropped: Mapping[str, int]) -> str:
     return "".join(f" Not used: {reason} ({count})." for reason, count in sorted(dropped.items()))
 

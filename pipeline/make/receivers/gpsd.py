@@ -17,7 +17,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.make.receivers.epochs import Gathered, satellite_name, velocity
-from pipeline.make.receivers.rivals import sees_twins, two_receivers
+from pipeline.make.receivers.rivals import metres, sees_twins, two_receivers
 from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
 from schemas.run import Stream
@@ -97,8 +97,6 @@ def _number(found: dict[str, Any], name: str, other: Any = None) -> Any:
 
 def _apart_m(seen: list[dict[str, Any]]) -> float:
     """How far apart devices tell to be at one time [m]; 0 where they never tell of the same."""
-    from pipeline.make.receivers.rivals import metres
-
     places: dict[int, tuple[str, tuple[float, float]]] = {}
     widest_m = 0.0
     for found in seen:
@@ -116,7 +114,8 @@ def _time_ns(found: dict[str, Any]) -> int | None:
     """UTC [ns since 1970]: ISO 8601, in old logs seconds."""
     value = found.get("time")
     if (seconds := _number(found, "time")) is not None:
-        return round(seconds * NS_PER_S)
+        whole_ns: int = round(seconds * NS_PER_S)
+        return whole_ns
     if not isinstance(value, str):
         return None
     whole, _, rest = value.removesuffix("Z").partition(".")
