@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import sys
 import time
+from typing import Any
 
 import numpy as np
 
 from pipeline.stages.odometry.odd_steps import odd_runs
+from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig
-from tests.stages.alignment.straight import odometer_of, odometry_from
+from tests.stages.alignment import straight
 from tests.stages.odometry.drives import drive, recorded
 
+STRAIGHT: Any = straight
 RATES_HZ = (1, 2, 5, 10, 20)
 COUNTS_M = (0.02, 0.1, 0.5, 1.0, 2.0, 5.0)
 NOISE_M = (0.1, 0.5, 1.0, 2.0)
@@ -52,13 +55,13 @@ def beyond_bound(drives: int) -> None:
             print(f"{rate_hz:3d} Hz resets {name}: beyond the bound {worst} m; {100 * lost / ways:.0f} % lost")
 
 
-def _ways(rng, rate_hz, least_m, most_m):
+def _ways(rng: np.random.Generator, rate_hz: int, least_m: float, most_m: float) -> tuple[Floats, Bools]:
     fine_s, way_m = drive(rng, DURATION_S)
     t_s = np.arange(0.0, DURATION_S - 1.0, 1.0 / rate_hz)
     true_m = np.interp(t_s, fine_s, way_m)
     rows = rng.choice(np.arange(20, t_s.size - 20), 8, replace=False)
     sets_m = sum(rng.uniform(least_m, most_m) * (np.arange(t_s.size) >= row) for row in rows)
-    odometry = odometry_from(odometer_of(t_s, distance_m=true_m + sets_m))
+    odometry = STRAIGHT.odometry_from(STRAIGHT.odometer_of(t_s, distance_m=true_m + sets_m))
     at = np.sort(rng.choice(t_s.size, 60, replace=False))
     begin, end = (ends.ravel() for ends in np.triu_indices(at.size, 1))
     at_ns = odometry.epoch_ns + np.round(t_s[at] * 1e9).astype(np.int64)
@@ -70,9 +73,9 @@ def _ways(rng, rate_hz, least_m, most_m):
 
 def cost() -> None:
     t_s = np.arange(0.0, 3600.0, 0.1)
-    stream = odometer_of(t_s, distance_m=np.floor(20.0 * t_s / 0.5) * 0.5)
+    stream = STRAIGHT.odometer_of(t_s, distance_m=np.floor(20.0 * t_s / 0.5) * 0.5)
     begin_s = time.perf_counter()
-    odometry_from(stream)
+    STRAIGHT.odometry_from(stream)
     print(f"an hour at 10 Hz: {1e3 * (time.perf_counter() - begin_s):.0f} ms")
 
 

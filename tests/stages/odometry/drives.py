@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from schemas.arrays import Floats
 
-def drive(rng, duration_s=600.0):
+
+def drive(rng: np.random.Generator, duration_s: float = 600.0) -> tuple[Floats, Floats]:
     """Times [s] 10 ms apart, and the true way [m]."""
     knots = [(0.0, 0.0)]
     while knots[-1][0] < duration_s:
@@ -18,7 +20,9 @@ def drive(rng, duration_s=600.0):
     return fine, np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * 0.01)])
 
 
-def recorded(rng, kind, size, rate_hz, duration_s=600.0):
+def recorded(
+    rng: np.random.Generator, kind: str, size: float, rate_hz: int, duration_s: float = 600.0
+) -> tuple[Floats, Floats, Floats]:
     """Stamps [s], rows [m] and the true way at them, of a healthy counter."""
     fine, way = drive(rng, duration_s)
     t = np.arange(0.0, duration_s - 1.0, 1.0 / rate_hz)
