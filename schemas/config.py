@@ -422,7 +422,7 @@ class MonitorConfig(Settings):
     # (1.44), with a fourth of the variance white 1.20 (1.27), all white 1.70 (1.84); of receivers 2, 3 and 4 times
     # worse than stated 1.71, 2.75 and 3.79 times. With 1/2: 1.35 (1.62) at 20 s. RTK of 2 cm: 1.00 (1.00), beside a map
     # whose length wiggles by 3e-4 1.00 (3.39); without the standard errors 8.2, of the scatter of the odometer alone.
-    stated_excess_share: NonNegative = 1.0 / 3.0
+    stated_excess_share: NonNegative = 0.33
     stated_excess_errors: NonNegative = 2.0
     # The second receiver of composite fail-safety (LOC Fig. 3).
     channel_reference: str | None = None
