@@ -54,7 +54,8 @@ class Declared(NamedTuple):
 def declared_of(folder: Path) -> Declared | None:
     """The declaration of a bag folder; None where there is none, or none that can be read."""
     try:
-        from ruamel.yaml import YAML, YAMLError
+        from ruamel.yaml import YAML
+        from ruamel.yaml.error import YAMLError
     except ImportError:
         return None
     try:

@@ -95,7 +95,7 @@ class KnownStretch:
     @property
     def doubtful(self) -> Bools:
         """Samples of which nobody knows how far they are off: the reference drifted, and no read says since when."""
-        return np.logical_or.reduce([~np.isfinite(known.low_m) for known in self.paths])
+        return np.asarray(np.logical_or.reduce([~np.isfinite(known.low_m) for known in self.paths]))
 
     def doubtful_spans(self) -> list[tuple[int, int]]:
         """The times of these samples, ends left out."""
@@ -586,7 +586,7 @@ def median_about(values: Floats, way_m: Floats, window_m: float) -> Floats:
     last = np.minimum(last + short, values.size)
     medians = [float(np.median(values[low:high])) for low, high in zip(first.tolist(), last.tolist(), strict=True)]
     nearest = np.rint((way_m - way_m[0]) / (0.25 * window_m)).astype(np.int64).clip(0, places_m.size - 1)
-    return np.array(medians)[nearest]
+    return np.asarray(np.array(medians)[nearest])
 
 
 def read_anchors(
