@@ -194,8 +194,6 @@ class MatchingConfig(Settings):
     # The truth may be so many times the stated sigma: of a receiver's own, and of a table's by kind of fix.
     sigma_doubt: Annotated[Number, Field(ge=1)] = 2.0
     table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
-    # DOMAIN section 2: a confidence of 0.99 has to be right in 99 of 100 runs. One track left of the set has it.
-    ambiguity_probability: Probability = 0.99
     # Level of the nine tests of a path together, in 600 s: measured, the true path is rejected in 1 % or less.
     paths_alpha: Probability = 0.05
     # So long the test of a position waits for those after it, which say whether it is an outlier.
