@@ -20,6 +20,7 @@ MODULES = (
     "matching",
     "calibration",
     "topologies",
+    "tracks",
     "campaign",
     "compact",
     "interruptions",

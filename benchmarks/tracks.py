@@ -199,8 +199,8 @@ def outcome(family: str, seed: int) -> Outcome:
     later = np.nan_to_num(floats(epochs, "path_probability")) >= SURE
     for row in np.flatnonzero(wrong & (live | later)).tolist():
         wrong[row] = apart_m(world, names[row], truth.place[row]) > ONE_TRACK_M
-    seconds = (np.count_nonzero(one) / rate_hz for one in (live, live & wrong, later, later & wrong))
-    return Outcome(*seconds, count / rate_hz)
+    seconds = [float(np.count_nonzero(one)) / rate_hz for one in (live, live & wrong, later, later & wrong)]
+    return Outcome(seconds[0], seconds[1], seconds[2], seconds[3], count / rate_hz)
 
 
 def figures(runs: int, seed: int, families: list[str]) -> list[Figure]:

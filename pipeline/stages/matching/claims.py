@@ -89,7 +89,7 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
     if not count:
         nothing = np.full(t_s.size, np.nan)
         none = np.zeros(0, dtype=np.int64)
-        return Claims(nothing, nothing, np.full(t_s.size, -1), Possible(none, np.zeros(1, np.int64), none, none * 1.0))
+        return Claims(nothing, nothing, np.full(t_s.size, -1), Possible(none, np.zeros(1, np.int64), none, np.zeros(0)))
     before = np.searchsorted(steps.end_s, t_s, side="right") - 1
     about = np.clip(np.searchsorted(steps.end_s, t_s, side="left"), 0, count - 1)
     speed_mps = steps.way_m / np.maximum(np.diff(steps.end_s, prepend=steps.begin_s[0]), 1e-3)
@@ -196,7 +196,7 @@ def _alone(found: PathSet) -> Floats:
     """Steps at which one line alone is within reach."""
     lines = found.groups[found.candidates.element]
     pairs = np.unique(np.column_stack([found.candidates.step, lines]), axis=0)
-    return (np.bincount(pairs[:, 0], minlength=len(found.steps)) == 1).astype(np.float64)
+    return np.asarray(np.bincount(pairs[:, 0], minlength=len(found.steps)) == 1, dtype=np.float64)
 
 
 def branches_beyond_m(network: Network, wanted: set[int]) -> dict[int, float]:

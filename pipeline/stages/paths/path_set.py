@@ -272,8 +272,9 @@ class _Growth:
         """Begin with every element near a step."""
         rows = np.arange(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
         for row in rows[self._near[rows]].tolist():
-            unknown = (np.full(len(self.steps), np.nan) for _ in range(3))
-            self._push(Node(2 * int(self.candidates.element[row]), step, *unknown, stretch=step))
+            none = np.full(len(self.steps), np.nan)
+            oriented = 2 * int(self.candidates.element[row])
+            self._push(Node(oriented, step, none, none.copy(), none.copy(), stretch=step))
 
     def _push(self, node: Node) -> None:
         same = self._by_element.setdefault(node.oriented, [])
@@ -407,5 +408,6 @@ class _Growth:
 
     def _child(self, node: Node, oriented: int, step: int) -> Node:
         copies = (node.residual_m.copy(), node.survey_m.copy(), node.heading_rad.copy())
-        end = {"rejected": node.rejected, "barred": node.barred}
-        return Node(oriented, step, *copies, parent=node, p=node.p, stretch=node.stretch, **end)
+        child = Node(oriented, step, *copies, parent=node, p=node.p, stretch=node.stretch)
+        child.rejected, child.barred = node.rejected, node.barred
+        return child

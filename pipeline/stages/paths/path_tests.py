@@ -42,6 +42,7 @@ class PathTests:
     """The tests at one level; `bias_m`: sigma of b; `merged_m`: by so much merged paths may differ.
 
     `measured_m2`: per window the variance of a movement along the track so far, NaN where it is not known yet.
+    `excess`: by how much that is larger than the stated sigma has it, 1 at least: stated sigmas may be too small.
     `windows`: per window the steps at which those that end at a step begin (`_windows`).
     """
 
@@ -51,13 +52,14 @@ class PathTests:
     offset_only: bool
     measured_m2: dict[float, Floats]
     windows: dict[float, tuple[Ints, Ints, Ints]]
+    excess: Floats
 
     @classmethod
     def of_run(cls, steps: PathSteps, alpha: float, bias_m: float, merged_m: float, offset_only: bool) -> PathTests:
         """Tests of the paths of a run; `offset_only`: no other track is near, so nothing has to be told apart."""
         measured = {window_s: _measured_m2(steps, window_s) for window_s in WINDOWS_S if window_s <= _MEASURED_S}
         windows = {window_s: _windows(steps.end_s, window_s) for window_s in WINDOWS_S}
-        return cls(alpha, bias_m, merged_m, offset_only, measured, windows)
+        return cls(alpha, bias_m, merged_m, offset_only, measured, windows, _excess(steps, measured))
 
     def offset_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
         """How far beside its track a single step may lie [m]."""
@@ -124,7 +126,7 @@ class PathTests:
         """
         long_m2 = sigma_m2 * _greatest_share(window_s, 50.0)
         if window_s > _MEASURED_S:
-            return long_m2
+            return long_m2 * self.excess[at]
         seen_m2 = self.measured_m2[window_s][at]
         soonest_s = 20.0 if np.isfinite(steps.along_m).any() else 10.0
         short_m2 = sigma_m2 * _greatest_share(window_s, soonest_s)
@@ -134,7 +136,7 @@ class PathTests:
         late = np.searchsorted(steps.end_s, steps.end_s[at] - OFFSET_S, side="right")
         late = np.minimum(late, at)
         usable = sums.count(late, at + 1) >= min(_WHOLE * OFFSET_S / steps.period_s, 1.0)
-        root_m = np.sqrt(self.bias_m**2 + sums.survey(late, at + 1) ** 2 + sums.sigma2(late, at + 1))
+        root_m = np.sqrt(self.bias_m**2 + sums.survey(late, at + 1) ** 2 + sums.sigma2(late, at + 1) * self.excess[at])
         mean_m = np.abs(sums.residual(late, at + 1))
         return np.where(usable & np.isfinite(mean_m) & (root_m > 0.0), mean_m / np.maximum(root_m, 1e-9), 0.0)
 
@@ -143,7 +145,7 @@ class PathTests:
         usable = sums.count(start, at + 1) >= 10
         lasted_s = np.maximum(steps.end_s[at] - steps.end_s[start], 1e-9)
         share = _SLOW + (1.0 - _SLOW) * np.minimum(1.0, _AVERAGED_S / lasted_s)
-        sigma_m2 = sums.sigma2(start, at + 1) * share
+        sigma_m2 = sums.sigma2(start, at + 1) * share * self.excess[at]
         root_m = np.sqrt(self.bias_m**2 + sums.survey(start, at + 1) ** 2 + sigma_m2)
         mean_m = np.abs(sums.residual(start, at + 1))
         return np.where(usable & np.isfinite(mean_m) & (root_m > 0.0), mean_m / np.maximum(root_m, 1e-9), 0.0)
@@ -234,6 +236,17 @@ def _windows(t_s: Floats, window_s: float) -> tuple[Ints, Ints, Ints]:
     """Of the last window the first step, of the window before the last but one the step after it, and its first."""
     late, early_end, early = (np.searchsorted(t_s, t_s - k * window_s, side="right") for k in (1.0, 2.0, 3.0))
     return late, early_end, early
+
+
+def _excess(steps: PathSteps, measured_m2: dict[float, Floats]) -> Floats:
+    """Variance along the track over what the stated sigma gives, of all windows that are known the middle one."""
+    stated_m2 = np.cumsum(steps.sigma_m**2) / np.arange(1, len(steps) + 1)
+    ratios = np.sort(
+        [seen / (stated_m2 * _greatest_share(window, 50.0)) for window, seen in measured_m2.items()], axis=0
+    )
+    known = np.isfinite(ratios).sum(axis=0)
+    middle = ratios[np.maximum(known - 1, 0) // 2, np.arange(len(steps))]
+    return np.where(known > 0, np.fmax(middle, 1.0), 1.0)
 
 
 def _measured_m2(steps: PathSteps, window_s: float) -> Floats:
