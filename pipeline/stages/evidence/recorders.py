@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.odometry import Odometry
-from schemas.arrays import floats, times_ns
+from schemas.arrays import NS_PER_S, floats, times_ns
 from schemas.config import HazardConfig
 
 
@@ -25,7 +25,7 @@ def without_frozen(
     """The reference without samples that repeat the one before while an independent odometer moves on.
 
     A recorder that stands still says nothing of where the train is (DOMAIN section 5.0): after so long the stretch
-    ends. A train that stands repeats too: there the odometer shows no way beyond the sample's own noise.
+    ends. A train that stands repeats too: there the odometer shows no way beyond its dead band and the sample's noise.
     """
     witnesses = [odometer for odometer in odometers if odometer.independent]
     if reference is None or reference.height < 2 or not witnesses:
@@ -40,5 +40,6 @@ def without_frozen(
     frozen = np.zeros(t_ns.size, dtype=np.bool_)
     for odometer in witnesses:
         way_m = np.abs(odometer.distance_between(t_ns[held], t_ns))
-        frozen |= repeats & (np.nan_to_num(way_m) > noise_m)
+        stands_m = odometer.deadband_mps * (t_ns - t_ns[held]) / NS_PER_S
+        frozen |= repeats & (np.nan_to_num(way_m) > noise_m + stands_m)
     return reference.filter(~pl.Series(frozen))

@@ -69,12 +69,15 @@ def reference(
     rate_hz: float = 10.0,
     late_s: float = 0.0,
     ahead_m: Floats | None = None,
+    aside_m: float = 0.0,
 ) -> pl.DataFrame:
-    """Places of the train; the stamps are `late_s` late. `ahead_m`: what each sample is off along the track."""
+    """Places of the train; the stamps are `late_s` late. `ahead_m`: what each sample is off along the track; `aside_m`:
+    all of them across it.
+    """
     t_s = np.arange(ride.t_s[0], ride.t_s[-1] - 1.0, 1.0 / rate_hz)
     noise = sigma_m * np.clip(rng.standard_normal((2, t_s.size)), -2.5, 2.5)
     off_m = 0.0 if ahead_m is None else np.interp(t_s, np.arange(ahead_m.size) / rate_hz, ahead_m)
-    latitude, longitude = degrees(ride.at(t_s) + noise[0] + off_m, noise[1])
+    latitude, longitude = degrees(ride.at(t_s) + noise[0] + off_m, noise[1] + aside_m)
     unknown = pl.Series("height_m", [None] * t_s.size, dtype=pl.Float64)
     columns = [stamps(t_s + late_s), pl.Series("latitude_deg", latitude), pl.Series("longitude_deg", longitude)]
     return pl.DataFrame([*columns, unknown, pl.Series("sigma_m", np.full(t_s.size, sigma_m))])
@@ -120,8 +123,9 @@ def known(
     of_reference: pl.DataFrame | None = None,
     of_reads: pl.DataFrame | None = None,
     vehicle: Vehicle = KNOWN,
+    config: Configuration | None = None,
 ) -> TrainEvidence:
-    config = Configuration()
+    config = config or Configuration()
     network = site_network(ground)
     stretches = reference_stretches(of_reference, network_in_pieces(ground), network.track.index, config)
     made = [odometry_of(one, vehicle if not number else Vehicle(), config) for number, one in enumerate(odometers)]
