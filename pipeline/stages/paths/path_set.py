@@ -140,8 +140,10 @@ def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, co
     candidates = candidates_of(steps.points, network, search, config.reach_m)
     survey_m = network.survey_sigmas_m(config.survey_sigma_default_m, candidates.vertex)
     groups = unbranched_groups(network)
-    # Where no other track comes near in the whole run there is nothing to tell apart.
-    alone = np.unique(groups[candidates.element]).size <= 1
+    # Until another track has come near there is nothing to tell apart.
+    lines = groups[candidates.element]
+    others = candidates.step[lines != lines[:1]]
+    alone = int(others[0]) if others.size else len(steps)
     tests = PathTests.of_run(steps, alpha, bias_m, config.paths_alike_m, alone)
     return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
 
