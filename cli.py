@@ -599,6 +599,9 @@ def make_a_site(
         float | None, Option(help="Join line ends up to so many metres apart (`survey.same_place_m`).")
     ] = None,
     flat: Annotated[bool, Option("--flat", help="Leave heights out.")] = False,
+    id_field: Annotated[
+        str | None, Option("--id", help="Attribute of GeoPackage, Shapefile or GeoJSON that names the lines.")
+    ] = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     force: Force = False,
@@ -611,7 +614,7 @@ def make_a_site(
     from pipeline.show.report.site_page import site_page
     from schemas.enums import TravelAlong
 
-    wish = wish_of(surveys, balises, epsg, join, flat, TravelAlong(direction))
+    wish = wish_of(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field)
     site = make_site(wish, _vehicle(vehicle), _configuration(config))
     write_made(site, site_page(out.resolve().name, site), out, force)
     elements, findings = elements_table(site), findings_table(site.findings)

@@ -31,6 +31,7 @@ MODULES = (
     "line",
     "undetected",
     "recorded",
+    "follows",
 )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from datasets import infrabel
 from datasets.comma2k19 import comma2k19_run
 from datasets.trial import write_run_as
-from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather
+from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather, said_of
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.studies.plausibility.report import FitReport, fit_report
@@ -30,7 +30,7 @@ class Conversion:
 
     def lines(self) -> list[str]:
         """For people."""
-        unused = [f"not used: {count} x {visible(reason)}" for reason, count in self.not_used.items()]
+        unused = [f"{said_of(reason)}: {count} x {visible(reason)}" for reason, count in self.not_used.items()]
         made = [f"corrected: {visible(text)}" for text in self.corrected]
         return [f"{self.epochs} epochs in {self.run}", *unused, *made, *self.fit.lines()]
 
@@ -49,7 +49,7 @@ def convert_logs(
     """
     settings = given or Configuration()
     recording = known_recording(logs[0]) if len(logs) == 1 and given is None else None
-    found = gather(logs, settings.ingest, day) if recording is None else recording.gathered()
+    found = gather(logs, settings.ingest, day, purpose.solution) if recording is None else recording.gathered()
     if to.is_file() or (to / "gnss.parquet").is_file():
         run = read_run(to, IngestConfig(), with_digest=False)
         converted = extended(run, to, found, purpose, settings.fix_sigma, force, settings.ingest.correct)

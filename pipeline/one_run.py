@@ -14,7 +14,8 @@ from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.stages.ride import Ride, ride_of
 from pipeline.stages.run_row.notes import ride_notes
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
-from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit
+from pipeline.studies.plausibility.accuracy import accuracy_checks, refuted
+from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, with_checks
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
@@ -127,6 +128,8 @@ def _results(
     """All that the `runs` row is made of."""
     prepared = ride.prepared
     run = prepared.run
+    accuracy = accuracy_checks(epochs, run.faults, prepared.config)
+    fit = with_checks(fit, accuracy)
     counts = prepared.counts.solutions[ride.solution.name]
     odometry = prepared.odometry
     columns = {
@@ -150,6 +153,7 @@ def _results(
         Reason.EVIDENCE_DISPUTED: evidence.disputed > 0 or evidence.parted,
         Reason.EVIDENCE_CONTRADICTED: evidence.doubted > 0,
         Reason.TRACK_ASSUMED: _track_assumed(judged),
+        Reason.SIGMA_DOUBTFUL: refuted(accuracy),
         Reason.INPUT_DOUBTFUL: bool(fit.unproving or counts.contradicting),
         Reason.CLOCK_ASSUMED: evidence.clock_assumed,
     }

@@ -284,13 +284,18 @@ class AlignConfig(Settings):
     # drop single rows at any rate.
     odometer_gap_s: Positive = 1.0
     odometer_gap_periods: Positive = 2.5
-    # A counter that grows faster was reset, overflowed or is wrong: the speed record is 160 m/s. Rows that are stamped
-    # in bunches seem to gain some metres in no time.
+    # No train is faster: the speed record is 160 m/s.
     fastest_mps: Positive = 200.0
+    # Neighbouring steps of a counter differ by no more than braking and acceleration allow, the rows' own scatter, two
+    # counts and this: the odometer's fixed error (SUBSET-041 5.3.1.1). Rows stamped in bunches gain some metres in no
+    # time.
+    leap_m: NonNegative = 5.0
     bunched_stamps_m: NonNegative = 20.0
-    reset_back_m: NonNegative = 5.0
-    # A recorder that restarts may set it back at several rows one after the other.
-    reset_moves: Annotated[int, Field(strict=True, gt=0)] = 4
+    # With fewer steps between two such places the counter was reset or wrong there: recorders that restart may set it
+    # back at several rows one after the other.
+    leap_steps: Annotated[int, Field(strict=True, gt=1)] = 4
+    # Smaller leaps than `leap_m` stay counted, but are in doubt from here on: a tenth of the fixed error.
+    near_leap_m: NonNegative = 0.5
     # Over a reset between two rows the speed about it counts where braking x dt^2 / 4 is no more than this, as at 1 Hz:
     # a tenth of the odometer's fixed error.
     reset_doubt_m: NonNegative = 0.5
@@ -411,6 +416,14 @@ class MonitorConfig(Settings):
     noise_quantiles: tuple[Probability, ...] = (0.5, 0.95, 0.99)
     # More, and a failure would be no more than noise; not set: `failure_limit_m` / (2 k_T), 1.88 m.
     noise_limit_m: Positive | None = None
+    # Of what second differences show beyond the stated sigma and so many standard errors of their model, this part is
+    # added to the variance of the confidence interval (DOMAIN section 3). Own simulation, 16 h at 1 Hz, sigma 1 m: a
+    # healthy receiver's interval grows 1.00 times (median over time; 95 %: 1.00), with a correlation of 20 s 1.24
+    # (1.44), with a fourth of the variance white 1.20 (1.27), all white 1.70 (1.84); of receivers 2, 3 and 4 times
+    # worse than stated 1.71, 2.75 and 3.79 times. With 1/2: 1.35 (1.62) at 20 s. RTK of 2 cm: 1.00 (1.00), beside a map
+    # whose length wiggles by 3e-4 1.00 (3.39); without the standard errors 8.2, of the scatter of the odometer alone.
+    stated_excess_share: NonNegative = 0.33
+    stated_excess_errors: NonNegative = 2.0
     # The second receiver of composite fail-safety (LOC Fig. 3).
     channel_reference: str | None = None
     disabled: tuple[str, ...] = ()
@@ -530,6 +543,14 @@ class EvidenceConfig(Settings):
     # An odometer of which the positions predict the steps to this part of what it or they leave unexplained alone is
     # made of them (V of DOMAIN section 5.0); independent ones stay above by own simulation (`benchmarks/follows.py`).
     follows_limit: Annotated[Number, Field(gt=0, lt=1)] = 0.25
+    # A stated sigma is refuted where the evidence shows errors beyond `lds.ci_factor` of it in more than this part of
+    # so many epochs at least; it is too large where none of them reaches this part of it (DOMAIN section 3). Shown is
+    # what is left of an error without this part of what the evidence leaves possible, which is 5 m and 5 % between
+    # reads: healthy odometers and reads err by less than 1 m and 1 %, RTK must not be blamed for them.
+    sigma_refuted_share: Probability = 0.01
+    sigma_evidence_part: Annotated[Number, Field(ge=0, le=1)] = 0.2
+    sigma_epochs_least: Annotated[int, Field(ge=1)] = 300
+    sigma_too_large: Annotated[Number, Field(gt=1)] = 5.0
     # Fewer steps show nothing: a prediction fits 73 numbers to them.
     follows_steps_least: Annotated[int, Field(ge=200)] = 300
     # More, spread over the run, cost more time than they add: the figure is a quantile.
@@ -606,6 +627,8 @@ class SiteConfig(Settings):
     near_ends_m: Positive = 5.0
     facing_m: Positive = 300.0
     facing_cosine: Probability = 0.94
+    # A corner into an element of less than half a metre is a finding from so much on: no track turns so, points do.
+    kink_deg: Positive = 20.0
     # A declared length is that of the geometry within this share: 3-D against 2-D on a grade of 4 %.
     length_share: Probability = 1e-3
     # Straight lines between points leave the curve by this: a quarter of the survey's own sigma.

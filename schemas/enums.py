@@ -194,6 +194,7 @@ class MisfitCause(StrEnum):
     VELOCITY_FRAME = "velocity_frame"
     VELOCITY_DOWN = "velocity_down"
     GPS_AS_UTC = "gps_as_utc"
+    LEAP_SECONDS = "leap_seconds"
     TIME_ZONE = "time_zone"
     GPS_WEEK = "gps_week"
     WRONG_DAY = "wrong_day"
@@ -205,6 +206,11 @@ class MisfitCause(StrEnum):
     BOTH_SIGNS = "both_signs"
     RADIANS = "radians"
     MINUTES = "minutes"
+    SIGMA_TOO_SMALL = "sigma_too_small"
+    SIGMA_TOO_LARGE = "sigma_too_large"
+    SIGMA_UNIT = "sigma_unit"
+    SIGMA_FOR_VARIANCE = "sigma_for_variance"
+    VARIANCE_FOR_SIGMA = "variance_for_sigma"
 
 
 class MisfitPlace(StrEnum):
@@ -245,6 +251,7 @@ class Note(StrEnum):
     BALISES_OFF = "balises_off"
     FAR_OFF = "far_off"
     PLACEHOLDERS = "placeholders"
+    HELD = "held"
     CONTRADICTING = "contradicting"
     SPANS_DIFFER = "spans_differ"
     ODOMETER_LEAPS = "odometer_leaps"

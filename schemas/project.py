@@ -85,6 +85,7 @@ class TrackEntry(Settings):
     epsg: int | None = None
     join_m: NonNegative | None = None
     flat: bool = False
+    id_field: str | None = None
 
 
 class CalibrateEntry(Settings):

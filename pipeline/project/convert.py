@@ -72,7 +72,7 @@ def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: 
                 else:
                     parts.append(_Part(purpose, known.gathered()))
         if paths:
-            parts.append(_Part(purpose, gather(paths, ingest, day)))
+            parts.append(_Part(purpose, gather(paths, ingest, day, purpose.solution)))
     return parts
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from pipeline import storage
 from pipeline.campaign import CampaignSummary, Plan, find_runs, make_plan, run_campaign
 from pipeline.campaign.watch import Follower
+from pipeline.make.receivers import said_of
 from pipeline.make.survey.make import Wish, make_site, wish_of, write_made
 from pipeline.project.convert import Recordings, logs_of, run_of_logs
 from pipeline.project.made import Product, Record, digest_over
@@ -166,7 +167,7 @@ def _write_run(steps: _Steps, entry: ConvertEntry, config: Configuration) -> lis
     steps.call.said("convert", f"{entry.run_id}: {logs} {'log' if logs == 1 else 'logs'}")
     converted = run_of_logs(steps.opened, entry, config, steps.recordings)
     for reason, count in sorted(converted.dropped.items()):
-        steps.call.said("convert", f"{entry.run_id}: not used: {count} x {reason}")
+        steps.call.said("convert", f"{entry.run_id}: {said_of(reason)}: {count} x {reason}")
     place = Path(steps.opened.place(entry.to))
     steps.recordings.write(converted.run, place)
     return [place] if place.is_file() else sorted(place.glob("*.parquet"))
@@ -227,7 +228,7 @@ def wish_for(opened: Opened, entry: TrackEntry) -> Wish:
     if balises is not None and not balises.startswith("every"):
         balises = opened.place(balises)
     surveys = [Path(opened.place(named)) for named in entry.survey]
-    return wish_of(surveys, balises, entry.epsg, entry.join_m, entry.flat, entry.direction)
+    return wish_of(surveys, balises, entry.epsg, entry.join_m, entry.flat, entry.direction, entry.id_field)
 
 
 def _calibrate(steps: _Steps) -> None:

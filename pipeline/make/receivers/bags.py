@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
+
+import polars as pl
 
 from pipeline.make.receivers.bag_budget import Unpack, budget_of_bag, unpacker_of
 from pipeline.read.ingest.run import read_run
 from pipeline.storage.budget import Budget
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
-from schemas.run import RunLog
+from schemas.run import STREAMS, RunLog
 
 _HEADER = "std_msgs/msg/Header"
 _ENDINGS = (".bag", ".db3")
@@ -27,6 +30,8 @@ def read_bag(path: Path, config: IngestConfig) -> tuple[RunLog, dict[str, int]]:
     """All streams of a bag, by schema name or as `[ingest]` maps its topics; what was left over."""
     if path.suffix.lower() == ".mcap":
         return _with_rest(read_run(path, config, with_digest=False), {})
+    if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
+        return _read_parts(path, declared, config)
     with TemporaryDirectory() as folder:
         log = Path(folder) / "bag.mcap"
         left = _transcribe(path, log, config)
@@ -36,6 +41,94 @@ def read_bag(path: Path, config: IngestConfig) -> tuple[RunLog, dict[str, int]]:
             error.place = None if error.place is None else error.place.replace(str(log), str(path))
             error.message = error.message.replace(str(log), str(path))
             raise
+
+
+class Declared(NamedTuple):
+    """What the `metadata.yaml` of a bag folder says that it holds: files in order, and messages of each."""
+
+    mcap: bool
+    files: tuple[str, ...]
+    messages: dict[str, int]
+
+
+def declared_of(folder: Path) -> Declared | None:
+    """The declaration of a bag folder; None where there is none, or none that can be read."""
+    try:
+        from ruamel.yaml import YAML
+        from ruamel.yaml.error import YAMLError
+    except ImportError:
+        return None
+    try:
+        told = YAML(typ="safe", pure=True).load((folder / "metadata.yaml").read_text(encoding="utf-8"))
+        bag = told["rosbag2_bagfile_information"]
+        names = tuple(str(name) for name in bag["relative_file_paths"])
+        counts = {str(part["path"]): int(part["message_count"]) for part in bag.get("files") or ()}
+        return Declared(str(bag["storage_identifier"]) == "mcap", names, counts)
+    except (OSError, UnicodeDecodeError, YAMLError, LookupError, TypeError, ValueError):
+        return None
+
+
+def _read_parts(folder: Path, declared: Declared, config: IngestConfig) -> tuple[RunLog, dict[str, int]]:
+    """The MCAP files of a bag folder, one after the other, as one run; what is missing makes it partial.
+
+    Raises `InputError` where none of them is there.
+    """
+    damages: list[str] = []
+    until: list[int] = []
+    runs: list[RunLog] = []
+    for name in declared.files:
+        part = folder / name
+        # A name of a folder's own file: what a declaration names elsewhere is not read.
+        if Path(name).name != name or not part.is_file():
+            damages.append(f"{name} is declared and not there")
+            continue
+        run = read_run(part, config, with_digest=False)
+        if run.notes.damage is not None:
+            damages.append(f"{name}: {run.notes.damage}")
+        if run.notes.partial_until_ns is not None:
+            until.append(run.notes.partial_until_ns)
+        count = message_count(part)
+        if (wanted := declared.messages.get(name)) is not None and count is not None and count < wanted:
+            damages.append(f"{name} holds {count} of {wanted} messages that are declared")
+        runs.append(run)
+    if not runs:
+        raise InputError(
+            "holds none of the files that its metadata.yaml declares",
+            place=str(folder),
+            expected=", ".join(declared.files),
+            remedy="Copy the whole folder.",
+        )
+    streams = {name: _one_after_the_other([run.stream(name) for run in runs]) for name in STREAMS}
+    notes = runs[0].notes
+    skipped = tuple(dict.fromkeys(topic for run in runs for topic in run.notes.skipped_topics))
+    whole = replace(
+        runs[0].with_streams(**streams),
+        notes=replace(
+            notes,
+            damage="; ".join(damages) or None,
+            partial_until_ns=min(until, default=None),
+            skipped_topics=skipped,
+        ),
+    )
+    return _with_rest(whole, {})
+
+
+def _one_after_the_other(frames: list[pl.DataFrame | None]) -> pl.DataFrame | None:
+    there = [frame for frame in frames if frame is not None]
+    return pl.concat(there) if there else None
+
+
+def message_count(log: Path) -> int | None:
+    """How many messages the summary of an MCAP file declares; None without a summary."""
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    try:
+        with log.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+    except (McapError, OSError, ValueError):
+        return None
+    return None if summary is None or summary.statistics is None else int(summary.statistics.message_count)
 
 
 def _with_rest(run: RunLog, left: dict[str, int]) -> tuple[RunLog, dict[str, int]]:

@@ -19,6 +19,8 @@ from pipeline.make.receivers.bags import is_bag, read_bag
 from pipeline.make.receivers.csv import TABLES, names_file, read_csv
 from pipeline.make.receivers.epochs import Epochs, Gathered
 from pipeline.make.receivers.frames import Frame, Protocol, frames, name_of
+from pipeline.make.receivers.gpsd import is_gpsd, read_gpsd
+from pipeline.make.receivers.rivals import sees_twins, two_receivers
 from pipeline.make.receivers.rtklib import is_solution, read_solution
 from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked
 from pipeline.read.ingest.conform import conform, refuse
@@ -129,10 +131,13 @@ def gathered_of(run: RunLog, dropped: Mapping[str, int]) -> Gatherings:
     return Gatherings(streams, dropped, run.notes.corrections)
 
 
-def gather(logs: list[Path], config: IngestConfig | None = None, date: date | None = None) -> Gatherings:
+def gather(
+    logs: list[Path], config: IngestConfig | None = None, date: date | None = None, solution: str | None = None
+) -> Gatherings:
     """What the logs hold: positions, or whatever else a mapping or a topic makes a stream of.
 
-    `date`: the day of the first sentence, for NMEA logs that hold none. Raises `InputError` where no log of a receiver
+    `date`: the day of the first sentence, for NMEA logs that hold none. `solution`: the talker or device that is meant,
+    where a log holds the positions of two receivers. Raises `InputError` where no log of a receiver
     holds an epoch, or where two logs tell of the same time under one solution.
     """
     dropped: Counter[str] = Counter()
@@ -144,7 +149,7 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
             for plain in inner:
                 place = log if plain == log else log / plain.name
                 try:
-                    parts.append((place, _convert_one(plain, config or IngestConfig(), date)))
+                    parts.append((place, _convert_one(plain, config or IngestConfig(), date, solution)))
                     dropped.update(parts[-1][1].dropped)
                 except (NoEpochError, UnknownError) as error:
                     if plain == log and isinstance(error, UnknownError):
@@ -182,6 +187,11 @@ class NoEpochError(InputError):
 
 class UnknownError(InputError):
     """A file without a message of a known receiver."""
+
+
+def said_of(reason: str) -> str:
+    """What became of the records of a reason: some are told and used all the same."""
+    return "noted" if re.search(r"\((kept|put right)", reason) else "not used"
 
 
 def _reasons(dropped: Mapping[str, int]) -> str:
@@ -247,7 +257,7 @@ def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -
             yield spans.with_columns(log=pl.lit(str(log)), column=pl.lit(column))
 
 
-def _convert_one(log: Path, config: IngestConfig, date: date | None) -> Gatherings:
+def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: str | None) -> Gatherings:
     if is_bag(log):
         # Corrections are made of the whole, once.
         return gathered_of(*read_bag(log, _of_topics(config).model_copy(update={"correct": ()})))
@@ -259,7 +269,11 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None) -> Gatherin
     content = files.read_bytes(log)
     if is_solution(content):
         return Gatherings(*read_solution(content, log))
-    return _read(content, log, date)
+    if is_gpsd(content):
+        streams, dropped = read_gpsd(content, log, solution)
+        if streams["gnss"].height:
+            return Gatherings(streams, dropped)
+    return _read(content, log, date, solution)
 
 
 def _of_topics(config: IngestConfig) -> IngestConfig:
@@ -272,13 +286,18 @@ def _of_topics(config: IngestConfig) -> IngestConfig:
     return config.model_copy(update=kept)
 
 
-def _read(content: bytes, log: Path, date: date | None) -> Gatherings:
-    """The epochs of the protocol that says most; what is damaged or said twice is counted."""
+def _read(
+    content: bytes, log: Path, date: date | None, solution: str | None, left_out: frozenset[str] = frozenset()
+) -> Gatherings:
+    """The epochs of the protocol that says most; what is damaged or said twice is counted. `left_out`: talkers."""
     dropped: Counter[str] = Counter()
     gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
-    for frame in frames(content, lambda: dropped.update(["damaged message"])):
+    gathered[Protocol.NMEA] = nmea.Sentences(left_out=left_out)
+    for frame in frames(content, lambda: dropped.update(["damaged message"]), lambda: dropped.update([_UNCHECKED])):
         if frame.protocol in gathered:
             _decode(frame, gathered[frame.protocol])
+    twins = {protocol: sees_twins(of) for protocol, of in gathered.items()}
+    ubx.settle_times(gathered[Protocol.UBX])
     nmea.settle_days(gathered[Protocol.NMEA], date)
     novatel.settle_source(gathered[Protocol.NOVATEL])
     settled = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
@@ -290,6 +309,11 @@ def _read(content: bytes, log: Path, date: date | None) -> Gatherings:
             dropped[f"{protocol} position beside those of {best}"] += epochs.positions
     if not settled[best].epochs:
         raise _no_epoch(content, log, dropped)
+    rivals = gathered[best].rivals
+    if solution in rivals:
+        return _read(content, log, date, None, rivals - {solution})
+    if rivals or twins[best] is not None:
+        raise two_receivers(str(log), rivals, max(gathered[best].widest_m, twins[best] or 0.0))
     return Gatherings(settled[best].streams(), dropped)
 
 
@@ -302,7 +326,7 @@ def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputErr
         return UnknownError(
             "holds no message of a known receiver" if content else "is empty",
             place=str(log),
-            expected="UBX, SBF, NMEA, NovAtel, RTKLIB .pos, a bag, or CSV",
+            expected="UBX, SBF, NMEA, NovAtel, JSON of gpsd, RTKLIB .pos, a bag, or CSV",
             remedy=hint + _reasons(dropped),
         )
     return NoEpochError(
@@ -352,6 +376,7 @@ _ALMOST = {
 _MOST_NAMES = 20
 # Where a hint is looked for: what begins with gigabytes of something else is no such file.
 _HEAD = 1024 * 1024
+_UNCHECKED = "sentence without a checksum (nothing shows whether it is whole)"
 _UNFIT = "message that does not fit its definition"
 
 

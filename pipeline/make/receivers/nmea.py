@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, time
 from itertools import pairwise
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.make.receivers.epochs import Epoch, Gathered
+from pipeline.make.receivers.rivals import Said, Talkers
 from pipeline.read.ingest.guesses import UNITS
 from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
@@ -28,6 +30,7 @@ _SBAS_PRNS = range(120, 159)
 _SBAS_NUMBERS = range(33, 65)
 _NUMBER_TO_PRN = 87
 _DAY_NS = 86_400 * NS_PER_S
+_STEP_NS = 60 * NS_PER_S  # of a log that goes on
 
 
 def parse(raw: bytes) -> Any:
@@ -41,8 +44,17 @@ def parse(raw: bytes) -> Any:
 
 def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
     """Add what this sentence says to its epoch, whose key is the time of day; most tell no more of the time."""
+    assert isinstance(gathered, Sentences)
+    if message.talker in gathered.left_out:
+        gathered.drop("sentence of another talker")
+        return
+    if message.msgID == "DTM":
+        gathered.datums[message.talker] = _datum(message)
+        return
     if not isinstance(message.time, time):
         gathered.drop("time not valid")
+        return
+    if message.msgID in _POSITIONS and not _belongs(gathered, message, raw):
         return
     epoch = gathered.at(message.time, message.identity if message.msgID in _POSITIONS else "", raw)
     # Before its first position a receiver tells a date of its own making.
@@ -54,6 +66,64 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
         _DECODERS[message.msgID](epoch, message)
 
 
+@dataclass
+class Sentences(Gathered):
+    """Epochs of NMEA, and who talks: `left_out` are talkers of receivers that are not meant; `datums` by talker."""
+
+    left_out: frozenset[str] = frozenset()
+    talkers: Talkers = field(default_factory=Talkers)
+    datums: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def rivals(self) -> frozenset[str]:
+        return self.talkers.rivals
+
+    @property
+    def widest_m(self) -> float:
+        return self.talkers.widest_m
+
+
+def _datum(m: Any) -> str:
+    """Of DTM: its code, where positions are not those of WGS 84."""
+    code = str(m.datum).strip().upper()
+    shifted = any(isinstance(value, float | int) and value for value in (m.latOfset, m.lonOfset))
+    return "" if code in ("", "W84") and not shifted else code or "999"
+
+
+def _belongs(gathered: Sentences, m: Any, raw: bytes) -> bool:
+    """Whether a position is of WGS 84 (or named for what it nearly is), and of the receiver of its epoch."""
+    datum = gathered.datums.get(m.talker) or ""
+    if datum in _NEAR_WGS84 or (datum and "89" in datum):
+        gathered.drop(f"position in {datum} (kept: decimetres from WGS 84)")
+    elif datum:
+        gathered.drop(f"position in another datum than WGS 84 ({datum})")
+        return False
+    said = Said(m.talker, None)
+    if m.lat != "" and m.lon != "" and _has_fix(m):
+        said = Said(m.talker, (float(m.lat), float(m.lon)), _digit_m(raw))
+    before = gathered.talkers.latest(m.time)
+    if not gathered.talkers.taken(m.time, said):
+        reason = "no fix beside the position of another talker" if said.place is None else "position of another talker"
+        gathered.drop(reason)
+        return False
+    if before is not None and before.talker != m.talker and before.place is None and said.place is not None:
+        gathered.at(m.time).gnss.clear()
+    return True
+
+
+def _has_fix(m: Any) -> bool:
+    if m.msgID == "RMC":
+        return bool(m.status == "A")
+    kind = _FIXES.get(int(m.quality or 0), Fix.NONE) if m.msgID == "GGA" else None
+    return kind is not Fix.NONE if m.msgID == "GGA" else any(mode in str(m.posMode) for mode in _MODES)
+
+
+def _digit_m(raw: bytes) -> float:
+    """The last digit of the minutes of the latitude, as a length: a minute is 1852 m."""
+    field_of = {b"GGA": 2, b"GNS": 2, b"RMC": 3}[raw[3:6]]
+    return float(1852.0 * 10.0 ** -len(raw.split(b",")[field_of].partition(b".")[2]))
+
+
 def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
     """Give the epochs without a date theirs: past midnight the next, before the first date counted back from it.
 
@@ -61,6 +131,7 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
     the first date may be that of a receiver just switched on, whose clock is not set yet: it is dropped.
     """
     epochs = gathered.epochs
+    gathered.drop("date that turned late or early at midnight (put right)", _turned_dates(epochs))
     first = next((number for number, epoch in enumerate(epochs) if epoch.t_ns is not None), None)
     if first is None and first_day is not None and epochs:
         first = 0
@@ -75,6 +146,28 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
         for known, epoch in pairwise(gathered.epochs[::way]):
             if epoch.t_ns is None and known.t_ns is not None:
                 epoch.t_ns = _beside(known.t_ns, epoch.key, way)
+
+
+def _turned_dates(epochs: list[Epoch]) -> int:
+    """Put dates that turn beside midnight on the day of their neighbours; how many.
+
+    Seen by time that goes back by a day within one step: so does no clock. The dates are wrong until time goes on by a
+    day within one step, or from such a step before on.
+    """
+    dated = [epoch for epoch in epochs if epoch.t_ns is not None]
+    steps = np.diff([epoch.t_ns or 0 for epoch in dated])
+    back = np.flatnonzero(np.abs(steps + _DAY_NS) <= _STEP_NS) + 1
+    forth = np.flatnonzero(np.abs(steps - _DAY_NS) <= _STEP_NS) + 1
+    turned = 0
+    for at in back.tolist():
+        until = next((end for end in forth.tolist() if end > at), None)
+        since = next((begin for begin in forth[::-1].tolist() if begin < at), None)
+        early = since is not None and at - since <= (len(dated) if until is None else until) - at
+        begin, end = (since or 0, at) if early else (at, len(dated) if until is None else until)
+        for epoch in dated[begin:end]:
+            epoch.t_ns = (epoch.t_ns or 0) + (-_DAY_NS if early else _DAY_NS)
+        turned += end - begin
+    return turned
 
 
 def _beside(known_ns: int, moment: time, way: int) -> int:
@@ -151,7 +244,8 @@ def _correlation(m: Any) -> dict[str, float]:
 
 
 _POSITIONS = ("GGA", "GNS", "RMC")
-_WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA")
+_WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA", b"DTM")
+_NEAR_WGS84 = ("P90", "ETR")
 _DECODERS = {
     "GGA": _position,
     "GNS": _position_of_systems,

@@ -16,6 +16,11 @@ from schemas.enums import Fix
 _NO_TOW, _NO_WEEK = 0xFFFFFFFF, 0xFFFF
 _DO_NOT_USE = -2e10
 _SBAS_PRNS = range(120, 159)
+# SBF reference guide, "Datum" of PVTGeodetic; of a base station: what its operator chose.
+_DATUM_OF_BASE = 19
+_DATUMS = {30: "ETRS89", 31: "NAD83(2011)", 32: "NAD83(PA11)", 33: "NAD83(MA11)", 34: "GDA94", 35: "GDA2020",
+           36: "JGD2011", 250: "user-defined", 251: "user-defined"}  # fmt: skip
+_NEAR_WGS84 = (30,)
 
 
 def parse(raw: bytes) -> Any:
@@ -33,9 +38,24 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
         gathered.drop("time not valid")
         return
     position = message.identity if message.identity in _POSITIONS else ""
+    if position and message.Error == 0 and not _datum(gathered, message):
+        return
     epoch = gathered.at((week, tow_ms), position, raw)
     epoch.t_ns = utc_of_week(week, tow_ms * 1_000_000)
     decoder(epoch, message)
+
+
+def _datum(gathered: Gathered, message: Any) -> bool:
+    """Whether a position is of WGS 84 or near to it, which is counted by name; user-defined ones are left out."""
+    number = int(getattr(message, "Datum", 0))
+    if number in (0, _DATUM_OF_BASE, 255):
+        return True
+    name = _DATUMS.get(number, f"datum {number}")
+    if number in _NEAR_WGS84:
+        gathered.drop(f"position in {name} (kept: decimetres from WGS 84)")
+        return True
+    gathered.drop(f"position in another datum than WGS 84 ({name})")
+    return False
 
 
 def _solution(epoch: Epoch, m: Any) -> bool:

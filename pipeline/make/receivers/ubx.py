@@ -16,6 +16,10 @@ from schemas.enums import Fix
 
 Columns = dict[str, Any]
 
+_UNRESOLVED = "time not yet resolved by the receiver (kept as it is told)"
+_WEEK_MS = 604_800_000
+_LEAP_NS = 60 * NS_PER_S  # leap seconds and more: what is farther off is of another week
+
 _SYSTEMS_BY_NAME = {"GPS": "G", "SBAS": "S", "Galileo": "E", "BeiDou": "C", "QZSS": "J", "GLONASS": "R", "NavIC": "I"}
 # Numbers of satellites in NAV-SVINFO: first of the system, last, letter, number of the first.
 _SVIDS = (
@@ -37,6 +41,9 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
     epoch = gathered.at(message.iTOW, message.identity if is_position else "", raw)
     if is_position:
         epoch.t_ns = _time_ns(message)
+        if epoch.t_ns is not None and not getattr(message, "fullyResolved", 1):
+            gathered.drop(_UNRESOLVED)
+            epoch.unresolved = True
     for what, rank, columns_of in _CONTENTS.get(message.identity, ()):
         if columns := columns_of(message):
             epoch.put(what, rank, columns)
@@ -46,6 +53,30 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
         epoch.satellites = _satellites(message, message.numSvs, 1.0)
     elif message.identity == "NAV-SVINFO" and not epoch.satellites:
         epoch.satellites = _satellites(message, message.numCh, 1e-2)
+
+
+def settle_times(gathered: Gathered) -> None:
+    """UTC of epochs that the receiver had not resolved yet: the time of the week goes on from the next that it had.
+
+    Where it never had, times stay as they are told, and are counted as what they are.
+    """
+    resolved = 0
+    for epochs in (gathered.epochs[::-1], gathered.epochs):
+        known: tuple[int, int] | None = None
+        for epoch in epochs:
+            if epoch.t_ns is None:
+                continue
+            if not epoch.unresolved:
+                known = (epoch.t_ns, int(epoch.key))
+            elif known is not None:
+                since_ms = (int(epoch.key) - known[1] + _WEEK_MS // 2) % _WEEK_MS - _WEEK_MS // 2
+                if abs(since_ms * 1_000_000 - (epoch.t_ns - known[0])) <= _LEAP_NS:
+                    epoch.t_ns, epoch.unresolved = known[0] + since_ms * 1_000_000, False
+                    resolved += 1
+    if resolved:
+        left = gathered.dropped.pop(_UNRESOLVED, 0) - resolved
+        gathered.drop(_UNRESOLVED, left)
+        gathered.drop("time not yet resolved (put right by the time of the week)", resolved)
 
 
 def _time_ns(m: Any) -> int | None:

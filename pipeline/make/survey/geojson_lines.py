@@ -8,7 +8,15 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pipeline.make.survey.pieces import Survey, piece_of
-from pipeline.read.site.geojson import has_relations, parts_of, read_network, triple
+from pipeline.read.site.geojson import (
+    AXES_IN_DOUBT,
+    AXES_REMEDY,
+    has_relations,
+    latitude_first,
+    parts_of,
+    read_network,
+    triple,
+)
 from pipeline.read.site.read import to_wgs84
 from schemas.config import SiteConfig
 from schemas.errors import SiteError, listed
@@ -24,24 +32,51 @@ Feature = tuple[dict[str, Any], Mapping[str, Any]]
 """Tags and GeoJSON geometry."""
 
 
-def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig) -> Survey:
+def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig, id_field: str | None = None) -> Survey:
     """Each LineString a piece, named by its own id. Where features have a `railway`, only those in use are taken.
 
-    A network that gives net relations (RailTopoModel, ERA RINF) is taken as it is. Raises `SiteError`.
+    A network that gives net relations (RailTopoModel, ERA RINF) is taken as it is, Overpass JSON like GeoJSON.
+    `id_field`: property that names the lines. Raises `SiteError`.
     """
     try:
-        items = json.loads(data)["features"]
+        document = json.loads(data)
+        if "features" not in document and "elements" in document:
+            return survey_of_features(place, stem, list(_of_overpass(place, document["elements"])), id_field)
+        items = document["features"]
         if has_relations(items):
             return _of_network(place, data, config)
         features = [_feature(item) for item in items]
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         message = f"is not a GeoJSON FeatureCollection ({type(error).__name__}: {error})"
         raise SiteError(message, place=place, remedy="Overpass exports GeoJSON under Export.") from None
-    return survey_of_features(place, stem, features)
+    survey = survey_of_features(place, stem, features, id_field)
+    if latitude_first(document):
+        survey.report("warning", f"{place}: crs", AXES_IN_DOUBT, AXES_REMEDY)
+    return survey
 
 
-def survey_of_features(place: str, stem: str, features: list[Feature]) -> Survey:
-    """A piece of each line, without railways that no train runs on. Raises `SiteError`."""
+def _of_overpass(place: str, elements: list[Any]) -> Iterator[Feature]:
+    """Ways and tagged nodes of Overpass JSON; places of a way stand in its `geometry` (`out geom`) or in its nodes."""
+    nodes = {item["id"]: [item["lon"], item["lat"]] for item in elements if item["type"] == "node"}
+    for item in elements:
+        tags = dict(item.get("tags") or {}) | {"@id": f"{item['type']}/{item['id']}"}
+        if item["type"] == "node" and item.get("tags"):
+            yield tags, {"type": "Point", "coordinates": nodes[item["id"]]}
+        elif item["type"] == "way":
+            if "geometry" in item:
+                line = [[point["lon"], point["lat"]] for point in item["geometry"] if point is not None]
+            elif all(node in nodes for node in item.get("nodes", ())):
+                line = [nodes[node] for node in item.get("nodes", ())]
+            else:
+                remedy = "Ask Overpass for `out geom;`, or for `out body; >; out skel;`."
+                raise SiteError("has ways without the places of their nodes", place=place, remedy=remedy)
+            yield tags, {"type": "LineString", "coordinates": line}
+
+
+def survey_of_features(place: str, stem: str, features: list[Feature], id_field: str | None = None) -> Survey:
+    """A piece of each line, but railways that no train runs on; named by `id_field`, if any. Raises `SiteError`."""
+    _require_field(place, features, id_field)
+    ids = _IDS if id_field is None else (id_field,)
     survey = Survey()
     kinds = {_kind(tags) for tags, geometry in features if next(_lines(geometry), None) is not None}
     railways = any(tags.get("railway") is not None for tags, _ in features)
@@ -54,7 +89,7 @@ def survey_of_features(place: str, stem: str, features: list[Feature]) -> Survey
             longitude, latitude, _ = _numbers(f"{place}: feature {number}", geometry.get("coordinates"))
             (survey.switches_deg if kind == "switch" else survey.crossings_deg).append((latitude, longitude))
         elif lines and (not railways or kind in used):
-            name = next((str(tags[key]).strip() for key in _IDS if tags.get(key) not in (None, "")), stem)
+            name = next((str(tags[key]).strip() for key in ids if tags.get(key) not in (None, "")), stem)
             survey.pieces += [_piece(f"{place}: feature {number}", name, line) for line in lines]
         elif lines:
             left_out[kind] += 1
@@ -79,10 +114,19 @@ def _of_network(place: str, data: bytes, config: SiteConfig) -> Survey:
         survey.pieces.append(piece_of(place, str(name), part.drop("netelement_id").to_dict(), whole=True))
     if network.links is not None:
         survey.relations += network.links.frame.rows()
+    if network.latitude_first:
+        survey.report("warning", f"{place}: crs", AXES_IN_DOUBT, AXES_REMEDY)
     if network.ignored:
         text = f"{network.ignored} features are not used: they are neither net element nor relation"
         survey.report("note", place, text)
     return survey
+
+
+def _require_field(place: str, features: list[Feature], id_field: str | None) -> None:
+    if id_field is None or any(id_field in tags for tags, _ in features):
+        return
+    known = sorted({key for tags, _ in features for key in tags})
+    raise SiteError("has no such attribute", place=f"{place}: --id {id_field}", expected=f"one of {', '.join(known)}")
 
 
 def _kind(tags: Mapping[str, Any]) -> str:

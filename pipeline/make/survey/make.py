@@ -32,7 +32,8 @@ _FILES = ("track", "links", "balises", "route")
 class Wish:
     """What a site is made of: balises every so many metres or of a list; ends this near [m] meet.
 
-    `travel`: for which direction of travel those every so many metres are valid.
+    `travel`: for which direction of travel those every so many metres are valid. `id_field`: attribute of maps that
+    names the lines.
     """
 
     surveys: list[Path]
@@ -42,6 +43,7 @@ class Wish:
     epsg: int | None = None
     join_m: float | None = None
     flat: bool = False
+    id_field: str | None = None
 
 
 def wish_of(
@@ -51,6 +53,7 @@ def wish_of(
     join_m: float | None,
     flat: bool,
     travel: TravelAlong = TravelAlong.BOTH,
+    id_field: str | None = None,
 ) -> Wish:
     """The words of the command; `--balises every 1000` leaves its number among the surveys. Raises `UsageError`."""
     words = [str(path) for path in surveys]
@@ -68,7 +71,8 @@ def wish_of(
     if spacing is None and travel is not TravelAlong.BOTH:
         remedy = "In a list of balises the column `direction` says it, one by one."
         raise UsageError("needs --balises every N", place=f"--direction {travel.value}", remedy=remedy)
-    return Wish(surveys, spacing, travel, None if spacing or balises is None else Path(balises), epsg, join_m, flat)
+    balise_list = None if spacing or balises is None else Path(balises)
+    return Wish(surveys, spacing, travel, balise_list, epsg, join_m, flat, id_field)
 
 
 def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
@@ -79,7 +83,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     if wish.join_m is not None and not 0.0 <= wish.join_m <= config.site.joined_m:
         expected = f"0 to {config.site.joined_m:g} m"
         raise UsageError("is no reach", place=f"--join {wish.join_m:g}", expected=expected)
-    survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config), config.survey)
+    survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config, wish.id_field), config.survey)
     if wish.flat:
         survey.pieces = [replace(piece, height_m=np.full(len(piece), np.nan)) for piece in survey.pieces]
     network = make_network(survey, wish.join_m, config.survey)

@@ -23,8 +23,8 @@ MAP_SUFFIXES = tuple(_BEGINNINGS)
 _POINT, _LINE_STRING, _MULTI_LINE_STRING = 1, 2, 5
 
 
-def read_map(path: Path, data: bytes) -> Survey:
-    """Each line of each layer a piece, in WGS 84. Raises `SiteError`."""
+def read_map(path: Path, data: bytes, id_field: str | None = None) -> Survey:
+    """Each line of each layer a piece, in WGS 84, named by `id_field` if given. Raises `SiteError`."""
     try:
         import pyogrio
     except ImportError:
@@ -42,7 +42,7 @@ def read_map(path: Path, data: bytes) -> Survey:
         features = [feature for layer in layers for feature in _features(path, layer)]
     except (ValueError, RuntimeError, OSError, struct.error, sqlite3.Error) as error:
         raise SiteError(f"cannot be read ({str(error).splitlines()[0]})", place=str(path)) from None
-    return survey_of_features(str(path), path.stem, features)
+    return survey_of_features(str(path), path.stem, features, id_field)
 
 
 def _refuse_computed(path: Path, layers: list[str]) -> None:

@@ -28,11 +28,16 @@ _RECORDED = "Of a recorded drive: `balise convert LOG --out DRIVE`, then the sam
 _KINDS = "GPX, KML, KMZ, GeoJSON, GeoPackage, Shapefile, FlatGeobuf, CSV, Parquet, a run, or a log of RTK"
 
 
-def read_surveys(paths: list[Path], epsg: int | None, vehicle: Vehicle, config: Configuration) -> Survey:
-    """All pieces of all files, each under a name of its own. Raises `SiteError`, for a run `InputError`."""
+def read_surveys(
+    paths: list[Path], epsg: int | None, vehicle: Vehicle, config: Configuration, id_field: str | None = None
+) -> Survey:
+    """All pieces of all files, each under a name of its own. Raises `SiteError`, for a run `InputError`.
+
+    `id_field`: attribute of maps that names the lines.
+    """
     survey = Survey()
     for path in paths:
-        survey.add(_read(path, epsg, vehicle, config))
+        survey.add(_read(path, epsg, vehicle, config, id_field))
     if not any(len(piece) > 1 for piece in survey.pieces):
         raise SiteError("holds no line", place=", ".join(map(str, paths)), expected="a line of two points or more")
     if 0 < sum(piece.whole for piece in survey.pieces) < len(survey.pieces):
@@ -46,7 +51,7 @@ def read_surveys(paths: list[Path], epsg: int | None, vehicle: Vehicle, config: 
     return survey
 
 
-def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration) -> Survey:
+def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration, id_field: str | None) -> Survey:
     suffix = path.suffix.lower()
     if path.is_dir() or suffix == ".mcap":
         return read_recorded(path, vehicle, config)
@@ -58,11 +63,11 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
         case ".kmz":
             return read_kmz(place, path.stem, data, config.survey)
         case ".geojson" | ".json":
-            return read_geojson(place, path.stem, data, config.site)
+            return read_geojson(place, path.stem, data, config.site, id_field)
         case ".csv" | ".txt" | ".parquet":
             return read_points(place, path.stem, data, epsg, config.site)
         case _ if suffix in MAP_SUFFIXES:
-            return read_map(path, data)
+            return read_map(path, data, id_field)
     return _of_receiver(path, vehicle, config)
 
 

@@ -13,6 +13,7 @@ from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table
 from schemas.config import SiteConfig
 from schemas.errors import SiteError
 
+_STATION = r"^(?<sign>[+-]?)(?<km>\d+)\s?\+\s?(?<m>\d{3}(?:\.\d+)?)$"
 NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "line_km", "sigma_m")
 
 
@@ -85,6 +86,16 @@ def _renamed(place: str, frame: pl.DataFrame) -> pl.DataFrame:
     return frame.rename(meanings)
 
 
+def _of_stations(text: pl.Series) -> pl.Series:
+    """Kilometres and metres, `48+050` and `-0+120`, as kilometres."""
+    table = text.str.strip_chars().str.extract_groups(_STATION).struct.unnest()
+    sign, km, m = (table[name] for name in ("sign", "km", "m"))
+    value = (km.cast(pl.Float64) + m.cast(pl.Float64) / 1000.0) * pl.select(
+        pl.when(sign == "-").then(-1.0).otherwise(1.0)
+    ).to_series()
+    return value.cast(pl.String).fill_null(text).alias(text.name)
+
+
 def _numbers(place: str, column: pl.Series) -> pl.Series:
     """Numbers, with a decimal comma where no number of the column has a point."""
     if column.dtype != pl.String:
@@ -92,6 +103,8 @@ def _numbers(place: str, column: pl.Series) -> pl.Series:
     text = column.replace("", None)
     if not text.str.contains(".", literal=True).any():
         text = text.str.replace(",", ".", literal=True)
+    if column.name == "line_km":
+        text = _of_stations(text)
     values = text.cast(pl.Float64, strict=False)
     wrong = (values.is_null() & text.is_not_null()) | ~values.fill_null(0.0).is_finite()
     if wrong.any():

@@ -20,15 +20,17 @@ _BLOCK = 2000
 
 def clean_traces(survey: Survey, config: SurveyConfig) -> Survey:
     """Recorded pieces cleaned, in order; each pass adds only track that none before it has. Others stay as they are."""
-    surveyed = [piece for piece in survey.pieces if not piece.recorded]
+    # Lines of one point, or none, as loggers write: `make_network` leaves them out with a note.
+    short = [piece for piece in survey.pieces if len(piece) < 2]
+    surveyed = [piece for piece in survey.pieces if not piece.recorded and len(piece) > 1]
     cleaned = replace(survey, pieces=list(surveyed))
     for piece in survey.pieces:
-        if piece.recorded:
+        if piece.recorded and len(piece) > 1:
             moving = piece.take(_moving(piece, config))
             for number, part in enumerate(_gapless(moving, cleaned, config), start=1):
                 name = f"{piece.name}/{number}" if number > 1 else piece.name
                 cleaned.pieces += _new_track(part, name, cleaned, config)
-    cleaned.pieces = _all_thinned(cleaned.pieces, len(surveyed), config.shape_m)
+    cleaned.pieces = [*_all_thinned(cleaned.pieces, len(surveyed), config.shape_m), *short]
     return cleaned
 
 

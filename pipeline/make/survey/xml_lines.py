@@ -63,7 +63,7 @@ class _XmlLines:
         self.path: list[str] = []
         self.text: list[str] = []
         self.name = ""
-        self.mode = _CLAMPED
+        self.mode = self.mode_of_all = _CLAMPED
         self.recorded = False
         self.points: list[list[float | None]] = []
         self.parser = expat.ParserCreate(namespace_separator=" ")
@@ -89,8 +89,11 @@ class _XmlLines:
             self.name = attributes.get("id", "")
         if local in _ENDS_OF_LINE:
             self.points = []
-            self.mode = _CLAMPED
+            # Tracks of a gx:MultiTrack have its altitude mode.
+            self.mode = self.mode_of_all if "MultiTrack" in self.path else _CLAMPED
             self.recorded = False
+        if local == "MultiTrack":
+            self.mode_of_all = _CLAMPED
         if local in ("trkpt", "rtept"):
             self.points.append([self._number(attributes.get(key)) for key in ("lat", "lon")] + [None])
 
@@ -107,6 +110,8 @@ class _XmlLines:
                 self.recorded = True
             case "altitudeMode":
                 self.mode = text
+                if self.path and self.path[-1] == "MultiTrack":
+                    self.mode_of_all = text
             case "coord":
                 self._add_triple(text.split())
             case "coordinates" if self.path and self.path[-1] == "LineString":

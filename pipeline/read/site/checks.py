@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import (
     GAP_COUNTS_M,
@@ -48,6 +49,7 @@ def remarks(
     passable, turning = _relations_that_turn_back(known, related, inward)
     collected = Remarks(passable, config, [*findings, *_relations_that_differ(known, related), *turning])
     _check_elements(track, declared_length_m, collected)
+    _check_kinks(track, known, related, inward, collected)
     _check_gaps(track, related, collected)
     collected.findings += _near_misses(track, related, inward, config)
     if balises is not None:
@@ -80,6 +82,31 @@ def drop_repeated_points(file: str, frame: pl.DataFrame, breaches: list[str]) ->
             text = f"{repeated[number]} of {points[number]} points repeat the one before and are left out"
             notes.append(Finding("warning", f"{file}: element {name}", text, remedy))
     return frame.filter(pl.Series(~repeats)), notes
+
+
+def drop_scattered_points(file: str, frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+    """A point from which the line turns back, half a metre or less from its neighbour: scatter of a survey, no track.
+
+    Left in, it would cut the element in two pieces of opposite directions. Dropped, and reported; ends stay.
+    """
+    places = points_of(*(frame[name].to_numpy() for name in ("latitude_deg", "longitude_deg"))).surface
+    element = frame["netelement_id"].rle_id().to_numpy()
+    step = np.diff(places, axis=0)
+    inner = (element[2:] == element[:-2]) & (np.einsum("ij,ij->i", step[1:], step[:-1]) < 0.0)
+    length_m = np.linalg.norm(step, axis=1)
+    back_m = np.minimum(length_m[1:], length_m[:-1])
+    rows = np.flatnonzero(inner & (back_m <= GAP_COUNTS_M))
+    # Of a point out and back again only the first is one.
+    rows = rows[np.diff(rows, prepend=-2) > 1] + 1
+    findings = []
+    for number in np.unique(element[rows]).tolist():
+        own = rows[element[rows] == number]
+        name = frame["netelement_id"][int(own[0])]
+        text = f"the line turns back over {back_m[own - 1].max():.2f} m at {len(own)} points, which are left out"
+        findings.append(Finding("warning", f"{file}: element {name}", text, "Remove them from the survey."))
+    kept = np.ones(frame.height, dtype=np.bool_)
+    kept[rows] = False
+    return frame.filter(pl.Series(kept)), findings
 
 
 def relations_to_nowhere(track: SurveyedTrack, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
@@ -192,6 +219,24 @@ def _check_elements(track: SurveyedTrack, declared_length_m: dict[str, float], c
             text += f"{chord_m[element]:.2f} m"
             collected.findings.append(Finding("note", place, text, "Survey curves with closer points."))
     _check_heights(track, collected)
+
+
+def _check_kinks(
+    track: SurveyedTrack, links: pl.DataFrame, related: tuple[Ints, Ints], inward: Floats, collected: Remarks
+) -> None:
+    """Corners at the ends of elements that are shorter than tracks are surveyed, where a train may pass."""
+    length_m = track.geometric_m[track.first[1:] - 1]
+    unit = inward / np.maximum(np.linalg.norm(inward, axis=1), 1e-12)[:, None]
+    turn_deg = np.degrees(
+        np.pi - np.arccos(np.clip(np.einsum("ij,ij->i", unit[related[0]], unit[related[1]]), -1.0, 1.0))
+    )
+    short_m = np.minimum(length_m[related[0] // 2], length_m[related[1] // 2])
+    passed = (links["navigability"] != Navigability.NONE.value).to_numpy()
+    for row in np.flatnonzero(passed & (short_m < GAP_COUNTS_M) & (turn_deg > collected.config.kink_deg)).tolist():
+        a, b = (track.ids[int(side[row]) // 2] for side in related)
+        text = f"turns by {turn_deg[row]:.0f} degrees into {b}, over an element of {short_m[row]:.2f} m"
+        remedy = "Leave the short element out, or survey it over a longer way."
+        collected.findings.append(Finding("warning", f"track: element {a}", text, remedy))
 
 
 def _check_heights(track: SurveyedTrack, collected: Remarks) -> None:

@@ -47,14 +47,21 @@ _LINK_COLUMNS = {
 }
 
 
+AXES_IN_DOUBT = (
+    "the coordinate system that it names has the latitude first; read all the same as GeoJSON has them, longitude first"
+)
+AXES_REMEDY = "Look at a map whether the track lies where it is, and exchange the axes if not; name no crs."
+
+
 @dataclass
 class GeoJsonNetwork:
-    """What one GeoJSON file holds; `declared_length_m` where elements state their length."""
+    """What one GeoJSON file holds; `declared_length_m` where elements state their length, `latitude_first`: its crs."""
 
     track: RawTable
     links: RawTable | None
     declared_length_m: dict[str, float]
     ignored: int
+    latitude_first: bool = False
 
 
 def read_network(file: str, data: bytes, breaches: list[str]) -> GeoJsonNetwork | None:
@@ -66,7 +73,14 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> GeoJsonNetwork 
     except _MALFORMED as error:
         breaches.append(f"{file}: is not a GeoJSON FeatureCollection ({error})")
         return None
-    return _network(file, features, epsg, breaches)
+    network = _network(file, features, epsg, breaches)
+    network.latitude_first = latitude_first(document)
+    return network
+
+
+def latitude_first(document: Mapping[str, Any]) -> bool:
+    """It names WGS 84 by an address of EPSG, which has the latitude first; GeoJSON has the longitude first."""
+    return bool(re.search(r"urn:.*EPSG.*4326|/EPSG/.*4326", json.dumps(document.get("crs")), re.IGNORECASE))
 
 
 def has_relations(features: Iterable[Any]) -> bool:

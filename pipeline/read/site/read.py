@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.read.site.checks import drop_repeated_points, remarks
-from pipeline.read.site.geojson import GeoJsonNetwork, read_network
+from pipeline.read.site.checks import drop_repeated_points, drop_scattered_points, remarks
+from pipeline.read.site.geojson import AXES_IN_DOUBT, AXES_REMEDY, GeoJsonNetwork, read_network
 from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
 from pipeline.stages.track.network import surveyed
@@ -151,6 +151,10 @@ def _read_track(
         return None, network, []
     frame = by_element(to_wgs84(raw, frame, config, breaches))
     frame, notes = drop_repeated_points(raw.file, frame, breaches)
+    frame, scattered = drop_scattered_points(raw.file, frame)
+    notes += scattered
+    if network and network.latitude_first:
+        notes.append(Finding("warning", f"{raw.file}: crs", AXES_IN_DOUBT, AXES_REMEDY))
     if network and network.ignored:
         text = f"{network.ignored} features are not used: they are neither net element nor relation"
         notes.append(Finding("note", raw.file, text))

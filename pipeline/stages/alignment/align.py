@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import polars as pl
 
-from pipeline.stages.alignment.learning import learn
+from pipeline.stages.alignment.learning import Hold, learn
 from pipeline.stages.alignment.odometer_filter import Estimates, stamp_jitter_s
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER, first_reason
 from pipeline.stages.monitors.axis import most_scatter_m
+from pipeline.stages.monitors.noise import NoiseMeter
+from pipeline.stages.monitors.series import along_axis
 from pipeline.stages.odometry.driven import hysteresis_m, with_hysteresis
 from pipeline.stages.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
@@ -34,8 +38,30 @@ def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, 
     positions = positions.with_columns(pl.Series("along_m", along_m, nan_to_null=True))
     t_ns = times_ns(positions)
     jitter_s = stamp_jitter_s(odometry.seconds(t_ns), periods_before_s(t_ns), config.align.clock_periods)
-    in_use = learn(positions, flags(positions, "on_track"), jitter_s, odometry, vehicle, config)
-    return positions.with_columns(_columns(t_ns, jitter_s, odometry, in_use, config))
+    in_use, holds = learn(positions, flags(positions, "on_track"), jitter_s, odometry, vehicle, config)
+    aligned = positions.with_columns(_columns(t_ns, jitter_s, odometry, in_use, config))
+    if not odometry.independent or config.lds.ci_source != "sigma":
+        return aligned
+    excess_m2 = stated_excess_m2(aligned, holds, config)
+    widened = (pl.col("sigma_along_m") ** 2 + pl.Series(excess_m2)).sqrt()
+    return aligned.with_columns(confidence_m=config.lds.ci_factor * widened)
+
+
+def stated_excess_m2(aligned: pl.DataFrame, holds: Sequence[Hold], config: Configuration) -> Floats:
+    """By how much the variance along the track is larger than stated, as epochs before each show it (DOMAIN section 3).
+
+    Measured in every run, whatever noise is given for the thresholds; nothing of a hold enters.
+    """
+    axis = along_axis(aligned, config)
+    meter = NoiseMeter(axis.series, axis.moving, None, config)
+    for alarm, back in holds:
+        meter.freeze(int(np.searchsorted(axis.series.epoch, alarm)))
+        if back < aligned.height:
+            meter.restart(int(np.searchsorted(axis.series.epoch, back)))
+    known = np.searchsorted(axis.series.epoch, np.arange(aligned.height), side="right") - 1
+    if not axis.series.epoch.size:
+        return np.zeros(aligned.height)
+    return np.asarray(np.where(known < 0, 0.0, meter.stated_excess_m2()[known]))
 
 
 def _sigmas(config: MonitorConfig) -> list[pl.Expr]:
@@ -49,7 +75,7 @@ def _sigmas(config: MonitorConfig) -> list[pl.Expr]:
 
 
 def _confidence(lds: LdsConfig) -> pl.Expr:
-    """K sigma along the track, or the receiver's HPL (DOMAIN section 4)."""
+    """K sigma along the track, as stated, or the receiver's HPL (DOMAIN section 4)."""
     half_width = lds.ci_factor * pl.col("sigma_along_m") if lds.ci_source == "sigma" else pl.col("hpl_m")
     return half_width.alias("confidence_m")
 

@@ -28,6 +28,11 @@ from pipeline.stages.odometry.recovery import RecoveryRule
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, Vehicle
 
+Hold = tuple[int, int]
+"""From the epoch of an alarm along the track to that of recovery (past the last one if there is none): nothing is
+learned.
+"""
+
 
 def learn(
     positions: pl.DataFrame,
@@ -36,21 +41,20 @@ def learn(
     odometry: Odometry,
     vehicle: Vehicle,
     config: Configuration,
-) -> Estimates:
-    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only.
+) -> tuple[Estimates, list[Hold]]:
+    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only; and the holds.
 
     `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `jitter_s`: of their stamps.
     """
     prior = prior_of(vehicle, config.align)
     learned = prior.over(positions.height)
-    if vehicle.odometer_scale is not None and vehicle.gnss_latency_s is not None:
-        return learned
-    _Learner(positions, usable, jitter_s, odometry, vehicle, config, learned).run(prior)
+    learner = _Learner(positions, usable, jitter_s, odometry, vehicle, config, learned)
+    learner.run(prior)
     if vehicle.odometer_scale is not None:
         learned.scale_sigma[:] = prior.scale_sigma
     if vehicle.gnss_latency_s is not None:
         learned.latency_sigma_s[:] = prior.latency_sigma_s
-    return learned
+    return learned, learner.holds
 
 
 class _Learner:
@@ -78,6 +82,7 @@ class _Learner:
         self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
         self._alphas = np.array(config.monitors.ewma_alphas)
         self._factor = config.monitors.threshold_factor
+        self.holds: list[Hold] = []
         self._limit_m = config.hazards.failure_limit_m
         self._rule = RecoveryRule(config)
         # The filter reads the odometer up to a latency of five sigmas earlier.
@@ -118,6 +123,8 @@ class _Learner:
                 break
             self._meter.freeze(alarm)
             row, unsettled_m2 = self._hold(float(estimates_of(state.joint).scale_sigma), alarm)
+            epochs = np.append(self._rows, self._learned.scale.size)
+            self.holds.append((int(epochs[alarm]), int(epochs[row])))
             self._meter.restart(row)
             if row < self._rows.size:
                 state = self._filter.restart(state, *self._observation(row), unsettled_m2)

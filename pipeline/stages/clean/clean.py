@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.stages.clean.held import copies
 from pipeline.stages.clean.journey import DAY_NS, require_spans, require_two_times
 from pipeline.stages.clean.placeholders import without_placeholders
 from schemas.arrays import Bools
@@ -41,7 +42,7 @@ class StreamCounts:
     """Rows dropped because their key stands twice, and rows that came before an earlier one.
 
     `far_off`: dropped for a time of another day. Of GNSS also `contradicting`: doubles at another place than the one
-    that stays; and `placeholders`.
+    that stays; `placeholders`; and `held`: rows that repeat a position at a higher rate than the receiver's.
     """
 
     duplicates: int = 0
@@ -49,6 +50,7 @@ class StreamCounts:
     contradicting: int = 0
     far_off: int = 0
     placeholders: int = 0
+    held: int = 0
 
 
 @dataclass(frozen=True)
@@ -80,11 +82,12 @@ def clean(
     if "odometer" in streams:
         streams["odometer"], others = _by_sensor(streams["odometer"], config.lds.odometer_sensor, run.run_id)
     streams["gnss"], placeholders = _with_fixes(streams["gnss"], config)
+    streams["gnss"], held = _without_copies(streams["gnss"])
     cleaned = replace(run, notes=_noted(run.notes, counts), other_odometers=others or run.other_odometers)
     cleaned = cleaned.with_streams(**streams)
     require_spans(cleaned, config.ingest)
     _require_times(cleaned, clock_advice)
-    return cleaned, CleanCounts(_solution_counts(*dated["gnss"], placeholders), counts)
+    return cleaned, CleanCounts(_solution_counts(*dated["gnss"], placeholders, held), counts)
 
 
 def _dated_streams(run: RunLog, few: float) -> dict[Stream, tuple[pl.DataFrame, pl.DataFrame]]:
@@ -104,12 +107,13 @@ def _dated_streams(run: RunLog, few: float) -> dict[Stream, tuple[pl.DataFrame, 
 
 
 def _solution_counts(
-    recorded: pl.DataFrame, far: pl.DataFrame, placeholders: Mapping[str, int]
+    recorded: pl.DataFrame, far: pl.DataFrame, placeholders: Mapping[str, int], held: Mapping[str, int]
 ) -> dict[str, StreamCounts]:
     counts: dict[str, StreamCounts] = {}
     for part in recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True):
         name = part["solution"][0]
-        counts[name] = replace(_of_solution(part, far), placeholders=placeholders.get(name, 0))
+        marked = {"placeholders": placeholders.get(name, 0), "held": held.get(name, 0)}
+        counts[name] = replace(_of_solution(part, far), **marked)
     return counts
 
 
@@ -169,6 +173,22 @@ def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame
         marked.append(part.select("_row", "fix"))
         counts[part["solution"][0]] = count
     return (gnss.with_columns(pl.concat(marked).sort("_row")["fix"]) if any(counts.values()) else gnss), counts
+
+
+def _without_copies(gnss: pl.DataFrame) -> tuple[pl.DataFrame, dict[str, int]]:
+    """Positions without rows that repeat them at a higher rate than the receiver's, and how many, by solution."""
+    if not {"solution", *_PLACE} <= set(gnss.columns):
+        return gnss, {}
+    counts: dict[str, int] = {}
+    left_out = np.zeros(gnss.height, dtype=np.bool_)
+    narrow = gnss.select("solution", "t", *_PLACE).with_row_index("_row")
+    for part in narrow.partition_by("solution", maintain_order=True):
+        t_ns = part["t"].to_physical().to_numpy()
+        places = (part[name].cast(pl.Float64).fill_null(float("nan")).to_numpy() for name in _PLACE)
+        held = copies((t_ns - t_ns[:1]) / 1e9, *places)
+        left_out[part["_row"].to_numpy()] = held
+        counts[part["solution"][0]] = int(held.sum())
+    return (gnss.filter(~left_out) if left_out.any() else gnss), counts
 
 
 def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:

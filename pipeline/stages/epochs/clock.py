@@ -116,7 +116,8 @@ def reactions_ns(detected_ns: Ints, position_ns: Ints, config: Configuration) ->
         return np.full(detected_ns.size, round((config.hazards.reaction_s or 0.0) * NS_PER_S))
     after = np.searchsorted(position_ns, detected_ns, side="right").clip(max=position_ns.size - 1)
     waits_ns = np.where(position_ns[after] > detected_ns, position_ns[after] - detected_ns, NS_PER_S)
-    return np.minimum(waits_ns, crossing_gaps_ns(position_ns, config.lds)[after])
+    reactions: Ints = np.minimum(waits_ns, crossing_gaps_ns(position_ns, config.lds)[after])
+    return reactions
 
 
 def gap_limit_s(period_s: float | None, gap_reset_s: float) -> float:

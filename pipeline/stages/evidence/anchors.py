@@ -95,7 +95,7 @@ class KnownStretch:
     @property
     def doubtful(self) -> Bools:
         """Samples of which nobody knows how far they are off: the reference drifted, and no read says since when."""
-        return np.logical_or.reduce([~np.isfinite(known.low_m) for known in self.paths])
+        return np.asarray(np.logical_or.reduce([~np.isfinite(known.low_m) for known in self.paths]))
 
     def doubtful_spans(self) -> list[tuple[int, int]]:
         """The times of these samples, ends left out."""
@@ -145,7 +145,7 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
     """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
     begin, end, step_m = _steps_of(stretch, 1.0)
     if counter is not None:
-        counted_m = counter.distance_m(stretch.t_ns[begin], stretch.t_ns[end])
+        counted_m = counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end])
         step_m = np.sign(step_m) * np.nan_to_num(counted_m)
     moved_m = np.cumsum(step_m)
     first = np.flatnonzero(np.abs(moved_m) >= least_m)
@@ -544,7 +544,8 @@ def _contradicted(
         way = counter.between(t_ns[begin], t_ns[end])
         step_sigma_m = np.sqrt(stretch.sigma_m[end] ** 2 + stretch.sigma_m[begin] ** 2 + way.variance_m2)
         way_m = known.at_m[end] - known.at_m[begin]
-        counted_m = known.sense * witnesses.scale * way.distance_m
+        sure_m = np.where(way.bound_m > 0.0, np.nan, way.distance_m)
+        counted_m = known.sense * witnesses.scale * sure_m
         if not witnesses.signed:
             counted_m = np.where(way_m * counted_m < 0.0, -counted_m, counted_m)
         off_m = way_m - counted_m
@@ -585,7 +586,7 @@ def median_about(values: Floats, way_m: Floats, window_m: float) -> Floats:
     last = np.minimum(last + short, values.size)
     medians = [float(np.median(values[low:high])) for low, high in zip(first.tolist(), last.tolist(), strict=True)]
     nearest = np.rint((way_m - way_m[0]) / (0.25 * window_m)).astype(np.int64).clip(0, places_m.size - 1)
-    return np.array(medians)[nearest]
+    return np.asarray(np.array(medians)[nearest])
 
 
 def read_anchors(

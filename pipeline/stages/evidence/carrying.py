@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.odometry import OdometerWay
 from pipeline.stages.track.path import Place
-from schemas.arrays import NS_PER_S, Floats, Ints, runs_of
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
 from schemas.config import Configuration
 from schemas.enums import Evidence
 
@@ -35,18 +35,16 @@ class TrueAnchor:
 
 @dataclass(frozen=True)
 class Counter:
-    """An odometer as evidence: silent over `breaks_ns`, the instants at which it did not count."""
+    """An odometer as evidence: silent over `breaks_ns`, and where its distance is in doubt by more than `silent_m`."""
 
     odometer: Odometry
     breaks_ns: Ints
+    silent_m: float = 0.0
 
     @classmethod
-    def of(cls, odometer: Odometry, without_sign: bool = False) -> Counter:
-        """Nothing is carried over a pause or a reset, nor over a stand without a sign: it may hide a turn."""
-        pause = np.flatnonzero(odometer.pause)
-        silent_ns = odometer.epoch_ns + (0.5e9 * (odometer.t_s[pause] + odometer.t_s[pause + 1])).astype(np.int64)
-        stands = _stands_ns(odometer) if without_sign else np.zeros(0, dtype=np.int64)
-        return cls(odometer, np.unique(np.concatenate([silent_ns, np.array(odometer.leaps_ns, np.int64), stands])))
+    def of(cls, odometer: Odometry, silent_m: float = 0.0, without_sign: bool = False) -> Counter:
+        """Silent over more than `silent_m` of doubt and over a stand without a sign, which may hide a turn."""
+        return cls(odometer, _stands_ns(odometer) if without_sign else np.zeros(0, dtype=np.int64), silent_m)
 
     @property
     def by_file(self) -> bool:
@@ -54,17 +52,23 @@ class Counter:
         return self.odometer.scale is not None
 
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
-        """True distance between instants and its variance; NaN over a break."""
+        """True distance between instants, its variance and bound; NaN over a break."""
         counted = self.odometer.between(begin_ns, end_ns)
-        return OdometerWay(self._unbroken(begin_ns, end_ns, counted.distance_m), counted.variance_m2)
+        known = self._same(begin_ns, end_ns) & (counted.bound_m <= self.silent_m)
+        return counted._replace(distance_m=np.where(known, counted.distance_m, np.nan))
 
     def distance_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """The distance of `between` alone, which takes half the time."""
-        return self._unbroken(begin_ns, end_ns, self.odometer.distance_between(begin_ns, end_ns))
+        """Distance where nothing of it is in doubt: NaN over slip, pauses and resets too."""
+        sure = self._same(begin_ns, end_ns) & (self.bound_m(begin_ns, end_ns) == 0.0)
+        return np.where(sure, self.odometer.distance_between(begin_ns, end_ns), np.nan)
 
-    def _unbroken(self, begin_ns: Ints | int, end_ns: Ints, distance_m: Floats) -> Floats:
+    def bound_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """By how much the distance between instants may be off [m]."""
+        return self.odometer.bound_between_m(begin_ns, end_ns)
+
+    def _same(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
         breaks = [np.searchsorted(self.breaks_ns, t_ns, side="right") for t_ns in (begin_ns, end_ns)]
-        return np.where(breaks[0] == breaks[1], distance_m, np.nan)
+        return np.asarray(breaks[0] == breaks[1])
 
     def driven_m(self, since_ns: Ints | int, t_ns: Ints) -> Floats:
         """Way driven, turns included [m]."""
@@ -108,9 +112,10 @@ def carried(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, confi
 def _carried_from(
     counter: Counter, since_ns: Ints | int, at_m: Floats | float, t_ns: Ints, known_m: float, config: Configuration
 ) -> Interval:
-    """Places at some instants, known to `known_m`, plus the distance since, +- (5 m + 5 %)."""
-    centre = at_m + counter.distance_m(since_ns, t_ns)
-    half = beside_m(counter.driven_m(since_ns, t_ns), known_m, config)
+    """Places at some instants, known to `known_m`, plus the distance since, +- (5 m + 5 % + bound)."""
+    way = counter.between(since_ns, t_ns)
+    centre = at_m + way.distance_m
+    half = beside_m(counter.driven_m(since_ns, t_ns), known_m, config) + way.bound_m
     return centre - half, centre + half
 
 
@@ -124,7 +129,8 @@ def between_anchors(
     """Between two anchors at these coordinates (DOMAIN section 5.1, carrying).
 
     Where the odometer of a vehicle file closes, the inverse-variance mean of both +- (k sigmas + closing error), as the
-    whole closing error may have arisen at one place. Else the hull of both.
+    whole closing error may have arisen at one place. Else the hull of both. Each is wider by its own bound; where
+    the less doubtful anchor alone tells more, it does.
     """
     factor = config.hazards.evidence_factor
     clock_m = [anchor.clock_m for anchor in anchors]
@@ -137,11 +143,36 @@ def between_anchors(
         centre = share * places[0] + (1.0 - share) * places[1]
         # The two places differ by the closing error at every instant.
         half = factor / np.sqrt(weights[0] + weights[1]) + np.abs(places[0] - places[1])
-        half += share * clock_m[0] + (1.0 - share) * clock_m[1]
-        return centre - half, centre + half
-    halves = [factor * np.sqrt(variance) + added_m for variance, added_m in zip(variances, clock_m, strict=True)]
+        half += share * (clock_m[0] + ways[0].bound_m) + (1.0 - share) * (clock_m[1] + ways[1].bound_m)
+        together = centre - half, centre + half
+        return _narrower(together, counter, anchors, at_m, t_ns, ways, config)
+    halves = [
+        factor * np.sqrt(variance) + added_m + way.bound_m
+        for variance, added_m, way in zip(variances, clock_m, ways, strict=True)
+    ]
     low = np.minimum(places[0] - halves[0], places[1] - halves[1])
-    return low, np.maximum(places[0] + halves[0], places[1] + halves[1])
+    hull = low, np.maximum(places[0] + halves[0], places[1] + halves[1])
+    return _narrower(hull, counter, anchors, at_m, t_ns, ways, config)
+
+
+def _narrower(
+    together: Interval,
+    counter: Counter,
+    anchors: tuple[TrueAnchor, TrueAnchor],
+    at_m: tuple[float, float],
+    t_ns: Ints,
+    ways: list[OdometerWay],
+    config: Configuration,
+) -> Interval:
+    """By both anchors together, or by the one from which less is in doubt, where that is narrower."""
+    doubtful = (ways[0].bound_m > 0.0) | (ways[1].bound_m > 0.0)
+    if not doubtful.any():
+        return together
+    first, second = (carried(counter, anchor, at, t_ns, config) for anchor, at in zip(anchors, at_m, strict=True))
+    by_first = ways[0].bound_m <= ways[1].bound_m
+    low_m, high_m = (np.where(by_first, *pair) for pair in zip(first, second, strict=True))
+    alone = doubtful & ~(together[1] - together[0] <= high_m - low_m)
+    return np.where(alone, low_m, together[0]), np.where(alone, high_m, together[1])
 
 
 def closes(counter: Counter, anchors: tuple[TrueAnchor, TrueAnchor], apart_m: float, config: Configuration) -> bool:
@@ -153,7 +184,7 @@ def closes(counter: Counter, anchors: tuple[TrueAnchor, TrueAnchor], apart_m: fl
     limit = config.hazards.evidence_factor * root
     if not counter.by_file:
         limit = beside_m(counter.driven_m(begin.t_ns, end_ns), 0.0, config)
-    return bool((np.abs(apart_m - way.distance_m) <= limit)[0])
+    return bool((np.abs(apart_m - way.distance_m) <= limit + way.bound_m)[0])
 
 
 def carried_forward(
@@ -169,7 +200,7 @@ def carried_forward(
     NaN before the first balise, over a break and over a stand in `stood`. `accepted_ns` in order, at `path_m` of the
     solution's own path, with which the odometer grows.
     """
-    counter = Counter.of(odometer)
+    counter = Counter.of(odometer, config.hazards.failure_limit_m)
     used = _consistent(accepted_ns, path_m, counter, config)
     low, high = np.full((2, t_ns.size), np.nan)
     if used.size:

@@ -311,7 +311,7 @@ def evidence_of(
     """
     hazards = config.hazards
     independent = [odometer for odometer in odometers if odometer.independent]
-    counters = [Counter.of(odometer) for odometer in independent or odometers]
+    counters = [Counter.of(odometer, config.hazards.failure_limit_m) for odometer in independent or odometers]
     # An odometer that may be made of the positions measures no clock, and contradicts no reference.
     witnesses = counters if independent else []
     main = counters[0] if counters else None

@@ -108,7 +108,8 @@ class GapSearch:
         borders = sorted(borders, key=lambda border: border[0].t_ns)
         gaps = self.gaps_of(borders)
         if self.turned or not self._sheets(gaps):
-            signless = replace(self, counter=Counter.of(self.counter.odometer, without_sign=True))
+            stands = Counter.of(self.counter.odometer, self.counter.silent_m, without_sign=True)
+            signless = replace(self, counter=stands)
             return Carried(signless.counter, tuple(signless.gaps_of(borders)))
         return Carried(self.counter, tuple(gaps))
 
@@ -133,16 +134,18 @@ class GapSearch:
         if end.t_ns < begin.t_ns:
             return []
         end_ns = np.array([end.t_ns])
-        length_m = float(self.counter.distance_m(begin.t_ns, end_ns)[0])
+        counted = self.counter.between(begin.t_ns, end_ns)
+        length_m, bound_m = float(counted.distance_m[0]), float(counted.bound_m[0])
         if np.isnan(length_m):
             return [Gap(begin.t_ns, end.t_ns, begin, None, []), Gap(begin.t_ns, end.t_ns, None, end, [])]
         way_m = self.counter.driven_m(begin.t_ns, end_ns)
         hazards = self.config.hazards
         noise_m = hazards.evidence_factor * (begin.sigma_m + end.sigma_m) + begin.clock_m + end.clock_m
-        slack_m = float(beside_m(way_m, 0.0, self.config)[0]) + noise_m
+        slack_m = float(beside_m(way_m, 0.0, self.config)[0]) + noise_m + bound_m
         ways = self._ways_of_length(begin, end, length_m, slack_m)
         if ways == []:
-            ways = self._ways_of_length(begin, end, length_m, hazards.slip_m + hazards.slip_share * float(way_m[0]))
+            slip_m = hazards.slip_m + hazards.slip_share * float(way_m[0]) + bound_m
+            ways = self._ways_of_length(begin, end, length_m, slip_m)
         if ways is not None:
             ends = (begin, end)
             ways = [replace(way, closed=closes(self.counter, ends, way.apart_m, self.config)) for way in ways]
@@ -153,7 +156,7 @@ class GapSearch:
         gaps = self._between(begin, end)
         if len(gaps) != 1 or not gaps[0].ways or gaps[0].closed:
             return 0.0
-        counted_m = float(self.counter.distance_m(begin.t_ns, np.array([end.t_ns]))[0])
+        counted_m = float(self.counter.between(begin.t_ns, np.array([end.t_ns])).distance_m[0])
         return min((way.apart_m - counted_m for way in gaps[0].ways), key=abs)
 
     def _ways_of_length(
@@ -218,7 +221,7 @@ class GapSearch:
 
     def _turned(self, gap: Gap, looks_ns: Ints) -> bool:
         """The train went back in the gap by more than the fixed error of the odometer."""
-        distance_m = self.counter.distance_m(gap.anchors[0].t_ns, looks_ns)
+        distance_m = self.counter.between(gap.anchors[0].t_ns, looks_ns).distance_m
         distance_m = distance_m[np.isfinite(distance_m)]
         # The largest fall behind the farthest place so far; a run without a turn has none in one of the two senses.
         senses = (distance_m, -distance_m)

@@ -222,7 +222,8 @@ def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence
     """The error along the solution's own path, for positions off the train's track, where that path leads to the train.
 
     Counted that far along the train's track, the position's place may lie on that track: then the two tracks are
-    parallel, and the position is on another track, at no distance along.
+    parallel, and the position is on another track, at no distance along. (Without this 5 of 5 runs that end 1 to 8 m
+    before a border of elements, with a position 6 to 12 m ahead, are `unsafe` for the element behind it; with it none.)
     """
     rows = there.rows
     middle_m = there.middle_m

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
+from pipeline.stages.epochs.passing import passings
 from pipeline.stages.evidence.evidence import Alternative, EvidenceSet
 from pipeline.stages.judge.case import Case
 from pipeline.stages.track.path import Place
@@ -120,12 +121,14 @@ def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config:
     close = half_m <= config.hazards.known_error_m
     beyond = np.abs(away_m) >= np.maximum(config.lds.rearm_m, half_m)
     ahead = away_m >= 0.0
-    changes = np.flatnonzero((ahead[1:] != ahead[:-1]) & (np.diff(rows) == 1)) + 1
     crossings: list[TrueCrossing] = []
     armed_from = 0
     passed = False
     far = np.flatnonzero(beyond)
-    for change in changes.tolist():
+    for passing in passings(away_m, [0.0]):
+        change = passing.after
+        if rows[change] - rows[change - 1] != 1:
+            continue
         armed = bool((beyond & (ahead != ahead[change]))[armed_from:change].any())
         # However often its middle wavers at the balise: on which side the train is next known to be beyond it.
         next_far = int(np.searchsorted(far, change))
@@ -135,8 +138,6 @@ def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config:
         armed_from = change
         passed = True
         if on_track[change]:
-            before_m, after_m = away_m[change - 1 : change + 1].tolist()
-            begin_ns, end_ns = train.t_ns[rows[change - 1 : change + 1]].tolist()
-            instant_ns = begin_ns + round((end_ns - begin_ns) * before_m / (before_m - after_m))
-            crossings.append(TrueCrossing(instant_ns, 1 if after_m > before_m else -1, clear))
+            instant_ns = passing.instant_ns(*train.t_ns[rows[change - 1 : change + 1]].tolist())
+            crossings.append(TrueCrossing(instant_ns, passing.sense, clear))
     return crossings

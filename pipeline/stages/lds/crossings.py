@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isnan
 
 import numpy as np
 import polars as pl
 
+from pipeline.stages.epochs.passing import Passing, passings
 from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.windows import Window
+from schemas.arrays import spans_of
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind, LinkingError, PassageStatus, Reaction
 from schemas.stages import Crossings
@@ -101,53 +103,34 @@ def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
 
 
 def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing]:
-    """Crossings of virtual balises, those of one step in the order of being passed.
-
-    Growing from before it to it or beyond, falling from there to before it: touching it and turning back are two.
-    """
+    """Crossings of virtual balises, those of one step in the order of being passed (`passings`)."""
     known = np.flatnonzero(journey.positioned)
     crossings: list[Crossing] = []
     for leg in sorted({balise.leg for balise in balises}):
         on_leg = [balise for balise in balises if balise.leg == leg]
-        at_m = np.array([balise.path_m for balise in on_leg])
-        steps = np.flatnonzero(journey.leg[known[1:]] == leg)
-        before = known[steps]
-        after = known[steps + 1]
-        passed_before = np.searchsorted(at_m, journey.path_m[before], side="right")
-        passed_after = np.searchsorted(at_m, journey.path_m[after], side="right")
-        passing = np.flatnonzero(passed_before != passed_after)
-        for step in passing.tolist():
-            begin, end = int(before[step]), int(after[step])
-            passed = _in_order(on_leg, int(passed_before[step]), int(passed_after[step]))
-            crossings += [_crossing(journey, balise, begin, end, sense) for balise, sense in passed]
+        # Every stretch of steps on this leg; of a step the leg is that of its later end.
+        for first, last in spans_of(journey.leg[known[1:]] == leg):
+            rows = known[first : last + 2]
+            passed = passings(journey.path_m[rows], [balise.path_m for balise in on_leg])
+            crossings += [
+                _crossing(journey, on_leg[one.place], one, *rows[one.after - 1 : one.after + 1]) for one in passed
+            ]
     # Valid in the direction as known then: in the first metres after a turn that is still the old one.
     return [crossing for crossing in crossings if crossing.balise.is_valid(crossing.direction)]
 
 
-def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tuple[Balise, int]]:
-    """The balises passed by a step, with its sense; `before`, `after`: how many lie behind it at its ends."""
-    if after > before:
-        yield from ((balise, 1) for balise in balises[before:after])
-    else:
-        yield from ((balise, -1) for balise in reversed(balises[after:before]))
-
-
-def _crossing(journey: Journey, balise: Balise, before: int, epoch: int, sense: int) -> Crossing:
+def _crossing(journey: Journey, balise: Balise, passing: Passing, before: int, epoch: int) -> Crossing:
     near = bool(journey.t_ns[epoch] - journey.t_ns[before] <= journey.gap_ns[epoch])
-    share = 1.0
-    t_ns = journey.t_ns
-    path_m = journey.path_m
+    passing = passing if near else passing._replace(share=1.0)
     odometer_m = journey.odometer_m
-    if near:
-        share = float((balise.path_m - path_m[before]) / (path_m[epoch] - path_m[before]))
     direction = int(journey.direction[epoch])
-    back_m = 0.0 if share == 1.0 else (1.0 - share) * float(odometer_m[epoch] - odometer_m[before])
+    back_m = 0.0 if passing.share == 1.0 else (1.0 - passing.share) * float(odometer_m[epoch] - odometer_m[before])
     return Crossing(
         balise=balise,
-        before=before,
-        epoch=epoch,
-        t_ns=int(t_ns[before]) + round(share * int(t_ns[epoch] - t_ns[before])),
-        sense=sense,
+        before=int(before),
+        epoch=int(epoch),
+        t_ns=passing.instant_ns(int(journey.t_ns[before]), int(journey.t_ns[epoch])),
+        sense=passing.sense,
         direction=direction,
         odometer_m=_known(float(odometer_m[epoch]) - back_m),
         travelled_m=float(journey.travelled_m[epoch]) - back_m * direction,

@@ -111,7 +111,8 @@ class LinkingChain:
     def turn(self, journey: Journey, epoch: int) -> None:
         """The train goes the other way, or on another leg: expect the balises on its new way.
 
-        Those whose window covers the place of the turn may have been passed or not: they are optional.
+        Those whose window covers the place of the turn may have been passed or not: they are optional. (Without this 9
+        of 10 healthy trains that turn 2 to 24 m before or 15 m behind a balise miss it, and brake.)
         """
         if self.reference is None or not self.linking:
             return

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
+from pipeline.stages.epochs.passing import passings
 from pipeline.stages.lds.crossings import (
     PLACE,
     Crossing,
@@ -203,11 +204,8 @@ def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
         return None
     known = journey.on_odometer
     rows = known[: int(np.searchsorted(journey.t_ns[known], passage.t_ns, side="right"))]
-    beyond = journey.odometer_m[rows] >= passage.announced_odometer_m
-    steps = np.flatnonzero(np.diff(beyond))
-    if not steps.size:
+    passed = passings(journey.odometer_m[rows], [passage.announced_odometer_m])
+    if not passed:
         return None
-    before, after = rows[steps[-1] : steps[-1] + 2].tolist()
-    part_m = passage.announced_odometer_m - journey.odometer_m[before]
-    share = float(part_m / (journey.odometer_m[after] - journey.odometer_m[before]))
-    return int(journey.t_ns[before]) + round(share * int(journey.t_ns[after] - journey.t_ns[before]))
+    before_ns, after_ns = journey.t_ns[rows[passed[-1].after - 1 : passed[-1].after + 1]].tolist()
+    return passed[-1].instant_ns(before_ns, after_ns)

@@ -77,6 +77,34 @@ class NoiseMeter:
         by_lag = self._by_lag(renewals)
         return np.asarray(np.take_along_axis(by_lag[self._renewal[begin:end] - renewals[0]], columns, axis=1))
 
+    def stated_excess_m2(self) -> Floats:
+        """What the lags of 10 and 100 s that are ready show beyond the stated sigma, row by row [m^2], causally.
+
+        0 until one is ready; s_L^2 - S_L is four times M without its doubt.
+        """
+        renewals, of_row = np.unique(self._renewal, return_inverse=True)
+        row = np.searchsorted(self._renewal, renewals)
+        excess_m2 = np.zeros(renewals.size)
+        for index, samples in enumerate(self._samples):
+            if self._lags_s[index] in self._memories_s[1:]:
+                end, ready = self._until(index, renewals)
+                ends, window = np.unique(end, return_inverse=True)
+                found_m2, error, _ = samples.looked_back(self._entering[index], ends)
+                model_m2 = _model_at_m2(self._series, row, self._lags_s[index], self._config)
+                shown_m2 = model_m2 + OF_WALK * found_m2[window]
+                lag_m2 = excess_of(shown_m2, model_m2, error[window], self._config)
+                excess_m2 = np.maximum(excess_m2, np.where(ready, lag_m2, 0.0))
+        return np.asarray(excess_m2[of_row])
+
+    def _until(self, index: int, renewals: Ints) -> tuple[Ints, Bools]:
+        """How many samples of a lag count at each renewal, and whether they are enough."""
+        samples = self._samples[index]
+        before = np.searchsorted(samples.renewal[self._entering[index]], renewals)
+        # The latest samples wait: a drift, whose onset shows in samples for 2 L, must not raise its own thresholds.
+        waiting = round(self._config.noise_wait_spans * samples.span)
+        end = np.maximum(before - waiting, np.minimum(before, samples.ready))
+        return end, end >= samples.ready
+
     def _by_lag(self, renewals: Ints) -> Floats:
         """M of every lag (columns) at these renewals (rows): measured, or expected from the shorter lags until it is.
 
@@ -108,11 +136,7 @@ class NoiseMeter:
         """M of one lag by the samples before each renewal (first row `row`), and whether they were enough."""
         samples = self._samples[index]
         entering = self._entering[index]
-        before = np.searchsorted(samples.renewal[entering], renewals)
-        # The latest samples wait: a drift, whose onset shows in samples for 2 L, must not raise its own thresholds.
-        waiting = round(self._config.noise_wait_spans * samples.span)
-        end = np.maximum(before - waiting, np.minimum(before, samples.ready))
-        ready = end >= samples.ready
+        end, ready = self._until(index, renewals)
         if not ready.any():
             return np.zeros(end.size), ready
         ends, window = np.unique(end, return_inverse=True)
@@ -254,6 +278,15 @@ class _Sampler:
         for lasting_m in self._lasting_m:
             model_m2 += rows.second_difference(lasting_m) ** 2
         return np.asarray(model_m2 + self._white_m2[rows.last] - self._white_m2[rows.oldest])
+
+
+def excess_of(shown_m2: Floats, model_m2: Floats, error: Floats, config: MonitorConfig) -> Floats:
+    """Variance that second differences over one lag add to the stated one (DOMAIN section 3) [m^2].
+
+    `shown_m2`: s_L^2; `model_m2`: S_L; `error`: relative standard error of s_L^2, sqrt(2 / stretches of 2 L seen).
+    """
+    beyond_m2 = shown_m2 - model_m2 * (1.0 + config.stated_excess_errors * error)
+    return np.asarray(config.stated_excess_share * np.maximum(beyond_m2, 0.0))
 
 
 def _lags_s(period_s: float, memories_s: Floats) -> list[float]:

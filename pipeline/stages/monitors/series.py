@@ -31,21 +31,29 @@ class Axis:
     reasons: pl.Series
 
 
+def along_axis(epochs: pl.DataFrame, config: Configuration) -> Axis:
+    """DIAG eq. 1-3; `epochs`: `schemas.stages.Aligned`."""
+    t_ns = times_ns(epochs)
+    t_s = (t_ns - t_ns[0]) * 1e-9
+    matched = _match_reasons(epochs)
+    reasons = matched.zip_with(matched.is_not_null(), epochs["odometer_reason"])
+    series = _along(epochs, t_s, reasons, config)
+    return Axis("along", series, _moving(epochs, t_s, config)[series.epoch], reasons)
+
+
 def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Axis]:
     """DIAG eq. 1-3 and 10-15."""
     t_ns = times_ns(epochs)
     t_s = (t_ns - t_ns[0]) * 1e-9
     matched = _match_reasons(epochs)
-    along_reasons = matched.zip_with(matched.is_not_null(), epochs["odometer_reason"])
     up_reasons = first_reason((matched.is_not_null(), matched), (epochs["vertical_m"].is_null(), NO_HEIGHT))
     moving = _moving(epochs, t_s, config)
     built = (
-        ("along", _along(epochs, t_s, along_reasons, config), along_reasons),
         ("cross", _across(epochs, t_s, matched, "cross_track_m", "cross", config), matched),
         ("up", _across(epochs, t_s, up_reasons, "vertical_m", "up", config), up_reasons),
     )
-    along, cross, up = (Axis(name, series, moving[series.epoch], reasons) for name, series, reasons in built)
-    return along, cross, up
+    cross, up = (Axis(name, series, moving[series.epoch], reasons) for name, series, reasons in built)
+    return along_axis(epochs, config), cross, up
 
 
 def _moving(epochs: pl.DataFrame, t_s: Floats, config: Configuration) -> Bools:

@@ -14,6 +14,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
+from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.monitors.pseudorange import pseudorange_monitor
 from pipeline.stages.monitors.series import FIRST_EPOCH
 from schemas.arrays import Floats, floats, times_ns
@@ -33,7 +34,9 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame
     t_s = (t_ns - t_ns[0]) * 1e-9
     velocity_mps = floats(epochs, "velocity_along_mps")
     no_odometer = epochs["odometer_reason"]
-    usable = np.isfinite(velocity_mps) & no_odometer.is_null().to_numpy() & epochs["fix_valid"].to_numpy()
+    # The sigma of rows is cut off there: with coarser ones a threshold would not hold.
+    coarse = floats(epochs, "odometer_rows_m") >= most_scatter_m(config)
+    usable = np.isfinite(velocity_mps) & no_odometer.is_null().to_numpy() & epochs["fix_valid"].to_numpy() & ~coarse
     first, span_s = _window(t_s, usable, epochs["odometer_segment"].to_numpy(), config)
     doppler_m = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity_mps, np.nan)))])[:-1]
     odometer_m = floats(epochs, "odometer_m")
@@ -43,6 +46,7 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame
         (~np.isfinite(velocity_mps), NO_VELOCITY),
         (no_odometer.is_not_null(), no_odometer),
         (~epochs["fix_valid"], NO_POSITION),
+        (coarse, NotEvaluated.NOISE_TOO_LARGE),
         (~np.isfinite(span_s), FIRST_EPOCH),
     )
     return verdicts(value_mps, config.monitors.threshold_factor * sigma_mps, reasons)

@@ -9,24 +9,25 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
+from pipeline.stages.odometry.bound import Bound
 from pipeline.stages.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
 from pipeline.stages.odometry.origin import declared_origin
 from pipeline.stages.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
-from pipeline.stages.odometry.rows import filled_in, leaps, ways_between
+from pipeline.stages.odometry.rows import filled_in, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
 
-# The bound of a bridged way holds for an emergency brake right after as hard acceleration: a Gaussian error comes as
-# far in 3 of 1000 cases.
-_BOUND_SIGMAS = 3.0
-
 
 class OdometerWay(NamedTuple):
-    """True distance between two instants, signed [m], and its variance [m^2]; NaN where it is not known."""
+    """True distance between two instants, signed [m], and its variance [m^2]; NaN where it is not known.
+
+    `bound_m`: by how much it may be off besides, as braking and acceleration prove it.
+    """
 
     distance_m: Floats
     variance_m2: Floats
+    bound_m: Floats
 
 
 class Increments(NamedTuple):
@@ -54,7 +55,8 @@ class Odometry:
     lost before a sample; `counter`: the same, over slip and pauses between speeds, where the way is known to
     `slip_doubt_m`, a sum. `pause[i]`: between samples i and i+1 nothing is interpolated. `scale`: true over recorded
     distance, None without its sigma. `leaps_ns`: rows to which the counter leaps; `bridged_m2`: variance over bridged
-    ones, a sum. `origin`: as declared; `follows_gnss`: found to be made of the positions all the same.
+    ones, a sum. `bound`: by how much the distance may be off as braking proves it. `origin`: as declared;
+    `follows_gnss`: found to be made of the positions all the same.
     """
 
     epoch_ns: int
@@ -73,6 +75,7 @@ class Odometry:
     scale_sigma: float | None = None
     leaps_ns: tuple[int, ...] = ()
     bridged_m2: Floats | None = None
+    bound: Bound | None = None
     origin: Origin = Origin.UNKNOWN
     follows_gnss: bool = False
 
@@ -139,26 +142,38 @@ class Odometry:
         """True distance between instants, and its variance.
 
         s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) + (sigma_s
-        D)^2 (DOMAIN section 5.1). NaN where either end is not known or the distance was lost in between.
+        D)^2 (DOMAIN section 5.1). NaN outside the recording and where the distance was lost in between; else off by
+        `bound_m` besides.
         """
         scale = self.scale or 1.0
         scale_sigma = self.scale_sigma or 0.0
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
-        recorded = self._recorded_between(begin_ns, end_ns)
+        begin_s, end_s = self.seconds(begin_ns), self.seconds(end_ns)
+        inside = (np.minimum(begin_s, end_s) >= self.t_s[0]) & (np.maximum(begin_s, end_s) <= self.t_s[-1])
+        inside &= self.counter_at_s(begin_s) == self.counter_at_s(end_s)
+        recorded = np.where(inside, self.distance_at_s(end_s) - self.distance_at_s(begin_s), np.nan)
         moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))
-        rows_m2 = self.row_sigma_m(self.seconds(begin_ns)) ** 2 + self.row_sigma_m(self.seconds(end_ns)) ** 2
+        rows_m2 = self.row_sigma_m(begin_s) ** 2 + self.row_sigma_m(end_s) ** 2
         variance = scale**2 * (self.noise.white_m2_per_s * moving_s + rows_m2) + (scale_sigma * recorded) ** 2
-        return OdometerWay(scale * recorded, variance)
+        return OdometerWay(scale * recorded, variance, self.bound_between_m(begin_ns, end_ns))
+
+    def bound_between_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """By how much the way between instants may be off, as braking and acceleration prove it [m]."""
+        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
+        if self.bound is None:
+            return np.zeros(end_ns.size)
+        return (self.scale or 1.0) * self.bound.between_m(self.seconds(begin_ns), self.seconds(end_ns))
 
     def distance_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """The distance of `between` [m]."""
+        """The same distance [m], NaN too where slip or a pause leaves doubt in it."""
         return np.asarray((self.scale or 1.0) * self._recorded_between(begin_ns, end_ns))
 
     def steps_m(self, t_ns: Ints) -> Floats:
-        """The distance of `between` from each instant to the next [m], shape (n - 1,)."""
+        """From each instant to the next [m], shape (n - 1,); NaN where anything of it is in doubt."""
         segment = self.segment_at(t_ns)
         step_m = np.diff(self.distance_at(t_ns))
-        return np.asarray((self.scale or 1.0) * np.where(segment[:-1] == segment[1:], step_m, np.nan))
+        sure = (segment[:-1] == segment[1:]) & (self.bound_between_m(t_ns[:-1], t_ns[1:]) == 0.0)
+        return np.asarray((self.scale or 1.0) * np.where(sure, step_m, np.nan))
 
     def _recorded_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
@@ -277,7 +292,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     dt_s = np.diff(t_s)
     period_s = float(np.median(dt_s))
     limit_s = max(align.odometer_gap_s, align.odometer_gap_periods * period_s)
-    way_m, counted, bridged_m = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
+    way_m, counted, bridged_m, odd, resets = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
     unknown = np.isnan(way_m)
     pause = unknown | (dt_s > limit_s)
     slip = _slips(stream, align)
@@ -295,6 +310,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     )
     white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
     noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, config) if counted.any() else None
+    doubtful = odd | pause | slip[:-1] | slip[1:]
+    bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, align) if doubtful.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
     row_s = t_s
     if apart.size:
@@ -319,8 +336,9 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         period_s=period_s,
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
-        leaps_ns=_leaps_ns(stream, align),
-        bridged_m2=np.interp(t_s, row_s, _sums((bridged_m / _BOUND_SIGMAS) ** 2)) if bridged_m.any() else None,
+        leaps_ns=tuple(t_ns[list(resets)].tolist()),
+        bridged_m2=np.interp(t_s, row_s, _sums(bridged_m**2)) if bridged_m.any() else None,
+        bound=bound,
         config=align,
         origin=declared_origin(stream, vehicle),
     )
@@ -371,12 +389,6 @@ def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, c
 def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
     declared = stream["sigma_speed_mps"].median()
     return float(declared) ** 2 * period_s if isinstance(declared, float) else 0.0
-
-
-def _leaps_ns(stream: pl.DataFrame, config: AlignConfig) -> tuple[int, ...]:
-    t_ns = times_ns(stream)
-    leap = leaps((t_ns - t_ns[0]) / NS_PER_S, floats(stream, "distance_m"), config)
-    return tuple(t_ns[1:][leap].tolist())
 
 
 def _sums(steps: Floats) -> Floats:

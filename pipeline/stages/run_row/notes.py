@@ -49,6 +49,7 @@ def ride_notes(ride: Ride, evidence: TrainEvidence) -> list[Remark]:
             Note.BALISES_OFF: _few(prepared.site.balises_off()),
             Note.FAR_OFF: counts.far_off,
             Note.PLACEHOLDERS: counts.placeholders,
+            Note.HELD: counts.held,
             Note.CONTRADICTING: counts.contradicting,
             Note.SPANS_DIFFER: _spans_differ(run),
             **_of_odometer(prepared.odometry, prepared.config.align.straight_s),

@@ -87,8 +87,9 @@ def remedies(
         Remedy.REFERENCE_SIGMA: False,
         Remedy.SURVEY_COMPLETE: Reason.TRACK_ASSUMED in reasons,
     }
-    # The line that declares an odometer comes first: nothing else helps as long as it is not there.
-    return sorted((remedy for remedy in Remedy if table[remedy]), key=lambda one: one is not Remedy.ODOMETER_ORIGIN)
+    # An odometer that counts comes first: nothing else helps as long as there is none.
+    first = None if independent else Remedy.ODOMETER if of_gnss else Remedy.ODOMETER_ORIGIN
+    return sorted((remedy for remedy in Remedy if table[remedy]), key=lambda one: one is not first)
 
 
 def _too_slow(run: Mapping[str, Any], config: Configuration) -> bool:

@@ -16,6 +16,8 @@ from schemas.enums import MisfitCause
 _UNIT_SHARE = 0.045
 # Streams are late by so much beside what explains the lag of a clock.
 _CLOCK_NEAR_S = 2.2
+# A few independent errors tell a sigma to so much.
+_ACCURACY_TIMES = 2.5
 _YEAR_S = 31_556_952
 
 
@@ -60,6 +62,7 @@ class KnownCauses(_Fact):
 
     speed_units: dict[str, float]
     way_units: dict[str, float]
+    accuracy_units: dict[str, float]
     leap_seconds: dict[float, int]
     clock_steps: tuple[ClockStep, ...]
     coordinate_mistakes: tuple[CoordinateMistake, ...]
@@ -75,6 +78,17 @@ def explain_factor(factor: float, speed: bool) -> tuple[Cause, float] | None:
     # A unit so near to 1 that a bad odometer could be taken for it has to be met more exactly.
     near = min(_UNIT_SHARE, abs(exact - 1.0) / 3.0)
     return (Cause(MisfitCause.UNIT, (name,)), exact) if abs(factor / exact - 1.0) <= near else None
+
+
+def explain_accuracy(factor: float, stated_m: float) -> Cause | None:
+    """What makes true deviations `factor` times the stated ones, of which the median is `stated_m`; the nearest one."""
+    known = {Cause(MisfitCause.SIGMA_UNIT, (name,)): size for name, size in KNOWN.accuracy_units.items()}
+    # Read as a variance, a sigma s gives sqrt(s); read as a sigma, a variance v = s^2 gives v.
+    known[Cause(MisfitCause.SIGMA_FOR_VARIANCE)] = stated_m
+    known[Cause(MisfitCause.VARIANCE_FOR_SIGMA)] = 1.0 / np.sqrt(stated_m)
+    away = {cause: abs(np.log(factor / size)) for cause, size in known.items()}
+    nearest = min(away, key=lambda cause: away[cause])
+    return nearest if away[nearest] < np.log(_ACCURACY_TIMES) else None
 
 
 def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> tuple[Cause, float] | None:

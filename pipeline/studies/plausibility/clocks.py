@@ -22,6 +22,11 @@ from schemas.enums import MisfitCause, MisfitPlace
 
 # Two lags so near to each other are of one clock.
 _SAME_CLOCK_S = 1.5
+# A clock with an old count of leap seconds (16 or 17 in place of 18, or none of the last three) is off by these; lags
+# of reads and odometers are known to so much beside their noise [s].
+_LEAPS_S = (2, 3)
+_WHOLE_NEAR_S = 0.3
+_LEAP_NEAR_S = 0.12
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,35 @@ def clock_checks(of: Recording, lags: list[StreamLag]) -> list[Check]:
     alike = all(abs(lag.lag_s - wrong[0].lag_s) < _SAME_CLOCK_S for lag in wrong)
     # One clock has one lag, and one line that mends it.
     of_gnss = min(wrong, key=lambda lag: lag.sigma_s) if len(wrong) >= 2 and alike and not others else None
+    leap = _leap_of_gnss(of, lags)
+    if leap is not None:
+        return [_of_leap(of, lag, leap) if not lag.reason else _check(of, lag, None, known=True) for lag in lags]
     return [_check(of, lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
+
+
+def _leap_of_gnss(of: Recording, lags: list[StreamLag]) -> int | None:
+    """The whole seconds by which two recorders and more say that the clock of the GNSS is off; none where they do not.
+
+    One second may be the age of positions. A misfit, not an impossibility: a slow fault of the GNSS can look like it.
+    """
+    known = [lag for lag in lags if not lag.reason]
+    sure = [lag for lag in known if lag.sure]
+    if len(known) < 2 or not sure:
+        return None
+    whole = round(sure[0].lag_s)
+    exact = abs(sure[0].lag_s - whole) <= _LEAP_NEAR_S
+    alike = exact and all(
+        abs(lag.lag_s - whole) <= _WHOLE_NEAR_S + SIGNIFICANT_SIGMAS * min(lag.sigma_s, 0.1) for lag in known
+    )
+    return whole if alike and abs(whole) in _LEAPS_S else None
+
+
+def _of_leap(of: Recording, lag: StreamLag, leap_s: int) -> Check:
+    later = "later" if lag.lag_s > 0 else "earlier"
+    found = f"{lag.lag_s:+.2f} s, stamps of the {lag.name} are {later}"
+    causes = (Cause(MisfitCause.LEAP_SECONDS, (f"{abs(leap_s)}",)), Cause(MisfitPlace.IN_STREAM, ("GNSS", lag.name)))
+    what = f"clock of the {lag.name} against the GNSS"
+    return Check(what, FitState.MISFIT, found, causes, _lines_of_gnss(of, float(leap_s)))
 
 
 def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
@@ -85,10 +118,15 @@ def _large(what: str, found: str, of: Recording, lag: StreamLag, of_gnss: Stream
     whose = Cause(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
     lines = correction(lag.stream, shift_s=-exact_s)
     if at_gnss:
-        streams = ("gnss",) if of.run.satellites is None else ("gnss", "satellites")
-        only = of.solution if len(of.run.solutions()) > 1 else None
-        lines = "".join(correction(stream, shift_s=exact_s, solution=only) for stream in streams)
+        lines = _lines_of_gnss(of, exact_s)
     return Check(what, FitState.IMPOSSIBLE, found, (cause, whose), lines)
+
+
+def _lines_of_gnss(of: Recording, shift_s: float) -> str:
+    """What moves the stamps of the positions, and of their satellites."""
+    streams = ("gnss",) if of.run.satellites is None else ("gnss", "satellites")
+    only = of.solution if len(of.run.solutions()) > 1 else None
+    return "".join(correction(stream, shift_s=shift_s, solution=only) for stream in streams)
 
 
 def _small(what: str, found: str, lag: StreamLag, file_s: float | None) -> Check:

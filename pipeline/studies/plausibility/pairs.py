@@ -37,6 +37,14 @@ _WINDOW_AGREES = 0.12
 _SLOW_SHARE = 0.2
 # A lag is known where its sigma is smaller.
 _LAG_SIGMA_S = 0.5
+# Leap seconds (16, 17 and 18 since 2012) make clocks differ by 1 and 2 s, with one unknown 3 s; one more on either side
+# shows that it is none of them. Windows in which the lags differ by more than noise tell of it; so many in each half.
+_WHOLE_MOST_S = 4.0
+_WHOLE_WINDOW_S = 8.0
+_WHOLE_TELLS_M = 4.0
+_WHOLE_LEAST = 3
+_WHOLE_BETTER = 0.5
+_WHOLE_SIGMA_S = 0.3
 # With less in common, of all and of the shorter record, any two journeys look alike.
 _COMMON_S = 90.0
 _COMMON_SHARE = 0.6
@@ -120,7 +128,41 @@ def fit_pair(gnss: Places, counter: Record) -> PairFit:
         fit = _fitted(gnss, counter, fit.lag_s)
     if coarse_s and abs(fit.lag_s - coarse_s) > _SPEED_LAG_S:
         fit = replace(fit, lag_s=coarse_s, lag_sigma_s=_SPEED_LAG_S / 2.0)
-    return replace(fit, shifted=coarse_s != 0.0, clock_reason=clock_reason)
+    whole_s = 0.0 if coarse_s or fit.lag_known or not fit.known else whole_lag(gnss, counter, abs(fit.scale))
+    if whole_s:
+        fit = replace(fit, lag_s=whole_s, lag_sigma_s=_WHOLE_SIGMA_S)
+        clock_reason = ""
+    return replace(fit, shifted=coarse_s != 0.0 or whole_s != 0.0, clock_reason=clock_reason)
+
+
+def whole_lag(gnss: Places, counter: Record, scale: float) -> float:
+    """The lag by which a clock with too few or too many leap seconds is off; 0 where none shows.
+
+    Tried one by one: a fit that begins at no lag takes the few parts in which the speed changes for outliers. The ways
+    of short windows have to agree at least twice as well, in both halves of the journey.
+    """
+    begin_s, end_s = _common(gnss, counter, 0.0)
+    starts = np.arange(begin_s + _WHOLE_MOST_S, end_s - _WHOLE_WINDOW_S - _WHOLE_MOST_S, _WHOLE_WINDOW_S / 2.0)
+    ends = starts + _WHOLE_WINDOW_S
+    if starts.size < 2 * LEAST:
+        return 0.0
+    ways = gnss.way(starts, ends)
+    lags_s = np.arange(-_WHOLE_MOST_S, _WHOLE_MOST_S + 1.0)
+    apart = np.stack([np.abs(np.abs(counter.gained(starts + lag, ends + lag)) * scale - ways) for lag in lags_s])
+    spread = np.ptp(apart, axis=0)
+    telling = np.isfinite(spread) & (spread > _WHOLE_TELLS_M)
+    halves = [part[:, telling[rows]] for rows in halves_of(starts.size) if (part := apart[:, rows]).size]
+    if any(half.shape[1] < _WHOLE_LEAST for half in halves):
+        return 0.0
+    medians = np.stack([np.median(half, axis=1) for half in halves])
+    best = int(np.median(apart[:, telling], axis=1).argmin())
+    none = lags_s.size // 2
+    clear = (medians[:, best] < _WHOLE_BETTER * medians[:, none]).all() and 0 < best < lags_s.size - 1
+    if not clear:
+        return 0.0
+    # What is left grows on both sides alike, from where the lag is.
+    before, after = np.median(apart[:, telling], axis=1)[[best - 1, best + 1]]
+    return float(lags_s[best] + (before - after) / max(before + after, 1e-9))
 
 
 def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:

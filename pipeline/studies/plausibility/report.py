@@ -120,4 +120,15 @@ def _checks(fits: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
         for name, counted in counts.solutions.items()
         if counted.placeholders
     ]
+    rows += [
+        (
+            name,
+            "repeated positions",
+            FitState.MISFIT.value,
+            f"{counted.held} rows repeat the position before",
+            "logged at a higher rate than the receiver's: left out",
+        )
+        for name, counted in counts.solutions.items()
+        if counted.held
+    ]
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row")

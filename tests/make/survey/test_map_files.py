@@ -114,3 +114,12 @@ def test_layers_that_a_map_only_declares_are_refused(tmp_path: Path) -> None:
     flat.write_bytes(content)
     with pytest.raises(SiteError, match="it declares more features than it has bytes"):
         read_surveys([flat], None, Vehicle(), Configuration())
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".shp"])
+def test_an_attribute_names_the_lines(tmp_path: Path, suffix: str) -> None:
+    path = write(tmp_path / f"line{suffix}", [line_wkb(belgian())])
+    (piece,) = read_surveys([path], None, Vehicle(), Configuration(), "railway").pieces
+    assert piece.name == "rail"
+    with pytest.raises(SiteError, match=r"no such attribute.*name, railway"):
+        read_surveys([path], None, Vehicle(), Configuration(), "track_id")

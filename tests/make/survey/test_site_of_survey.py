@@ -371,9 +371,10 @@ BAD = {
     ),
     "page.kml": ("<html/>", "neither GPX nor KML"),
     "text.kmz": ("text", "cannot be unpacked"),
-    "overpass.json": ('{"elements": []}', "Overpass exports GeoJSON"),
+    "overpass.json": ('{"elements": []}', "holds no line"),
     "deep.geojson": ("[" * 100_000, "not a GeoJSON"),
     "null.geojson": ('{"features": [null]}', "a feature is no object"),
+    "ids.json": ('{"elements": [{"type": "way", "id": 1, "nodes": [1, 2]}]}', "without the places of their nodes"),
     "one.geojson": ('{"features": []}', "holds no line"),
     "word.csv": ("lat,lon\n50,4\n50,x\n", "column longitude_deg: row 2: cannot be read; found 'x'"),
     "plane.csv": ("x,y\n150000,170000\n150100,170000\n", "names no EPSG code"),
@@ -402,3 +403,78 @@ def test_what_a_survey_is_taken_for_is_configuration(tmp_path: Path) -> None:
     joined = {frozenset([("a", 1), ("b", 0)])}
     assert navigable(site_of(apart, config={"same_place_m": 1.0})) == joined
     assert navigable(site_of(apart, join_m=1.0)) == joined
+
+
+def test_overpass_json_is_read_like_its_geojson(tmp_path: Path) -> None:
+    """Places of `out geom`, or in the nodes of `out skel`; a way that no train runs on is left out."""
+    feature = way("way/7", (0.0, 0.0), (500.0, 0.0))
+    places = [{"lon": x, "lat": y} for x, y in feature["geometry"]["coordinates"]]
+    nodes = [{"type": "node", "id": number, **place} for number, place in enumerate(places)]
+    tags = {"railway": "rail"}
+    old = {"type": "way", "id": 8, "nodes": [0, 1], "tags": {"railway": "abandoned"}}
+    plain = site_of(written(tmp_path, "line.geojson", feature))
+    for name, elements in {
+        "geom": [{"type": "way", "id": 7, "tags": tags, "geometry": places}],
+        "skel": [{"type": "way", "id": 7, "tags": tags, "nodes": [0, 1]}, old, *nodes],
+    }.items():
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps({"version": 0.6, "elements": elements}))
+        assert site_of(path).track.equals(plain.track)
+    assert plain.track["netelement_id"].unique().to_list() == ["way/7"]
+
+
+@pytest.mark.parametrize(("text", "km"), [("48+050", 48.05), ("-0+120", -0.12), ("7+000.5", 7.0005), ("48.05", 48.05)])
+def test_kilometres_and_metres_of_a_station(tmp_path: Path, text: str, km: float) -> None:
+    latitude, longitude = degrees([0.0, 100.0], [0.0, 0.0])
+    rows = [f"{y},{x},{at}" for y, x, at in zip(latitude, longitude, (text, "50+000"), strict=True)]
+    path = tmp_path / "line.csv"
+    path.write_text("\n".join(["latitude_deg,longitude_deg,line_km", *rows]) + "\n")
+    assert site_of(path).track["line_km"][0] == pytest.approx(km, abs=1e-9)
+
+
+def test_a_station_of_two_digits_of_metres_is_no_kilometre(tmp_path: Path) -> None:
+    path = tmp_path / "line.csv"
+    path.write_text("latitude_deg,longitude_deg,line_km\n50,4,48+05\n50,4.001,48+100\n")
+    with pytest.raises(SiteError, match=r"48\+05"):
+        site_of(path)
+
+
+def test_an_empty_track_of_a_logger_ends_no_site(tmp_path: Path) -> None:
+    def track(east_m: list[float], north_m: list[float]) -> str:
+        points = zip(*degrees(east_m, north_m), strict=True)
+        inside = (f'<trkpt lat="{y}" lon="{x}"><time>2025-01-01T00:00:00Z</time></trkpt>' for y, x in points)
+        return f"<trk><trkseg>{''.join(inside)}</trkseg></trk>"
+
+    east = [50.0 * number for number in range(20)]
+    passes = [track(east, [0.0] * 20), track([], []), track([10.0], [5.0]), track(east, [0.0] * 10 + [40.0] * 10)]
+    path = tmp_path / "log.gpx"
+    path.write_text(f"<gpx>{''.join(passes)}</gpx>")
+    site = site_of(path)
+    assert site.track.height > 2
+    assert [one.message for one in site.findings if one.place == "survey"] == [
+        "2 lines with fewer than two points are left out"
+    ]
+
+
+@pytest.mark.parametrize(("of_all", "own", "high"), [("absolute", "", True), ("", "absolute", True), ("", "", False)])
+def test_the_altitude_mode_of_a_multitrack_is_that_of_its_tracks(
+    tmp_path: Path, of_all: str, own: str, high: bool
+) -> None:
+    def mode(text: str) -> str:
+        return f"<altitudeMode>{text}</altitudeMode>" if text else ""
+
+    latitude, longitude = degrees([0.0, 300.0], [0.0, 0.0])
+    coordinates = "".join(f"<coord>{x} {y} 250</coord>" for y, x in zip(latitude, longitude, strict=True))
+    track = f"<Track>{mode(own)}<when>2025-01-01</when><when>2025-01-01</when>{coordinates}</Track>"
+    path = tmp_path / "log.kml"
+    path.write_text(f"<kml><Placemark><MultiTrack>{mode(of_all)}{track}</MultiTrack></Placemark></kml>")
+    assert (site_of(path).track["height_m"].null_count() == 0) == high
+
+
+def test_a_crs_with_the_latitude_first_is_a_finding(tmp_path: Path) -> None:
+    line = way("1", (0.0, 0.0), (500.0, 0.0))
+    path = tmp_path / "line.geojson"
+    for name, told in {"urn:ogc:def:crs:EPSG::4326": True, "urn:ogc:def:crs:OGC:1.3:CRS84": False}.items():
+        crs = {"type": "name", "properties": {"name": name}}
+        path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": [line]}))
+        assert any("latitude first" in finding.message for finding in site_of(path).findings) == told

@@ -35,16 +35,22 @@ def replayed(
 
 @pytest.mark.parametrize("share", [0.02, 0.08, -0.08])
 @pytest.mark.parametrize("said", [Slip(), Slip(flag=False, sigma_mps=0.4)], ids=["flag", "sigma"])
-def test_the_rest_of_the_run_stands(share: float, said: Slip) -> None:
-    """Three starts with 12 s of slip or slide; 4.6 m are lost at 8 %, more than the positions' noise explains."""
-    tables = replayed(Slip(share, flag=said.flag, sigma_mps=said.sigma_mps))
+def test_slip_stands_until_its_doubt_adds_up(share: float, said: Slip) -> None:
+    """Three starts with 12 s of slip or slide; 4.6 m are lost at 8 %, more than the positions' noise explains.
+
+    Each start leaves 5.8 m in doubt, and the anchor is the first TVB: after the second one only a telegram links again.
+    """
+    slip = Slip(share, flag=said.flag, sigma_mps=said.sigma_mps)
+    tables = replayed(slip)
     run = tables.runs.row(0, named=True)
     assert (run["verdict"], run["unsafe_accepted"], run["alarms"]) == ("safe", 0, 0)
-    assert accepted(tables) == list(BALISES)
+    assert accepted(tables) == ["V0", "V1", "V2", "V3"]
     reasons = dict(tables.epochs["withheld_for"].value_counts().rows())
     assert reasons["slip"] == pytest.approx(360, abs=6)
-    # The first epoch of the run, and the first after each slip.
-    assert reasons["relink"] == 4
+    read = replayed(slip, read=True)
+    beyond = [name for name, at_m in BALISES.items() if at_m > READ_M]
+    assert accepted(read) == ["V0", "V1", "V2", "V3", *beyond]
+    assert read.runs.select("unsafe_accepted", "alarms").row(0) == (0, 0)
 
 
 def test_slip_that_nobody_reports_is_the_monitors() -> None:
@@ -68,8 +74,8 @@ def test_a_fault_during_slip_does_not_get_through(size_m: float) -> None:
 def test_a_fault_right_after_slip_is_found_at_once(after_s: float) -> None:
     """The bank begins with the first epoch after the slip, 12.1 s after the start."""
     tables = replayed(Slip(0.08), Fault(SECOND_START_S + 12.1 + after_s, 25.0))
-    # V4 lies 100 m after the station, where the train is after 15.8 s.
-    assert accepted(tables) == ["V0", "V1", "V2", "V3", *(["V4"] if after_s > 3.7 else [])]
+    # Two starts leave more in doubt than a re-link may explain.
+    assert accepted(tables) == ["V0", "V1", "V2", "V3"]
     seen_s = (tables.alarms["t_start"][0] - tables.epochs["t"][0]).total_seconds()
     assert seen_s == pytest.approx(SECOND_START_S + 12.1 + after_s, abs=0.15)
 

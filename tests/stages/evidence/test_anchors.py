@@ -58,9 +58,9 @@ def test_a_stretch_faces_along_its_element_as_the_odometer_counts_up(forward: bo
 
 def test_a_shunt_before_the_journey_does_not_turn_the_sense() -> None:
     """An odometer without a sign: 20 m back, less than the 50 m that tell the sense, then 300 m ahead."""
-    t_s = np.arange(0.0, 40.0)
-    at_m = np.interp(t_s, [0, 4, 9, 39], [100, 80, 80, 380])
-    counted_m = np.interp(t_s, [0, 4, 9, 39], [0, 20, 20, 320])
+    t_s = np.arange(0.0, 50.0)
+    at_m = np.interp(t_s, [0, 4, 19, 49], [100, 80, 80, 380])
+    counted_m = np.interp(t_s, [0, 4, 19, 49], [0, 20, 20, 320])
     side = sided(stretch(t_s, at_m), counter(counted_m, 1.0), 50.0)
     assert (side.sense, side.with_m, side.against_m) == (1, pytest.approx(300.0), pytest.approx(20.0))
 

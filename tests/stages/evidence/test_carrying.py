@@ -29,7 +29,7 @@ def odometer(scale: float | None) -> Any:
 
     def between(begin_ns: Ints, end_ns: Ints) -> SimpleNamespace:
         way_s = (end_ns - begin_ns) / NS_PER_S
-        return SimpleNamespace(distance_m=10.2 * way_s, variance_m2=0.01 * np.abs(way_s))
+        return SimpleNamespace(distance_m=10.2 * way_s, variance_m2=0.01 * np.abs(way_s), bound_m=np.zeros(way_s.shape))
 
     def driven_m(begin_ns: Ints, end_ns: Ints) -> Any:
         return 10.2 * np.abs(end_ns - begin_ns) / NS_PER_S

@@ -239,3 +239,36 @@ def test_white_noise_of_the_run() -> None:
     found = bank.white_noise()
     assert found["white_noise_along_m"] == pytest.approx(0.2, rel=0.25)
     assert found["white_noise_up_m"] == pytest.approx(0.3, rel=0.25)
+
+
+def excess_m2(offset_m: Floats, sigma_m: float) -> Floats:
+    return meter_of(series_of(offset_m, sigma_m=sigma_m)).stated_excess_m2()
+
+
+def nominal_m(sigma_m: float, draw: np.random.Generator, seconds: int = 7200) -> Floats:
+    """Gauss-Markov errors of DIAG Table 1 at 1 Hz."""
+    total = np.zeros(seconds)
+    for share, tau_s in ((0.083, 360.0), (0.014, 1800.0), (0.15, 3600.0), (0.752, 100.0)):
+        kept = np.exp(-1.0 / tau_s)
+        steps = draw.normal(0.0, sigma_m * np.sqrt(share * (1.0 - kept**2)), seconds)
+        error_m = draw.normal(0.0, sigma_m * np.sqrt(share))
+        for second in range(seconds):
+            error_m = kept * error_m + steps[second]
+            total[second] += error_m
+    return total
+
+
+def test_a_stated_sigma_grows_where_the_offset_shows_more() -> None:
+    """Three times the stated sigma more than doubles the interval, the stated one leaves it as it is."""
+    draw = np.random.default_rng(4)
+    healthy, worse = (np.sqrt(1.0 + excess_m2(nominal_m(times, draw), 1.0)[-1]) for times in (1.0, 3.0))
+    assert healthy < 1.2
+    assert 2.0 < worse < 5.0
+
+
+def test_what_is_beyond_the_stated_sigma_is_known_from_what_came_before() -> None:
+    offset_m = nominal_m(4.0, np.random.default_rng(6), 2400)
+    later = offset_m.copy()
+    later[1200:] += 50.0 * np.sin(np.arange(1200.0))
+    np.testing.assert_array_equal(excess_m2(offset_m, 1.0)[:1200], excess_m2(later, 1.0)[:1200])
+    assert excess_m2(later, 1.0)[-1] > 100.0 * excess_m2(offset_m, 1.0)[-1]

@@ -12,16 +12,15 @@ from pipeline.stages.odometry.odometry import Noise
 from pipeline.stages.odometry.odometry import odometry_of as odometry_of_stream
 from pipeline.stages.odometry.polarity import grows_with, polarity
 from pipeline.stages.odometry.quantisation import QuantisationNoise
-from pipeline.stages.odometry.rows import ways_between
-from schemas.config import AlignConfig, Configuration, Vehicle
+from schemas.config import Configuration, Vehicle
 from tests.stages.alignment.straight import odometer_of, odometry_from
 
 
 def test_distance_is_interpolated_and_never_extrapolated():
-    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=[100.0, 110.0, 130.0]))
+    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=[100.0, 110.0, 121.0]))
     at = np.array([-0.1, 0.0, 0.5, 1.5, 2.0, 2.1])
     assert odometry.known_at_s(at).tolist() == [False, True, True, True, True, False]
-    np.testing.assert_allclose(odometry.distance_at_s(at)[1:5], [0.0, 5.0, 20.0, 30.0])
+    np.testing.assert_allclose(odometry.distance_at_s(at)[1:5], [0.0, 5.0, 15.5, 21.0])
 
 
 def test_rows_scatter_by_their_step_and_by_stamps_with_the_square_of_the_speed():
@@ -128,8 +127,8 @@ def test_polarity_comes_from_the_first_twenty_metres(reads, expected):
 
 
 def test_speed_is_the_mean_over_the_second_before():
-    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=[0.0, 10.0, 30.0]))
-    np.testing.assert_allclose(odometry.speed_at_s(np.array([0.5, 1.0, 2.0, 1.5])), [10.0, 10.0, 20.0, 15.0])
+    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=[0.0, 10.0, 22.0]))
+    np.testing.assert_allclose(odometry.speed_at_s(np.array([0.5, 1.0, 2.0, 1.5])), [10.0, 10.0, 12.0, 11.0])
 
 
 def test_a_leap_in_the_first_metres_does_not_turn_the_odometer_round():
@@ -250,12 +249,12 @@ def test_a_counter_that_is_reset_in_a_pause_loses_the_way(speed):
 
 def test_a_spike_of_the_counter_is_passed_over():
     t = 0.5 * np.arange(7.0)
-    reads = np.arange(7.0) ** 2
+    reads = 0.2 * np.arange(7.0) ** 2
     for row in (1, 3, 5):
         spiked = 1e5 + reads + 500.0 * (np.arange(7) == row)  # of a counter that has run for 100 km
         odometry = odometry_from(odometer_of(t, distance_m=spiked))
         # Between its neighbours by a straight line; all other rows count.
-        np.testing.assert_allclose(odometry.distance_m, reads + 1.0 * (np.arange(7) == row))
+        np.testing.assert_allclose(odometry.distance_m, reads + 0.2 * (np.arange(7) == row))
         assert (odometry.segment == 0).all()
         assert odometry.known_at_s(t).all()
 
@@ -329,9 +328,9 @@ def test_a_speed_of_another_unit_or_sign_tells_no_way_over_a_leap(factor):
 
 def test_a_standstill_between_rows_far_apart_stays_one():
     odometry = odometry_from(
-        odometer_of([0.0, 4.0, 8.0, 12.0], distance_m=[0.0, 30.0, 30.0, 60.0], speed_mps=[9.0, 2.0, 2.0, 9.0]),
+        odometer_of([0.0, 4.0, 8.0, 12.0], distance_m=[0.0, 20.0, 20.0, 40.0], speed_mps=[9.0, 1.0, 1.0, 9.0]),
     )
-    np.testing.assert_allclose(odometry.distance_at_s(np.arange(4.0, 8.1, 0.25)), 30.0)
+    np.testing.assert_allclose(odometry.distance_at_s(np.arange(4.0, 8.1, 0.25)), 20.0)
 
 
 def test_nothing_is_filled_in_where_the_way_is_lost():
@@ -360,14 +359,6 @@ def test_turns_show_once_the_train_came_back_so_far():
     assert turns_of(distance_m, 5.0) == [(3, 5, -1), (6, 8, 1)]
     assert turns_of(np.array([0.0, -3.0, -6.0, -20.0]), 5.0) == [(0, 2, -1)]
     assert turns_of(np.zeros(0), 5.0) == []
-
-
-@pytest.mark.parametrize(("last_m", "way_m"), [(420.0, [210.0, 210.0]), (430.0, [np.nan, np.nan])])
-def test_a_row_is_a_spike_only_where_a_train_could_have_driven_on_without_it(last_m, way_m):
-    """1000 s into a run: in two seconds at most 2 * 200 m and 20 m; half of the way, 215 m, would be no leap."""
-    t, reads = np.array([1000.0, 1001.0, 1002.0]), np.array([0.0, 900.0, last_m])
-    found = ways_between(t, reads, np.full(3, np.nan), 5.0, AlignConfig())
-    np.testing.assert_array_equal(found.way_m, way_m)
 
 
 def test_one_row_or_none_is_no_odometry() -> None:

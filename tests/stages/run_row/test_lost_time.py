@@ -117,6 +117,16 @@ def cures(
     return remedies(RUN | (run or {}), lost, unknown, stated, CONFIG)
 
 
+def test_an_odometer_that_may_be_of_the_gnss_is_mended_first_and_calibrates_nothing() -> None:
+    lacking = {"evidence": None, "verdict": "unproven", "vehicle": "learned"}
+    unknown = {"reasons": ["unknown_in_use", "odometer_origin_unknown"], "odometer_origin": "unknown"}
+    assert cures(lacking | unknown, {LostTo.ALARM: 0.5}) == [Remedy.ODOMETER_ORIGIN, Remedy.REFERENCE]
+    # What was declared, or found, to be of the GNSS is not to be declared a wheel.
+    assert cures(lacking | unknown | {"odometer_origin": "gnss"}) == [Remedy.ODOMETER, Remedy.REFERENCE]
+    follows = {"reasons": ["unknown_in_use", "odometer_follows_gnss"], "odometer_origin": "wheel"}
+    assert cures(lacking | follows) == [Remedy.ODOMETER, Remedy.REFERENCE]
+
+
 def test_alarms_that_nothing_explains_are_mended_by_calibration_and_not_by_more_evidence() -> None:
     """The NMEA log of issue 35: availability 0, raw monitors fail, no evidence at all."""
     noisy = {LostTo.ALARM: 0.5}

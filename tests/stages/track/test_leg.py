@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.stages.track.leg import Leg, Visit, leg_of
+from pipeline.stages.track.geodesy import points_of
+from pipeline.stages.track.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.stages.track.path import TravelledPath
 from pipeline.stages.track.survey import track_of
-from tests.stages.matching.builders import line, site
+from tests.stages.matching.builders import degrees, line, site
 
 ALONG, AGAINST = Visit(0, True), Visit(1, False)
 
@@ -60,3 +61,31 @@ def test_a_path_position_is_a_place_of_its_own_leg(leg: int, path_m: float, plac
     names, measures = path_of(0.0, [ALONG, AGAINST], [AGAINST]).locate(leg, path_m)
     assert names[0] == place[0]
     assert measures[0] == pytest.approx(place[1], abs=0.01, nan_ok=True)
+
+
+def kinked() -> Leg:
+    """East for 100 m, 9 cm to the north-east by 45 degrees, east again: a step of 6 cm aside within 9 cm."""
+    step = 0.0636
+    elements = {
+        "a": line((0.0, 0.0), (100.0, 0.0), 10.0),
+        "t": line((100.0, 0.0), (100.0 + step, step), 0.09),
+        "b": line((100.0 + step, step), (200.0, step), 10.0),
+    }
+    track = track_of(site(elements).track)
+    return leg_of(track, [Visit(number, True) for number in range(3)])
+
+
+def test_a_chord_of_centimetres_has_the_direction_of_the_line_about_it() -> None:
+    """6 cm aside over 5 m are 0.7 degrees, not 45."""
+    leg = kinked()
+    assert np.abs(leg.heading_deg - 90.0).max() < 1.5
+    assert np.abs(leg.turn_start_rad).max() < np.radians(1.5)
+    assert leg.end_m == pytest.approx(200.0 + 0.09 - 0.0636, abs=0.02)
+
+
+def test_a_position_beside_a_kink_moves_on_as_the_train_does() -> None:
+    """5 m to the left, a metre a step: on the kinked line some step would be 3 m short."""
+    leg = kinked()
+    east, north = 90.0 + np.arange(21.0), np.full(21, 5.0)
+    steps = np.diff(path_at(leg, nearest_on_leg(points_of(*degrees(east, north)), leg)))
+    assert np.abs(steps - 1.0).max() < 0.2
