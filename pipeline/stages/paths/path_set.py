@@ -350,12 +350,13 @@ class _Growth:
         return 2**62
 
     def _inside(self, rows: Ints) -> Bools:
-        """Places on the element; past an end as far as noise, and the survey of the next element, may lead."""
+        """Places on the element; past an open end as far as the noise may lead."""
         candidates = self.candidates
         past = candidates.past[rows]
+        linked = np.where(past < 0, candidates.linked_start[rows], candidates.linked_end[rows])
         sigma_m = np.hypot(self.steps.sigma_m[candidates.step[rows]], self.survey_m[rows])
         near = candidates.beyond_m[rows] <= self.config.paths_open_sigmas * sigma_m + _OPEN_M
-        inside: Bools = (past == 0) | near
+        inside: Bools = (past == 0) | (~linked & near)
         return inside
 
     def _onward(self, node: Node) -> list[Node]:
