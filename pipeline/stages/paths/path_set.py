@@ -140,8 +140,10 @@ def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, co
     candidates = candidates_of(steps.points, network, search, config.reach_m)
     survey_m = network.survey_sigmas_m(config.survey_sigma_default_m, candidates.vertex)
     groups = unbranched_groups(network)
-    # Where no other track comes near in the whole run there is nothing to tell apart.
-    alone = np.unique(groups[candidates.element]).size <= 1
+    # Until another track has come near there is nothing to tell apart.
+    lines = groups[candidates.element]
+    others = candidates.step[lines != lines[:1]]
+    alone = int(others[0]) if others.size else len(steps)
     tests = PathTests.of_run(steps, alpha, bias_m, config.paths_alike_m, alone)
     return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
 
@@ -348,12 +350,13 @@ class _Growth:
         return 2**62
 
     def _inside(self, rows: Ints) -> Bools:
-        """Places on the element; past an end as far as noise, and the survey of the next element, may lead."""
+        """Places on the element; past an open end as far as the noise may lead."""
         candidates = self.candidates
         past = candidates.past[rows]
+        linked = np.where(past < 0, candidates.linked_start[rows], candidates.linked_end[rows])
         sigma_m = np.hypot(self.steps.sigma_m[candidates.step[rows]], self.survey_m[rows])
         near = candidates.beyond_m[rows] <= self.config.paths_open_sigmas * sigma_m + _OPEN_M
-        inside: Bools = (past == 0) | near
+        inside: Bools = (past == 0) | (~linked & near)
         return inside
 
     def _onward(self, node: Node) -> list[Node]:

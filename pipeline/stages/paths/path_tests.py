@@ -49,17 +49,17 @@ class PathTests:
     alpha: float
     bias_m: float
     merged_m: float
-    offset_only: bool
+    alone: int
     measured_m2: dict[float, Floats]
     windows: dict[float, tuple[Ints, Ints, Ints]]
     excess: Floats
 
     @classmethod
-    def of_run(cls, steps: PathSteps, alpha: float, bias_m: float, merged_m: float, offset_only: bool) -> PathTests:
-        """Tests of the paths of a run; `offset_only`: no other track is near, so nothing has to be told apart."""
+    def of_run(cls, steps: PathSteps, alpha: float, bias_m: float, merged_m: float, alone: int) -> PathTests:
+        """Tests of the paths of a run; `alone`: before this step no other track was near, only offsets are tested."""
         measured = {window_s: _measured_m2(steps, window_s) for window_s in WINDOWS_S if window_s <= _MEASURED_S}
         windows = {window_s: _windows(steps.end_s, window_s) for window_s in WINDOWS_S}
-        return cls(alpha, bias_m, merged_m, offset_only, measured, windows, _excess(steps, measured))
+        return cls(alpha, bias_m, merged_m, alone, measured, windows, _excess(steps, measured))
 
     def offset_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
         """How far beside its track a single step may lie [m]."""
@@ -92,14 +92,16 @@ class PathTests:
     ) -> list[tuple[Floats, float, float]]:
         """Per test its size in sigmas at each step (0 where it cannot be made), its limit, its looks."""
         found: list[tuple[Floats, float, float]] = []
-        for window_s in () if self.offset_only else WINDOWS_S:
+        apart = at >= self.alone
+        for window_s in WINDOWS_S if apart.any() else ():
             if window_s < 2.0 * steps.period_s:
                 continue
             moved = self._movement(steps, sums, heading_rad, at, window_s)
-            found.append((moved, *self._limit(_LOOKED_S / window_s)))
+            found.append((np.where(apart, moved, 0.0), *self._limit(_LOOKED_S / window_s)))
         found.append((self._offset(steps, sums, at), *self._limit(_LOOKED_S / OFFSET_S)))
-        if not self.offset_only:
-            found.append((self._lasting(steps, sums, at), *self._limit(_LASTING_LOOKS)))
+        if apart.any():
+            lasting = np.where(apart, self._lasting(steps, sums, at), 0.0)
+            found.append((lasting, *self._limit(_LASTING_LOOKS)))
         return found
 
     def _limit(self, looks: float) -> tuple[float, float]:
