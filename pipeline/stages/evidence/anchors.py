@@ -402,7 +402,8 @@ class Levels:
 
     @property
     def doubts(self) -> int:
-        return self.heights_m.size - 1
+        """Steps of which no read says which side was right; between two confirmed levels the odometer failed."""
+        return int((~(self.confirmed[:-1] & self.confirmed[1:])).sum())
 
     @property
     def rise_m(self) -> float:
