@@ -99,7 +99,8 @@ def test_clean_ranges_raise_no_alarm(local: Scenario) -> None:
     assert tables.alarms.is_empty()
     assert tables.hazards.is_empty()
     assert set(tables.passages["status"]) == {"accepted"}
-    assert set(tables.epochs["pseudorange_state"]) == {"pass"}
+    # In the first second no track is claimed yet.
+    assert set(tables.epochs["pseudorange_state"][10:]) == {"pass"}
 
 
 def test_a_range_that_drifts_is_seen_before_the_position_fails(local: Scenario) -> None:

@@ -42,7 +42,8 @@ def between(tables, begin_s, end_s):
 def test_by_the_reference_a_frozen_odometer_is_no_standing_train(form):
     run, site = journey()
     tables = replay(run.with_streams(odometer=frozen(run.odometer, 100.0, 160.0, form)), site, VEHICLE)
-    assert set(between(tables, 101.0, 159.0)["moving"]) == {True}
+    # The odometer contradicts the reference: nobody knows which of the two stands, so nobody says that the train does.
+    assert False not in set(between(tables, 101.0, 159.0)["moving"])
     assert not between(tables, 102.0, 159.0)["tvb"].any()
     assert row(tables)["availability"] < 0.6
 

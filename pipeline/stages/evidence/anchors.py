@@ -267,15 +267,15 @@ class Witnesses:
     """The independent odometers that may contradict a reference.
 
     `lag_s`, `clock_s`: stamps of the reference less those of the odometers, as measured, and how far that may be off;
-    `scale`, `scale_doubt`: true over counted distance where no vehicle file gives it, and by what share of the way that
-    may be off; `signed`: they count down when the train goes back.
+    `scales`, `scale_doubts`: true over counted distance where no vehicle file gives it, and the sigma of that;
+    `signed`: they count down when the train goes back.
     """
 
     counters: tuple[Counter, ...]
     lag_s: float
     clock_s: float
-    scale: float
-    scale_doubt: float
+    scales: tuple[float, ...]
+    scale_doubts: tuple[float, ...]
     signed: bool
 
     @classmethod
@@ -290,19 +290,16 @@ class Witnesses:
         factor = config.hazards.evidence_factor
         known = np.isfinite(lag.sigma_s)
         clock_s = factor * lag.sigma_s if known else config.hazards.evidence_clock_s
-        by_file = bool(counters) and counters[0].odometer.scale_sigma is not None
-        if by_file:
-            return cls(
-                tuple(counters),
-                lag.lag_s,
-                clock_s,
-                1.0,
-                factor * float(counters[0].odometer.scale_sigma or 0.0),
-                signed,
-            )
-        measured = factor * lag.scale_sigma < config.lds.odometer_share
-        doubt = factor * lag.scale_sigma if measured else config.lds.odometer_share
-        return cls(tuple(counters), lag.lag_s, clock_s, lag.scale if measured else 1.0, doubt, signed)
+        share = config.lds.odometer_share
+        scales = [1.0] * len(counters)
+        # At k_T sigmas the 5 % of an odometer of which nothing is known.
+        doubts = [share / config.align.sure_sigmas] * len(counters)
+        if counters and counters[0].by_file:
+            doubts[0] = 0.0  # its variance holds that of the file's scale
+        elif counters and factor * lag.scale_sigma < share:
+            scales[0] = lag.scale
+            doubts[0] = lag.scale_sigma
+        return cls(tuple(counters), lag.lag_s, clock_s, tuple(scales), tuple(doubts), signed)
 
 
 def contradictions(
@@ -357,9 +354,8 @@ def _drifts(
     whole_m, root_m = _contradicted(known, stretch, witnesses, begin, end)
     rest_m = whole_m - (explained_m[end] - explained_m[begin])
     speed_mps = _speed_mps(t_ns, known.at_m, known.path.leg)
-    way_m = np.abs(known.at_m[end] - known.at_m[begin])
     late_m = witnesses.clock_s * np.abs(speed_mps[end] - speed_mps[begin])
-    allowed_m = config.align.sure_sigmas * root_m + late_m + witnesses.scale_doubt * way_m + fixed_m
+    allowed_m = config.align.sure_sigmas * root_m + late_m + fixed_m
     windows = np.flatnonzero((whole_m != 0.0) & (np.abs(rest_m) > allowed_m)).tolist()
     return [
         ReferenceStep(
@@ -541,12 +537,14 @@ def _contradicted(
     t_ns = stretch.t_ns - round(witnesses.lag_s * NS_PER_S)
     least = np.full(begin.size, np.inf)
     root = np.ones(begin.size)
-    for counter in witnesses.counters:
+    for counter, scale, doubt in zip(witnesses.counters, witnesses.scales, witnesses.scale_doubts, strict=True):
         way = counter.between(t_ns[begin], t_ns[end])
-        step_sigma_m = np.sqrt(stretch.sigma_m[end] ** 2 + stretch.sigma_m[begin] ** 2 + way.variance_m2)
+        step_sigma_m = np.sqrt(
+            stretch.sigma_m[end] ** 2 + stretch.sigma_m[begin] ** 2 + way.variance_m2 + (doubt * way.distance_m) ** 2
+        )
         way_m = known.at_m[end] - known.at_m[begin]
         sure_m = np.where(way.bound_m > 0.0, np.nan, way.distance_m)
-        counted_m = known.sense * witnesses.scale * sure_m
+        counted_m = known.sense * scale * sure_m
         if not witnesses.signed:
             counted_m = np.where(way_m * counted_m < 0.0, -counted_m, counted_m)
         off_m = way_m - counted_m

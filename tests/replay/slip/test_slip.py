@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.one_run import replay
-from schemas.config import Configuration, MonitorConfig, Vehicle
+from schemas.config import Configuration, EvidenceConfig, MonitorConfig, Vehicle
 from schemas.run import RunTables
 from tests.replay.slip.world import BALISES, LEG_S, READ_M, STAND_S, VEHICLE, Fault, Slip, ride, site, times, way_m
 
@@ -15,7 +15,10 @@ SECOND_START_S = LEG_S + STAND_S
 SITE = site()
 NONE = (0.0, 0.0, 0.0, 0.0)
 # Else nothing would be in use before the run has shown it.
-KNOWN = Configuration(monitors=MonitorConfig(noise_along_m=NONE, noise_cross_m=NONE, noise_up_m=NONE))
+KNOWN = Configuration(
+    monitors=MonitorConfig(noise_along_m=NONE, noise_cross_m=NONE, noise_up_m=NONE),
+    evidence=EvidenceConfig(survey_complete=True),
+)
 
 
 def accepted(tables: RunTables) -> list[str]:

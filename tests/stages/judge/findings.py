@@ -143,8 +143,14 @@ def rungs_of(journey: Journey, config: Configuration | None = None) -> dict[str,
     return {name: rung_of(journey, name, gone[name], config) for name in RUNGS if _has(journey, name)}
 
 
+def complete(config: Configuration | None) -> Configuration:
+    """The survey of these worlds holds every track that the train may use, and says so."""
+    config = config or Configuration()
+    return config.model_copy(update={"evidence": config.evidence.model_copy(update={"survey_complete": True})})
+
+
 def rung_of(journey: Journey, name: str, gone: tuple[str, ...] = (), config: Configuration | None = None) -> Rung:
-    return Rung(name, journey, replay(journey.weaker(*gone), journey.site, journey.vehicle, config))
+    return Rung(name, journey, replay(journey.weaker(*gone), journey.site, journey.vehicle, complete(config)))
 
 
 def _has(journey: Journey, name: str) -> bool:
