@@ -173,8 +173,10 @@ def judge(path: Path, expected: RunLog) -> tuple[str, str]:
     partial = log.notes.partial_until_ns is not None
     for name in ("gnss", "odometer"):
         found, whole = log.stream(name), expected.stream(name)
+        if whole is None and found is None:  # a twist that no mapping names
+            continue
         if whole is None:
-            raise ValueError("a subject lacks a stream")
+            return "WRONG", f"{name} out of nothing"
         if found is None and partial:
             continue
         if found is None or not found.equals(whole.head(found.height) if partial else whole):

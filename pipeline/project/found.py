@@ -11,7 +11,7 @@ from pipeline.campaign.plan import is_run
 from pipeline.make.receivers.bags import is_bag
 from pipeline.make.survey.map_files import MAP_SUFFIXES
 from pipeline.read.ingest.csv_text import read_log_table
-from pipeline.read.ingest.guesses import WORDS, columns_in, first, word_of
+from pipeline.read.ingest.guesses import POSITION, WORDS, columns_in, first, word_of
 from schemas.config import Configuration, Settings, Vehicle, read_toml, settings_from
 from schemas.errors import BaliseError
 from schemas.project import FILE_NAME
@@ -101,4 +101,4 @@ def _kind_of_table(path: Path) -> Kind:
         return "logs"
     if first(words, WORDS["balise"]):
         return "balises"
-    return "surveys" if columns_in("reference", words) else "logs"
+    return "surveys" if set(columns_in("gnss", words)) >= POSITION else "logs"

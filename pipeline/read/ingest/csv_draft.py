@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import polars as pl
 
 from pipeline.read.ingest.csv_text import read_log_table, with_points
-from pipeline.read.ingest.guesses import COLUMNS, WORDS, columns_in, first, mapping_lines, one_line, unit_in, word_of
+from pipeline.read.ingest.guesses import (
+    COLUMNS,
+    POSITION,
+    WORDS,
+    columns_in,
+    first,
+    mapping_lines,
+    one_line,
+    unit_in,
+    word_of,
+)
 from pipeline.read.ingest.stamps import LEAST_DAY, MOST_DAY, day_is_unclear
+from schemas.enums import Fix
 from schemas.run import Stream
 
 _EMPTY = """
@@ -20,6 +32,15 @@ _EMPTY = """
 # time = "field:COLUMN"
 # fields = {{ distance_m = "COLUMN" }}
 """
+
+# One recorder's speed is mostly its receiver's: as odometer it would prove what it comes from (DOMAIN section 5.0).
+_BESIDE_POSITIONS = (
+    "# Beside positions: taken for the receiver's own, which is no odometer. Remove the # where it is a sensor's,\n"
+    "# and say of which; where it is the receiver's, leave it out."
+)
+
+# Zones that names of columns tell; a time in one of them is not taken for UTC.
+_LOCAL = r"\b(mesz|cest|mez|cet|bst|wet|west|eet|eest|local|lokal|ortszeit|heure locale)\b"
 
 Words = Mapping[str, str]
 
@@ -36,7 +57,17 @@ def draft_mapping(path: Path) -> str:
     parts += _reads(words, path.name, time)
     head = f"# Draft from the header of {path.name}: check each line, above all units and the scale of the times.\n"
     columns = f"# Columns: {', '.join(map(one_line, table.columns))}\n"
+    columns += _unused(table.columns, parts)
     return head + columns + ("\n".join(parts) if parts else _EMPTY.format(topic=json.dumps(path.name)))
+
+
+def _unused(columns: Sequence[str], parts: Sequence[str]) -> str:
+    """The columns that no line of the draft uses, so that nothing is left out without a word."""
+    active = [line for part in parts for line in part.splitlines() if line and not line.startswith("#")]
+    texts = [text for line in active for text in re.findall(r'"((?:[^"\\]|\\.)*)"', line)]
+    used = {name for text in texts for name in (text, *text.removeprefix("field:").split(" + "))}
+    rest = [name for name in columns if json.dumps(name, ensure_ascii=False)[1:-1] not in used]
+    return f"# Unused columns: {', '.join(map(one_line, rest))}\n" if rest else ""
 
 
 def _stream(
@@ -45,9 +76,22 @@ def _stream(
     numbers = {name: word for name, word in words.items() if table[name].dtype.is_numeric()}
     # Rows of several odometers must stay apart: one after the other they are no counter.
     sensor = first(words, WORDS["sensor"]) if stream == "odometer" else None
-    lines = mapping_lines(stream, file, numbers, *time, units, {"sensor": sensor} if sensor else {})
+    kind = _kinds_of_fix(table, words) if stream == "gnss" else None
+    texts = {column: name for column, name in (("sensor", sensor), ("fix", kind)) if name is not None}
+    lines = mapping_lines(stream, file, numbers, *time, units, texts)
     unfit = _unfit(stream, table, {name: word for name, word in words.items() if name not in numbers})
+    if stream == "odometer" and lines and set(columns_in("gnss", words)) >= POSITION:
+        lines = [_BESIDE_POSITIONS, *(line if line.startswith("#") else f"# {line}" for line in lines)]
     return "\n".join(["", *lines, *unfit]) + "\n" if lines or unfit else ""
+
+
+def _kinds_of_fix(table: pl.DataFrame, words: Words) -> str | None:
+    """The column of kinds of fix, where it holds this program's own words; codes of others need `fix_codes`."""
+    name = first(words, WORDS["fix"])
+    if name is None or table[name].dtype != pl.String:
+        return None
+    told = set(table[name].replace("", None).drop_nulls())
+    return name if told and told <= {kind.value for kind in Fix} else None
 
 
 def _reads(words: Words, file: str, time: tuple[list[str], float | None]) -> list[str]:
@@ -86,9 +130,18 @@ def _time_lines(table: pl.DataFrame, words: Words, units: Words) -> tuple[list[s
     if names[0] is None:
         return ['# time = "field:COLUMN"  # no name shows which column is the time'], None
     written = [name for name in names if name]
+    if zone := next((found[0] for name in written if (found := re.search(_LOCAL, name.lower()))), None):
+        return [f"# {_field(*written)}  # in {zone.upper()}, which is not UTC: add time_zone, as Europe/Berlin"], None
+    if any("gpsepoch" in words[name] for name in written):
+        return [_field(*written), 'time_epoch = "gps"', 'time_scale = "gps"'], _since_gps(words[written[0]])
     epoch, scale = _epoch(table[written[0]])
     gps = ['# time_scale = "gps"  # if these times are 18 s ahead of UTC'] if "gps" in words[written[-1]] else []
     return [_field(*written), *epoch, *_order(table[written[0]]), *gps], scale
+
+
+def _since_gps(word: str) -> float | None:
+    """Seconds per unit of what counts from 1980-01-06, as the name says."""
+    return next((unit for name, unit in (("milli", 1e-3), ("ms", 1e-3), ("nano", 1e-9)) if word.startswith(name)), 1.0)
 
 
 def _field(*names: str) -> str:

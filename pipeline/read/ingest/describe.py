@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -9,11 +10,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.read.ingest.fields import fields_of
-from pipeline.read.ingest.guesses import COLUMNS, columns_in, mapping_lines, word_of
+from pipeline.read.ingest.guesses import COLUMNS, ORIGIN, columns_in, mapping_lines, word_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
 from pipeline.read.ingest.plan import Sample, sources_of
+from pipeline.read.ingest.recipes import recipes_for
 from pipeline.read.ingest.run import read_run
 from pipeline.stages.clean.clean import StreamCounts, stamp_counts
 from pipeline.stages.epochs.clock import GAP_PERIODS
@@ -215,6 +217,12 @@ def starting_config(topics: Sequence[TopicSummary]) -> str:
 
 
 def _suggestion(topic: TopicSummary) -> str:
+    if recipe := next((recipe for recipe in recipes_for(topic.schema, topic.topic) if recipe.only_mapped), None):
+        written = [f"[[ingest.{recipe.stream}]]", f"topic = {json.dumps(topic.topic, ensure_ascii=False)}"]
+        remark = (
+            f"{topic.schema}: a sensor or a filter of the positions, only you know. If it is an odometer, remove the #:"
+        )
+        return "\n".join([f"# {remark}", *(f"# {line}" for line in written), ORIGIN]) + "\n"
     numbers = [path for path, kind in topic.fields.items() if kind in ("int", "float")]
     words = {path: word_of(path.split(".")[-1]) for path in sorted(numbers, key=lambda path: (path.count("."), path))}
     for stream in COLUMNS:

@@ -20,8 +20,11 @@ BALISE_LIST: Mapping[str, list[str]] = _FILE["balise_list"]
 BALISE_KINDS: Mapping[str, str] = _FILE["balise_kinds"]
 WORDS: Mapping[str, str] = _FILE["words"]
 UNITS: Mapping[str, float] = _FILE["units"]
-_POSITION = {"latitude_deg", "longitude_deg"}
+POSITION = {"latitude_deg", "longitude_deg"}
 _UNIT_NEEDED = ("distance_m", "speed_mps", "vel_e_mps", "vel_n_mps", "vel_u_mps", "height_m")
+ORIGIN = (
+    '# origin = "wheel"  # or radar, inertial, gnss, fused: where it comes from; while nobody says, it proves nothing'
+)
 _GEOID = "# height_m: only a height over the ellipsoid; one over the sea is another 20 to 60 m in Europe"
 
 
@@ -31,7 +34,7 @@ def one_line(text: str) -> str:
 
 def word_of(name: str) -> str:
     """A name without unit, blanks and signs."""
-    return re.sub(r"[^a-zäöüß0-9]", "", re.sub(r"[\[(<].*", "", name).lower())
+    return re.sub(r"[^a-zäöüßàâçéèêëîïôûùąćęłńóśźż0-9]", "", re.sub(r"[\[(<].*", "", name).lower())
 
 
 def first(words: Mapping[str, str], pattern: str) -> str | None:
@@ -67,7 +70,7 @@ def mapping_lines(
     hold no numbers.
     """
     names = columns_in(stream, words)
-    if not names or (stream == "gnss" and not set(names) >= _POSITION):
+    if not names or (stream == "gnss" and not set(names) >= POSITION):
         return []
     factors = {"t": scale} if scale else {}
     remarks: list[str] = []
@@ -83,5 +86,7 @@ def mapping_lines(
     fields = {**(texts or {}), **names}
     pairs = ", ".join(f"{column} = {json.dumps(name, ensure_ascii=False)}" for column, name in fields.items())
     listed = ", ".join(f"{column} = {factor:.10g}" for column, factor in factors.items())
+    if stream == "odometer":
+        remarks.append(ORIGIN)
     lines = [f"[[ingest.{stream}]]", f"topic = {json.dumps(topic, ensure_ascii=False)}", *time]
     return [*lines, f"fields = {{ {pairs} }}", *([f"factors = {{ {listed} }}"] if listed else []), *remarks]

@@ -71,15 +71,20 @@ def sources_of(sample: Sample, config: IngestConfig) -> list[Source]:
     for stream in STREAMS:
         mappings = mappings_of(config, stream)
         sources += [mapped_source(sample, stream, m) for m in mappings if m.topic == sample.channel.topic]
-        if known is not None and known.recipe.stream == stream and (not mappings or known.recipe.supplement):
+        if known is not None and known.recipe.stream == stream and _by_itself(known.recipe, bool(mappings)):
             sources.append(known)
     return sources
+
+
+def _by_itself(recipe: Recipe, is_mapped: bool) -> bool:
+    """Whether the schema alone makes the stream, in a log of whose stream some topic `is_mapped` or not."""
+    return not recipe.only_mapped and (not is_mapped or recipe.supplement)
 
 
 def is_candidate(channel: Channel, config: IngestConfig) -> bool:
     """Whether anything may be made of the channel at all."""
     mapped = any(mapping.topic == channel.topic for stream in STREAMS for mapping in mappings_of(config, stream))
-    return mapped or bool(recipes_for(channel.schema_name, channel.topic))
+    return mapped or any(not recipe.only_mapped for recipe in recipes_for(channel.schema_name, channel.topic))
 
 
 def _by_schema(sample: Sample) -> Source | None:

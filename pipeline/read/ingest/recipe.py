@@ -26,6 +26,7 @@ class Recipe:
     the types of others that are no floats. `key` names the fields by which a `supplement` (a message that holds
     further columns of the same epochs, such as a covariance) finds its epoch. `time` is set where the time is a
     calendar. `rows` names an array whose elements become one row each; paths are then looked up in the element first.
+    `only_mapped`: read only where a mapping names the topic, since the schema does not tell what is measured.
     """
 
     stream: Stream
@@ -39,6 +40,7 @@ class Recipe:
     remark: str = ""
     time: CivilTime | None = None
     rows: str = ""
+    only_mapped: bool = False
 
     def fields_of(self, column: str) -> list[str]:
         """The recorded fields that a column is made of."""

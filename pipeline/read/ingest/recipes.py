@@ -55,7 +55,8 @@ def _location_fix() -> Recipe:
 
 
 def _twist(path: str) -> Recipe:
-    return Recipe(stream="odometer", columns={"speed_mps": pl.col(path)})
+    """A speed of nobody knows what, a filter of positions as often as a wheel: read where a mapping names the topic."""
+    return Recipe(stream="odometer", columns={"speed_mps": pl.col(path)}, only_mapped=True)
 
 
 def own_recipe(stream: Stream) -> Recipe:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
@@ -303,3 +304,36 @@ def test_ranges_without_positions_name_the_next_step(tmp_path):
     log.write_text("     3.04           OBSERVATION DATA    M                   RINEX VERSION / TYPE\n")
     with pytest.raises(InputError, match=r"holds no message.*RINEX holds ranges, no positions.*rnx2rtkp.*\.pos"):
         gather([log])
+
+
+def test_a_draft_declares_no_odometer_beside_positions(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("time,lat,lon,speed,bearing,fix,cov_ee_m2\n2025-06-01T10:00:00Z,50.1,4.1,3.5,90,sbas,0.25\n")
+    draft = draft_mapping(log)
+    drafted = tomllib.loads(draft)["ingest"]
+    assert list(drafted) == ["gnss"]
+    assert '# fields = { speed_mps = "speed" }' in draft
+    assert "# Unused columns: speed, bearing\n" in draft
+    (gnss,) = drafted["gnss"]
+    gnss = gnss["fields"]
+    assert (gnss["fix"], gnss["cov_ee_m2"]) == ("fix", "cov_ee_m2")
+
+
+def test_a_draft_leaves_the_origin_of_an_odometer_to_its_owner(tmp_path):
+    log = tmp_path / "odo.csv"
+    log.write_text("time,speed (m/s)\n2025-06-01T10:00:00Z,3.5\n")
+    draft = draft_mapping(log)
+    (mapping,) = tomllib.loads(draft)["ingest"]["odometer"]
+    assert "origin" not in mapping
+    assert '# origin = "wheel"' in draft
+
+
+def test_times_of_a_draft_are_never_taken_for_utc_against_their_name(tmp_path):
+    local, gps = tmp_path / "local.csv", tmp_path / "gps.csv"
+    local.write_text("Zeit (MESZ);Breite;Länge\n2025-06-01 10:00:00;50.1;4.1\n")
+    assert "time" not in tomllib.loads(draft_mapping(local))["ingest"]["gnss"][0]
+    gps.write_text("millisSinceGpsEpoch,LatitudeDegrees,LongitudeDegrees\n1300000000000,50.1,4.1\n")
+    mapping = settings_from(tomllib.loads(draft_mapping(gps)), Configuration, "draft").ingest
+    # 1.3e9 s after 1980-01-06 on a scale that is 18 s ahead of UTC.
+    expected = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(seconds=1.3e9 - 18)
+    assert gather([gps], mapping).streams["gnss"]["t"].to_list() == [expected]

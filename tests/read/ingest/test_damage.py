@@ -13,7 +13,7 @@ import zstandard
 from polars.testing import assert_frame_equal
 
 from pipeline.read.ingest import read_run
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import InputError
 from tests.read.ingest import samples
 from tests.read.ingest.samples import (
@@ -37,13 +37,13 @@ from tests.read.ingest.samples import (
 CONFIG = IngestConfig()
 
 
-def read(tmp_path, content: bytes):
-    return read_run(samples.save(tmp_path, content), CONFIG)
+def read(tmp_path, content: bytes, config: IngestConfig = CONFIG):
+    return read_run(samples.save(tmp_path, content), config)
 
 
-def refused(tmp_path, content: bytes) -> str:
+def refused(tmp_path, content: bytes, config: IngestConfig = CONFIG) -> str:
     with pytest.raises(InputError) as caught:
-        read(tmp_path, content)
+        read(tmp_path, content, config)
     assert "run.mcap" in str(caught.value)
     return str(caught.value)
 
@@ -337,15 +337,16 @@ def test_bit_flips_are_found(tmp_path, encoding):
 
 def test_big_endian_and_parameter_list_cdr(tmp_path):
     little = samples.log_bytes(compression="none", chunk_size=None, checksums=False)
-    expected = read(tmp_path, little)
+    twist = IngestConfig(odometer=(StreamMapping(topic="/odometer"),))
+    expected = read(tmp_path, little, twist)
     from tests.read.ingest.oracle import with_payloads
 
     big = with_payloads(little, "/odometer", big_endian_twist)
-    assert_frame_equal(read(tmp_path, big).odometer, expected.odometer, check_exact=True)
+    assert_frame_equal(read(tmp_path, big, twist).odometer, expected.odometer, check_exact=True)
     listed = with_payloads(little, "/odometer", lambda payload: b"\x00\x03" + payload[2:])
-    assert "0x0003" in refused(tmp_path, listed)
+    assert "0x0003" in refused(tmp_path, listed, twist)
     short = with_payloads(little, "/odometer", lambda payload: payload[:-9])
-    assert "/odometer" in refused(tmp_path, short)
+    assert "/odometer" in refused(tmp_path, short, twist)
 
 
 def big_endian_twist(payload: bytes) -> bytes:

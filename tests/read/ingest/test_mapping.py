@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Mapping
 from datetime import UTC, datetime
 
 import polars as pl
@@ -34,12 +35,12 @@ def config(**streams: object) -> IngestConfig:
     return settings_from(streams, IngestConfig, "test")
 
 
-def json_log(tmp_path, topics: dict[str, list[dict]], schema: str = "acme.Thing"):
+def json_log(tmp_path, topics: dict[str, list[dict]], schema: str = "acme.Thing", of: Mapping[str, str] | None = None):
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()
     for topic, messages in topics.items():
-        schema_id = writer.register_schema(schema, "jsonschema", b"{}")
+        schema_id = writer.register_schema((of or {}).get(topic, schema), "jsonschema", b"{}")
         channel_id = writer.register_channel(topic, "json", schema_id)
         for number, message in enumerate(messages):
             writer.add_message(channel_id, STAMP_NS + number, json.dumps(message).encode(), STAMP_NS + 1000 + number)
@@ -205,13 +206,23 @@ def test_solutions_are_named_after_their_topics(tmp_path):
     assert read_run(two, IngestConfig()).solutions() == ["gps", "rx_egnos"]
 
 
-def test_two_odometers_are_not_guessed_between(tmp_path):
+@pytest.mark.parametrize("schema", ["geometry_msgs/msg/TwistStamped", "geometry_msgs/TwistStamped"])
+def test_a_twist_is_an_odometer_where_a_mapping_names_it_only(tmp_path, schema):
     speed = {"header": {"stamp": STAMP, "frame_id": ""}, "twist": {"linear": {"x": 1.0}}}
-    fix = {"t": 5, "latitude_deg": 50.0, "longitude_deg": 4.0, "fix": "sbas"}
-    path = json_log(tmp_path, {"/a": [speed], "/b": [speed]}, "geometry_msgs/msg/TwistStamped")
+    fix = {"timestamp": {"sec": 5, "nsec": 0}, "latitude": 50.0, "longitude": 4.0, "altitude": 1.0}
+    path = json_log(tmp_path, {"/a": [speed], "/b": [speed], "/gps": [fix]}, schema, {"/gps": "foxglove.LocationFix"})
+    alone = read_run(path, IngestConfig())
+    assert alone.odometer is None
+    assert alone.notes.skipped_topics == (f"/a ({schema})", f"/b ({schema})")
+    draft = describe_log(path, IngestConfig()).starting_config
+    assert '# topic = "/a"' in draft
+    assert "\n[[" not in draft
+    named = read_run(path, config(odometer={"topic": "/a"}))
+    assert named.odometer is not None
+    assert named.odometer["speed_mps"].to_list() == [1.0]
+    assert named.odometer["origin"].to_list() == [None]
     with pytest.raises(InputError, match="several topics could be the odometer; found /a, /b"):
-        read_run(path, IngestConfig())
-    del fix
+        read_run(path, config(odometer=[{"topic": "/a"}, {"topic": "/b"}]))
 
 
 def test_leap_seconds():

@@ -16,7 +16,7 @@ from polars.testing import assert_frame_equal
 from pipeline.read.ingest import read_run
 from pipeline.show.export.messages import descriptor, message_class
 from pipeline.show.export.position_messages import LOCATION_FIELDS, LOCATION_FIX
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, StreamMapping
 from tests.read.ingest import oracle, samples
 from tests.read.ingest.samples import DEFINITIONS
 
@@ -111,7 +111,8 @@ def ros_speed(name: str, speed: dict) -> bytes:
 
 
 def check(tmp_path, content: bytes, gnss: pl.DataFrame, odometer: pl.DataFrame | None, slow: int = 0) -> None:
-    log = read_run(samples.save(tmp_path, content), IngestConfig())
+    mapped = () if odometer is None else (StreamMapping(topic="/odom"),)
+    log = read_run(samples.save(tmp_path, content), IngestConfig(odometer=mapped))
     assert_frame_equal(oracle.compared(log.gnss, gnss.columns), gnss, check_exact=True)
     assert log.notes.slow_path_messages <= slow
     assert log.notes.partial_until_ns is None
@@ -224,7 +225,9 @@ def test_written_runs_come_back(tmp_path, encoding, compression, chunk_size):
     run = samples.run()
     content = samples.log_bytes(run, encoding, compression, chunk_size)
     assert content == samples.log_bytes(run, encoding, compression, chunk_size)
-    log = read_run(samples.save(tmp_path, content), IngestConfig())
+    # A twist is read as an odometer where a mapping names its topic.
+    mapped = (StreamMapping(topic="/odometer"),) if encoding == "cdr" else ()
+    log = read_run(samples.save(tmp_path, content), IngestConfig(odometer=mapped))
     assert_frame_equal(log.gnss, run.gnss, check_exact=True)
     assert_frame_equal(log.odometer, run.odometer, check_exact=True)
     assert log.notes.slow_path_messages == 0
