@@ -544,7 +544,10 @@ def _contradicted(
         )
         way_m = known.at_m[end] - known.at_m[begin]
         sure_m = np.where(way.bound_m > 0.0, np.nan, way.distance_m)
-        counted_m = known.sense * scale * sure_m
+        # Others may count the other way round.
+        agreed_m = np.nansum(way_m * sure_m)
+        sense = known.sense if counter is witnesses.counters[0] or agreed_m == 0.0 else np.sign(agreed_m)
+        counted_m = sense * scale * sure_m
         if not witnesses.signed:
             counted_m = np.where(way_m * counted_m < 0.0, -counted_m, counted_m)
         off_m = way_m - counted_m

@@ -130,14 +130,15 @@ def between_anchors(
 
     Where the odometer of a vehicle file closes, the inverse-variance mean of both +- (k sigmas + closing error), as the
     whole closing error may have arisen at one place. Else the hull of both. Each is wider by its own bound; where
-    the less doubtful anchor alone tells more, it does.
+    the gap closes with it and the less doubtful anchor alone tells more, it does.
     """
     factor = config.hazards.evidence_factor
     clock_m = [anchor.clock_m for anchor in anchors]
     ways = [counter.between(anchor.t_ns, t_ns) for anchor in anchors]
     places = [at + way.distance_m for at, way in zip(at_m, ways, strict=True)]
     variances = [anchor.sigma_m**2 + way.variance_m2 for anchor, way in zip(anchors, ways, strict=True)]
-    if counter.by_file and closes(counter, anchors, at_m[1] - at_m[0], config):
+    closed = closes(counter, anchors, at_m[1] - at_m[0], config)
+    if counter.by_file and closed:
         weights = [1.0 / variance for variance in variances]
         share = weights[0] / (weights[0] + weights[1])
         centre = share * places[0] + (1.0 - share) * places[1]
@@ -152,7 +153,8 @@ def between_anchors(
     ]
     low = np.minimum(places[0] - halves[0], places[1] - halves[1])
     hull = low, np.maximum(places[0] + halves[0], places[1] + halves[1])
-    return _narrower(hull, counter, anchors, at_m, t_ns, ways, config)
+    # What does not close is not explained by the known doubts: it may have been lost anywhere between.
+    return _narrower(hull, counter, anchors, at_m, t_ns, ways, config) if closed else hull
 
 
 def _narrower(

@@ -164,6 +164,8 @@ class TrainEvidence:
         heard = ~within_spans(t_ns, self.silent)
         alternatives = self._covered(t_ns, heard, shown)
         alternatives += self._carried(self.carried, t_ns, heard & (kind == NOTHING), shown)
+        # Its clock puts the ends of a stretch anywhere within what is not known of it.
+        alternatives += self._covered(t_ns, heard & (kind == NOTHING), shown, beyond=True)
         if self.stretches and self.by_reads and self.by_reads[0].counter.odometer.independent:
             of_reads = _Shown(np.full(t_ns.size, NOTHING), *np.zeros((2, t_ns.size), dtype=np.bool_))
             by_reads = self._carried(self.by_reads, t_ns, heard, of_reads)
@@ -174,13 +176,15 @@ class TrainEvidence:
         complete = self.config.evidence.survey_complete
         return EvidenceSet(kind, tuple(alternatives), proves, on_survey | (complete & (kind != NOTHING)))
 
-    def _covered(self, t_ns: Ints, heard: Bools, shown: _Shown) -> list[Alternative]:
-        """By the reference; writes into `shown` where it speaks."""
+    def _covered(self, t_ns: Ints, heard: Bools, shown: _Shown, beyond: bool = False) -> list[Alternative]:
+        """By the reference; writes into `shown` where it speaks. `beyond`: past its ends as far as its clock may be."""
         alternatives: list[Alternative] = []
         for stretch in self.stretches:
             first_ns = stretch.t_ns[0]
             last_ns = stretch.t_ns[-1]
-            reached = (t_ns >= first_ns - stretch.clock_ns) & (t_ns <= last_ns + stretch.clock_ns)
+            # One sample shows no speed, and so not how far the train came meanwhile.
+            margin_ns = stretch.clock_ns if beyond and stretch.t_ns.size > 1 else 0
+            reached = (t_ns >= first_ns - margin_ns) & (t_ns <= last_ns + margin_ns)
             rows = np.flatnonzero(reached & heard & (shown.kind == NOTHING))
             shown.proves[rows] = True
             at_ns = np.clip(t_ns[rows], first_ns, last_ns)

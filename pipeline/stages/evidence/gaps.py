@@ -152,12 +152,22 @@ class GapSearch:
         return [Gap(begin.t_ns, end.t_ns, begin, end, ways)]
 
     def misclosure_m(self, begin: TrueAnchor, end: TrueAnchor) -> float:
-        """How much farther apart the anchors are than the odometer counted [m]; 0 where a way closes, or none leads."""
+        """How much farther apart the anchors are than the odometer counted [m].
+
+        0 where a way closes within k_T sigmas (at k = 3 a reference of few samples would step every few minutes), or
+        none leads.
+        """
         gaps = self._between(begin, end)
         if len(gaps) != 1 or not gaps[0].ways or gaps[0].closed:
             return 0.0
-        counted_m = float(self.counter.between(begin.t_ns, np.array([end.t_ns])).distance_m[0])
-        return min((way.apart_m - counted_m for way in gaps[0].ways), key=abs)
+        end_ns = np.array([end.t_ns])
+        counted = self.counter.between(begin.t_ns, end_ns)
+        limit_m = self.config.align.sure_sigmas * np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + counted.variance_m2)
+        if not self.counter.by_file:
+            limit_m = beside_m(self.counter.driven_m(begin.t_ns, end_ns), 0.0, self.config)
+        apart_m = min((way.apart_m - float(counted.distance_m[0]) for way in gaps[0].ways), key=abs)
+        allowed_m = float((limit_m + counted.bound_m)[0]) + begin.clock_m + end.clock_m
+        return apart_m if abs(apart_m) > allowed_m else 0.0
 
     def _ways_of_length(
         self, first: TrueAnchor, second: TrueAnchor, length_m: float, slack_m: float

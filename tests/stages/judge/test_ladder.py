@@ -23,7 +23,11 @@ def test_random_runs(first: int) -> None:
     found: list[str] = []
     for seed in range(first, first + SEEDS_EACH):
         journey = random_journey(seed)
-        found += findings(journey, rungs_of(journey))
+        rungs = rungs_of(journey)
+        # A slip that contradicts the reference leaves open which of the two failed: then neither need decide.
+        disputed = "reference" in rungs and "evidence_contradicted" in rungs["reference"].row["reasons"]
+        of_run = findings(journey, rungs, crooked=disputed)
+        found += [text for text in of_run if not (disputed and "unknown" in text)]
     assert not found, f"{len(found)} findings:\n" + "\n".join(found[:20])
 
 
