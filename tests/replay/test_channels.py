@@ -180,7 +180,8 @@ def test_compared_after_the_fact_is_what_the_monitor_sees():
     assert composite["delays_s"] == pytest.approx([(fails["t"][0] - seen["t"][0]).total_seconds() - 150.0])
     # Neither the alarm nor the recovery after it is time in use.
     alarm_s = (fails["t"][-1] - fails["t"][0]).total_seconds() + 30.0
-    assert composite["judged_s"] == pytest.approx(judged.height * 0.1 - alarm_s, abs=0.3)
+    # In the first second no track is claimed yet.
+    assert composite["judged_s"] == pytest.approx(judged.height * 0.1 - alarm_s, abs=1.1)
 
 
 def _tables(tables):

@@ -90,7 +90,7 @@ class TrainEvidence:
     the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
     odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
     of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that every independent
-    odometer contradicts.
+    odometer contradicts; `unsure`: times in which nobody knows which of the two failed.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -105,6 +105,7 @@ class TrainEvidence:
     stands: tuple[Stand, ...] = ()
     parted: bool = False
     doubted: int = 0
+    unsure: tuple[Span, ...] = ()
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
@@ -349,6 +350,7 @@ def evidence_of(
         config=config,
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
+        unsure=tuple(unsure),
         doubted=unclosed + sum(stretch.levels.doubts for stretch in recorded),
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.evidence.carrying import Interval, carried_forward
-from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
+from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet, within_spans
 from pipeline.stages.judge.case import Case
 from pipeline.stages.track.path import RoutePath
 from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
@@ -141,7 +141,10 @@ def judgements_of(case: Case, positions: MatchedPositions, at_ns: Ints, evidence
     accepted = case.solution.accepted
     accepted_ns = case.instants(times_ns(accepted))
     stood = case.evidence.stood
-    train_m = carried_forward(accepted_ns, floats(accepted, "path_m"), at_ns, case.odometry, stood, case.config)
+    low_m, high_m = carried_forward(accepted_ns, floats(accepted, "path_m"), at_ns, case.odometry, stood, case.config)
+    # Where it contradicts a reference, and nobody knows which of the two failed, it shows nothing.
+    unsure = within_spans(at_ns, case.evidence.unsure)
+    train_m = np.where(unsure, np.nan, low_m), np.where(unsure, np.nan, high_m)
     return with_own_anchors(judged, positions, train_m, case.config.hazards)
 
 

@@ -125,12 +125,11 @@ class Rung:
         return usable & ~safe & ~alarm, usable & ~(safe & before)
 
     def counted_s(self, mask: Bools) -> Floats:
-        """Time from the epoch before: whole where that is of the mask too, else at most one period (DOMAIN 5.3)."""
+        """Time from the epoch before, up to max(1.5 periods, 1 s) (DOMAIN 5.3)."""
         time = self.epochs.time_s
         period = float(np.median(np.diff(time)))
         step = np.diff(time, prepend=time[0] - period)
-        lasted = np.concatenate([[False], mask[:-1]])
-        return np.where(mask, np.where(lasted, step, np.minimum(step, period)), 0.0)
+        return np.where(mask, np.minimum(step, max(1.5 * period, 1.0)), 0.0)
 
 
 def rungs_of(journey: Journey, config: Configuration | None = None) -> dict[str, Rung]:
