@@ -34,7 +34,7 @@ class ExpectedRun(Settings):
     hazards: tuple[ExpectedHazard, ...] = ()
     passages: dict[str, PassageStatus]
     once: tuple[str, ...] = ()
-    alarms: Annotated[str, Field(pattern=r"^(none|true|false)$")] = "none"
+    alarms: Annotated[str, Field(pattern=r"^(none|true|false|unknown)$")] = "none"
     suspect: str | None = None
     odometer_scale: Positive | None = None
     odometer_scale_tolerance: NonNegative = 1e-3
