@@ -232,6 +232,9 @@ def known_stretch(
         of_path = Levels.of(steps, t_ns, reads_ns)
         levels.append(of_path.seen(side.sense))
         paths.append(left_open(known, t_ns, steps, of_path, beyond.seen(side.sense)))
+    if t_ns.size == 1 and witnesses.counters:
+        # One sample shows no speed.
+        speed_mps = np.abs(witnesses.counters[0].best_speed_mps(t_ns))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
     around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in (-clock.delta_s, 0.0, clock.delta_s)]
     clock_m = np.maximum.reduce(around) * clock.delta_s
