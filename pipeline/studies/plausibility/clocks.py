@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from pipeline.studies.plausibility.causes import explain_lag, leap_seconds
+from pipeline.read.ingest.timescale import leap_seconds
+from pipeline.studies.plausibility.causes import explain_lag
 from pipeline.studies.plausibility.check import (
     IN_VEHICLE_FILE,
     VEHICLE_FILE,
@@ -136,7 +137,9 @@ def _large(what: str, found: str, of: Recording, lag: StreamLag, of_gnss: Stream
     cause, exact_s = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0)) or constant
     # GPS time is ahead of UTC, so where nobody else knows the stream with the later stamps holds it.
     leaps = abs(abs(lag.lag_s) - leap_seconds(of.epoch_ns)) < _SAME_CLOCK_S
-    at_gnss = of_gnss is not None or (not known and leaps and lag.lag_s < 0)
+    # A counter of weeks that begins anew shows an earlier date.
+    weeks = cause.code is MisfitCause.GPS_WEEK and lag.lag_s > 0
+    at_gnss = of_gnss is not None or (not known and ((leaps and lag.lag_s < 0) or weeks))
     pair = ("GNSS", lag.name) if at_gnss else (lag.name, "GNSS")
     whose = Cause(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
     lines = correction(lag.stream, shift_s=-exact_s)
