@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Self
@@ -133,6 +133,17 @@ class Sided:
     with_m: float
     against_m: float
 
+    def anchor(self, sample: int) -> TrueAnchor:
+        """The places of one sample, by its own clock."""
+        paths = self.stretch.paths
+        places = [path.legs[int(path.leg[sample])].locate(path.at_m[[sample]]) for path in paths]
+        return TrueAnchor(
+            t_ns=int(self.stretch.t_ns[sample]),
+            places=tuple(dict.fromkeys(Place(int(element[0]), float(at_m[0])) for element, at_m, _ in places)),
+            sigma_m=float(self.stretch.sigma_m[sample]),
+            kind=Evidence.REFERENCE,
+        )
+
     @property
     def facing(self) -> int:
         """The oriented net element of the first sample, in the sense in which the odometer counts up."""
@@ -145,8 +156,9 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
     """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
     begin, end, step_m = _steps_of(stretch, 1.0)
     if counter is not None:
-        counted_m = counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end])
-        step_m = np.sign(step_m) * np.nan_to_num(counted_m)
+        counted_m = np.nan_to_num(counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end]))
+        # The noise of a reference that stands still has no direction to give to a way that the odometer counts.
+        step_m = np.sign(step_m * counted_m) * np.minimum(np.abs(step_m), np.abs(counted_m))
     moved_m = np.cumsum(step_m)
     first = np.flatnonzero(np.abs(moved_m) >= least_m)
     total_m = float(moved_m[first[0]]) if first.size else float(step_m.sum())
@@ -167,14 +179,26 @@ def _steps_of(stretch: ReferenceStretch, step_s: float) -> tuple[Ints, Ints, Flo
     return begin, end, path.at_m[end] - path.at_m[begin]
 
 
-def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> RecorderLag:
-    """The reference's clock against the odometer's, by its ways of ten seconds, as the odometer counts up."""
+def reference_lag(
+    sides: Sequence[Sided], counter: Counter, lengths_m: Callable[[TrueAnchor, TrueAnchor], list[float]]
+) -> RecorderLag:
+    """The reference's clock against the odometer's, as the odometer counts up.
+
+    By its ways of ten seconds, and by those from stretch to stretch where `lengths_m` knows one: a slow reference is
+    all gaps.
+    """
+    if not sides:
+        return RecorderLag()
     ways = []
     for side in sides:
         begin, end, way_m = _steps_of(side.stretch, _LAG_WINDOW_S)
         ways.append((side.stretch.t_ns[begin], side.stretch.t_ns[end], side.sense * way_m))
-    if not ways:
-        return RecorderLag()
+    for before, after in pairwise(sorted(sides, key=lambda side: int(side.stretch.t_ns[0]))):
+        begin_at, end_at = before.anchor(-1), after.anchor(0)
+        across_m = np.array(lengths_m(begin_at, end_at), dtype=np.float64)
+        ways.append(
+            (np.full(across_m.size, begin_at.t_ns, np.int64), np.full(across_m.size, end_at.t_ns, np.int64), across_m)
+        )
     begins, ends, lengths = (np.concatenate(column) for column in zip(*ways, strict=True))
     return lag_of(begins, ends, lengths, counter)
 

@@ -162,14 +162,16 @@ class TrainEvidence:
         kind = np.full(t_ns.size, NOTHING)
         proves, on_survey = np.zeros((2, t_ns.size), dtype=np.bool_)
         shown = _Shown(kind, proves, on_survey)
-        heard = ~within_spans(t_ns, self.silent)
+        on_track = ~within_spans(t_ns, self.silent)
+        heard = on_track & ~within_spans(t_ns, self.unsure)
         alternatives = self._covered(t_ns, heard, shown)
         alternatives += self._carried(self.carried, t_ns, heard & (kind == NOTHING), shown)
         # Its clock puts the ends of a stretch anywhere within what is not known of it.
         alternatives += self._covered(t_ns, heard & (kind == NOTHING), shown, beyond=True)
-        if self.stretches and self.by_reads and self.by_reads[0].counter.odometer.independent:
+        if self.by_reads and self.by_reads[0].counter.odometer.independent:
             of_reads = _Shown(np.full(t_ns.size, NOTHING), *np.zeros((2, t_ns.size), dtype=np.bool_))
-            by_reads = self._carried(self.by_reads, t_ns, heard, of_reads)
+            # A reference that drifted by nobody knows how much leaves the reads what they prove without it.
+            by_reads = self._carried(self.by_reads, t_ns, on_track, of_reads)
             alternatives, _ = common(alternatives, by_reads, t_ns.size)
             kind = np.where(kind == NOTHING, of_reads.kind, kind)
             proves |= of_reads.proves
@@ -334,22 +336,22 @@ def evidence_of(
     hazards = config.hazards
     independent = [odometer for odometer in odometers if odometer.independent]
     counters = [Counter.of(odometer, config.hazards.failure_limit_m) for odometer in independent or odometers]
-    # An odometer that may be made of the positions measures no clock, and contradicts no reference.
-    witnesses = counters if independent else []
     main = counters[0] if counters else None
-    clock_main = witnesses[0] if witnesses else None
     least_m = config.matching.orientation_distance_m
     stretches, silent = reference
     sides = [anchors.sided(stretch, main, least_m) for stretch in stretches]
     facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
     turned = any(min(side.with_m, side.against_m) >= least_m for side in sides)
     searches = [GapSearch(counter, network, config, facing, turned) for counter in counters]
-    lag_of_reference = anchors.reference_lag(sides, clock_main)
-    of_reference = clock_of(lag_of_reference, hazards)
-    held_against = anchors.Witnesses.of(witnesses, lag_of_reference, not turned, config)
+    lag_of_reference = RecorderLag()
+    if main is not None:
+        lag_of_reference = anchors.reference_lag(sides, main, searches[0].only_length_m)
+    of_reference = clock_of(lag_of_reference, bool(independent), hazards)
+    # Any odometer may contradict a reference; where one is independent, the others cannot confirm it against that one.
+    held_against = anchors.Witnesses.of(counters, lag_of_reference, not turned, config)
     read = anchors.read_anchors(reads, balises, network.track, hazards)
-    lag_of_reads = RecorderLag() if clock_main is None else _lag_of_reads(searches[0].carried(_points(read)))
-    of_reads = clock_of(lag_of_reads, hazards)
+    lag_of_reads = RecorderLag() if main is None else _lag_of_reads(searches[0].carried(_points(read)))
+    of_reads = clock_of(lag_of_reads, bool(independent), hazards)
     clocked = [] if main is None else anchors.on_clock(read, of_reads, main)
     recorded, unclosed = _known_stretches(sides, of_reference, held_against, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
@@ -358,9 +360,9 @@ def evidence_of(
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return TrainEvidence(
         stretches=known,
-        silent=(*((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent), *unsure),
+        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent),
         carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
-        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if known else (),
+        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
         reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
         clocks=(of_reference,) * bool(known) + (of_reads,) * bool(apart),
         network=network,
