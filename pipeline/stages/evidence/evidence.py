@@ -283,6 +283,23 @@ def _narrowed(first: Alternative, second: Alternative) -> Alternative:
     return Alternative(first.rows, first.route, low_m, high_m).where(low_m <= high_m)
 
 
+def either(sets: Sequence[EvidenceSet]) -> EvidenceSet:
+    """One of several sets holds, nobody knows which: every alternative stays possible, and proved is what all prove.
+
+    Where one is silent, so are all: it could have said anything.
+    """
+    first, *others = sets
+    for other in others:
+        spoken = (first.kind != NOTHING) & (other.kind != NOTHING)
+        first = EvidenceSet(
+            kind=np.where(spoken, np.maximum(first.kind, other.kind), NOTHING),
+            alternatives=tuple(there.where(spoken[there.rows]) for there in (*first.alternatives, *other.alternatives)),
+            proves=first.proves & other.proves,
+            on_survey=first.on_survey & other.on_survey,
+        )
+    return first
+
+
 def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
     """Instants of the spans, their ends left out."""
     inside = np.zeros(t_ns.size, dtype=np.bool_)
