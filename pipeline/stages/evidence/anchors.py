@@ -61,7 +61,7 @@ class KnownStretch:
     """A stretch of the reference on the odometer's clock; the train was on one of its paths.
 
     `proved`: samples that lie on no track that the survey lacks; `levels`: between its steps, as the odometer counts;
-    `clock_ns`: so far beyond its ends the samples there may have been made.
+    `clock_ns`: so far beyond its ends the samples there may have been made; `lags_s`: as of a `TrueAnchor`.
     """
 
     t_ns: Ints
@@ -72,6 +72,7 @@ class KnownStretch:
     reference: ReferenceStretch
     levels: Levels
     clock_ns: int = 0
+    lags_s: tuple[float, float] = (0.0, 0.0)
 
     def proved_at(self, t_ns: Ints) -> Bools:
         """Whether the samples about each instant are."""
@@ -90,6 +91,8 @@ class KnownStretch:
             kind=Evidence.REFERENCE,
             clock_m=float(self.clock_m[sample]) + open_m,
             proved=bool(self.proved[sample]),
+            lags_s=self.lags_s,
+            open_m=open_m,
         )
 
     @property
@@ -236,11 +239,20 @@ def known_stretch(
         # One sample shows no speed.
         speed_mps = np.abs(witnesses.counters[0].best_speed_mps(t_ns))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
-    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in (-clock.delta_s, 0.0, clock.delta_s)]
+    lates_s = np.linspace(-clock.delta_s, clock.delta_s, 3 + 2 * int(clock.delta_s / _EVEN_S))
+    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in lates_s.tolist()]
     clock_m = np.maximum.reduce(around) * clock.delta_s
     proved = shown_on_its_track(stretch, config)
     return KnownStretch(
-        t_ns, stretch.sigma_m, clock_m, tuple(paths), proved, stretch, levels[0], round(clock.delta_s * NS_PER_S)
+        t_ns,
+        stretch.sigma_m,
+        clock_m,
+        tuple(paths),
+        proved,
+        stretch,
+        levels[0],
+        round(clock.delta_s * NS_PER_S),
+        clock.lags_s,
     )
 
 
@@ -640,7 +652,9 @@ def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Count
     clock_m = clock.delta_s * np.abs(counter.best_speed_mps(t_ns))
     shift_ns = round(clock.shift_s * NS_PER_S)
     rows = zip(anchors, clock_m.tolist(), strict=True)
-    return [replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=added_m) for anchor, added_m in rows]
+    return [
+        replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=added_m, lags_s=clock.lags_s) for anchor, added_m in rows
+    ]
 
 
 def outside(anchors: Sequence[TrueAnchor], stretches: Sequence[KnownStretch]) -> list[TrueAnchor]:

@@ -48,6 +48,11 @@ class RecorderClock:
     delta_s: float
     assumed: bool = False
 
+    @property
+    def lags_s(self) -> tuple[float, float]:
+        """Least and largest lag that it leaves possible."""
+        return self.shift_s - self.delta_s, self.shift_s + self.delta_s
+
 
 def clock_of(lag: RecorderLag, independent: bool, config: HazardConfig) -> RecorderClock:
     """DOMAIN section 5.1: the hull of no lag and the measured one, each +- k sigma.
