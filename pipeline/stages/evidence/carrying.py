@@ -60,6 +60,10 @@ class Counter:
         """Silent over more than `silent_m` of doubt and over a stand without a sign, which may hide a turn."""
         return cls(odometer, _stands_ns(odometer) if without_sign else np.zeros(0, dtype=np.int64), silent_m)
 
+    def without_sign(self) -> Counter:
+        """The same odometer, that says nothing over a stand."""
+        return Counter.of(self.odometer, self.silent_m, without_sign=True)
+
     @property
     def by_file(self) -> bool:
         """Scale and its sigma are those of a vehicle file."""
