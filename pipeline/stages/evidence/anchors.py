@@ -12,7 +12,8 @@ import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
-from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, lag_of
+from pipeline.stages.evidence.clock import RecorderClock, lag_of
+from pipeline.stages.odometry.scale_lag import ScaleLag, spans_of_rows
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
 from pipeline.stages.track.survey import SurveyedTrack
@@ -20,8 +21,6 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import BaliseKind, Evidence
 
-# Numerics: a lag shows where the speed changes, so ways over this time are compared [s].
-_LAG_WINDOW_S = 10.0
 # DOMAIN section 5.1: the reference is held against the odometer over so long; a spike is no longer [s].
 _WINDOW_S = 10.0
 _LONG_WINDOW_S = 100.0
@@ -157,24 +156,30 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
 
 def _steps_of(stretch: ReferenceStretch, step_s: float) -> tuple[Ints, Ints, Floats]:
     """Pairs of samples so far apart in time on one leg of the first path, and the way between them [m]."""
-    path = stretch.paths[0]
     t_ns = stretch.t_ns
     instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, round(step_s * NS_PER_S), dtype=np.int64)
     rows = np.unique(np.searchsorted(t_ns, instants))
-    whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
-    begin = rows[:-1][whole]
-    end = rows[1:][whole]
+    return _ways_of(stretch, rows[:-1], rows[1:])
+
+
+def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, Ints, Floats]:
+    """Those of these pairs of samples that lie on one leg of the first path, and the way between them [m]."""
+    path = stretch.paths[0]
+    whole = path.leg[begin] == path.leg[end]
+    begin = begin[whole]
+    end = end[whole]
     return begin, end, path.at_m[end] - path.at_m[begin]
 
 
-def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> RecorderLag:
+def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> ScaleLag:
     """The reference's clock against the odometer's, by its ways of ten seconds, as the odometer counts up."""
+    if counter is None or not sides:
+        return ScaleLag()
     ways = []
     for side in sides:
-        begin, end, way_m = _steps_of(side.stretch, _LAG_WINDOW_S)
-        ways.append((side.stretch.t_ns[begin], side.stretch.t_ns[end], side.sense * way_m))
-    if not ways:
-        return RecorderLag()
+        t_ns = side.stretch.t_ns
+        begin, end, way_m = _ways_of(side.stretch, *spans_of_rows(counter.odometer.seconds(t_ns)))
+        ways.append((t_ns[begin], t_ns[end], side.sense * way_m))
     begins, ends, lengths = (np.concatenate(column) for column in zip(*ways, strict=True))
     return lag_of(begins, ends, lengths, counter)
 
@@ -282,14 +287,13 @@ class Witnesses:
     def of(
         cls,
         counters: Sequence[Counter],
-        lag: RecorderLag,
+        lag: ScaleLag,
         signed: bool,
         config: Configuration,
     ) -> Self:
         """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1)."""
         factor = config.hazards.evidence_factor
-        known = np.isfinite(lag.sigma_s)
-        clock_s = factor * lag.sigma_s if known else config.hazards.evidence_clock_s
+        clock_s = factor * lag.lag_sigma_s if lag.measured else config.hazards.evidence_clock_s
         share = config.lds.odometer_share
         scales = [1.0] * len(counters)
         # At k_T sigmas the 5 % of an odometer of which nothing is known.

@@ -12,10 +12,11 @@ import polars as pl
 from pipeline.stages.evidence import anchors
 from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
 from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried
-from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, clock_of, lag_of
+from pipeline.stages.evidence.clock import RecorderClock, clock_of, lag_of
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
 from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
 from pipeline.stages.odometry import Odometry
+from pipeline.stages.odometry.scale_lag import ScaleLag
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
@@ -331,7 +332,7 @@ def evidence_of(
     of_reference = clock_of(lag_of_reference, hazards)
     held_against = anchors.Witnesses.of(witnesses, lag_of_reference, not turned, config)
     read = anchors.read_anchors(reads, balises, network.track, hazards)
-    lag_of_reads = RecorderLag() if clock_main is None else _lag_of_reads(searches[0].carried(_points(read)))
+    lag_of_reads = ScaleLag() if clock_main is None else _lag_of_reads(searches[0].carried(_points(read)))
     of_reads = clock_of(lag_of_reads, hazards)
     clocked = [] if main is None else anchors.on_clock(read, of_reads, main)
     recorded, unclosed = _known_stretches(sides, of_reference, held_against, clocked, searches, vehicle, config)
@@ -391,7 +392,7 @@ def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
     return [(anchor, anchor) for anchor in known]
 
 
-def _lag_of_reads(source: Carried) -> RecorderLag:
+def _lag_of_reads(source: Carried) -> ScaleLag:
     """The clock of the reads against the odometer's, by the ways between reads, whether they close or not."""
     ways = [(gap.begin_ns, gap.end_ns, apart_m) for gap in source.gaps for apart_m in gap.only_length_m]
     begins, ends, lengths = zip(*ways, strict=True) if ways else ((), (), ())
