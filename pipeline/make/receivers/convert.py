@@ -67,7 +67,8 @@ def as_run(
             remedy="Convert the log of the receiver first or in the same call." + _reasons(logs.dropped),
         )
     held = logs.corrections_as(purpose or Purpose())
-    run = RunLog(run_id, streams["gnss"], notes=IngestNotes(corrections=held)).with_streams(**streams)
+    notes = IngestNotes(damage=logs.damage, corrections=held)
+    run = RunLog(run_id, streams["gnss"], notes=notes).with_streams(**streams)
     return Converted(corrected(run, correct, later=True), logs.dropped)
 
 
@@ -91,7 +92,9 @@ def extended(
             _refuse_unlike(corrections_of(old, name), corrections_of(new, name), name, place)
     whole = added(old, {name: frame for name in streams if (frame := new.stream(name)) is not None}, force, place)
     held = [made for name in STREAMS for made in corrections_of(new if name in streams else old, name)]
-    return Converted(replace(whole, notes=replace(old.notes, corrections=tuple(held))), logs.dropped)
+    damages = dict.fromkeys(filter(None, [old.notes.damage, logs.damage]))
+    notes = replace(old.notes, corrections=tuple(held), damage="; ".join(damages) or None)
+    return Converted(replace(whole, notes=notes), logs.dropped)
 
 
 def _refuse_unlike(
@@ -112,12 +115,14 @@ def _refuse_unlike(
 class Gatherings:
     """The streams of all logs, as the contract has them, and what could not be used: reason to number.
 
-    `corrections`: those that the streams hold already, of logs that are runs of this program.
+    `corrections`: those that the streams hold already, of logs that are runs of this program; `damage`: what the logs
+    lack.
     """
 
     streams: Streams
     dropped: Mapping[str, int]
     corrections: tuple[StreamCorrection, ...] = ()
+    damage: str | None = None
 
     def corrections_as(self, purpose: Purpose) -> tuple[StreamCorrection, ...]:
         """Those of the streams as they are meant: positions that become the reference are no stream `gnss` any more."""
@@ -128,7 +133,7 @@ class Gatherings:
 def gathered_of(run: RunLog, dropped: Mapping[str, int]) -> Gatherings:
     """The streams of a run, and the corrections that they hold."""
     streams: Streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
-    return Gatherings(streams, dropped, run.notes.corrections)
+    return Gatherings(streams, dropped, run.notes.corrections, run.notes.damage)
 
 
 def gather(
@@ -160,7 +165,8 @@ def gather(
     names = {NoEpochError: "log without an epoch", UnknownError: "file of an archive that is no log"}
     dropped.update(names[type(error)] for error in unread)
     _refuse_overlaps(parts)
-    return Gatherings(_joined(parts), dict(dropped), _common(parts))
+    damages = [f"{log.name}: {gathered.damage}" for log, gathered in parts if gathered.damage is not None]
+    return Gatherings(_joined(parts), dict(dropped), _common(parts), "; ".join(damages) or None)
 
 
 def _refuse_unread(unread: list[NoEpochError | UnknownError], parts: list[tuple[Path, Gatherings]]) -> None:

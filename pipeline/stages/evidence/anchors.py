@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Self
@@ -60,7 +60,7 @@ class KnownStretch:
     """A stretch of the reference on the odometer's clock; the train was on one of its paths.
 
     `proved`: samples that lie on no track that the survey lacks; `levels`: between its steps, as the odometer counts;
-    `clock_ns`: so far beyond its ends the samples there may have been made.
+    `clock_ns`: so far beyond its ends the samples there may have been made; `lags_s`: as of a `TrueAnchor`.
     """
 
     t_ns: Ints
@@ -71,6 +71,7 @@ class KnownStretch:
     reference: ReferenceStretch
     levels: Levels
     clock_ns: int = 0
+    lags_s: tuple[float, float] = (0.0, 0.0)
 
     def proved_at(self, t_ns: Ints) -> Bools:
         """Whether the samples about each instant are."""
@@ -89,6 +90,8 @@ class KnownStretch:
             kind=Evidence.REFERENCE,
             clock_m=float(self.clock_m[sample]) + open_m,
             proved=bool(self.proved[sample]),
+            lags_s=self.lags_s,
+            open_m=open_m,
         )
 
     @property
@@ -132,6 +135,17 @@ class Sided:
     with_m: float
     against_m: float
 
+    def anchor(self, sample: int) -> TrueAnchor:
+        """The places of one sample, by its own clock."""
+        paths = self.stretch.paths
+        places = [path.legs[int(path.leg[sample])].locate(path.at_m[[sample]]) for path in paths]
+        return TrueAnchor(
+            t_ns=int(self.stretch.t_ns[sample]),
+            places=tuple(dict.fromkeys(Place(int(element[0]), float(at_m[0])) for element, at_m, _ in places)),
+            sigma_m=float(self.stretch.sigma_m[sample]),
+            kind=Evidence.REFERENCE,
+        )
+
     @property
     def facing(self) -> int:
         """The oriented net element of the first sample, in the sense in which the odometer counts up."""
@@ -144,8 +158,9 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
     """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
     begin, end, step_m = _steps_of(stretch, 1.0)
     if counter is not None:
-        counted_m = counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end])
-        step_m = np.sign(step_m) * np.nan_to_num(counted_m)
+        counted_m = np.nan_to_num(counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end]))
+        # The noise of a reference that stands still has no direction to give to a way that the odometer counts.
+        step_m = np.sign(step_m * counted_m) * np.minimum(np.abs(step_m), np.abs(counted_m))
     moved_m = np.cumsum(step_m)
     first = np.flatnonzero(np.abs(moved_m) >= least_m)
     total_m = float(moved_m[first[0]]) if first.size else float(step_m.sum())
@@ -171,15 +186,27 @@ def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, I
     return begin, end, path.at_m[end] - path.at_m[begin]
 
 
-def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> ScaleLag:
-    """The reference's clock against the odometer's, by its ways of ten seconds, as the odometer counts up."""
-    if counter is None or not sides:
+def reference_lag(
+    sides: Sequence[Sided], counter: Counter, lengths_m: Callable[[TrueAnchor, TrueAnchor], list[float]]
+) -> ScaleLag:
+    """The reference's clock against the odometer's, as the odometer counts up.
+
+    By its ways of ten seconds, and by those from stretch to stretch where `lengths_m` knows one: a slow reference is
+    all gaps.
+    """
+    if not sides:
         return ScaleLag()
     ways = []
     for side in sides:
         t_ns = side.stretch.t_ns
         begin, end, way_m = _ways_of(side.stretch, *spans_of_rows(counter.odometer.seconds(t_ns)))
         ways.append((t_ns[begin], t_ns[end], side.sense * way_m))
+    for before, after in pairwise(sorted(sides, key=lambda side: int(side.stretch.t_ns[0]))):
+        begin_at, end_at = before.anchor(-1), after.anchor(0)
+        across_m = np.array(lengths_m(begin_at, end_at), dtype=np.float64)
+        ways.append(
+            (np.full(across_m.size, begin_at.t_ns, np.int64), np.full(across_m.size, end_at.t_ns, np.int64), across_m)
+        )
     begins, ends, lengths = (np.concatenate(column) for column in zip(*ways, strict=True))
     return lag_of(begins, ends, lengths, counter)
 
@@ -213,12 +240,24 @@ def known_stretch(
         of_path = Levels.of(steps, t_ns, reads_ns)
         levels.append(of_path.seen(side.sense))
         paths.append(left_open(known, t_ns, steps, of_path, beyond.seen(side.sense)))
+    if t_ns.size == 1 and witnesses.counters:
+        # One sample shows no speed.
+        speed_mps = np.abs(witnesses.counters[0].best_speed_mps(t_ns))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
-    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in (-clock.delta_s, 0.0, clock.delta_s)]
+    lates_s = np.linspace(-clock.delta_s, clock.delta_s, 3 + 2 * int(clock.delta_s / _EVEN_S))
+    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in lates_s.tolist()]
     clock_m = np.maximum.reduce(around) * clock.delta_s
     proved = shown_on_its_track(stretch, config)
     return KnownStretch(
-        t_ns, stretch.sigma_m, clock_m, tuple(paths), proved, stretch, levels[0], round(clock.delta_s * NS_PER_S)
+        t_ns,
+        stretch.sigma_m,
+        clock_m,
+        tuple(paths),
+        proved,
+        stretch,
+        levels[0],
+        round(clock.delta_s * NS_PER_S),
+        clock.lags_s,
     )
 
 
@@ -617,7 +656,9 @@ def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Count
     clock_m = clock.delta_s * np.abs(counter.best_speed_mps(t_ns))
     shift_ns = round(clock.shift_s * NS_PER_S)
     rows = zip(anchors, clock_m.tolist(), strict=True)
-    return [replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=added_m) for anchor, added_m in rows]
+    return [
+        replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=added_m, lags_s=clock.lags_s) for anchor, added_m in rows
+    ]
 
 
 def outside(anchors: Sequence[TrueAnchor], stretches: Sequence[KnownStretch]) -> list[TrueAnchor]:

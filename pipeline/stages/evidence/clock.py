@@ -21,16 +21,25 @@ class RecorderClock:
     delta_s: float
     assumed: bool = False
 
+    @property
+    def lags_s(self) -> tuple[float, float]:
+        """Least and largest lag that it leaves possible."""
+        return self.shift_s - self.delta_s, self.shift_s + self.delta_s
 
-def clock_of(lag: ScaleLag, config: HazardConfig) -> RecorderClock:
+
+def clock_of(lag: ScaleLag, independent: bool, config: HazardConfig) -> RecorderClock:
     """DOMAIN section 5.1: the hull of no lag and the measured one, each +- k sigma.
 
-    A measured lag belongs to nobody: odometer and GNSS may share it, or the recorder has it.
+    A measured lag belongs to nobody: odometer and GNSS may share it, or the recorder has it. By an odometer that is not
+    `independent` it may widen what is assumed, and never narrow it.
     """
     noise_s = config.evidence_factor * lag.lag_sigma_s
     if abs(lag.lag_s) < _SHOWN_SIGMAS * lag.lag_sigma_s and noise_s > config.evidence_clock_s:
         return RecorderClock(0.0, config.evidence_clock_s, assumed=True)
-    return RecorderClock(0.5 * lag.lag_s, 0.5 * abs(lag.lag_s) + noise_s)
+    least_s = 0.0 if independent else config.evidence_clock_s
+    low_s = min(min(lag.lag_s, 0.0) - noise_s, -least_s)
+    high_s = max(max(lag.lag_s, 0.0) + noise_s, least_s)
+    return RecorderClock(0.5 * (low_s + high_s), 0.5 * (high_s - low_s), assumed=not independent)
 
 
 def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter) -> ScaleLag:

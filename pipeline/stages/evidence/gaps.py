@@ -151,6 +151,11 @@ class GapSearch:
             ways = [replace(way, closed=closes(self.counter, ends, way.apart_m, self.config)) for way in ways]
         return [Gap(begin.t_ns, end.t_ns, begin, end, ways)]
 
+    def only_length_m(self, begin: TrueAnchor, end: TrueAnchor) -> list[float]:
+        """The length of the ways between two anchors, as the odometer counts up [m]; nothing if there are several."""
+        gaps = self._between(begin, end)
+        return gaps[0].only_length_m if len(gaps) == 1 else []
+
     def misclosure_m(self, begin: TrueAnchor, end: TrueAnchor) -> float:
         """How much farther apart the anchors are than the odometer counted [m].
 

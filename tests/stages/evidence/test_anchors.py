@@ -66,6 +66,10 @@ def test_a_shunt_before_the_journey_does_not_turn_the_sense() -> None:
     assert (side.sense, side.with_m, side.against_m) == (1, pytest.approx(300.0), pytest.approx(20.0))
 
 
+def no_gaps(begin: TrueAnchor, end: TrueAnchor) -> list[float]:
+    raise AssertionError(f"one stretch has no gap from {begin} to {end}")
+
+
 def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     """Seven ways of ten seconds, and six are enough; the odometer stamps 0.4 s earlier."""
     fine_s = np.arange(0.0, 73.0, 0.01)
@@ -73,12 +77,12 @@ def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     t_s = np.arange(0.0, 71.0, 0.1)
     late = stretch(t_s + 0.4, np.interp(t_s, fine_s, way_m))
     counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, way_m), 10.0)
-    found = reference_lag([Sided(late, 1, 1.0, 0.0)], counted)
+    found = reference_lag([Sided(late, 1, 1.0, 0.0)], counted, no_gaps)
     assert found.lag_s == pytest.approx(0.4, abs=0.03)
     assert found.lag_sigma_s < 0.05
     cut = late.t_ns <= 60 * NS_PER_S
     few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (late.paths[0].part(slice(int(cut.sum()))),))
-    assert reference_lag([Sided(few, 1, 1.0, 0.0)], counted).state is LagState.TOO_FEW
+    assert reference_lag([Sided(few, 1, 1.0, 0.0)], counted, no_gaps).state is LagState.TOO_FEW
 
 
 def test_a_clock_counts_by_the_greatest_speed_that_it_leaves_possible() -> None:
