@@ -12,7 +12,8 @@ import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
-from pipeline.stages.evidence.clock import RecorderClock, RecorderLag
+from pipeline.stages.evidence.clock import RecorderClock
+from pipeline.stages.odometry.scale_lag import ScaleLag, spans_of_rows
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
 from pipeline.stages.track.survey import SurveyedTrack
@@ -20,8 +21,6 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import BaliseKind, Evidence
 
-# Numerics: a lag shows where the speed changes, so ways over this time are compared [s].
-_LAG_WINDOW_S = 10.0
 # DOMAIN section 5.1: the reference is held against the odometer over so long; a spike is no longer [s].
 _WINDOW_S = 10.0
 _LONG_WINDOW_S = 100.0
@@ -174,13 +173,18 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
 
 def _steps_of(stretch: ReferenceStretch, step_s: float) -> tuple[Ints, Ints, Floats]:
     """Pairs of samples so far apart in time on one leg of the first path, and the way between them [m]."""
-    path = stretch.paths[0]
     t_ns = stretch.t_ns
     instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, round(step_s * NS_PER_S), dtype=np.int64)
     rows = np.unique(np.searchsorted(t_ns, instants))
-    whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
-    begin = rows[:-1][whole]
-    end = rows[1:][whole]
+    return _ways_of(stretch, rows[:-1], rows[1:])
+
+
+def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, Ints, Floats]:
+    """Those of these pairs of samples that lie on one leg of the first path, and the way between them [m]."""
+    path = stretch.paths[0]
+    whole = path.leg[begin] == path.leg[end]
+    begin = begin[whole]
+    end = end[whole]
     return begin, end, path.at_m[end] - path.at_m[begin]
 
 
@@ -194,8 +198,9 @@ def reference_ways(
     nothing = np.zeros(0, dtype=np.int64)
     ways: list[tuple[Ints, Ints, Floats]] = [(nothing, nothing, np.zeros(0))]
     for side in sides:
-        begin, end, way_m = _steps_of(side.stretch, _LAG_WINDOW_S)
-        ways.append((side.stretch.t_ns[begin], side.stretch.t_ns[end], side.sense * way_m))
+        t_ns = side.stretch.t_ns
+        begin, end, way_m = _ways_of(side.stretch, *spans_of_rows((t_ns - t_ns[0]) / NS_PER_S))
+        ways.append((t_ns[begin], t_ns[end], side.sense * way_m))
     for before, after in pairwise(sorted(sides, key=lambda side: int(side.stretch.t_ns[0]))):
         begin_at, end_at = before.anchor(-1), after.anchor(0)
         across_m = np.array(lengths_m(begin_at, end_at), dtype=np.float64)
@@ -231,8 +236,10 @@ def known_stretch(
         speed_mps = np.maximum(speed_mps, path_mps)
         known = KnownPath(path, side.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
         clock_m = path_mps * clock.delta_s
-        reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor)
-        possible_ns |= set(_confirming_ns(known, stretch, clock_m, reads, config.align.sure_sigmas))
+        # A clock that leaves more than half the failure limit open lets a read confirm nothing.
+        most_m = 0.5 * config.hazards.failure_limit_m
+        reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor, most_m)
+        possible_ns |= set(_confirming_ns(known, stretch, clock_m, reads, config.align.sure_sigmas, np.inf))
         steps = contradictions(known, side.stretch, witnesses, config)
         of_path = Levels.of(steps, t_ns, reads_ns)
         levels.append(of_path.seen(side.sense))
@@ -287,9 +294,17 @@ def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
 
 
 def _confirming_ns(
-    known: KnownPath, stretch: ReferenceStretch, clock_m: Floats, reads: Sequence[TrueAnchor], factor: float
+    known: KnownPath,
+    stretch: ReferenceStretch,
+    clock_m: Floats,
+    reads: Sequence[TrueAnchor],
+    factor: float,
+    most_m: float,
 ) -> list[int]:
-    """Times of reads at balises where the reference was too, within `factor` sigmas of both and both clocks."""
+    """Times of reads at balises where the reference was too, within `factor` sigmas of both and both clocks.
+
+    Not where these are more than `most_m`.
+    """
     t_ns = stretch.t_ns
     since_ns = (t_ns - t_ns[0]).astype(np.float64)
     confirming: set[int] = set()
@@ -303,7 +318,7 @@ def _confirming_ns(
         half_m += float(clock_m[sample]) + read.clock_m
         for place in read.places:
             there_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
-            if abs(float(there_m[0] - at_m[0])) <= half_m:
+            if abs(float(there_m[0] - at_m[0])) <= half_m <= most_m:
                 confirming.add(read.t_ns)
     return sorted(confirming)
 
@@ -336,17 +351,17 @@ class Witness:
     scale_sigma: float = 0.0
 
     @classmethod
-    def of(cls, counter: Counter, lags: Sequence[RecorderLag], config: Configuration) -> Self:
+    def of(cls, counter: Counter, lags: Sequence[ScaleLag], config: Configuration) -> Self:
         """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1)."""
         factor = config.hazards.evidence_factor
         share = config.lds.odometer_share
-        known = [lag for lag in lags if np.isfinite(lag.sigma_s)]
-        low_s = min((lag.lag_s - factor * lag.sigma_s for lag in known), default=-config.hazards.evidence_clock_s)
-        high_s = max((lag.lag_s + factor * lag.sigma_s for lag in known), default=config.hazards.evidence_clock_s)
+        known = [lag for lag in lags if np.isfinite(lag.lag_sigma_s)]
+        low_s = min((lag.lag_s - factor * lag.lag_sigma_s for lag in known), default=-config.hazards.evidence_clock_s)
+        high_s = max((lag.lag_s + factor * lag.lag_sigma_s for lag in known), default=config.hazards.evidence_clock_s)
         middle_s, half_s = 0.5 * (low_s + high_s), 0.5 * (high_s - low_s)
         if counter.by_file:
             return cls(counter, middle_s, half_s)  # the variance of a way holds that of the file's scale
-        best = min(known, key=lambda lag: lag.scale_sigma, default=RecorderLag())
+        best = min(lags, key=lambda lag: lag.scale_sigma, default=ScaleLag())
         if factor * best.scale_sigma < share:
             return cls(counter, middle_s, half_s, best.scale, best.scale_sigma)
         # At k_T sigmas the 5 % of an odometer of which nothing is known.

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.odometry import OdometerWay
+from pipeline.stages.odometry.scale_lag import CountedRows
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
 from schemas.config import Configuration
@@ -83,6 +85,15 @@ class Counter:
     def bound_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """By how much the distance between instants may be off [m]."""
         return self.odometer.bound_between_m(begin_ns, end_ns)
+
+    @cached_property
+    def rows(self) -> CountedRows:
+        """Its rows; a step of which anything is in doubt tells no way."""
+        odometer = self.odometer
+        t_ns = odometer.epoch_ns + np.round(odometer.t_s * NS_PER_S).astype(np.int64)
+        doubtful = np.concatenate([[0.0], np.cumsum(np.isnan(self.distance_m(t_ns[:-1], t_ns[1:])))])
+        noise_m = float(np.sqrt(odometer.noise.quantisation.still_m2))
+        return CountedRows(odometer.t_s, (odometer.scale or 1.0) * odometer.distance_m, doubtful, noise_m)
 
     def within(self, t_ns: Ints, beyond_s: float) -> tuple[Ints, Floats]:
         """The instants, those less than `beyond_s` off its recording put at its ends, and how far the train drives."""
