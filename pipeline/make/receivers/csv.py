@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import dataframely as dy
 import numpy as np
 import polars as pl
 
@@ -13,10 +16,12 @@ from pipeline.read.ingest.conform import refuse
 from pipeline.read.ingest.csv_text import CUT_ROW, read_log_table, with_points
 from pipeline.read.ingest.mapping import mappings_of
 from pipeline.read.ingest.mcap_records import Channel
+from pipeline.read.ingest.parts import LogPart, mappings_for, parts_of_table
 from pipeline.read.ingest.plan import Sample, Source, mapped_source
 from pipeline.stages.epochs.clock import GAP_PERIODS
 from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import InputError
+from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
@@ -38,22 +43,20 @@ def names_file(config: IngestConfig, path: Path) -> bool:
     return path.suffix.lower() in TABLES and bool(named & {path.name, path.stem})
 
 
-def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
-    """Streams of a CSV file, each mapping whose `topic` is the file's name, its stem or `*` makes one; what was left
-    out, reason to number.
-    """
+class CsvLog(NamedTuple):
+    """Streams of a table, what was left out, reason to number, and its columns."""
+
+    streams: dict[Stream, pl.DataFrame]
+    left: dict[str, int]
+    parts: list[LogPart]
+
+
+def read_csv(path: Path, config: IngestConfig) -> CsvLog:
+    """A CSV file; each mapping whose `topic` is the file's name, its stem or `*` makes a stream, or a part of it."""
     log = read_log_table(path, infer=True)
     table = with_points(log)
-    streams: dict[Stream, pl.DataFrame] = {}
-    empty: Counter[str] = Counter()
-    for name in STREAMS:
-        for mapping in mappings_of(config, name):
-            if mapping.topic in (path.name, path.stem, "*"):
-                mapped = _mapped(table, mapping, name, path)
-                frame = mapped.filter(_recorded(mapped, name, "fix" in mapping.fields))
-                empty[f"row without a value of {name}"] += mapped.height - frame.height
-                streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
-    if not streams:
+    mappings = mappings_for(path, config)
+    if not mappings:
         raise InputError(
             "no mapping for this file",
             place=str(path),
@@ -61,8 +64,31 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
             expected=f'a table [ingest.gnss] with topic = "{path.name}"',
             remedy="Give a mapping by --config; `balise inspect` of the file prints a draft.",
         )
-    left = {CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short} | empty
-    return streams, {reason: count for reason, count in left.items() if count}
+    table = _with_ids(table, mappings, path)
+    streams: dict[Stream, pl.DataFrame] = {}
+    left = Counter({CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short})
+    for name, mapping in mappings:
+        mapped = _mapped(table, mapping, name, path)
+        frame = mapped.filter(_recorded(mapped, name, "fix" in mapping.fields))
+        left[f"row without a value of {name}"] += mapped.height - frame.height
+        streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
+    parts = parts_of_table(path.name, table.height, table.columns, mappings)
+    return CsvLog(streams, {reason: count for reason, count in left.items() if count}, parts)
+
+
+def _with_ids(table: pl.DataFrame, mappings: Sequence[tuple[Stream, StreamMapping]], path: Path) -> pl.DataFrame:
+    """The table with ids as they are written: 007 is no number."""
+    named = {
+        recorded
+        for stream, mapping in mappings
+        for column, recorded in mapping.fields.items()
+        if recorded in table.columns and isinstance(STREAM_SCHEMAS[stream].columns().get(column), dy.String)
+    }
+    ids = [name for name in table.columns if name in named and table[name].dtype != pl.String]
+    if not ids:
+        return table
+    texts = read_log_table(path, infer=False).table
+    return table.with_columns(texts[name].replace("", None) for name in ids)
 
 
 def _recorded(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:

@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from zoneinfo import available_timezones
 
 import polars as pl
 
@@ -17,6 +16,7 @@ from pipeline.read.ingest.guesses import (
     WORDS,
     columns_in,
     first,
+    known_zones,
     mapping_lines,
     one_line,
     unit_in,
@@ -143,11 +143,11 @@ def _time_lines(table: pl.DataFrame, words: Words, units: Words) -> tuple[list[s
 
 def _in_zone(zone: str, names: Sequence[str], table: pl.DataFrame) -> list[str]:
     """The lines on times of a zone: with it where it is known for certain, else commented out."""
-    known = zone if zone in available_timezones() else None
+    known = zone if zone in known_zones() else None
     if offset := re.fullmatch(r"UTC([+-])0?([0-9]{1,2})(?::?00)?", zone):
         # The sign of these names is turned round: Etc/GMT-2 is ahead of UTC.
         known = f"Etc/GMT{'-' if offset[1] == '+' else '+'}{int(offset[2])}"
-    if known in available_timezones() and all(table[name].dtype == pl.String for name in names):
+    if known in known_zones() and all(table[name].dtype == pl.String for name in names):
         return [_field(*names), f"time_zone = {json.dumps(known)}  # as the name says: {one_line(zone)}"]
     reason = f"# in {one_line(zone)!r}, which is not UTC as far as is known here"
     return [f"# {_field(*names)}  {reason}: add time_zone, as Europe/Berlin, or take these words away for UTC"]
