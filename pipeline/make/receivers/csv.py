@@ -18,6 +18,7 @@ from pipeline.read.ingest.mapping import mappings_of
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.parts import LogPart, mappings_for, parts_of_table
 from pipeline.read.ingest.plan import Sample, Source, mapped_source
+from pipeline.read.ingest.wraps import said_of_wraps, with_whole_counts
 from pipeline.stages.epochs.clock import GAP_PERIODS
 from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import InputError
@@ -68,7 +69,7 @@ def read_csv(path: Path, config: IngestConfig) -> CsvLog:
     streams: dict[Stream, pl.DataFrame] = {}
     left = Counter({CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short})
     for name, mapping in mappings:
-        mapped = _mapped(table, mapping, name, path)
+        mapped = _mapped(table, mapping, name, path, left)
         frame = mapped.filter(_recorded(mapped, name, "fix" in mapping.fields))
         left[f"row without a value of {name}"] += mapped.height - frame.height
         streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
@@ -114,7 +115,9 @@ def _recorded(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
     return filled | has_fix | pl.Series(~between)
 
 
-def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path) -> pl.DataFrame:
+def _mapped(
+    table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path, left: Counter[str]
+) -> pl.DataFrame:
     if not mapping.time.startswith("field:"):
         raise InputError("a CSV has no log time", place=str(path), expected='time = "field:COLUMN"')
     kinds = {name: _kind(dtype) for name, dtype in table.schema.items()}
@@ -124,10 +127,18 @@ def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: P
     source = mapped_source(sample, stream, mapping.model_copy(update={"time": first}))
     refuse(source.breaches)
     fields = pl.DataFrame([_typed(table[name], source, path) for name in source.types])
+    times = instants(table, mapping, path)
+    counter = mapping.fields.get("distance_m") if stream == "odometer" else None
+    if counter in fields.columns:
+        sensors = fields[mapping.fields["sensor"]] if "sensor" in mapping.fields else None
+        whole, found = with_whole_counts(
+            fields[counter], times.to_physical().fill_null(0).to_numpy(), mapping.wrap, sensors
+        )
+        fields = fields.with_columns(whole) if found else fields
+        left.update(said_of_wraps(found, counter))
     columns = {name: _not_nan(expression, fields) for name, expression in source.columns.items()}
     if stream in ("gnss", "satellites"):
         columns = {"solution": pl.lit(mapping.solution, dtype=pl.String)} | columns
-    times = instants(table, mapping, path)
     return pl.DataFrame({"t": times}).with_columns(fields.select(pl.lit(0).alias("t"), **columns).drop("t"))
 
 

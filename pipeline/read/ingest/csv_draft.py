@@ -25,6 +25,7 @@ from pipeline.read.ingest.guesses import (
     zone_in,
 )
 from pipeline.read.ingest.stamps import LEAST_DAY, MOST_DAY, day_is_unclear
+from pipeline.read.ingest.wraps import wrap_of
 from schemas.enums import Fix
 from schemas.run import Stream
 
@@ -79,10 +80,22 @@ def _stream(
     kind = _kinds_of_fix(table, words) if stream == "gnss" else None
     texts = {column: name for column, name in (("sensor", sensor), ("fix", kind)) if name is not None}
     lines = mapping_lines(stream, file, numbers, *time, units, texts)
+    lines += _wrap_lines(table, columns_in(stream, numbers)) if stream == "odometer" and lines and not sensor else []
     unfit = _unfit(stream, table, {name: word for name, word in words.items() if name not in numbers})
     if stream == "odometer" and lines and set(columns_in("gnss", words)) >= POSITION:
         lines = [_BESIDE_POSITIONS, *(line if line.startswith("#") else f"# {line}" for line in lines)]
     return "\n".join(["", *lines, *unfit]) + "\n" if lines or unfit else ""
+
+
+def _wrap_lines(table: pl.DataFrame, names: Words) -> list[str]:
+    """The line that counts a distance on over the end of its counter."""
+    if "distance_m" not in names:
+        return []
+    recorded = table[names["distance_m"]].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    wrap = wrap_of(recorded)
+    if wrap is None:
+        return []
+    return [wrap.line if wrap.certain else f"# {wrap.line}  # if the counter begins anew there, and was not reset"]
 
 
 def _kinds_of_fix(table: pl.DataFrame, words: Words) -> str | None:
