@@ -13,7 +13,7 @@ import dataframely as dy
 import numpy as np
 import polars as pl
 
-from schemas.arrays import Floats
+from schemas.arrays import Bools, Floats
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform
 from schemas.inputs import BaliseReads, Balises, Gnss, Odometer, Reference, Track
@@ -39,7 +39,7 @@ class Recorder:
     aside_m: Floats
     sigma_m: float
 
-    def where(self, kept: Floats) -> Recorder:
+    def where(self, kept: Bools) -> Recorder:
         return replace(self, t_s=self.t_s[kept], along_m=self.along_m[kept], aside_m=self.aside_m[kept])
 
 
@@ -68,10 +68,14 @@ class World:
     def place_m(self, at_s: Floats) -> Floats:
         return np.interp(at_s, self.t_s, self.true_m)
 
+    @property
+    def read_ns(self) -> list[int]:
+        return [START_NS + round(1e9 * at_s) for at_s, _ in self.reads]
+
     def run(self) -> RunLog:
-        streams = {"odometer": self._odometer(), "balise_reads": self._reads()}
+        reference = None
         if self.reference is not None and self.reference.t_s.size:
-            streams["reference"] = _table(
+            reference = _table(
                 self._places(self.reference).with_columns(sigma_m=pl.lit(self.reference.sigma_m)), Reference
             )
         variance = self.gnss.sigma_m**2
@@ -85,7 +89,13 @@ class World:
             cov_eu_m2=pl.lit(0.0),
             cov_nu_m2=pl.lit(0.0),
         )
-        return RunLog("crooked", _table(gnss, Gnss), **streams)
+        return RunLog(
+            "crooked",
+            _table(gnss, Gnss),
+            odometer=self._odometer(),
+            reference=reference,
+            balise_reads=self._reads(),
+        )
 
     def site(self) -> Site:
         return ground(self.survey_m)
@@ -342,11 +352,13 @@ def aside(world: World) -> World:
     """The train runs on a track 3.6 to 5 m beside the surveyed one, and nobody says that the survey is complete."""
     off_m = float(world.dice.choice([-1.0, 1.0]) * world.dice.uniform(3.6, 5.0))
     world.complete = False
-    begin_s = float(world.dice.choice([-1.0, 100.0]))
+    begin_s = float(world.dice.choice([-9.0, 100.0]))
     for name in ("gnss", "reference"):
         recorder = getattr(world, name)
-        setattr(world, name, replace(recorder, aside_m=recorder.aside_m + off_m * (recorder.t_s > begin_s)))
-    world.aside_m = off_m * (world.t_s > begin_s)
+        # Over a turnout of some 100 m.
+        there = np.clip((recorder.t_s - begin_s) / 5.0, 0.0, 1.0)
+        setattr(world, name, replace(recorder, aside_m=recorder.aside_m + off_m * there))
+    world.aside_m = np.where(world.t_s > begin_s + 4.0, off_m, 0.0)
     world.reads = [] if begin_s < 0.0 else [(at_s, name) for at_s, name in world.reads if at_s < begin_s]
     return world
 
@@ -354,8 +366,8 @@ def aside(world: World) -> World:
 def copied(world: World) -> World:
     """The odometer and the reads are made of the positions; declared a wheel, undeclared, or what it is."""
     smooth = max(1, round(1.0 / float(np.median(np.diff(world.gnss.t_s)))))
-    along_m = np.convolve(np.pad(world.gnss.along_m, smooth, mode="edge"), np.ones(2 * smooth + 1), "valid")
-    along_m /= 2 * smooth + 1
+    mean = np.ones(2 * smooth + 1) / (2 * smooth + 1)
+    along_m: Floats = np.convolve(np.pad(world.gnss.along_m, smooth, mode="edge"), mean, "valid")
     world.odometer = Recorder(world.gnss.t_s, along_m - along_m[0], 0.0 * along_m, 0.0)
     world.origin = str(world.dice.choice(["unknown", "gnss", "fused"]))
     world.reference = None
@@ -404,7 +416,7 @@ def _reference(world: World) -> Recorder:
     return world.reference
 
 
-def _shifted(recorder: Recorder, where: Floats, by_m: float) -> Recorder:
+def _shifted(recorder: Recorder, where: Bools, by_m: float) -> Recorder:
     return replace(recorder, along_m=recorder.along_m + by_m * where)
 
 

@@ -11,8 +11,8 @@ import polars as pl
 
 from pipeline.stages.evidence import anchors
 from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
-from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried
-from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, clock_of, lag_of
+from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried, carried_closely
+from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, clock_of, lags_of
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
 from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
 from pipeline.stages.odometry import Odometry
@@ -28,8 +28,9 @@ KINDS = tuple(Kind)
 NOTHING = -1
 Span = tuple[int, int]
 
-# Numerics: ways over which two odometers are compared [s].
+# Numerics: ways over which two odometers are compared, and steps over the possible lags of a recorder [s].
 _PARTED_S = 60.0
+_LAG_STEP_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -168,11 +169,12 @@ class TrainEvidence:
         alternatives += self._carried(self.carried, t_ns, heard & (kind == NOTHING), shown)
         # Its clock puts the ends of a stretch anywhere within what is not known of it.
         alternatives += self._covered(t_ns, heard & (kind == NOTHING), shown, beyond=True)
-        if self.by_reads and self.by_reads[0].counter.odometer.independent:
+        if self.by_reads:
             of_reads = _Shown(np.full(t_ns.size, NOTHING), *np.zeros((2, t_ns.size), dtype=np.bool_))
             # A reference that drifted by nobody knows how much leaves the reads what they prove without it.
             by_reads = self._carried(self.by_reads, t_ns, on_track, of_reads)
-            alternatives, _ = common(alternatives, by_reads, t_ns.size)
+            narrows = self.by_reads[0].counter.odometer.independent
+            alternatives, _ = common(alternatives, by_reads, t_ns.size, narrows)
             kind = np.where(kind == NOTHING, of_reads.kind, kind)
             proves |= of_reads.proves
             on_survey |= of_reads.on_survey
@@ -225,9 +227,34 @@ class TrainEvidence:
         return alternatives
 
     def _interval(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints) -> Interval:
+        """By the anchors of the gap, whatever the clocks leave open.
+
+        A lag belongs to nobody: if the recorder of the anchor has it the odometer's own stamps count, else odometer and
+        GNSS share it, and the train was at an instant where the odometer had it one lag before. What that is in metres
+        hangs on the speed at the instant, not at the anchor.
+        """
+        most_s = max(abs(lag_s) for anchor in gap.anchors for lag_s in anchor.lags_s)
+        low_m, high_m = self._together(counter, gap, way, t_ns)
+        if most_s == 0.0:
+            return low_m, high_m
+        for share in np.linspace(0.0, 1.0, 2 + int(most_s / _LAG_STEP_S)).tolist():
+            known = replace(
+                gap,
+                begin=gap.begin and gap.begin.at_lag(share),
+                end=gap.end and gap.end.at_lag(share),
+            )
+            for lag_s in sorted({0.0, *(anchor.lag_s(share) for anchor in gap.anchors)}):
+                at_ns, beyond_m = counter.within(t_ns - round(lag_s * NS_PER_S), abs(lag_s))
+                low, high = self._together(counter, known, way, at_ns, closely=True)
+                low_m = np.minimum(low_m, low - beyond_m)
+                high_m = np.maximum(high_m, high + beyond_m)
+        return low_m, high_m
+
+    def _together(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints, closely: bool = False) -> Interval:
         if gap.begin is not None and gap.end is not None:
             return between_anchors(counter, (gap.begin, gap.end), (way.at_m[0], way.at_m[1]), t_ns, self.config)
-        return carried(counter, gap.anchors[0], way.at_m[0], t_ns, self.config)
+        from_one = carried_closely if closely else carried
+        return from_one(counter, gap.anchors[0], way.at_m[0], t_ns, self.config)
 
 
 def _on_path(stretch: KnownStretch, path: KnownPath, rows: Ints, t_ns: Ints, factor: float) -> list[Alternative]:
@@ -251,16 +278,19 @@ def _on_path(stretch: KnownStretch, path: KnownPath, rows: Ints, t_ns: Ints, fac
     ]
 
 
-def common(first: Sequence[Alternative], second: Sequence[Alternative], size: int) -> tuple[list[Alternative], Ints]:
+def common(
+    first: Sequence[Alternative], second: Sequence[Alternative], size: int, narrows: bool = True
+) -> tuple[list[Alternative], Ints]:
     """Two sources of evidence together, and the instants at which they exclude each other.
 
-    Where they agree: the net elements common to both, with the narrower interval. Where only one speaks, or they
-    exclude each other, every alternative of either stays possible.
+    Where they agree: the net elements common to both, with the narrower interval; that of the first where the second
+    may narrow nothing. Where only one speaks, or they exclude each other, every alternative of either stays possible.
     """
     narrowed = [_narrowed(left, right) for left in first for right in second]
     agreed = _spoken(narrowed, size)
+    together = narrowed if narrows else [alternative.where(agreed[alternative.rows]) for alternative in first]
     alone = [alternative.where(~agreed[alternative.rows]) for alternative in (*first, *second)]
-    return narrowed + alone, np.flatnonzero(_spoken(first, size) & _spoken(second, size) & ~agreed)
+    return together + alone, np.flatnonzero(_spoken(first, size) & _spoken(second, size) & ~agreed)
 
 
 def _spoken(alternatives: Sequence[Alternative], size: int) -> Bools:
@@ -343,16 +373,15 @@ def evidence_of(
     facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
     turned = any(min(side.with_m, side.against_m) >= least_m for side in sides)
     searches = [GapSearch(counter, network, config, facing, turned) for counter in counters]
-    lag_of_reference = RecorderLag()
-    if main is not None:
-        lag_of_reference = anchors.reference_lag(sides, main, searches[0].only_length_m)
-    of_reference = clock_of(lag_of_reference, bool(independent), hazards)
-    # Any odometer may contradict a reference; where one is independent, the others cannot confirm it against that one.
-    held_against = anchors.Witnesses.of(counters, lag_of_reference, not turned, config)
+    lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
+    of_reference = clock_of([lag for of_one in lags for lag in of_one], bool(independent), hazards)
+    # Any odometer contradicts a reference; where one is independent, the others are not asked.
+    found = [anchors.Witness.of(counter, of_one, config) for counter, of_one in zip(counters, lags, strict=True)]
+    held_against = anchors.Witnesses(tuple(found), not turned)
     read = anchors.read_anchors(reads, balises, network.track, hazards)
-    lag_of_reads = RecorderLag() if main is None else _lag_of_reads(searches[0].carried(_points(read)))
-    of_reads = clock_of(lag_of_reads, bool(independent), hazards)
-    clocked = [] if main is None else anchors.on_clock(read, of_reads, main)
+    lags_of_reads = [lag for search in searches for lag in _lags_of_reads(search.carried(_points(read)))]
+    of_reads = clock_of(lags_of_reads, bool(independent), hazards)
+    clocked = anchors.on_clock(read, of_reads, main)
     recorded, unclosed = _known_stretches(sides, of_reference, held_against, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
     unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
@@ -370,7 +399,7 @@ def evidence_of(
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
         unsure=tuple(unsure),
-        doubted=unclosed + sum(stretch.levels.doubts for stretch in recorded),
+        doubted=unclosed + sum(stretch.levels.doubts + stretch.refuted for stretch in recorded),
     )
 
 
@@ -386,7 +415,7 @@ def _known_stretches(
     """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
     ahead_m = vehicle.gnss_antenna_ahead_m
     known = [anchors.known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
-    if not witnesses.counters:
+    if not witnesses.all:
         return known, 0
     search = searches[0]
     order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
@@ -410,11 +439,23 @@ def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
     return [(anchor, anchor) for anchor in known]
 
 
-def _lag_of_reads(source: Carried) -> RecorderLag:
-    """The clock of the reads against the odometer's, by the ways between reads, whether they close or not."""
+def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> list[RecorderLag]:
+    """Its clock against that of one odometer, in the sense in which that one counts.
+
+    One that counts up both ways is compared where the train cannot have turned.
+    """
+    sides = [anchors.sided(stretch, search.counter, least_m) for stretch in stretches]
+    begin_ns, end_ns, way_m = anchors.reference_ways(sides, search.only_length_m)
+    if not search.turned:
+        return lags_of(begin_ns, end_ns, way_m, search.counter)
+    return lags_of(begin_ns, end_ns, np.abs(way_m), search.counter.without_sign())
+
+
+def _lags_of_reads(source: Carried) -> list[RecorderLag]:
+    """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
     ways = [(gap.begin_ns, gap.end_ns, apart_m) for gap in source.gaps for apart_m in gap.only_length_m]
     begins, ends, lengths = zip(*ways, strict=True) if ways else ((), (), ())
-    return lag_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(lengths, np.float64), source.counter)
+    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(lengths, np.float64), source.counter)
 
 
 def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
