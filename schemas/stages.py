@@ -78,7 +78,9 @@ class Aligned(Positions):
     )
     slip_doubt_m = real("m", "by how much slip and pauses may have falsified the distance since the first epoch", min=0)
     odometer_white_m2_per_s = real("m2/s", "variance that the odometer's distance gathers in a second", min=0)
-    odometer_rows_m = real("m", "quantisation noise of the odometer's rows, as far as thresholds allow for it", min=0)
+    odometer_rows_m = real(
+        "m", "quantisation noise of the odometer's rows as shown so far, as far as thresholds allow for it", min=0
+    )
     odometer_period_s = real("s", "time between rows of the odometer", min=0)
     stamp_jitter_s = real("s", "deviation of the stamps about the receiver's clock", min=0)
     speed_mps = real("m/s", "speed along growing path by the odometer, by GNSS where there is none")

@@ -88,7 +88,8 @@ class _Learner:
         # The filter reads the odometer up to a latency of five sigmas earlier.
         margin_ns = round(5e9 * config.align.latency_prior_sigma_s)
         t_ns = times_ns(positions)
-        self._rows = np.flatnonzero(usable & odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns))
+        known = odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns)
+        self._rows = np.flatnonzero(usable & known & odometry.noise_at_s(odometry.seconds(t_ns)).shown)
         self._path_m, self._calibrated_m, self._digits_m = (
             floats(positions, name)[self._rows] for name in ("along_m", "calibrated_along_m", "digits_along_m")
         )
@@ -229,17 +230,11 @@ class _Learner:
             scale_sigma=in_use.scale_sigma,
             latency_sigma_s=in_use.latency_sigma_s,
             white_m2_per_s=self._odometry.white_m2_per_s_at(at_s),
-            rows_m=self._rows_m(at_s),
-            period_s=self._odometry.period_s,
+            rows_m=np.minimum(self._odometry.known_row_sigma_m(at_s), most_scatter_m(self._config)),
+            period_s=self._odometry.noise_at_s(at_s).period_s,
         )
         odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s)
         return along_series(epochs, odometer, self._config).between(begin - part.start, end - part.start)
-
-    def _rows_m(self, at_s: Floats) -> Floats | None:
-        """Noise of the odometer's rows; None where it has none: 0 at a stand may be more under way."""
-        if not self._odometry.noise.quantisation:
-            return None
-        return np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config))
 
     def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:
         """Row from which learning goes on after the alarm, and what the offset has still to settle by [m^2].

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
+from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.odometry.bound import Bound
-from pipeline.stages.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
+from pipeline.stages.odometry.counts import CountStep, count_step
+from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_steps, travelled_m
 from pipeline.stages.odometry.origin import declared_origin
-from pipeline.stages.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
+from pipeline.stages.odometry.quantisation import (
+    NO_QUANTISATION,
+    QuantisationNoise,
+    first_scatter_m2,
+    known_at_rows,
+    of_the_run,
+    scatter_pieces,
+)
 from pipeline.stages.odometry.rows import filled_in, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
+
+# Numerics: of so many rows the declared sigma is usual.
+_DECLARED_ROWS = 100
 
 
 class OdometerWay(NamedTuple):
@@ -39,11 +51,40 @@ class Increments(NamedTuple):
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the distance: what gathers in a second, the scatter of rows, and the step of a counter."""
+    """Noise of the distance as the whole run shows it: what gathers in a second, the scatter of rows, the step of a
+    counter. For evidence and calibration; detection uses `KnownNoise`.
+    """
 
     white_m2_per_s: float
     quantisation: QuantisationNoise = NO_QUANTISATION
     counter_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class KnownNoise:
+    """The same as the rows up to each sample show it, and the period of the rows [s].
+
+    `still_m2`, `moving_s2`: of `QuantisationNoise`; a first figure where too few rows show them yet (not `shown`).
+    """
+
+    white_m2_per_s: Floats
+    still_m2: Floats
+    moving_s2: Floats
+    period_s: Floats
+    shown: Bools
+
+    @classmethod
+    def constant(cls, noise: Noise, period_s: float, size: int) -> KnownNoise:
+        rows = noise.quantisation
+        values = (noise.white_m2_per_s, rows.still_m2, rows.moving_s2, period_s)
+        return cls(*(np.full(size, value) for value in values), shown=np.ones(size, dtype=np.bool_))
+
+    def at(self, samples: Ints) -> KnownNoise:
+        return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
+
+    def row_m2(self, speed_mps: Floats) -> Floats:
+        """Variance of a row [m^2]."""
+        return np.asarray(self.still_m2 + self.moving_s2 * speed_mps**2)
 
 
 @dataclass(frozen=True)
@@ -68,6 +109,7 @@ class Odometry:
     counter: Ints
     slip_doubt_m: Floats
     noise: Noise
+    known_noise: KnownNoise
     deadband_mps: float
     config: AlignConfig
     period_s: float = 0.0
@@ -198,8 +240,8 @@ class Odometry:
         return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
 
     def white_m2_per_s_at(self, t_s: Floats) -> Floats:
-        """White noise of the steps to these instants, with that of bridged resets [m^2/s]."""
-        white = np.full(t_s.size, self.noise.white_m2_per_s)
+        """White noise of the steps to these instants as known there, with that of bridged resets [m^2/s]."""
+        white = self.noise_at_s(t_s).white_m2_per_s
         dt_s = np.diff(t_s)
         white[1:] += np.where(dt_s > 0.0, np.diff(self.bridged_m2_at(t_s)) / np.maximum(dt_s, 1e-9), 0.0)
         return white
@@ -241,7 +283,22 @@ class Odometry:
         speed_mps = (self.distance_at_s(end_s) - self.distance_at_s(begin_s)) / (end_s - begin_s)
         return self.distance_at_s(t_s), speed_mps
 
+    def noise_at_s(self, t_s: Floats) -> KnownNoise:
+        return self.known_noise.at(self._sample_at(t_s))
+
+    def known_row_sigma_m(self, t_s: Floats) -> Floats:
+        """Of the rows' noise, as known at these instants [m]."""
+        return np.sqrt(self.noise_at_s(t_s).row_m2(self.speed_at_s(t_s)))
+
+    def hysteresis_m(self, t_s: Floats) -> Floats:
+        """How far the distance may leave the held distance before that follows, as known at these instants [m].
+
+        Before it is known by how much rows scatter nothing moves; what was driven counts once it is.
+        """
+        return np.where(self.noise_at_s(t_s).shown, hysteresis_m(self.known_row_sigma_m(t_s), self.config), np.inf)
+
     def row_sigma_m(self, t_s: Floats) -> Floats:
+        """Of the rows' noise, as the run shows it [m]."""
         if not self.noise.quantisation:
             return np.zeros(t_s.size)
         return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
@@ -270,10 +327,8 @@ class Odometry:
 
     @cached_property
     def _travelled_m(self) -> Floats:
-        if self.noise.quantisation:
-            return driven_m(self.distance_m, hysteresis_m(self.row_sigma_m(self.t_s), self.config))
-        moving = moving_steps(self.t_s, self.distance_m, self.deadband_mps, self.config.speed_window_s)
-        return driven_or_left_m(self.distance_m, moving)
+        width_m = self.hysteresis_m(self.t_s)
+        return travelled_m(self.t_s, self.distance_m, width_m, self.deadband_mps, self.config.speed_window_s)
 
 
 def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> Odometry | None:
@@ -290,16 +345,18 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     speed = floats(stream, "speed_mps")
     t_s: Floats = ((t_ns - int(t_ns[0])) * 1e-9).astype(np.float64)
     dt_s = np.diff(t_s)
-    period_s = float(np.median(dt_s))
-    limit_s = max(align.odometer_gap_s, align.odometer_gap_periods * period_s)
-    way_m, counted, bridged_m, odd, resets = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
+    distance_m = floats(stream, "distance_m")
+    period_s = _periods_s(t_ns)
+    limit_s = np.maximum(align.odometer_gap_s, align.odometer_gap_periods * period_s[1:])
+    counts = count_step(distance_m, align)
+    way_m, counted, bridged_m, odd, resets = ways_between(t_s, distance_m, speed, counts.step_m, limit_s, align)
     unknown = np.isnan(way_m)
     pause = unknown | (dt_s > limit_s)
     slip = _slips(stream, align)
     silent = pause & ~counted
     lost = silent | slip[1:]
     guessed = silent & ~unknown
-    guess_m, guess_doubt_m = _guessed_ways(way_m, dt_s, speed, period_s, config)
+    guess_m, guess_doubt_m = _guessed_ways(way_m, dt_s, speed, period_s[1:], config)
     way_m = np.where(guessed, guess_m, way_m)
     distance_m = _sums(np.where(unknown, 0.0, way_m))
     segment = _sums(lost.astype(np.float64)).astype(np.int64)
@@ -308,8 +365,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
         + np.where(guessed, guess_doubt_m, 0.0)
     )
-    white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
-    noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, config) if counted.any() else None
+    whole = counted & ~lost & ~pause
+    noise, known_noise = _noise(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
     doubtful = odd | pause | slip[:-1] | slip[1:]
     bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, align) if doubtful.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
@@ -321,6 +378,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         slip = slip[row]
         counter = counter[row]
         doubt_m = np.interp(t_s, row_s, doubt_m)
+        known_noise = known_noise.at(row)
     in_file = vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None
     return Odometry(
         epoch_ns=int(t_ns[0]),
@@ -331,9 +389,10 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         slip=slip,
         counter=counter,
         slip_doubt_m=doubt_m,
-        noise=noise or Noise(white_m2_per_s),
+        noise=noise,
+        known_noise=known_noise,
         deadband_mps=config.matching.deadband_mps,
-        period_s=period_s,
+        period_s=float(np.median(dt_s)),
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
         leaps_ns=tuple(t_ns[list(resets)].tolist()),
@@ -345,7 +404,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 
 
 def _guessed_ways(
-    way_m: Floats, dt_s: Floats, speed_mps: Floats, period_s: float, config: Configuration
+    way_m: Floats, dt_s: Floats, speed_mps: Floats, period_s: Floats, config: Configuration
 ) -> tuple[Floats, Floats]:
     """The way over a pause of speeds at each step, and by how much it may be off [m].
 
@@ -362,12 +421,47 @@ def _guessed_ways(
     return np.where(stood, stand_m, way_m), np.where(stood, stand_doubt_m, 0.25 * braking_mps2 * dt_s**2)
 
 
-def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: Configuration) -> Noise:
-    """`whole`: steps that the counter recorded without a gap."""
-    counter_m = count_step_m(distance_m, whole, config.align)
-    deadband_mps = config.matching.deadband_mps
-    scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, deadband_mps, config.align)
-    return Noise(white_m2_per_s, scatter, counter_m)
+def _periods_s(t_ns: Ints) -> Floats:
+    """The period of the rows as known before each; of the first step nothing is known but that step."""
+    period_s = periods_before_s(t_ns)
+    period_s[:2] = (t_ns[1] - t_ns[0]) / NS_PER_S
+    return period_s
+
+
+def _noise(
+    t_s: Floats,
+    distance_m: Floats,
+    whole: Bools,
+    counts: CountStep,
+    period_s: Floats,
+    declared_mps: Floats,
+    config: Configuration,
+) -> tuple[Noise, KnownNoise]:
+    """Noise as the run shows it, and as the rows up to each do.
+
+    `whole`: steps that the counter recorded without a gap; `counts`, `period_s`, `declared_mps`: step of the counter,
+    period and sigma of the speed as known at each row.
+    """
+    align = config.align
+    least_m2_per_s = config.monitors.odometer_sigma_mps**2
+    white_m2_per_s = np.maximum(least_m2_per_s, np.nan_to_num(declared_mps) ** 2 * period_s)
+    pieces = scatter_pieces(t_s, distance_m, whole, period_s, white_m2_per_s, config.matching.deadband_mps, align)
+    noise = Noise(
+        white_m2_per_s=float(np.median(white_m2_per_s)),
+        quantisation=of_the_run(pieces, align).of_counter(float(counts.step_m[-1])),
+        counter_m=float(counts.step_m[-1]),
+    )
+    first_m2 = first_scatter_m2(distance_m, period_s, white_m2_per_s, align)
+    known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)
+    # Rows far apart, or of speeds alone, have no such noise.
+    none = (period_s > align.straight_s) | ~np.concatenate([whole[:1], whole])
+    return noise, KnownNoise(
+        white_m2_per_s=white_m2_per_s,
+        still_m2=np.maximum(known.still_m2, counts.step_m**2 / 12.0),
+        moving_s2=known.moving_s2,
+        period_s=period_s,
+        shown=known.shown | none | counts.shown,
+    )
 
 
 def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
@@ -386,9 +480,10 @@ def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, c
     return np.where(slip[1:] | slip[:-1], doubt_m, 0.0)
 
 
-def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
-    declared = stream["sigma_speed_mps"].median()
-    return float(declared) ** 2 * period_s if isinstance(declared, float) else 0.0
+def _declared_mps(stream: pl.DataFrame) -> Floats:
+    """The usual sigma of the speed as declared up to each row [m/s]; NaN where none is."""
+    declared = stream["sigma_speed_mps"].cast(pl.Float64)
+    return declared.rolling_median(_DECLARED_ROWS, min_samples=1).to_numpy()
 
 
 def _sums(steps: Floats) -> Floats:

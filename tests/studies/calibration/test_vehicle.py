@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from pipeline.stages.monitors.axis import error_model
-from pipeline.stages.odometry.odometry import Noise, Odometry
-from pipeline.stages.odometry.quantisation import count_step_m, quantisation_noise
+from pipeline.stages.odometry.counts import count_step
+from pipeline.stages.odometry.odometry import KnownNoise, Noise, Odometry
+from pipeline.stages.odometry.quantisation import of_the_run, scatter_pieces
 from pipeline.studies.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
 from schemas.config import AlignConfig, CalibrationConfig, Configuration, MonitorConfig
 
@@ -38,8 +39,10 @@ def simulated_run(seed: int, duration_s: int = 1000, moving: bool = True) -> tup
     position = np.interp(at - LATENCY_S, t, true) + error + 500.0
     none = np.zeros(t.size, dtype=bool)
     segment = np.zeros(t.size, dtype=np.int64)
+    noise = Noise(0.05**2)
+    known = KnownNoise.constant(noise, 0.1, t.size)
     track = Odometry(
-        0, t, true / SCALE + walk, segment, none[1:], none, segment, 0.0 * t, Noise(0.05**2), 0.3, AlignConfig()
+        0, t, true / SCALE + walk, segment, none[1:], none, segment, 0.0 * t, noise, known, 0.3, AlignConfig()
     )
     return Observations(at, position, np.full(at.size, SIGMA_M)), track
 
@@ -128,8 +131,10 @@ def with_rows(track: Odometry, kind: str, size_m: float, seed: int) -> Odometry:
     whole = np.ones(rows.size - 1, dtype=bool)
     align, deadband_mps = Configuration().align, Configuration().matching.deadband_mps
     white_m2_per_s = track.noise.white_m2_per_s
-    counter_m = count_step_m(rows, whole, align)
-    found = quantisation_noise(track.t_s, rows, whole, white_m2_per_s, counter_m, deadband_mps, align)
+    counter_m = float(count_step(rows, align).step_m[-1])
+    tenths, white = np.full(rows.size, 0.1), np.full(rows.size, white_m2_per_s)
+    pieces = scatter_pieces(track.t_s, rows, whole, tenths, white, deadband_mps, align)
+    found = of_the_run(pieces, align).of_counter(counter_m)
     return replace(track, distance_m=rows, period_s=0.1, noise=Noise(white_m2_per_s, found, counter_m))
 
 
