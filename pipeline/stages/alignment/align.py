@@ -105,7 +105,7 @@ def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometry: Odometry) -> 
     at_s = odometry.seconds(times.dt.timestamp("ns").to_numpy())
     near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
     way = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
-    whole = odometry.segment_at_s(at_s) == odometry.segment_at_s(anchor_s[near])
+    whole = odometry.doubt_at_s(at_s) == odometry.doubt_at_s(anchor_s[near])
     distance = floats(anchors, "odometer_m")[near] + floats(anchors, "odometer_scale")[near] * way
     known = np.where(odometry.known_at_s(at_s) & whole, distance, np.nan)
     return pl.Series("odometer_m", known, nan_to_null=True)
@@ -137,10 +137,8 @@ def _columns(
         pl.Series("odometer_m", total, nan_to_null=True),
         pl.Series("travelled_m", travelled, nan_to_null=True),
         reason.alias("odometer_reason"),
-        pl.Series("odometer_segment", odometry.segment_at_s(at)),
+        pl.Series("odometer_doubt_m", odometry.doubt_at_s(at)),
         pl.Series("odometer_slips", odometry.slips_at_s(at) & inside),
-        pl.Series("odometer_counter", odometry.counter_at_s(at)),
-        pl.Series("slip_doubt_m", odometry.slip_doubt_at_s(at)),
         pl.Series("stamp_jitter_s", jitter_s),
         pl.Series("odometer_white_m2_per_s", odometry.white_m2_per_s_at(at)),
         pl.Series("odometer_rows_m", rows_m),
@@ -173,10 +171,8 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
     return positions.with_columns(
         **dict.fromkeys(_OF_ODOMETER, nothing),
         odometer_reason=pl.lit(NO_ODOMETER),
-        odometer_segment=pl.lit(0, pl.Int64),
+        odometer_doubt_m=pl.lit(0.0),
         odometer_slips=pl.lit(value=False),
-        odometer_counter=pl.lit(0, pl.Int64),
-        slip_doubt_m=pl.lit(0.0),
         speed_mps=pl.Series(speed, nan_to_null=True),
         direction=_direction(speed, config.matching.deadband_mps),
         latency_s=pl.lit(latency, pl.Float64),

@@ -97,7 +97,7 @@ class _Learner:
         t_s = odometry.seconds(t_ns)
         self._t_ns = t_ns[self._rows]
         self._t_s = t_s[self._rows]
-        self._segment = odometry.segment_at_s(self._t_s)
+        self._doubt_m = odometry.doubt_at_s(self._t_s)
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
         self._jitter_s = jitter_s[self._rows]
@@ -173,7 +173,7 @@ class _Learner:
         """The filter over rows [begin, end): its last state, first use of each joint state, joint states."""
         due = self._due(state.t_s, begin, end)
         before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
-        broken = (self._segment[before] != self._segment[due]) | (self._breaks[before] != self._breaks[due])
+        broken = (self._doubt_m[before] != self._doubt_m[due]) | (self._breaks[before] != self._breaks[due])
         joints = np.empty((due.size, *state.joint.shape))
         for first, last in pairwise((0, *np.flatnonzero(broken).tolist(), due.size)):
             if first == last:
@@ -190,7 +190,7 @@ class _Learner:
 
     def _beyond_break(self, state: FilterState, before: int, row: int) -> FilterState:
         """Where the odometer lost its distance the offset begins anew: nothing shows whether the position moved."""
-        if self._segment[before] == self._segment[row]:
+        if self._doubt_m[before] == self._doubt_m[row]:
             observed = *self._observation(row), float(self._sigma_m[row]), float(self._jitter_s[row])
             return self._filter.resume(state, *observed, self._limit_m)
         away = self._outages[before] != self._outages[row]
@@ -223,7 +223,7 @@ class _Learner:
             epoch=self._rows[part],
             t_s=self._t_s[part],
             along_m=self._path_m[part],
-            segment=self._odometry.segment_at_s(at_s),
+            doubt_m=self._odometry.doubt_at_s(at_s),
             sigma_m=self._calibrated_m[part],
             digits_m=self._digits_m[part],
             jitter_s=self._jitter_s[part],

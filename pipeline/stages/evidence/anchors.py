@@ -145,7 +145,7 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
     """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
     begin, end, step_m = _steps_of(stretch, 1.0)
     if counter is not None:
-        counted_m = counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end])
+        counted_m = counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end])
         step_m = np.sign(step_m) * np.nan_to_num(counted_m)
     moved_m = np.cumsum(step_m)
     first = np.flatnonzero(np.abs(moved_m) >= least_m)

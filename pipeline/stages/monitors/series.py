@@ -78,7 +78,7 @@ def _along(epochs: pl.DataFrame, t_s: Floats, reasons: pl.Series, config: Config
         epoch=rows,
         t_s=t_s[rows],
         along_m=floats(used, "along_m"),
-        segment=used["odometer_segment"].to_numpy(),
+        doubt_m=floats(used, "odometer_doubt_m"),
         sigma_m=floats(used, "calibrated_along_m"),
         digits_m=floats(used, "digits_along_m"),
         jitter_s=floats(used, "stamp_jitter_s"),

@@ -53,7 +53,7 @@ def turns_of(distance_m: Floats, back_m: float) -> list[tuple[int, int, int]]:
 def travelled_m(t_s: Floats, distance_m: Floats, width_m: Floats, deadband_mps: float, window_s: float) -> Floats:
     """Way driven up to each row, to and fro [m]; of a stand only the farthest it was from its place.
 
-    `width_m`: of the hysteresis that takes the noise of rows away.
+    `width_m`: of the hysteresis that takes the noise of rows away, infinite where it is not known yet.
     """
     held_m = with_hysteresis(distance_m, width_m)
     driven = driven_or_left_m(held_m, moving_steps(t_s, held_m, deadband_mps, window_s))
@@ -63,7 +63,9 @@ def travelled_m(t_s: Floats, distance_m: Floats, width_m: Floats, deadband_mps: 
     # Before a turn the held distance lags behind, after it too (`with_hysteresis`): both were driven all the same.
     lags_m = np.zeros(held_m.size)
     lags_m[moves[1:][turned] + 1] = width_m[moves[:-1][turned] + 1] + width_m[moves[1:][turned] + 1]
-    return np.asarray(driven + np.cumsum(lags_m))
+    # While it is not known how wide the hysteresis is, the way is that from the place held.
+    away_m = np.where(np.isinf(width_m), np.abs(distance_m - held_m), 0.0)
+    return np.asarray(np.maximum.accumulate(driven + np.cumsum(lags_m) + away_m))
 
 
 def under_way(t_s: Floats, way_m: Floats, deadband_mps: float, window_s: float) -> Bools:

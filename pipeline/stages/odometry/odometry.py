@@ -10,9 +10,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import periods_before_s
-from pipeline.stages.odometry.bound import Bound
+from pipeline.stages.odometry.bound import LEAST_DOUBT_M, Bound, is_lost
 from pipeline.stages.odometry.counts import CountStep, count_step
 from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_steps, travelled_m
+from pipeline.stages.odometry.odd_steps import LOST_M
 from pipeline.stages.odometry.origin import declared_origin
 from pipeline.stages.odometry.quantisation import (
     NO_QUANTISATION,
@@ -89,25 +90,23 @@ class KnownNoise:
 
 @dataclass(frozen=True)
 class Odometry:
-    """Distance over time in continuity segments, with its noise.
+    """Distance over time with its noise and two sums of doubt.
 
     Instants are int64 nanoseconds; `t_s` (rows, and what was filled in) and all `_s` arguments are seconds since
-    `epoch_ns`. Distances are as recorded, but for `between` and `increments`. `segment`: how often the distance was
-    lost before a sample; `counter`: the same, over slip and pauses between speeds, where the way is known to
-    `slip_doubt_m`, a sum. `pause[i]`: between samples i and i+1 nothing is interpolated. `scale`: true over recorded
-    distance, None without its sigma. `leaps_ns`: rows to which the counter leaps; `bridged_m2`: variance over bridged
-    ones, a sum. `bound`: by how much the distance may be off as braking proves it. `origin`: as declared;
+    `epoch_ns`. Distances are as recorded, but for `between` and `increments`. `doubt_m`: by how much the distance may
+    be off as the train itself believes it, a sum, `LOST_M` more where it was lost. `pause[i]`: between samples i and
+    i+1 nothing is interpolated. `scale`: true over recorded distance, None without its sigma. `leaps_ns`: rows to which
+    the counter leaps; `bridged_m2`: variance over bridged ones, a sum. `bound`: by how much the distance may be off as
+    braking proves it. `period_s`: usual time between rows of the run, for words about it. `origin`: as declared;
     `follows_gnss`: found to be made of the positions all the same.
     """
 
     epoch_ns: int
     t_s: Floats
     distance_m: Floats
-    segment: Ints
     pause: Bools
     slip: Bools
-    counter: Ints
-    slip_doubt_m: Floats
+    doubt_m: Floats
     noise: Noise
     known_noise: KnownNoise
     deadband_mps: float
@@ -149,20 +148,13 @@ class Odometry:
     def known_at(self, t_ns: Ints) -> Bools:
         return self.known_at_s(self.seconds(t_ns))
 
-    def segment_at(self, t_ns: Ints) -> Ints:
-        """Distances compare only within one."""
-        return self.segment_at_s(self.seconds(t_ns))
-
     def slips_at_s(self, t_s: Floats) -> Bools:
         """By the sample before or after."""
         return self._slips_between(*self._around(t_s))
 
-    def counter_at_s(self, t_s: Floats) -> Ints:
-        counter: Ints = self.counter[self._sample_at(t_s)]
-        return counter
-
-    def slip_doubt_at_s(self, t_s: Floats) -> Floats:
-        return np.interp(t_s, self.t_s, self.slip_doubt_m)
+    def doubt_at_s(self, t_s: Floats) -> Floats:
+        """Distances compare to a millimetre where it is the same, and not at all across a loss (`is_lost`) [m]."""
+        return np.interp(t_s, self.t_s, self.doubt_m)
 
     def distance_at(self, t_ns: Ints) -> Floats:
         """As recorded [m]; NaN where it is not known."""
@@ -192,12 +184,13 @@ class Odometry:
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
         begin_s, end_s = self.seconds(begin_ns), self.seconds(end_ns)
         inside = (np.minimum(begin_s, end_s) >= self.t_s[0]) & (np.maximum(begin_s, end_s) <= self.t_s[-1])
-        inside &= self.counter_at_s(begin_s) == self.counter_at_s(end_s)
+        bound_m = self.bound_between_m(begin_ns, end_ns)
+        inside &= ~is_lost(bound_m)
         recorded = np.where(inside, self.distance_at_s(end_s) - self.distance_at_s(begin_s), np.nan)
         moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))
         rows_m2 = self.row_sigma_m(begin_s) ** 2 + self.row_sigma_m(end_s) ** 2
         variance = scale**2 * (self.noise.white_m2_per_s * moving_s + rows_m2) + (scale_sigma * recorded) ** 2
-        return OdometerWay(scale * recorded, variance, self.bound_between_m(begin_ns, end_ns))
+        return OdometerWay(scale * recorded, variance, bound_m)
 
     def bound_between_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """By how much the way between instants may be off, as braking and acceleration prove it [m]."""
@@ -207,20 +200,23 @@ class Odometry:
         return (self.scale or 1.0) * self.bound.between_m(self.seconds(begin_ns), self.seconds(end_ns))
 
     def distance_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """The same distance [m], NaN too where slip or a pause leaves doubt in it."""
-        return np.asarray((self.scale or 1.0) * self._recorded_between(begin_ns, end_ns))
+        """The same distance as the train itself believes it [m]; NaN where anything of it is in doubt."""
+        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
+        same = self.doubt_at_s(self.seconds(begin_ns)) == self.doubt_at_s(self.seconds(end_ns))
+        return self._counted_between(begin_ns, end_ns, same)
+
+    def proved_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """The same distance [m], NaN where braking and acceleration leave any of it in doubt."""
+        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
+        return self._counted_between(begin_ns, end_ns, self.bound_between_m(begin_ns, end_ns) == 0.0)
 
     def steps_m(self, t_ns: Ints) -> Floats:
-        """From each instant to the next [m], shape (n - 1,); NaN where anything of it is in doubt."""
-        segment = self.segment_at(t_ns)
-        step_m = np.diff(self.distance_at(t_ns))
-        sure = (segment[:-1] == segment[1:]) & (self.bound_between_m(t_ns[:-1], t_ns[1:]) == 0.0)
-        return np.asarray((self.scale or 1.0) * np.where(sure, step_m, np.nan))
+        """The same from each instant to the next [m], shape (n - 1,)."""
+        return self.proved_between(t_ns[:-1], t_ns[1:])
 
-    def _recorded_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
-        same = self.segment_at(begin_ns) == self.segment_at(end_ns)
-        return np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
+    def _counted_between(self, begin_ns: Ints, end_ns: Ints, sure: Bools) -> Floats:
+        way_m = self.distance_at(end_ns) - self.distance_at(begin_ns)
+        return np.asarray((self.scale or 1.0) * np.where(sure, way_m, np.nan))
 
     def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
         """Both ends of a step with the scale and latency in use at the later one."""
@@ -256,10 +252,6 @@ class Odometry:
         inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
         known: Bools = inside & ~paused & ~self._slips_between(before, after)
         return known
-
-    def segment_at_s(self, t_s: Floats) -> Ints:
-        segment: Ints = self.segment[self._sample_at(t_s)]
-        return segment
 
     def distance_at_s(self, t_s: Floats) -> Floats:
         """Interpolated where it is not known, the end value outside the recording [m]."""
@@ -334,8 +326,8 @@ class Odometry:
 def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> Odometry | None:
     """The odometer of a cleaned stream, as recorded; None without at least two rows.
 
-    A new continuity segment begins where the way is lost: a pause beyond `odometer_gap_s` without a counter, slip that
-    the odometer reports, a leap that no speed bridges. White noise is `odometer_sigma_mps`, or a larger declared
+    In doubt are pauses beyond `odometer_gap_s` without a counter and slip that the odometer reports; lost is the way
+    over a leap or pause that nothing bridges. White noise is `odometer_sigma_mps`, or a larger declared
     `sigma_speed_mps`, taken as independent from row to row.
     """
     if stream is None or stream.height < 2:
@@ -359,12 +351,9 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     guess_m, guess_doubt_m = _guessed_ways(way_m, dt_s, speed, period_s[1:], config)
     way_m = np.where(guessed, guess_m, way_m)
     distance_m = _sums(np.where(unknown, 0.0, way_m))
-    segment = _sums(lost.astype(np.float64)).astype(np.int64)
-    counter = _sums((silent & unknown).astype(np.float64)).astype(np.int64)
-    doubt_m = _sums(
-        _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
-        + np.where(guessed, guess_doubt_m, 0.0)
-    )
+    doubt_m = _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
+    doubt_m += np.where(guessed, guess_doubt_m, 0.0)
+    doubt_m = _sums(np.where(silent & unknown, LOST_M, doubt_m))
     whole = counted & ~lost & ~pause
     noise, known_noise = _noise(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
     doubtful = odd | pause | slip[:-1] | slip[1:]
@@ -373,10 +362,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     row_s = t_s
     if apart.size:
         t_s, distance_m, row = filled_in(t_s, distance_m, speed, apart, align)
-        segment = segment[row]
         pause = pause[row[:-1]]
         slip = slip[row]
-        counter = counter[row]
         doubt_m = np.interp(t_s, row_s, doubt_m)
         known_noise = known_noise.at(row)
     in_file = vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None
@@ -384,11 +371,9 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         epoch_ns=int(t_ns[0]),
         t_s=t_s,
         distance_m=distance_m,
-        segment=segment,
         pause=pause,
         slip=slip,
-        counter=counter,
-        slip_doubt_m=doubt_m,
+        doubt_m=doubt_m,
         noise=noise,
         known_noise=known_noise,
         deadband_mps=config.matching.deadband_mps,
@@ -473,10 +458,10 @@ def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
 def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
     """By how much the count of each step into, in or out of slip may be off [m].
 
-    A share of the step, or its reported sigma times dt: the error lasts while it slips.
+    A share of the step, or its reported sigma times dt: the error lasts while it slips. A locked wheel counts nothing.
     """
     sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
-    doubt_m = np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s)
+    doubt_m = np.maximum(np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s), LEAST_DOUBT_M)
     return np.where(slip[1:] | slip[:-1], doubt_m, 0.0)
 
 

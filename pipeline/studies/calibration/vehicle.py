@@ -91,7 +91,7 @@ def _blocks(seen: Observations, odometry: Odometry, config: CalibrationConfig) -
     rows = np.flatnonzero(known & np.isfinite(seen.path_m) & np.isfinite(seen.sigma_m) & (seen.sigma_m > 0))
     rows = rows[_thinned(seen.t_s[rows], config)]
     pieces: list[Observations] = []
-    for piece in np.split(rows, np.flatnonzero(np.diff(odometry.segment_at_s(seen.t_s[rows]))) + 1):
+    for piece in np.split(rows, np.flatnonzero(np.diff(odometry.doubt_at_s(seen.t_s[rows]))) + 1):
         for part in np.array_split(piece, max(1, -(-piece.size // _BLOCK_POINTS))):
             if part.size >= config.least_points:
                 pieces.append(Observations(seen.t_s[part], seen.path_m[part], seen.sigma_m[part]))

@@ -38,12 +38,9 @@ def simulated_run(seed: int, duration_s: int = 1000, moving: bool = True) -> tup
         error += np.sqrt(share) * SIGMA_M * unit
     position = np.interp(at - LATENCY_S, t, true) + error + 500.0
     none = np.zeros(t.size, dtype=bool)
-    segment = np.zeros(t.size, dtype=np.int64)
     noise = Noise(0.05**2)
     known = KnownNoise.constant(noise, 0.1, t.size)
-    track = Odometry(
-        0, t, true / SCALE + walk, segment, none[1:], none, segment, 0.0 * t, noise, known, 0.3, AlignConfig()
-    )
+    track = Odometry(0, t, true / SCALE + walk, none[1:], none, 0.0 * t, noise, known, 0.3, AlignConfig())
     return Observations(at, position, np.full(at.size, SIGMA_M)), track
 
 
@@ -96,8 +93,8 @@ def test_louder_noise_than_stated_widens_the_uncertainty() -> None:
 
 def test_lost_distance_is_bridged_by_separate_offsets() -> None:
     seen, track = simulated_run(5)
-    jump = (track.t_s >= 700.0).astype(np.int64)
-    broken = replace(track, distance_m=track.distance_m + 300.0 * jump, segment=jump)
+    jump = (track.t_s >= 700.0).astype(np.float64)
+    broken = replace(track, distance_m=track.distance_m + 300.0 * jump, doubt_m=1e6 * jump)
     whole, parts = (estimate_run(seen, one, SHARES, TAUS_S, CONFIG) for one in (track, broken))
     assert whole is not None
     assert parts is not None
