@@ -26,6 +26,8 @@ _WINDOW_S = 10.0
 _LONG_WINDOW_S = 100.0
 # Least number of samples for a median.
 _FEWEST_IN_WINDOW = 5
+# Numerics: so many sigmas show a direction.
+_DIRECTION_SIGMAS = 4.0
 # Numerics: the speed is compared with its median over this time before and after [s].
 _EVEN_S = 2.0
 
@@ -157,12 +159,15 @@ class Sided:
 
 
 def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) -> Sided:
-    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
-    begin, end, step_m = _steps_of(stretch, 1.0)
+    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2).
+
+    Movements of the reference beyond its noise tell, where the odometer counted about as much: a reference that stands
+    or creeps while the odometer counts has no direction to give.
+    """
+    begin, end, step_m = _movements(stretch)
     if counter is not None:
-        counted_m = np.nan_to_num(counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end]))
-        # The noise of a reference that stands still has no direction to give to a way that the odometer counts.
-        step_m = np.sign(step_m * counted_m) * np.minimum(np.abs(step_m), np.abs(counted_m))
+        counted_m = np.nan_to_num(counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end]))
+        step_m = np.where(np.abs(step_m) > 0.5 * np.abs(counted_m), np.sign(step_m) * counted_m, 0.0)
     moved_m = np.cumsum(step_m)
     first = np.flatnonzero(np.abs(moved_m) >= least_m)
     total_m = float(moved_m[first[0]]) if first.size else float(step_m.sum())
@@ -171,12 +176,27 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
     return Sided(stretch, sense, with_m, against_m)
 
 
-def _steps_of(stretch: ReferenceStretch, step_s: float) -> tuple[Ints, Ints, Floats]:
-    """Pairs of samples so far apart in time on one leg of the first path, and the way between them [m]."""
+def _movements(stretch: ReferenceStretch) -> tuple[Ints, Ints, Floats]:
+    """Pairs of samples, a second or more apart, between which the reference moved beyond its noise, and how far [m]."""
     t_ns = stretch.t_ns
-    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, round(step_s * NS_PER_S), dtype=np.int64)
-    rows = np.unique(np.searchsorted(t_ns, instants))
-    return _ways_of(stretch, rows[:-1], rows[1:])
+    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, NS_PER_S, dtype=np.int64)
+    rows = np.unique(np.searchsorted(t_ns, instants)).tolist()
+    at_m = stretch.paths[0].at_m.tolist()
+    leg = stretch.paths[0].leg.tolist()
+    noise_m = (_DIRECTION_SIGMAS * np.sqrt(2.0) * stretch.sigma_m).tolist()
+    begin: list[int] = []
+    end: list[int] = []
+    since = rows[0]
+    for row in rows[1:]:
+        if leg[row] != leg[since]:
+            since = row
+        elif abs(at_m[row] - at_m[since]) > max(noise_m[row], noise_m[since]):
+            begin.append(since)
+            end.append(row)
+            since = row
+    ends = np.array(end, dtype=np.int64)
+    begins = np.array(begin, dtype=np.int64)
+    return begins, ends, stretch.paths[0].at_m[ends] - stretch.paths[0].at_m[begins]
 
 
 def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, Ints, Floats]:

@@ -79,12 +79,7 @@ class Counter:
 
     def distance_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """Distance where nothing of it is in doubt: NaN over slip, pauses and resets too."""
-        sure = self._same(begin_ns, end_ns) & (self.bound_m(begin_ns, end_ns) == 0.0)
-        return np.where(sure, self.odometer.distance_between(begin_ns, end_ns), np.nan)
-
-    def bound_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """By how much the distance between instants may be off [m]."""
-        return self.odometer.bound_between_m(begin_ns, end_ns)
+        return np.where(self._same(begin_ns, end_ns), self.odometer.proved_between(begin_ns, end_ns), np.nan)
 
     @cached_property
     def rows(self) -> CountedRows:

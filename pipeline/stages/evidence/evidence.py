@@ -470,7 +470,7 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
             begin_ns = max(other.begin_ns, witness.begin_ns)
             end_ns = min(other.end_ns, witness.end_ns)
             at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
-            ways = [np.abs(odometer.distance_between(at_ns[:-1], at_ns[1:])) for odometer in (other, witness)]
+            ways = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
             allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
             if (np.abs(ways[0] - ways[1]) > allowed_m).any():
                 return True

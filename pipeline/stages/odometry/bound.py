@@ -10,6 +10,15 @@ from pipeline.stages.odometry.odd_steps import LOST_M, weighed
 from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig
 
+# Each step of slip is in doubt by so much at least [m]: a locked wheel counts nothing.
+LEAST_DOUBT_M = 1e-3
+
+
+def is_lost(doubt_m: Floats) -> Bools:
+    """Differences of a sum of doubt that hold a loss of the distance: nothing of it is left."""
+    lost: Bools = np.abs(doubt_m) > 0.5 * LOST_M
+    return lost
+
 
 @dataclass(frozen=True)
 class Bound:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.stages.odometry.odd_steps import OddRun, driven_within_m, odd_runs
-from pipeline.stages.odometry.quantisation import count_step_m
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import AlignConfig
 
@@ -31,13 +30,15 @@ class Ways(NamedTuple):
     resets: tuple[int, ...] = ()
 
 
-def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: float, config: AlignConfig) -> Ways:
+def ways_between(
+    t_s: Floats, distance_m: Floats, speed_mps: Floats, counts_m: Floats, limit_s: Floats, config: AlignConfig
+) -> Ways:
     """Ways between rows at these times [s]; `distance_m` and `speed_mps` as recorded, NaN where not.
 
-    Over a leap of the distance the speeds count, if they agree with the distance elsewhere. By turns, nothing is
-    interpolated over more than `limit_s`.
+    `counts_m`: the step of the counter as known at each row. Over a leap of the distance the speeds count, if they
+    agreed with the distance before. By turns, nothing is interpolated over more than `limit_s`, of each step.
     """
-    runs = odd_runs(t_s, distance_m, _counts_m(t_s, distance_m, config), config)
+    runs = odd_runs(t_s, distance_m, counts_m, config)
     resets = [run for run in runs.odd if not run.kept]
     distance_m = _interpolated(t_s, distance_m, [run for run in runs.odd if run.kept])
     leap = np.zeros(t_s.size - 1, dtype=np.bool_)
@@ -92,24 +93,17 @@ def _interpolated(t_s: Floats, distance_m: Floats, wrong: list[OddRun]) -> Float
     return distance_m
 
 
-def _counts_m(t_s: Floats, distance_m: Floats, config: AlignConfig) -> float:
-    """The step of the counter [m]; ways that no train drives do not count."""
-    rows = np.flatnonzero(np.isfinite(distance_m))
-    ways = np.abs(np.diff(distance_m[rows]))
-    usual = ways <= config.bunched_stamps_m + 2.0 * np.median(ways) if ways.size else ways > 0.0
-    return count_step_m(distance_m[rows], usual, config)
-
-
 def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignConfig) -> Floats:
-    """None over leaps if speeds and counter disagree elsewhere (a wrong unit, sign or sensor)."""
-    both = np.isfinite(recorded_m) & np.isfinite(driven_m)
-    if not leap.any() or not both.any():
+    """None over leaps if speeds and counter disagreed before (a wrong unit, sign or sensor)."""
+    if not leap.any():
         return driven_m
-    recorded = recorded_m[both]
-    driven = driven_m[both]
-    apart_m = abs(recorded.sum() - driven.sum())
-    most_m = config.speed_agreement * np.abs(recorded).sum()
-    return driven_m if apart_m <= most_m else np.where(leap, np.nan, driven_m)
+    both = np.isfinite(recorded_m) & np.isfinite(driven_m)
+    recorded_sum_m, driven_sum_m, way_m = (
+        np.cumsum(np.where(both, values, 0.0)) for values in (recorded_m, driven_m, np.abs(recorded_m))
+    )
+    # The steps of a leap add nothing to these sums: they are those of the time before.
+    disagreed = np.abs(recorded_sum_m - driven_sum_m) > config.speed_agreement * way_m
+    return np.where(leap & disagreed, np.nan, driven_m)
 
 
 def _driven(t_s: Floats, speed_mps: Floats) -> Floats:
@@ -118,13 +112,13 @@ def _driven(t_s: Floats, speed_mps: Floats) -> Floats:
     return steps
 
 
-def _carried(t_s: Floats, values: Floats, limit_s: float) -> Floats:
-    """Interpolated between known rows no farther apart than the limit; NaN elsewhere."""
+def _carried(t_s: Floats, values: Floats, limit_s: Floats) -> Floats:
+    """Interpolated between known rows no farther apart than the limit known before the later one; NaN elsewhere."""
     known = np.flatnonzero(np.isfinite(values))
     if known.size < 2:
         return values
     after = np.searchsorted(known, np.arange(values.size)).clip(1, known.size - 1)
-    near = t_s[known[after]] - t_s[known[after - 1]] <= limit_s
+    near = t_s[known[after]] - t_s[known[after - 1]] <= limit_s[known[after] - 1]
     inside = (t_s >= t_s[known[0]]) & (t_s <= t_s[known[-1]])
     return np.where(
         np.isfinite(values), values, np.where(near & inside, np.interp(t_s, t_s[known], values[known]), np.nan)

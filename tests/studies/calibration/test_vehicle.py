@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from pipeline.stages.monitors.axis import error_model
-from pipeline.stages.odometry.odometry import Noise, Odometry
-from pipeline.stages.odometry.quantisation import count_step_m, quantisation_noise
+from pipeline.stages.odometry.bound import Bound
+from pipeline.stages.odometry.counts import count_step
+from pipeline.stages.odometry.odometry import KnownNoise, Noise, Odometry
+from pipeline.stages.odometry.quantisation import of_the_run, scatter_pieces
 from pipeline.studies.calibration.vehicle import RunEstimate, estimate_run, pooled
 from schemas.arrays import Floats
 from schemas.config import AlignConfig, Configuration, MonitorConfig
@@ -37,10 +39,9 @@ def simulated_run(seed: int, duration_s: int = 1000, moving: bool = True) -> tup
         error += np.sqrt(share) * SIGMA_M * unit
     position = np.interp(at - LATENCY_S, t, true) + error + 500.0
     none = np.zeros(t.size, dtype=bool)
-    segment = np.zeros(t.size, dtype=np.int64)
-    track = Odometry(
-        0, t, true / SCALE + walk, segment, none[1:], none, segment, 0.0 * t, Noise(0.05**2), 0.3, AlignConfig()
-    )
+    noise = Noise(0.05**2)
+    known = KnownNoise.constant(noise, 0.1, t.size)
+    track = Odometry(0, t, true / SCALE + walk, none[1:], none, 0.0 * t, noise, known, 0.3, AlignConfig())
     return at, position, track
 
 
@@ -72,8 +73,10 @@ def test_constant_speed_tells_no_latency() -> None:
 
 def test_lost_distance_joins_no_way() -> None:
     t_s, path_m, track = simulated_run(5)
-    jump = (track.t_s >= 700.0).astype(np.int64)
-    broken = replace(track, distance_m=track.distance_m + 300.0 * jump, segment=jump)
+    jump = (track.t_s >= 700.0).astype(np.float64)
+    lost_m = 1e6 * jump
+    counted_m = track.distance_m + 300.0 * jump
+    broken = replace(track, distance_m=counted_m, doubt_m=lost_m, bound=Bound(track.t_s, lost_m, lost_m))
     whole, parts = (estimate_run(t_s, path_m, one) for one in (track, broken))
     assert whole is not None
     assert parts is not None
@@ -106,8 +109,10 @@ def with_rows(track: Odometry, kind: str, size_m: float, seed: int) -> Odometry:
     whole = np.ones(rows.size - 1, dtype=bool)
     align, deadband_mps = Configuration().align, Configuration().matching.deadband_mps
     white_m2_per_s = track.noise.white_m2_per_s
-    counter_m = count_step_m(rows, whole, align)
-    found = quantisation_noise(track.t_s, rows, whole, white_m2_per_s, counter_m, deadband_mps, align)
+    counter_m = float(count_step(rows, align).step_m[-1])
+    tenths, white = np.full(rows.size, 0.1), np.full(rows.size, white_m2_per_s)
+    pieces = scatter_pieces(track.t_s, rows, whole, tenths, white, deadband_mps, align)
+    found = of_the_run(pieces, align).of_counter(counter_m)
     return replace(track, distance_m=rows, period_s=0.1, noise=Noise(white_m2_per_s, found, counter_m))
 
 
