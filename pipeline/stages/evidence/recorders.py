@@ -22,12 +22,12 @@ def on_time(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | Non
 def without_frozen(
     reference: pl.DataFrame | None, odometers: Sequence[Odometry], config: HazardConfig
 ) -> pl.DataFrame | None:
-    """The reference without samples that repeat the one before while an independent odometer moves on.
+    """The reference without samples that repeat the one before while an odometer moves on: any, or any independent one.
 
     A recorder that stands still says nothing of where the train is (DOMAIN section 5.0): after so long the stretch
     ends. A train that stands repeats too: there the odometer shows no way beyond its dead band and the sample's noise.
     """
-    witnesses = [odometer for odometer in odometers if odometer.independent]
+    witnesses = [odometer for odometer in odometers if odometer.independent] or list(odometers)
     if reference is None or reference.height < 2 or not witnesses:
         return reference
     t_ns = times_ns(reference)

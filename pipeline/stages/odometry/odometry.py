@@ -52,13 +52,12 @@ class Increments(NamedTuple):
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the distance as the whole run shows it: what gathers in a second, the scatter of rows, the step of a
-    counter. For evidence and calibration; detection uses `KnownNoise`.
+    """Noise of the distance as the whole run shows it: what gathers in a second, and the scatter of rows. For
+    evidence and calibration; detection uses `KnownNoise`.
     """
 
     white_m2_per_s: float
     quantisation: QuantisationNoise = NO_QUANTISATION
-    counter_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -264,16 +263,12 @@ class Odometry:
         speed: Floats = (self.distance_at_s(t_s) - self.distance_at_s(start)) / span
         return speed
 
-    def span_s(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Begin and end of the time about an instant over which its speed is taken."""
-        about_s = self.config.latency_span_s
-        return np.maximum(t_s - about_s, self.t_s[0]), np.minimum(t_s + about_s, self.t_s[-1])
-
-    def reading_at_s(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Distance [m] and speed [m/s] centred on each instant: a speed of the second before would bias a latency."""
-        begin_s, end_s = self.span_s(t_s)
-        speed_mps = (self.distance_at_s(end_s) - self.distance_at_s(begin_s)) / (end_s - begin_s)
-        return self.distance_at_s(t_s), speed_mps
+    def speed_about(self, t_ns: Ints) -> Floats:
+        """True speed over as much of the second about each instant as was recorded [m/s]; a best guess over a pause."""
+        half_s = 0.5 * self.config.speed_window_s
+        begin_s, end_s = (np.clip(self.seconds(t_ns) + off_s, self.t_s[0], self.t_s[-1]) for off_s in (-half_s, half_s))
+        moved_m = self.distance_at_s(end_s) - self.distance_at_s(begin_s)
+        return np.asarray((self.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9))
 
     def noise_at_s(self, t_s: Floats) -> KnownNoise:
         return self.known_noise.at(self._sample_at(t_s))
@@ -434,7 +429,6 @@ def _noise(
     noise = Noise(
         white_m2_per_s=float(np.median(white_m2_per_s)),
         quantisation=of_the_run(pieces, align).of_counter(float(counts.step_m[-1])),
-        counter_m=float(counts.step_m[-1]),
     )
     first_m2 = first_scatter_m2(distance_m, period_s, white_m2_per_s, align)
     known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)
