@@ -73,12 +73,6 @@ class KnownNoise:
     period_s: Floats
     shown: Bools
 
-    @classmethod
-    def constant(cls, noise: Noise, period_s: float, size: int) -> KnownNoise:
-        rows = noise.quantisation
-        values = (noise.white_m2_per_s, rows.still_m2, rows.moving_s2, period_s)
-        return cls(*(np.full(size, value) for value in values), shown=np.ones(size, dtype=np.bool_))
-
     def at(self, samples: Ints) -> KnownNoise:
         return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
 
