@@ -11,6 +11,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.odometry.bound import LEAST_DOUBT_M, Bound, is_lost
+from pipeline.stages.odometry.contradicted import contradicted_by_speeds
 from pipeline.stages.odometry.counts import CountStep, count_step
 from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_steps, travelled_m
 from pipeline.stages.odometry.odd_steps import LOST_M
@@ -330,7 +331,10 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     period_s = _periods_s(t_ns)
     limit_s = np.maximum(align.odometer_gap_s, align.odometer_gap_periods * period_s[1:])
     counts = count_step(distance_m, align)
-    way_m, counted, bridged_m, odd, resets = ways_between(t_s, distance_m, speed, counts.step_m, limit_s, align)
+    ways = ways_between(t_s, distance_m, speed, counts.step_m, limit_s, align)
+    way_m, counted, bridged_m = ways.way_m, ways.counted, ways.bridged_m
+    recorded_m = np.where(counted & ~ways.odd, way_m, np.nan)
+    parts = contradicted_by_speeds(t_s, recorded_m, ways.driven_m, counts.step_m, config.matching.deadband_mps, align)
     unknown = np.isnan(way_m)
     pause = unknown | (dt_s > limit_s)
     slip = _slips(stream, align)
@@ -341,12 +345,12 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     way_m = np.where(guessed, guess_m, way_m)
     distance_m = _sums(np.where(unknown, 0.0, way_m))
     doubt_m = _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
-    doubt_m += np.where(guessed, guess_doubt_m, 0.0)
+    doubt_m += np.where(guessed, guess_doubt_m, parts.doubt_m)
     doubt_m = _sums(np.where(silent & unknown, LOST_M, doubt_m))
     whole = counted & ~lost & ~pause
     noise, known_noise = _noise(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
-    doubtful = odd | pause | slip[:-1] | slip[1:]
-    bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, align) if doubtful.any() else None
+    doubtful = ways.odd | pause | slip[:-1] | slip[1:] | parts.steps
+    bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, parts.off_m, align) if doubtful.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
     row_s = t_s
     if apart.size:
@@ -369,7 +373,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         period_s=float(np.median(dt_s)),
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
-        leaps_ns=tuple(t_ns[list(resets)].tolist()),
+        leaps_ns=tuple(t_ns[list(ways.resets)].tolist()),
         bridged_m2=np.interp(t_s, row_s, _sums(bridged_m**2)) if bridged_m.any() else None,
         bound=bound,
         config=align,
