@@ -13,6 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
 from pipeline.stages.evidence.clock import RecorderClock
+from pipeline.stages.odometry.polarity import sense_of_ways, shared_ways_m
 from pipeline.stages.odometry.scale_lag import ScaleLag, spans_of_rows
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
@@ -159,15 +160,12 @@ class Sided:
 def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) -> Sided:
     """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
     begin, end, step_m = _steps_of(stretch, 1.0)
+    counted_m = np.abs(step_m)
     if counter is not None:
-        counted_m = np.nan_to_num(counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end]))
-        # The noise of a reference that stands still has no direction to give to a way that the odometer counts.
-        step_m = np.sign(step_m * counted_m) * np.minimum(np.abs(step_m), np.abs(counted_m))
-    moved_m = np.cumsum(step_m)
-    first = np.flatnonzero(np.abs(moved_m) >= least_m)
-    total_m = float(moved_m[first[0]]) if first.size else float(step_m.sum())
-    sense = -1 if total_m < 0.0 else 1
-    with_m, against_m = (float((sign * sense * step_m).clip(min=0.0).sum()) for sign in (1, -1))
+        counted_m = counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end])
+    sense = sense_of_ways(counted_m, step_m, least_m)
+    shared_m = sense * shared_ways_m(counted_m, step_m)
+    with_m, against_m = (float((sign * shared_m).clip(min=0.0).sum()) for sign in (1, -1))
     return Sided(stretch, sense, with_m, against_m)
 
 
@@ -627,8 +625,8 @@ def _contradicted(
         t_ns = stretch.t_ns - round(witness.lag_s * NS_PER_S)
         way = witness.counter.between(t_ns[begin], t_ns[end])
         # Others may count the other way round.
-        agreed_m = np.nansum(way_m * way.distance_m)
-        sense = known.sense if number == 0 or agreed_m == 0.0 else np.sign(agreed_m)
+        least_m = config.matching.orientation_distance_m
+        sense = sense_of_ways(way.distance_m, way_m, least_m) if number else known.sense
         counted_m = sense * witness.scale * way.distance_m
         if not witnesses.signed:
             counted_m = np.where(way_m * counted_m < 0.0, -counted_m, counted_m)
