@@ -166,6 +166,18 @@ class Odometry:
         """Whether the train moved for more than half of each step (DOMAIN section 2), shape (n - 1,)."""
         return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
 
+    def drove(self, begin_ns: Ints | int, end_ns: Ints, noise_m: Floats | float = 0.0) -> Bools:
+        """Whether the train is farther from its place than dead band and noise; not where that is in doubt."""
+        return np.abs(np.nan_to_num(self.proved_between(begin_ns, end_ns))) > self._still_m(begin_ns, end_ns) + noise_m
+
+    def stood(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
+        """Whether it is no farther from its place than the dead band; not where that is in doubt."""
+        stood: Bools = np.abs(self.proved_between(begin_ns, end_ns)) <= self._still_m(begin_ns, end_ns)
+        return stood
+
+    def _still_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        return np.asarray(self.deadband_mps * np.abs(end_ns - begin_ns) / NS_PER_S)
+
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
         """True distance between instants, and its variance.
 
