@@ -203,7 +203,7 @@ class ScaleLatencyFilter:
         return state.unsettled_m2 * math.exp((state.t_s - t_s) / self.config.settling_tau_s)
 
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
-        """As `Odometry.reading_at_s` of one instant, several times faster."""
+        """Distance [m], and speed centred on the instant: one of the second before would bias a latency [m/s]."""
         times_s = self.odometry.t_s
         span_s = self.config.latency_span_s
         begin_s = max(at_s - span_s, times_s.item(0))

@@ -13,6 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
 from pipeline.stages.evidence.clock import RecorderClock
+from pipeline.stages.odometry.polarity import sense_of_ways, shared_ways_m
 from pipeline.stages.odometry.scale_lag import ScaleLag, spans_of_rows
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
@@ -165,14 +166,13 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
     or creeps while the odometer counts has no direction to give.
     """
     begin, end, step_m = _movements(stretch)
+    counted_m = np.abs(step_m)
     if counter is not None:
-        counted_m = np.nan_to_num(counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end]))
-        step_m = np.where(np.abs(step_m) > 0.5 * np.abs(counted_m), np.sign(step_m) * counted_m, 0.0)
-    moved_m = np.cumsum(step_m)
-    first = np.flatnonzero(np.abs(moved_m) >= least_m)
-    total_m = float(moved_m[first[0]]) if first.size else float(step_m.sum())
-    sense = -1 if total_m < 0.0 else 1
-    with_m, against_m = (float((sign * sense * step_m).clip(min=0.0).sum()) for sign in (1, -1))
+        counted_m = counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end])
+        counted_m = np.where(np.abs(step_m) > 0.5 * np.abs(counted_m), counted_m, 0.0)
+    sense = sense_of_ways(counted_m, step_m, least_m)
+    shared_m = sense * shared_ways_m(counted_m, step_m)
+    with_m, against_m = (float((sign * shared_m).clip(min=0.0).sum()) for sign in (1, -1))
     return Sided(stretch, sense, with_m, against_m)
 
 
@@ -271,7 +271,7 @@ def known_stretch(
         paths = [replace(known, low_m=known.low_m - open_m, high_m=known.high_m + open_m) for known in paths]
     if t_ns.size == 1 and witnesses.all:
         # One sample shows no speed.
-        speed_mps = np.abs(witnesses.all[0].counter.best_speed_mps(t_ns))
+        speed_mps = np.abs(witnesses.all[0].counter.odometer.speed_about(t_ns))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
     lates_s = np.linspace(-clock.delta_s, clock.delta_s, 3 + 2 * int(clock.delta_s / _EVEN_S))
     around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in lates_s.tolist()]
@@ -647,8 +647,8 @@ def _contradicted(
         t_ns = stretch.t_ns - round(witness.lag_s * NS_PER_S)
         way = witness.counter.between(t_ns[begin], t_ns[end])
         # Others may count the other way round.
-        agreed_m = np.nansum(way_m * way.distance_m)
-        sense = known.sense if number == 0 or agreed_m == 0.0 else np.sign(agreed_m)
+        least_m = config.matching.orientation_distance_m
+        sense = sense_of_ways(way.distance_m, way_m, least_m) if number else known.sense
         counted_m = sense * witness.scale * way.distance_m
         if not witnesses.signed:
             counted_m = np.where(way_m * counted_m < 0.0, -counted_m, counted_m)
@@ -716,7 +716,7 @@ def read_anchors(
 def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Counter | None) -> list[TrueAnchor]:
     """The reads on the odometer's clock, with what that clock may add at their speed; nothing without an odometer."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
-    speed_mps = np.zeros(t_ns.size) if counter is None else np.abs(counter.best_speed_mps(t_ns))
+    speed_mps = np.zeros(t_ns.size) if counter is None else np.abs(counter.odometer.speed_about(t_ns))
     clock_m = clock.delta_s * speed_mps
     shift_ns = round(clock.shift_s * NS_PER_S)
     rows = zip(anchors, clock_m.tolist(), strict=True)

@@ -11,6 +11,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.odometry.bound import LEAST_DOUBT_M, Bound, is_lost
+from pipeline.stages.odometry.contradicted import contradicted_by_speeds
 from pipeline.stages.odometry.counts import CountStep, count_step
 from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_steps, travelled_m
 from pipeline.stages.odometry.odd_steps import LOST_M
@@ -52,13 +53,12 @@ class Increments(NamedTuple):
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the distance as the whole run shows it: what gathers in a second, the scatter of rows, the step of a
-    counter. For evidence and calibration; detection uses `KnownNoise`.
+    """Noise of the distance as the whole run shows it: what gathers in a second, and the scatter of rows. For
+    evidence and calibration; detection uses `KnownNoise`.
     """
 
     white_m2_per_s: float
     quantisation: QuantisationNoise = NO_QUANTISATION
-    counter_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -73,17 +73,6 @@ class KnownNoise:
     moving_s2: Floats
     period_s: Floats
     shown: Bools
-
-    @classmethod
-    def constant(cls, noise: Noise, period_s: float, size: int) -> KnownNoise:
-        rows = noise.quantisation
-        return cls(
-            white_m2_per_s=np.full(size, noise.white_m2_per_s),
-            still_m2=np.full(size, rows.still_m2),
-            moving_s2=np.full(size, rows.moving_s2),
-            period_s=np.full(size, period_s),
-            shown=np.ones(size, dtype=np.bool_),
-        )
 
     def at(self, samples: Ints) -> KnownNoise:
         return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
@@ -177,6 +166,18 @@ class Odometry:
         """Whether the train moved for more than half of each step (DOMAIN section 2), shape (n - 1,)."""
         return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
 
+    def drove(self, begin_ns: Ints | int, end_ns: Ints, noise_m: Floats | float = 0.0) -> Bools:
+        """Whether the train is farther from its place than dead band and noise; not where that is in doubt."""
+        return np.abs(np.nan_to_num(self.proved_between(begin_ns, end_ns))) > self._still_m(begin_ns, end_ns) + noise_m
+
+    def stood(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
+        """Whether it is no farther from its place than the dead band; not where that is in doubt."""
+        stood: Bools = np.abs(self.proved_between(begin_ns, end_ns)) <= self._still_m(begin_ns, end_ns)
+        return stood
+
+    def _still_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        return np.asarray(self.deadband_mps * np.abs(end_ns - begin_ns) / NS_PER_S)
+
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
         """True distance between instants, and its variance.
 
@@ -269,16 +270,12 @@ class Odometry:
         speed: Floats = (self.distance_at_s(t_s) - self.distance_at_s(start)) / span
         return speed
 
-    def span_s(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Begin and end of the time about an instant over which its speed is taken."""
-        about_s = self.config.latency_span_s
-        return np.maximum(t_s - about_s, self.t_s[0]), np.minimum(t_s + about_s, self.t_s[-1])
-
-    def reading_at_s(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Distance [m] and speed [m/s] centred on each instant: a speed of the second before would bias a latency."""
-        begin_s, end_s = self.span_s(t_s)
-        speed_mps = (self.distance_at_s(end_s) - self.distance_at_s(begin_s)) / (end_s - begin_s)
-        return self.distance_at_s(t_s), speed_mps
+    def speed_about(self, t_ns: Ints) -> Floats:
+        """True speed over as much of the second about each instant as was recorded [m/s]; a best guess over a pause."""
+        half_s = 0.5 * self.config.speed_window_s
+        begin_s, end_s = (np.clip(self.seconds(t_ns) + off_s, self.t_s[0], self.t_s[-1]) for off_s in (-half_s, half_s))
+        moved_m = self.distance_at_s(end_s) - self.distance_at_s(begin_s)
+        return np.asarray((self.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9))
 
     def noise_at_s(self, t_s: Floats) -> KnownNoise:
         return self.known_noise.at(self._sample_at(t_s))
@@ -346,7 +343,10 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     period_s = _periods_s(t_ns)
     limit_s = np.maximum(align.odometer_gap_s, align.odometer_gap_periods * period_s[1:])
     counts = count_step(distance_m, align)
-    way_m, counted, bridged_m, odd, resets = ways_between(t_s, distance_m, speed, counts.step_m, limit_s, align)
+    ways = ways_between(t_s, distance_m, speed, counts.step_m, limit_s, align)
+    way_m, counted, bridged_m = ways.way_m, ways.counted, ways.bridged_m
+    recorded_m = np.where(counted & ~ways.odd, way_m, np.nan)
+    parts = contradicted_by_speeds(t_s, recorded_m, ways.driven_m, counts.step_m, config.matching.deadband_mps, align)
     unknown = np.isnan(way_m)
     pause = unknown | (dt_s > limit_s)
     slip = _slips(stream, align)
@@ -357,12 +357,12 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     way_m = np.where(guessed, guess_m, way_m)
     distance_m = _sums(np.where(unknown, 0.0, way_m))
     doubt_m = _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
-    doubt_m += np.where(guessed, guess_doubt_m, 0.0)
+    doubt_m += np.where(guessed, guess_doubt_m, parts.doubt_m)
     doubt_m = _sums(np.where(silent & unknown, LOST_M, doubt_m))
     whole = counted & ~lost & ~pause
     noise, known_noise = _noise(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
-    doubtful = odd | pause | slip[:-1] | slip[1:]
-    bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, align) if doubtful.any() else None
+    doubtful = ways.odd | pause | slip[:-1] | slip[1:] | parts.steps
+    bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, parts.off_m, align) if doubtful.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
     row_s = t_s
     if apart.size:
@@ -385,7 +385,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         period_s=float(np.median(dt_s)),
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
-        leaps_ns=tuple(t_ns[list(resets)].tolist()),
+        leaps_ns=tuple(t_ns[list(ways.resets)].tolist()),
         bridged_m2=np.interp(t_s, row_s, _sums(bridged_m**2)) if bridged_m.any() else None,
         bound=bound,
         config=align,
@@ -439,7 +439,6 @@ def _noise(
     noise = Noise(
         white_m2_per_s=float(np.median(white_m2_per_s)),
         quantisation=of_the_run(pieces, align).of_counter(float(counts.step_m[-1])),
-        counter_m=float(counts.step_m[-1]),
     )
     first_m2 = first_scatter_m2(distance_m, period_s, white_m2_per_s, align)
     known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)

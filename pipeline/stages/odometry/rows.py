@@ -20,13 +20,15 @@ _BOUND_SIGMAS = 3.0
 class Ways(NamedTuple):
     """Per step: way [m], NaN where not known; whether it is of the recorded distance; sigma over a bridged reset [m].
 
-    `odd`: where the count may be off; `resets`: the rows to which it was set.
+    `odd`: where the count may be off; `driven_m`: by the speeds, NaN where not recorded; `resets`: the rows to which it
+    was set.
     """
 
     way_m: Floats
     counted: Bools
     bridged_m: Floats
     odd: Bools
+    driven_m: Floats
     resets: tuple[int, ...] = ()
 
 
@@ -46,7 +48,8 @@ def ways_between(
         distance_m[run.first + 1 : run.last] = np.nan
         leap[run.first : run.last] = True
     recorded = np.where(leap, np.nan, np.diff(distance_m))
-    driven = _trusted(_driven(t_s, speed_mps), recorded, leap, config)
+    by_speeds = _driven(t_s, speed_mps)
+    driven = _trusted(by_speeds, recorded, leap, config)
     way_m = np.where(np.isnan(recorded), driven, recorded)
     unknown = np.isnan(way_m)
     places = tuple(run.last for run in resets)
@@ -54,7 +57,7 @@ def ways_between(
     for run in (*runs.odd, *runs.near):
         odd[run.first : run.last] = True
     if not unknown.any():
-        return Ways(way_m, ~np.isnan(recorded), np.zeros(way_m.size), odd, places)
+        return Ways(way_m, ~np.isnan(recorded), np.zeros(way_m.size), odd, by_speeds, places)
     # Rows by turns: fill the gaps of either column between its own rows, then decide again.
     carried_m = _carried(t_s, distance_m, limit_s)
     recorded = np.where(unknown & ~leap, np.diff(carried_m), recorded)
@@ -64,7 +67,7 @@ def ways_between(
     bridged_m = np.zeros(way_m.size)
     for run in resets:
         _bridge(run, t_s, way_m, bridged_m, config)
-    return Ways(way_m, counted, bridged_m, odd, places)
+    return Ways(way_m, counted, bridged_m, odd, by_speeds, places)
 
 
 def _bridge(run: OddRun, t_s: Floats, way_m: Floats, sigma_m: Floats, config: AlignConfig) -> None:

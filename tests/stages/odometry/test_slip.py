@@ -54,10 +54,10 @@ def test_a_locked_wheel_that_counts_nothing_is_in_doubt_all_the_same() -> None:
 def test_another_odometer_counts_over_slip(sense: float) -> None:
     one = odometry_from(odometer_of(T_S, distance_m=COUNTED_M, slip=SLIPS))
     other = odometry_from(odometer_of(T_S, distance_m=[sense * 11.0 * t for t in T_S]))
-    found = counted_over_slip(one, [other], AlignConfig())
+    found = counted_over_slip(one, [other], 20.0, AlignConfig())
     # The steps into slip and out of it are the other's 11 m each, with one percent in doubt.
     assert found.distance_m == pytest.approx([0.0, 10.0, 21.0, 32.0, 42.0, 52.0])
     assert found.doubt_m == pytest.approx([0.0, 0.0, 0.11, 0.22, 0.22, 0.22])
     assert found.slip.tolist() == SLIPS
     slips_too = odometry_from(odometer_of(T_S, distance_m=[11.0 * t for t in T_S], slip=SLIPS))
-    assert counted_over_slip(one, [slips_too], AlignConfig()).distance_m == pytest.approx(COUNTED_M)
+    assert counted_over_slip(one, [slips_too], 20.0, AlignConfig()).distance_m == pytest.approx(COUNTED_M)
