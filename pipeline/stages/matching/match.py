@@ -18,7 +18,7 @@ from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.track.network import network_in_pieces
 from pipeline.stages.track.path import TravelledPath
 from pipeline.stages.track.survey import SurveyedTrack
-from schemas.arrays import Ints, floats, ints, times_ns
+from schemas.arrays import NS_PER_S, Ints, floats, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import Site
@@ -69,9 +69,11 @@ def match(
         pinned=_pins_of_positions(pinned, rows),
     )
     found = path_set(steps, network, config.cross_bias_sigma_m, config.paths_alpha, config)
-    path, assignment = find_path(arrays, odometry, network, pinned, found, config)
+    path, assignment = find_path(arrays, odometry, found, config)
     element = elements_of(arrays, path, assignment)
-    claimed = claims(found, arrays.t_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
+    # The set counts from the first position, not from the first epoch.
+    since_s = (arrays.t_ns - arrays.t_ns[rows[0]]) / NS_PER_S
+    claimed = claims(found, since_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
     assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
     ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, pinned >= 0, network)
     epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)

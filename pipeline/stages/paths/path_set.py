@@ -21,18 +21,6 @@ from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
-# DOMAIN section 2: over gaps every way of at most so many times the distance, and so much more [m].
-_DETOUR = 1.2
-_DETOUR_M = 50.0
-# Behind an open end a path goes on for so much more than the noise [m].
-_OPEN_M = 10.0
-# Before a position is on the element that it goes over to, it may lie so far before its end [m].
-_LATE_M = 10.0
-# Where a stretch ends off the network, paths refuted in its last seconds are equal [s].
-_LAST_S = 60.0
-# A longer step is a gap: the train may have taken any way meanwhile [s].
-_GAP_S = 3.5
-
 
 @dataclass
 class Node:
@@ -74,6 +62,7 @@ class PathSet:
     """All hypotheses of a run with what became of each; `groups`: lines without a branch, per net element.
 
     `overflow`: step from which on there were more hypotheses than are followed; nothing is claimed after it.
+    `last_s`: where a stretch ends off the network, paths refuted in its last seconds are equal.
     """
 
     nodes: tuple[Node, ...]
@@ -82,6 +71,7 @@ class PathSet:
     network: Network
     candidates: Candidates
     overflow: int
+    last_s: float
 
     def living(self, delay_s: float) -> list[Span]:
         """The hypotheses, each over the steps at which nothing up to `delay_s` before their end had refuted it."""
@@ -101,7 +91,7 @@ class PathSet:
             refuted = [node for node in nodes if node.rejected < count]
             if not alive and refuted:
                 latest_s = self.steps.end_s[max(node.rejected for node in refuted)]
-                alive = [node for node in refuted if self.steps.end_s[node.rejected] >= latest_s - _LAST_S]
+                alive = [node for node in refuted if self.steps.end_s[node.rejected] >= latest_s - self.last_s]
             found += alive
         return found
 
@@ -144,7 +134,7 @@ def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, co
     lines = groups[candidates.element]
     others = candidates.step[lines != lines[:1]]
     alone = int(others[0]) if others.size else len(steps)
-    tests = PathTests.of_run(steps, alpha, bias_m, config.paths_alike_m, alone)
+    tests = PathTests.of_run(steps, alpha, bias_m, alone, config)
     return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
 
 
@@ -178,7 +168,7 @@ class _Growth:
         # Rows of the candidates of each net element, in order of steps.
         self._order = np.lexsort((self.candidates.step, self.candidates.element))
         self._first = np.searchsorted(self.candidates.element[self._order], np.arange(self.network.count + 1))
-        self._gap = np.concatenate([[False], np.diff(self.steps.end_s) > _GAP_S])
+        self._gap = np.concatenate([[False], np.diff(self.steps.end_s) > self.config.paths_gap_s])
         self._queue: list[tuple[int, int, Node]] = []
         self._made: list[Node] = []
         self._by_element: dict[int, list[Node]] = {}
@@ -199,7 +189,8 @@ class _Growth:
                 for child in self._follow(node):
                     self._push(child)
             start = count if overflow < count else self._anew(self._made[first:])
-        return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow)
+        last_s = self.config.paths_anew_s
+        return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow, last_s)
 
     def _anew(self, nodes: list[Node]) -> int:
         """Where the set begins anew once these are all refuted: at once in the first minute, later where it came back.
@@ -262,7 +253,7 @@ class _Growth:
         candidates = self.candidates
         limit_m = self.tests.offset_m(self.steps.sigma_m[candidates.step], self.survey_m)
         near: Bools = (np.abs(candidates.offset_m) <= limit_m) & (
-            self._inside(np.arange(len(candidates.step))) | (candidates.beyond_m <= _LATE_M)
+            self._inside(np.arange(len(candidates.step))) | (candidates.beyond_m <= self.config.paths_end_m)
         )
         return near
 
@@ -310,9 +301,8 @@ class _Growth:
         run &= ~self._gap[np.minimum(step, count - 1)] | (step == node.begin)
         inside = self._inside(rows)
         # Not yet on it, by the noise along the track or of an offset at a bend: it came in over that end.
-        late = np.logical_and.accumulate(inside | (candidates.beyond_m[rows] <= _LATE_M)) & ~np.logical_or.accumulate(
-            inside
-        )
+        near = inside | (candidates.beyond_m[rows] <= self.config.paths_end_m)
+        late = np.logical_and.accumulate(near) & ~np.logical_or.accumulate(inside)
         run &= inside | late
         stays = int(rows.size if run.all() else np.argmin(run))
         rows = rows[:stays]
@@ -355,7 +345,7 @@ class _Growth:
         past = candidates.past[rows]
         linked = np.where(past < 0, candidates.linked_start[rows], candidates.linked_end[rows])
         sigma_m = np.hypot(self.steps.sigma_m[candidates.step[rows]], self.survey_m[rows])
-        near = candidates.beyond_m[rows] <= self.config.paths_open_sigmas * sigma_m + _OPEN_M
+        near = candidates.beyond_m[rows] <= self.config.paths_along_sigmas * sigma_m + self.config.paths_end_m
         inside: Bools = (past == 0) | (~linked & near)
         return inside
 
@@ -366,8 +356,8 @@ class _Growth:
             return []
         candidates = self.candidates
         rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
-        inside = rows[self._inside(rows) | (candidates.beyond_m[rows] <= _LATE_M)]
-        way_m = _DETOUR * float(self.steps.way_m[step]) + _DETOUR_M
+        inside = rows[self._inside(rows) | (candidates.beyond_m[rows] <= self.config.paths_end_m)]
+        way_m = (1.0 + self.config.detour_share) * float(self.steps.way_m[step]) + self.config.detour_m
         reached: dict[int, int] = {}
         for leaving in (node.oriented, node.oriented ^ 1):
             for to, reach in self.network.reach(leaving, way_m).items():
@@ -395,7 +385,7 @@ class _Growth:
             rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
             (row,) = rows[candidates.element[rows] == node.element][:1].tolist()
             sigma_m = float(np.hypot(self.steps.sigma_m[step], self.survey_m[row]))
-            if candidates.beyond_m[row] > self.config.paths_open_sigmas * sigma_m + _OPEN_M:
+            if candidates.beyond_m[row] > self.config.paths_along_sigmas * sigma_m + self.config.paths_end_m:
                 node.rejected = min(node.rejected, step)
                 return []
             child = children[0]

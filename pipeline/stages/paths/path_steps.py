@@ -22,11 +22,14 @@ _HEADING_STEPS = 5
 class PathSteps:
     """Means of a second of positions, shapes (n,); `points` (n, 3).
 
-    `begin_s`, `end_s`: times of its first and last position; `sigma_m` of the position across; `way_m`: since the step
-    before, the larger of odometer and positions; `counted`: it moved by a metre, and is no outlier; `along_m`: position
-    along the track minus an independent odometer, NaN without one; `pinned`: element of a balise read then, else -1.
+    `t_ns`: mean time; `begin_s`, `end_s`: of its first and last position, since `start_ns`, the first of all;
+    `sigma_m` of the position across; `way_m`: since the step before, the larger of odometer and positions; `counted`:
+    it moved by a metre, and is no outlier; `along_m`: position along the track minus an independent odometer, NaN
+    without one; `pinned`: element of a balise read then, else -1.
     """
 
+    t_ns: Ints
+    start_ns: int
     begin_s: Floats
     end_s: Floats
     points: Points
@@ -38,6 +41,10 @@ class PathSteps:
 
     def __len__(self) -> int:
         return len(self.end_s)
+
+    @property
+    def begin_ns(self) -> Ints:
+        return np.round(self.begin_s * NS_PER_S).astype(np.int64) + self.start_ns
 
     @cached_property
     def period_s(self) -> float:
@@ -69,8 +76,9 @@ def path_steps(
     means = Points(*(mean(vectors) for vectors in (points.surface, points.east, points.north)))
     chord_m = np.linalg.norm(np.diff(means.surface, axis=0, prepend=means.surface[:1]), axis=1)
     counted_m = np.full(len(means), np.nan)
+    start_ns = int(t_ns[0]) if t_ns.size else 0
+    middle_ns = np.round(mean(t_s) * NS_PER_S).astype(np.int64) + start_ns
     if way is not None:
-        middle_ns = np.round(mean(t_s) * NS_PER_S).astype(np.int64) + t_ns[0]
         counted_m[1:] = way(middle_ns[:-1], middle_ns[1:])
     known = np.isfinite(counted_m)
     moved_m = np.where(known, np.abs(counted_m), chord_m)
@@ -81,6 +89,8 @@ def path_steps(
         read = np.flatnonzero(pinned >= 0)
         pins[np.searchsorted(first, read, side="right") - 1] = pinned[read]
     return PathSteps(
+        t_ns=middle_ns,
+        start_ns=start_ns,
         begin_s=t_s[first],
         end_s=t_s[first + size - 1],
         points=means,

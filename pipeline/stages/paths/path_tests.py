@@ -13,10 +13,10 @@ import numpy as np
 
 from pipeline.stages.paths.path_steps import PathSteps
 from schemas.arrays import Bools, Floats, Ints
+from schemas.config import MatchingConfig
 
-# Windows of the movements, and of the offset [s].
+# Windows of the movements [s].
 WINDOWS_S = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0)
-OFFSET_S = 8.0
 # The nine tests share the level; looks of each in 600 s, of the lasting offset three.
 _LOOKED_S = 600.0
 _LASTING_LOOKS = 3.0
@@ -26,8 +26,8 @@ _WHOLE = 0.6
 _TAUS_S = np.array([10.0, 20.0, 50.0, 75.0, 100.0, 150.0, 200.0, 300.0, 400.0, 600.0, 1000.0, 2000.0])
 # Part of the variance that lasts, and how fast the rest of it averages (DIAG Table 1 at 45 degrees).
 _SLOW, _AVERAGED_S = 0.247, 400.0
-# By so much the variance measured along the track may be too small; windows up to so long are measured, after so many.
-_MEASURED, _MEASURED_S, _MEASURED_WINDOWS = 1.5, 48.0, 6.0
+# Windows up to so long are measured along the track, after so many.
+_MEASURED_S, _MEASURED_WINDOWS = 48.0, 6.0
 
 
 class Verdict(NamedTuple):
@@ -53,17 +53,19 @@ class PathTests:
     measured_m2: dict[float, Floats]
     windows: dict[float, tuple[Ints, Ints, Ints]]
     excess: Floats
+    config: MatchingConfig
 
     @classmethod
-    def of_run(cls, steps: PathSteps, alpha: float, bias_m: float, merged_m: float, alone: int) -> PathTests:
+    def of_run(cls, steps: PathSteps, alpha: float, bias_m: float, alone: int, config: MatchingConfig) -> PathTests:
         """Tests of the paths of a run; `alone`: before this step no other track was near, only offsets are tested."""
         measured = {window_s: _measured_m2(steps, window_s) for window_s in WINDOWS_S if window_s <= _MEASURED_S}
         windows = {window_s: _windows(steps.end_s, window_s) for window_s in WINDOWS_S}
-        return cls(alpha, bias_m, merged_m, alone, measured, windows, _excess(steps, measured))
+        excess = _excess(steps, measured)
+        return cls(alpha, bias_m, config.paths_alike_m, alone, measured, windows, excess, config)
 
     def offset_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
         """How far beside its track a single step may lie [m]."""
-        limit = _size(self.alpha, _LOOKED_S / OFFSET_S)
+        limit = _size(self.alpha, _LOOKED_S / self.config.paths_level_s)
         return np.asarray(limit * np.sqrt(self.bias_m**2 + survey_m**2 + sigma_m**2))
 
     @property
@@ -98,7 +100,7 @@ class PathTests:
                 continue
             moved = self._movement(steps, sums, heading_rad, at, window_s)
             found.append((np.where(apart, moved, 0.0), *self._limit(_LOOKED_S / window_s)))
-        found.append((self._offset(steps, sums, at), *self._limit(_LOOKED_S / OFFSET_S)))
+        found.append((self._offset(steps, sums, at), *self._limit(_LOOKED_S / self.config.paths_level_s)))
         if apart.any():
             lasting = np.where(apart, self._lasting(steps, sums, at), 0.0)
             found.append((lasting, *self._limit(_LASTING_LOOKS)))
@@ -132,12 +134,12 @@ class PathTests:
         seen_m2 = self.measured_m2[window_s][at]
         soonest_s = 20.0 if np.isfinite(steps.along_m).any() else 10.0
         short_m2 = sigma_m2 * _greatest_share(window_s, soonest_s)
-        return np.where(np.isfinite(seen_m2), np.fmax(long_m2, _MEASURED * seen_m2), short_m2)
+        return np.where(np.isfinite(seen_m2), np.fmax(long_m2, self.config.paths_measured_factor * seen_m2), short_m2)
 
     def _offset(self, steps: PathSteps, sums: _Sums, at: Ints) -> Floats:
-        late = np.searchsorted(steps.end_s, steps.end_s[at] - OFFSET_S, side="right")
+        late = np.searchsorted(steps.end_s, steps.end_s[at] - self.config.paths_level_s, side="right")
         late = np.minimum(late, at)
-        usable = sums.count(late, at + 1) >= min(_WHOLE * OFFSET_S / steps.period_s, 1.0)
+        usable = sums.count(late, at + 1) >= min(_WHOLE * self.config.paths_level_s / steps.period_s, 1.0)
         root_m = np.sqrt(self.bias_m**2 + sums.survey(late, at + 1) ** 2 + sums.sigma2(late, at + 1) * self.excess[at])
         mean_m = np.abs(sums.residual(late, at + 1))
         return np.where(usable & np.isfinite(mean_m) & (root_m > 0.0), mean_m / np.maximum(root_m, 1e-9), 0.0)
