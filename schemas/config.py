@@ -206,7 +206,7 @@ class MatchingConfig(Settings):
     paths_gap_s: Positive = 3.5
     detour_share: NonNegative = 0.2
     detour_m: Positive = 50.0
-    # More hypotheses than any run had (14 in the prototype's): beyond them nothing is claimed.
+    # More hypotheses than began in 600 s of any run (200 beside a double track): beyond them nothing is claimed.
     paths_limit: Annotated[int, Field(strict=True, gt=0)] = 5000
     # Reflections follow no error model: a position counts as one of so many sigmas at most, or one decides the track.
     outlier_sigmas: Positive = 4.0

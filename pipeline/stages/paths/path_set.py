@@ -7,6 +7,7 @@ overbound, the true path is rejected in at most alpha per 600 s, in any network,
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
 from pipeline.stages.paths.path_steps import PathSteps
-from pipeline.stages.paths.path_tests import PathTests
+from pipeline.stages.paths.path_tests import LOOKED_S, NO_STEPS, PathTests, Totals, Trail
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
@@ -27,26 +28,45 @@ class Node:
     """One hypothesis while it is on one net element, oriented as its path began.
 
     Covers the steps from `begin` on, before `end`; `rejected`: the step at which its residuals refuted it, a large
-    number if none did; `residual_m` of its whole path, NaN before its begin; `p`: least p-value of its tests so far.
+    number if none did; `residual_m`, `survey_m`, `heading_rad`, `left_m` (to both ends of the element): of its own
+    steps; `before`: what its whole path comes to before `begin`; `p`: least p-value of its tests so far.
     """
 
     oriented: int
     begin: int
-    residual_m: Floats
-    survey_m: Floats
-    heading_rad: Floats
+    stretch: int
     parent: Node | None = None
+    before: Totals = NO_STEPS
     p: float = 1.0
     end: int = 0
     rejected: int = 2**62
     barred: int = 2**62
-    left_m: Floats = field(default_factory=lambda: np.zeros(0))
+    residual_m: Floats = field(default_factory=lambda: np.zeros(0))
+    survey_m: Floats = field(default_factory=lambda: np.zeros(0))
+    heading_rad: Floats = field(default_factory=lambda: np.zeros(0))
+    left_m: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     followed: bool = False
-    stretch: int = 0
 
     @property
     def element(self) -> int:
         return self.oriented // 2
+
+    def since(self, step: int) -> list[Node]:
+        """The hypotheses that it went through, itself the last, as far back as a step."""
+        chain = [self]
+        while chain[-1].begin > step and chain[-1].parent is not None:
+            chain.append(chain[-1].parent)
+        return chain[::-1]
+
+    def residuals_m(self, first: int, last: int) -> Floats:
+        """Of its path over the steps from `first` on, before `last`; NaN before its beginning."""
+        chain = self.since(first)
+        known = np.concatenate([node.residual_m for node in chain])
+        whole_m = np.full(last - first, np.nan)
+        begin = max(chain[0].begin, first)
+        part = known[begin - chain[0].begin : last - chain[0].begin]
+        whole_m[begin - first : begin - first + part.size] = part
+        return whole_m
 
 
 class Span(NamedTuple):
@@ -171,6 +191,7 @@ class _Growth:
         self._gap = np.concatenate([[False], np.diff(self.steps.end_s) > self.config.paths_gap_s])
         self._queue: list[tuple[int, int, Node]] = []
         self._made: list[Node] = []
+        self._begun_s: deque[float] = deque()
         self._by_element: dict[int, list[Node]] = {}
 
     def grown(self) -> PathSet:
@@ -182,7 +203,7 @@ class _Growth:
             self._push_all(start)
             while self._queue:
                 _, _, node = heapq.heappop(self._queue)
-                if len(self._made) > self.config.paths_limit:
+                if self._too_many(node):
                     overflow = min(overflow, node.begin)
                     self._queue.clear()
                     break
@@ -191,6 +212,14 @@ class _Growth:
             start = count if overflow < count else self._anew(self._made[first:])
         last_s = self.config.paths_anew_s
         return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow, last_s)
+
+    def _too_many(self, node: Node) -> bool:
+        """More hypotheses have begun of late than are followed."""
+        now_s = float(self.steps.end_s[node.begin])
+        self._begun_s.append(now_s)
+        while self._begun_s[0] < now_s - LOOKED_S:
+            self._begun_s.popleft()
+        return len(self._begun_s) > self.config.paths_limit
 
     def _anew(self, nodes: list[Node]) -> int:
         """Where the set begins anew once these are all refuted: at once in the first minute, later where it came back.
@@ -216,18 +245,19 @@ class _Growth:
         the survey lacks. Beside the nearest element then, as long as positions lie within reach of one.
         """
         steps = self.steps
-        known = np.flatnonzero(np.isfinite(node.residual_m[:died]) & steps.counted[:died])
-        before = known[steps.end_s[known] <= steps.end_s[died] - self.config.paths_level_s]
-        before = before[steps.end_s[before] > steps.end_s[died] - 3.0 * self.config.paths_level_s]
-        if not before.size:
+        level_s = self.config.paths_level_s
+        first, last = np.searchsorted(steps.end_s, steps.end_s[died] - level_s * np.array([3.0, 1.0]), side="right")
+        residual_m = node.residuals_m(int(first), int(last))
+        before = np.isfinite(residual_m) & steps.counted[first:last]
+        if not before.any():
             return len(steps)
-        level_m = float(np.mean(node.residual_m[before]))
+        level_m = float(np.mean(residual_m[before]))
         beside_m = self._nearest_m[died:]
-        window = max(1, round(self.config.paths_level_s / steps.period_s))
+        window = max(1, round(level_s / float(steps.period_s[died])))
         if beside_m.size < window:
             return len(steps)
         means_m = sliding_window_view(beside_m, window).mean(axis=1)
-        root_m = np.hypot(steps.sigma_m[died:], float(np.nanmedian(node.survey_m[before])))[window - 1 :]
+        root_m = np.hypot(steps.sigma_m[died:], float(np.median(node.survey_m)))[window - 1 :]
         signs = (level_m, -level_m)  # the nearest element may run the other way
         off_m = np.minimum(*(np.abs(means_m - sign) for sign in signs))
         back = np.flatnonzero(np.nan_to_num(off_m, nan=np.inf) <= self.config.paths_back_sigmas * root_m)
@@ -265,9 +295,7 @@ class _Growth:
         """Begin with every element near a step."""
         rows = np.arange(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
         for row in rows[self._near[rows]].tolist():
-            none = np.full(len(self.steps), np.nan)
-            oriented = 2 * int(self.candidates.element[row])
-            self._push(Node(oriented, step, none, none.copy(), none.copy(), stretch=step))
+            self._push(Node(2 * int(self.candidates.element[row]), step, stretch=step))
 
     def _push(self, node: Node) -> None:
         same = self._by_element.setdefault(node.oriented, [])
@@ -285,9 +313,9 @@ class _Growth:
         """Two paths that lead to one element with the same residuals as far back as any test looks."""
         last = other.begin
         first = int(np.searchsorted(self.steps.end_s, self.steps.end_s[last] - self.tests.longest_s))
-        apart = one.residual_m[first:last] - other.residual_m[first:last]
-        known = np.isfinite(one.residual_m[first:last]) == np.isfinite(other.residual_m[first:last])
-        return bool(known.all()) and bool(np.nanmax(np.abs(apart), initial=0.0) <= self.config.paths_alike_m)
+        one_m, other_m = (node.residuals_m(first, last) for node in (one, other))
+        known = np.isfinite(one_m) == np.isfinite(other_m)
+        return bool(known.all()) and bool(np.nanmax(np.abs(one_m - other_m), initial=0.0) <= self.config.paths_alike_m)
 
     def _follow(self, node: Node) -> list[Node]:
         """Along its element up to where it leaves it or is refuted for long enough; returns what it goes on as."""
@@ -310,15 +338,13 @@ class _Growth:
         node.end = node.begin + stays
         if stays:
             sense = 1.0 - 2.0 * (node.oriented % 2)
-            part = slice(node.begin, node.end)
-            node.residual_m[part] = sense * candidates.offset_m[rows]
-            node.survey_m[part] = self.survey_m[rows]
-            node.heading_rad[part] = candidates.heading_rad[rows] + np.pi * (node.oriented % 2)
-            ends_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
-            node.left_m = ends_m
+            node.residual_m = sense * candidates.offset_m[rows]
+            node.survey_m = self.survey_m[rows]
+            node.heading_rad = candidates.heading_rad[rows] + np.pi * (node.oriented % 2)
+            node.left_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
             node.barred = min(node.barred, self._unread(node))
             node.rejected = min(node.rejected, node.barred)
-            verdict = self.tests.of(self.steps, node.residual_m, node.survey_m, node.heading_rad, node.begin, node.end)
+            verdict = self.tests.of(self.steps, self._trail(node))
             node.p = min(node.p, verdict.p)
             node.rejected = min(node.rejected, verdict.rejected)
         if node.rejected < count:
@@ -329,6 +355,15 @@ class _Growth:
                 return self._onward(node)
             return []
         return self._onward(node) if node.end < count else []
+
+    def _trail(self, node: Node) -> Trail:
+        """Its path as far back as any test looks."""
+        end_s = self.steps.end_s
+        chain = node.since(int(np.searchsorted(end_s, end_s[node.begin] - self.tests.longest_s)))
+        residual_m, survey_m, heading_rad = (
+            np.concatenate([getattr(one, name) for one in chain]) for name in ("residual_m", "survey_m", "heading_rad")
+        )
+        return Trail(node.stretch, chain[0].begin, node.begin, residual_m, survey_m, heading_rad, node.before)
 
     def _unread(self, node: Node) -> int:
         """The first step of the node at which a balise was read that is on no element that joins its own."""
@@ -389,18 +424,20 @@ class _Growth:
                 node.rejected = min(node.rejected, step)
                 return []
             child = children[0]
-            sense = 1.0 - 2.0 * (node.oriented % 2)
-            child.residual_m[step] = sense * candidates.offset_m[row]
-            child.survey_m[step] = self.survey_m[row]
-            child.heading_rad[step] = child.heading_rad[step - 1]
             if not self._inside(np.array([row]))[0]:
-                child.begin = step + 1
+                sense = 1.0 - 2.0 * (node.oriented % 2)
+                node.residual_m = np.append(node.residual_m, sense * candidates.offset_m[row])
+                node.survey_m = np.append(node.survey_m, self.survey_m[row])
+                node.heading_rad = np.append(node.heading_rad, node.heading_rad[-1:] if node.heading_rad.size else 0.0)
+                node.left_m = np.vstack([node.left_m, [candidates.along_m[row], candidates.left_m[row]]])
                 node.end = step + 1
+                child = self._child(node, node.oriented, step + 1)
                 return [child] if child.begin < len(self.steps) else []
         return children
 
     def _child(self, node: Node, oriented: int, step: int) -> Node:
-        copies = (node.residual_m.copy(), node.survey_m.copy(), node.heading_rad.copy())
-        child = Node(oriented, step, *copies, parent=node, p=node.p, stretch=node.stretch)
+        own = self.tests.totals(self.steps, node.begin, node.residual_m, node.survey_m)
+        before = Totals(*(one + other for one, other in zip(node.before, own, strict=True)))
+        child = Node(oriented, step, node.stretch, node, before, node.p)
         child.rejected, child.barred = node.rejected, node.barred
         return child

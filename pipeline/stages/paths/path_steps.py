@@ -14,6 +14,8 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
 # Steps on each side with which one is compared before it counts.
 _NEIGHBOURS = 3
+# The usual time between steps is that of so many before.
+_PERIOD_STEPS = 31
 # The direction of the way is that over so many steps before.
 _HEADING_STEPS = 5
 
@@ -47,9 +49,23 @@ class PathSteps:
         return np.round(self.begin_s * NS_PER_S).astype(np.int64) + self.start_ns
 
     @cached_property
-    def period_s(self) -> float:
-        """Usual time from one to the next, a second at least [s]."""
-        return max(float(np.median(np.diff(self.end_s))), 1.0) if len(self.end_s) > 1 else 1.0
+    def measured(self) -> Bools:
+        """Steps by which an independent odometer has told of the noise along the track."""
+        return np.asarray(np.logical_or.accumulate(np.isfinite(self.along_m)))
+
+    @cached_property
+    def period_s(self) -> Floats:
+        """Usual time from one to the next, a second at least: median of the last half minute of steps [s].
+
+        Of those before alone: what feeds detection knows nothing of later ones.
+        """
+        since_s = np.diff(self.end_s)
+        period_s = np.ones(len(self.end_s))
+        for step in range(1, min(_PERIOD_STEPS, len(period_s))):
+            period_s[step] = np.median(since_s[:step])
+        if since_s.size >= _PERIOD_STEPS:
+            period_s[_PERIOD_STEPS:] = np.median(sliding_window_view(since_s, _PERIOD_STEPS), axis=1)
+        return np.maximum(period_s, 1.0)
 
 
 def path_steps(
