@@ -30,6 +30,7 @@ class Node:
     Covers the steps from `begin` on, before `end`; `rejected`: the step at which its residuals refuted it, a large
     number if none did; `residual_m`, `survey_m`, `heading_rad`, `left_m` (to both ends of the element): of its own
     steps; `before`: what its whole path comes to before `begin`; `p`: least p-value of its tests so far.
+    `also`: hypotheses that came to it later, and have been one with it since.
     """
 
     oriented: int
@@ -46,6 +47,7 @@ class Node:
     heading_rad: Floats = field(default_factory=lambda: np.zeros(0))
     left_m: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     followed: bool = False
+    also: list[Node] = field(default_factory=list)
 
     @property
     def element(self) -> int:
@@ -118,11 +120,12 @@ class PathSet:
     def to_the_end(self) -> list[Span]:
         """The hypotheses that live to the end of their stretch, or through one that does."""
         lives: dict[int, Node] = {}
-        for node in self.survivors():
-            at: Node | None = node
-            while at is not None and id(at) not in lives:
-                lives[id(at)] = at
-                at = at.parent
+        waiting = self.survivors()
+        while waiting:
+            node = waiting.pop()
+            if id(node) not in lives:
+                lives[id(node)] = node
+                waiting += [*([] if node.parent is None else [node.parent]), *node.also]
         return [Span(node, node.begin, min(node.end, node.rejected)) for node in lives.values()]
 
     def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
@@ -304,6 +307,8 @@ class _Growth:
             if covers and other.rejected >= node.rejected and self._alike(other, node):
                 # Their tests cannot differ by more than the bounds allow for (rule 8).
                 other.p = max(other.p, node.p)
+                if node.parent is not None:
+                    other.also.append(node.parent)
                 return
         same.append(node)
         self._made.append(node)
