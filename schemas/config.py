@@ -40,6 +40,8 @@ class StreamMapping(Settings):
     (floats) unless `factors.t` gives the seconds per unit, counted from `time_epoch` (of `excel`: days). CSV files may
     name two columns, `field:DATE + TIME`, or with epoch `gps` the week and its seconds; `date_order` says what
     01.02.2025 means where the whole file leaves it open, `time_zone` (IANA) of which place times without a zone are.
+    `wrap`: recorded distances begin anew after so much, before `factors`; `frame`: in which the components of recorded
+    velocities are, where the message does not say it or says another. A path may be `norm(PATH)`: length of a vector.
     """
 
     topic: str
@@ -48,6 +50,8 @@ class StreamMapping(Settings):
     constants: dict[str, str | float | bool] = {}
     fix_codes: dict[str, Fix] = {}
     origin: Origin | None = None
+    wrap: Positive | None = None
+    frame: str | None = None
     time: str = Field(default="auto", pattern=r"^(auto|log|publish|field:.+)$")
     time_scale: Literal["utc", "gps"] = "utc"
     time_epoch: Literal["unix", "gps", "excel"] = "unix"

@@ -21,6 +21,7 @@ from pipeline.project.rides import Ride, rides_of, stem_of
 from pipeline.project.run import wish_for
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected_further
+from pipeline.read.ingest.parts import LogPart, lines_of_parts
 from pipeline.read.site.read import read_site
 from pipeline.studies.plausibility.check import CONFIGURATION, FitState
 from pipeline.studies.plausibility.report import FitReport, fit_report
@@ -67,6 +68,8 @@ class Drafted:
     logs: pl.DataFrame
     proposals: list[Proposal] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    parts: tuple[LogPart, ...] = ()
+    """Of all logs: what they consist of, and what of it is used."""
 
 
 Accept = Callable[[str, Sequence[str], Sequence[StreamCorrection]], bool]
@@ -86,7 +89,8 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     if not rides and logs:
         raise InputError("no log holds positions", place=", ".join(str(log.path) for log in logs), expected="GNSS")
     remarks += [_unused(log) for log in alone]
-    drafted = Drafted(base, _table_of(rides), [], remarks)
+    parts = tuple(part for log in logs for part in log.parts)
+    drafted = Drafted(base, _table_of(rides), [], remarks + lines_of_parts(parts), parts)
     drafted.remarks += _without_odometer(rides)
     drafted.remarks += [note for ride in rides for note in _notes_of(ride)]
     site = _site(base)

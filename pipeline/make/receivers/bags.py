@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from pipeline.make.receivers.bag_budget import Unpack, budget_of_bag, unpacker_of
 from pipeline.read.ingest.correct import corrected
+from pipeline.read.ingest.describe import LogDescription, TopicSummary, description_of, topics_of
 from pipeline.read.ingest.mcap_run import read_mcaps
 from pipeline.read.ingest.run import read_run
 from pipeline.storage.budget import Budget
@@ -28,21 +29,54 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in (*_ENDINGS, ".mcap") or (path / "metadata.yaml").is_file()
 
 
-def read_bag(path: Path, config: IngestConfig) -> tuple[RunLog, dict[str, int]]:
-    """All streams of a bag, by schema name or as `[ingest]` maps its topics; what was left over."""
+class Bag(NamedTuple):
+    """All streams of a bag, what was left over, reason to number, and its topics."""
+
+    run: RunLog
+    left: dict[str, int]
+    topics: tuple[TopicSummary, ...]
+
+
+def read_bag(path: Path, config: IngestConfig) -> Bag:
+    """The streams of a bag, by schema name or as `[ingest]` maps its topics."""
     if path.suffix.lower() == ".mcap":
-        return _with_rest(read_run(path, config, with_digest=False), {})
+        return Bag(*_with_rest(read_run(path, config, with_digest=False), {}), topics_of([path], config))
     if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
-        return _read_parts(path, declared, config)
+        return Bag(*_read_parts(path, declared, config), topics_of(files_of(path, declared), config))
     with TemporaryDirectory() as folder:
         log = Path(folder) / "bag.mcap"
         left, counts = _transcribe(path, log, config)
         try:
-            return _with_rest(_held_against(read_run(log, config, with_digest=False), path, counts), left)
+            run, rest = _with_rest(_held_against(read_run(log, config, with_digest=False), path, counts), left)
+            return Bag(run, rest, topics_of([log], config))
         except BaliseError as error:
             error.place = None if error.place is None else error.place.replace(str(log), str(path))
             error.message = error.message.replace(str(log), str(path))
             raise
+
+
+def describe_bag(path: Path, config: IngestConfig) -> LogDescription:
+    """Describe a bag; one of which no run can be made is described as far as it can be read."""
+    files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
+    size = sum(file.stat().st_size for file in files)
+    try:
+        bag = read_bag(path, config)
+        return description_of(str(path), "bag", size, bag.topics, bag.run, ())
+    except BaliseError as error:
+        topics = _topics_alone(path, config)
+        return description_of(str(path), "bag", size, topics, None, (str(error),))
+
+
+def _topics_alone(path: Path, config: IngestConfig) -> tuple[TopicSummary, ...]:
+    try:
+        if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
+            return topics_of(files_of(path, declared), config)
+        with TemporaryDirectory() as folder:
+            log = Path(folder) / "bag.mcap"
+            _transcribe(path, log, config)
+            return topics_of([log], config)
+    except BaliseError:
+        return ()
 
 
 class Declared(NamedTuple):

@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from zoneinfo import available_timezones
 
 import polars as pl
 
@@ -17,6 +16,7 @@ from pipeline.read.ingest.guesses import (
     WORDS,
     columns_in,
     first,
+    known_zones,
     mapping_lines,
     one_line,
     unit_in,
@@ -25,6 +25,7 @@ from pipeline.read.ingest.guesses import (
     zone_in,
 )
 from pipeline.read.ingest.stamps import LEAST_DAY, MOST_DAY, day_is_unclear
+from pipeline.read.ingest.wraps import wrap_of
 from schemas.enums import Fix
 from schemas.run import Stream
 
@@ -79,10 +80,22 @@ def _stream(
     kind = _kinds_of_fix(table, words) if stream == "gnss" else None
     texts = {column: name for column, name in (("sensor", sensor), ("fix", kind)) if name is not None}
     lines = mapping_lines(stream, file, numbers, *time, units, texts)
+    lines += _wrap_lines(table, columns_in(stream, numbers)) if stream == "odometer" and lines and not sensor else []
     unfit = _unfit(stream, table, {name: word for name, word in words.items() if name not in numbers})
     if stream == "odometer" and lines and set(columns_in("gnss", words)) >= POSITION:
         lines = [_BESIDE_POSITIONS, *(line if line.startswith("#") else f"# {line}" for line in lines)]
     return "\n".join(["", *lines, *unfit]) + "\n" if lines or unfit else ""
+
+
+def _wrap_lines(table: pl.DataFrame, names: Words) -> list[str]:
+    """The line that counts a distance on over the end of its counter."""
+    if "distance_m" not in names:
+        return []
+    recorded = table[names["distance_m"]].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    wrap = wrap_of(recorded)
+    if wrap is None:
+        return []
+    return [wrap.line if wrap.certain else f"# {wrap.line}  # if the counter begins anew there, and was not reset"]
 
 
 def _kinds_of_fix(table: pl.DataFrame, words: Words) -> str | None:
@@ -143,11 +156,11 @@ def _time_lines(table: pl.DataFrame, words: Words, units: Words) -> tuple[list[s
 
 def _in_zone(zone: str, names: Sequence[str], table: pl.DataFrame) -> list[str]:
     """The lines on times of a zone: with it where it is known for certain, else commented out."""
-    known = zone if zone in available_timezones() else None
+    known = zone if zone in known_zones() else None
     if offset := re.fullmatch(r"UTC([+-])0?([0-9]{1,2})(?::?00)?", zone):
         # The sign of these names is turned round: Etc/GMT-2 is ahead of UTC.
         known = f"Etc/GMT{'-' if offset[1] == '+' else '+'}{int(offset[2])}"
-    if known in available_timezones() and all(table[name].dtype == pl.String for name in names):
+    if known in known_zones() and all(table[name].dtype == pl.String for name in names):
         return [_field(*names), f"time_zone = {json.dumps(known)}  # as the name says: {one_line(zone)}"]
     reason = f"# in {one_line(zone)!r}, which is not UTC as far as is known here"
     return [f"# {_field(*names)}  {reason}: add time_zone, as Europe/Berlin, or take these words away for UTC"]

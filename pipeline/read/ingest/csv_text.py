@@ -122,7 +122,7 @@ def _lines(data: bytes) -> list[str]:
 
 def _heads(comment: str, row: str) -> bool:
     """Whether a comment names the columns of a row that has no names itself."""
-    separator = max(_SEPARATORS, key=row.count)
+    separator = max(_SEPARATORS, key=comment.count)
     (names,), (cells,) = (csv.reader([line], delimiter=separator) for line in (comment or " ", row))
     written = [cell.strip() for cell in cells]
     numbers = sum(map(_has_number, written))

@@ -6,8 +6,10 @@ import json
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
+from functools import cache
 from importlib.resources import files
 from typing import Any
+from zoneinfo import available_timezones
 
 from schemas.run import Stream
 
@@ -38,13 +40,20 @@ def word_of(name: str) -> str:
     return re.sub(r"[^a-zäöüßàâçéèêëîïôûùąćęłńóśźż0-9]", "", re.sub(r"[\[(<].*", "", name).lower())
 
 
+@cache
+def known_zones() -> frozenset[str]:
+    """The names of time zones that this computer knows."""
+    return frozenset(available_timezones())
+
+
 def zone_in(name: str) -> tuple[str | None, str]:
     """The zone that the name of a time tells, None for UTC and none, and the name without it.
 
     A zone is told by its name (`Europe/Berlin`), by an offset (`UTC+2`), by letters (`CEST`) or by a word (`local`).
     """
-    if place := re.search(r"[A-Z][A-Za-z]+/[A-Z][A-Za-z_]+", name):
-        return place[0], name.replace(place[0], "")
+    places = set(re.findall(r"[A-Z][A-Za-z]+/[A-Z][A-Za-z_]+", name)) & known_zones()
+    if place := next(iter(sorted(places)), None):
+        return place, name.replace(place, "")
     if offset := re.search(r"(?:(?:utc|gmt)\s*|[\[(<]\s*)([+-]\s*[0-9]{1,2}(?::?[0-9]{2})?)", name, re.IGNORECASE):
         hours = re.sub(r"\s", "", offset[1])
         return (None if re.fullmatch(r"[+-][0:]+", hours) else f"UTC{hours}"), name.replace(offset[0], "")

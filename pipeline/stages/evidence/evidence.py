@@ -12,7 +12,7 @@ import polars as pl
 from pipeline.stages.evidence import anchors
 from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
 from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried, carried_closely
-from pipeline.stages.evidence.clock import RecorderClock, clock_of, lag_of
+from pipeline.stages.evidence.clock import RecorderClock, clock_of, lags_of
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
 from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
 from pipeline.stages.odometry import Odometry
@@ -91,8 +91,8 @@ class TrainEvidence:
     `silent`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends of
     the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
     odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
-    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that every independent
-    odometer contradicts; `unsure`: times in which nobody knows which of the two failed.
+    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer
+    or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -374,16 +374,15 @@ def evidence_of(
     facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
     turned = any(min(side.with_m, side.against_m) >= least_m for side in sides)
     searches = [GapSearch(counter, network, config, facing, turned) for counter in counters]
-    lag_of_reference = ScaleLag()
-    if main is not None:
-        lag_of_reference = anchors.reference_lag(sides, main, searches[0].only_length_m)
-    of_reference = clock_of(lag_of_reference, bool(independent), hazards)
-    # Any odometer may contradict a reference; where one is independent, the others cannot confirm it against that one.
-    held_against = anchors.Witnesses.of(counters, lag_of_reference, not turned, config)
+    lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
+    of_reference = clock_of([lag for of_one in lags for lag in of_one], bool(independent), hazards)
+    # Any odometer contradicts a reference; where one is independent, the others are not asked.
+    found = [anchors.Witness.of(counter, of_one, config) for counter, of_one in zip(counters, lags, strict=True)]
+    held_against = anchors.Witnesses(tuple(found), not turned)
     read = anchors.read_anchors(reads, balises, network.track, hazards)
-    lag_of_reads = ScaleLag() if main is None else _lag_of_reads(searches[0].carried(_points(read)))
-    of_reads = clock_of(lag_of_reads, bool(independent), hazards)
-    clocked = [] if main is None else anchors.on_clock(read, of_reads, main)
+    lags_of_reads = [lag for search in searches for lag in _lags_of_reads(search.carried(_points(read)))]
+    of_reads = clock_of(lags_of_reads, bool(independent), hazards)
+    clocked = anchors.on_clock(read, of_reads, main)
     recorded, unclosed = _known_stretches(sides, of_reference, held_against, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
     unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
@@ -401,7 +400,9 @@ def evidence_of(
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
         unsure=tuple(unsure),
-        doubted=unclosed + sum(stretch.levels.doubts for stretch in recorded),
+        doubted=unclosed
+        + sum(stretch.levels.doubts + stretch.refuted for stretch in recorded)
+        + sum(len(of_one) > 1 for of_one in lags),
     )
 
 
@@ -417,7 +418,7 @@ def _known_stretches(
     """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
     ahead_m = vehicle.gnss_antenna_ahead_m
     known = [anchors.known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
-    if not witnesses.counters:
+    if not witnesses.all:
         return known, 0
     search = searches[0]
     order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
@@ -441,11 +442,23 @@ def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
     return [(anchor, anchor) for anchor in known]
 
 
-def _lag_of_reads(source: Carried) -> ScaleLag:
-    """The clock of the reads against the odometer's, by the ways between reads, whether they close or not."""
+def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> list[ScaleLag]:
+    """Its clock against that of one odometer, in the sense in which that one counts.
+
+    One that counts up both ways is compared where the train cannot have turned.
+    """
+    sides = [anchors.sided(stretch, search.counter, least_m) for stretch in stretches]
+    begin_ns, end_ns, way_m = anchors.reference_ways(sides, search.only_length_m)
+    if not search.turned:
+        return lags_of(begin_ns, end_ns, way_m, search.counter)
+    return lags_of(begin_ns, end_ns, np.abs(way_m), search.counter.without_sign())
+
+
+def _lags_of_reads(source: Carried) -> list[ScaleLag]:
+    """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
     ways = [(gap.begin_ns, gap.end_ns, apart_m) for gap in source.gaps for apart_m in gap.only_length_m]
     begins, ends, lengths = zip(*ways, strict=True) if ways else ((), (), ())
-    return lag_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(lengths, np.float64), source.counter)
+    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(lengths, np.float64), source.counter)
 
 
 def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
@@ -457,7 +470,7 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
             begin_ns = max(other.begin_ns, witness.begin_ns)
             end_ns = min(other.end_ns, witness.end_ns)
             at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
-            ways = [np.abs(odometer.distance_between(at_ns[:-1], at_ns[1:])) for odometer in (other, witness)]
+            ways = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
             allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
             if (np.abs(ways[0] - ways[1]) > allowed_m).any():
                 return True

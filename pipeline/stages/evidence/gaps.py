@@ -108,8 +108,7 @@ class GapSearch:
         borders = sorted(borders, key=lambda border: border[0].t_ns)
         gaps = self.gaps_of(borders)
         if self.turned or not self._sheets(gaps):
-            stands = Counter.of(self.counter.odometer, self.counter.silent_m, without_sign=True)
-            signless = replace(self, counter=stands)
+            signless = replace(self, counter=self.counter.without_sign())
             return Carried(signless.counter, tuple(signless.gaps_of(borders)))
         return Carried(self.counter, tuple(gaps))
 

@@ -22,17 +22,17 @@ from schemas.config import HazardConfig
     ],
 )
 def test_the_hull_of_no_lag_and_the_measured_one(lag_s: float, sigma_s: float, clock: RecorderClock) -> None:
-    found = clock_of(ScaleLag(1.0, 0.01, lag_s, sigma_s, LagState.MEASURED), True, HazardConfig())
+    found = clock_of([ScaleLag(1.0, 0.01, lag_s, sigma_s, LagState.MEASURED)], True, HazardConfig())
     assert (found.shift_s, found.delta_s) == pytest.approx((clock.shift_s, clock.delta_s))
     assert found.assumed == clock.assumed
 
 
 def test_what_is_not_measured_is_assumed() -> None:
-    assert clock_of(ScaleLag(), True, HazardConfig()) == RecorderClock(0.0, 0.1, assumed=True)
+    assert clock_of([ScaleLag()], True, HazardConfig()) == RecorderClock(0.0, 0.1, assumed=True)
 
 
 @pytest.mark.parametrize(("lag_s", "lags_s"), [(0.0, (-0.1, 0.1)), (0.4, (-0.1, 0.43)), (-0.05, (-0.1, 0.1))])
 def test_by_an_odometer_that_is_not_independent_it_only_widens(lag_s: float, lags_s: tuple[float, float]) -> None:
-    found = clock_of(ScaleLag(1.0, 0.01, lag_s, 0.01, LagState.MEASURED), False, HazardConfig())
+    found = clock_of([ScaleLag(1.0, 0.01, lag_s, 0.01, LagState.MEASURED)], False, HazardConfig())
     assert found.lags_s == pytest.approx(lags_s)
     assert found.assumed

@@ -1,17 +1,16 @@
 """Scale and latency against known truth, with honest uncertainty; pooling worked by hand."""
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
 
 from pipeline.stages.monitors.axis import error_model
-from pipeline.stages.odometry.odometry import Noise, Odometry
-from pipeline.stages.odometry.quantisation import count_step_m, quantisation_noise
+from pipeline.stages.odometry.odometry import Odometry
 from pipeline.studies.calibration.vehicle import RunEstimate, estimate_run, pooled
 from schemas.arrays import Floats
-from schemas.config import AlignConfig, Configuration, MonitorConfig
+from schemas.config import MonitorConfig
+from tests.stages.alignment.straight import odometer_of, odometry_from
 
 SHARES, TAUS_S = error_model(MonitorConfig())
 SCALE, LATENCY_S, SIGMA_M = 1.004, 0.12, 1.2
@@ -36,12 +35,7 @@ def simulated_run(seed: int, duration_s: int = 1000, moving: bool = True) -> tup
             unit[k] = phi * unit[k - 1] + np.sqrt(1 - phi**2) * noise[k]
         error += np.sqrt(share) * SIGMA_M * unit
     position = np.interp(at - LATENCY_S, t, true) + error + 500.0
-    none = np.zeros(t.size, dtype=bool)
-    segment = np.zeros(t.size, dtype=np.int64)
-    track = Odometry(
-        0, t, true / SCALE + walk, segment, none[1:], none, segment, 0.0 * t, Noise(0.05**2), 0.3, AlignConfig()
-    )
-    return at, position, track
+    return at, position, odometry_from(odometer_of(t, distance_m=true / SCALE + walk))
 
 
 def test_truth_lies_within_the_stated_uncertainty() -> None:
@@ -72,8 +66,7 @@ def test_constant_speed_tells_no_latency() -> None:
 
 def test_lost_distance_joins_no_way() -> None:
     t_s, path_m, track = simulated_run(5)
-    jump = (track.t_s >= 700.0).astype(np.int64)
-    broken = replace(track, distance_m=track.distance_m + 300.0 * jump, segment=jump)
+    broken = odometry_from(odometer_of(track.t_s, distance_m=track.distance_m + 300.0 * (track.t_s >= 700.0)))
     whole, parts = (estimate_run(t_s, path_m, one) for one in (track, broken))
     assert whole is not None
     assert parts is not None
@@ -103,12 +96,7 @@ def with_rows(track: Odometry, kind: str, size_m: float, seed: int) -> Odometry:
     """The track by counts of this size, or with noise of it in every row."""
     noise = np.random.default_rng(seed).normal(0.0, size_m, track.t_s.size)
     rows = np.floor(track.distance_m / size_m) * size_m if kind == "counts" else track.distance_m + noise
-    whole = np.ones(rows.size - 1, dtype=bool)
-    align, deadband_mps = Configuration().align, Configuration().matching.deadband_mps
-    white_m2_per_s = track.noise.white_m2_per_s
-    counter_m = count_step_m(rows, whole, align)
-    found = quantisation_noise(track.t_s, rows, whole, white_m2_per_s, counter_m, deadband_mps, align)
-    return replace(track, distance_m=rows, period_s=0.1, noise=Noise(white_m2_per_s, found, counter_m))
+    return odometry_from(odometer_of(track.t_s, distance_m=rows))
 
 
 ROWS = [("counts", 5.0), ("noise", 0.5)]
