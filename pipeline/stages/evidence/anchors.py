@@ -12,7 +12,9 @@ import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
-from pipeline.stages.evidence.clock import RecorderClock, RecorderLag
+from pipeline.stages.evidence.clock import RecorderClock
+from pipeline.stages.odometry.polarity import sense_of_ways, shared_ways_m
+from pipeline.stages.odometry.scale_lag import ScaleLag, spans_of_rows
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
 from pipeline.stages.track.survey import SurveyedTrack
@@ -20,13 +22,13 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import BaliseKind, Evidence
 
-# Numerics: a lag shows where the speed changes, so ways over this time are compared [s].
-_LAG_WINDOW_S = 10.0
 # DOMAIN section 5.1: the reference is held against the odometer over so long; a spike is no longer [s].
 _WINDOW_S = 10.0
 _LONG_WINDOW_S = 100.0
 # Least number of samples for a median.
 _FEWEST_IN_WINDOW = 5
+# Numerics: so many sigmas show a direction.
+_DIRECTION_SIGMAS = 4.0
 # Numerics: the speed is compared with its median over this time before and after [s].
 _EVEN_S = 2.0
 
@@ -158,29 +160,51 @@ class Sided:
 
 
 def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) -> Sided:
-    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
-    begin, end, step_m = _steps_of(stretch, 1.0)
+    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2).
+
+    Movements of the reference beyond its noise tell, where the odometer counted about as much: a reference that stands
+    or creeps while the odometer counts has no direction to give.
+    """
+    begin, end, step_m = _movements(stretch)
+    counted_m = np.abs(step_m)
     if counter is not None:
-        counted_m = np.nan_to_num(counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end]))
-        # The noise of a reference that stands still has no direction to give to a way that the odometer counts.
-        step_m = np.sign(step_m * counted_m) * np.minimum(np.abs(step_m), np.abs(counted_m))
-    moved_m = np.cumsum(step_m)
-    first = np.flatnonzero(np.abs(moved_m) >= least_m)
-    total_m = float(moved_m[first[0]]) if first.size else float(step_m.sum())
-    sense = -1 if total_m < 0.0 else 1
-    with_m, against_m = (float((sign * sense * step_m).clip(min=0.0).sum()) for sign in (1, -1))
+        counted_m = counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end])
+        counted_m = np.where(np.abs(step_m) > 0.5 * np.abs(counted_m), counted_m, 0.0)
+    sense = sense_of_ways(counted_m, step_m, least_m)
+    shared_m = sense * shared_ways_m(counted_m, step_m)
+    with_m, against_m = (float((sign * shared_m).clip(min=0.0).sum()) for sign in (1, -1))
     return Sided(stretch, sense, with_m, against_m)
 
 
-def _steps_of(stretch: ReferenceStretch, step_s: float) -> tuple[Ints, Ints, Floats]:
-    """Pairs of samples so far apart in time on one leg of the first path, and the way between them [m]."""
-    path = stretch.paths[0]
+def _movements(stretch: ReferenceStretch) -> tuple[Ints, Ints, Floats]:
+    """Pairs of samples, a second or more apart, between which the reference moved beyond its noise, and how far [m]."""
     t_ns = stretch.t_ns
-    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, round(step_s * NS_PER_S), dtype=np.int64)
-    rows = np.unique(np.searchsorted(t_ns, instants))
-    whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
-    begin = rows[:-1][whole]
-    end = rows[1:][whole]
+    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, NS_PER_S, dtype=np.int64)
+    rows = np.unique(np.searchsorted(t_ns, instants)).tolist()
+    at_m = stretch.paths[0].at_m.tolist()
+    leg = stretch.paths[0].leg.tolist()
+    noise_m = (_DIRECTION_SIGMAS * np.sqrt(2.0) * stretch.sigma_m).tolist()
+    begin: list[int] = []
+    end: list[int] = []
+    since = rows[0]
+    for row in rows[1:]:
+        if leg[row] != leg[since]:
+            since = row
+        elif abs(at_m[row] - at_m[since]) > max(noise_m[row], noise_m[since]):
+            begin.append(since)
+            end.append(row)
+            since = row
+    ends = np.array(end, dtype=np.int64)
+    begins = np.array(begin, dtype=np.int64)
+    return begins, ends, stretch.paths[0].at_m[ends] - stretch.paths[0].at_m[begins]
+
+
+def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, Ints, Floats]:
+    """Those of these pairs of samples that lie on one leg of the first path, and the way between them [m]."""
+    path = stretch.paths[0]
+    whole = path.leg[begin] == path.leg[end]
+    begin = begin[whole]
+    end = end[whole]
     return begin, end, path.at_m[end] - path.at_m[begin]
 
 
@@ -194,8 +218,9 @@ def reference_ways(
     nothing = np.zeros(0, dtype=np.int64)
     ways: list[tuple[Ints, Ints, Floats]] = [(nothing, nothing, np.zeros(0))]
     for side in sides:
-        begin, end, way_m = _steps_of(side.stretch, _LAG_WINDOW_S)
-        ways.append((side.stretch.t_ns[begin], side.stretch.t_ns[end], side.sense * way_m))
+        t_ns = side.stretch.t_ns
+        begin, end, way_m = _ways_of(side.stretch, *spans_of_rows((t_ns - t_ns[0]) / NS_PER_S))
+        ways.append((t_ns[begin], t_ns[end], side.sense * way_m))
     for before, after in pairwise(sorted(sides, key=lambda side: int(side.stretch.t_ns[0]))):
         begin_at, end_at = before.anchor(-1), after.anchor(0)
         across_m = np.array(lengths_m(begin_at, end_at), dtype=np.float64)
@@ -231,8 +256,10 @@ def known_stretch(
         speed_mps = np.maximum(speed_mps, path_mps)
         known = KnownPath(path, side.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
         clock_m = path_mps * clock.delta_s
-        reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor)
-        possible_ns |= set(_confirming_ns(known, stretch, clock_m, reads, config.align.sure_sigmas))
+        # A clock that leaves more than half the failure limit open lets a read confirm nothing.
+        most_m = 0.5 * config.hazards.failure_limit_m
+        reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor, most_m)
+        possible_ns |= set(_confirming_ns(known, stretch, clock_m, reads, config.align.sure_sigmas, np.inf))
         steps = contradictions(known, side.stretch, witnesses, config)
         of_path = Levels.of(steps, t_ns, reads_ns)
         levels.append(of_path.seen(side.sense))
@@ -244,7 +271,7 @@ def known_stretch(
         paths = [replace(known, low_m=known.low_m - open_m, high_m=known.high_m + open_m) for known in paths]
     if t_ns.size == 1 and witnesses.all:
         # One sample shows no speed.
-        speed_mps = np.abs(witnesses.all[0].counter.best_speed_mps(t_ns))
+        speed_mps = np.abs(witnesses.all[0].counter.odometer.speed_about(t_ns))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
     lates_s = np.linspace(-clock.delta_s, clock.delta_s, 3 + 2 * int(clock.delta_s / _EVEN_S))
     around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in lates_s.tolist()]
@@ -287,9 +314,17 @@ def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
 
 
 def _confirming_ns(
-    known: KnownPath, stretch: ReferenceStretch, clock_m: Floats, reads: Sequence[TrueAnchor], factor: float
+    known: KnownPath,
+    stretch: ReferenceStretch,
+    clock_m: Floats,
+    reads: Sequence[TrueAnchor],
+    factor: float,
+    most_m: float,
 ) -> list[int]:
-    """Times of reads at balises where the reference was too, within `factor` sigmas of both and both clocks."""
+    """Times of reads at balises where the reference was too, within `factor` sigmas of both and both clocks.
+
+    Not where these are more than `most_m`.
+    """
     t_ns = stretch.t_ns
     since_ns = (t_ns - t_ns[0]).astype(np.float64)
     confirming: set[int] = set()
@@ -303,7 +338,7 @@ def _confirming_ns(
         half_m += float(clock_m[sample]) + read.clock_m
         for place in read.places:
             there_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
-            if abs(float(there_m[0] - at_m[0])) <= half_m:
+            if abs(float(there_m[0] - at_m[0])) <= half_m <= most_m:
                 confirming.add(read.t_ns)
     return sorted(confirming)
 
@@ -336,17 +371,17 @@ class Witness:
     scale_sigma: float = 0.0
 
     @classmethod
-    def of(cls, counter: Counter, lags: Sequence[RecorderLag], config: Configuration) -> Self:
+    def of(cls, counter: Counter, lags: Sequence[ScaleLag], config: Configuration) -> Self:
         """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1)."""
         factor = config.hazards.evidence_factor
         share = config.lds.odometer_share
-        known = [lag for lag in lags if np.isfinite(lag.sigma_s)]
-        low_s = min((lag.lag_s - factor * lag.sigma_s for lag in known), default=-config.hazards.evidence_clock_s)
-        high_s = max((lag.lag_s + factor * lag.sigma_s for lag in known), default=config.hazards.evidence_clock_s)
+        known = [lag for lag in lags if np.isfinite(lag.lag_sigma_s)]
+        low_s = min((lag.lag_s - factor * lag.lag_sigma_s for lag in known), default=-config.hazards.evidence_clock_s)
+        high_s = max((lag.lag_s + factor * lag.lag_sigma_s for lag in known), default=config.hazards.evidence_clock_s)
         middle_s, half_s = 0.5 * (low_s + high_s), 0.5 * (high_s - low_s)
         if counter.by_file:
             return cls(counter, middle_s, half_s)  # the variance of a way holds that of the file's scale
-        best = min(known, key=lambda lag: lag.scale_sigma, default=RecorderLag())
+        best = min(lags, key=lambda lag: lag.scale_sigma, default=ScaleLag())
         if factor * best.scale_sigma < share:
             return cls(counter, middle_s, half_s, best.scale, best.scale_sigma)
         # At k_T sigmas the 5 % of an odometer of which nothing is known.
@@ -612,8 +647,8 @@ def _contradicted(
         t_ns = stretch.t_ns - round(witness.lag_s * NS_PER_S)
         way = witness.counter.between(t_ns[begin], t_ns[end])
         # Others may count the other way round.
-        agreed_m = np.nansum(way_m * way.distance_m)
-        sense = known.sense if number == 0 or agreed_m == 0.0 else np.sign(agreed_m)
+        least_m = config.matching.orientation_distance_m
+        sense = sense_of_ways(way.distance_m, way_m, least_m) if number else known.sense
         counted_m = sense * witness.scale * way.distance_m
         if not witnesses.signed:
             counted_m = np.where(way_m * counted_m < 0.0, -counted_m, counted_m)
@@ -681,7 +716,7 @@ def read_anchors(
 def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Counter | None) -> list[TrueAnchor]:
     """The reads on the odometer's clock, with what that clock may add at their speed; nothing without an odometer."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
-    speed_mps = np.zeros(t_ns.size) if counter is None else np.abs(counter.best_speed_mps(t_ns))
+    speed_mps = np.zeros(t_ns.size) if counter is None else np.abs(counter.odometer.speed_about(t_ns))
     clock_m = clock.delta_s * speed_mps
     shift_ns = round(clock.shift_s * NS_PER_S)
     rows = zip(anchors, clock_m.tolist(), strict=True)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.odometry import OdometerWay
+from pipeline.stages.odometry.scale_lag import CountedRows
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
 from schemas.config import Configuration
@@ -77,12 +79,16 @@ class Counter:
 
     def distance_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """Distance where nothing of it is in doubt: NaN over slip, pauses and resets too."""
-        sure = self._same(begin_ns, end_ns) & (self.bound_m(begin_ns, end_ns) == 0.0)
-        return np.where(sure, self.odometer.distance_between(begin_ns, end_ns), np.nan)
+        return np.where(self._same(begin_ns, end_ns), self.odometer.proved_between(begin_ns, end_ns), np.nan)
 
-    def bound_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """By how much the distance between instants may be off [m]."""
-        return self.odometer.bound_between_m(begin_ns, end_ns)
+    @cached_property
+    def rows(self) -> CountedRows:
+        """Its rows; a step of which anything is in doubt tells no way."""
+        odometer = self.odometer
+        t_ns = odometer.epoch_ns + np.round(odometer.t_s * NS_PER_S).astype(np.int64)
+        doubtful = np.concatenate([[0.0], np.cumsum(np.isnan(self.distance_m(t_ns[:-1], t_ns[1:])))])
+        noise_m = float(np.sqrt(odometer.noise.quantisation.still_m2))
+        return CountedRows(odometer.t_s, (odometer.scale or 1.0) * odometer.distance_m, doubtful, noise_m)
 
     def within(self, t_ns: Ints, beyond_s: float) -> tuple[Ints, Floats]:
         """The instants, those less than `beyond_s` off its recording put at its ends, and how far the train drives."""
@@ -92,7 +98,9 @@ class Counter:
         near = (off_s > 0.0) & (off_s <= beyond_s)
         if not near.any():
             return t_ns, np.zeros(t_ns.size)
-        beyond_m = np.abs(self.best_speed_mps(held_ns)) * off_s + 0.5 * self.odometer.config.braking_mps2 * off_s**2
+        beyond_m = (
+            np.abs(self.odometer.speed_about(held_ns)) * off_s + 0.5 * self.odometer.config.braking_mps2 * off_s**2
+        )
         return np.where(near, held_ns, t_ns), np.where(near, beyond_m, 0.0)
 
     def _same(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
@@ -103,21 +111,6 @@ class Counter:
         """Way driven, turns included [m]."""
         travelled_at = self.odometer.travelled_at
         return np.asarray(np.abs(travelled_at(t_ns) - travelled_at(np.atleast_1d(since_ns))))
-
-    def speed_mps(self, t_ns: Ints) -> Floats:
-        """Speed over a second about each instant [m/s]; NaN where it did not count throughout."""
-        half_ns = round(0.5 * self.odometer.config.speed_window_s * NS_PER_S)
-        return np.asarray(self.distance_m(t_ns - half_ns, t_ns + half_ns) / (2 * half_ns / NS_PER_S))
-
-    def best_speed_mps(self, t_ns: Ints) -> Floats:
-        """Speed over as much of that second as was recorded [m/s]; a best guess over a break."""
-        odometer = self.odometer
-        half_s = 0.5 * odometer.config.speed_window_s
-        begin_s, end_s = (
-            np.clip(odometer.seconds(t_ns) + off_s, odometer.t_s[0], odometer.t_s[-1]) for off_s in (-half_s, half_s)
-        )
-        moved_m = odometer.distance_at_s(end_s) - odometer.distance_at_s(begin_s)
-        return np.asarray((odometer.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9))
 
 
 def _stands_ns(odometer: Odometry) -> Ints:

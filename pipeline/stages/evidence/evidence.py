@@ -12,10 +12,11 @@ import polars as pl
 from pipeline.stages.evidence import anchors
 from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
 from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried, carried_closely
-from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, clock_of, lags_of
+from pipeline.stages.evidence.clock import RecorderClock, clock_of, lags_of
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
 from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
 from pipeline.stages.odometry import Odometry
+from pipeline.stages.odometry.scale_lag import ScaleLag
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
@@ -90,8 +91,8 @@ class TrainEvidence:
     `silent`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends of
     the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
     odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
-    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that every independent
-    odometer contradicts; `unsure`: times in which nobody knows which of the two failed.
+    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer
+    or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -399,7 +400,9 @@ def evidence_of(
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
         unsure=tuple(unsure),
-        doubted=unclosed + sum(stretch.levels.doubts + stretch.refuted for stretch in recorded),
+        doubted=unclosed
+        + sum(stretch.levels.doubts + stretch.refuted for stretch in recorded)
+        + sum(len(of_one) > 1 for of_one in lags),
     )
 
 
@@ -439,7 +442,7 @@ def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
     return [(anchor, anchor) for anchor in known]
 
 
-def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> list[RecorderLag]:
+def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> list[ScaleLag]:
     """Its clock against that of one odometer, in the sense in which that one counts.
 
     One that counts up both ways is compared where the train cannot have turned.
@@ -451,7 +454,7 @@ def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch,
     return lags_of(begin_ns, end_ns, np.abs(way_m), search.counter.without_sign())
 
 
-def _lags_of_reads(source: Carried) -> list[RecorderLag]:
+def _lags_of_reads(source: Carried) -> list[ScaleLag]:
     """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
     ways = [(gap.begin_ns, gap.end_ns, apart_m) for gap in source.gaps for apart_m in gap.only_length_m]
     begins, ends, lengths = zip(*ways, strict=True) if ways else ((), (), ())
@@ -467,7 +470,7 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
             begin_ns = max(other.begin_ns, witness.begin_ns)
             end_ns = min(other.end_ns, witness.end_ns)
             at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
-            ways = [np.abs(odometer.distance_between(at_ns[:-1], at_ns[1:])) for odometer in (other, witness)]
+            ways = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
             allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
             if (np.abs(ways[0] - ways[1]) > allowed_m).any():
                 return True

@@ -96,9 +96,9 @@ class LinkDistance:
         self._done = epoch
 
     def can_measure(self, epoch: int) -> bool:
-        """The odometer's distance is known from the anchor on."""
-        segment = self._journey.segment
-        return self._anchor is not None and bool(segment[self._anchor.epoch] == segment[epoch])
+        """Nothing of the odometer's distance since the anchor is in doubt."""
+        doubt_m = self._journey.doubt_m
+        return self._anchor is not None and bool(doubt_m[self._anchor.epoch] == doubt_m[epoch])
 
     def fails(self, epoch: int) -> bool:
         if self._anchor is None:
@@ -124,7 +124,7 @@ class LinkDistance:
         way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
         noise_m = self._factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
         threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
-        lost = self._possible[ahead] & (self._journey.segment[ahead] != self._journey.segment[anchor.epoch])
+        lost = self._possible[ahead] & (self._journey.doubt_m[ahead] != self._journey.doubt_m[anchor.epoch])
         known = self._possible[ahead] & ~lost
         moved_m, bound_m = self._since_return[:, ahead]
         held = known & np.isfinite(moved_m)

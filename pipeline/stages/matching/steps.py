@@ -37,22 +37,22 @@ class Steps:
 
 @dataclass(frozen=True)
 class Travelled:
-    """Odometer distance at each epoch [m], NaN where it is not known; comparable within one `segment` only."""
+    """Odometer distance at each epoch [m], NaN where it is not known; comparable where nothing is in doubt between."""
 
     distance_m: Floats
-    segment: Ints
+    doubt_m: Floats
 
     def between(self, earlier: Ints, later: Ints) -> Floats:
         """Signed distance from some epochs to others, NaN where the odometer does not know it."""
-        same = self.segment[earlier] == self.segment[later]
+        same = self.doubt_m[earlier] == self.doubt_m[later]
         return np.where(same, self.distance_m[later] - self.distance_m[earlier], np.nan)
 
 
 def travelled(fixes: Fixes, odometry: Odometry | None) -> Travelled:
     """The odometer at the epochs' times."""
     if odometry is None:
-        return Travelled(np.full(len(fixes), np.nan), np.zeros(len(fixes), dtype=np.int64))
-    return Travelled(odometry.distance_at(fixes.t_ns), odometry.segment_at(fixes.t_ns))
+        return Travelled(np.full(len(fixes), np.nan), np.zeros(len(fixes)))
+    return Travelled(odometry.distance_at(fixes.t_ns), odometry.doubt_at_s(odometry.seconds(fixes.t_ns)))
 
 
 def spaced(fixes: Fixes, rows: Ints, config: MatchingConfig) -> Ints:

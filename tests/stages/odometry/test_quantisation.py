@@ -7,8 +7,9 @@ import polars as pl
 import pytest
 
 from pipeline.stages.monitors.axis import AlongEpochs, along_series, most_scatter_m, run_axis
+from pipeline.stages.odometry.counts import count_step
 from pipeline.stages.odometry.odometry import Increments
-from pipeline.stages.odometry.quantisation import QuantisationNoise, count_step_m
+from pipeline.stages.odometry.quantisation import QuantisationNoise
 from schemas.config import Configuration, threshold_factor
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 from tests.stages.alignment.straight import align_run, epochs_of, odometer_of, odometry_from
@@ -53,16 +54,29 @@ def test_counts_scatter_by_their_step_over_root_twelve(step_m, rate_hz):
 
 def test_a_counter_is_known_by_its_step():
     ways = np.concatenate([[0.0], np.cumsum(0.5 * np.tile([3, 1, 0, 3, 2, 5], 4))])
-    whole = np.ones(ways.size - 1, dtype=bool)
-    assert count_step_m(ways, whole, CONFIG.align) == 0.5
-    assert count_step_m(ways - 1000.0 * (ways > 10.0) + 1e-7 * np.sin(ways), whole, CONFIG.align) == pytest.approx(
-        0.5, rel=1e-5
-    )
-    assert count_step_m(ways / 50.0, whole, CONFIG.align) == 0.0
-    assert count_step_m(ways + 0.1 * np.sin(ways), whole, CONFIG.align) == 0.0
-    lost = ways + 0.2 * (np.arange(ways.size) > 7)
-    assert count_step_m(lost, whole, CONFIG.align) == 0.0
-    assert count_step_m(lost, whole & (np.arange(whole.size) != 7), CONFIG.align) == 0.5
+
+    def count_m(rows_m):
+        return count_step(rows_m, CONFIG.align).step_m[-1]
+
+    assert count_m(ways) == 0.5
+    assert count_m(ways - 1000.0 * (ways > 10.0) + 1e-7 * np.sin(ways)) == pytest.approx(0.5, rel=1e-5)
+    assert count_m(ways / 50.0) == 0.0
+    assert count_m(ways + 0.1 * np.sin(ways)) == 0.0
+    assert count_m(ways + 0.2 * (np.arange(ways.size) > 7)) == 0.0
+    # A leap that no train drives is no way.
+    assert count_m(ways + 300.2 * (np.arange(ways.size) > 7)) == 0.5
+
+
+def test_the_step_of_a_counter_is_known_once_enough_ways_have_shown_it():
+    """Ways of 1.5, 0.5, 0, 1.5, 1, 2.5 m by turns: each differs from the one before, so the ninth is enough."""
+    ways = np.concatenate([[0.0], np.cumsum(0.5 * np.tile([3, 1, 0, 3, 2, 5], 4))])
+    known = count_step(ways, CONFIG.align)
+    assert known.shown.tolist() == [True] * 2 + [False] * 7 + [True] * 16
+    assert known.step_m.tolist() == [0.0] * 9 + [0.5] * 16
+    rows = np.insert(ways, 12, np.nan)
+    assert count_step(rows, CONFIG.align).step_m.tolist() == [0.0] * 9 + [0.5] * 17
+    # From a way that is no multiple of it on there is none.
+    assert count_step(np.append(ways, ways[-1] + 0.7), CONFIG.align).step_m.tolist() == [0.0] * 9 + [0.5] * 16 + [0.0]
 
 
 def test_a_smooth_way_at_few_speeds_is_no_counter():
