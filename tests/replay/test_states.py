@@ -1,4 +1,4 @@
-"""States of the LDS through the whole replay, the first that applies: P1 wrong in use, P2 negated, P3 not diagnosed, P0."""
+"""States of the LDS through the whole replay, the first that applies: P1 wrong in use, P2 negated, P3 faulty, P0."""
 
 from __future__ import annotations
 
