@@ -180,17 +180,36 @@ def test_a_coarse_counter_raises_no_alarm_and_hides_no_leap(step_m):
     hides_no_fault(coarse)
 
 
-@pytest.mark.parametrize("rate_mps", [None, 0.5])
-def test_by_a_counter_too_coarse_for_the_failure_limit_nothing_is_accepted_and_nothing_fails(rate_mps):
-    """Counts of 20 m, a healthy run and a drift: no monitor can tell one from the other."""
-    ramp = None if rate_mps is None else {"kind": "ramp", "rate_mps": rate_mps, "start_s": 90.0, "duration_s": 160.0}
-    run, site = journey() if ramp is None else journey(ramp)
+def by_counts_of_20_m(*faults, **settings):
+    run, site = journey(*faults, **settings)
     counts = (run.odometer["distance_m"] / 20.0).floor() * 20.0
-    tables = replay(run.with_streams(odometer=run.odometer.with_columns(counts.alias("distance_m"))), site, VEHICLE)
-    states = [name for name in tables.epochs.columns if name.startswith("along_") and name.endswith("_state")]
-    assert len(states) == 5
-    assert tables.epochs.filter(pl.any_horizontal(pl.col(name) == "fail" for name in states)).is_empty()
+    return replay(run.with_streams(odometer=run.odometer.with_columns(counts.alias("distance_m"))), site, VEHICLE)
+
+
+def reasons_of(tables):
+    """Of the epochs from the first count on, none of which passes."""
+    epochs = tables.epochs.filter(pl.col("odometer_m") > 0.0)
+    names = [name for name in epochs.columns if name.startswith("along_") and name.endswith("_state")]
+    assert len(names) == 5
+    assert "pass" not in {state for name in names for state in epochs[name].cast(pl.String)}
+    return set(epochs["along_raw_reason"].cast(pl.String))
+
+
+@pytest.mark.parametrize("sigma_m", [0.3, 1.5])
+def test_by_a_counter_too_coarse_for_the_failure_limit_a_healthy_run_has_no_alarm_and_nothing_accepted(sigma_m):
+    tables = by_counts_of_20_m(gnss={"sigma_east_m": sigma_m, "sigma_north_m": sigma_m})
+    assert "noise too large" in reasons_of(tables)
+    assert tables.alarms.height == 0
     assert tables.runs["balises_accepted"].item() == 0
+
+
+def test_by_a_counter_too_coarse_for_the_failure_limit_no_drift_is_hidden():
+    """A ramp of 80 m, which no monitor can tell from counts: no balise is accepted, and nothing calls it safe."""
+    tables = by_counts_of_20_m({"kind": "ramp", "rate_mps": 0.5, "start_s": 90.0, "duration_s": 160.0})
+    assert "noise too large" in reasons_of(tables)
+    assert tables.epochs["error_along_m"].max() > 60.0
+    assert tables.runs["balises_accepted"].item() == 0
+    assert tables.runs["verdict"].item() != "safe"
 
 
 def test_no_more_noise_enters_than_leaves_the_failure_limit_seen():
