@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date, datetime, timedelta
@@ -135,11 +136,14 @@ def _seen(
 
 def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> SeenLog:
     """A table by the mapping that its header suggests."""
-    drafted = toml_of(draft_mapping(path).encode(), f"mapping of {path}").get("ingest")
+    text = draft_mapping(path)
+    drafted = toml_of(text.encode(), f"mapping of {path}").get("ingest")
     mapping: dict[str, Any] = drafted if isinstance(drafted, dict) else {}
     mapping = {stream: entries if isinstance(entries, list) else [entries] for stream, entries in mapping.items()}
     if not mapping or any("time" not in entry for entries in mapping.values() for entry in entries):
-        raise _undecided(path, "the names of its columns do not tell " + ("its time" if mapping else "what they are"))
+        left_open = re.search(r"(?m)^# (time = .*?)  # (in .*)$", text)
+        told = "the names of its columns do not tell " + ("its time" if mapping else "what they are")
+        raise _undecided(path, f"{left_open[1]} is {left_open[2]}" if left_open else told)
     for entries in mapping.values():
         for entry in entries:
             entry["topic"] = path.name

@@ -161,7 +161,7 @@ def inspect_site(
 
     config = config or Configuration()
     site = read_site(path, config.site)
-    alike = (*window_findings(site, config.lds, config.site), *parallel_findings(site, config.matching))
+    alike = (*window_findings(site, config.lds, config.site), *parallel_findings(site, config))
     findings = (*site.findings, *without_balises(site.balises), *alike)
     tables = {
         "Site": _figures(describe_site(site)),
@@ -171,7 +171,7 @@ def inspect_site(
     if result is None:
         return tables
     epochs = (store.read_table(result, "epochs", run).collect() for run in store.complete_runs(result))
-    return {**tables, "Survey": survey_findings(epochs, site.track, config.matching)}
+    return {**tables, "Survey": survey_findings(epochs, site.track, config)}
 
 
 def inspect_result(path: Address) -> dict[str, pl.DataFrame]:

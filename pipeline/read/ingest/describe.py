@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.read.ingest.fields import fields_of
-from pipeline.read.ingest.guesses import COLUMNS, ORIGIN, columns_in, mapping_lines, word_of
+from pipeline.read.ingest.guesses import COLUMNS, ORIGIN, WORDS, columns_in, first, mapping_lines, word_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
@@ -249,11 +249,16 @@ def _suggestion(topic: TopicSummary) -> str:
         return "\n".join([f"# {remark}", *(f"# {line}" for line in written), ORIGIN]) + "\n"
     numbers = [path for path, kind in topic.fields.items() if kind in ("int", "float")]
     words = {path: word_of(path.split(".")[-1]) for path in sorted(numbers, key=lambda path: (path.count("."), path))}
+    time = ['time = "auto"  # or "log", "publish", "field:PATH"']
     for stream in COLUMNS:
-        time = ['time = "auto"  # or "log", "publish", "field:PATH"']
         if lines := mapping_lines(stream, topic.topic, words, time, None, {}):
             used = set(columns_in(stream, words).values())
             return "\n".join([*lines, f"# other fields: {_others(topic.fields, used)}\n"])
+    named = {path: word_of(path.split(".")[-1]) for path, kind in topic.fields.items() if kind in ("int", "text")}
+    if balise := first(named, WORDS["balise"]):
+        head = ["[[ingest.balise_reads]]", f"topic = {json.dumps(topic.topic, ensure_ascii=False)}", *time]
+        fields = f"fields = {{ balise_id = {json.dumps(balise, ensure_ascii=False)} }}"
+        return "\n".join([*head, fields, f"# other fields: {_others(topic.fields, {balise})}\n"])
     return (
         f'# [[ingest.STREAM]]\n# topic = "{topic.topic}"  # {topic.schema or "no schema"}\n'
         f"# fields: {_others(topic.fields, set())}\n"

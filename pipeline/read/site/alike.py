@@ -17,11 +17,12 @@ from pipeline.stages.track.path import valid_along_measure
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import SurveyedTrack, places_along
 from schemas.arrays import Floats
-from schemas.config import LdsConfig, MatchingConfig, SiteConfig
+from schemas.config import Configuration, LdsConfig, MatchingConfig, SiteConfig
 from schemas.enums import BaliseKind
 from schemas.run import Finding, Site
 
 _DEFAULTS = SiteConfig()
+_WHOLE = Configuration()
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class _ParallelStretch:
     apart_m: float
 
 
-def parallel_findings(site: Site, config: MatchingConfig) -> list[Finding]:
+def parallel_findings(site: Site, config: Configuration = _WHOLE) -> list[Finding]:
     """One warning per pair of elements and stretch; nothing where a route is given.
 
     The bias of the run and the survey alone decide here, as for a receiver without any noise: offsets tell tracks apart
@@ -135,9 +136,9 @@ def parallel_findings(site: Site, config: MatchingConfig) -> list[Finding]:
         return []
     network = network_of(surveyed(site), site.links)
     return [
-        _finding(site, network, stretch, config)
-        for stretch in _stretches(network, config)
-        if stretch.end_m - stretch.begin_m >= config.parallel_least_m
+        _finding(site, network, stretch, config.matching)
+        for stretch in _stretches(network, config.matching)
+        if stretch.end_m - stretch.begin_m >= config.site.parallel_least_m
     ]
 
 

@@ -27,6 +27,8 @@ _WINDOW_S = 10.0
 _LONG_WINDOW_S = 100.0
 # Least number of samples for a median.
 _FEWEST_IN_WINDOW = 5
+# Numerics: so many sigmas show a direction.
+_DIRECTION_SIGMAS = 4.0
 # Numerics: the speed is compared with its median over this time before and after [s].
 _EVEN_S = 2.0
 
@@ -158,23 +160,43 @@ class Sided:
 
 
 def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) -> Sided:
-    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
-    begin, end, step_m = _steps_of(stretch, 1.0)
+    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2).
+
+    Movements of the reference beyond its noise tell, where the odometer counted about as much: a reference that stands
+    or creeps while the odometer counts has no direction to give.
+    """
+    begin, end, step_m = _movements(stretch)
     counted_m = np.abs(step_m)
     if counter is not None:
-        counted_m = counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end])
+        counted_m = counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end])
+        counted_m = np.where(np.abs(step_m) > 0.5 * np.abs(counted_m), counted_m, 0.0)
     sense = sense_of_ways(counted_m, step_m, least_m)
     shared_m = sense * shared_ways_m(counted_m, step_m)
     with_m, against_m = (float((sign * shared_m).clip(min=0.0).sum()) for sign in (1, -1))
     return Sided(stretch, sense, with_m, against_m)
 
 
-def _steps_of(stretch: ReferenceStretch, step_s: float) -> tuple[Ints, Ints, Floats]:
-    """Pairs of samples so far apart in time on one leg of the first path, and the way between them [m]."""
+def _movements(stretch: ReferenceStretch) -> tuple[Ints, Ints, Floats]:
+    """Pairs of samples, a second or more apart, between which the reference moved beyond its noise, and how far [m]."""
     t_ns = stretch.t_ns
-    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, round(step_s * NS_PER_S), dtype=np.int64)
-    rows = np.unique(np.searchsorted(t_ns, instants))
-    return _ways_of(stretch, rows[:-1], rows[1:])
+    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, NS_PER_S, dtype=np.int64)
+    rows = np.unique(np.searchsorted(t_ns, instants)).tolist()
+    at_m = stretch.paths[0].at_m.tolist()
+    leg = stretch.paths[0].leg.tolist()
+    noise_m = (_DIRECTION_SIGMAS * np.sqrt(2.0) * stretch.sigma_m).tolist()
+    begin: list[int] = []
+    end: list[int] = []
+    since = rows[0]
+    for row in rows[1:]:
+        if leg[row] != leg[since]:
+            since = row
+        elif abs(at_m[row] - at_m[since]) > max(noise_m[row], noise_m[since]):
+            begin.append(since)
+            end.append(row)
+            since = row
+    ends = np.array(end, dtype=np.int64)
+    begins = np.array(begin, dtype=np.int64)
+    return begins, ends, stretch.paths[0].at_m[ends] - stretch.paths[0].at_m[begins]
 
 
 def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, Ints, Floats]:

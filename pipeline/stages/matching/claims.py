@@ -94,7 +94,7 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
     about = np.clip(np.searchsorted(steps.end_s, t_s, side="left"), 0, count - 1)
     speed_mps = steps.way_m / np.maximum(np.diff(steps.end_s, prepend=steps.begin_s[0]), 1e-3)
     since_s = np.where(before >= 0, t_s - steps.end_s[np.maximum(before, 0)], 0.0)
-    carried_m = 1.2 * speed_mps[np.maximum(before, 0)] * since_s + config.paths_border_sigmas * np.nan_to_num(sigma_m)
+    carried_m = 1.2 * speed_mps[np.maximum(before, 0)] * since_s + config.paths_along_sigmas * np.nan_to_num(sigma_m)
     group = np.where(element >= 0, found.groups[np.maximum(element, 0)], -1)
     alone = _alone(found)
     live = _left(found, found.living(config.paths_delay_s))

@@ -1,42 +1,24 @@
-"""How plausible it is that a train went from one place on the network to another within a step."""
+"""How a train gets from one place on the network to another, and how well that agrees with the way it made."""
 
 from __future__ import annotations
 
+import heapq
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.stages.matching.path_states import PathStates
+from pipeline.stages.odometry import Odometry
+from pipeline.stages.paths.path_steps import PathSteps
 from pipeline.stages.track.network import Network
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig
 
-
-@dataclass(frozen=True)
-class StepDistances:
-    """How far each step is thought to have led [m]: signed in the odometer's sense where `measured`, else its size.
-
-    `limit_m` is how far to search the network for it; `polarity` the odometer's sign against each oriented element.
-    """
-
-    distance_m: Floats
-    measured: Bools
-    limit_m: Floats
-    polarity: Ints
-
-    def along(self, steps: Ints, oriented: Ints) -> MoveDistances:
-        """The distances of some steps, signed along the oriented element on which each begins, if the sign is known."""
-        polarity = self.polarity[oriented]
-        signed = self.measured[steps] & (polarity != 0)
-        return MoveDistances(np.where(signed, polarity, 1) * self.distance_m[steps], signed, self.limit_m[steps])
-
-
-class MoveDistances(NamedTuple):
-    """As `StepDistances`, one row for each of some moves: signed along the path where `signed`."""
-
-    distance_m: Floats
-    signed: Bools
-    limit_m: Floats
+# Ways that are looked for are longer than the distance by so many of its sigmas (`detour_share`, `detour_m`).
+_MARGIN_SIGMAS = 10.0
 
 
 class Move(NamedTuple):
@@ -49,63 +31,137 @@ class Move(NamedTuple):
     sense: int
 
 
-def move_scores(
-    network: Network, start: Ints, start_m: Floats, end: Ints, end_m: Floats, way: MoveDistances, config: MatchingConfig
-) -> Floats:
-    """Log-probability of each move between pairs of places, -inf where there is none: `[sense, pair]`.
+class Way(NamedTuple):
+    """Between two steps [m]: signed in the odometer's sense where `measured`, else its size; how far to search."""
 
-    Rows: on the element, ahead, behind. Places are oriented elements and metres from their entries.
+    distance_m: float
+    measured: bool
+    limit_m: float
+
+
+class Place(NamedTuple):
+    """A step, and where the train was then: oriented element, and metres from its entry."""
+
+    step: int
+    oriented: int
+    at_m: float
+
+
+@dataclass(frozen=True)
+class Moves:
+    """`polarity`: sign of the odometer against each oriented element, 0 where unknown."""
+
+    network: Network
+    steps: PathSteps
+    odometry: Odometry | None
+    polarity: Ints
+    config: MatchingConfig
+
+    def way(self, earlier: int, later: int) -> Way:
+        """By the odometer where it knows it, else straight on."""
+        places = self.steps.points.surface
+        chord_m = float(np.linalg.norm(places[later] - places[earlier]))
+        counted_m = float("nan")
+        if self._doubt_m[later] == self._doubt_m[earlier]:
+            counted_m = self._counted_m[later] - self._counted_m[earlier]
+        measured = bool(np.isfinite(counted_m))
+        distance_m = counted_m if measured else chord_m
+        limit_m = (1.0 + self.config.detour_share) * max(chord_m, abs(distance_m)) + self.config.detour_m
+        return Way(distance_m, measured, limit_m)
+
+    def cost(self, here: Place, there: Place, way: Way) -> float:
+        """The least cost of a move between two places, infinite where the network has none."""
+        return min((cost for cost, _, _ in self._all(here, there, way)), default=np.inf)
+
+    def best(self, here: Place, there: Place) -> Move | None:
+        """The move of least cost, none where the network has none."""
+        moves = self._all(here, there, self.way(here.step, there.step))
+        chosen = min(moves, key=lambda move: move[0], default=None)
+        if chosen is None:
+            return None
+        _, sense, between = chosen
+        return Move(between[::-1] if sense < 0 else between, sense)
+
+    @property
+    def break_cost(self) -> float:
+        """Of going over to a track that no relation leads to: so many seconds of positions off the path."""
+        return self.config.break_s * self.config.outlier_sigmas**2
+
+    def _all(self, here: Place, there: Place, way: Way) -> Iterator[tuple[float, int, tuple[int, ...]]]:
+        """Cost and sense of every move, and what lies between: on the element, ahead, behind.
+
+        A relation that is passed against its navigability costs as much as a break.
+        """
+        if here.oriented == there.oriented:
+            yield self._mismatch(there.at_m - here.at_m, here.oriented, way), 0, ()
+        for sense, first, last in ((1, here, there), (-1, there, here)):
+            # From the exit of the first to the entry of the last, both run in the sense of their elements.
+            found = self.network.reach(first.oriented, way.limit_m).get(last.oriented)
+            if found is None:
+                continue
+            ends_m = self.network.length_m(first.oriented) - first.at_m + last.at_m
+            driven_m = sense * (ends_m + found.distance_m)
+            cost = self._mismatch(driven_m, here.oriented, way)
+            barred = found.barred_forward if sense > 0 else found.barred_backward
+            yield cost + (self.break_cost if barred else 0.0), sense, found.between
+            if cost > 1.0 and way.measured and abs(driven_m) < abs(way.distance_m):
+                # Another way may be as long as the odometer says.
+                for longer_m, between in self._longer(first.oriented, last.oriented, sense, way.limit_m - ends_m):
+                    yield self._mismatch(sense * (ends_m + longer_m), here.oriented, way), sense, between
+
+    def _longer(self, first: int, last: int, sense: int, limit_m: float) -> Iterator[tuple[float, tuple[int, ...]]]:
+        """Ways from the exit of an element to the entry of another, of those as long as each other the first found."""
+        waiting: list[tuple[float, int, tuple[int, ...]]] = [(0.0, first, ())]
+        known: set[tuple[int, int]] = set()
+        while waiting:
+            gone_m, oriented, between = heapq.heappop(waiting)
+            for edge in self.network.successors[oriented]:
+                entry_m = gone_m + edge.gap_m
+                alike = edge.to, round(entry_m / (self.config.detour_m / _MARGIN_SIGMAS))
+                if entry_m > limit_m or alike in known or not (edge.forward if sense > 0 else edge.backward):
+                    continue
+                known.add(alike)
+                if edge.to == last:
+                    yield entry_m, between
+                heapq.heappush(waiting, (entry_m + self.network.length_m(edge.to), edge.to, (*between, edge.to)))
+
+    def _mismatch(self, driven_m: float, oriented: int, way: Way) -> float:
+        """Square of the difference from the way made over its own sigma, limited as that of every position."""
+        sign = int(self.polarity[oriented]) if way.measured else 0
+        apart_m = driven_m - sign * way.distance_m if sign else abs(driven_m) - abs(way.distance_m)
+        root_m = (self.config.detour_share * abs(way.distance_m) + self.config.detour_m) / _MARGIN_SIGMAS
+        return min((apart_m / root_m) ** 2, self.config.outlier_sigmas**2)
+
+    @cached_property
+    def _counted_m(self) -> list[float]:
+        if self.odometry is None:
+            return [float("nan")] * len(self.steps)
+        return [float(value) for value in (self.odometry.scale or 1.0) * self.odometry.distance_at(self.steps.t_ns)]
+
+    @cached_property
+    def _doubt_m(self) -> list[float]:
+        """Ways compare where nothing of the distance came into doubt between."""
+        if self.odometry is None:
+            return [0.0] * len(self.steps)
+        return [float(value) for value in self.odometry.doubt_at_s(self.odometry.seconds(self.steps.t_ns))]
+
+
+def polarity(network: Network, states: PathStates, counted_m: Floats) -> Ints:
+    """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown.
+
+    `counted_m`: per step of the states the way since the step before, signed, NaN where unknown. The sign belongs to
+    the installation and holds for the whole run, but the orientation of a connected part of the network is arbitrary:
+    so one sign for each part, by the votes of all states that stay on one element for a step.
     """
-    ahead_m, ahead_barred, behind_m, behind_barred = _network_distances(network, start, end, way.limit_m)
-    length = network.track.length_m
-    start_left_m = length[start // 2] - start_m
-    end_left_m = length[end // 2] - end_m
-    stay = np.where(start == end, distance_scores(end_m - start_m, way, config), -np.inf)
-    ahead = distance_scores(start_left_m + ahead_m + end_m, way, config) - config.barred_cost * ahead_barred
-    behind = distance_scores(-(start_m + behind_m + end_left_m), way, config) - config.barred_cost * behind_barred
-    ahead[~np.isfinite(ahead_m)] = behind[~np.isfinite(behind_m)] = -np.inf
-    return np.stack([stay, ahead, behind])
-
-
-def distance_scores(displacement_m: Floats, way: MoveDistances, config: MatchingConfig) -> Floats:
-    """Exponential in the difference of distances (Newson & Krumm 2009, eq. 2), limited."""
-    plain = np.abs(np.abs(displacement_m) - np.abs(way.distance_m))
-    mismatch = np.where(way.signed, np.abs(displacement_m - way.distance_m), plain)
-    scale = config.transition_scale_m + config.transition_share * np.abs(way.distance_m)
-    return np.asarray(-np.minimum(mismatch / scale, config.mismatch_limit))
-
-
-def best_moves(
-    network: Network, start: Ints, start_m: Floats, end: Ints, end_m: Floats, way: MoveDistances, config: MatchingConfig
-) -> list[Move | None]:
-    """The most plausible move of each pair of places, none where the network has none."""
-    scores = move_scores(network, start, start_m, end, end_m, way, config)
-    chosen = np.where(np.isfinite(scores.max(axis=0)), scores.argmax(axis=0), -1)
-    rows = zip(chosen.tolist(), start.tolist(), end.tolist(), way.limit_m.tolist(), strict=True)
-    return [_move(network, *row) for row in rows]
-
-
-def _move(network: Network, chosen: int, start: int, end: int, limit_m: float) -> Move | None:
-    """The move of a row of `move_scores`, -1 for none."""
-    if chosen <= 0:
-        return None if chosen else Move((), 0)
-    if chosen == 1:
-        return Move(network.reach(start, limit_m)[end].between, 1)
-    return Move(network.reach(end, limit_m)[start].between[::-1], -1)
-
-
-def _network_distances(network: Network, start: Ints, end: Ints, limit_m: Floats) -> tuple[Floats, ...]:
-    """From exit to entry, ahead and behind, with the relations not navigable that way; inf where none leads."""
-    pairs, inverse = np.unique(start * len(network.successors) + end, return_inverse=True)
-    limit = np.zeros(len(pairs))
-    np.maximum.at(limit, inverse, limit_m)
-    table = np.full((4, len(pairs)), np.inf)
-    for index, (pair, far) in enumerate(zip(pairs.tolist(), limit.tolist(), strict=True)):
-        here, there = divmod(pair, len(network.successors))
-        ahead = network.reach(here, far).get(there)
-        if ahead is not None:
-            table[:2, index] = ahead.distance_m, ahead.barred_forward
-        behind = network.reach(there, far).get(here)
-        if behind is not None:
-            table[2:, index] = behind.distance_m, behind.barred_backward
-    return tuple(table[:, inverse])
+    count = len(network.successors)
+    if not network.orientable:
+        return np.zeros(count, dtype=np.int64)
+    part = network.parts
+    step = np.repeat(np.arange(len(states.first) - 1), np.diff(states.first))
+    # Step and oriented element in one sorted number: the same element a step before is `count` less.
+    keys = step * count + states.oriented
+    before = np.minimum(np.searchsorted(keys, keys - count), len(keys) - 1)
+    stayed = np.flatnonzero((keys[before] == keys - count) & np.isfinite(counted_m[step]))
+    moved_m = states.place_m[stayed] - states.place_m[before[stayed]]
+    votes = np.sign(moved_m) * counted_m[step[stayed]]
+    return np.sign(np.bincount(part[states.oriented[stayed]], votes, part.max() + 1)).astype(np.int64)[part]

@@ -9,14 +9,14 @@ import polars as pl
 import pytest
 
 from pipeline.read.site.alike import parallel_findings
-from schemas.config import MatchingConfig
+from schemas.config import Configuration, SiteConfig
 from tests.stages.matching.builders import line, matched, run, site
 from tests.stages.matching.ladder import ladder
 
 
 def found(spacing_m: float, **options: float) -> list[str]:
     place = site({"a": line((0, 0), (2000, 0)), "b": line((0, spacing_m), (2000, spacing_m))}, **options)
-    return [f"{one.place}: {one.message}" for one in parallel_findings(place, MatchingConfig())]
+    return [f"{one.place}: {one.message}" for one in parallel_findings(place)]
 
 
 def test_double_track_is_named_once_with_its_extent_and_what_tells_it_apart() -> None:
@@ -41,13 +41,13 @@ def test_a_poor_survey_widens_it() -> None:
 
 def test_tracks_that_cross_or_part_are_none() -> None:
     crossing = site({"a": line((0, 0), (2000, 0)), "b": line((900, -500), (1100, 500))})
-    assert parallel_findings(crossing, MatchingConfig()) == []
+    assert parallel_findings(crossing) == []
 
 
 def test_what_would_tell_is_named() -> None:
     place = ladder()
     balises = pl.DataFrame({"balise_id": ["p7"], "netelement_id": ["B1"], "kind": ["physical"]})
-    remedies = {one.place: one.remedy for one in parallel_findings(replace(place, balises=balises), MatchingConfig())}
+    remedies = {one.place: one.remedy for one in parallel_findings(replace(place, balises=balises))}
     assert "route" in remedies["element A2"]
     assert "p7" in remedies["element A1"]
     assert "switch" in remedies["element A1"]
@@ -56,13 +56,13 @@ def test_what_would_tell_is_named() -> None:
 
 def test_with_a_route_nothing_is_in_doubt() -> None:
     route = pl.DataFrame({"netelement_id": ["A1", "A2"], "direction": ["AB", "AB"]})
-    assert parallel_findings(replace(ladder(), route=route), MatchingConfig()) == []
+    assert parallel_findings(replace(ladder(), route=route)) == []
 
 
 def test_how_long_tracks_have_to_be_beside_each_other_is_configuration() -> None:
     place = site({"a": line((0, 0), (2000, 0)), "b": line((0, 4), (2000, 4))})
-    assert len(parallel_findings(place, MatchingConfig(parallel_least_m=1900.0))) == 1
-    assert parallel_findings(place, MatchingConfig(parallel_least_m=2100.0)) == []
+    assert len(parallel_findings(place, Configuration(site=SiteConfig(parallel_least_m=1900.0)))) == 1
+    assert parallel_findings(place, Configuration(site=SiteConfig(parallel_least_m=2100.0))) == []
 
 
 @pytest.mark.parametrize(("spacing_m", "claimed"), [(4.5, False), (6.5, True)])
