@@ -499,13 +499,19 @@ def inspect(
     project: OfProject = None,
 ) -> None:
     """Describe a log, a site or a result, and list problems that need attention."""
-    from pipeline.show.kinds import kind_at
+    from pipeline.show.kinds import Kind, kind_at
 
-    kind_at(path)  # what is mistyped is said before anything is loaded
+    kind = kind_at(path)  # what is mistyped is said before anything is loaded
     from pipeline.show.inspection import inspect_path, show
 
     settings = _configuration(config)
-    tables = inspect_path(path, settings, result, site, _vehicle(vehicle))
+    if kind is Kind.RAW:
+        from pipeline.project.raw import inspect_raw
+
+        ground = None if site is None else _ground(site, settings)
+        tables = inspect_raw(Path(path), settings, ground, _vehicle(vehicle))
+    else:
+        tables = inspect_path(path, settings, result, site, _vehicle(vehicle))
     _print_json(tables) if as_json else show(tables)
     raise Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 

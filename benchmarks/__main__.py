@@ -32,6 +32,7 @@ MODULES = (
     "undetected",
     "recorded",
     "follows",
+    "witnesses",
 )
 
 

@@ -14,10 +14,11 @@ from pathlib import Path
 from benchmarks.filled import filled
 from benchmarks.notebook import notebook
 from benchmarks.results import Figure, processor_s, stopwatch
-from benchmarks.trials import write_cdr_trial
+from benchmarks.trials import MAPPED_WHEEL, write_cdr_trial
 from pipeline.campaign import make_plan, run_campaign
 from pipeline.read.ingest import read_run
 from pipeline.results import store
+from schemas.config import Configuration
 from schemas.enums import RunStatus
 
 TIMES_READING_AND_WRITING = 2.5
@@ -43,13 +44,13 @@ def measure(folder: Path) -> list[Figure]:
 
 def _log_to_tables(log: Path, site: Path, out: Path, what: str) -> list[Figure]:
     """In this process, once warm."""
-    plan = make_plan([str(log)], site, out)
+    plan = make_plan([str(log)], site, out, Configuration(ingest=MAPPED_WHEEL))
     if run_campaign(plan, force=True).count(RunStatus.OK) != 1:
         raise RuntimeError(f"the run of {log} is not ok: its time means nothing")
     tables = store.read_run(out, log.stem)
     again = out.with_name(f"{out.name}-again")
     replay_s = processor_s(3, lambda: run_campaign(plan, force=True))
-    reading_s = processor_s(3, lambda: read_run(log))
+    reading_s = processor_s(3, lambda: read_run(log, MAPPED_WHEEL))
     writing_s = processor_s(3, lambda: store.write_run(tables, again, {}))
     notebook_s = processor_s(1, lambda: notebook(log, site, out.with_name("notebook")))
     least_s = reading_s + writing_s
@@ -70,7 +71,9 @@ def command_peak_mb(log: Path, site: Path, out: Path) -> float:
         "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL); "
         "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)"
     )
+    config = site.parent / "config.toml"
     balise = [sys.executable, "-m", "cli", "replay", str(log), "--site", str(site), "--out", str(out)]
+    balise += ["--config", str(config)]
     done = subprocess.run(
         [sys.executable, "-c", code, *balise, "--force", "--quiet"], check=True, capture_output=True, text=True
     )

@@ -23,10 +23,9 @@ from typing import Any
 
 import pyarrow as pa
 
-from benchmarks.ingest_logs import CASES, Case, run_of, write_case
+from benchmarks.ingest_logs import CASES, Case, config_of, run_of, write_case
 from benchmarks.results import Figure, stopwatch
 from pipeline.read.ingest import read_run
-from schemas.config import IngestConfig
 from schemas.run import RunLog
 
 # Largest ratio to reading and decompressing, as 0.1.0 had them, and smallest to `mcap` with its decoder package. The
@@ -107,9 +106,9 @@ def _case(run: RunLog, case: Case, folder: Path, repeats: int) -> list[Figure]:
     bound, ours, with_crc, with_digest = _in_turn(
         repeats,
         lambda: read_and_decompress(plain),
-        lambda: read_run(plain, IngestConfig(), with_digest=False),
-        lambda: read_run(checked, IngestConfig(), with_digest=False),
-        lambda: read_run(plain, IngestConfig()),
+        lambda: read_run(plain, config_of(plain), with_digest=False),
+        lambda: read_run(checked, config_of(checked), with_digest=False),
+        lambda: read_run(plain, config_of(plain)),
     )
     with stopwatch() as stock:
         stock_columns(plain)
@@ -148,7 +147,7 @@ def _long(folder: Path, repeats: int, short: list[Figure]) -> list[Figure]:
         name = f"{case}: against read and decompress"
         before = next(figure.value for figure in short if figure.name == name)
         bound, ours = _in_turn(
-            repeats, partial(read_and_decompress, path), partial(read_run, path, IngestConfig(), with_digest=False)
+            repeats, partial(read_and_decompress, path), partial(read_run, path, config_of(path), with_digest=False)
         )
         ratio = median(ours) / median(bound)
         figures += [
@@ -162,16 +161,16 @@ def _long(folder: Path, repeats: int, short: list[Figure]) -> list[Figure]:
 _MEMORY_SCRIPT = """
 import re, sys
 from pathlib import Path
+from benchmarks.ingest_logs import config_of
 from pipeline.read.ingest import read_run
-from schemas.config import IngestConfig
 
 def status(name):
     return 1024 * int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text()).group(1))
 
-read_run(Path(sys.argv[1]), IngestConfig())
+read_run(Path(sys.argv[1]), config_of(Path(sys.argv[1])))
 Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from what is resident now
 before = status("VmRSS")
-run = read_run(Path(sys.argv[2]), IngestConfig())
+run = read_run(Path(sys.argv[2]), config_of(Path(sys.argv[2])))
 print((status("VmHWM") - before) / sum(frame.estimated_size() for frame in (run.gnss, run.odometer)))
 """
 

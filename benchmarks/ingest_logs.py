@@ -10,6 +10,8 @@ import polars as pl
 
 from datasets.mcap_log import Encoding, OdometerMessage, write_mcap
 from pipeline.read.ingest.conform import conform
+from schemas.config import IngestConfig, StreamMapping
+from schemas.enums import Origin
 from schemas.run import RunLog, Stream
 
 Case = Literal["cdr Odometry", "cdr TwistStamped", "protobuf", "json"]
@@ -57,3 +59,9 @@ def write_case(run: RunLog, case: Case, folder: Path, chunk_crc: bool = True) ->
     path = folder / f"{case.replace(' ', '_')}_{'crc' if chunk_crc else 'nocrc'}.mcap"
     write_mcap(run, path, encoding, odometer_message=message, checksums=chunk_crc)
     return path
+
+
+def config_of(log: Path) -> IngestConfig:
+    """What reads both streams of a case: a twist of ROS is an odometer only where a mapping names it."""
+    wheel = StreamMapping(topic="/odometer", origin=Origin.WHEEL)
+    return IngestConfig(odometer=(wheel,)) if log.name.startswith("cdr") else IngestConfig()

@@ -137,7 +137,7 @@ def epochs_of(
         **dict.fromkeys(("latency_sigma_s", "odometer_rows_m", "odometer_period_s"), pl.lit(0.0)),
         survey_sigma_m=pl.lit(0.1),
         netelement_id=pl.lit("line"),
-        odometer_segment=pl.lit(0, pl.Int64),
+        odometer_doubt_m=pl.lit(0.0),
         speed_mps=pl.lit(_SPEED_MPS),
         odometer_reason=pl.lit(None, pl.String),
         velocity_along_mps=nothing,

@@ -10,6 +10,8 @@ from datasets.mcap_log import write_mcap
 from datasets.motion import MotionSpec, PhaseSpec
 from datasets.scenario import BaliseSpec, ElementSpec, RunSpec, Scenario, with_seed
 from datasets.trial import build_run, build_site, write_run_log, write_site
+from schemas.config import Configuration, IngestConfig, StreamMapping, to_toml
+from schemas.enums import Origin
 
 _ELEMENT_M = 6000.0
 _SPEED_MPS = 33.0
@@ -34,14 +36,21 @@ def _steady(run: RunSpec, hours: float) -> RunSpec:
     return run.model_copy(update={"motion": motion, "odometer": odometer, "faults": ()})
 
 
+# What a project or `--config` says of the wheel of a ROS 2 log: a twist is an odometer only where a mapping names it.
+MAPPED_WHEEL = IngestConfig(odometer=(StreamMapping(topic="/odometer", origin=Origin.WHEEL),))
+
+
 def write_cdr_trial(folder: Path, hours: float, balises: int) -> Path:
-    """One long journey as a ROS 2 log (`nav_msgs/Odometry`), its site in `folder/site`; returns the log."""
+    """One long journey as a ROS 2 log (`nav_msgs/Odometry`), its site in `folder/site`, its mapping in
+    `folder/config.toml`; returns the log.
+    """
     log = folder / "long.mcap"
     if not log.exists():
         scenario = line_scenario(hours, balises, seed=11)
         run = build_run(scenario, scenario.runs[0]).with_streams(reference=None, faults=None)
         write_site(build_site(scenario), folder / "site")
         write_mcap(run, log, "cdr", odometer_message="nav_msgs/msg/Odometry")
+        (folder / "config.toml").write_text(to_toml(Configuration(ingest=MAPPED_WHEEL)), encoding="utf-8")
     return log
 
 

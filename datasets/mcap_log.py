@@ -9,7 +9,7 @@ from typing import IO, Literal
 import polars as pl
 
 from datasets.mcap_messages import json_topic, odometry_topic, twist_topic
-from pipeline.read.ingest.correct import recorded_corrections
+from pipeline.read.ingest.correct import recorded_notes
 from pipeline.read.ingest.recipes import OWN_SCHEMAS
 from pipeline.show.export.mcap_file import Compression, write_topics
 from pipeline.show.export.messages import Topic, rows_topic
@@ -39,7 +39,7 @@ def write_mcap(
     """
     losses: list[str] = []
     topics = [
-        replace(topic, notes=recorded_corrections(run, stream))
+        replace(topic, notes=recorded_notes(run, stream))
         for stream in STREAMS
         for topic in _topics(run, stream, encoding, odometer_message, losses)
     ]

@@ -13,6 +13,7 @@ from datasets.trial import write_run_as
 from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather, said_of
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
+from pipeline.read.ingest.parts import LogPart, drafts_of, lines_of_parts
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import visible
@@ -20,24 +21,28 @@ from schemas.errors import visible
 
 @dataclass(frozen=True)
 class Conversion:
-    """What was written, how often which kind of record was not used, what was corrected, and what does not fit."""
+    """What was written, how often which kind of record was not used, what the logs consist of, what was corrected, and
+    what does not fit.
+    """
 
     run: Path
     epochs: int
     not_used: Mapping[str, int]
     corrected: Sequence[str]
     fit: FitReport
+    parts: Sequence[LogPart] = ()
 
     def lines(self) -> list[str]:
         """For people."""
         unused = [f"{said_of(reason)}: {count} x {visible(reason)}" for reason, count in self.not_used.items()]
         made = [f"corrected: {visible(text)}" for text in self.corrected]
-        return [f"{self.epochs} epochs in {self.run}", *unused, *made, *self.fit.lines()]
+        listed = map(visible, [*lines_of_parts(self.parts), *drafts_of(self.parts)])
+        return [f"{self.epochs} epochs in {self.run}", *unused, *made, *listed, *self.fit.lines()]
 
     def as_dict(self) -> dict[str, object]:
         """For programs."""
         head = {"run": self.run, "epochs": self.epochs, "not_used": self.not_used, "corrected": self.corrected}
-        return {**head, **self.fit.as_dict()}
+        return {**head, "parts": [vars(part) for part in self.parts], **self.fit.as_dict()}
 
 
 def convert_logs(
@@ -58,7 +63,9 @@ def convert_logs(
         converted = as_run(found, name, purpose, settings.fix_sigma, settings.ingest.correct)
     write_run_as(converted.run, to)
     made = tuple(f"{correction.stream}: {correction.changes}" for correction in converted.run.notes.corrections)
-    return Conversion(to, converted.run.gnss.height, converted.dropped, made, fit_report(converted.run, settings))
+    return Conversion(
+        to, converted.run.gnss.height, converted.dropped, made, fit_report(converted.run, settings), converted.parts
+    )
 
 
 def known_recording(path: Path) -> Converted | None:

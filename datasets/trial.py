@@ -21,7 +21,7 @@ from datasets.motion import Motion, build_motion
 from datasets.odometer import odometer_stream
 from datasets.receiver import TrainOnLine, gnss_streams, reference_stream
 from datasets.scenario import LogKind, RunSpec, Scenario
-from pipeline.read.ingest.correct import recorded_corrections
+from pipeline.read.ingest.correct import recorded_notes
 from pipeline.storage import replace_files
 from pipeline.storage.described import table_bytes
 from schemas.config import Vehicle, settings_from, to_toml
@@ -126,7 +126,7 @@ def _stream_bytes(name: Stream, run: RunLog, run_id: str) -> bytes | None:
     stream = run.stream(name)
     if stream is None:
         return None
-    return table_bytes(stream, name, STREAM_SCHEMAS[name], {"run_id": run_id, **recorded_corrections(run, name)})
+    return table_bytes(stream, name, STREAM_SCHEMAS[name], {"run_id": run_id, **recorded_notes(run, name)})
 
 
 def _start_ns(scenario: Scenario, spec: RunSpec) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import polars as pl
@@ -92,7 +93,7 @@ def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence
     fit = required_fit(prepared, solution, prepared.vehicle)
     ride = ride_of(prepared, solution, _with_match(beside, prepared, solution), evidence)
     unnoticed = unnoticed_of(ride)
-    judged = judge(_case(ride, unnoticed, evidence))
+    judged = judge(_case(ride, unnoticed, evidence, fit.leaps_s))
     epochs = pl.concat([judged.epochs, ride.solution.fixes.select("satellites")], how="horizontal")
     results = _results(ride, judged, epochs, unnoticed, fit, evidence)
     tables = {
@@ -106,7 +107,7 @@ def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence
     return {name: shaped(table, TABLES[name]) for name, table in tables.items()}
 
 
-def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence) -> Case:
+def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence, leaps_s: Sequence[int]) -> Case:
     """The solution before the judge."""
     replayed = ride.solution
     run = ride.prepared.run
@@ -119,6 +120,7 @@ def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence) -> Case:
         config=ride.prepared.config,
         reference=run.reference,
         faults=run.faults,
+        leaps_s=tuple(leaps_s),
     )
 
 
@@ -154,7 +156,7 @@ def _results(
         Reason.EVIDENCE_CONTRADICTED: evidence.doubted > 0,
         Reason.TRACK_ASSUMED: _track_assumed(judged),
         Reason.SIGMA_DOUBTFUL: refuted(accuracy),
-        Reason.INPUT_DOUBTFUL: bool(fit.unproving or counts.contradicting),
+        Reason.INPUT_DOUBTFUL: bool(fit.unproving or fit.leaps_s or counts.contradicting),
         Reason.CLOCK_ASSUMED: evidence.clock_assumed,
     }
     return SolutionResults(

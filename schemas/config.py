@@ -40,6 +40,8 @@ class StreamMapping(Settings):
     (floats) unless `factors.t` gives the seconds per unit, counted from `time_epoch` (of `excel`: days). CSV files may
     name two columns, `field:DATE + TIME`, or with epoch `gps` the week and its seconds; `date_order` says what
     01.02.2025 means where the whole file leaves it open, `time_zone` (IANA) of which place times without a zone are.
+    `wrap`: recorded distances begin anew after so much, before `factors`; `frame`: in which the components of recorded
+    velocities are, where the message does not say it or says another. A path may be `norm(PATH)`: length of a vector.
     """
 
     topic: str
@@ -48,6 +50,8 @@ class StreamMapping(Settings):
     constants: dict[str, str | float | bool] = {}
     fix_codes: dict[str, Fix] = {}
     origin: Origin | None = None
+    wrap: Positive | None = None
+    frame: str | None = None
     time: str = Field(default="auto", pattern=r"^(auto|log|publish|field:.+)$")
     time_scale: Literal["utc", "gps"] = "utc"
     time_epoch: Literal["unix", "gps", "excel"] = "unix"
@@ -544,15 +548,6 @@ class UndetectedConfig(Settings):
 class CalibrationConfig(Settings):
     """What `balise calibrate` measures from."""
 
-    # Epochs used are so far apart: user errors last 100 s, accelerations a few seconds, so that a long run loses little
-    # at 2 s; a short one is used to the full.
-    step_least_s: Positive = 0.1
-    step_most_s: Positive = 2.0
-    # Scale, latency and offset of a stretch of odometry are fitted to so many epochs at least.
-    least_points: Annotated[int, Field(strict=True, ge=3)] = 20
-    # Share of a position's variance without memory, only to keep the covariance well conditioned where epochs repeat.
-    # With `align.white_share`, which makes a replay learn carefully, the misfit of simulated runs is 0.75 instead of 1.
-    white_share: Probability = 0.001
     # A standard deviation from so many is known to 7 %, if they were independent.
     least_epochs: Annotated[int, Field(strict=True, gt=0)] = 100
     # Standard errors of the sigmas come from leaving out one run, or one piece of a few runs, of so many: epochs are

@@ -188,7 +188,7 @@ class ExperimentRuns(dy.Schema):
     usable_s = real("s", "time in which a fault may begin", min=0)
     alarm_s = real("s", "left out: a monitor failed or the position was negated", min=0)
     ambiguous_s = real("s", "left out: track in doubt", min=0)
-    no_tvb_s = real("s", "left out: no TVB (without an odometer: position not in use)", min=0)
+    no_tvb_s = real("s", "left out: no TVB", min=0)
     not_right_s = real("s", "left out: judged wrong or unknown", min=0)
     too_soon_s = real("s", "left out: within `quiet_s` of one of these or of the beginning", min=0)
     longest_watch_s = real("s", "longest watch without an alarm, from where a fault may begin", min=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -26,7 +27,7 @@ class IngestNotes:
     """What reading found out about the log beside its data.
 
     `partial_until_ns` is set when the log is damaged at its end and read up to there; `corrections`: those that
-    its streams hold already, made when it was read or when it was written.
+    its streams hold already, made when it was read or when it was written. `messages`: how many a log holds, by topic.
     """
 
     partial_until_ns: int | None = None
@@ -36,6 +37,7 @@ class IngestNotes:
     files_without_crc: tuple[str, ...] = ()
     skipped_topics: tuple[str, ...] = ()
     corrections: tuple[StreamCorrection, ...] = ()
+    messages: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -71,14 +71,17 @@ class Aligned(Positions):
     odometer_m = real("m", "odometer distance along growing path, scale corrected, 0 at the first epoch")
     travelled_m = real("m", "way driven since the first epoch by the odometer, turns included, scale corrected", min=0)
     odometer_reason = text("why there is no odometer", nullable=True)
-    odometer_segment = dy.Int64(min=0, description="continuity segment: distances compare where it is the same")
     odometer_slips = flag("the odometer says itself that it slips here")
-    odometer_counter = dy.Int64(
-        min=0, description="the same number over slip and pauses between speeds: there the way is known roughly"
+    odometer_doubt_m = real(
+        "m",
+        "by how much slip, pauses and losses (1e6 m each) may have falsified the distance since the first row: "
+        "distances compare where it is the same",
+        min=0,
     )
-    slip_doubt_m = real("m", "by how much slip and pauses may have falsified the distance since the first epoch", min=0)
     odometer_white_m2_per_s = real("m2/s", "variance that the odometer's distance gathers in a second", min=0)
-    odometer_rows_m = real("m", "quantisation noise of the odometer's rows, as far as thresholds allow for it", min=0)
+    odometer_rows_m = real(
+        "m", "quantisation noise of the odometer's rows as shown so far, as far as thresholds allow for it", min=0
+    )
     odometer_period_s = real("s", "time between rows of the odometer", min=0)
     stamp_jitter_s = real("s", "deviation of the stamps about the receiver's clock", min=0)
     speed_mps = real("m/s", "speed along growing path by the odometer, by GNSS where there is none")

@@ -49,13 +49,15 @@ def run_of_logs(opened: Opened, entry: ConvertEntry, config: Configuration, reco
     common = config.ingest.correct
     made = as_run(first.found, entry.run_id, first.purpose, config.fix_sigma, common)
     dropped = Counter(made.dropped)
+    listed = list(made.parts)
     for part in parts[1:]:
         made = extended(made.run, Path(entry.to), part.found, part.purpose, config.fix_sigma, False, common)
         dropped.update(made.dropped)
+        listed += made.parts
     run = corrected(made.run, common)
     # A log that is a run of this program may have been corrected so when it was written.
     own = [correction for correction in entry.correct if correction not in run.notes.corrections]
-    return Converted(corrected_further(run, own), dict(dropped))
+    return Converted(corrected_further(run, own), dict(dropped), tuple(listed))
 
 
 def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: Recordings) -> list[_Part]:

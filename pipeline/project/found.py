@@ -11,7 +11,7 @@ from pipeline.campaign.plan import is_run
 from pipeline.make.receivers.bags import is_bag
 from pipeline.make.survey.map_files import MAP_SUFFIXES
 from pipeline.read.ingest.csv_text import read_log_table
-from pipeline.read.ingest.guesses import POSITION, WORDS, columns_in, first, word_of
+from pipeline.read.ingest.guesses import POSITION, WORDS, columns_in, first, word_of, words_of_times
 from schemas.config import Configuration, Settings, Vehicle, read_toml, settings_from
 from schemas.errors import BaliseError
 from schemas.project import FILE_NAME
@@ -97,7 +97,8 @@ def _kind_of_table(path: Path) -> Kind:
     except BaliseError:
         return "logs"
     words = {name: word_of(name) for name in table.columns if name.strip()}
-    if any(first(words, WORDS[kind]) for kind in ("time", "date", "clock", "week")):
+    times = words_of_times(words)
+    if any(first(times, WORDS[kind]) for kind in ("time", "date", "clock", "week")):
         return "logs"
     if first(words, WORDS["balise"]):
         return "balises"

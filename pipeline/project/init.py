@@ -9,6 +9,7 @@ from pipeline import storage
 from pipeline.project.draft import project_text
 from pipeline.project.found import Kind, look_around
 from pipeline.project.trial import Drafted, Wanted, correction_lines
+from pipeline.read.ingest.parts import drafts_of
 from schemas.errors import UsageError
 from schemas.project import FILE_NAME
 
@@ -65,9 +66,15 @@ def words_of(drafted: Drafted, file: Path) -> list[str]:
         words += [f"  {line}" for line in correction_lines(proposal.corrections)]
         how = "accepted." if proposal.accepted else f"NOT accepted: {_UNACCEPTED}"
         words.append(f"  These corrections are {how}")
+    drafts = drafts_of(drafted.parts)
+    if drafts:
+        words += [_DRAFTS, *(f"  {line}" for line in drafts)]
     return [*words, *drafted.remarks, f"Wrote {file}. Look at it, then", f"now: {next_command(file)}"]
 
 
+_DRAFTS = (
+    "Topics that feed nothing. To read one, save its lines without # as config.toml, and add --config config.toml:"
+)
 _UNACCEPTED = "they stand in the file as comments; remove the # or add --accept-corrections."
 
 
@@ -78,6 +85,7 @@ def answer_of(drafted: Drafted, file: Path) -> dict[str, Any]:
         "file": file,
         "logs": drafted.logs,
         "corrections": [{name: proposal[name] for name in fields} for proposal in proposals],
+        "parts": [vars(part) for part in drafted.parts],
         "remarks": drafted.remarks,
         "next": next_command(file),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date, datetime, timedelta
@@ -17,10 +18,12 @@ from pipeline.make.receivers.csv import TABLES, names_file
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.csv_draft import draft_mapping
+from pipeline.read.ingest.describe import topics_of
+from pipeline.read.ingest.parts import LogPart, parts_of_topics
 from schemas.config import IngestConfig, settings_from, toml_of
 from schemas.enums import Fix
 from schemas.errors import BaliseError, InputError
-from schemas.run import STREAMS, Stream
+from schemas.run import STREAMS, RunLog, Stream
 
 _A_DAY = timedelta(days=1)  # clocks of one ride may be local and UTC
 
@@ -36,13 +39,16 @@ class StreamSpan:
 
 @dataclass(frozen=True)
 class SeenLog:
-    """A log and what it feeds; `mapping`: of a table, by stream; `is_run`: needs no conversion."""
+    """A log and what it feeds; `mapping`: of a table, by stream; `is_run`: needs no conversion; `parts`: what it
+    consists of.
+    """
 
     path: Path
     spans: Mapping[Stream, StreamSpan]
     mapping: Mapping[str, list[dict[str, Any]]] = field(default_factory=dict)
     is_run: bool = False
     mostly_fixed: bool = False
+    parts: tuple[LogPart, ...] = ()
 
     @property
     def has_positions(self) -> bool:
@@ -85,18 +91,28 @@ def look_at(path: Path, config: IngestConfig, day: date | None, recordings: Reco
     if is_run(path):
         run = read_run(path, config, with_digest=False)
         streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
-        return _seen(path, streams, is_run=True)
+        return _seen(path, streams, is_run=True, parts=_parts_of_run(path, config, run))
     known = None if names_file(config, path) else recordings.known(path)
     if known is not None:
-        return _seen(path, known.gathered().streams)
+        return _seen(path, known.gathered().streams, parts=known.parts)
     if path.suffix.lower() == ".csv" and not names_file(config, path):
         return _table(path, config)
     try:
-        return _seen(path, gather([path], config, day).streams)
+        found = gather([path], config, day)
+        return _seen(path, found.streams, parts=found.parts)
     except UnknownError:
         if path.suffix.lower() not in TABLES:
             raise
         return _table(path, config)
+
+
+def _parts_of_run(path: Path, config: IngestConfig, run: RunLog) -> tuple[LogPart, ...]:
+    """The topics of an MCAP log; of a folder the columns and files that are none of the contract's."""
+    if path.suffix.lower() == ".mcap":
+        return tuple(parts_of_topics(path.name, topics_of([path], config), run.notes.skipped_topics))
+    used = [(name, frame.height) for name in STREAMS if (frame := run.stream(name)) is not None]
+    whole = [LogPart(path.name, "file", f"{name}.parquet", rows, name) for name, rows in used]
+    return (*whole, *(LogPart(path.name, "file", name, 0) for name in run.notes.skipped_topics))
 
 
 def _seen(
@@ -104,6 +120,7 @@ def _seen(
     streams: Mapping[Stream, pl.DataFrame],
     mapping: Mapping[str, list[dict[str, Any]]] | None = None,
     is_run: bool = False,
+    parts: tuple[LogPart, ...] = (),
 ) -> SeenLog:
     spans: dict[Stream, StreamSpan] = {}
     for name, frame in streams.items():
@@ -114,16 +131,19 @@ def _seen(
         raise InputError("holds no row with a time", place=str(path), expected="positions, distances, speeds or reads")
     gnss = streams.get("gnss")
     fixed = 0 if gnss is None else (gnss["fix"].cast(pl.String) == Fix.RTK_FIXED.value).sum()
-    return SeenLog(path, spans, mapping or {}, is_run, mostly_fixed=gnss is not None and 2 * fixed > gnss.height)
+    return SeenLog(path, spans, mapping or {}, is_run, gnss is not None and 2 * fixed > gnss.height, parts)
 
 
 def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> SeenLog:
     """A table by the mapping that its header suggests."""
-    drafted = toml_of(draft_mapping(path).encode(), f"mapping of {path}").get("ingest")
+    text = draft_mapping(path)
+    drafted = toml_of(text.encode(), f"mapping of {path}").get("ingest")
     mapping: dict[str, Any] = drafted if isinstance(drafted, dict) else {}
     mapping = {stream: entries if isinstance(entries, list) else [entries] for stream, entries in mapping.items()}
     if not mapping or any("time" not in entry for entries in mapping.values() for entry in entries):
-        raise _undecided(path, "the names of its columns do not tell " + ("its time" if mapping else "what they are"))
+        left_open = re.search(r"(?m)^# (time = .*?)  # (in .*)$", text)
+        told = "the names of its columns do not tell " + ("its time" if mapping else "what they are")
+        raise _undecided(path, f"{left_open[1]} is {left_open[2]}" if left_open else told)
     for entries in mapping.values():
         for entry in entries:
             entry["topic"] = path.name
@@ -131,11 +151,11 @@ def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> S
                 entry["date_order"] = date_order
     ingest = settings_from({**config.model_dump(exclude_defaults=True), **mapping}, IngestConfig, str(path))
     try:
-        streams = gather([path], ingest).streams
+        found = gather([path], ingest)
     except InputError as error:
         raise _undecided(path, error.message, error) from None
     own = {name: [{k: v for k, v in entry.items() if k != "topic"} for entry in of] for name, of in mapping.items()}
-    return _seen(path, streams, own)
+    return _seen(path, found.streams, own, parts=found.parts)
 
 
 def _undecided(path: Path, why: str, error: InputError | None = None) -> InputError:

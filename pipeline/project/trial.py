@@ -14,13 +14,14 @@ import tomli_w
 
 from pipeline.make.survey.make import make_site
 from pipeline.project.convert import Recordings, run_of_logs
-from pipeline.project.found import is_one_log, is_prose, is_site, logs_below
+from pipeline.project.found import Kind, is_one_log, is_prose, is_site, logs_below, look_around
 from pipeline.project.looking import SeenLog, look_at, look_at_dates
 from pipeline.project.opened import Opened, named_from
 from pipeline.project.rides import Ride, rides_of, stem_of
 from pipeline.project.run import wish_for
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected_further
+from pipeline.read.ingest.parts import LogPart, lines_of_parts
 from pipeline.read.site.read import read_site
 from pipeline.studies.plausibility.check import CONFIGURATION, FitState
 from pipeline.studies.plausibility.report import FitReport, fit_report
@@ -67,6 +68,8 @@ class Drafted:
     logs: pl.DataFrame
     proposals: list[Proposal] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    parts: tuple[LogPart, ...] = ()
+    """Of all logs: what they consist of, and what of it is used."""
 
 
 Accept = Callable[[str, Sequence[str], Sequence[StreamCorrection]], bool]
@@ -82,11 +85,19 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     base = _base(wanted, folder)
     remarks: list[str] = []
     logs, unread = _looked_at(wanted, base.given_config().ingest, recordings, remarks)
+    remarks += _passed_over(wanted)
     rides, alone = rides_of(logs, [path.absolute() for path in wanted.references])
     if not rides and logs:
-        raise InputError("no log holds positions", place=", ".join(str(log.path) for log in logs), expected="GNSS")
+        # Why the log that does could not be read is what has to be mended.
+        raise InputError(
+            "no log holds positions",
+            place=", ".join(str(log.path) for log in logs),
+            expected="GNSS",
+            remedy=" ".join(remarks) or None,
+        )
     remarks += [_unused(log) for log in alone]
-    drafted = Drafted(base, _table_of(rides), [], remarks)
+    parts = tuple(part for log in logs for part in log.parts)
+    drafted = Drafted(base, _table_of(rides), [], remarks + lines_of_parts(parts), parts)
     drafted.remarks += _without_odometer(rides)
     drafted.remarks += [note for ride in rides for note in _notes_of(ride)]
     site = _site(base)
@@ -178,6 +189,28 @@ def _named_logs(wanted: Wanted) -> dict[Path, tuple[Path, bool]]:
             if path.absolute() not in surveys:
                 named.setdefault(path.absolute(), (path, is_log and wanted.strict))
     return named
+
+
+_TAKEN_FOR: Mapping[Kind, str] = {
+    "surveys": "a line",
+    "sites": "a site",
+    "balises": "a list of balises",
+    "vehicles": "a vehicle file",
+    "configs": "a configuration",
+}
+
+
+def _passed_over(wanted: Wanted) -> list[str]:
+    """What lies in folders of logs, is no log by its kind, and is named nowhere else."""
+    own = [wanted.vehicle, wanted.config, *wanted.track, *([Path(wanted.balises)] if wanted.balises else [])]
+    named = {path.absolute() for path in own if path is not None}
+    folders = [raw for raw in _expanded(wanted.raws) if raw.is_dir() and not is_one_log(raw)]
+    found = [(kind, path) for folder in folders for kind, paths in look_around(folder).items() for path in paths]
+    return [
+        f"not used: {path}: taken for {_TAKEN_FOR[kind]}"
+        for kind, path in found
+        if kind in _TAKEN_FOR and path.absolute() not in named
+    ]
 
 
 def _expanded(raws: Sequence[Path]) -> list[Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,7 +10,8 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.read.ingest.csv_draft import draft_mapping
-from pipeline.read.ingest.describe import StreamSummary, TopicSummary, describe_log
+from pipeline.read.ingest.describe import LogDescription, StreamSummary, TopicSummary, describe_log
+from pipeline.read.ingest.parts import LogPart, parts_of_table_by
 from pipeline.read.site.read import read_site
 from pipeline.results import store
 from pipeline.results.figures.head import head_of, run_verdicts
@@ -22,10 +23,12 @@ from pipeline.storage.address import Address, redacted
 from pipeline.storage.described import PREFIX, describe
 from pipeline.storage.parquet import ParquetError
 from pipeline.studies.plausibility.report import FitReport, fit_report
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, IngestConfig, Vehicle
 from schemas.errors import UsageError
 from schemas.run import Finding, Site
 
+NOT_USED = "unused"
+PARTS = "Parts"
 STARTING_CONFIG = "Configuration to begin with"
 _RUN_COLUMNS = (
     *("verdict", "run_id", "solution", "reasons", "part_verdict", "proof_margin_m", "remedies", "status"),
@@ -56,15 +59,24 @@ def inspect_path(
     if kind is Kind.RESULT:
         return inspect_result(path)
     if kind is Kind.CSV:
-        return inspect_csv(Path(path))
+        return inspect_csv(Path(path), config.ingest)
     if kind is Kind.TABLE:
         return inspect_table(path)
     return inspect_log(path, config, None if site is None else read_site(site, config.site), vehicle)
 
 
-def inspect_csv(path: Path) -> dict[str, pl.DataFrame]:
-    """A mapping to begin with; the columns stand in it."""
-    return {STARTING_CONFIG: pl.DataFrame({"toml": draft_mapping(path).splitlines()})}
+def inspect_csv(path: Path, config: IngestConfig | None = None) -> dict[str, pl.DataFrame]:
+    """A mapping to begin with, and the columns as it uses them, or as the configuration does where that maps them."""
+    text = draft_mapping(path)
+    parts = parts_of_table_by(path, config or IngestConfig(), text)
+    return {PARTS: parts_table(parts), STARTING_CONFIG: pl.DataFrame({"toml": text.splitlines()})}
+
+
+def parts_table(parts: Sequence[LogPart]) -> pl.DataFrame:
+    """What a log consists of, and what of it is used as what."""
+    rows = [(part.log, part.kind, part.name, part.count, part.used_as or NOT_USED) for part in parts]
+    types = {"log": pl.String, "kind": pl.String, "name": pl.String, "count": pl.Int64, "used_as": pl.String}
+    return pl.DataFrame(rows, schema=types, orient="row")
 
 
 def inspect_table(path: Address) -> dict[str, pl.DataFrame]:
@@ -78,8 +90,12 @@ def inspect_table(path: Address) -> dict[str, pl.DataFrame]:
 
 
 def show(tables: Mapping[str, pl.DataFrame]) -> None:
-    """Print the tables; what is to be saved as configuration last, without a frame."""
-    show_tables({name: table for name, table in tables.items() if name != STARTING_CONFIG})
+    """Print the tables; what is to be saved as configuration last, without a frame.
+
+    A mapping that comes alone can be saved as it is printed: its comments say what it uses.
+    """
+    alone = tables.keys() == {PARTS, STARTING_CONFIG}
+    show_tables({name: table for name, table in tables.items() if name != STARTING_CONFIG and not alone})
     if STARTING_CONFIG in tables:
         print("\n".join(tables[STARTING_CONFIG]["toml"]))
 
@@ -88,7 +104,13 @@ def inspect_log(
     path: Address, config: Configuration, site: Site | None = None, vehicle: Vehicle | None = None
 ) -> dict[str, pl.DataFrame]:
     """Streams, topics, what is mapped to what, what does not fit, and what keeps the log from being replayed."""
-    log = describe_log(path, config.ingest)
+    return tables_of_log(describe_log(path, config.ingest), config, site, vehicle)
+
+
+def tables_of_log(
+    log: LogDescription, config: Configuration, site: Site | None = None, vehicle: Vehicle | None = None
+) -> dict[str, pl.DataFrame]:
+    """The same of a log that was described already."""
     figures = {
         "kind": log.kind,
         "size_bytes": log.size_bytes,

@@ -10,12 +10,18 @@ from schemas.errors import UsageError
 from schemas.run import STREAMS
 
 _SITE_FILES = {"track.parquet", "track.csv", "track.geojson"}
+# Bags, logs of receivers, and what these are packed in; what they hold is seen when they are read.
+_RAW = (
+    *(".bag", ".db3", ".ubx", ".sbf", ".nmea", ".nma", ".gps", ".pos", ".log", ".txt", ".tsv", ".dat", ".json", ".bin"),
+    *(".gz", ".zip", ".tar", ".tgz", ".bz2", ".xz", ".zst"),
+)
 
 
 class Kind(Enum):
     """What `balise inspect` can describe."""
 
     LOG = "log"
+    RAW = "raw log"
     SITE = "site"
     RESULT = "result"
     CSV = "csv"
@@ -33,6 +39,8 @@ def kind_at(path: Address) -> Kind:
         return Kind.RESULT
     if name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
         return Kind.LOG
+    if "metadata.yaml" in names or (not names and name_of(path).lower().endswith(_RAW)):
+        return Kind.RAW
     if name_of(path).lower().endswith(".csv"):
         return Kind.CSV
     if name_of(path).lower().endswith(".parquet") and not names:
@@ -40,8 +48,8 @@ def kind_at(path: Address) -> Kind:
     raise UsageError(
         "is neither a log, a site nor a result",
         place=redacted(str(path)),
-        expected="RUN.mcap, SITE.geojson, FILE.parquet, or a folder with gnss.parquet (log), track.parquet (site) or"
-        " runs/ (result)",
+        expected="RUN.mcap, a bag, a log of a receiver, SITE.geojson, FILE.csv, FILE.parquet, or a folder with"
+        " gnss.parquet or metadata.yaml (log), track.parquet (site) or runs/ (result)",
         remedy="`balise convert` makes runs of receiver logs and CSV files.",
     )
 

@@ -111,7 +111,9 @@ def prepare(
     used = odometers[0] if odometers and sensors[0].height >= 2 else None
     # Another one takes part in what the LDS uses only where it is free of the positions.
     others = [odometer for odometer in odometers[1:] if odometer.independent]
-    counted = None if used is None else counted_over_slip(used, others, config.align)
+    counted = (
+        None if used is None else counted_over_slip(used, others, config.matching.orientation_distance_m, config.align)
+    )
     follows = found[0] if found else {}
     return PreparedRun(recorded, journey, site, vehicle, config, counts, odometers, counted, follows)
 

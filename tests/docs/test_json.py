@@ -29,7 +29,10 @@ SLOW = {"demo"}
 UNSEEN = {
     "init": {"corrections[]." + name for name in ("run_id", "found", "toml", "accepted")},
     "trial": {"corrections[]." + name for name in ("run_id", "found", "toml", "accepted")},
-    "inspect": {"Problems", "Problems[].problem", "Lines that mend it", "Lines that mend it[].toml"},
+    "inspect": {
+        *("Problems", "Problems[].problem", "Lines that mend it", "Lines that mend it[].toml"),
+        *("Noted or not used", "Noted or not used[].reason", "Noted or not used[].count"),
+    },
     "diff": {"runs[].hazards[].differences[]." + name for name in ("table", "kind", "column", "message", "rows")},
 }
 

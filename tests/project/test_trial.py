@@ -252,3 +252,23 @@ def test_dates_are_in_the_order_that_fits_other_logs(tmp_path: Path) -> None:
     assert start(on(6, 12)) == datetime(2025, 6, 12, 11, 30, tzinfo=UTC)
     assert start(on(12, 6)) == datetime(2025, 12, 6, 11, 30, tzinfo=UTC)
     assert start() is start(on(3, 3)) is start(on(6, 12), on(12, 6)) is None
+
+
+def test_what_lies_beside_logs_and_is_none_is_named(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A ride recorded as GPX is taken for a line; nothing in a folder of logs is passed over without a word."""
+    (raw / "raw" / "ride.gpx").write_text("<gpx/>")
+    assert call("trial", "raw", "--track", "line.gpx", "--to", "week12") == 0
+    said = capsys.readouterr().out
+    assert "not used: raw/ride.gpx: taken for a line" in said
+    assert "still.nmea: messages used: " in said
+    assert "plc.csv: columns not used: none" in said
+
+
+def test_why_no_log_holds_positions(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (raw / "raw" / "still.nmea").unlink()
+    rows = "".join(f"2025-03-03 10:12:{second:02d},50.1,14.2\n" for second in range(40))
+    (raw / "raw" / "gnss.csv").write_text("Time (CEST),lat,lon\n" + rows)
+    assert call("trial", "raw", "--track", "line.gpx", "--to", "week12") != 0
+    told = capsys.readouterr().err
+    assert "no log holds positions" in told
+    assert "in 'CEST', which is not UTC" in told

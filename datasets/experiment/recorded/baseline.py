@@ -92,15 +92,13 @@ class Baseline:
     def left_out(self, quiet_s: float) -> Ints:
         """Per epoch the reason (number in `LeftOut`) why no fault begins there, -1 where one may."""
         after_gap = np.diff(self.t_ns, prepend=self.t_ns[:1]) > self.clock.limit_s * NS_PER_S
-        # Without an odometer there is no TVB at all: a position in use has to do.
-        validated = flags(self.epochs, "in_use" if self.ride.odometry is None else "tvb")
         doubtful = np.zeros(self.t_ns.size, dtype=bool)
         if self.own_error is OwnError.MEASURED:
             doubtful = ~met(self.epochs, pl.col("judgement") == Judgement.RIGHT.value)
         reason = np.full(self.t_ns.size, -1)
         for why, where in (
             (LeftOut.NOT_RIGHT, doubtful),
-            (LeftOut.NO_TVB, ~validated | after_gap),
+            (LeftOut.NO_TVB, ~flags(self.epochs, "tvb") | after_gap),
             (LeftOut.AMBIGUOUS, ~met(self.epochs, unambiguous()) & floats_known(self.epochs, "path_m")),
             (LeftOut.ALARM, self.alarming),
         ):
@@ -139,7 +137,7 @@ def _with_quiet(reason: Ints, t_ns: Ints, quiet_s: float) -> Ints:
 def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution: str) -> Baseline:
     """Replay and judge the run as it is.
 
-    Raises `InputError` where faults were injected, its odometer is not independent, or it cannot be replayed.
+    Raises `InputError` where faults were injected, it has no independent odometer, or it cannot be replayed.
     """
     if run.faults is not None and run.faults.height:
         raise InputError(
@@ -149,9 +147,8 @@ def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution:
             expected="a run as it was recorded",
         )
     ride = ride_alone(run, site, vehicle, bank.config, solution)
-    if ride.odometry is not None:
-        # Along the track the experiment would measure how well the positions agree with themselves.
-        require_independent_odometer(ride.prepared)
+    # Along the track the experiment would measure how well the positions agree with themselves, or nothing at all.
+    require_independent_odometer(ride.prepared)
     evidence = ride.prepared.evidence()
     judged = _judged(ride, evidence)
     return Baseline(run, site, bank, ride, evidence, judged.epochs, judged.alarms, Recording(run, site))

@@ -182,7 +182,7 @@ def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
         "duration_s": first.clock.duration_s,
         **room.seconds_left_out(),
         "longest_watch_s": room.longest_s(),
-        "has_odometer": room.has_odometer,
+        "has_odometer": True,
         "has_ranges": room.has_ranges,
     }
     return _Surveyed(run_id, row, room, tuple(map(_quiet, baselines)), first.run.input_digest)
@@ -259,8 +259,7 @@ def _refuse_lack_of_room(
         if count == cell.count:
             continue
         if not any(room.takes(cell) for room in rooms):
-            lacking = "satellites beside its positions" if cell.hits_satellite else "an odometer"
-            raise ConfigError(f"no run has {lacking}", place=f"{plan_file}: {cell.name}")
+            raise ConfigError("no run has satellites beside its positions", place=f"{plan_file}: {cell.name}")
         raise ConfigError(
             "has no room for so many injections",
             place=f"{plan_file}: {cell.name}",

@@ -32,12 +32,11 @@ class Room:
     held_s: np.ndarray
     left_out: Ints
     free_ns: Ints
-    has_odometer: bool
     has_ranges: bool
 
     def takes(self, cell: Cell) -> bool:
         """The run records what the fault needs."""
-        return (self.has_odometer or not cell.hits_odometer) and (self.has_ranges or not cell.hits_satellite)
+        return self.has_ranges or not cell.hits_satellite
 
     def eligible(self, cell: Cell) -> Bools:
         """Epochs at which a fault of this cell may begin and be watched to its end."""
@@ -71,7 +70,6 @@ def room_of(baselines: Sequence[Baseline], quiet_s: float) -> Room:
         held_s=first.clock.held_s,
         left_out=left_out,
         free_ns=np.minimum.accumulate(ends_ns[::-1])[::-1],
-        has_odometer=all(base.ride.odometry is not None for base in baselines),
         has_ranges=first.has_ranges,
     )
 

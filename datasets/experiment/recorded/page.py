@@ -63,9 +63,6 @@ def remarks_on(tables: Mapping[str, pl.DataFrame]) -> list[str]:
     if assumed:
         names = ", ".join(assumed)
         remarks.insert(0, f"No evidence of where the train was, recorded positions taken to be right: {names}.")
-    blind = runs.filter(~pl.col("has_odometer"))["run_id"].to_list()
-    if blind:
-        remarks.insert(0, f"Without an odometer nothing watches the position along the track: {', '.join(blind)}.")
     return remarks
 
 

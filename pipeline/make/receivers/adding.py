@@ -120,7 +120,7 @@ def _refuse_other_times(run: RunLog, name: Stream, new: pl.DataFrame, place: Pat
 
 def _refuse_what_is_lost(run: RunLog, place: Path) -> None:
     """A run is written anew with all its streams: what reading left out would be gone."""
-    lost = [*run.notes.skipped_topics, *filter(None, [run.notes.damage])]
+    lost = run.notes.skipped_topics
     if lost:
         raise UsageError(
             "would lose what is no stream",

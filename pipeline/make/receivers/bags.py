@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-import polars as pl
-
 from pipeline.make.receivers.bag_budget import Unpack, budget_of_bag, unpacker_of
+from pipeline.read.ingest.correct import corrected
+from pipeline.read.ingest.describe import LogDescription, TopicSummary, description_of, topics_of
+from pipeline.read.ingest.mcap_run import read_mcaps
 from pipeline.read.ingest.run import read_run
 from pipeline.storage.budget import Budget
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
-from schemas.run import STREAMS, RunLog
+from schemas.run import RunLog
 
 _HEADER = "std_msgs/msg/Header"
 _ENDINGS = (".bag", ".db3")
@@ -26,29 +29,66 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in (*_ENDINGS, ".mcap") or (path / "metadata.yaml").is_file()
 
 
-def read_bag(path: Path, config: IngestConfig) -> tuple[RunLog, dict[str, int]]:
-    """All streams of a bag, by schema name or as `[ingest]` maps its topics; what was left over."""
+class Bag(NamedTuple):
+    """All streams of a bag, what was left over, reason to number, and its topics."""
+
+    run: RunLog
+    left: dict[str, int]
+    topics: tuple[TopicSummary, ...]
+
+
+def read_bag(path: Path, config: IngestConfig) -> Bag:
+    """The streams of a bag, by schema name or as `[ingest]` maps its topics."""
     if path.suffix.lower() == ".mcap":
-        return _with_rest(read_run(path, config, with_digest=False), {})
+        return Bag(*_with_rest(read_run(path, config, with_digest=False), {}), topics_of([path], config))
     if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
-        return _read_parts(path, declared, config)
+        return Bag(*_read_parts(path, declared, config), topics_of(files_of(path, declared), config))
     with TemporaryDirectory() as folder:
         log = Path(folder) / "bag.mcap"
-        left = _transcribe(path, log, config)
+        left, counts = _transcribe(path, log, config)
         try:
-            return _with_rest(read_run(log, config, with_digest=False), left)
+            run, rest = _with_rest(_held_against(read_run(log, config, with_digest=False), path, counts), left)
+            return Bag(run, rest, topics_of([log], config))
         except BaliseError as error:
             error.place = None if error.place is None else error.place.replace(str(log), str(path))
             error.message = error.message.replace(str(log), str(path))
             raise
 
 
+def describe_bag(path: Path, config: IngestConfig) -> LogDescription:
+    """Describe a bag; one of which no run can be made is described as far as it can be read."""
+    files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
+    size = sum(file.stat().st_size for file in files)
+    try:
+        bag = read_bag(path, config)
+        return description_of(str(path), "bag", size, bag.topics, bag.run, ())
+    except BaliseError as error:
+        topics = _topics_alone(path, config)
+        return description_of(str(path), "bag", size, topics, None, (str(error),))
+
+
+def _topics_alone(path: Path, config: IngestConfig) -> tuple[TopicSummary, ...]:
+    try:
+        if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
+            return topics_of(files_of(path, declared), config)
+        with TemporaryDirectory() as folder:
+            log = Path(folder) / "bag.mcap"
+            _transcribe(path, log, config)
+            return topics_of([log], config)
+    except BaliseError:
+        return ()
+
+
 class Declared(NamedTuple):
-    """What the `metadata.yaml` of a bag folder says that it holds: files in order, and messages of each."""
+    """What the `metadata.yaml` of a bag folder says that it holds: files in order, all messages and those by topic.
+
+    `mcap`: its files are MCAP logs as they stand, not packed once more.
+    """
 
     mcap: bool
     files: tuple[str, ...]
-    messages: dict[str, int]
+    messages: int
+    topics: dict[str, int]
 
 
 def declared_of(folder: Path) -> Declared | None:
@@ -61,74 +101,58 @@ def declared_of(folder: Path) -> Declared | None:
     try:
         told = YAML(typ="safe", pure=True).load((folder / "metadata.yaml").read_text(encoding="utf-8"))
         bag = told["rosbag2_bagfile_information"]
-        names = tuple(str(name) for name in bag["relative_file_paths"])
-        counts = {str(part["path"]): int(part["message_count"]) for part in bag.get("files") or ()}
-        return Declared(str(bag["storage_identifier"]) == "mcap", names, counts)
-    except (OSError, UnicodeDecodeError, YAMLError, LookupError, TypeError, ValueError):
+        # Older writers name the folder too.
+        names = tuple(PurePosixPath(str(name)).name for name in bag["relative_file_paths"])
+        packed = str(bag.get("compression_mode") or "").upper() in ("FILE", "MESSAGE")
+        by_topic = bag.get("topics_with_message_count") or ()
+        topics = {str(one["topic_metadata"]["name"]): int(one["message_count"]) for one in by_topic}
+        mcap = str(bag["storage_identifier"]) == "mcap" and not packed
+        return Declared(mcap, names, int(bag.get("message_count") or 0), topics)
+    except (OSError, UnicodeDecodeError, YAMLError, LookupError, TypeError, ValueError, AttributeError):
         return None
 
 
-def _read_parts(folder: Path, declared: Declared, config: IngestConfig) -> tuple[RunLog, dict[str, int]]:
-    """The MCAP files of a bag folder, one after the other, as one run; what is missing makes it partial.
+def files_of(folder: Path, declared: Declared) -> list[Path]:
+    """The files of a bag folder that are there, in order.
 
     Raises `InputError` where none of them is there.
     """
-    damages: list[str] = []
-    until: list[int] = []
-    runs: list[RunLog] = []
-    for name in declared.files:
-        part = folder / name
-        # A name of a folder's own file: what a declaration names elsewhere is not read.
-        if Path(name).name != name or not part.is_file():
-            damages.append(f"{name} is declared and not there")
-            continue
-        run = read_run(part, config, with_digest=False)
-        if run.notes.damage is not None:
-            damages.append(f"{name}: {run.notes.damage}")
-        if run.notes.partial_until_ns is not None:
-            until.append(run.notes.partial_until_ns)
-        count = message_count(part)
-        if (wanted := declared.messages.get(name)) is not None and count is not None and count < wanted:
-            damages.append(f"{name} holds {count} of {wanted} messages that are declared")
-        runs.append(run)
-    if not runs:
+    found = [folder / name for name in declared.files if (folder / name).is_file()]
+    if not found:
         raise InputError(
             "holds none of the files that its metadata.yaml declares",
             place=str(folder),
             expected=", ".join(declared.files),
             remedy="Copy the whole folder.",
         )
-    streams = {name: _one_after_the_other([run.stream(name) for run in runs]) for name in STREAMS}
-    notes = runs[0].notes
-    skipped = tuple(dict.fromkeys(topic for run in runs for topic in run.notes.skipped_topics))
-    whole = replace(
-        runs[0].with_streams(**streams),
-        notes=replace(
-            notes,
-            damage="; ".join(damages) or None,
-            partial_until_ns=min(until, default=None),
-            skipped_topics=skipped,
-        ),
-    )
-    return _with_rest(whole, {})
+    return found
 
 
-def _one_after_the_other(frames: list[pl.DataFrame | None]) -> pl.DataFrame | None:
-    there = [frame for frame in frames if frame is not None]
-    return pl.concat(there) if there else None
+def _read_parts(folder: Path, declared: Declared, config: IngestConfig) -> tuple[RunLog, dict[str, int]]:
+    """The MCAP files of a bag folder as one run; what is missing makes it partial."""
+    found = files_of(folder, declared)
+    run = read_mcaps(found, config)
+    damages = [*filter(None, [run.notes.damage]), *_absent(folder, declared, found)]
+    damages += _fewer(declared, run.notes.messages)
+    whole = replace(run, notes=replace(run.notes, damage="; ".join(damages) or None))
+    return _with_rest(corrected(whole, config.correct), {})
 
 
-def message_count(log: Path) -> int | None:
-    """How many messages the summary of an MCAP file declares; None without a summary."""
-    from mcap.exceptions import McapError
-    from mcap.reader import make_reader
+def _absent(folder: Path, declared: Declared, found: Sequence[Path]) -> Iterator[str]:
+    """Files that are declared and not there, and those that are there and not declared."""
+    names = [path.name for path in found]
+    yield from (f"{name} is declared and not there" for name in declared.files if name not in names)
+    beside = sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
+    yield from (f"{name} is not declared, and not read" for name in beside if name not in declared.files)
 
-    try:
-        with log.open("rb") as stream:
-            summary = make_reader(stream).get_summary()
-    except (McapError, OSError, ValueError):
-        return None
-    return None if summary is None or summary.statistics is None else int(summary.statistics.message_count)
+
+def _fewer(declared: Declared, counts: Mapping[str, int]) -> Iterator[str]:
+    """Topics of which fewer messages were met than are declared."""
+    lost = {topic: wanted for topic, wanted in sorted(declared.topics.items()) if counts.get(topic, 0) < wanted}
+    for topic, wanted in lost.items():
+        yield f"holds {counts.get(topic, 0)} of {wanted} messages of {topic} that are declared"
+    if not lost and sum(counts.values()) < declared.messages:
+        yield f"holds {sum(counts.values())} of {declared.messages} messages that are declared"
 
 
 def _with_rest(run: RunLog, left: dict[str, int]) -> tuple[RunLog, dict[str, int]]:
@@ -137,8 +161,18 @@ def _with_rest(run: RunLog, left: dict[str, int]) -> tuple[RunLog, dict[str, int
     return run, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
 
 
-def _transcribe(path: Path, to: Path, config: IngestConfig) -> dict[str, int]:
-    """Write the messages with their definitions; those of a topic whose definition is not known are counted."""
+def _held_against(run: RunLog, path: Path, counts: Mapping[str, int]) -> RunLog:
+    """What the folder of a bag declares and its files lack makes the run partial."""
+    declared = declared_of(path) if path.is_dir() else None
+    if declared is None or not (damages := list(_fewer(declared, counts))):
+        return run
+    return replace(run, notes=replace(run.notes, damage="; ".join(damages)))
+
+
+def _transcribe(path: Path, to: Path, config: IngestConfig) -> tuple[dict[str, int], dict[str, int]]:
+    """Write the messages with their definitions; those of a topic whose definition is not known are counted. Also how
+    many there are of each topic.
+    """
     budget = budget_of_bag(path, config)
     try:
         from rosbags.highlevel import AnyReader
@@ -163,10 +197,11 @@ def _transcribe(path: Path, to: Path, config: IngestConfig) -> dict[str, int]:
         ) from None
 
 
-def _write(bag: Any, to: Path, unpack: Unpack, budget: Budget) -> dict[str, int]:
+def _write(bag: Any, to: Path, unpack: Unpack, budget: Budget) -> tuple[dict[str, int], dict[str, int]]:
     from mcap.writer import CompressionType, Writer
 
     left: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     types = bag.typestore if bag.is2 else _without_sequence(bag.typestore)
     with to.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.NONE)
@@ -178,16 +213,18 @@ def _write(bag: Any, to: Path, unpack: Unpack, budget: Budget) -> dict[str, int]
                 left[f"message on {connection.topic} ({connection.msgtype}), whose definition is not in the bag"] = (
                     connection.msgcount
                 )
+                counts[connection.topic] += connection.msgcount
                 continue
             schema = writer.register_schema(connection.msgtype, "ros2msg", definition.encode())
             channels[connection.id, connection.owner] = writer.register_channel(connection.topic, "cdr", schema)
         for connection, t_ns, raw in bag.messages([c for c in bag.connections if (c.id, c.owner) in channels]):
+            counts[connection.topic] += 1
             message = unpack(raw)
             budget.take(len(message))
             data = message if bag.is2 else bytes(types.ros1_to_cdr(message, connection.msgtype))
             writer.add_message(channels[connection.id, connection.owner], t_ns, data, t_ns)
         writer.finish()  # type: ignore[no-untyped-call]
-    return left
+    return left, dict(counts)
 
 
 def _without_sequence(known: Any) -> Any:

@@ -19,13 +19,14 @@ from pipeline.make.receivers.bags import is_bag, read_bag
 from pipeline.make.receivers.csv import TABLES, names_file, read_csv
 from pipeline.make.receivers.epochs import Epochs, Gathered
 from pipeline.make.receivers.frames import Frame, Protocol, frames, name_of
-from pipeline.make.receivers.gpsd import is_gpsd, read_gpsd
+from pipeline.make.receivers.gpsd import is_gpsd, objects_in, read_gpsd
 from pipeline.make.receivers.rivals import sees_twins, two_receivers
-from pipeline.make.receivers.rtklib import is_solution, read_solution
+from pipeline.make.receivers.rtklib import is_solution, parts_of_solution, read_solution
 from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked
 from pipeline.read.ingest.conform import conform, refuse
 from pipeline.read.ingest.correct import corrected, corrections_of
 from pipeline.read.ingest.mapping import mappings_of
+from pipeline.read.ingest.parts import LogPart, parts_of_messages, parts_of_topics
 from pipeline.storage import files
 from schemas.config import FixSigma, IngestConfig, StreamCorrection
 from schemas.errors import InputError
@@ -34,14 +35,15 @@ from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 @dataclass(frozen=True)
 class Converted:
-    """The run, and what could not be used: reason to number."""
+    """The run, what could not be used, reason to number, and what the logs consist of."""
 
     run: RunLog
     dropped: Mapping[str, int]
+    parts: tuple[LogPart, ...] = ()
 
     def gathered(self) -> Gatherings:
         """The streams, and the corrections that they hold."""
-        return gathered_of(self.run, self.dropped)
+        return replace(gathered_of(self.run, self.dropped), parts=self.parts)
 
 
 def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -> Converted:
@@ -67,8 +69,9 @@ def as_run(
             remedy="Convert the log of the receiver first or in the same call." + _reasons(logs.dropped),
         )
     held = logs.corrections_as(purpose or Purpose())
-    run = RunLog(run_id, streams["gnss"], notes=IngestNotes(corrections=held)).with_streams(**streams)
-    return Converted(corrected(run, correct, later=True), logs.dropped)
+    notes = IngestNotes(damage=logs.damage, corrections=held)
+    run = RunLog(run_id, streams["gnss"], notes=notes).with_streams(**streams)
+    return Converted(corrected(run, correct, later=True), logs.dropped, logs.parts)
 
 
 def extended(
@@ -91,7 +94,9 @@ def extended(
             _refuse_unlike(corrections_of(old, name), corrections_of(new, name), name, place)
     whole = added(old, {name: frame for name in streams if (frame := new.stream(name)) is not None}, force, place)
     held = [made for name in STREAMS for made in corrections_of(new if name in streams else old, name)]
-    return Converted(replace(whole, notes=replace(old.notes, corrections=tuple(held))), logs.dropped)
+    damages = dict.fromkeys(filter(None, [old.notes.damage, logs.damage]))
+    notes = replace(old.notes, corrections=tuple(held), damage="; ".join(damages) or None)
+    return Converted(replace(whole, notes=notes), logs.dropped, logs.parts)
 
 
 def _refuse_unlike(
@@ -112,12 +117,15 @@ def _refuse_unlike(
 class Gatherings:
     """The streams of all logs, as the contract has them, and what could not be used: reason to number.
 
-    `corrections`: those that the streams hold already, of logs that are runs of this program.
+    `corrections`: those that the streams hold already, of logs that are runs of this program; `damage`: what the logs
+    lack; `parts`: what they consist of, and what of it is used.
     """
 
     streams: Streams
     dropped: Mapping[str, int]
     corrections: tuple[StreamCorrection, ...] = ()
+    damage: str | None = None
+    parts: tuple[LogPart, ...] = ()
 
     def corrections_as(self, purpose: Purpose) -> tuple[StreamCorrection, ...]:
         """Those of the streams as they are meant: positions that become the reference are no stream `gnss` any more."""
@@ -128,7 +136,7 @@ class Gatherings:
 def gathered_of(run: RunLog, dropped: Mapping[str, int]) -> Gatherings:
     """The streams of a run, and the corrections that they hold."""
     streams: Streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
-    return Gatherings(streams, dropped, run.notes.corrections)
+    return Gatherings(streams, dropped, run.notes.corrections, run.notes.damage)
 
 
 def gather(
@@ -160,7 +168,9 @@ def gather(
     names = {NoEpochError: "log without an epoch", UnknownError: "file of an archive that is no log"}
     dropped.update(names[type(error)] for error in unread)
     _refuse_overlaps(parts)
-    return Gatherings(_joined(parts), dict(dropped), _common(parts))
+    damages = [f"{log.name}: {gathered.damage}" for log, gathered in parts if gathered.damage is not None]
+    listed = tuple(part for _, gathered in parts for part in gathered.parts)
+    return Gatherings(_joined(parts), dict(dropped), _common(parts), "; ".join(damages) or None, listed)
 
 
 def _refuse_unread(unread: list[NoEpochError | UnknownError], parts: list[tuple[Path, Gatherings]]) -> None:
@@ -260,19 +270,24 @@ def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -
 def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: str | None) -> Gatherings:
     if is_bag(log):
         # Corrections are made of the whole, once.
-        return gathered_of(*read_bag(log, _of_topics(config).model_copy(update={"correct": ()})))
+        bag = read_bag(log, _of_topics(config).model_copy(update={"correct": ()}))
+        return replace(
+            gathered_of(bag.run, bag.left),
+            parts=tuple(parts_of_topics(log.name, bag.topics, bag.run.notes.skipped_topics)),
+        )
     if log.suffix.lower() == ".csv" or names_file(config, log):
-        return Gatherings(*read_csv(log, config))
+        table = read_csv(log, config)
+        return Gatherings(table.streams, table.left, parts=tuple(table.parts))
     if log.is_dir():
         expected = f"a file, or the folder of a bag with its {BAG_FOLDER}"
         raise InputError("cannot be read: it is a folder", place=str(log), expected=expected)
     content = files.read_bytes(log)
     if is_solution(content):
-        return Gatherings(*read_solution(content, log))
+        return Gatherings(*read_solution(content, log), parts=tuple(parts_of_solution(content, log)))
     if is_gpsd(content):
         streams, dropped = read_gpsd(content, log, solution)
         if streams["gnss"].height:
-            return Gatherings(streams, dropped)
+            return Gatherings(streams, dropped, parts=tuple(parts_of_messages(log.name, objects_in(content))))
     return _read(content, log, date, solution)
 
 
@@ -293,9 +308,10 @@ def _read(
     dropped: Counter[str] = Counter()
     gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
     gathered[Protocol.NMEA] = nmea.Sentences(left_out=left_out)
+    named: Counter[tuple[Protocol, str, bool]] = Counter()
     for frame in frames(content, lambda: dropped.update(["damaged message"]), lambda: dropped.update([_UNCHECKED])):
-        if frame.protocol in gathered:
-            _decode(frame, gathered[frame.protocol])
+        is_used = frame.protocol in gathered and _decode(frame, gathered[frame.protocol])
+        named[frame.protocol, name_of(frame), is_used] += 1
     twins = {protocol: sees_twins(of) for protocol, of in gathered.items()}
     ubx.settle_times(gathered[Protocol.UBX])
     nmea.settle_days(gathered[Protocol.NMEA], date)
@@ -314,7 +330,10 @@ def _read(
         return _read(content, log, date, None, rivals - {solution})
     if rivals or twins[best] is not None:
         raise two_receivers(str(log), rivals, max(gathered[best].widest_m, twins[best] or 0.0))
-    return Gatherings(settled[best].streams(), dropped)
+    counts = Counter({(name, used and protocol is best): 0 for protocol, name, used in named})
+    for (protocol, name, used), count in named.items():
+        counts[name, used and protocol is best] += count
+    return Gatherings(settled[best].streams(), dropped, parts=tuple(parts_of_messages(log.name, counts)))
 
 
 def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
@@ -345,7 +364,8 @@ def _worth(protocol: Protocol, epochs: Epochs) -> int:
     return epochs.positions * (1 if protocol is Protocol.NMEA else 2)
 
 
-def _decode(frame: Frame, gathered: Gathered) -> None:
+def _decode(frame: Frame, gathered: Gathered) -> bool:
+    """Add what a message says to its epoch; whether it is of a kind that is used."""
     parse, decode = _PROTOCOLS[frame.protocol]
     try:
         message = parse(frame.content)
@@ -358,12 +378,13 @@ def _decode(frame: Frame, gathered: Gathered) -> None:
     except Exception:
         # The parsers' own errors share no base class.
         gathered.drop(_UNFIT)
-        return
+        return True
     try:
         if message is not None:
             decode(gathered, message, frame.content)
     except (AttributeError, OverflowError):  # a message that ends before its fields do, a time beyond all calendars
         gathered.drop(_UNFIT)
+    return message is not None
 
 
 # What is left out though it is almost a log, and what to do.

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import dataframely as dy
 import numpy as np
 import polars as pl
 
@@ -13,10 +16,13 @@ from pipeline.read.ingest.conform import refuse
 from pipeline.read.ingest.csv_text import CUT_ROW, read_log_table, with_points
 from pipeline.read.ingest.mapping import mappings_of
 from pipeline.read.ingest.mcap_records import Channel
+from pipeline.read.ingest.parts import LogPart, mappings_for, parts_of_table
 from pipeline.read.ingest.plan import Sample, Source, mapped_source
+from pipeline.read.ingest.wraps import said_of_wraps, with_whole_counts
 from pipeline.stages.epochs.clock import GAP_PERIODS
 from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import InputError
+from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
@@ -38,22 +44,20 @@ def names_file(config: IngestConfig, path: Path) -> bool:
     return path.suffix.lower() in TABLES and bool(named & {path.name, path.stem})
 
 
-def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
-    """Streams of a CSV file, each mapping whose `topic` is the file's name, its stem or `*` makes one; what was left
-    out, reason to number.
-    """
+class CsvLog(NamedTuple):
+    """Streams of a table, what was left out, reason to number, and its columns."""
+
+    streams: dict[Stream, pl.DataFrame]
+    left: dict[str, int]
+    parts: list[LogPart]
+
+
+def read_csv(path: Path, config: IngestConfig) -> CsvLog:
+    """A CSV file; each mapping whose `topic` is the file's name, its stem or `*` makes a stream, or a part of it."""
     log = read_log_table(path, infer=True)
     table = with_points(log)
-    streams: dict[Stream, pl.DataFrame] = {}
-    empty: Counter[str] = Counter()
-    for name in STREAMS:
-        for mapping in mappings_of(config, name):
-            if mapping.topic in (path.name, path.stem, "*"):
-                mapped = _mapped(table, mapping, name, path)
-                frame = mapped.filter(_recorded(mapped, name, "fix" in mapping.fields))
-                empty[f"row without a value of {name}"] += mapped.height - frame.height
-                streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
-    if not streams:
+    mappings = mappings_for(path, config)
+    if not mappings:
         raise InputError(
             "no mapping for this file",
             place=str(path),
@@ -61,8 +65,31 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
             expected=f'a table [ingest.gnss] with topic = "{path.name}"',
             remedy="Give a mapping by --config; `balise inspect` of the file prints a draft.",
         )
-    left = {CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short} | empty
-    return streams, {reason: count for reason, count in left.items() if count}
+    table = _with_ids(table, mappings, path)
+    streams: dict[Stream, pl.DataFrame] = {}
+    left = Counter({CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short})
+    for name, mapping in mappings:
+        mapped = _mapped(table, mapping, name, path, left)
+        frame = mapped.filter(_recorded(mapped, name, "fix" in mapping.fields))
+        left[f"row without a value of {name}"] += mapped.height - frame.height
+        streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
+    parts = parts_of_table(path.name, table.height, table.columns, mappings)
+    return CsvLog(streams, {reason: count for reason, count in left.items() if count}, parts)
+
+
+def _with_ids(table: pl.DataFrame, mappings: Sequence[tuple[Stream, StreamMapping]], path: Path) -> pl.DataFrame:
+    """The table with ids as they are written: 007 is no number."""
+    named = {
+        recorded
+        for stream, mapping in mappings
+        for column, recorded in mapping.fields.items()
+        if recorded in table.columns and isinstance(STREAM_SCHEMAS[stream].columns().get(column), dy.String)
+    }
+    ids = [name for name in table.columns if name in named and table[name].dtype != pl.String]
+    if not ids:
+        return table
+    texts = read_log_table(path, infer=False).table
+    return table.with_columns(texts[name].replace("", None) for name in ids)
 
 
 def _recorded(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
@@ -88,7 +115,9 @@ def _recorded(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
     return filled | has_fix | pl.Series(~between)
 
 
-def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path) -> pl.DataFrame:
+def _mapped(
+    table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path, left: Counter[str]
+) -> pl.DataFrame:
     if not mapping.time.startswith("field:"):
         raise InputError("a CSV has no log time", place=str(path), expected='time = "field:COLUMN"')
     kinds = {name: _kind(dtype) for name, dtype in table.schema.items()}
@@ -98,10 +127,18 @@ def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: P
     source = mapped_source(sample, stream, mapping.model_copy(update={"time": first}))
     refuse(source.breaches)
     fields = pl.DataFrame([_typed(table[name], source, path) for name in source.types])
+    times = instants(table, mapping, path)
+    counter = mapping.fields.get("distance_m") if stream == "odometer" else None
+    if counter in fields.columns:
+        sensors = fields[mapping.fields["sensor"]] if "sensor" in mapping.fields else None
+        whole, found = with_whole_counts(
+            fields[counter], times.to_physical().fill_null(0).to_numpy(), mapping.wrap, sensors
+        )
+        fields = fields.with_columns(whole) if found else fields
+        left.update(said_of_wraps(found, counter))
     columns = {name: _not_nan(expression, fields) for name, expression in source.columns.items()}
     if stream in ("gnss", "satellites"):
         columns = {"solution": pl.lit(mapping.solution, dtype=pl.String)} | columns
-    times = instants(table, mapping, path)
     return pl.DataFrame({"t": times}).with_columns(fields.select(pl.lit(0).alias("t"), **columns).drop("t"))
 
 

@@ -18,7 +18,7 @@ from pipeline.read.ingest.stamps import (
     within,
 )
 from pipeline.read.ingest.timescale import WEEK_NS
-from schemas.arrays import NS_PER_S
+from schemas.arrays import NS_PER_S, runs_of
 from schemas.config import StreamMapping
 from schemas.errors import ConfigError, InputError
 
@@ -32,8 +32,12 @@ _TEXT = (
     r"^(?:(?P<y>[0-9]{4})[-/.](?P<ym>[0-9]{1,2})[-/.](?P<yd>[0-9]{1,2})"
     r"|(?P<a>[0-9]{1,2})[-/.](?P<b>[0-9]{1,2})[-/.](?P<c>[0-9]{4}|[0-9]{2}))"
     r"[T ,]+(?P<h>[0-9]{1,2}):(?P<m>[0-9]{2})(?::(?P<s>[0-9]{2})(?:[.,](?P<f>[0-9]{1,9})[0-9]*)?)?"
-    r" ?(?P<half>[AaPp][Mm])? ?(?P<zone>Z|[+-][0-9]{2}:?[0-9]{2})?$"
+    r" ?(?P<half>[AaPp][Mm])? ?(?P<zone>Z|UTC|GMT|[+-][0-9]{2}:?[0-9]{2})? ?(?P<letters>[A-Z]{3,4})?$"
 )
+_HOUR_NS = 3600 * NS_PER_S
+# Rows so near to each other are of one recording without a pause.
+_FOLLOWS_NS = 60 * NS_PER_S
+_GERMAN_LETTERS = {"MESZ": "CEST", "MEZ": "CET"}
 _FORMS = "2025-06-01T12:00:00.25, 01.06.2025 12:00:00, 6/1/2025 1:00 PM, or numbers"
 
 
@@ -114,7 +118,13 @@ def _texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
     texts = texts.str.strip_chars().replace("", None)
     parts = texts.str.extract_groups(_TEXT).struct.unnest()
     _refuse(parts["h"].is_null() & texts.is_not_null(), texts, place, "holds no times", _FORMS)
-    number = parts.select(pl.all().exclude("half", "zone", "f").cast(pl.Int64))
+    if mapping.time_zone is None:
+        lettered = parts["letters"].is_not_null() & parts["zone"].is_null()
+        remedy = 'Name the place whose clock it is in the mapping: time_zone = "Europe/Berlin".'
+        _refuse(
+            lettered, texts, place, "holds times of a zone that its letters do not tell for certain", _FORMS, remedy
+        )
+    number = parts.select(pl.all().exclude("half", "zone", "letters", "f").cast(pl.Int64))
     day, month = ("a", "b") if _day_first(number["a"], number["b"], mapping.date_order, place) else ("b", "a")
     year = pl.when(pl.col("c") < 100).then(pl.col("c") + 2000).otherwise(pl.col("c"))
     late = parts["half"].str.to_lowercase()
@@ -132,27 +142,92 @@ def _texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
     written_ns = whole + fraction
     if mapping.time_zone is not None:
         written_ns = _from_zone(written_ns, parts["zone"].is_null(), mapping.time_zone, place)
+        _refuse_other_letters(written_ns, parts["letters"], texts, mapping.time_zone, place)
     return written_ns - _offset_ns(parts["zone"])
 
 
 def _from_zone(local_ns: pl.Series, local: pl.Series, zone: str, place: str) -> pl.Series:
-    """UTC of what clocks of a place show, where times are local. What they show twice or never is refused."""
+    """UTC of what clocks of a place show, where times are local.
+
+    Of an hour that they show twice, rows that follow each other tell which is which; else it is refused, and what they
+    never show is too.
+    """
     civil = local_ns.cast(pl.Datetime("ns"))
     try:
-        instants = civil.dt.replace_time_zone(zone, ambiguous="null", non_existent="null")
+        first, second = (
+            civil.dt.replace_time_zone(zone, ambiguous=which, non_existent="null").to_physical()
+            for which in ("earliest", "latest")
+        )
     except pl.exceptions.PolarsError:
         raise ConfigError(
             "is no time zone", place="time_zone", found=zone, expected="a name such as Europe/Berlin"
         ) from None
-    unclear = local & instants.is_null() & local_ns.is_not_null()
-    remedy = "Let the logger write UTC or the offset (+02:00), or leave these rows out."
-    expected = "each time once; clocks show an hour twice in autumn, and leave one out in spring"
-    _refuse(unclear, civil, place, f"holds a time that is not clear in {zone}", expected, remedy)
-    return pl.select(pl.when(local).then(instants.to_physical()).otherwise(local_ns)).to_series()
+    never = local & first.is_null() & local_ns.is_not_null()
+    if never.any():
+        before_ns = local_ns[int(never.arg_max() or 0)] - 2 * _HOUR_NS
+        utc_ns = pl.Series([before_ns]).cast(pl.Datetime("ns")).dt.replace_time_zone(zone).to_physical()[0]
+        remedy = (
+            f"If the logger does not change its clock in spring, say so: time_zone = {_fixed_zone(before_ns - utc_ns)}."
+        )
+        expected = "times that there are; clocks leave an hour out in spring"
+        _refuse(never, civil, place, f"holds a time that clocks never show in {zone}", expected, remedy)
+    instants, unclear = _told_apart(local_ns, first, second, local & (first != second))
+    if unclear.any():
+        row = int(unclear.arg_max() or 0)
+        zones = " or ".join(_fixed_zone(local_ns[row] - utc_ns[row]) for utc_ns in (first, second))
+        fixed = f"if one of them holds for all rows: time_zone = {zones}."
+        remedy = f"Let the logger write UTC or the offset (+02:00), or, {fixed}"
+        expected = "each time once, or rows that show the change; clocks show an hour twice in autumn"
+        _refuse(unclear, civil, place, f"holds a time that is not clear in {zone}", expected, remedy)
+    return pl.select(pl.when(local).then(instants).otherwise(local_ns)).to_series()
+
+
+def _refuse_other_letters(utc_ns: pl.Series, letters: pl.Series, texts: pl.Series, zone: str, place: str) -> None:
+    """Refuse letters behind times that are not those of the zone then: CET in summer is another hour than CEST."""
+    then = utc_ns.cast(pl.Datetime("ns", "UTC")).dt.convert_time_zone(zone).dt.to_string("%Z")
+    told = letters.replace(_GERMAN_LETTERS)
+    wrong = told.is_not_null() & then.str.contains("^[A-Z]+$") & (told != then)
+    remedy = "Name the zone of these letters, or one of a fixed offset, such as Etc/GMT-1."
+    _refuse(wrong, texts, place, f"holds times whose letters are not those of {zone}", "letters of this zone", remedy)
+
+
+def _fixed_zone(ahead_ns: int) -> str:
+    """The name of the zone that is always so far ahead of UTC; the sign of these names is turned round."""
+    hours = round(ahead_ns / _HOUR_NS)
+    return f'"Etc/GMT{-hours:+d}"' if hours else '"UTC"'
+
+
+def _told_apart(
+    local_ns: pl.Series, first: pl.Series, second: pl.Series, twice: pl.Series
+) -> tuple[pl.Series, pl.Series]:
+    """The instants with each hour that is shown `twice` told apart by the order of its rows, and where it cannot be.
+
+    Rows that follow each other within a minute show the one step back by the hour; without it, they are of the first
+    hour where they go on from before it, of the second where they go on behind it.
+    """
+    instants = first.to_numpy().copy()
+    unclear = np.zeros(instants.size, dtype=np.bool_)
+    clock_ns = local_ns.fill_null(0).to_numpy()
+    steps_ns = np.diff(clock_ns)
+    back_ns = second.fill_null(0).to_numpy() - first.fill_null(0).to_numpy()
+    for begin, end in zip(*runs_of(twice.fill_null(value=False).to_numpy()), strict=True):
+        inside = steps_ns[begin:end]
+        (turn,) = np.nonzero(np.abs(inside + back_ns[begin]) <= _FOLLOWS_NS) if inside.size else (np.zeros(0, int),)
+        others = np.delete(inside, turn)
+        follows = bool(np.all((others >= 0) & (others <= _FOLLOWS_NS)))
+        before = begin > 0 and 0 <= steps_ns[begin - 1] <= _FOLLOWS_NS
+        behind = end < steps_ns.size and 0 <= steps_ns[end] <= _FOLLOWS_NS
+        rows = slice(begin, end + 1)
+        if not follows or turn.size > 1 or (turn.size == 0 and before == behind):
+            unclear[rows] = True
+        elif turn.size or behind:
+            later = slice(begin + int(turn[0]) + 1 if turn.size else begin, end + 1)
+            instants[later] += back_ns[begin]
+    return pl.Series(instants).set(first.is_null(), None), pl.Series(unclear)
 
 
 def _offset_ns(zone: pl.Series) -> pl.Series:
-    digits = zone.str.replace_all("[Z:]", "").str.extract(r"([0-9]{4})").fill_null("0000")
+    digits = zone.str.replace_all("[A-Z:]", "").str.extract(r"([0-9]{4})").fill_null("0000")
     minutes = digits.str.slice(0, 2).cast(pl.Int64) * 60 + digits.str.slice(2, 2).cast(pl.Int64)
     sign = pl.Series(np.where(zone.str.starts_with("-").fill_null(False).to_numpy(), -1, 1))
     return sign * minutes * 60 * NS_PER_S

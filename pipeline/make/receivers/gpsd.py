@@ -62,6 +62,12 @@ def read_gpsd(
     return epochs.streams(), gathered.dropped
 
 
+def objects_in(content: bytes) -> dict[tuple[str, bool], int]:
+    """How many objects of each class there are, and whether it is read."""
+    names = re.findall(rb'(?m)^\s*\{\s*"class"\s*:\s*"(\w+)"', content)
+    return dict(Counter((f"gpsd {name.decode()}", name.decode() in _DECODERS) for name in names))
+
+
 def _objects(content: bytes, gathered: Gathered) -> Iterator[dict[str, Any]]:
     """TPV and SKY; others are of no interest, what is no whole object is counted."""
     for line in content.splitlines():

@@ -16,6 +16,7 @@ import polars as pl
 
 from pipeline.make.receivers.earth_fixed import east_north_up, geodetic
 from pipeline.read.ingest.csv_text import CUT_ROW
+from pipeline.read.ingest.parts import LogPart
 from pipeline.read.ingest.stamps import gps_ns_of_weeks, utc_of, within
 from pipeline.read.numbers import numbers_of
 from schemas.arrays import NS_PER_S, Floats
@@ -78,6 +79,28 @@ def read_solution(content: bytes, path: Path) -> tuple[dict[Stream, pl.DataFrame
     is_placed = pl.col("fix") != Fix.NONE.value
     kept = ("t", "solution", "fix", "satellites")
     return {"gnss": fixes.with_columns(pl.when(is_placed).then(pl.exclude(kept)))}, dropped
+
+
+def parts_of_solution(content: bytes, path: Path) -> list[LogPart]:
+    """The columns of a solution, and what they become."""
+    lines = content.decode("utf-8", "replace").splitlines()
+    layout = _layout([line for line in lines if line.startswith("%")], path)
+    rows = sum(bool(line.strip()) and not line.startswith("%") for line in lines)
+    parts = [LogPart(path.name, "column", layout.scale, rows, "gnss t")]
+    for name in layout.columns:
+        used = _USES.get(name) or ("gnss covariance" if re.fullmatch("sd[xyzenu]+", name) else "")
+        unplaced = name == "height" and "geodetic" in layout.comments
+        parts.append(LogPart(path.name, "column", name, rows, "" if unplaced else used))
+    return parts
+
+
+_USES = {
+    **dict.fromkeys(("latitude", "longitude", "height", "x-ecef", "y-ecef", "z-ecef"), "gnss position"),
+    **dict.fromkeys(("vx", "vy", "vz", "ve", "vn", "vu"), "gnss velocity"),
+    "Q": "gnss fix",
+    "ns": "gnss satellites",
+    "age": "gnss sbas_age_s",
+}
 
 
 def _layout(comments: list[str], path: Path) -> _RtklibHeader:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import polars as pl
 
 from pipeline.read.ingest.conform import DEFAULTS, conform
-from pipeline.read.ingest.plan import Source, missing_field
+from pipeline.read.ingest.plan import Source, is_world_frame, missing_field, world_frame
 from pipeline.read.ingest.reader import ORDINAL
+from pipeline.read.ingest.wraps import said_of_wraps, with_whole_counts
 from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
@@ -76,19 +77,47 @@ def _same_receiver(part: DecodedRows, supplement: DecodedRows) -> bool:
 
 def _rows(part: DecodedRows, supplements: Sequence[DecodedRows], few: float, remarks: list[str]) -> pl.DataFrame:
     source = part.source
-    columns = part.frame.select(ORDINAL, **source.columns)
+    _refuse_world_frame(part)
     try:
         times = [time.instants(part.frame, name) for name, time in source.times.items()]
     except (ValueError, pl.exceptions.PolarsError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
-    columns = _explicit(columns, source)
+    part = replace(part, frame=_counted_on(part, times, remarks))
+    columns = _explicit(part.frame.select(ORDINAL, **source.columns), source)
     frame = _supplemented(_named(columns.with_columns(times), part), part, supplements)
     if "t" not in source.times:
         return frame
     if frame["t"].null_count() and _may_be_left_out(part, frame["t"].is_null(), few, remarks):
         frame = frame.drop_nulls("t")
     return _stamped(frame, source, remarks)
+
+
+def _refuse_world_frame(part: DecodedRows) -> None:
+    """Raise `InputError` for a component of a velocity in a frame that does not turn with the train."""
+    source = part.source
+    if not source.frame:
+        return
+    for frame in part.frame[source.frame].drop_nulls().unique(maintain_order=True):
+        if is_world_frame(frame):
+            (path,) = source.columns["speed_mps"].meta.root_names()
+            raise world_frame(source.channel, path, frame)
+
+
+def _counted_on(part: DecodedRows, times: Sequence[pl.Series], remarks: list[str]) -> pl.DataFrame:
+    """The fields with a mapped counter counted on where it begins anew."""
+    mapping = part.source.mapping
+    if mapping is None or part.source.recipe.stream != "odometer" or "distance_m" not in mapping.fields:
+        return part.frame
+    path = mapping.fields["distance_m"]
+    if path not in part.frame.columns:
+        return part.frame
+    t_ns = times[0].to_physical().fill_null(0).to_numpy()
+    sensors = part.frame[mapping.fields["sensor"]] if mapping.fields.get("sensor") in part.frame.columns else None
+    whole, found = with_whole_counts(part.frame[path], t_ns, mapping.wrap, sensors)
+    topic = part.source.channel.topic
+    remarks += [f"{topic}: {times} x {said}" for said, times in said_of_wraps(found, path).items()]
+    return part.frame.with_columns(whole) if found else part.frame
 
 
 def _may_be_left_out(part: DecodedRows, unknown: pl.Series, few: float, remarks: list[str]) -> bool:

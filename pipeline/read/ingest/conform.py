@@ -111,7 +111,9 @@ def _may_be(column: dy.Column, dtype: pl.DataType) -> bool:
     if isinstance(column, dy.Float64 | dy.Int64):
         return dtype.is_numeric()
     if isinstance(column, dy.Enum | dy.String):
-        return isinstance(dtype, pl.String | pl.Categorical | pl.Enum)
+        # Ids are names, and some are written as numbers.
+        is_id = isinstance(column, dy.String) and dtype.is_integer()
+        return is_id or isinstance(dtype, pl.String | pl.Categorical | pl.Enum)
     return isinstance(column, dy.Datetime) and isinstance(dtype, pl.Datetime)
 
 

@@ -20,6 +20,7 @@ from schemas.run import STREAMS, RunLog, Stream
 RECORDED = "corrections"
 """In the metadata of a stream that was written: the corrections that it holds already."""
 
+_DAMAGE = "damage"
 _PLACE = ("latitude_deg", "longitude_deg")
 
 
@@ -72,10 +73,16 @@ def corrections_of(run: RunLog, stream: Stream) -> list[StreamCorrection]:
     return [correction for correction in run.notes.corrections if correction.stream == stream]
 
 
-def recorded_corrections(run: RunLog, stream: Stream) -> dict[str, str]:
-    """What a written stream says of its corrections, for its metadata."""
+def recorded_notes(run: RunLog, stream: Stream) -> dict[str, str]:
+    """What a written stream says of its corrections and, of positions, of what its log lacked, for its metadata."""
     held = [correction.model_dump(mode="json", exclude_defaults=True) for correction in corrections_of(run, stream)]
-    return {RECORDED: json.dumps(held)} if held else {}
+    lost = run.notes.damage if stream == "gnss" else None
+    return ({RECORDED: json.dumps(held)} if held else {}) | ({_DAMAGE: lost} if lost else {})
+
+
+def read_damage(metadata: Mapping[str, str]) -> str | None:
+    """What the log lacked that a stream was written of."""
+    return metadata.get(_DAMAGE)
 
 
 def read_corrections(metadata: Mapping[str, str], stream: Stream, place: str) -> tuple[StreamCorrection, ...]:

@@ -16,12 +16,16 @@ from pipeline.read.ingest.guesses import (
     WORDS,
     columns_in,
     first,
+    known_zones,
     mapping_lines,
     one_line,
     unit_in,
     word_of,
+    words_of_times,
+    zone_in,
 )
 from pipeline.read.ingest.stamps import LEAST_DAY, MOST_DAY, day_is_unclear
+from pipeline.read.ingest.wraps import wrap_of
 from schemas.enums import Fix
 from schemas.run import Stream
 
@@ -38,9 +42,6 @@ _BESIDE_POSITIONS = (
     "# Beside positions: taken for the receiver's own, which is no odometer. Remove the # where it is a sensor's,\n"
     "# and say of which; where it is the receiver's, leave it out."
 )
-
-# Zones that names of columns tell; a time in one of them is not taken for UTC.
-_LOCAL = r"\b(mesz|cest|mez|cet|bst|wet|west|eet|eest|local|lokal|ortszeit|heure locale)\b"
 
 Words = Mapping[str, str]
 
@@ -79,10 +80,22 @@ def _stream(
     kind = _kinds_of_fix(table, words) if stream == "gnss" else None
     texts = {column: name for column, name in (("sensor", sensor), ("fix", kind)) if name is not None}
     lines = mapping_lines(stream, file, numbers, *time, units, texts)
+    lines += _wrap_lines(table, columns_in(stream, numbers)) if stream == "odometer" and lines and not sensor else []
     unfit = _unfit(stream, table, {name: word for name, word in words.items() if name not in numbers})
     if stream == "odometer" and lines and set(columns_in("gnss", words)) >= POSITION:
         lines = [_BESIDE_POSITIONS, *(line if line.startswith("#") else f"# {line}" for line in lines)]
     return "\n".join(["", *lines, *unfit]) + "\n" if lines or unfit else ""
+
+
+def _wrap_lines(table: pl.DataFrame, names: Words) -> list[str]:
+    """The line that counts a distance on over the end of its counter."""
+    if "distance_m" not in names:
+        return []
+    recorded = table[names["distance_m"]].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    wrap = wrap_of(recorded)
+    if wrap is None:
+        return []
+    return [wrap.line if wrap.certain else f"# {wrap.line}  # if the counter begins anew there, and was not reset"]
 
 
 def _kinds_of_fix(table: pl.DataFrame, words: Words) -> str | None:
@@ -119,6 +132,7 @@ def _unfit(stream: Stream, table: pl.DataFrame, words: Words) -> list[str]:
 
 def _time_lines(table: pl.DataFrame, words: Words, units: Words) -> tuple[list[str], float | None]:
     """The lines on time, and the seconds per unit of the times where they are not seconds."""
+    words = words_of_times(words)
     week = first(words, WORDS["week"])
     seconds = first(words, WORDS["seconds"])
     if week and seconds:
@@ -130,13 +144,26 @@ def _time_lines(table: pl.DataFrame, words: Words, units: Words) -> tuple[list[s
     if names[0] is None:
         return ['# time = "field:COLUMN"  # no name shows which column is the time'], None
     written = [name for name in names if name]
-    if zone := next((found[0] for name in written if (found := re.search(_LOCAL, name.lower()))), None):
-        return [f"# {_field(*written)}  # in {zone.upper()}, which is not UTC: add time_zone, as Europe/Berlin"], None
+    told = [zone for name in written for part in (name, f"({units.get(name, '')})") if (zone := zone_in(part)[0])]
+    if told and (lines := _in_zone(told[0], written, table)):
+        return lines, None
     if any("gpsepoch" in words[name] for name in written):
         return [_field(*written), 'time_epoch = "gps"', 'time_scale = "gps"'], _since_gps(words[written[0]])
     epoch, scale = _epoch(table[written[0]])
     gps = ['# time_scale = "gps"  # if these times are 18 s ahead of UTC'] if "gps" in words[written[-1]] else []
     return [_field(*written), *epoch, *_order(table[written[0]]), *gps], scale
+
+
+def _in_zone(zone: str, names: Sequence[str], table: pl.DataFrame) -> list[str]:
+    """The lines on times of a zone: with it where it is known for certain, else commented out."""
+    known = zone if zone in known_zones() else None
+    if offset := re.fullmatch(r"UTC([+-])0?([0-9]{1,2})(?::?00)?", zone):
+        # The sign of these names is turned round: Etc/GMT-2 is ahead of UTC.
+        known = f"Etc/GMT{'-' if offset[1] == '+' else '+'}{int(offset[2])}"
+    if known in known_zones() and all(table[name].dtype == pl.String for name in names):
+        return [_field(*names), f"time_zone = {json.dumps(known)}  # as the name says: {one_line(zone)}"]
+    reason = f"# in {one_line(zone)!r}, which is not UTC as far as is known here"
+    return [f"# {_field(*names)}  {reason}: add time_zone, as Europe/Berlin, or take these words away for UTC"]
 
 
 def _since_gps(word: str) -> float | None:

@@ -109,7 +109,29 @@ def _has_number(cell: str) -> bool:
 
 
 def _lines(data: bytes) -> list[str]:
-    return [line for line in text_of(data).splitlines() if not re.match(_NO_ROW, line)]
+    """The lines that are no comments; the header may stand in the last comment before the first row."""
+    written = text_of(data).splitlines()
+    lines = [line for line in written if not re.match(_NO_ROW, line)]
+    first = next((line for line in lines if line.strip()), None)
+    if first is None:
+        return lines
+    before = [line for line in written[: written.index(first)] if line.startswith("#")]
+    header = before[-1].lstrip("# ") if before else ""
+    return [header, *lines] if _heads(header, first) else lines
+
+
+def _heads(comment: str, row: str) -> bool:
+    """Whether a comment names the columns of a row that has no names itself."""
+    separator = max(_SEPARATORS, key=comment.count)
+    (names,), (cells,) = (csv.reader([line], delimiter=separator) for line in (comment or " ", row))
+    written = [cell.strip() for cell in cells]
+    numbers = sum(map(_has_number, written))
+    return (
+        len(names) == len(cells) > 1
+        and not any(map(_has_number, names))
+        and 2 * numbers > len(cells)
+        and all(name.strip() for name in names)
+    )
 
 
 def _header(lines: list[str]) -> str:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
 
 from pipeline.read.ingest.fields import fields_of
-from pipeline.read.ingest.guesses import COLUMNS, ORIGIN, columns_in, mapping_lines, word_of
+from pipeline.read.ingest.guesses import COLUMNS, ORIGIN, WORDS, columns_in, first, mapping_lines, word_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
@@ -80,7 +81,7 @@ class LogDescription:
 def describe_log(path: Address, config: IngestConfig) -> LogDescription:
     """Describe a run; a log that cannot be replayed is described as far as it can be read."""
     is_mcap = name_of(path).endswith(".mcap")
-    topics = _topics(path, config) if is_mcap else ()
+    topics = topics_of([path], config) if is_mcap else ()
     parts = [path] if is_mcap else [join(path, name) for name in files.list_dir(path) if name.endswith(".parquet")]
     run: RunLog | None = None
     problems: tuple[str, ...] = ()
@@ -88,14 +89,26 @@ def describe_log(path: Address, config: IngestConfig) -> LogDescription:
         run = read_run(path, config, with_digest=False)
     except BaliseError as error:
         problems = (str(error),)
-    summaries = tuple(_summaries(run)) if run else ()
+    size = sum(files.size_of(file) for file in parts)
+    return description_of(str(path), "mcap" if is_mcap else "parquet", size, topics, run, problems)
+
+
+def description_of(
+    path: str,
+    kind: str,
+    size_bytes: int,
+    topics: tuple[TopicSummary, ...],
+    run: RunLog | None,
+    problems: tuple[str, ...],
+) -> LogDescription:
+    """What there is to say of a log: of its topics, and of what was read of it, or why nothing was."""
     notes = run.notes if run else IngestNotes()
     left = tuple(topic.topic for topic in topics if topic.stream is None) or notes.skipped_topics
     return LogDescription(
-        path=str(path),
-        kind="mcap" if is_mcap else "parquet",
-        size_bytes=sum(files.size_of(file) for file in parts),
-        streams=summaries,
+        path=path,
+        kind=kind,
+        size_bytes=size_bytes,
+        streams=tuple(_summaries(run)) if run else (),
         topics=topics,
         left_over=left,
         notes=notes,
@@ -173,15 +186,25 @@ def _fields(channel: Channel, messages: Messages) -> Mapping[str, str]:
         return {}
 
 
-def _topics(path: Address, config: IngestConfig) -> tuple[TopicSummary, ...]:
-    """All topics as far as the log can be read; damage is a problem that reading reports."""
+def topics_of(paths: Sequence[Address], config: IngestConfig) -> tuple[TopicSummary, ...]:
+    """All topics of a log, in one or several files, as far as it can be read; of damage it says nothing."""
+    logs = [_census_of(path, config) for path in paths]
+    if len(logs) == 1:
+        return tuple(_topic(logs[0].met[channel_id], config) for channel_id in sorted(logs[0].met))
+    joined: dict[tuple[str, str, str], _ChannelCounts] = {}
+    for met in (met for census in logs for met in census.met.values()):
+        key = (met.channel.topic, met.channel.schema_name, met.channel.encoding)
+        before = joined.setdefault(key, _ChannelCounts(met.channel, met.fields))
+        before.messages += met.messages
+        before.span_ns += met.span_ns
+    return tuple(_topic(joined[key], config) for key in sorted(joined))
+
+
+def _census_of(path: Address, config: IngestConfig) -> _Census:
     census = _Census()
-    try:
+    with suppress(InputError):
         walk_log(path, config, census)
-    except InputError:
-        if not census.met:
-            return ()
-    return tuple(_topic(census.met[channel_id], config) for channel_id in sorted(census.met))
+    return census
 
 
 def _topic(met: _ChannelCounts, config: IngestConfig) -> TopicSummary:
@@ -193,7 +216,8 @@ def _topic(met: _ChannelCounts, config: IngestConfig) -> TopicSummary:
     if source is not None:
         mapping = {name: " + ".join(time.fields) for name, time in source.times.items()}
         mapping |= {
-            name: ", ".join(expression.meta.root_names()) or "constant" for name, expression in source.columns.items()
+            name: ", ".join(dict.fromkeys(expression.meta.root_names())) or "constant"
+            for name, expression in source.columns.items()
         }
     return TopicSummary(
         topic=met.channel.topic,
@@ -225,11 +249,16 @@ def _suggestion(topic: TopicSummary) -> str:
         return "\n".join([f"# {remark}", *(f"# {line}" for line in written), ORIGIN]) + "\n"
     numbers = [path for path, kind in topic.fields.items() if kind in ("int", "float")]
     words = {path: word_of(path.split(".")[-1]) for path in sorted(numbers, key=lambda path: (path.count("."), path))}
+    time = ['time = "auto"  # or "log", "publish", "field:PATH"']
     for stream in COLUMNS:
-        time = ['time = "auto"  # or "log", "publish", "field:PATH"']
         if lines := mapping_lines(stream, topic.topic, words, time, None, {}):
             used = set(columns_in(stream, words).values())
             return "\n".join([*lines, f"# other fields: {_others(topic.fields, used)}\n"])
+    named = {path: word_of(path.split(".")[-1]) for path, kind in topic.fields.items() if kind in ("int", "text")}
+    if balise := first(named, WORDS["balise"]):
+        head = ["[[ingest.balise_reads]]", f"topic = {json.dumps(topic.topic, ensure_ascii=False)}", *time]
+        fields = f"fields = {{ balise_id = {json.dumps(balise, ensure_ascii=False)} }}"
+        return "\n".join([*head, fields, f"# other fields: {_others(topic.fields, {balise})}\n"])
     return (
         f'# [[ingest.STREAM]]\n# topic = "{topic.topic}"  # {topic.schema or "no schema"}\n'
         f"# fields: {_others(topic.fields, set())}\n"

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from functools import cache
 from importlib.resources import files
 from typing import Any
+from zoneinfo import available_timezones
 
 from schemas.run import Stream
 
@@ -19,6 +21,7 @@ SURVEY: Mapping[str, str] = _FILE["survey"] | {
 BALISE_LIST: Mapping[str, list[str]] = _FILE["balise_list"]
 BALISE_KINDS: Mapping[str, str] = _FILE["balise_kinds"]
 WORDS: Mapping[str, str] = _FILE["words"]
+ZONES: Mapping[str, str] = _FILE["zones"]
 UNITS: Mapping[str, float] = _FILE["units"]
 POSITION = {"latitude_deg", "longitude_deg"}
 _UNIT_NEEDED = ("distance_m", "speed_mps", "vel_e_mps", "vel_n_mps", "vel_u_mps", "height_m")
@@ -37,6 +40,41 @@ def word_of(name: str) -> str:
     return re.sub(r"[^a-zäöüßàâçéèêëîïôûùąćęłńóśźż0-9]", "", re.sub(r"[\[(<].*", "", name).lower())
 
 
+@cache
+def known_zones() -> frozenset[str]:
+    """The names of time zones that this computer knows."""
+    return frozenset(available_timezones())
+
+
+def zone_in(name: str) -> tuple[str | None, str]:
+    """The zone that the name of a time tells, None for UTC and none, and the name without it.
+
+    A zone is told by its name (`Europe/Berlin`), by an offset (`UTC+2`), by letters (`CEST`) or by a word (`local`).
+    """
+    places = set(re.findall(r"[A-Z][A-Za-z]+/[A-Z][A-Za-z_]+", name)) & known_zones()
+    if place := next(iter(sorted(places)), None):
+        return place, name.replace(place, "")
+    if offset := re.search(r"(?:(?:utc|gmt)\s*|[\[(<]\s*)([+-]\s*[0-9]{1,2}(?::?[0-9]{2})?)", name, re.IGNORECASE):
+        hours = re.sub(r"\s", "", offset[1])
+        return (None if re.fullmatch(r"[+-][0:]+", hours) else f"UTC{hours}"), name.replace(offset[0], "")
+    apart = re.sub(r"(?<=[a-ząćęłńóśźż])(?=[A-Z])", " ", name)
+    words = re.findall(r"[^\W_]+", re.sub(r"(?i)(?<=local|lokal)(?=time|zeit)|(?<=orts)(?=zeit)", " ", apart))
+    told = [word for word in words if re.fullmatch(ZONES["local"] + "|orts", word.lower())]
+    bracket = re.search(r"[\[(<]\s*([^\])>]*?)\s*[\])>]", name)
+    if not told and bracket and not all(re.fullmatch(ZONES["utc"], word) for word in _words(bracket[1])):
+        return bracket[1], name.replace(bracket[0], "")
+    return " ".join(told) or None, " ".join(word for word in words if word not in told) if told else name
+
+
+def words_of_times(names: Iterable[str]) -> dict[str, str]:
+    """The words of names as `word_of`, without the zones that they tell: a name that tells nothing else is a time."""
+    return {name: word_of(rest) or "zeit" * bool(zone) for name in names for zone, rest in (zone_in(name),)}
+
+
+def _words(text: str) -> list[str]:
+    return re.findall(r"[^\W_]+", text.lower())
+
+
 def first(words: Mapping[str, str], pattern: str) -> str | None:
     """The first name whose word fits."""
     return next((name for name, word in words.items() if re.fullmatch(pattern, word)), None)
@@ -50,7 +88,8 @@ def columns_in(stream: Stream, words: Mapping[str, str]) -> dict[str, str]:
 def unit_in(name: str) -> str | None:
     """The unit in brackets, or at the end of a name."""
     patterns = (r"[\[(<]\s*([^\])>]+?)\s*[\])>]", r"_(kmh|kph|mps|mph|km|mm|cm|m|ms|s|ft|kn|knots)$")
-    found = next((match[1] for pattern in patterns if (match := re.search(pattern, name.lower()))), None)
+    written = re.sub(r"(?<=[a-z])(Kmh|Kph|Mps|Mph|Knots)$", r"_\1", name)
+    found = next((match[1] for pattern in patterns if (match := re.search(pattern, written.lower()))), None)
     # A column that is called by its unit alone: kilometres.
     return "km" if found is None and word_of(name) == "km" else found
 

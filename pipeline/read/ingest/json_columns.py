@@ -210,13 +210,17 @@ _KINDS: dict[type[pl.DataType], tuple[type, str]] = {
 
 
 def _fitting(value: Any, dtype: pl.DataType) -> Any:
-    """The value in the type asked for: whole numbers also serve as floats, and floats that are whole as integers."""
+    """The value in the type asked for: whole numbers also serve as floats and as ids, which are texts, and floats that
+    are whole as integers.
+    """
     kind, name = _KINDS[type(dtype)]
     fits = value is None or type(value) is kind
     if fits and (kind is not int or value is None or -(2**63) <= value < 2**63):
         return value
     if kind is float and type(value) is int and abs(value) < 2**1023:
         return float(value)
+    if kind is str and type(value) is int and value.bit_length() <= 64:
+        return str(value)
     if kind is int and type(value) is float and value.is_integer() and abs(value) < 2**53:
         return int(value)
     # Python does not even write integers of 4,300 digits.

@@ -72,6 +72,11 @@ class Field:
             return self
         if self.kind in (pl.Int64, pl.Float64) and isinstance(dtype, pl.Int64 | pl.Float64):
             return replace(self, kind=type(dtype))
+        if self.kind is pl.Int64 and isinstance(dtype, pl.String):
+            # Ids are names, whatever a message holds them as.
+            return replace(
+                self, kind=pl.String, take=lambda rows: pl.Series(np.asarray(self.take(rows))).cast(pl.String)
+            )
         raise UndecodableError(f"a field holds {self.kind.__name__}, not {dtype}")
 
     def values(self, rows: Bytes) -> Values:

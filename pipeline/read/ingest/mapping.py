@@ -39,8 +39,10 @@ def mapped_recipe(base: Recipe | None, fields: Mapping[str, str], stream: Stream
     contract = STREAM_SCHEMAS[stream].columns()
     _refuse_unknown_columns(stream, mapping, contract)
     paths = {name: path for name, path in mapping.fields.items() if name != "t"}
-    columns = dict(base.columns) | {name: pl.col(path) for name, path in paths.items()}
-    types = dict(base.types) | {path: recorded_type(contract[name]) for name, path in paths.items()}
+    columns = dict(base.columns) | {name: _recorded(path) for name, path in paths.items()}
+    types = dict(base.types) | {
+        root: recorded_type(contract[name]) for name in paths for root in columns[name].meta.root_names()
+    }
     if "fix" in paths and mapping.fix_codes:
         types[paths["fix"]], columns["fix"] = _coded(fields.get(paths["fix"]), paths["fix"], mapping)
     columns |= {name: _constant(stream, mapping, name, contract[name]) for name in mapping.constants}
@@ -51,6 +53,15 @@ def mapped_recipe(base: Recipe | None, fields: Mapping[str, str], stream: Stream
     elif mapping.origin is not None:
         columns["origin"] = _origin(stream, mapping, mapping.origin, columns.get("origin"), fields)
     return replace(base, columns=columns, types=types)
+
+
+def _recorded(path: str) -> pl.Expr:
+    """What a path of a mapping means: a field, or the length of a vector."""
+    vector = re.fullmatch(r"norm\((.+)\)", path)
+    if vector is None:
+        return pl.col(path)
+    parts = [pl.col(f"{vector[1].strip()}.{axis}") ** 2 for axis in "xyz"]
+    return pl.sum_horizontal(parts, ignore_nulls=False).sqrt()
 
 
 def _origin(

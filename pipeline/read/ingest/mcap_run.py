@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import io
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -12,15 +14,15 @@ import polars as pl
 
 from pipeline.read.ingest.assemble import DecodedRows, stream_frames
 from pipeline.read.ingest.conform import refuse
-from pipeline.read.ingest.correct import read_corrections
+from pipeline.read.ingest.correct import read_corrections, read_damage
 from pipeline.read.ingest.fields import fields_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel, DamageError
 from pipeline.read.ingest.mcap_walk import McapWalk
 from pipeline.read.ingest.plan import Sample, Source, is_candidate, settle, solution_of, sources_of
-from pipeline.read.ingest.reader import SourceReader
+from pipeline.read.ingest.reader import ORDINAL, SourceReader
 from pipeline.storage import files
-from pipeline.storage.address import Address, stem_of
+from pipeline.storage.address import Address, name_of, stem_of
 from pipeline.storage.budget import most_unpacked
 from schemas.arrays import times_ns
 from schemas.config import IngestConfig, StreamCorrection
@@ -86,24 +88,66 @@ def _pieces(messages: Messages) -> Iterator[Messages]:
     yield from (messages.chosen(rows) for rows in np.split(np.arange(len(messages)), cuts))
 
 
+@dataclass(frozen=True)
+class _WalkedLog:
+    """One file that was walked, and what its messages fed."""
+
+    path: Address
+    walk: McapWalk
+    streams: McapStreams
+    digest: str
+
+
 def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
     """All streams of a log, read strictly from front to back in pieces."""
-    streams = McapStreams(config)
-    walk, digest = walk_log(path, config, streams, with_digest)
-    frames, held, slow_messages, left_over = _frames(path, config, walk, streams)
+    return read_mcaps([path], config, with_digest)
+
+
+def read_mcaps(paths: Sequence[Address], config: IngestConfig, with_digest: bool = False) -> RunLog:
+    """All streams of a log that a recorder split into several files, in order; the digest is of the first.
+
+    A topic need not be in each of them.
+    """
+    logs: list[_WalkedLog] = []
+    for path in paths:
+        streams = McapStreams(config)
+        ordinal = logs[-1].walk.next_ordinal if logs else 0
+        walk, digest = walk_log(path, config, streams, with_digest, ordinal)
+        logs.append(_WalkedLog(path, walk, streams, digest))
+    frames, held, slow_messages, left_over, damage = _frames(logs, config)
+    messages: Counter[str] = Counter()
+    for log in logs:
+        messages.update(log.walk.message_counts())
     return RunLog(
-        run_id=stem_of(path),
+        run_id=stem_of(paths[0]),
         notes=IngestNotes(
-            partial_until_ns=times_ns(frames["gnss"]).max().item() if walk.cut_at is not None else None,
-            damage=f"cut off at byte {walk.cut_at}" if walk.cut_at is not None else None,
+            partial_until_ns=_partial_until_ns(logs, frames["gnss"]),
+            damage="; ".join(dict.fromkeys([*_damages(logs), *damage])) or None,
             slow_path_messages=slow_messages,
-            chunks_without_crc=walk.without_crc,
+            chunks_without_crc=sum(log.walk.without_crc for log in logs),
             skipped_topics=left_over,
             corrections=held,
+            messages=dict(messages),
         ),
-        input_digest=digest,
+        input_digest=logs[0].digest,
         gnss=frames["gnss"],
     ).with_streams(**frames)
+
+
+def _damages(logs: Sequence[_WalkedLog]) -> list[str]:
+    """What the files lack; of several each is named."""
+    several = len(logs) > 1
+    return [f"{name_of(log.path)}: {text}" if several else text for log in logs for text in log.walk.damages]
+
+
+def _partial_until_ns(logs: Sequence[_WalkedLog], gnss: pl.DataFrame) -> int | None:
+    """The last position of a log that is cut off; of one that goes on in another file, the last message before."""
+    cut = [log for log in logs if log.walk.cut_at is not None]
+    if not cut:
+        return None
+    last_ns: int = times_ns(gnss).max().item()
+    ends_ns = [span_ns[1] for log in cut if log is not logs[-1] and (span_ns := log.walk.met.span_ns) is not None]
+    return min(last_ns, *ends_ns) if ends_ns else last_ns
 
 
 class BlockSink(Protocol):
@@ -111,7 +155,7 @@ class BlockSink(Protocol):
 
 
 def walk_log(
-    path: Address, config: IngestConfig, streams: BlockSink, with_digest: bool = False
+    path: Address, config: IngestConfig, streams: BlockSink, with_digest: bool = False, first_ordinal: int = 0
 ) -> tuple[McapWalk, str]:
     """Walk the whole log into `streams`; damage becomes one error that names file, byte and kind.
 
@@ -121,7 +165,7 @@ def walk_log(
         with files.open_binary(path) as raw, io.BufferedReader(raw, _MIB) as stream:  # type: ignore[type-var]
             size = stream.seek(0, io.SEEK_END)
             chunk_limit = int(config.chunk_limit_mib * _MIB)
-            walk = McapWalk(stream, size, str(path), chunk_limit, most_unpacked(size, config))
+            walk = McapWalk(stream, size, str(path), chunk_limit, most_unpacked(size, config), first_ordinal)
             for block in walk.blocks():
                 streams.add(block, walk.channels)
             stream.seek(0)
@@ -135,12 +179,15 @@ def walk_log(
 
 
 def _frames(
-    path: Address, config: IngestConfig, walk: McapWalk, streams: McapStreams
-) -> tuple[dict[str, pl.DataFrame], tuple[StreamCorrection, ...], int, tuple[str, ...]]:
-    """Frames of all streams, corrections that they hold, messages decoded one by one, and the topics that fed none."""
-    readers = [reader for of_channel in streams.readers.values() for reader in of_channel]
-    met = [walk.channels[channel_id] for channel_id in streams.readers]
-    settled = settle([reader.source for reader in readers], [c.topic for c in met], config, str(path))
+    logs: Sequence[_WalkedLog], config: IngestConfig
+) -> tuple[dict[str, pl.DataFrame], tuple[StreamCorrection, ...], int, tuple[str, ...], list[str]]:
+    """Frames of all streams, corrections that they hold, messages decoded one by one, the topics that fed none, and
+    what was lost when the log was written.
+    """
+    place = str(logs[0].path) if len(logs) == 1 else ", ".join(str(log.path) for log in logs)
+    readers = [reader for log in logs for of_channel in log.streams.readers.values() for reader in of_channel]
+    met = [log.walk.channels[channel_id] for log in logs for channel_id in log.streams.readers]
+    settled = settle([reader.source for reader in readers], [c.topic for c in met], config, place)
     chosen = [reader for reader in readers if any(reader.source is source for source in settled)]
     decoded = [DecodedRows(r.source, solution_of(r.source, settled), r.frame()) for r in chosen]
     used = {source.channel.topic for source in settled}
@@ -148,12 +195,26 @@ def _frames(
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
     breaches: list[InputError] = []
     remarks: list[str] = []
-    frames = stream_frames(decoded, breaches, config.wrong_dates_share, remarks)
+    frames = stream_frames(decoded if len(logs) == 1 else _joined(decoded), breaches, config.wrong_dates_share, remarks)
     if "gnss" not in frames:
-        breaches.append(_no_gnss(path, walk, left_over))
+        breaches.append(_no_gnss(logs, left_over))
     refuse(breaches)
     slow_messages = sum(reader.slow_messages for reader in chosen)
-    return frames, _held([*settled], str(path)), slow_messages, (*left_over, *remarks)
+    held = _held([*settled], place)
+    damage = [text for source in settled if (text := read_damage(dict(source.channel.notes)))]
+    return frames, held, slow_messages, (*left_over, *remarks), damage
+
+
+def _joined(decoded: Sequence[DecodedRows]) -> list[DecodedRows]:
+    """The rows of one topic in several files as those of one source."""
+    joined: dict[tuple[object, ...], DecodedRows] = {}
+    for part in decoded:
+        source = part.source
+        key = (source.channel.topic, source.recipe.stream, id(source.mapping), *source.columns, *source.types)
+        before = joined.get(key)
+        frame = part.frame if before is None else pl.concat([before.frame, part.frame]).sort(ORDINAL)
+        joined[key] = replace(part if before is None else before, frame=frame)
+    return list(joined.values())
 
 
 def _held(sources: Sequence[Source], place: str) -> tuple[StreamCorrection, ...]:
@@ -168,16 +229,18 @@ def _held(sources: Sequence[Source], place: str) -> tuple[StreamCorrection, ...]
     return tuple(held)
 
 
-def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> InputError:
-    if walk.cut_at is not None and not walk.met.message_counts:
+def _no_gnss(logs: Sequence[_WalkedLog], left_over: tuple[str, ...]) -> InputError:
+    place = ", ".join(str(log.path) for log in logs)
+    walk = logs[0].walk
+    if walk.cut_at is not None and not any(log.walk.met.message_counts for log in logs):
         return InputError(
             f"is cut off at byte {walk.cut_at}, before any complete message",
-            place=str(path),
+            place=place,
             remedy="Record or copy the log again.",
         )
     return InputError(
         "holds no GNSS stream",
-        place=str(path),
+        place=place,
         found=", ".join(left_over[:40]) or "no messages",
         expected="a topic of a known schema, or one mapped by [ingest.gnss]",
         remedy="Map a topic in the configuration; `balise inspect` prints one to start from.",

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex, Footer, Statistics
 
-from pipeline.read.ingest.mcap_records import HEAD_SIZE, DamageError, parse
+from pipeline.read.ingest.mcap_records import HEAD_SIZE, Channel, DamageError, parse
 
 
 @dataclass
@@ -41,11 +42,17 @@ class WalkCounts:
 
 
 class Summary:
-    """The summary section, record by record; raises where it contradicts what was met."""
+    """The summary section, record by record; raises where it contradicts what was met.
 
-    def __init__(self, start: int, met: WalkCounts) -> None:
+    `lost`: what it declares beyond that.
+    """
+
+    def __init__(self, start: int, met: WalkCounts, channels: Mapping[int, Channel]) -> None:
+        self.lost: list[str] = []
         self._start = start
         self._met = met
+        self._channels = channels
+        self._stated_chunks = 0
         self._crc = 0
         self._indexed = 0
         self._index_sum = 0
@@ -64,22 +71,40 @@ class Summary:
             self._check_statistics(parse(Statistics, whole[HEAD_SIZE:], position), position)
 
     def _check_statistics(self, stated: Statistics, position: int) -> None:
+        """Fewer records than stated are a loss, which is said; everything else that differs is a contradiction."""
         met = self._met
         per_channel = {channel: count for channel, count in stated.channel_message_counts.items() if count}
+        counts = dict(met.message_counts)
         pairs: list[tuple[str, object, object]] = [
-            ("messages", stated.message_count, met.message_counts.total()),
-            ("chunks", stated.chunk_count, met.chunks),
             ("attachments", stated.attachment_count, met.attachments),
             ("metadata records", stated.metadata_count, met.metadata),
-            ("messages per channel", per_channel or dict(met.message_counts), dict(met.message_counts)),
         ]
+        if _is_less(counts, per_channel or counts) and counts != (per_channel or counts):
+            lost = [(channel, counts.get(channel, 0), count) for channel, count in sorted(per_channel.items())]
+            self.lost += [_loss(f"messages of {self._topic(of)}", *both) for of, *both in lost if both[0] < both[1]]
+        elif per_channel:
+            pairs.append(("messages per channel", per_channel, counts))
+        for name, held, count in (
+            ("messages", met.message_counts.total(), stated.message_count),
+            ("chunks", met.chunks, stated.chunk_count),
+        ):
+            if held < count:
+                self.lost += [_loss(name, held, count)] if name == "chunks" or not self.lost else []
+            else:
+                pairs.append((name, count, held))
+        self._stated_chunks = stated.chunk_count
         if met.span_ns:
             # Some writers take a first time of 0 for none yet, and state the earliest after it.
             start_ns = stated.message_start_time if met.span_ns[0] else 0
-            pairs.append(("times", (start_ns, stated.message_end_time), met.span_ns))
+            span_ns = (start_ns, stated.message_end_time)
+            if not (self.lost and start_ns <= met.span_ns[0] and met.span_ns[1] <= span_ns[1]):
+                pairs.append(("times", span_ns, met.span_ns))
         for name, recorded, counted in pairs:
             if recorded != counted:
                 raise DamageError(position, f"the statistics record gives {recorded} {name}, the file holds {counted}")
+
+    def _topic(self, channel_id: int) -> str:
+        return self._channels[channel_id].topic if channel_id in self._channels else f"channel {channel_id}"
 
     def finish(self, footer: bytes, position: int) -> None:
         """The footer. A chunk index lists every chunk once, or there is none."""
@@ -89,5 +114,16 @@ class Summary:
             raise DamageError(position, f"the footer places the summary at {stated.summary_start}, it is at {start}")
         if stated.summary_crc and crc32(footer[:-4], self._crc) != stated.summary_crc:
             raise DamageError(position, "the checksum of the summary does not match")
-        if self._indexed and (self._indexed, self._index_sum) != (self._met.chunks, self._met.chunk_sum):
+        all_indexed = (self._indexed, self._index_sum) == (self._met.chunks, self._met.chunk_sum)
+        # Chunks that the statistics miss too are lost; without them the sum shows nothing of the others.
+        known = bool(self.lost) and self._met.chunks < self._indexed == self._stated_chunks
+        if self._indexed and not (all_indexed or known):
             raise DamageError(position, "the chunk index disagrees with the chunks")
+
+
+def _is_less(counts: Mapping[int, int], stated: Mapping[int, int]) -> bool:
+    return all(count <= stated.get(channel, 0) for channel, count in counts.items())
+
+
+def _loss(what: str, held: int, declared: int) -> str:
+    return f"{held} of {declared} {what} that are declared"

@@ -8,6 +8,7 @@ checksums, statistics) is then held against what was met.
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 from collections.abc import Iterator
 from typing import IO
 
@@ -46,7 +47,9 @@ _SLACK = 1024 * 1024  # what does not compress grows a little
 class McapWalk:
     """Walks a log once; `blocks` yields its messages, the attributes hold what was met so far."""
 
-    def __init__(self, stream: IO[bytes], size: int, file: str, chunk_limit: int, most_unpacked: int) -> None:
+    def __init__(
+        self, stream: IO[bytes], size: int, file: str, chunk_limit: int, most_unpacked: int, first_ordinal: int = 0
+    ) -> None:
         self.channels: dict[int, Channel] = {}
         self.met = WalkCounts()
         self.cut_at: int | None = None
@@ -62,9 +65,27 @@ class McapWalk:
         self._pieces: list[Piece] = []
         self._waiting = 0
         self._loose_until = 0
-        self._ordinal = 0
+        self._ordinal = first_ordinal
         self._allowance = Allowance(_FREE_RECORDS + size)
         self._summary: Summary | None = None
+
+    @property
+    def next_ordinal(self) -> int:
+        """Of the first message that follows in another file."""
+        return self._ordinal
+
+    @property
+    def damages(self) -> list[str]:
+        """What the file lacks: its end, or records that it declares."""
+        cut = [] if self.cut_at is None else [f"cut off at byte {self.cut_at}"]
+        return cut + ([] if self._summary is None else [f"holds {lost}" for lost in self._summary.lost])
+
+    def message_counts(self) -> dict[str, int]:
+        """Messages that were met, by topic."""
+        counts: Counter[str] = Counter()
+        for channel_id, count in self.met.message_counts.items():
+            counts[self.channels[channel_id].topic] += count
+        return dict(counts)
 
     def blocks(self) -> Iterator[Block]:
         """All messages in order of the file. Stops at a cut, with `cut_at` set; raises `DamageError`.
@@ -162,7 +183,7 @@ class McapWalk:
             parse(records.Header, body, position)
         elif opcode == Opcode.DATA_END:
             self._data_end(parse(records.DataEnd, body, position).data_section_crc, position)
-            self._summary = Summary(position + HEAD_SIZE + len(body), self.met)
+            self._summary = Summary(position + HEAD_SIZE + len(body), self.met, self.channels)
 
     def _body(self, opcode: int, length: int, position: int) -> bytes:
         """No record that is loaded whole may be larger than a chunk."""

@@ -7,7 +7,7 @@ import hashlib
 import polars as pl
 
 from pipeline.read.ingest.conform import conform, refuse, refuse_too_many
-from pipeline.read.ingest.correct import read_corrections
+from pipeline.read.ingest.correct import read_corrections, read_damage
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
 from pipeline.storage.described import notes_of
@@ -29,6 +29,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
     skipped: list[str] = []
     unproved: list[str] = []
     held: list[StreamCorrection] = []
+    damages: list[str] = []
     for stream in STREAMS:
         if f"{stream}.parquet" not in present:
             continue
@@ -40,17 +41,32 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
         recorded = _read(content, stream, str(file), config, breaches)
         if recorded is not None:
             frames[stream] = conform(recorded, stream, str(file), breaches)
-            held += read_corrections(notes_of(content), stream, str(file))
+            said = notes_of(content)
+            held += read_corrections(said, stream, str(file))
+            damages += [*filter(None, [read_damage(said)]), *_lost(stream, content, recorded)]
             unproved += [f"{stream}.parquet"] if without_checksums(content) else []
             skipped += [f"{stream}.parquet: column {name}" for name in recorded.columns if not _is_known(name, stream)]
     refuse(breaches)
     skipped += sorted(present - {f"{stream}.parquet" for stream in STREAMS})
     return RunLog(
         run_id=stem_of(path),
-        notes=IngestNotes(skipped_topics=tuple(skipped), files_without_crc=tuple(unproved), corrections=tuple(held)),
+        notes=IngestNotes(
+            damage="; ".join(damages) or None,
+            skipped_topics=tuple(skipped),
+            files_without_crc=tuple(unproved),
+            corrections=tuple(held),
+        ),
         input_digest=digest.hexdigest() if with_digest else "",
         gnss=frames["gnss"],
     ).with_streams(**frames)
+
+
+def _lost(stream: Stream, content: bytes, recorded: pl.DataFrame) -> list[str]:
+    """Rows that a file declares and does not hold."""
+    declared = rows_of(content)
+    return [f"{stream}.parquet holds {recorded.height} of {declared} rows that are declared"] * (
+        recorded.height < declared
+    )
 
 
 def _no_gnss(path: Address, present: set[str]) -> InputError:

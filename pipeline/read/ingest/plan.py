@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -28,6 +29,8 @@ from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
 _POSITION = ("latitude_deg", "longitude_deg")
+_FRAMES = ("child_frame_id", "header.frame_id", "frame_id")
+_WORLD = r"(map|odom|world|earth|ecef|enu|ned|utm|wgs84|global|local|navigation|nav|inertial|gps|gnss|navsat)(_.*)?"
 _USUAL_STAMPS = ("header.stamp", "timestamp", "stamp")
 
 
@@ -44,7 +47,8 @@ class Source:
     """One channel that feeds a stream: fields to decode, columns and times over them.
 
     `doubtful` are fields that the first message lacks and some message must have, by column. `implicit` are
-    nullable columns of this project's protobuf messages whose field cannot be left out: 0 may say that it was.
+    nullable columns of this project's protobuf messages whose field cannot be left out: 0 may say that it was. `frame`:
+    the field that names the frame of a speed, empty where none has to be looked at.
     """
 
     channel: Channel
@@ -56,6 +60,7 @@ class Source:
     breaches: Sequence[InputError]
     doubtful: Mapping[str, str]
     implicit: Sequence[str]
+    frame: str = ""
 
     @property
     def dropped(self) -> bool:
@@ -127,7 +132,42 @@ def _source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None
     for time in times.values():
         types |= time.types
     implicit = _without_presence(sample.channel, columns) if recipe.own else ()
-    return Source(sample.channel, recipe, mapping, columns, times, types, breaches, doubtful, implicit)
+    frame = _frame_of_speed(sample, columns.get("speed_mps"), mapping, breaches)
+    types |= {frame: pl.String()} if frame else {}
+    return Source(sample.channel, recipe, mapping, columns, times, types, breaches, doubtful, implicit, frame)
+
+
+def _frame_of_speed(
+    sample: Sample, speed: pl.Expr | None, mapping: StreamMapping | None, breaches: list[InputError]
+) -> str:
+    """The field with the frame of a speed that is one component of a vector; empty where the mapping gives it."""
+    roots = [] if speed is None else speed.meta.root_names()
+    if len(roots) != 1 or not re.search(r"\.[xyz]$", roots[0]):
+        return ""
+    if mapping is not None and mapping.frame is not None:
+        if is_world_frame(mapping.frame):
+            breaches.append(world_frame(sample.channel, roots[0], mapping.frame))
+        return ""
+    # A twist is in the frame of the child where a message has one (REP 105, nav_msgs/Odometry).
+    return next((name for name in _FRAMES if sample.fields.get(name) == "text"), "")
+
+
+def is_world_frame(frame: str) -> bool:
+    """Whether a frame does not turn with the train, by the names that REP 105 and drivers use."""
+    return re.fullmatch(_WORLD, frame.strip("/ ").rpartition("/")[2].lower()) is not None
+
+
+def world_frame(channel: Channel, path: str, frame: str) -> InputError:
+    """A component of a velocity in the world, which is no speed of the train."""
+    vector = path.rpartition(".")[0]
+    return InputError(
+        f"{path} is one component of a velocity in a frame that does not turn with the train",
+        place=channel.place,
+        found=f"frame {frame!r}",
+        expected="a frame of the vehicle, such as base_link",
+        remedy=f'Write fields = {{ speed_mps = "norm({vector})" }} for its length, which is never negative, or, if the '
+        'component is along the train all the same, frame = "base_link" in this mapping.',
+    )
 
 
 def _without_presence(channel: Channel, columns: Iterable[str]) -> tuple[str, ...]:

@@ -31,6 +31,11 @@ def utc_from_gps(t_ns: Ints) -> Ints:
     return t_ns - leaps.astype(np.int64) * 1_000_000_000
 
 
+def leap_seconds(utc_ns: int) -> int:
+    """GPS time minus UTC at an instant [s]."""
+    return int(np.searchsorted(_LEAP_UTC_NS, utc_ns, side="right"))
+
+
 def utc_of_week(week: int, tow_ns: int) -> int:
     """UTC of a time of the week on the GPS scale [ns since 1970]."""
     return int(utc_from_gps(np.array([GPS_EPOCH_NS + week * WEEK_NS + tow_ns], dtype=np.int64))[0])

@@ -14,7 +14,7 @@ from pipeline.stages.epochs.verdicts import NO_ODOMETER, first_reason
 from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.monitors.series import along_axis
-from pipeline.stages.odometry.driven import hysteresis_m, with_hysteresis
+from pipeline.stages.odometry.driven import with_hysteresis
 from pipeline.stages.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
@@ -105,7 +105,7 @@ def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometry: Odometry) -> 
     at_s = odometry.seconds(times.dt.timestamp("ns").to_numpy())
     near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
     way = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
-    whole = odometry.segment_at_s(at_s) == odometry.segment_at_s(anchor_s[near])
+    whole = odometry.doubt_at_s(at_s) == odometry.doubt_at_s(anchor_s[near])
     distance = floats(anchors, "odometer_m")[near] + floats(anchors, "odometer_scale")[near] * way
     known = np.where(odometry.known_at_s(at_s) & whole, distance, np.nan)
     return pl.Series("odometer_m", known, nan_to_null=True)
@@ -123,25 +123,26 @@ def _columns(
     driven[rows] = odometry.driven(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows])
     total, travelled = (np.where(known, np.cumsum(steps), np.nan) for steps in (step, driven))
     speed = np.where(known, in_use.scale * odometry.speed_at_s(at), np.nan)
-    rows_m = np.minimum(odometry.row_sigma_m(at), most_scatter_m(config))
-    turning = speed
-    if rows_m.any():
-        held = with_hysteresis(total, hysteresis_m(rows_m, config.align))
-        turning = speed_of_positions(at, held, config.align.speed_window_s)
+    noise = odometry.noise_at_s(at)
+    rows_m = np.minimum(odometry.known_row_sigma_m(at), most_scatter_m(config))
+    width_m = odometry.hysteresis_m(at)
+    held = with_hysteresis(total, width_m)
+    turning = np.where(width_m > 0.0, speed_of_positions(at, held, config.align.speed_window_s), speed)
+    turning[at < odometry.t_s[0] + config.align.speed_window_s] = np.nan
     inside = (at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])
-    reason = first_reason((~known & inside, NotEvaluated.INTERRUPTED), (~known, BEYOND_SPAN))
+    reason = first_reason(
+        (~known & inside, NotEvaluated.INTERRUPTED), (~known, BEYOND_SPAN), (~noise.shown, NotEvaluated.NOISE_UNKNOWN)
+    )
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
         pl.Series("travelled_m", travelled, nan_to_null=True),
         reason.alias("odometer_reason"),
-        pl.Series("odometer_segment", odometry.segment_at_s(at)),
+        pl.Series("odometer_doubt_m", odometry.doubt_at_s(at)),
         pl.Series("odometer_slips", odometry.slips_at_s(at) & inside),
-        pl.Series("odometer_counter", odometry.counter_at_s(at)),
-        pl.Series("slip_doubt_m", odometry.slip_doubt_at_s(at)),
         pl.Series("stamp_jitter_s", jitter_s),
         pl.Series("odometer_white_m2_per_s", odometry.white_m2_per_s_at(at)),
         pl.Series("odometer_rows_m", rows_m),
-        pl.Series("odometer_period_s", np.full(known.size, odometry.period_s)),
+        pl.Series("odometer_period_s", noise.period_s),
         pl.Series("speed_mps", speed, nan_to_null=True),
         pl.Series("direction", _direction(turning, config.matching.deadband_mps)),
         pl.Series("odometer_scale", in_use.scale),
@@ -170,10 +171,8 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
     return positions.with_columns(
         **dict.fromkeys(_OF_ODOMETER, nothing),
         odometer_reason=pl.lit(NO_ODOMETER),
-        odometer_segment=pl.lit(0, pl.Int64),
+        odometer_doubt_m=pl.lit(0.0),
         odometer_slips=pl.lit(value=False),
-        odometer_counter=pl.lit(0, pl.Int64),
-        slip_doubt_m=pl.lit(0.0),
         speed_mps=pl.Series(speed, nan_to_null=True),
         direction=_direction(speed, config.matching.deadband_mps),
         latency_s=pl.lit(latency, pl.Float64),

@@ -88,7 +88,8 @@ class _Learner:
         # The filter reads the odometer up to a latency of five sigmas earlier.
         margin_ns = round(5e9 * config.align.latency_prior_sigma_s)
         t_ns = times_ns(positions)
-        self._rows = np.flatnonzero(usable & odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns))
+        known = odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns)
+        self._rows = np.flatnonzero(usable & known & odometry.noise_at_s(odometry.seconds(t_ns)).shown)
         self._path_m, self._calibrated_m, self._digits_m = (
             floats(positions, name)[self._rows] for name in ("along_m", "calibrated_along_m", "digits_along_m")
         )
@@ -96,7 +97,7 @@ class _Learner:
         t_s = odometry.seconds(t_ns)
         self._t_ns = t_ns[self._rows]
         self._t_s = t_s[self._rows]
-        self._segment = odometry.segment_at_s(self._t_s)
+        self._doubt_m = odometry.doubt_at_s(self._t_s)
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
         self._jitter_s = jitter_s[self._rows]
@@ -172,7 +173,7 @@ class _Learner:
         """The filter over rows [begin, end): its last state, first use of each joint state, joint states."""
         due = self._due(state.t_s, begin, end)
         before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
-        broken = (self._segment[before] != self._segment[due]) | (self._breaks[before] != self._breaks[due])
+        broken = (self._doubt_m[before] != self._doubt_m[due]) | (self._breaks[before] != self._breaks[due])
         joints = np.empty((due.size, *state.joint.shape))
         for first, last in pairwise((0, *np.flatnonzero(broken).tolist(), due.size)):
             if first == last:
@@ -189,7 +190,7 @@ class _Learner:
 
     def _beyond_break(self, state: FilterState, before: int, row: int) -> FilterState:
         """Where the odometer lost its distance the offset begins anew: nothing shows whether the position moved."""
-        if self._segment[before] == self._segment[row]:
+        if self._doubt_m[before] == self._doubt_m[row]:
             observed = *self._observation(row), float(self._sigma_m[row]), float(self._jitter_s[row])
             return self._filter.resume(state, *observed, self._limit_m)
         away = self._outages[before] != self._outages[row]
@@ -222,24 +223,18 @@ class _Learner:
             epoch=self._rows[part],
             t_s=self._t_s[part],
             along_m=self._path_m[part],
-            segment=self._odometry.segment_at_s(at_s),
+            doubt_m=self._odometry.doubt_at_s(at_s),
             sigma_m=self._calibrated_m[part],
             digits_m=self._digits_m[part],
             jitter_s=self._jitter_s[part],
             scale_sigma=in_use.scale_sigma,
             latency_sigma_s=in_use.latency_sigma_s,
             white_m2_per_s=self._odometry.white_m2_per_s_at(at_s),
-            rows_m=self._rows_m(at_s),
-            period_s=self._odometry.period_s,
+            rows_m=np.minimum(self._odometry.known_row_sigma_m(at_s), most_scatter_m(self._config)),
+            period_s=self._odometry.noise_at_s(at_s).period_s,
         )
         odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s)
         return along_series(epochs, odometer, self._config).between(begin - part.start, end - part.start)
-
-    def _rows_m(self, at_s: Floats) -> Floats | None:
-        """Noise of the odometer's rows; None where it has none: 0 at a stand may be more under way."""
-        if not self._odometry.noise.quantisation:
-            return None
-        return np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config))
 
     def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:
         """Row from which learning goes on after the alarm, and what the offset has still to settle by [m^2].

@@ -123,11 +123,14 @@ class ScaleLatencyFilter:
         joint = np.empty_like(state.joint)
         row = self._rows(np.array([sigma_m]))[0]
         left_m2 = self._unsettled_m2(state, t_s)
-        self._predict(state.joint, _nanoseconds(t_s - state.t_s), state.unsettled_m2 - left_m2, joint)
+        step_ns = _nanoseconds(t_s - state.t_s)
+        known = self.odometry.noise_at_s(np.array([t_s]))
+        walked_m2 = state.unsettled_m2 - left_m2 + known.white_m2_per_s.item() * step_ns * 1e-9
+        self._predict(state.joint, step_ns, walked_m2, joint)
         seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
-        variance_m2 = (
-            row.dot(seen[:-1]).item() + self.config.white_share * sigma_m**2 + self._scatter_m2(jitter_s, speed_mps)
-        )
+        scatter = known.still_m2.item(), jitter_s**2 + known.moving_s2.item()
+        variance_m2 = row.dot(seen[:-1]).item() + self.config.white_share * sigma_m**2
+        variance_m2 += self._scatter_m2(scatter, speed_mps)
         probability = self.config.break_moved_probability * -math.expm1((state.t_s - t_s) / self.config.break_moving_s)
         # Beyond the prior of the offset nothing changes, but the digits of the position's noise would be lost.
         brought_m2 = min(moved_m2(seen.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
@@ -142,20 +145,23 @@ class ScaleLatencyFilter:
         joints = np.empty((t_s.size, *state.joint.shape))
         times_s = t_s.tolist()
         rows = self._rows(sigma_m)
-        steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
+        dt_s = np.diff(t_s, prepend=state.t_s)
+        steps_ns = [_nanoseconds(step_s) for step_s in dt_s.tolist()]
+        known = self.odometry.noise_at_s(t_s)
         unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / self.config.settling_tau_s)
         bridged_m2 = np.diff(self.odometry.bridged_m2_at(np.concatenate([[state.t_s], t_s])))
-        settled_m2 = (bridged_m2 - np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
+        walked_m2 = bridged_m2 + known.white_m2_per_s * dt_s - np.diff(unsettled_m2, prepend=state.unsettled_m2)
         white_m2 = (self.config.white_share * sigma_m**2).tolist()
         before = state.joint
-        scatter_s = jitter_s.tolist()
-        epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, scatter_s, steps_ns, settled_m2, strict=True)
-        for joint, row, now_s, place_m, noise_m2, stamp_s, step_ns, walked_m2 in epochs:
-            self._predict(before, step_ns, walked_m2, joint)
+        scatters = list(zip(known.still_m2.tolist(), (jitter_s**2 + known.moving_s2).tolist(), strict=True))
+        walks_m2 = walked_m2.tolist()
+        epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, scatters, steps_ns, walks_m2, strict=True)
+        for joint, row, now_s, place_m, noise_m2, scatter, step_ns, walk_m2 in epochs:
+            self._predict(before, step_ns, walk_m2, joint)
             seen, speed_mps = self._seen(joint, row, now_s, place_m, state.origin_m)
             spread = seen[:-1]
             # Kalman update of covariance and mean at once: minus gain times (H P, predicted minus observed).
-            variance_m2 = row.dot(spread).item() + noise_m2 + self._scatter_m2(stamp_s, speed_mps)
+            variance_m2 = row.dot(spread).item() + noise_m2 + self._scatter_m2(scatter, speed_mps)
             joint -= (spread / variance_m2)[:, None] * seen
             before = joint
         return joints
@@ -166,12 +172,12 @@ class ScaleLatencyFilter:
         rows[:, _OFFSET] = 1.0
         return rows
 
-    def _predict(self, before: Floats, step_ns: int, settled_m2: float, joint: Floats) -> None:
-        """Decay, noise, and the offset that settles over the step."""
+    def _predict(self, before: Floats, step_ns: int, walked_m2: float, joint: Floats) -> None:
+        """Decay, noise, and the offset that walks and settles over the step."""
         decay, noise = self._transition(step_ns)
         np.multiply(before, decay, out=joint)
         joint += noise
-        joint[_OFFSET, _OFFSET] += settled_m2
+        joint[_OFFSET, _OFFSET] += walked_m2
 
     def _seen(self, joint: Floats, row: Floats, now_s: float, place_m: float, origin_m: float) -> tuple[Floats, float]:
         """H P and, as its last element, predicted minus observed position; and the speed. Completes `row` (H).
@@ -187,16 +193,17 @@ class ScaleLatencyFilter:
         seen[-1] += way_m + scale * speed_mps * latency_s - place_m
         return seen, speed_mps
 
-    def _scatter_m2(self, jitter_s: float, speed_mps: float) -> float:
+    @staticmethod
+    def _scatter_m2(scatter: tuple[float, float], speed_mps: float) -> float:
         """Variance of stamps and of the odometer's rows, both without memory [m^2]."""
-        rows = self.odometry.noise.quantisation
-        return rows.still_m2 + (jitter_s**2 + rows.moving_s2) * speed_mps**2
+        still_m2, moving_s2 = scatter
+        return still_m2 + moving_s2 * speed_mps**2
 
     def _unsettled_m2(self, state: FilterState, t_s: float) -> float:
         return state.unsettled_m2 * math.exp((state.t_s - t_s) / self.config.settling_tau_s)
 
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
-        """As `Odometry.reading_at_s` of one instant, several times faster."""
+        """Distance [m], and speed centred on the instant: one of the second before would bias a latency [m/s]."""
         times_s = self.odometry.t_s
         span_s = self.config.latency_span_s
         begin_s = max(at_s - span_s, times_s.item(0))
@@ -214,7 +221,7 @@ class ScaleLatencyFilter:
         dt_s = dt_ns * 1e-9
         decay = np.concatenate([np.ones(_ERRORS), np.exp(-dt_s / self.taus_s)])
         noise = 1.0 - decay * decay
-        noise[_OFFSET] = self.odometry.noise.white_m2_per_s * dt_s
+        noise[_OFFSET] = 0.0
         return np.outer(decay, np.append(decay, 1.0)), np.column_stack([np.diag(noise), np.zeros(decay.size)])
 
 

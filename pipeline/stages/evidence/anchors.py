@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Self
@@ -12,7 +12,9 @@ import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
-from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, lag_of
+from pipeline.stages.evidence.clock import RecorderClock
+from pipeline.stages.odometry.polarity import sense_of_ways, shared_ways_m
+from pipeline.stages.odometry.scale_lag import ScaleLag, spans_of_rows
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
 from pipeline.stages.track.survey import SurveyedTrack
@@ -20,13 +22,13 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import BaliseKind, Evidence
 
-# Numerics: a lag shows where the speed changes, so ways over this time are compared [s].
-_LAG_WINDOW_S = 10.0
 # DOMAIN section 5.1: the reference is held against the odometer over so long; a spike is no longer [s].
 _WINDOW_S = 10.0
 _LONG_WINDOW_S = 100.0
 # Least number of samples for a median.
 _FEWEST_IN_WINDOW = 5
+# Numerics: so many sigmas show a direction.
+_DIRECTION_SIGMAS = 4.0
 # Numerics: the speed is compared with its median over this time before and after [s].
 _EVEN_S = 2.0
 
@@ -61,7 +63,8 @@ class KnownStretch:
     """A stretch of the reference on the odometer's clock; the train was on one of its paths.
 
     `proved`: samples that lie on no track that the survey lacks; `levels`: between its steps, as the odometer counts;
-    `clock_ns`: so far beyond its ends the samples there may have been made.
+    `clock_ns`: so far beyond its ends the samples there may have been made; `lags_s`: as of a `TrueAnchor`;
+    `refuted`: reads that exclude it where no odometer carries them.
     """
 
     t_ns: Ints
@@ -72,6 +75,8 @@ class KnownStretch:
     reference: ReferenceStretch
     levels: Levels
     clock_ns: int = 0
+    lags_s: tuple[float, float] = (0.0, 0.0)
+    refuted: int = 0
 
     def proved_at(self, t_ns: Ints) -> Bools:
         """Whether the samples about each instant are."""
@@ -90,6 +95,8 @@ class KnownStretch:
             kind=Evidence.REFERENCE,
             clock_m=float(self.clock_m[sample]) + open_m,
             proved=bool(self.proved[sample]),
+            lags_s=self.lags_s,
+            open_m=open_m,
         )
 
     @property
@@ -133,6 +140,17 @@ class Sided:
     with_m: float
     against_m: float
 
+    def anchor(self, sample: int) -> TrueAnchor:
+        """The places of one sample, by its own clock."""
+        paths = self.stretch.paths
+        places = [path.legs[int(path.leg[sample])].locate(path.at_m[[sample]]) for path in paths]
+        return TrueAnchor(
+            t_ns=int(self.stretch.t_ns[sample]),
+            places=tuple(dict.fromkeys(Place(int(element[0]), float(at_m[0])) for element, at_m, _ in places)),
+            sigma_m=float(self.stretch.sigma_m[sample]),
+            kind=Evidence.REFERENCE,
+        )
+
     @property
     def facing(self) -> int:
         """The oriented net element of the first sample, in the sense in which the odometer counts up."""
@@ -142,41 +160,74 @@ class Sided:
 
 
 def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) -> Sided:
-    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2)."""
-    begin, end, step_m = _steps_of(stretch, 1.0)
+    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2).
+
+    Movements of the reference beyond its noise tell, where the odometer counted about as much: a reference that stands
+    or creeps while the odometer counts has no direction to give.
+    """
+    begin, end, step_m = _movements(stretch)
+    counted_m = np.abs(step_m)
     if counter is not None:
-        counted_m = counter.odometer.distance_between(stretch.t_ns[begin], stretch.t_ns[end])
-        step_m = np.sign(step_m) * np.nan_to_num(counted_m)
-    moved_m = np.cumsum(step_m)
-    first = np.flatnonzero(np.abs(moved_m) >= least_m)
-    total_m = float(moved_m[first[0]]) if first.size else float(step_m.sum())
-    sense = -1 if total_m < 0.0 else 1
-    with_m, against_m = (float((sign * sense * step_m).clip(min=0.0).sum()) for sign in (1, -1))
+        counted_m = counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end])
+        counted_m = np.where(np.abs(step_m) > 0.5 * np.abs(counted_m), counted_m, 0.0)
+    sense = sense_of_ways(counted_m, step_m, least_m)
+    shared_m = sense * shared_ways_m(counted_m, step_m)
+    with_m, against_m = (float((sign * shared_m).clip(min=0.0).sum()) for sign in (1, -1))
     return Sided(stretch, sense, with_m, against_m)
 
 
-def _steps_of(stretch: ReferenceStretch, step_s: float) -> tuple[Ints, Ints, Floats]:
-    """Pairs of samples so far apart in time on one leg of the first path, and the way between them [m]."""
-    path = stretch.paths[0]
+def _movements(stretch: ReferenceStretch) -> tuple[Ints, Ints, Floats]:
+    """Pairs of samples, a second or more apart, between which the reference moved beyond its noise, and how far [m]."""
     t_ns = stretch.t_ns
-    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, round(step_s * NS_PER_S), dtype=np.int64)
-    rows = np.unique(np.searchsorted(t_ns, instants))
-    whole = np.flatnonzero(np.diff(path.leg[rows]) == 0)
-    begin = rows[:-1][whole]
-    end = rows[1:][whole]
+    instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, NS_PER_S, dtype=np.int64)
+    rows = np.unique(np.searchsorted(t_ns, instants)).tolist()
+    at_m = stretch.paths[0].at_m.tolist()
+    leg = stretch.paths[0].leg.tolist()
+    noise_m = (_DIRECTION_SIGMAS * np.sqrt(2.0) * stretch.sigma_m).tolist()
+    begin: list[int] = []
+    end: list[int] = []
+    since = rows[0]
+    for row in rows[1:]:
+        if leg[row] != leg[since]:
+            since = row
+        elif abs(at_m[row] - at_m[since]) > max(noise_m[row], noise_m[since]):
+            begin.append(since)
+            end.append(row)
+            since = row
+    ends = np.array(end, dtype=np.int64)
+    begins = np.array(begin, dtype=np.int64)
+    return begins, ends, stretch.paths[0].at_m[ends] - stretch.paths[0].at_m[begins]
+
+
+def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, Ints, Floats]:
+    """Those of these pairs of samples that lie on one leg of the first path, and the way between them [m]."""
+    path = stretch.paths[0]
+    whole = path.leg[begin] == path.leg[end]
+    begin = begin[whole]
+    end = end[whole]
     return begin, end, path.at_m[end] - path.at_m[begin]
 
 
-def reference_lag(sides: Sequence[Sided], counter: Counter | None) -> RecorderLag:
-    """The reference's clock against the odometer's, by its ways of ten seconds, as the odometer counts up."""
-    ways = []
+def reference_ways(
+    sides: Sequence[Sided], lengths_m: Callable[[TrueAnchor, TrueAnchor], list[float]]
+) -> tuple[Ints, Ints, Floats]:
+    """Ways of the reference between its stamps, as the odometer counts up: begin and end [ns], length [m].
+
+    Of ten seconds, and from stretch to stretch where `lengths_m` knows one: a slow reference is all gaps.
+    """
+    nothing = np.zeros(0, dtype=np.int64)
+    ways: list[tuple[Ints, Ints, Floats]] = [(nothing, nothing, np.zeros(0))]
     for side in sides:
-        begin, end, way_m = _steps_of(side.stretch, _LAG_WINDOW_S)
-        ways.append((side.stretch.t_ns[begin], side.stretch.t_ns[end], side.sense * way_m))
-    if not ways:
-        return RecorderLag()
+        t_ns = side.stretch.t_ns
+        begin, end, way_m = _ways_of(side.stretch, *spans_of_rows((t_ns - t_ns[0]) / NS_PER_S))
+        ways.append((t_ns[begin], t_ns[end], side.sense * way_m))
+    for before, after in pairwise(sorted(sides, key=lambda side: int(side.stretch.t_ns[0]))):
+        begin_at, end_at = before.anchor(-1), after.anchor(0)
+        across_m = np.array(lengths_m(begin_at, end_at), dtype=np.float64)
+        ends_ns = [np.full(across_m.size, anchor.t_ns, dtype=np.int64) for anchor in (begin_at, end_at)]
+        ways.append((ends_ns[0], ends_ns[1], across_m))
     begins, ends, lengths = (np.concatenate(column) for column in zip(*ways, strict=True))
-    return lag_of(begins, ends, lengths, counter)
+    return begins, ends, lengths
 
 
 def known_stretch(
@@ -198,23 +249,58 @@ def known_stretch(
     paths: list[KnownPath] = []
     speed_mps = np.zeros(t_ns.size)
     levels: list[Levels] = []
+    possible_ns: set[int] = set()
     for path in stretch.paths:
         at_m = path.at_m - side.sense * ahead_m
         path_mps = _speed_mps(t_ns, at_m, path.leg)
         speed_mps = np.maximum(speed_mps, path_mps)
         known = KnownPath(path, side.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
-        reads_ns = _confirming_ns(known, stretch, path_mps * clock.delta_s, reads, config.hazards)
+        clock_m = path_mps * clock.delta_s
+        # A clock that leaves more than half the failure limit open lets a read confirm nothing.
+        most_m = 0.5 * config.hazards.failure_limit_m
+        reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor, most_m)
+        possible_ns |= set(_confirming_ns(known, stretch, clock_m, reads, config.align.sure_sigmas, np.inf))
         steps = contradictions(known, side.stretch, witnesses, config)
         of_path = Levels.of(steps, t_ns, reads_ns)
         levels.append(of_path.seen(side.sense))
         paths.append(left_open(known, t_ns, steps, of_path, beyond.seen(side.sense)))
+    refuted = _refuted(t_ns, reads, possible_ns) if not witnesses.all else []
+    for first_ns, last_ns in refuted:
+        # Nothing is carried from the reads, so nobody knows since when the reference has been off.
+        open_m = np.where((t_ns >= first_ns) & (t_ns <= last_ns), np.inf, 0.0)
+        paths = [replace(known, low_m=known.low_m - open_m, high_m=known.high_m + open_m) for known in paths]
+    if t_ns.size == 1 and witnesses.all:
+        # One sample shows no speed.
+        speed_mps = np.abs(witnesses.all[0].counter.odometer.speed_about(t_ns))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
-    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in (-clock.delta_s, 0.0, clock.delta_s)]
+    lates_s = np.linspace(-clock.delta_s, clock.delta_s, 3 + 2 * int(clock.delta_s / _EVEN_S))
+    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in lates_s.tolist()]
     clock_m = np.maximum.reduce(around) * clock.delta_s
     proved = shown_on_its_track(stretch, config)
     return KnownStretch(
-        t_ns, stretch.sigma_m, clock_m, tuple(paths), proved, stretch, levels[0], round(clock.delta_s * NS_PER_S)
+        t_ns,
+        stretch.sigma_m,
+        clock_m,
+        tuple(paths),
+        proved,
+        stretch,
+        levels[0],
+        round(clock.delta_s * NS_PER_S),
+        clock.lags_s,
+        len(refuted),
     )
+
+
+def _refuted(t_ns: Ints, reads: Sequence[TrueAnchor], possible_ns: set[int]) -> list[tuple[int, int]]:
+    """For each read within the stretch at which the train was on none of its paths: the time between its neighbours."""
+    within = sorted(read.t_ns for read in reads if t_ns[0] <= read.t_ns <= t_ns[-1])
+    found: list[tuple[int, int]] = []
+    for read_ns in within:
+        if read_ns not in possible_ns:
+            before_ns = max((at_ns for at_ns in possible_ns if at_ns < read_ns), default=int(t_ns[0]))
+            after_ns = min((at_ns for at_ns in possible_ns if at_ns > read_ns), default=int(t_ns[-1]))
+            found.append((before_ns, after_ns))
+    return found
 
 
 def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
@@ -228,9 +314,17 @@ def _speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
 
 
 def _confirming_ns(
-    known: KnownPath, stretch: ReferenceStretch, clock_m: Floats, reads: Sequence[TrueAnchor], config: HazardConfig
+    known: KnownPath,
+    stretch: ReferenceStretch,
+    clock_m: Floats,
+    reads: Sequence[TrueAnchor],
+    factor: float,
+    most_m: float,
 ) -> list[int]:
-    """Times of reads at balises where the reference was too, within k sigmas of both and both clocks."""
+    """Times of reads at balises where the reference was too, within `factor` sigmas of both and both clocks.
+
+    Not where these are more than `most_m`.
+    """
     t_ns = stretch.t_ns
     since_ns = (t_ns - t_ns[0]).astype(np.float64)
     confirming: set[int] = set()
@@ -240,11 +334,11 @@ def _confirming_ns(
         at_m = np.interp([float(read.t_ns - t_ns[0])], since_ns, known.at_m)
         sample = int(np.searchsorted(t_ns, read.t_ns))
         route = known.path.legs[int(known.path.leg[sample])]
-        half_m = config.evidence_factor * float(np.hypot(stretch.sigma_m[sample], read.sigma_m))
+        half_m = factor * float(np.hypot(stretch.sigma_m[sample], read.sigma_m))
         half_m += float(clock_m[sample]) + read.clock_m
         for place in read.places:
             there_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
-            if abs(float(there_m[0] - at_m[0])) <= half_m:
+            if abs(float(there_m[0] - at_m[0])) <= half_m <= most_m:
                 confirming.add(read.t_ns)
     return sorted(confirming)
 
@@ -263,69 +357,76 @@ class ReferenceStep:
 
 
 @dataclass(frozen=True)
-class Witnesses:
-    """The independent odometers that may contradict a reference.
+class Witness:
+    """An odometer that may contradict a reference.
 
-    `lag_s`, `clock_s`: stamps of the reference less those of the odometers, as measured, and how far that may be off;
-    `scales`, `scale_doubts`: true over counted distance where no vehicle file gives it, and the sigma of that;
-    `signed`: they count down when the train goes back.
+    `lag_s`, `clock_s`: stamps of the reference less its own, as measured, and how far that may be off; `scale`,
+    `scale_sigma`: true over counted distance where no vehicle file gives it.
     """
 
-    counters: tuple[Counter, ...]
-    lag_s: float
-    clock_s: float
-    scales: tuple[float, ...]
-    scale_doubts: tuple[float, ...]
-    signed: bool
+    counter: Counter
+    lag_s: float = 0.0
+    clock_s: float = 0.0
+    scale: float = 1.0
+    scale_sigma: float = 0.0
 
     @classmethod
-    def of(
-        cls,
-        counters: Sequence[Counter],
-        lag: RecorderLag,
-        signed: bool,
-        config: Configuration,
-    ) -> Self:
+    def of(cls, counter: Counter, lags: Sequence[ScaleLag], config: Configuration) -> Self:
         """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1)."""
         factor = config.hazards.evidence_factor
-        known = np.isfinite(lag.sigma_s)
-        clock_s = factor * lag.sigma_s if known else config.hazards.evidence_clock_s
         share = config.lds.odometer_share
-        scales = [1.0] * len(counters)
+        known = [lag for lag in lags if np.isfinite(lag.lag_sigma_s)]
+        low_s = min((lag.lag_s - factor * lag.lag_sigma_s for lag in known), default=-config.hazards.evidence_clock_s)
+        high_s = max((lag.lag_s + factor * lag.lag_sigma_s for lag in known), default=config.hazards.evidence_clock_s)
+        middle_s, half_s = 0.5 * (low_s + high_s), 0.5 * (high_s - low_s)
+        if counter.by_file:
+            return cls(counter, middle_s, half_s)  # the variance of a way holds that of the file's scale
+        best = min(lags, key=lambda lag: lag.scale_sigma, default=ScaleLag())
+        if factor * best.scale_sigma < share:
+            return cls(counter, middle_s, half_s, best.scale, best.scale_sigma)
         # At k_T sigmas the 5 % of an odometer of which nothing is known.
-        doubts = [share / config.align.sure_sigmas] * len(counters)
-        if counters and counters[0].by_file:
-            doubts[0] = 0.0  # its variance holds that of the file's scale
-        elif counters and factor * lag.scale_sigma < share:
-            scales[0] = lag.scale
-            doubts[0] = lag.scale_sigma
-        return cls(tuple(counters), lag.lag_s, clock_s, tuple(scales), tuple(doubts), signed)
+        return cls(counter, middle_s, half_s, 1.0, share / config.align.sure_sigmas)
+
+    def without_sign(self) -> Self:
+        """It says nothing of a way over a stand, at which the train may have turned."""
+        return replace(self, counter=self.counter.without_sign())
+
+
+@dataclass(frozen=True)
+class Witnesses:
+    """The odometers that may contradict a reference, any one of them; `signed`: they count down when the train goes
+    back.
+    """
+
+    all: tuple[Witness, ...]
+    signed: bool = True
 
 
 def contradictions(
     known: KnownPath, stretch: ReferenceStretch, witnesses: Witnesses, config: Configuration
 ) -> list[ReferenceStep]:
-    """Steps that every odometer contradicts by more than k_T sigmas: between samples, over 10 s and over 100 s.
+    """Steps that an odometer contradicts by more than k_T sigmas: between samples, over 10 s and over 100 s.
 
     A step between samples is one that the speed around it does not explain. Of a window the difference that no step in
     it explains counts as one step in its middle: the reference drifted, or stood still (DOMAIN section 5.1). Over 100 s
     the fixed 5 m of an odometer, its slip, are allowed too: so drifts of 0.1 m/s show.
     """
     t_ns = stretch.t_ns
-    if t_ns.size < 2 or not witnesses.counters:
+    if t_ns.size < 2 or not witnesses.all:
         return []
-    factor = config.align.sure_sigmas
     rows = np.arange(t_ns.size)
-    step_m, root_m = _contradicted(known, stretch, witnesses, rows[:-1], rows[1:])
-    limit_m = factor * root_m
+    nothing_m = np.zeros(t_ns.size - 1)
+    step_m, limit_m = _contradicted(known, stretch, witnesses, (rows[:-1], rows[1:]), nothing_m, config)
     stepped = np.flatnonzero((np.abs(step_m) > limit_m) & _uneven(known.at_m, t_ns, limit_m))
     steps = [ReferenceStep(row, float(step_m[row]), float(limit_m[row])) for row in stepped.tolist()]
     gathered_m = np.zeros(t_ns.size)
     gathered_m[1:][stepped] = step_m[stepped]
-    # A counter without a sign says nothing of a window in which the train may have turned.
-    windows = () if not witnesses.signed else ((_WINDOW_S, 0.0), (_LONG_WINDOW_S, config.lds.odometer_fixed_m))
-    for window_s, fixed_m in windows:
-        found = _drifts(known, stretch, witnesses, np.cumsum(gathered_m), (window_s, fixed_m), config)
+    # Without a sign nothing is said of a window in which the train may have turned.
+    over_windows = witnesses
+    if not witnesses.signed:
+        over_windows = replace(witnesses, all=tuple(witness.without_sign() for witness in witnesses.all))
+    for window_s, fixed_m in ((_WINDOW_S, 0.0), (_LONG_WINDOW_S, config.lds.odometer_fixed_m)):
+        found = _drifts(known, stretch, over_windows, np.cumsum(gathered_m), (window_s, fixed_m), config)
         for step in found:
             gathered_m[step.sample + 1] += step.step_m
         steps += found
@@ -340,10 +441,7 @@ def _drifts(
     window: tuple[float, float],
     config: Configuration,
 ) -> list[ReferenceStep]:
-    """Windows (length [s], fixed error of odometers [m]) that the odometers contradict beyond `explained_m` of steps.
-
-    Their tolerance is k_T roots, the clock at a change of speed, and k sigmas of the scale on the way.
-    """
+    """Windows (length [s], fixed error of odometers [m]) that an odometer contradicts beyond `explained_m` of steps."""
     t_ns = stretch.t_ns
     window_s, fixed_m = window
     ends = np.unique(np.searchsorted(t_ns, np.arange(int(t_ns[0]), int(t_ns[-1]), round(window_s * NS_PER_S))))
@@ -351,12 +449,9 @@ def _drifts(
     end = ends[1:]
     if begin.size == 0:
         return []
-    whole_m, root_m = _contradicted(known, stretch, witnesses, begin, end)
-    rest_m = whole_m - (explained_m[end] - explained_m[begin])
-    speed_mps = _speed_mps(t_ns, known.at_m, known.path.leg)
-    late_m = witnesses.clock_s * np.abs(speed_mps[end] - speed_mps[begin])
-    allowed_m = config.align.sure_sigmas * root_m + late_m + fixed_m
-    windows = np.flatnonzero((whole_m != 0.0) & (np.abs(rest_m) > allowed_m)).tolist()
+    explained_m = explained_m[end] - explained_m[begin]
+    rest_m, allowed_m = _contradicted(known, stretch, witnesses, (begin, end), explained_m, config)
+    allowed_m += fixed_m
     return [
         ReferenceStep(
             sample=int(begin[row] + end[row]) // 2,
@@ -364,7 +459,7 @@ def _drifts(
             noise_m=float(allowed_m[row]),
             span=(int(begin[row]), int(end[row])),
         )
-        for row in windows
+        for row in np.flatnonzero(np.abs(rest_m) > allowed_m).tolist()
     ]
 
 
@@ -528,34 +623,45 @@ def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
 
 
 def _contradicted(
-    known: KnownPath, stretch: ReferenceStretch, witnesses: Witnesses, begin: Ints, end: Ints
+    known: KnownPath,
+    stretch: ReferenceStretch,
+    witnesses: Witnesses,
+    ways: tuple[Ints, Ints],
+    explained_m: Floats,
+    config: Configuration,
 ) -> tuple[Floats, Floats]:
-    """Per way between samples: its difference from the odometer that agrees best, and the sigma of that [m].
+    """Per way between samples: its difference, less what is explained, from the odometer that contradicts it most [m].
 
-    `stretch`: with the stamps of the reference; compared at the lag that was measured.
+    And what is allowed: k_T sigmas, the clock at a change of speed, and what the odometer itself doubts of its way.
+    `stretch`: with the stamps of the reference; each is compared at the lag that was measured.
     """
-    t_ns = stretch.t_ns - round(witnesses.lag_s * NS_PER_S)
-    least = np.full(begin.size, np.inf)
-    root = np.ones(begin.size)
-    for counter, scale, doubt in zip(witnesses.counters, witnesses.scales, witnesses.scale_doubts, strict=True):
-        way = counter.between(t_ns[begin], t_ns[end])
-        step_sigma_m = np.sqrt(
-            stretch.sigma_m[end] ** 2 + stretch.sigma_m[begin] ** 2 + way.variance_m2 + (doubt * way.distance_m) ** 2
-        )
-        way_m = known.at_m[end] - known.at_m[begin]
-        sure_m = np.where(way.bound_m > 0.0, np.nan, way.distance_m)
+    begin, end = ways
+    way_m = known.at_m[end] - known.at_m[begin]
+    speed_mps = _speed_mps(stretch.t_ns, known.at_m, known.path.leg)
+    change_mps = np.abs(speed_mps[end] - speed_mps[begin])
+    rest_m = np.zeros(begin.size)
+    allowed_m = np.full(begin.size, np.inf)
+    excess_m = np.full(begin.size, -np.inf)
+    whole = known.path.leg[begin] == known.path.leg[end]
+    for number, witness in enumerate(witnesses.all):
+        t_ns = stretch.t_ns - round(witness.lag_s * NS_PER_S)
+        way = witness.counter.between(t_ns[begin], t_ns[end])
         # Others may count the other way round.
-        agreed_m = np.nansum(way_m * sure_m)
-        sense = known.sense if counter is witnesses.counters[0] or agreed_m == 0.0 else np.sign(agreed_m)
-        counted_m = sense * scale * sure_m
+        least_m = config.matching.orientation_distance_m
+        sense = sense_of_ways(way.distance_m, way_m, least_m) if number else known.sense
+        counted_m = sense * witness.scale * way.distance_m
         if not witnesses.signed:
             counted_m = np.where(way_m * counted_m < 0.0, -counted_m, counted_m)
-        off_m = way_m - counted_m
-        nearer = np.isfinite(off_m) & (np.abs(off_m) / step_sigma_m < np.abs(least) / root)
-        least = np.where(nearer, off_m, least)
-        root = np.where(nearer, step_sigma_m, root)
-    whole = known.path.leg[begin] == known.path.leg[end]
-    return np.where(whole & np.isfinite(least), least, 0.0), root
+        variance_m2 = stretch.sigma_m[end] ** 2 + stretch.sigma_m[begin] ** 2 + way.variance_m2
+        root_m = np.sqrt(variance_m2 + (witness.scale_sigma * way.distance_m) ** 2)
+        limit_m = config.align.sure_sigmas * root_m + witness.clock_s * change_mps + way.bound_m
+        off_m = way_m - counted_m - explained_m
+        beyond_m = np.abs(off_m) - limit_m
+        more = whole & np.isfinite(beyond_m) & (beyond_m > excess_m)
+        rest_m = np.where(more, off_m, rest_m)
+        allowed_m = np.where(more, limit_m, allowed_m)
+        excess_m = np.where(more, beyond_m, excess_m)
+    return rest_m, allowed_m
 
 
 def shown_on_its_track(stretch: ReferenceStretch, config: Configuration) -> Bools:
@@ -607,13 +713,16 @@ def read_anchors(
     ]
 
 
-def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Counter) -> list[TrueAnchor]:
-    """The reads on the odometer's clock, with what that clock may add at their speed."""
+def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Counter | None) -> list[TrueAnchor]:
+    """The reads on the odometer's clock, with what that clock may add at their speed; nothing without an odometer."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
-    clock_m = clock.delta_s * np.abs(counter.best_speed_mps(t_ns))
+    speed_mps = np.zeros(t_ns.size) if counter is None else np.abs(counter.odometer.speed_about(t_ns))
+    clock_m = clock.delta_s * speed_mps
     shift_ns = round(clock.shift_s * NS_PER_S)
     rows = zip(anchors, clock_m.tolist(), strict=True)
-    return [replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=added_m) for anchor, added_m in rows]
+    return [
+        replace(anchor, t_ns=anchor.t_ns - shift_ns, clock_m=added_m, lags_s=clock.lags_s) for anchor, added_m in rows
+    ]
 
 
 def outside(anchors: Sequence[TrueAnchor], stretches: Sequence[KnownStretch]) -> list[TrueAnchor]:

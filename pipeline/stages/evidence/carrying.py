@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.odometry import OdometerWay
+from pipeline.stages.odometry.scale_lag import CountedRows
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
 from schemas.config import Configuration
@@ -22,7 +24,9 @@ Interval = tuple[Floats, Floats]
 class TrueAnchor:
     """At an instant the train was at one of `places`; `clock_m`: what the clock may add [m].
 
-    `proved`: it shows that the track is one of the survey (DOMAIN section 5.0).
+    `proved`: it shows that the track is one of the survey (DOMAIN section 5.0). `lags_s`: least and largest stamp of
+    its recorder less that of the odometer, of which `t_ns` has the middle taken off; `open_m`: what of `clock_m` is no
+    clock's.
     """
 
     t_ns: int
@@ -31,6 +35,18 @@ class TrueAnchor:
     kind: Evidence
     clock_m: float = 0.0
     proved: bool = True
+    lags_s: tuple[float, float] = (0.0, 0.0)
+    open_m: float = 0.0
+
+    def lag_s(self, share: float) -> float:
+        """A possible lag: from the least (0) to the largest (1)."""
+        return self.lags_s[0] + share * (self.lags_s[1] - self.lags_s[0])
+
+    def at_lag(self, share: float) -> TrueAnchor:
+        """As it is if its recorder's lag is that one, on the odometer's clock."""
+        middle_s = 0.5 * (self.lags_s[0] + self.lags_s[1])
+        later_ns = round((middle_s - self.lag_s(share)) * NS_PER_S)
+        return replace(self, t_ns=self.t_ns + later_ns, clock_m=self.open_m, lags_s=(0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -46,6 +62,10 @@ class Counter:
         """Silent over more than `silent_m` of doubt and over a stand without a sign, which may hide a turn."""
         return cls(odometer, _stands_ns(odometer) if without_sign else np.zeros(0, dtype=np.int64), silent_m)
 
+    def without_sign(self) -> Counter:
+        """The same odometer, that says nothing over a stand."""
+        return Counter.of(self.odometer, self.silent_m, without_sign=True)
+
     @property
     def by_file(self) -> bool:
         """Scale and its sigma are those of a vehicle file."""
@@ -59,12 +79,29 @@ class Counter:
 
     def distance_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """Distance where nothing of it is in doubt: NaN over slip, pauses and resets too."""
-        sure = self._same(begin_ns, end_ns) & (self.bound_m(begin_ns, end_ns) == 0.0)
-        return np.where(sure, self.odometer.distance_between(begin_ns, end_ns), np.nan)
+        return np.where(self._same(begin_ns, end_ns), self.odometer.proved_between(begin_ns, end_ns), np.nan)
 
-    def bound_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """By how much the distance between instants may be off [m]."""
-        return self.odometer.bound_between_m(begin_ns, end_ns)
+    @cached_property
+    def rows(self) -> CountedRows:
+        """Its rows; a step of which anything is in doubt tells no way."""
+        odometer = self.odometer
+        t_ns = odometer.epoch_ns + np.round(odometer.t_s * NS_PER_S).astype(np.int64)
+        doubtful = np.concatenate([[0.0], np.cumsum(np.isnan(self.distance_m(t_ns[:-1], t_ns[1:])))])
+        noise_m = float(np.sqrt(odometer.noise.quantisation.still_m2))
+        return CountedRows(odometer.t_s, (odometer.scale or 1.0) * odometer.distance_m, doubtful, noise_m)
+
+    def within(self, t_ns: Ints, beyond_s: float) -> tuple[Ints, Floats]:
+        """The instants, those less than `beyond_s` off its recording put at its ends, and how far the train drives."""
+        begin_ns, end_ns = self.odometer.begin_ns, self.odometer.end_ns
+        held_ns = np.clip(t_ns, begin_ns, end_ns)
+        off_s = np.abs(t_ns - held_ns) / NS_PER_S
+        near = (off_s > 0.0) & (off_s <= beyond_s)
+        if not near.any():
+            return t_ns, np.zeros(t_ns.size)
+        beyond_m = (
+            np.abs(self.odometer.speed_about(held_ns)) * off_s + 0.5 * self.odometer.config.braking_mps2 * off_s**2
+        )
+        return np.where(near, held_ns, t_ns), np.where(near, beyond_m, 0.0)
 
     def _same(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
         breaks = [np.searchsorted(self.breaks_ns, t_ns, side="right") for t_ns in (begin_ns, end_ns)]
@@ -74,21 +111,6 @@ class Counter:
         """Way driven, turns included [m]."""
         travelled_at = self.odometer.travelled_at
         return np.asarray(np.abs(travelled_at(t_ns) - travelled_at(np.atleast_1d(since_ns))))
-
-    def speed_mps(self, t_ns: Ints) -> Floats:
-        """Speed over a second about each instant [m/s]; NaN where it did not count throughout."""
-        half_ns = round(0.5 * self.odometer.config.speed_window_s * NS_PER_S)
-        return np.asarray(self.distance_m(t_ns - half_ns, t_ns + half_ns) / (2 * half_ns / NS_PER_S))
-
-    def best_speed_mps(self, t_ns: Ints) -> Floats:
-        """Speed over as much of that second as was recorded [m/s]; a best guess over a break."""
-        odometer = self.odometer
-        half_s = 0.5 * odometer.config.speed_window_s
-        begin_s, end_s = (
-            np.clip(odometer.seconds(t_ns) + off_s, odometer.t_s[0], odometer.t_s[-1]) for off_s in (-half_s, half_s)
-        )
-        moved_m = odometer.distance_at_s(end_s) - odometer.distance_at_s(begin_s)
-        return np.asarray((odometer.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9))
 
 
 def _stands_ns(odometer: Odometry) -> Ints:
@@ -104,7 +126,13 @@ def beside_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
 
 
 def carried(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
-    """On one side of an anchor at `at_m`."""
+    """On one side of an anchor at `at_m`; the fixed 5 m hold what may be off at the anchor itself."""
+    known_m = max(config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m, config.lds.odometer_fixed_m)
+    return _carried_from(counter, anchor.t_ns, at_m, t_ns, known_m, config)
+
+
+def carried_closely(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
+    """The same without the fixed 5 m: what is known of the anchor, and 5 % of the way."""
     known_m = config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m
     return _carried_from(counter, anchor.t_ns, at_m, t_ns, known_m, config)
 
@@ -112,10 +140,10 @@ def carried(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, confi
 def _carried_from(
     counter: Counter, since_ns: Ints | int, at_m: Floats | float, t_ns: Ints, known_m: float, config: Configuration
 ) -> Interval:
-    """Places at some instants, known to `known_m`, plus the distance since, +- (5 m + 5 % + bound)."""
+    """Places at some instants, known to `known_m`, plus the distance since, +- (5 % + bound)."""
     way = counter.between(since_ns, t_ns)
     centre = at_m + way.distance_m
-    half = beside_m(counter.driven_m(since_ns, t_ns), known_m, config) + way.bound_m
+    half = known_m + config.lds.odometer_share * counter.driven_m(since_ns, t_ns) + way.bound_m
     return centre - half, centre + half
 
 
@@ -213,7 +241,8 @@ def carried_forward(
         over_stand = np.zeros(rows.size, dtype=np.bool_)
         for begin_ns, end_ns in stood:
             over_stand |= (t_ns[rows] >= begin_ns) & (accepted_ns[since] <= end_ns)
-        interval = _carried_from(counter, accepted_ns[since], path_m[since], t_ns[rows], 0.0, config)
+        fixed_m = config.lds.odometer_fixed_m
+        interval = _carried_from(counter, accepted_ns[since], path_m[since], t_ns[rows], fixed_m, config)
         low[rows], high[rows] = np.where(over_stand, np.nan, interval)
     return low, high
 
@@ -227,7 +256,8 @@ def _consistent(accepted_ns: Ints, path_m: Floats, counter: Counter, config: Con
         if used:
             before = used[-1]
             since_ns = accepted_ns[before : before + 1]
-            low, high = _carried_from(counter, since_ns, float(path_m[before]), here_ns, 0.0, config)
+            fixed_m = config.lds.odometer_fixed_m
+            low, high = _carried_from(counter, since_ns, float(path_m[before]), here_ns, fixed_m, config)
             if at_m < low[0] - limit_m or at_m > high[0] + limit_m:
                 continue
         if counter.odometer.known_at(here_ns)[0]:

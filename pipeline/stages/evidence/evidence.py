@@ -11,11 +11,12 @@ import polars as pl
 
 from pipeline.stages.evidence import anchors
 from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
-from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried
-from pipeline.stages.evidence.clock import RecorderClock, RecorderLag, clock_of, lag_of
+from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried, carried_closely
+from pipeline.stages.evidence.clock import RecorderClock, clock_of, lags_of
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
 from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
 from pipeline.stages.odometry import Odometry
+from pipeline.stages.odometry.scale_lag import ScaleLag
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
@@ -28,8 +29,9 @@ KINDS = tuple(Kind)
 NOTHING = -1
 Span = tuple[int, int]
 
-# Numerics: ways over which two odometers are compared [s].
+# Numerics: ways over which two odometers are compared, and steps over the possible lags of a recorder [s].
 _PARTED_S = 60.0
+_LAG_STEP_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,8 @@ class TrainEvidence:
     `silent`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends of
     the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
     odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
-    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that every independent
-    odometer contradicts; `unsure`: times in which nobody knows which of the two failed.
+    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer
+    or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -162,15 +164,18 @@ class TrainEvidence:
         kind = np.full(t_ns.size, NOTHING)
         proves, on_survey = np.zeros((2, t_ns.size), dtype=np.bool_)
         shown = _Shown(kind, proves, on_survey)
-        heard = ~within_spans(t_ns, self.silent)
+        on_track = ~within_spans(t_ns, self.silent)
+        heard = on_track & ~within_spans(t_ns, self.unsure)
         alternatives = self._covered(t_ns, heard, shown)
         alternatives += self._carried(self.carried, t_ns, heard & (kind == NOTHING), shown)
         # Its clock puts the ends of a stretch anywhere within what is not known of it.
         alternatives += self._covered(t_ns, heard & (kind == NOTHING), shown, beyond=True)
-        if self.stretches and self.by_reads and self.by_reads[0].counter.odometer.independent:
+        if self.by_reads:
             of_reads = _Shown(np.full(t_ns.size, NOTHING), *np.zeros((2, t_ns.size), dtype=np.bool_))
-            by_reads = self._carried(self.by_reads, t_ns, heard, of_reads)
-            alternatives, _ = common(alternatives, by_reads, t_ns.size)
+            # A reference that drifted by nobody knows how much leaves the reads what they prove without it.
+            by_reads = self._carried(self.by_reads, t_ns, on_track, of_reads)
+            narrows = self.by_reads[0].counter.odometer.independent
+            alternatives, _ = common(alternatives, by_reads, t_ns.size, narrows)
             kind = np.where(kind == NOTHING, of_reads.kind, kind)
             proves |= of_reads.proves
             on_survey |= of_reads.on_survey
@@ -223,9 +228,34 @@ class TrainEvidence:
         return alternatives
 
     def _interval(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints) -> Interval:
+        """By the anchors of the gap, whatever the clocks leave open.
+
+        A lag belongs to nobody: if the recorder of the anchor has it the odometer's own stamps count, else odometer and
+        GNSS share it, and the train was at an instant where the odometer had it one lag before. What that is in metres
+        hangs on the speed at the instant, not at the anchor.
+        """
+        most_s = max(abs(lag_s) for anchor in gap.anchors for lag_s in anchor.lags_s)
+        low_m, high_m = self._together(counter, gap, way, t_ns)
+        if most_s == 0.0:
+            return low_m, high_m
+        for share in np.linspace(0.0, 1.0, 2 + int(most_s / _LAG_STEP_S)).tolist():
+            known = replace(
+                gap,
+                begin=gap.begin and gap.begin.at_lag(share),
+                end=gap.end and gap.end.at_lag(share),
+            )
+            for lag_s in sorted({0.0, *(anchor.lag_s(share) for anchor in gap.anchors)}):
+                at_ns, beyond_m = counter.within(t_ns - round(lag_s * NS_PER_S), abs(lag_s))
+                low, high = self._together(counter, known, way, at_ns, closely=True)
+                low_m = np.minimum(low_m, low - beyond_m)
+                high_m = np.maximum(high_m, high + beyond_m)
+        return low_m, high_m
+
+    def _together(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints, closely: bool = False) -> Interval:
         if gap.begin is not None and gap.end is not None:
             return between_anchors(counter, (gap.begin, gap.end), (way.at_m[0], way.at_m[1]), t_ns, self.config)
-        return carried(counter, gap.anchors[0], way.at_m[0], t_ns, self.config)
+        from_one = carried_closely if closely else carried
+        return from_one(counter, gap.anchors[0], way.at_m[0], t_ns, self.config)
 
 
 def _on_path(stretch: KnownStretch, path: KnownPath, rows: Ints, t_ns: Ints, factor: float) -> list[Alternative]:
@@ -249,16 +279,19 @@ def _on_path(stretch: KnownStretch, path: KnownPath, rows: Ints, t_ns: Ints, fac
     ]
 
 
-def common(first: Sequence[Alternative], second: Sequence[Alternative], size: int) -> tuple[list[Alternative], Ints]:
+def common(
+    first: Sequence[Alternative], second: Sequence[Alternative], size: int, narrows: bool = True
+) -> tuple[list[Alternative], Ints]:
     """Two sources of evidence together, and the instants at which they exclude each other.
 
-    Where they agree: the net elements common to both, with the narrower interval. Where only one speaks, or they
-    exclude each other, every alternative of either stays possible.
+    Where they agree: the net elements common to both, with the narrower interval; that of the first where the second
+    may narrow nothing. Where only one speaks, or they exclude each other, every alternative of either stays possible.
     """
     narrowed = [_narrowed(left, right) for left in first for right in second]
     agreed = _spoken(narrowed, size)
+    together = narrowed if narrows else [alternative.where(agreed[alternative.rows]) for alternative in first]
     alone = [alternative.where(~agreed[alternative.rows]) for alternative in (*first, *second)]
-    return narrowed + alone, np.flatnonzero(_spoken(first, size) & _spoken(second, size) & ~agreed)
+    return together + alone, np.flatnonzero(_spoken(first, size) & _spoken(second, size) & ~agreed)
 
 
 def _spoken(alternatives: Sequence[Alternative], size: int) -> Bools:
@@ -279,6 +312,23 @@ def _narrowed(first: Alternative, second: Alternative) -> Alternative:
     low_m = np.maximum(first.low_m, np.minimum(*ends_m))
     high_m = np.minimum(first.high_m, np.maximum(*ends_m))
     return Alternative(first.rows, first.route, low_m, high_m).where(low_m <= high_m)
+
+
+def either(sets: Sequence[EvidenceSet]) -> EvidenceSet:
+    """One of several sets holds, nobody knows which: every alternative stays possible, and proved is what all prove.
+
+    Where one is silent, so are all: it could have said anything.
+    """
+    first, *others = sets
+    for other in others:
+        spoken = (first.kind != NOTHING) & (other.kind != NOTHING)
+        first = EvidenceSet(
+            kind=np.where(spoken, np.maximum(first.kind, other.kind), NOTHING),
+            alternatives=tuple(there.where(spoken[there.rows]) for there in (*first.alternatives, *other.alternatives)),
+            proves=first.proves & other.proves,
+            on_survey=first.on_survey & other.on_survey,
+        )
+    return first
 
 
 def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
@@ -317,23 +367,22 @@ def evidence_of(
     hazards = config.hazards
     independent = [odometer for odometer in odometers if odometer.independent]
     counters = [Counter.of(odometer, config.hazards.failure_limit_m) for odometer in independent or odometers]
-    # An odometer that may be made of the positions measures no clock, and contradicts no reference.
-    witnesses = counters if independent else []
     main = counters[0] if counters else None
-    clock_main = witnesses[0] if witnesses else None
     least_m = config.matching.orientation_distance_m
     stretches, silent = reference
     sides = [anchors.sided(stretch, main, least_m) for stretch in stretches]
     facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
     turned = any(min(side.with_m, side.against_m) >= least_m for side in sides)
     searches = [GapSearch(counter, network, config, facing, turned) for counter in counters]
-    lag_of_reference = anchors.reference_lag(sides, clock_main)
-    of_reference = clock_of(lag_of_reference, hazards)
-    held_against = anchors.Witnesses.of(witnesses, lag_of_reference, not turned, config)
+    lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
+    of_reference = clock_of([lag for of_one in lags for lag in of_one], bool(independent), hazards)
+    # Any odometer contradicts a reference; where one is independent, the others are not asked.
+    found = [anchors.Witness.of(counter, of_one, config) for counter, of_one in zip(counters, lags, strict=True)]
+    held_against = anchors.Witnesses(tuple(found), not turned)
     read = anchors.read_anchors(reads, balises, network.track, hazards)
-    lag_of_reads = RecorderLag() if clock_main is None else _lag_of_reads(searches[0].carried(_points(read)))
-    of_reads = clock_of(lag_of_reads, hazards)
-    clocked = [] if main is None else anchors.on_clock(read, of_reads, main)
+    lags_of_reads = [lag for search in searches for lag in _lags_of_reads(search.carried(_points(read)))]
+    of_reads = clock_of(lags_of_reads, bool(independent), hazards)
+    clocked = anchors.on_clock(read, of_reads, main)
     recorded, unclosed = _known_stretches(sides, of_reference, held_against, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
     unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
@@ -341,9 +390,9 @@ def evidence_of(
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return TrainEvidence(
         stretches=known,
-        silent=(*((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent), *unsure),
+        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent),
         carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
-        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if known else (),
+        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
         reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
         clocks=(of_reference,) * bool(known) + (of_reads,) * bool(apart),
         network=network,
@@ -351,7 +400,9 @@ def evidence_of(
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
         unsure=tuple(unsure),
-        doubted=unclosed + sum(stretch.levels.doubts for stretch in recorded),
+        doubted=unclosed
+        + sum(stretch.levels.doubts + stretch.refuted for stretch in recorded)
+        + sum(len(of_one) > 1 for of_one in lags),
     )
 
 
@@ -367,7 +418,7 @@ def _known_stretches(
     """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
     ahead_m = vehicle.gnss_antenna_ahead_m
     known = [anchors.known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
-    if not witnesses.counters:
+    if not witnesses.all:
         return known, 0
     search = searches[0]
     order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
@@ -391,11 +442,23 @@ def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
     return [(anchor, anchor) for anchor in known]
 
 
-def _lag_of_reads(source: Carried) -> RecorderLag:
-    """The clock of the reads against the odometer's, by the ways between reads, whether they close or not."""
+def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> list[ScaleLag]:
+    """Its clock against that of one odometer, in the sense in which that one counts.
+
+    One that counts up both ways is compared where the train cannot have turned.
+    """
+    sides = [anchors.sided(stretch, search.counter, least_m) for stretch in stretches]
+    begin_ns, end_ns, way_m = anchors.reference_ways(sides, search.only_length_m)
+    if not search.turned:
+        return lags_of(begin_ns, end_ns, way_m, search.counter)
+    return lags_of(begin_ns, end_ns, np.abs(way_m), search.counter.without_sign())
+
+
+def _lags_of_reads(source: Carried) -> list[ScaleLag]:
+    """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
     ways = [(gap.begin_ns, gap.end_ns, apart_m) for gap in source.gaps for apart_m in gap.only_length_m]
     begins, ends, lengths = zip(*ways, strict=True) if ways else ((), (), ())
-    return lag_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(lengths, np.float64), source.counter)
+    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(lengths, np.float64), source.counter)
 
 
 def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
@@ -407,7 +470,7 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
             begin_ns = max(other.begin_ns, witness.begin_ns)
             end_ns = min(other.end_ns, witness.end_ns)
             at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
-            ways = [np.abs(odometer.distance_between(at_ns[:-1], at_ns[1:])) for odometer in (other, witness)]
+            ways = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
             allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
             if (np.abs(ways[0] - ways[1]) > allowed_m).any():
                 return True

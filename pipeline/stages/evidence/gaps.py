@@ -108,8 +108,7 @@ class GapSearch:
         borders = sorted(borders, key=lambda border: border[0].t_ns)
         gaps = self.gaps_of(borders)
         if self.turned or not self._sheets(gaps):
-            stands = Counter.of(self.counter.odometer, self.counter.silent_m, without_sign=True)
-            signless = replace(self, counter=stands)
+            signless = replace(self, counter=self.counter.without_sign())
             return Carried(signless.counter, tuple(signless.gaps_of(borders)))
         return Carried(self.counter, tuple(gaps))
 
@@ -150,6 +149,11 @@ class GapSearch:
             ends = (begin, end)
             ways = [replace(way, closed=closes(self.counter, ends, way.apart_m, self.config)) for way in ways]
         return [Gap(begin.t_ns, end.t_ns, begin, end, ways)]
+
+    def only_length_m(self, begin: TrueAnchor, end: TrueAnchor) -> list[float]:
+        """The length of the ways between two anchors, as the odometer counts up [m]; nothing if there are several."""
+        gaps = self._between(begin, end)
+        return gaps[0].only_length_m if len(gaps) == 1 else []
 
     def misclosure_m(self, begin: TrueAnchor, end: TrueAnchor) -> float:
         """How much farther apart the anchors are than the odometer counted [m].

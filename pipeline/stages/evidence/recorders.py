@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.odometry import Odometry
-from schemas.arrays import NS_PER_S, floats, times_ns
+from schemas.arrays import floats, times_ns
 from schemas.config import HazardConfig
 
 
@@ -22,12 +22,12 @@ def on_time(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | Non
 def without_frozen(
     reference: pl.DataFrame | None, odometers: Sequence[Odometry], config: HazardConfig
 ) -> pl.DataFrame | None:
-    """The reference without samples that repeat the one before while an independent odometer moves on.
+    """The reference without samples that repeat the one before while an odometer moves on: any, or any independent one.
 
     A recorder that stands still says nothing of where the train is (DOMAIN section 5.0): after so long the stretch
     ends. A train that stands repeats too: there the odometer shows no way beyond its dead band and the sample's noise.
     """
-    witnesses = [odometer for odometer in odometers if odometer.independent]
+    witnesses = [odometer for odometer in odometers if odometer.independent] or list(odometers)
     if reference is None or reference.height < 2 or not witnesses:
         return reference
     t_ns = times_ns(reference)
@@ -39,7 +39,5 @@ def without_frozen(
     noise_m = config.evidence_factor * reference["sigma_m"].fill_null(config.reference_sigma_m).to_numpy()
     frozen = np.zeros(t_ns.size, dtype=np.bool_)
     for odometer in witnesses:
-        way_m = np.abs(odometer.distance_between(t_ns[held], t_ns))
-        stands_m = odometer.deadband_mps * (t_ns - t_ns[held]) / NS_PER_S
-        frozen |= repeats & (np.nan_to_num(way_m) > noise_m + stands_m)
+        frozen |= repeats & odometer.drove(t_ns[held], t_ns, noise_m)
     return reference.filter(~pl.Series(frozen))

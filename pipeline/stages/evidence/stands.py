@@ -32,11 +32,8 @@ def final_stands(
     """
     ends: list[tuple[int, bool]] = []
     for odometer in odometers:
-        last_ns = odometer.epoch_ns + round(float(odometer.t_s[-1]) * 1e9)
-        span_ns = np.array([last_ns - round(_STOOD_S * NS_PER_S), last_ns])
-        way_m = float(np.abs(np.diff(odometer.distance_at(span_ns)))[0])
-        stood = way_m <= odometer.deadband_mps * _STOOD_S and not bool(odometer.slip[-1])
-        ends.append((last_ns, stood))
+        end_ns = np.array([odometer.epoch_ns + round(float(odometer.t_s[-1]) * 1e9)])
+        ends.append((int(end_ns[0]), bool(odometer.stood(end_ns - round(_STOOD_S * NS_PER_S), end_ns)[0])))
     for stretch in reference:
         last_ns = int(stretch.t_ns[-1])
         path = stretch.paths[0]

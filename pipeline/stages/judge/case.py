@@ -7,7 +7,7 @@ from functools import cached_property
 
 import polars as pl
 
-from pipeline.stages.evidence import TrainEvidence
+from pipeline.stages.evidence import EvidenceSet, TrainEvidence, either
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.track.path import RoutePath, TravelledPath
 from schemas.arrays import NS_PER_S, Ints, times_ns
@@ -43,7 +43,10 @@ class Solution:
 
 @dataclass(frozen=True)
 class Case:
-    """One solution with the evidence of its run; `odometry` grows with its path, `faults` were injected."""
+    """One solution with the evidence of its run; `odometry` grows with its path, `faults` were injected.
+
+    `leaps_s`: whole leap seconds that may have to be added to the stamps of the positions, beside none; nobody knows.
+    """
 
     solution: Solution
     evidence: TrainEvidence
@@ -52,6 +55,15 @@ class Case:
     config: Configuration
     reference: pl.DataFrame | None = None
     faults: pl.DataFrame | None = None
+    leaps_s: tuple[int, ...] = ()
+
+    def evidence_at(self, at_ns: Ints) -> EvidenceSet:
+        """Where the train was at instants of the positions' clock: by either clock, where that may be off by leaps."""
+        return either([self.evidence.at(clock_ns) for clock_ns in self.clocks_ns(at_ns)])
+
+    def clocks_ns(self, at_ns: Ints) -> list[Ints]:
+        """The same instants of the positions' clock by each clock of the evidence that they may have."""
+        return [at_ns, *(at_ns + leap_s * NS_PER_S for leap_s in self.leaps_s)]
 
     def instants(self, t_ns: Ints) -> Ints:
         """When positions of these stamps were true: less the latency of the vehicle file, 0 without one."""

@@ -23,7 +23,7 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
     config = case.config
     at_ns = case.instants_of_epochs()
     positions = MatchedPositions.of(case, epochs, met(epochs, unambiguous()))
-    evidence = case.evidence.at(at_ns)
+    evidence = case.evidence_at(at_ns)
     along = judgements_of(case, positions, at_ns, evidence)
     direction = _direction(case, positions, at_ns, along)
     judged = along.turned(direction.to_numpy())
@@ -68,7 +68,7 @@ def direction_by_evidence(case: Case) -> pl.Series:
     """Direction of travel of a run without an odometer, before anything is judged: `epochs` as they are aligned."""
     at_ns = case.instants_of_epochs()
     positions = MatchedPositions.of(case, case.solution.epochs, met(case.solution.epochs, unambiguous()))
-    along = judge_positions(positions, case.evidence.at(at_ns), case.legs(), case.config.hazards)
+    along = judge_positions(positions, case.evidence_at(at_ns), case.legs(), case.config.hazards)
     return _direction(case, positions, at_ns, along)
 
 
@@ -84,7 +84,7 @@ def judged_offers(case: Case, epochs: pl.DataFrame) -> pl.DataFrame:
     sure = flags(epochs, "unambiguous")
     positions = MatchedPositions.of(case, offers, sure[before] & sure[ints(offers["epoch"])])
     at_ns = np.where(flags(offers, "virtual"), case.instants(t_ns), t_ns)
-    along = judgements_of(case, positions, at_ns, case.evidence.at(at_ns))
+    along = judgements_of(case, positions, at_ns, case.evidence_at(at_ns))
     judged = along.turned(ints(epochs["direction"])[before])
     margin_m = np.where(judged.is_right, limits.failure_limit_m - judged.largest_m, np.nan)
     late = case.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]

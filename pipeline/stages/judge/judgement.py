@@ -141,7 +141,13 @@ def judgements_of(case: Case, positions: MatchedPositions, at_ns: Ints, evidence
     accepted = case.solution.accepted
     accepted_ns = case.instants(times_ns(accepted))
     stood = case.evidence.stood
-    low_m, high_m = carried_forward(accepted_ns, floats(accepted, "path_m"), at_ns, case.odometry, stood, case.config)
+    place_m = floats(accepted, "path_m")
+    own = [
+        carried_forward(anchor_ns, place_m, clock_ns, case.odometry, stood, case.config)
+        for anchor_ns, clock_ns in zip(case.clocks_ns(accepted_ns), case.clocks_ns(at_ns), strict=True)
+    ]
+    # NaN, where one of the clocks leaves nothing known.
+    low_m, high_m = np.min([low for low, _ in own], axis=0), np.max([high for _, high in own], axis=0)
     # Where it contradicts a reference, and nobody knows which of the two failed, it shows nothing.
     unsure = within_spans(at_ns, case.evidence.unsure)
     train_m = np.where(unsure, np.nan, low_m), np.where(unsure, np.nan, high_m)

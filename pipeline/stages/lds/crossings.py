@@ -193,7 +193,7 @@ def _read(
     before = max(int(np.searchsorted(journey.t_ns, t_ns, side="right")) - 1, 0)
     here_m = float(np.nan_to_num(journey.path_m[epoch]))
     # The place of the last telegram plus the odometer since then; the matched position only where there is none.
-    before_m = None if last is None or journey.segment[last.before] != journey.segment[before] else last.odometer_m
+    before_m = None if last is None or journey.doubt_m[last.before] != journey.doubt_m[before] else last.odometer_m
     if last is not None and before_m is not None and odometer_m is not None:
         here_m = last.balise.path_m + odometer_m - before_m
     leg = int(journey.leg[epoch])

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import confident, crossing_gaps_ns, met, unambiguous
+from pipeline.stages.odometry.bound import is_lost
 from pipeline.stages.odometry.driven import turns_of
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig
@@ -18,9 +19,9 @@ class Journey:
     """Epochs in order of time; NaN is not known. Names are those of `schemas.stages.Aligned`, but:
 
     `refusal`: why a detection here would not count, None where it would. `direction` of travel (+1/-1 along growing
-    path) as known at that epoch. `segment`: changes where the odometer lost its distance; `counter`: the same, over
-    slip and guessed pauses. `gap_ns`: the longest step to the epoch that a crossing is interpolated over; `blind`: no
-    position for longer.
+    path) as known at that epoch. `doubt_m`: in the odometer's distance, a sum; the epochs between which it stays the
+    same compare; `rows_m`: noise of its rows. `gap_ns`: the longest step to the epoch that a crossing is interpolated
+    over; `blind`: no position for longer.
     """
 
     def __init__(self, epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> None:
@@ -34,10 +35,9 @@ class Journey:
         self.sigma_m = floats(epochs.select(pl.col("position_sigma_m").forward_fill()), "position_sigma_m")
         self.confidence_m = floats(epochs, "confidence_m")
         self.odometer_m = floats(epochs, "odometer_m")
-        self.segment: Ints = epochs["odometer_segment"].to_numpy().astype(np.int64)
+        self.doubt_m = floats(epochs, "odometer_doubt_m")
         self.slips = flags(epochs, "odometer_slips")
-        self.counter: Ints = epochs["odometer_counter"].to_numpy().astype(np.int64)
-        self.slip_doubt_m = floats(epochs, "slip_doubt_m")
+        self.rows_m = np.nan_to_num(floats(epochs, "odometer_rows_m"))
         self.scale_sigma = scale_sigma
         self.direction = _direction(self.odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
         self.travelled_m = floats(epochs, "travelled_m")
@@ -113,8 +113,8 @@ def turning_epochs(journey: Journey) -> frozenset[int]:
 
 
 def odometer_epochs(journey: Journey) -> list[int]:
-    """Epochs at which the odometer begins to slip or a continuity segment."""
-    changes = (np.diff(journey.segment) != 0) | (journey.slips[1:] & ~journey.slips[:-1])
+    """Epochs at which the odometer begins to slip, or its distance came into doubt."""
+    changes = (np.diff(journey.doubt_m) != 0.0) | (journey.slips[1:] & ~journey.slips[:-1])
     epochs: list[int] = (np.flatnonzero(changes) + 1).tolist()
     return epochs
 
@@ -134,6 +134,6 @@ def unwatched_epochs(journey: Journey, watched: Ints, gap_reset_s: float) -> fro
     """
     waited_ns = np.diff(journey.t_ns[watched])
     slipped = np.diff(np.cumsum(journey.slips)[watched]) > 0
-    paused = (np.diff(journey.segment[watched]) != 0) & ~slipped
-    lost = paused | (np.diff(journey.counter[watched]) != 0)
+    doubt_m = np.diff(journey.doubt_m[watched])
+    lost = ((doubt_m != 0.0) & ~slipped) | is_lost(doubt_m)
     return frozenset(watched[1:][lost | (waited_ns > gap_reset_s * NS_PER_S)].tolist())

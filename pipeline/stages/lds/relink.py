@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.stages.lds.crossings import Crossing
 from pipeline.stages.lds.journey import Journey
 from pipeline.stages.monitors.bank import MonitorBank
+from pipeline.stages.odometry.bound import is_lost
 from pipeline.stages.odometry.recovery import RecoveryRule
 from schemas.arrays import NS_PER_S, Floats
 from schemas.config import Configuration
@@ -43,7 +44,7 @@ class Anchor:
     @classmethod
     def at_crossing(cls, journey: Journey, crossing: Crossing, sigma_m: float) -> Anchor | None:
         """By the balise's own place; None where the odometer is not known there."""
-        whole = journey.segment[crossing.epoch] == journey.segment[crossing.before]
+        whole = journey.doubt_m[crossing.epoch] == journey.doubt_m[crossing.before]
         if crossing.odometer_m is None or not whole or not isfinite(crossing.travelled_m):
             return None
         offset_m = crossing.balise.path_m - crossing.odometer_m
@@ -134,11 +135,11 @@ class Relink:
             return Comparison(reason=NotEvaluated.RELINK_OFF)
         if anchor is None:
             return Comparison(reason=NotEvaluated.RELINK_NO_ANCHOR)
-        if self._journey.counter[anchor.epoch] != self._journey.counter[epoch]:
+        doubt_m = float(self._journey.doubt_m[epoch] - self._journey.doubt_m[anchor.epoch])
+        if is_lost(np.array(doubt_m)):
             return Comparison(reason=NotEvaluated.RELINK_DISTANCE_LOST)
         if self._journey.scale_sigma is None and not (anchor.is_read and anchor.epoch == epoch):
             return Comparison(reason=NotEvaluated.RELINK_NO_VEHICLE)
-        doubt_m = float(self._journey.slip_doubt_m[epoch] - self._journey.slip_doubt_m[anchor.epoch])
         if doubt_m > self._rule.most_m:
             # Slip at each start counts too much each time, and would soon explain any fault.
             return Comparison(reason=NotEvaluated.RELINK_SLIPPED)
@@ -160,8 +161,8 @@ class Relink:
         way_m = journey.travelled_m[at] - anchor.travelled_m
         positions_m2 = anchor.sigma_m**2 + journey.sigma_m[at] ** 2
         bound_m = self._rule.bound_m(self._rule.variance_m2(positions_m2, waited_s, way_m, journey.scale_sigma or 0.0))
-        doubt_m = journey.slip_doubt_m[at] - journey.slip_doubt_m[anchor.epoch]
-        known = (journey.counter[at] == journey.counter[anchor.epoch]) & (doubt_m <= self._rule.most_m)
+        doubt_m = journey.doubt_m[at] - journey.doubt_m[anchor.epoch]
+        known = doubt_m <= self._rule.most_m
         return np.where(known, moved_m, np.nan), np.minimum(self._rule.most_m, bound_m + doubt_m)
 
     def _first_tvb(self, epoch: int) -> Anchor | None:

@@ -33,12 +33,12 @@ def find_path(
     states = path_states(found, fixes.height_m[middle], np.sqrt(fixes.cov_uu_m2[middle]), config)
     moves = Moves.without_odometer(network, found.steps, config)
     if odometry is not None:
-        counted_m = (odometry.scale or 1.0) * odometry.distance_at(found.steps.t_ns)
-        segment = odometry.segment_at(found.steps.t_ns)
-        same = np.diff(segment[states.step], prepend=-1) == 0
-        since_m = np.where(same, np.diff(counted_m[states.step], prepend=np.nan), np.nan)
-        signs = polarity(network, states, since_m)
-        moves = Moves(network, found.steps, counted_m, segment, signs, config)
+        at_ns = found.steps.t_ns
+        counted_m = (odometry.scale or 1.0) * odometry.distance_at(at_ns)
+        since_m = np.full(states.step.size, np.nan)
+        since_m[1:] = odometry.distance_between(at_ns[states.step[:-1]], at_ns[states.step[1:]])
+        doubt_m = odometry.doubt_at_s(odometry.seconds(at_ns))
+        moves = Moves(network, found.steps, counted_m, doubt_m, polarity(network, states, since_m), config)
     course = least_squares(states, moves)
     decoded = aligned(moves, course, decode(course, moves))
     legs = legs_of(moves, course, decoded)

@@ -132,22 +132,22 @@ def _raw_variance(series: AxisSeries, increment_m2: Floats) -> Floats:
 class AlongEpochs:
     """Epochs with a position and an odometer, in order, and the errors there; all arrays of one length m.
 
-    `sigma_m`: of the Gauss-Markov errors; `digits_m`: how coarsely positions are written; `jitter_s`: scatter of the
-    stamps; `white_m2_per_s`: what the odometer's distance gathers; `rows_m`: quantisation noise of its rows, `period_s`
-    apart, None where it has none in the whole run, for the recursions carry each source on.
+    `doubt_m`: in the odometer's distance, a sum; `sigma_m`: of the Gauss-Markov errors; `digits_m`: how coarsely
+    positions are written; `jitter_s`: scatter of the stamps; `white_m2_per_s`: what the odometer's distance gathers;
+    `rows_m`: quantisation noise of its rows, `period_s` apart.
     """
 
     epoch: Ints
     t_s: Floats
     along_m: Floats
-    segment: Ints
+    doubt_m: Floats
     sigma_m: Floats
     digits_m: Floats
     jitter_s: Floats | float
     scale_sigma: Floats
     latency_sigma_s: Floats
     white_m2_per_s: Floats | float
-    rows_m: Floats | None
+    rows_m: Floats
     period_s: Floats | float
 
 
@@ -156,12 +156,13 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
     zero = np.zeros(dt.size)
     # New at each epoch: a stamp's error times the speed, and the digits. The odometer's rows lose theirs by and by.
     memoryless_m = np.hypot(epochs.jitter_s * odometer.distance_m / dt, epochs.digits_m)
-    beside = [(np.abs(memoryless_m), np.ones(dt.size))]
-    if epochs.rows_m is not None:
-        beside.append((epochs.rows_m, _rows_decorrelation(dt, epochs.period_s, config.monitors)))
+    beside = [
+        (np.abs(memoryless_m), np.ones(dt.size)),
+        (epochs.rows_m, _rows_decorrelation(dt, epochs.period_s, config.monitors)),
+    ]
     return AxisSeries(
         epoch=epochs.epoch,
-        fresh=fresh | (np.diff(epochs.segment, prepend=epochs.segment[:1]) != 0),
+        fresh=fresh | (np.diff(epochs.doubt_m, prepend=epochs.doubt_m[:1]) != 0.0),
         border=np.zeros(dt.size, dtype=np.bool_),
         dt_s=dt,
         rate_mps=(np.diff(epochs.along_m, prepend=epochs.along_m[:1]) - odometer.distance_m) / dt,

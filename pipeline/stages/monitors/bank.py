@@ -55,7 +55,8 @@ class AxisBank:
         self.noise_m = np.full(shape, np.nan, order="F")
         self.state = np.full(shape, NOT_EVALUATED, dtype=np.int8, order="F")
         self.begins = np.zeros(epochs, dtype=np.bool_)
-        self.noise_known = np.ones(epochs, dtype=np.bool_)
+        # Rows of the odometer scatter by nobody knows how much yet.
+        self.noise_known: Bools = axis.reasons.ne_missing(NOISE_UNKNOWN).to_numpy()
         given_m: tuple[float, ...] | None = getattr(config.monitors, f"noise_{axis.name}_m")
         self._meter = NoiseMeter(axis.series, axis.moving, given_m, config)
         self._begin_at(0, None, BLOCK)

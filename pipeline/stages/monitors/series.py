@@ -74,19 +74,18 @@ def _match_reasons(epochs: pl.DataFrame) -> pl.Series:
 
 def _along(epochs: pl.DataFrame, t_s: Floats, reasons: pl.Series, config: Configuration) -> AxisSeries:
     rows, used = _without_reason(epochs, reasons)
-    rows_m = floats(used, "odometer_rows_m")
     at_rows = AlongEpochs(
         epoch=rows,
         t_s=t_s[rows],
         along_m=floats(used, "along_m"),
-        segment=used["odometer_segment"].to_numpy(),
+        doubt_m=floats(used, "odometer_doubt_m"),
         sigma_m=floats(used, "calibrated_along_m"),
         digits_m=floats(used, "digits_along_m"),
         jitter_s=floats(used, "stamp_jitter_s"),
         scale_sigma=floats(used, "scale_sigma"),
         latency_sigma_s=floats(used, "latency_sigma_s"),
         white_m2_per_s=floats(used, "odometer_white_m2_per_s"),
-        rows_m=rows_m if rows_m.any() else None,
+        rows_m=floats(used, "odometer_rows_m"),
         period_s=floats(used, "odometer_period_s"),
     )
     return along_series(at_rows, Increments(_steps(used, "odometer_m"), _steps(used, "speed_mps")), config)

@@ -37,7 +37,7 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame
     # The sigma of rows is cut off there: with coarser ones a threshold would not hold.
     coarse = floats(epochs, "odometer_rows_m") >= most_scatter_m(config)
     usable = np.isfinite(velocity_mps) & no_odometer.is_null().to_numpy() & epochs["fix_valid"].to_numpy() & ~coarse
-    first, span_s = _window(t_s, usable, epochs["odometer_segment"].to_numpy(), config)
+    first, span_s = _window(t_s, usable, floats(epochs, "odometer_doubt_m"), config)
     doppler_m = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity_mps, np.nan)))])[:-1]
     odometer_m = floats(epochs, "odometer_m")
     value_mps = (doppler_m - doppler_m[first]) / span_s - (odometer_m - odometer_m[first]) / span_s
@@ -91,7 +91,7 @@ def channel_monitor(
 
 
 def _window(
-    t_s: Floats, usable: npt.NDArray[np.bool_], segment: npt.NDArray[np.int64], config: Configuration
+    t_s: Floats, usable: npt.NDArray[np.bool_], doubt_m: Floats, config: Configuration
 ) -> tuple[npt.NDArray[np.int64], Floats]:
     """Epoch `speed_window_s` before or earlier, and the time since; NaN unless all between is usable and connected."""
     least_s = config.align.speed_window_s * (1.0 - 1e-6)
@@ -100,7 +100,7 @@ def _window(
     clean = bad[np.arange(t_s.size) + 1] == bad[first]
     span = t_s - t_s[first]
     connected = clean & (span >= least_s) & (span <= config.monitors.doppler_gap_s)
-    connected &= segment == segment[first]
+    connected &= doubt_m == doubt_m[first]
     return first, np.where(connected, span, np.nan)
 
 

@@ -10,6 +10,15 @@ from pipeline.stages.odometry.odd_steps import LOST_M, weighed
 from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig
 
+# Each step of slip is in doubt by so much at least [m]: a locked wheel counts nothing.
+LEAST_DOUBT_M = 1e-3
+
+
+def is_lost(doubt_m: Floats) -> Bools:
+    """Differences of a sum of doubt that hold a loss of the distance: nothing of it is left."""
+    lost: Bools = np.abs(doubt_m) > 0.5 * LOST_M
+    return lost
+
 
 @dataclass(frozen=True)
 class Bound:
@@ -24,12 +33,15 @@ class Bound:
     ended_m: Floats
 
     @classmethod
-    def of(cls, t_s: Floats, distance_m: Floats, doubtful: Bools, lost: Bools, config: AlignConfig) -> Bound:
-        """`doubtful` and `lost` (rows - 1,): leaps, stalls, pauses, slip; the distance is not known at all."""
+    def of(
+        cls, t_s: Floats, distance_m: Floats, doubtful: Bools, lost: Bools, least_m: Floats, config: AlignConfig
+    ) -> Bound:
+        """All per step: `doubtful` by leaps, stalls, pauses, slip, speeds; `lost`, not known at all; by `least_m`."""
         begun_m, ended_m = np.zeros((2, t_s.size))
         gone = np.concatenate([[0], np.cumsum(lost)])
         for run in weighed(t_s, distance_m, doubtful | lost, config):
-            off_m = LOST_M if gone[run.last] > gone[run.first] else run.off_m
+            off_m = max(run.off_m, float(least_m[run.first : run.last].sum()))
+            off_m = LOST_M if gone[run.last] > gone[run.first] else off_m
             begun_m[run.first + 1] += off_m
             ended_m[run.last] += off_m
         return cls(t_s, np.cumsum(begun_m), np.cumsum(ended_m))

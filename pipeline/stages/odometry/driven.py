@@ -50,15 +50,22 @@ def turns_of(distance_m: Floats, back_m: float) -> list[tuple[int, int, int]]:
     return turns
 
 
-def driven_m(distance_m: Floats, width_m: Floats) -> Floats:
-    """Way driven up to each row, to and fro [m]."""
-    steps = np.diff(with_hysteresis(distance_m, width_m))
+def travelled_m(t_s: Floats, distance_m: Floats, width_m: Floats, deadband_mps: float, window_s: float) -> Floats:
+    """Way driven up to each row, to and fro [m]; of a stand only the farthest it was from its place.
+
+    `width_m`: of the hysteresis that takes the noise of rows away, infinite where it is not known yet.
+    """
+    held_m = with_hysteresis(distance_m, width_m)
+    driven = driven_or_left_m(held_m, moving_steps(t_s, held_m, deadband_mps, window_s))
+    steps = np.diff(held_m)
     moves = np.flatnonzero(steps)
-    turns = moves[1:][np.sign(steps[moves[1:]]) != np.sign(steps[moves[:-1]])]
-    # At a turn the held distance lags by twice the width (`with_hysteresis`), which was driven all the same.
-    ways = np.abs(steps)
-    ways[turns] += 2.0 * width_m[turns + 1]
-    return np.concatenate([[0.0], np.cumsum(ways)])
+    turned = np.sign(steps[moves[1:]]) != np.sign(steps[moves[:-1]])
+    # Before a turn the held distance lags behind, after it too (`with_hysteresis`): both were driven all the same.
+    lags_m = np.zeros(held_m.size)
+    lags_m[moves[1:][turned] + 1] = width_m[moves[:-1][turned] + 1] + width_m[moves[1:][turned] + 1]
+    # While it is not known how wide the hysteresis is, the way is that from the place held.
+    away_m = np.where(np.isinf(width_m), np.abs(distance_m - held_m), 0.0)
+    return np.asarray(np.maximum.accumulate(driven + np.cumsum(lags_m) + away_m))
 
 
 def under_way(t_s: Floats, way_m: Floats, deadband_mps: float, window_s: float) -> Bools:

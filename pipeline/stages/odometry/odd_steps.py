@@ -51,11 +51,11 @@ class OddRuns(NamedTuple):
 
 
 class _Counted(NamedTuple):
-    """Rows of a counter without gaps, and what their second differences scatter by [m]."""
+    """Rows of a counter without gaps, its step as known before each, and what second differences scatter by [m]."""
 
     t_s: Floats
     distance_m: Floats
-    counts_m: float
+    counts_m: Floats
     scatter_m: Floats  # of interior rows
 
 
@@ -70,14 +70,21 @@ def beside_s(time_s: float, config: AlignConfig) -> float:
     return config.speed_window_s + 0.5 * time_s
 
 
-def odd_runs(t_s: Floats, distance_m: Floats, counts_m: float, config: AlignConfig) -> OddRuns:
-    """Of rows at these times [s], NaN where not recorded; `counts_m`: the step of the counter, 0 where it has none."""
+def odd_runs(t_s: Floats, distance_m: Floats, counts_m: Floats | float, config: AlignConfig) -> OddRuns:
+    """Of rows at these times [s], NaN where not recorded.
+
+    `counts_m`: the step of the counter as known at each row, 0 where none is.
+    """
     rows = np.flatnonzero(np.isfinite(distance_m))
     if rows.size < 3:
         return OddRuns([], [])
+    counts_m = np.broadcast_to(counts_m, t_s.shape)[rows]
     t_s, distance_m = t_s[rows], distance_m[rows]
-    counted = _Counted(t_s, distance_m, counts_m, _scatter_m(t_s, distance_m, counts_m, config))
-    leaps, near = _places(counted, config)
+    before_m = np.concatenate([counts_m[:1], counts_m[:-1]])
+    counted = _Counted(t_s, distance_m, before_m, _scatter_m(t_s, distance_m, before_m, config))
+    leaps, _ = _places(counted, config)
+    # Near ones are for evidence, which may look back: a counter whose step is not yet known is healthy all the same.
+    _, near = _places(counted._replace(counts_m=np.maximum(before_m, counts_m[-1])), config)
     stalls = _stalls(counted, config)
     odd = _between_places(leaps, t_s.size, config) | stalls | _too_far(t_s, distance_m, config)
     odd |= _set_in_a_hole(counted, stalls, config)
@@ -92,7 +99,7 @@ def _in_all_rows(run: OddRun, rows: Ints) -> OddRun:
     return run._replace(first=int(rows[run.first]), last=int(rows[run.last]))
 
 
-def _scatter_m(t_s: Floats, distance_m: Floats, counts_m: float, config: AlignConfig) -> Floats:
+def _scatter_m(t_s: Floats, distance_m: Floats, counts_m: Floats, config: AlignConfig) -> Floats:
     """Sigma of the second difference at each interior row, from the rows before; a counter's own step left out.
 
     By third differences: constant braking has none.
@@ -102,8 +109,8 @@ def _scatter_m(t_s: Floats, distance_m: Floats, counts_m: float, config: AlignCo
         return np.zeros(t_s.size - 2)
     median_m = _running_median(third_m, _NOISE_ROWS)
     median_m[:_FIRST_ROWS] = median_m[min(_FIRST_ROWS, median_m.size) - 1]
-    variance_m2 = _SECOND / _THIRD * (median_m / _MEDIAN_SIGMAS) ** 2 - counts_m**2
-    variance_m2 = np.concatenate([variance_m2[:1], variance_m2])
+    variance_m2 = _SECOND / _THIRD * (median_m / _MEDIAN_SIGMAS) ** 2
+    variance_m2 = np.concatenate([variance_m2[:1], variance_m2]) - counts_m[1:-1] ** 2
     scatter_m = np.sqrt(np.maximum(variance_m2, 0.0) + _by_stamps_m(t_s, distance_m) ** 2)
     # Rows farther apart differ by how the train drives.
     return np.where(_periods_s(t_s, config)[1:] > config.straight_s, 0.0, scatter_m)
@@ -138,7 +145,7 @@ def _places(counted: _Counted, config: AlignConfig) -> tuple[Bools, Bools]:
     least_s = np.minimum(dt_s[1:], dt_s[:-1])
     apart_m = np.abs(np.diff(speed_mps)) * least_s - 0.5 * config.braking_mps2 * (dt_s[1:] + dt_s[:-1]) * least_s
     bunched = least_s < 0.5 * _periods_s(counted.t_s, config)[1:]
-    rows_m = 2.0 * counted.counts_m + config.sure_sigmas * counted.scatter_m
+    rows_m = 2.0 * counted.counts_m[1:-1] + config.sure_sigmas * counted.scatter_m
     leap = apart_m > rows_m + np.where(bunched, config.bunched_stamps_m, config.leap_m)
     near = (apart_m > rows_m + config.near_leap_m) & ~bunched
     leaps, nears = np.zeros((2, counted.t_s.size), dtype=np.bool_)
@@ -193,7 +200,8 @@ def _stalls(counted: _Counted, config: AlignConfig) -> Bools:
             continue
         beside = sums.beside(t_s, begin, end, config)
         missing_m = abs(beside.mean_mps) * time_s - driven_within_m(time_s, config, beside.about_s)
-        tolerance_m = config.leap_m + 2.0 * counted.counts_m + config.sure_sigmas * float(counted.scatter_m[end - 1])
+        counts_m = float(counted.counts_m[begin])
+        tolerance_m = config.leap_m + 2.0 * counts_m + config.sure_sigmas * float(counted.scatter_m[end - 1])
         if missing_m > tolerance_m:
             stalls[begin : end + 1] = True
     return stalls
@@ -215,7 +223,7 @@ def _set_in_a_hole(counted: _Counted, odd: Bools, config: AlignConfig) -> Bools:
         off_m = abs(distance_m[step + 1] - distance_m[step] - around.mean_mps * time_s)
         scatter_m = config.sure_sigmas * float(counted.scatter_m[min(step, counted.scatter_m.size - 1)])
         within_m = driven_within_m(time_s, config, around.about_s)
-        found[step] = off_m > config.leap_m + 2.0 * counted.counts_m + scatter_m + within_m
+        found[step] = off_m > config.leap_m + 2.0 * float(counted.counts_m[step]) + scatter_m + within_m
     return found
 
 
@@ -260,7 +268,8 @@ class _Sums(NamedTuple):
 
 def weighed(t_s: Floats, distance_m: Floats, steps: Bools, config: AlignConfig) -> list[OddRun]:
     """Each run of these steps (pauses, slip) by the mean speed beside it."""
-    return _runs(_Counted(t_s, distance_m, 0.0, np.zeros(max(t_s.size - 2, 1))), steps, steps, config)
+    counted = _Counted(t_s, distance_m, np.zeros(t_s.size), np.zeros(max(t_s.size - 2, 1)))
+    return _runs(counted, steps, steps, config)
 
 
 def _runs(counted: _Counted, steps: Bools, left_out: Bools, config: AlignConfig) -> list[OddRun]:
@@ -283,7 +292,7 @@ def _runs(counted: _Counted, steps: Bools, left_out: Bools, config: AlignConfig)
         about_mps = float(np.fmin(before_mps, after_mps)) if one_sided else mean_mps
         off_m = abs(counted_m - about_mps * time_s)
         scatter_m = config.sure_sigmas * float(counted.scatter_m[min(first, counted.scatter_m.size - 1)])
-        kept = off_m <= config.leap_m + 2.0 * counted.counts_m + scatter_m + within_m
+        kept = off_m <= config.leap_m + 2.0 * float(counted.counts_m[first]) + scatter_m + within_m
         doubt_m = off_m + within_m if np.isfinite(off_m) else LOST_M
         runs.append(OddRun(first, last, counted_m, mean_mps, doubt_m, bool(kept)))
     return runs

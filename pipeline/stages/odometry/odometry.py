@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.odometry.bound import Bound
-from pipeline.stages.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
+from pipeline.stages.epochs.clock import periods_before_s
+from pipeline.stages.odometry.bound import LEAST_DOUBT_M, Bound, is_lost
+from pipeline.stages.odometry.contradicted import contradicted_by_speeds
+from pipeline.stages.odometry.counts import CountStep, count_step
+from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_steps, travelled_m
+from pipeline.stages.odometry.odd_steps import LOST_M
 from pipeline.stages.odometry.origin import declared_origin
-from pipeline.stages.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
+from pipeline.stages.odometry.quantisation import (
+    NO_QUANTISATION,
+    QuantisationNoise,
+    first_scatter_m2,
+    known_at_rows,
+    of_the_run,
+    scatter_pieces,
+)
 from pipeline.stages.odometry.rows import filled_in, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
+
+# Numerics: of so many rows the declared sigma is usual.
+_DECLARED_ROWS = 100
 
 
 class OdometerWay(NamedTuple):
@@ -39,35 +53,56 @@ class Increments(NamedTuple):
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the distance: what gathers in a second, the scatter of rows, and the step of a counter."""
+    """Noise of the distance as the whole run shows it: what gathers in a second, and the scatter of rows. For
+    evidence and calibration; detection uses `KnownNoise`.
+    """
 
     white_m2_per_s: float
     quantisation: QuantisationNoise = NO_QUANTISATION
-    counter_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class KnownNoise:
+    """The same as the rows up to each sample show it, and the period of the rows [s].
+
+    `still_m2`, `moving_s2`: of `QuantisationNoise`; a first figure where too few rows show them yet (not `shown`).
+    """
+
+    white_m2_per_s: Floats
+    still_m2: Floats
+    moving_s2: Floats
+    period_s: Floats
+    shown: Bools
+
+    def at(self, samples: Ints) -> KnownNoise:
+        return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
+
+    def row_m2(self, speed_mps: Floats) -> Floats:
+        """Variance of a row [m^2]."""
+        return np.asarray(self.still_m2 + self.moving_s2 * speed_mps**2)
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """Distance over time in continuity segments, with its noise.
+    """Distance over time with its noise and two sums of doubt.
 
     Instants are int64 nanoseconds; `t_s` (rows, and what was filled in) and all `_s` arguments are seconds since
-    `epoch_ns`. Distances are as recorded, but for `between` and `increments`. `segment`: how often the distance was
-    lost before a sample; `counter`: the same, over slip and pauses between speeds, where the way is known to
-    `slip_doubt_m`, a sum. `pause[i]`: between samples i and i+1 nothing is interpolated. `scale`: true over recorded
-    distance, None without its sigma. `leaps_ns`: rows to which the counter leaps; `bridged_m2`: variance over bridged
-    ones, a sum. `bound`: by how much the distance may be off as braking proves it. `origin`: as declared;
+    `epoch_ns`. Distances are as recorded, but for `between` and `increments`. `doubt_m`: by how much the distance may
+    be off as the train itself believes it, a sum, `LOST_M` more where it was lost. `pause[i]`: between samples i and
+    i+1 nothing is interpolated. `scale`: true over recorded distance, None without its sigma. `leaps_ns`: rows to which
+    the counter leaps; `bridged_m2`: variance over bridged ones, a sum. `bound`: by how much the distance may be off as
+    braking proves it. `period_s`: usual time between rows of the run, for words about it. `origin`: as declared;
     `follows_gnss`: found to be made of the positions all the same.
     """
 
     epoch_ns: int
     t_s: Floats
     distance_m: Floats
-    segment: Ints
     pause: Bools
     slip: Bools
-    counter: Ints
-    slip_doubt_m: Floats
+    doubt_m: Floats
     noise: Noise
+    known_noise: KnownNoise
     deadband_mps: float
     config: AlignConfig
     period_s: float = 0.0
@@ -107,20 +142,13 @@ class Odometry:
     def known_at(self, t_ns: Ints) -> Bools:
         return self.known_at_s(self.seconds(t_ns))
 
-    def segment_at(self, t_ns: Ints) -> Ints:
-        """Distances compare only within one."""
-        return self.segment_at_s(self.seconds(t_ns))
-
     def slips_at_s(self, t_s: Floats) -> Bools:
         """By the sample before or after."""
         return self._slips_between(*self._around(t_s))
 
-    def counter_at_s(self, t_s: Floats) -> Ints:
-        counter: Ints = self.counter[self._sample_at(t_s)]
-        return counter
-
-    def slip_doubt_at_s(self, t_s: Floats) -> Floats:
-        return np.interp(t_s, self.t_s, self.slip_doubt_m)
+    def doubt_at_s(self, t_s: Floats) -> Floats:
+        """Distances compare to a millimetre where it is the same, and not at all across a loss (`is_lost`) [m]."""
+        return np.interp(t_s, self.t_s, self.doubt_m)
 
     def distance_at(self, t_ns: Ints) -> Floats:
         """As recorded [m]; NaN where it is not known."""
@@ -138,6 +166,18 @@ class Odometry:
         """Whether the train moved for more than half of each step (DOMAIN section 2), shape (n - 1,)."""
         return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
 
+    def drove(self, begin_ns: Ints | int, end_ns: Ints, noise_m: Floats | float = 0.0) -> Bools:
+        """Whether the train is farther from its place than dead band and noise; not where that is in doubt."""
+        return np.abs(np.nan_to_num(self.proved_between(begin_ns, end_ns))) > self._still_m(begin_ns, end_ns) + noise_m
+
+    def stood(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
+        """Whether it is no farther from its place than the dead band; not where that is in doubt."""
+        stood: Bools = np.abs(self.proved_between(begin_ns, end_ns)) <= self._still_m(begin_ns, end_ns)
+        return stood
+
+    def _still_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        return np.asarray(self.deadband_mps * np.abs(end_ns - begin_ns) / NS_PER_S)
+
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
         """True distance between instants, and its variance.
 
@@ -150,12 +190,13 @@ class Odometry:
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
         begin_s, end_s = self.seconds(begin_ns), self.seconds(end_ns)
         inside = (np.minimum(begin_s, end_s) >= self.t_s[0]) & (np.maximum(begin_s, end_s) <= self.t_s[-1])
-        inside &= self.counter_at_s(begin_s) == self.counter_at_s(end_s)
+        bound_m = self.bound_between_m(begin_ns, end_ns)
+        inside &= ~is_lost(bound_m)
         recorded = np.where(inside, self.distance_at_s(end_s) - self.distance_at_s(begin_s), np.nan)
         moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))
         rows_m2 = self.row_sigma_m(begin_s) ** 2 + self.row_sigma_m(end_s) ** 2
         variance = scale**2 * (self.noise.white_m2_per_s * moving_s + rows_m2) + (scale_sigma * recorded) ** 2
-        return OdometerWay(scale * recorded, variance, self.bound_between_m(begin_ns, end_ns))
+        return OdometerWay(scale * recorded, variance, bound_m)
 
     def bound_between_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """By how much the way between instants may be off, as braking and acceleration prove it [m]."""
@@ -165,20 +206,23 @@ class Odometry:
         return (self.scale or 1.0) * self.bound.between_m(self.seconds(begin_ns), self.seconds(end_ns))
 
     def distance_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """The same distance [m], NaN too where slip or a pause leaves doubt in it."""
-        return np.asarray((self.scale or 1.0) * self._recorded_between(begin_ns, end_ns))
+        """The same distance as the train itself believes it [m]; NaN where anything of it is in doubt."""
+        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
+        same = self.doubt_at_s(self.seconds(begin_ns)) == self.doubt_at_s(self.seconds(end_ns))
+        return self._counted_between(begin_ns, end_ns, same)
+
+    def proved_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """The same distance [m], NaN where braking and acceleration leave any of it in doubt."""
+        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
+        return self._counted_between(begin_ns, end_ns, self.bound_between_m(begin_ns, end_ns) == 0.0)
 
     def steps_m(self, t_ns: Ints) -> Floats:
-        """From each instant to the next [m], shape (n - 1,); NaN where anything of it is in doubt."""
-        segment = self.segment_at(t_ns)
-        step_m = np.diff(self.distance_at(t_ns))
-        sure = (segment[:-1] == segment[1:]) & (self.bound_between_m(t_ns[:-1], t_ns[1:]) == 0.0)
-        return np.asarray((self.scale or 1.0) * np.where(sure, step_m, np.nan))
+        """The same from each instant to the next [m], shape (n - 1,)."""
+        return self.proved_between(t_ns[:-1], t_ns[1:])
 
-    def _recorded_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
-        same = self.segment_at(begin_ns) == self.segment_at(end_ns)
-        return np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
+    def _counted_between(self, begin_ns: Ints, end_ns: Ints, sure: Bools) -> Floats:
+        way_m = self.distance_at(end_ns) - self.distance_at(begin_ns)
+        return np.asarray((self.scale or 1.0) * np.where(sure, way_m, np.nan))
 
     def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
         """Both ends of a step with the scale and latency in use at the later one."""
@@ -198,8 +242,8 @@ class Odometry:
         return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
 
     def white_m2_per_s_at(self, t_s: Floats) -> Floats:
-        """White noise of the steps to these instants, with that of bridged resets [m^2/s]."""
-        white = np.full(t_s.size, self.noise.white_m2_per_s)
+        """White noise of the steps to these instants as known there, with that of bridged resets [m^2/s]."""
+        white = self.noise_at_s(t_s).white_m2_per_s
         dt_s = np.diff(t_s)
         white[1:] += np.where(dt_s > 0.0, np.diff(self.bridged_m2_at(t_s)) / np.maximum(dt_s, 1e-9), 0.0)
         return white
@@ -215,10 +259,6 @@ class Odometry:
         known: Bools = inside & ~paused & ~self._slips_between(before, after)
         return known
 
-    def segment_at_s(self, t_s: Floats) -> Ints:
-        segment: Ints = self.segment[self._sample_at(t_s)]
-        return segment
-
     def distance_at_s(self, t_s: Floats) -> Floats:
         """Interpolated where it is not known, the end value outside the recording [m]."""
         return np.interp(t_s, self.t_s, self.distance_m)
@@ -230,18 +270,29 @@ class Odometry:
         speed: Floats = (self.distance_at_s(t_s) - self.distance_at_s(start)) / span
         return speed
 
-    def span_s(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Begin and end of the time about an instant over which its speed is taken."""
-        about_s = self.config.latency_span_s
-        return np.maximum(t_s - about_s, self.t_s[0]), np.minimum(t_s + about_s, self.t_s[-1])
+    def speed_about(self, t_ns: Ints) -> Floats:
+        """True speed over as much of the second about each instant as was recorded [m/s]; a best guess over a pause."""
+        half_s = 0.5 * self.config.speed_window_s
+        begin_s, end_s = (np.clip(self.seconds(t_ns) + off_s, self.t_s[0], self.t_s[-1]) for off_s in (-half_s, half_s))
+        moved_m = self.distance_at_s(end_s) - self.distance_at_s(begin_s)
+        return np.asarray((self.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9))
 
-    def reading_at_s(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Distance [m] and speed [m/s] centred on each instant: a speed of the second before would bias a latency."""
-        begin_s, end_s = self.span_s(t_s)
-        speed_mps = (self.distance_at_s(end_s) - self.distance_at_s(begin_s)) / (end_s - begin_s)
-        return self.distance_at_s(t_s), speed_mps
+    def noise_at_s(self, t_s: Floats) -> KnownNoise:
+        return self.known_noise.at(self._sample_at(t_s))
+
+    def known_row_sigma_m(self, t_s: Floats) -> Floats:
+        """Of the rows' noise, as known at these instants [m]."""
+        return np.sqrt(self.noise_at_s(t_s).row_m2(self.speed_at_s(t_s)))
+
+    def hysteresis_m(self, t_s: Floats) -> Floats:
+        """How far the distance may leave the held distance before that follows, as known at these instants [m].
+
+        Before it is known by how much rows scatter nothing moves; what was driven counts once it is.
+        """
+        return np.where(self.noise_at_s(t_s).shown, hysteresis_m(self.known_row_sigma_m(t_s), self.config), np.inf)
 
     def row_sigma_m(self, t_s: Floats) -> Floats:
+        """Of the rows' noise, as the run shows it [m]."""
         if not self.noise.quantisation:
             return np.zeros(t_s.size)
         return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
@@ -270,17 +321,15 @@ class Odometry:
 
     @cached_property
     def _travelled_m(self) -> Floats:
-        if self.noise.quantisation:
-            return driven_m(self.distance_m, hysteresis_m(self.row_sigma_m(self.t_s), self.config))
-        moving = moving_steps(self.t_s, self.distance_m, self.deadband_mps, self.config.speed_window_s)
-        return driven_or_left_m(self.distance_m, moving)
+        width_m = self.hysteresis_m(self.t_s)
+        return travelled_m(self.t_s, self.distance_m, width_m, self.deadband_mps, self.config.speed_window_s)
 
 
 def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> Odometry | None:
     """The odometer of a cleaned stream, as recorded; None without at least two rows.
 
-    A new continuity segment begins where the way is lost: a pause beyond `odometer_gap_s` without a counter, slip that
-    the odometer reports, a leap that no speed bridges. White noise is `odometer_sigma_mps`, or a larger declared
+    In doubt are pauses beyond `odometer_gap_s` without a counter and slip that the odometer reports; lost is the way
+    over a leap or pause that nothing bridges. White noise is `odometer_sigma_mps`, or a larger declared
     `sigma_speed_mps`, taken as independent from row to row.
     """
     if stream is None or stream.height < 2:
@@ -290,53 +339,53 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     speed = floats(stream, "speed_mps")
     t_s: Floats = ((t_ns - int(t_ns[0])) * 1e-9).astype(np.float64)
     dt_s = np.diff(t_s)
-    period_s = float(np.median(dt_s))
-    limit_s = max(align.odometer_gap_s, align.odometer_gap_periods * period_s)
-    way_m, counted, bridged_m, odd, resets = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
+    distance_m = floats(stream, "distance_m")
+    period_s = _periods_s(t_ns)
+    limit_s = np.maximum(align.odometer_gap_s, align.odometer_gap_periods * period_s[1:])
+    counts = count_step(distance_m, align)
+    ways = ways_between(t_s, distance_m, speed, counts.step_m, limit_s, align)
+    way_m, counted, bridged_m = ways.way_m, ways.counted, ways.bridged_m
+    recorded_m = np.where(counted & ~ways.odd, way_m, np.nan)
+    parts = contradicted_by_speeds(t_s, recorded_m, ways.driven_m, counts.step_m, config.matching.deadband_mps, align)
     unknown = np.isnan(way_m)
     pause = unknown | (dt_s > limit_s)
     slip = _slips(stream, align)
     silent = pause & ~counted
     lost = silent | slip[1:]
     guessed = silent & ~unknown
-    guess_m, guess_doubt_m = _guessed_ways(way_m, dt_s, speed, period_s, config)
+    guess_m, guess_doubt_m = _guessed_ways(way_m, dt_s, speed, period_s[1:], config)
     way_m = np.where(guessed, guess_m, way_m)
     distance_m = _sums(np.where(unknown, 0.0, way_m))
-    segment = _sums(lost.astype(np.float64)).astype(np.int64)
-    counter = _sums((silent & unknown).astype(np.float64)).astype(np.int64)
-    doubt_m = _sums(
-        _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
-        + np.where(guessed, guess_doubt_m, 0.0)
-    )
-    white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
-    noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, config) if counted.any() else None
-    doubtful = odd | pause | slip[:-1] | slip[1:]
-    bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, align) if doubtful.any() else None
+    doubt_m = _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
+    doubt_m += np.where(guessed, guess_doubt_m, parts.doubt_m)
+    doubt_m = _sums(np.where(silent & unknown, LOST_M, doubt_m))
+    whole = counted & ~lost & ~pause
+    noise, known_noise = _noise(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
+    doubtful = ways.odd | pause | slip[:-1] | slip[1:] | parts.steps
+    bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, parts.off_m, align) if doubtful.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
     row_s = t_s
     if apart.size:
         t_s, distance_m, row = filled_in(t_s, distance_m, speed, apart, align)
-        segment = segment[row]
         pause = pause[row[:-1]]
         slip = slip[row]
-        counter = counter[row]
         doubt_m = np.interp(t_s, row_s, doubt_m)
+        known_noise = known_noise.at(row)
     in_file = vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None
     return Odometry(
         epoch_ns=int(t_ns[0]),
         t_s=t_s,
         distance_m=distance_m,
-        segment=segment,
         pause=pause,
         slip=slip,
-        counter=counter,
-        slip_doubt_m=doubt_m,
-        noise=noise or Noise(white_m2_per_s),
+        doubt_m=doubt_m,
+        noise=noise,
+        known_noise=known_noise,
         deadband_mps=config.matching.deadband_mps,
-        period_s=period_s,
+        period_s=float(np.median(dt_s)),
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
-        leaps_ns=tuple(t_ns[list(resets)].tolist()),
+        leaps_ns=tuple(t_ns[list(ways.resets)].tolist()),
         bridged_m2=np.interp(t_s, row_s, _sums(bridged_m**2)) if bridged_m.any() else None,
         bound=bound,
         config=align,
@@ -345,7 +394,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 
 
 def _guessed_ways(
-    way_m: Floats, dt_s: Floats, speed_mps: Floats, period_s: float, config: Configuration
+    way_m: Floats, dt_s: Floats, speed_mps: Floats, period_s: Floats, config: Configuration
 ) -> tuple[Floats, Floats]:
     """The way over a pause of speeds at each step, and by how much it may be off [m].
 
@@ -362,12 +411,46 @@ def _guessed_ways(
     return np.where(stood, stand_m, way_m), np.where(stood, stand_doubt_m, 0.25 * braking_mps2 * dt_s**2)
 
 
-def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: Configuration) -> Noise:
-    """`whole`: steps that the counter recorded without a gap."""
-    counter_m = count_step_m(distance_m, whole, config.align)
-    deadband_mps = config.matching.deadband_mps
-    scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, deadband_mps, config.align)
-    return Noise(white_m2_per_s, scatter, counter_m)
+def _periods_s(t_ns: Ints) -> Floats:
+    """The period of the rows as known before each; of the first step nothing is known but that step."""
+    period_s = periods_before_s(t_ns)
+    period_s[:2] = (t_ns[1] - t_ns[0]) / NS_PER_S
+    return period_s
+
+
+def _noise(
+    t_s: Floats,
+    distance_m: Floats,
+    whole: Bools,
+    counts: CountStep,
+    period_s: Floats,
+    declared_mps: Floats,
+    config: Configuration,
+) -> tuple[Noise, KnownNoise]:
+    """Noise as the run shows it, and as the rows up to each do.
+
+    `whole`: steps that the counter recorded without a gap; `counts`, `period_s`, `declared_mps`: step of the counter,
+    period and sigma of the speed as known at each row.
+    """
+    align = config.align
+    least_m2_per_s = config.monitors.odometer_sigma_mps**2
+    white_m2_per_s = np.maximum(least_m2_per_s, np.nan_to_num(declared_mps) ** 2 * period_s)
+    pieces = scatter_pieces(t_s, distance_m, whole, period_s, white_m2_per_s, config.matching.deadband_mps, align)
+    noise = Noise(
+        white_m2_per_s=float(np.median(white_m2_per_s)),
+        quantisation=of_the_run(pieces, align).of_counter(float(counts.step_m[-1])),
+    )
+    first_m2 = first_scatter_m2(distance_m, period_s, white_m2_per_s, align)
+    known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)
+    # Rows far apart, or of speeds alone, have no such noise.
+    none = (period_s > align.straight_s) | ~np.concatenate([whole[:1], whole])
+    return noise, KnownNoise(
+        white_m2_per_s=white_m2_per_s,
+        still_m2=np.maximum(known.still_m2, counts.step_m**2 / 12.0),
+        moving_s2=known.moving_s2,
+        period_s=period_s,
+        shown=known.shown | none | counts.shown,
+    )
 
 
 def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
@@ -379,16 +462,17 @@ def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
 def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
     """By how much the count of each step into, in or out of slip may be off [m].
 
-    A share of the step, or its reported sigma times dt: the error lasts while it slips.
+    A share of the step, or its reported sigma times dt: the error lasts while it slips. A locked wheel counts nothing.
     """
     sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
-    doubt_m = np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s)
+    doubt_m = np.maximum(np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s), LEAST_DOUBT_M)
     return np.where(slip[1:] | slip[:-1], doubt_m, 0.0)
 
 
-def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
-    declared = stream["sigma_speed_mps"].median()
-    return float(declared) ** 2 * period_s if isinstance(declared, float) else 0.0
+def _declared_mps(stream: pl.DataFrame) -> Floats:
+    """The usual sigma of the speed as declared up to each row [m/s]; NaN where none is."""
+    declared = stream["sigma_speed_mps"].cast(pl.Float64)
+    return declared.rolling_median(_DECLARED_ROWS, min_samples=1).to_numpy()
 
 
 def _sums(steps: Floats) -> Floats:

@@ -1,4 +1,7 @@
-"""Which way the path grows, and the odometer's sign against it: by a run's first metres (DOMAIN section 2)."""
+"""Which way a counter counts, and the path grows: by the first metres of movement (DOMAIN section 2).
+
+Against positions, which scatter and leap, by votes (`polarity`); against ways that another recorder knows, by the ways.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +29,24 @@ def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) 
     starts = starts[starts < min(window, way.size)]
     votes = [_side(odometer[start:window], path[start:window], distance_m) for start in starts]
     return -1 if sum(votes) < 0 else 1
+
+
+def shared_ways_m(counted_m: Floats, other_m: Floats) -> Floats:
+    """Of two recorders' ways over the same times what both moved, negative where in opposite senses [m].
+
+    The noise of one that stands has no direction to give to a way that the other counts.
+    """
+    shared: Floats = np.sign(counted_m * other_m) * np.minimum(np.abs(counted_m), np.abs(other_m))
+    return np.nan_to_num(shared)
+
+
+def sense_of_ways(counted_m: Floats, other_m: Floats, distance_m: float) -> int:
+    """+1 or -1: which way one counts against the other, by the first `distance_m` that both moved, or by all."""
+    moved_m = np.cumsum(shared_ways_m(counted_m, other_m))
+    if not moved_m.size:
+        return 1
+    first = np.flatnonzero(np.abs(moved_m) >= distance_m)
+    return -1 if moved_m[first[0] if first.size else -1] < 0.0 else 1
 
 
 def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distance_m: float) -> bool:

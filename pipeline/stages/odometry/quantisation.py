@@ -1,16 +1,18 @@
 """Quantisation noise: what single rows of an odometer's distance are off by, measured from the rows themselves.
 
 A counter of whole metres, stamps on receipt, noise of the reading: nothing of it adds up, but at 10 Hz a counter of
-half metres seems to change its speed by metres per second from epoch to epoch.
+half metres seems to change its speed by metres per second from epoch to epoch. Detection uses what the rows before
+show, evidence and calibration what the run shows.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import polars as pl
 
-from pipeline.stages.odometry.written_steps import step_of
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import AlignConfig
 
@@ -21,8 +23,9 @@ _DEGREE = 3
 # Enough for the median, however long the run is; with fewer it is chance.
 _PIECES = 400
 _FEWEST_PIECES = 8
-# Less is rounding of decimal numbers, which are not whole in binary; far below any `counter_step_m`.
-_ROUNDED_M = 1e-3
+# Of third differences so many show a first figure; a normal distribution's median of |x|, in sigmas.
+_THIRD_ROWS, _FEWEST_THIRD = 100, 5
+_MEDIAN_SIGMAS = 0.6745
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,10 @@ class QuantisationNoise:
     def variance_m2(self, speed_mps: Floats) -> Floats:
         return self.still_m2 + self.moving_s2 * speed_mps**2
 
+    def of_counter(self, counter_m: float) -> QuantisationNoise:
+        """At least that of its step, which does not show at one speed."""
+        return QuantisationNoise(max(self.still_m2, counter_m**2 / 12.0), self.moving_s2)
+
     def __bool__(self) -> bool:
         return self.still_m2 > 0.0 or self.moving_s2 > 0.0
 
@@ -42,43 +49,103 @@ class QuantisationNoise:
 NO_QUANTISATION = QuantisationNoise()
 
 
-def quantisation_noise(
+class ScatterPieces(NamedTuple):
+    """Pieces of rows in which the train moves, in order of time: the row at which each is known, its mean speed [m/s],
+    its variance about a smooth curve [m^2], and what white noise of the increments makes of that.
+    """
+
+    end: Ints
+    speed_mps: Floats
+    scatter_m2: Floats
+    explained_m2: Floats
+
+    def take(self, pieces: Ints | slice) -> ScatterPieces:
+        return ScatterPieces(
+            self.end[pieces], self.speed_mps[pieces], self.scatter_m2[pieces], self.explained_m2[pieces]
+        )
+
+
+def scatter_pieces(
     t_s: Floats,
     distance_m: Floats,
     whole: Bools,
-    white_m2_per_s: float,
-    counter_m: float,
+    period_s: Floats,
+    white_m2_per_s: Floats,
     deadband_mps: float,
     config: AlignConfig,
-) -> QuantisationNoise:
-    """What rows scatter about smooth curves beyond white noise of the increments.
+) -> ScatterPieces:
+    """`whole` (rows - 1,): ways that are recorded; `period_s` of the rows and their white noise, as known at each."""
+    shape = _moving_pieces(t_s, distance_m, whole, period_s, deadband_mps, config)
+    pieces = ScatterPieces(shape.end, *np.zeros((3, shape.end.size)))
+    for count in np.unique(shape.rows).tolist():
+        of_count = np.flatnonzero(shape.rows == count)
+        rows = shape.begin[of_count, None] + shape.stride[of_count, None] * np.arange(count)
+        since_s = t_s[rows] - t_s[rows[:, :1]]
+        ways = distance_m[rows] - distance_m[rows[:, :1]]
+        pieces.speed_mps[of_count] = np.abs(ways[:, -1]) / since_s[:, -1]
+        scatter_m2, walked_s = _scatter(since_s, ways)
+        pieces.scatter_m2[of_count] = scatter_m2
+        pieces.explained_m2[of_count] = white_m2_per_s[shape.end[of_count]] * walked_s
+    return pieces
 
-    `whole` (rows - 1,): ways that are recorded. Medians over pieces in which the train moves, so that slips do not
-    count. Noise of stamps grows with the square of the speed: low and high speeds are separated where their squares
-    differ by `quantisation_factor`. A counter has the noise of its step at least: it does not show at one speed.
+
+def of_the_run(pieces: ScatterPieces, config: AlignConfig) -> QuantisationNoise:
+    """What rows scatter about smooth curves beyond white noise of the increments; of pieces spread over the run."""
+    count = pieces.end.size
+    return _fit(pieces.take(np.arange(0, count, max(1, count // _PIECES))), config)
+
+
+class KnownScatter(NamedTuple):
+    """Per row the terms of `QuantisationNoise`; `shown`: enough pieces before it show them."""
+
+    still_m2: Floats
+    moving_s2: Floats
+    shown: Bools
+
+
+def known_at_rows(
+    pieces: ScatterPieces, first_m2: Floats, renewal_s: float, t_s: Floats, config: AlignConfig
+) -> KnownScatter:
+    """As the last pieces before each row show it; `first_m2`: of each row until there are enough of them."""
+    known = KnownScatter(first_m2.copy(), np.zeros(t_s.size), np.zeros(t_s.size, dtype=np.bool_))
+    renewed_s = -np.inf
+    for number, end in enumerate(pieces.end.tolist(), start=1):
+        if number >= _FEWEST_PIECES and t_s[end] - renewed_s >= renewal_s:
+            found = _fit(pieces.take(slice(max(number - _PIECES, 0), number)), config)
+            known.still_m2[end:] = found.still_m2
+            known.moving_s2[end:] = found.moving_s2
+            known.shown[end:] = True
+            renewed_s = t_s[end]
+    return known
+
+
+def first_scatter_m2(distance_m: Floats, period_s: Floats, white_m2_per_s: Floats, config: AlignConfig) -> Floats:
+    """Variance of a row [m^2] by third differences of the rows up to each, which constant braking has not.
+
+    White noise of the increments has 6 r dt of their 20 sigma^2. A median of few is uncertain: by 3 / root of their
+    number more.
     """
-    scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s, deadband_mps, config)
-    return replace(scatter, still_m2=max(scatter.still_m2, counter_m**2 / 12.0))
+    third_m = np.abs(np.diff(distance_m, 3))
+    median_m = pl.Series(third_m).rolling_median(_THIRD_ROWS, min_samples=_FEWEST_THIRD).fill_null(0.0).to_numpy()
+    count = np.minimum(np.arange(1, third_m.size + 1), _THIRD_ROWS)
+    sigma_m = median_m / _MEDIAN_SIGMAS * (1.0 + 3.0 / np.sqrt(count))
+    scatter_m2 = np.concatenate([np.zeros(min(3, distance_m.size)), sigma_m**2 / 20.0])
+    explained_m2 = 6.0 / 20.0 * white_m2_per_s * period_s
+    beyond = (scatter_m2 > config.quantisation_factor * explained_m2) & (period_s <= config.straight_s)
+    return np.where(beyond, scatter_m2 - explained_m2, 0.0)
 
 
-def count_step_m(distance_m: Floats, whole: Bools, config: AlignConfig) -> float:
-    """0 where there is none, or one finer than `counter_step_m`."""
-    ways = np.abs(np.diff(distance_m)[whole])
-    return step_of(ways, ways, config.counter_step_m, _ROUNDED_M)
+def _fit(pieces: ScatterPieces, config: AlignConfig) -> QuantisationNoise:
+    """Medians over pieces, so that slips do not count.
 
-
-def _scatter_beyond(
-    t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, deadband_mps: float, config: AlignConfig
-) -> QuantisationNoise:
-    rows = _moving_pieces(t_s, distance_m, whole, deadband_mps, config)
-    if len(rows) < _FEWEST_PIECES:
-        return QuantisationNoise()
-    since_s = t_s[rows] - t_s[rows[:, :1]]
-    ways = distance_m[rows] - distance_m[rows[:, :1]]
-    scatter, explained = _scatter(since_s, ways, white_m2_per_s)
-    speeds = np.abs(ways[:, -1]) / since_s[:, -1]
-    fast = speeds > np.median(speeds)
-    low_mps, high_mps = (float(np.median(speeds[part])) if part.any() else 0.0 for part in (~fast, fast))
+    Noise of stamps grows with the square of the speed: low and high speeds are separated where their squares differ by
+    `quantisation_factor`.
+    """
+    if pieces.end.size < _FEWEST_PIECES:
+        return NO_QUANTISATION
+    scatter, explained = pieces.scatter_m2, pieces.explained_m2
+    fast = pieces.speed_mps > np.median(pieces.speed_mps)
+    low_mps, high_mps = (float(np.median(pieces.speed_mps[part])) if part.any() else 0.0 for part in (~fast, fast))
     if fast.sum() < _FEWEST_PIECES or high_mps**2 < config.quantisation_factor * low_mps**2:
         return QuantisationNoise(_beyond(scatter, explained, config))
     low_m2, high_m2 = (_beyond(scatter[part], explained[part], config) for part in (~fast, fast))
@@ -86,29 +153,46 @@ def _scatter_beyond(
     return QuantisationNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
 
 
-def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, deadband_mps: float, config: AlignConfig) -> Ints:
-    """Rows of pieces without a gap in which the train moves, spread over the run; shape (pieces, rows).
+class _Shapes(NamedTuple):
+    """First and last row of each piece, how many rows of it are taken, and how far apart they are."""
+
+    begin: Ints
+    end: Ints
+    rows: Ints
+    stride: Ints
+
+
+def _moving_pieces(
+    t_s: Floats, distance_m: Floats, whole: Bools, period_s: Floats, deadband_mps: float, config: AlignConfig
+) -> _Shapes:
+    """Pieces without a gap in which the train moves, one after the other.
 
     None where rows are so far apart that the train drives otherwise from one to the next.
     """
-    period_s = float(np.median(np.diff(t_s)))
-    if period_s > config.straight_s or period_s <= 0.0:
-        return np.zeros((0, 1), dtype=np.int64)
-    count = int(np.clip(np.ceil(config.quantisation_span_s / period_s) + 1, _FEWEST_ROWS, _MOST_ROWS))
-    stride = max(1, round(config.quantisation_span_s / period_s / (count - 1)))
-    length = (count - 1) * stride
-    starts = np.arange(0, t_s.size - length, max(length, (t_s.size - length) // _PIECES))
+    usable = (period_s > 0.0) & (period_s <= config.straight_s)
+    periods_s = np.where(usable, period_s, 1.0)
+    counts = np.clip(np.ceil(config.quantisation_span_s / periods_s) + 1, _FEWEST_ROWS, _MOST_ROWS).astype(np.int64)
+    strides = np.maximum(1, np.round(config.quantisation_span_s / periods_s / (counts - 1))).astype(np.int64)
+    ends = np.arange(t_s.size) + (counts - 1) * strides
+    inside = usable & (ends < t_s.size)
+    last = np.where(inside, ends, 0)
     broken = np.concatenate([[0], np.cumsum(~whole)])
-    way_m = distance_m[starts + length] - distance_m[starts]
-    time_s = t_s[starts + length] - t_s[starts]
-    moves = np.abs(way_m) > deadband_mps * time_s
-    starts = starts[moves & (broken[starts + length] == broken[starts])]
-    chosen: Ints = starts[:, None] + stride * np.arange(count)
-    return chosen
+    moves = np.abs(distance_m[last] - distance_m) > deadband_mps * (t_s[last] - t_s)
+    taken = inside & moves & (broken[last] == broken)
+    # One begins where the one before ends, wherever it can.
+    begins: list[int] = []
+    next_taken = np.append(np.where(taken, np.arange(t_s.size), t_s.size)[::-1], t_s.size)
+    next_taken = np.minimum.accumulate(next_taken[:-1])[::-1]
+    row = 0
+    while row < t_s.size and (begin := int(next_taken[row])) < t_s.size:
+        begins.append(begin)
+        row = int(ends[begin])
+    chosen = np.array(begins, dtype=np.int64)
+    return _Shapes(chosen, ends[chosen], counts[chosen], strides[chosen])
 
 
-def _scatter(since_s: Floats, way_m: Floats, white_m2_per_s: float) -> tuple[Floats, Floats]:
-    """Variance about the curves [m^2] of each piece, and what white noise of the increments makes of it."""
+def _scatter(since_s: Floats, way_m: Floats) -> tuple[Floats, Floats]:
+    """Variance about the curves [m^2] of each piece, and what white noise of the increments of 1 m^2/s makes of it."""
     count = since_s.shape[1]
     powers = (2.0 * since_s / since_s[:, -1:] - 1.0)[:, :, None] ** np.arange(_DEGREE + 1)
     curves, _ = np.linalg.qr(powers)
@@ -117,7 +201,7 @@ def _scatter(since_s: Floats, way_m: Floats, white_m2_per_s: float) -> tuple[Flo
     walk = np.minimum(since_s[:, :, None], since_s[:, None, :])
     left = since_s.sum(axis=1) - (curves * (walk @ curves)).sum(axis=(1, 2))
     free = count - _DEGREE - 1
-    return scatter / free, white_m2_per_s * left / free
+    return scatter / free, left / free
 
 
 def _beyond(scatter_m2: Floats, explained_m2: Floats, config: AlignConfig) -> float:

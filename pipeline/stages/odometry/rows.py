@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.stages.odometry.odd_steps import OddRun, driven_within_m, odd_runs
-from pipeline.stages.odometry.quantisation import count_step_m
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import AlignConfig
 
@@ -21,23 +20,27 @@ _BOUND_SIGMAS = 3.0
 class Ways(NamedTuple):
     """Per step: way [m], NaN where not known; whether it is of the recorded distance; sigma over a bridged reset [m].
 
-    `odd`: where the count may be off; `resets`: the rows to which it was set.
+    `odd`: where the count may be off; `driven_m`: by the speeds, NaN where not recorded; `resets`: the rows to which it
+    was set.
     """
 
     way_m: Floats
     counted: Bools
     bridged_m: Floats
     odd: Bools
+    driven_m: Floats
     resets: tuple[int, ...] = ()
 
 
-def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: float, config: AlignConfig) -> Ways:
+def ways_between(
+    t_s: Floats, distance_m: Floats, speed_mps: Floats, counts_m: Floats, limit_s: Floats, config: AlignConfig
+) -> Ways:
     """Ways between rows at these times [s]; `distance_m` and `speed_mps` as recorded, NaN where not.
 
-    Over a leap of the distance the speeds count, if they agree with the distance elsewhere. By turns, nothing is
-    interpolated over more than `limit_s`.
+    `counts_m`: the step of the counter as known at each row. Over a leap of the distance the speeds count, if they
+    agreed with the distance before. By turns, nothing is interpolated over more than `limit_s`, of each step.
     """
-    runs = odd_runs(t_s, distance_m, _counts_m(t_s, distance_m, config), config)
+    runs = odd_runs(t_s, distance_m, counts_m, config)
     resets = [run for run in runs.odd if not run.kept]
     distance_m = _interpolated(t_s, distance_m, [run for run in runs.odd if run.kept])
     leap = np.zeros(t_s.size - 1, dtype=np.bool_)
@@ -45,7 +48,8 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
         distance_m[run.first + 1 : run.last] = np.nan
         leap[run.first : run.last] = True
     recorded = np.where(leap, np.nan, np.diff(distance_m))
-    driven = _trusted(_driven(t_s, speed_mps), recorded, leap, config)
+    by_speeds = _driven(t_s, speed_mps)
+    driven = _trusted(by_speeds, recorded, leap, config)
     way_m = np.where(np.isnan(recorded), driven, recorded)
     unknown = np.isnan(way_m)
     places = tuple(run.last for run in resets)
@@ -53,7 +57,7 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
     for run in (*runs.odd, *runs.near):
         odd[run.first : run.last] = True
     if not unknown.any():
-        return Ways(way_m, ~np.isnan(recorded), np.zeros(way_m.size), odd, places)
+        return Ways(way_m, ~np.isnan(recorded), np.zeros(way_m.size), odd, by_speeds, places)
     # Rows by turns: fill the gaps of either column between its own rows, then decide again.
     carried_m = _carried(t_s, distance_m, limit_s)
     recorded = np.where(unknown & ~leap, np.diff(carried_m), recorded)
@@ -63,7 +67,7 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
     bridged_m = np.zeros(way_m.size)
     for run in resets:
         _bridge(run, t_s, way_m, bridged_m, config)
-    return Ways(way_m, counted, bridged_m, odd, places)
+    return Ways(way_m, counted, bridged_m, odd, by_speeds, places)
 
 
 def _bridge(run: OddRun, t_s: Floats, way_m: Floats, sigma_m: Floats, config: AlignConfig) -> None:
@@ -92,24 +96,17 @@ def _interpolated(t_s: Floats, distance_m: Floats, wrong: list[OddRun]) -> Float
     return distance_m
 
 
-def _counts_m(t_s: Floats, distance_m: Floats, config: AlignConfig) -> float:
-    """The step of the counter [m]; ways that no train drives do not count."""
-    rows = np.flatnonzero(np.isfinite(distance_m))
-    ways = np.abs(np.diff(distance_m[rows]))
-    usual = ways <= config.bunched_stamps_m + 2.0 * np.median(ways) if ways.size else ways > 0.0
-    return count_step_m(distance_m[rows], usual, config)
-
-
 def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignConfig) -> Floats:
-    """None over leaps if speeds and counter disagree elsewhere (a wrong unit, sign or sensor)."""
-    both = np.isfinite(recorded_m) & np.isfinite(driven_m)
-    if not leap.any() or not both.any():
+    """None over leaps if speeds and counter disagreed before (a wrong unit, sign or sensor)."""
+    if not leap.any():
         return driven_m
-    recorded = recorded_m[both]
-    driven = driven_m[both]
-    apart_m = abs(recorded.sum() - driven.sum())
-    most_m = config.speed_agreement * np.abs(recorded).sum()
-    return driven_m if apart_m <= most_m else np.where(leap, np.nan, driven_m)
+    both = np.isfinite(recorded_m) & np.isfinite(driven_m)
+    recorded_sum_m, driven_sum_m, way_m = (
+        np.cumsum(np.where(both, values, 0.0)) for values in (recorded_m, driven_m, np.abs(recorded_m))
+    )
+    # The steps of a leap add nothing to these sums: they are those of the time before.
+    disagreed = np.abs(recorded_sum_m - driven_sum_m) > config.speed_agreement * way_m
+    return np.where(leap & disagreed, np.nan, driven_m)
 
 
 def _driven(t_s: Floats, speed_mps: Floats) -> Floats:
@@ -118,13 +115,13 @@ def _driven(t_s: Floats, speed_mps: Floats) -> Floats:
     return steps
 
 
-def _carried(t_s: Floats, values: Floats, limit_s: float) -> Floats:
-    """Interpolated between known rows no farther apart than the limit; NaN elsewhere."""
+def _carried(t_s: Floats, values: Floats, limit_s: Floats) -> Floats:
+    """Interpolated between known rows no farther apart than the limit known before the later one; NaN elsewhere."""
     known = np.flatnonzero(np.isfinite(values))
     if known.size < 2:
         return values
     after = np.searchsorted(known, np.arange(values.size)).clip(1, known.size - 1)
-    near = t_s[known[after]] - t_s[known[after - 1]] <= limit_s
+    near = t_s[known[after]] - t_s[known[after - 1]] <= limit_s[known[after] - 1]
     inside = (t_s >= t_s[known[0]]) & (t_s <= t_s[known[-1]])
     return np.where(
         np.isfinite(values), values, np.where(near & inside, np.interp(t_s, t_s[known], values[known]), np.nan)

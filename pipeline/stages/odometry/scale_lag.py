@@ -1,41 +1,453 @@
-"""Scale and lag of a counter against another recorder of the same journey: one equation, however it is weighed.
+"""Scale and lag of a counter against another recorder of the same journey: the one estimator of both.
 
 way of the other = scale * way counted - scale * lag * change of speed,
 
 with ways and speeds counted at the stamps less an assumed lag, and `lag` what is left of it: linear in scale and scale
-* lag. The causal filter (`alignment.odometer_filter`) follows it from epoch to epoch. Calibration weighs observations
-of whole runs, the fit of a run (`plausibility.pairs`) windows without outliers; both solve it here.
+* lag. Evidence asks it for the clocks of reference and reads, the input checks for the odometer's against positions,
+calibration for the vehicle file; the causal filter (`alignment.odometer_filter`) follows the same equation from epoch
+to epoch. It knows neither where the ways come from nor what they are used for.
+
+The lag is searched over +- 30 s by the mean absolute difference of ways, each time at the scale that fits best, and
+refined from there by regression; then it is held against all lags far from it. No figure is told where another lag does
+nearly as well, or where the changes of speed are noise.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 
-from schemas.arrays import Floats
+from schemas.arrays import Bools, Floats, Ints
 
+# Numerics: a lag shows where the speed changes, so ways over this time are compared, one every so often [s]; no longer
+# ones where a recorder pauses.
+WAY_S, WAY_EVERY_S = 10.0, 2.0
+_LONGEST = 1.5
+# Numerics: range and step of the search [s].
+_FARTHEST_S, _STEP_S = 30.0, 0.5
+_LAGS_S: Floats = np.linspace(-_FARTHEST_S, _FARTHEST_S, 2 * round(_FARTHEST_S / _STEP_S) + 1)
+_ROUNDS = 20
+# A lag stays where it moves by less than this share of its sigma.
+_STAYS = 0.05
+# Least number of ways for a lag, and for one of more than a second; no more are looked at in the search.
+FEWEST, _FEWEST_FAR = 6, 12
+_NEAR_S = 1.0
+_SEARCHED = 800
+# A speed is taken over so much on both sides of an instant, and beside it from twice to four times that, so that the
+# rows whose noise is in one are not in the other [s].
+_SPEED_S = 0.5
+# Numerics: rows farther apart are joined by curves [s].
+_APART_S = 0.25
+# Outliers, in robust standard deviations: slip, or a step of the other recorder.
+_USUAL = 4.5
+# 1.4826 MAD is the sigma of normal residuals, whatever less than half of them do.
+_MAD = 1.4826
+# So many lengths of a way are left out to see how much depends on them.
+_LEFT_OUT = 6
 # Numerics: with less independent information about scale and lag, as a share of the whole, they are not told apart.
 _LEAST_INDEPENDENT = 1e-12
+# Numerics: ways are not written finer than this [m].
+_FINEST_M = 1e-3
+# Noise is correlated over so many lengths of a way, beyond those that overlap.
+_MEMORY = 10
+# Changes of speed, and ways, are more than noise by so many sigmas; far lags are worse than the one found by so many.
+_SHOWN, _WORSE = 6.0, 3.0
+# A lag so many sigmas, and so many seconds, from the one found is far.
+_FAR_SIGMAS, _FAR_S = 15.0, 2.0
 
 
-class ScaleLag(NamedTuple):
-    """True over counted distance; stamp of the other recorder minus the counter's [s]; standard deviations."""
+class LagState(StrEnum):
+    """Whether a lag is measured, and why not."""
 
-    scale: float
-    scale_sigma: float
-    lag_s: float
-    lag_sigma_s: float
+    MEASURED = "measured"
+    TOO_FEW = "too few ways"
+    CONSTANT_SPEED = "the speed changes too little"
+    AMBIGUOUS = "several lags fit"
 
 
-def scale_and_lag(normal: Floats, right: Floats, spread: float = 1.0, assumed_s: float = 0.0) -> ScaleLag | None:
-    """Solve the normal equations (2, 2), (2,) of way counted and minus change of speed; None where they cannot be."""
-    information = float(np.prod(np.diag(normal)))
-    if not np.linalg.det(normal) > _LEAST_INDEPENDENT * information:
-        return None
-    covariance = spread**2 * np.linalg.inv(normal)
-    scale, scaled_lag_s = np.linalg.solve(normal, right).tolist()
-    if scale == 0.0:
-        return None
-    sigma, scaled_sigma_s = np.sqrt(np.diag(covariance)).tolist()
-    return ScaleLag(scale, sigma, assumed_s + scaled_lag_s / scale, scaled_sigma_s / abs(scale))
+@dataclass(frozen=True)
+class ScaleLag:
+    """Way of the other recorder over that counted; stamp of a moment by the other minus the counter's [s].
+
+    Standard deviations beside them, infinite where a figure is not measured: 4 of them hold whatever the noise is like.
+    `halves`: scale and lag of the first and the second half of the run alone.
+    """
+
+    scale: float = 1.0
+    scale_sigma: float = float("inf")
+    lag_s: float = 0.0
+    lag_sigma_s: float = float("inf")
+    state: LagState = LagState.TOO_FEW
+    halves: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def measured(self) -> bool:
+        return self.state is LagState.MEASURED
+
+
+@dataclass(frozen=True)
+class CountedRows:
+    """Rows of a counter: times [s], distance [m], how many steps before each row are in doubt; sigma of a row [m]."""
+
+    t_s: Floats
+    distance_m: Floats
+    doubtful: Floats
+    row_sigma_m: float = 0.0
+
+    def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
+        """Way between instants [m]; NaN outside the recording and over a step in doubt."""
+        ends = [np.interp(at_s, self.t_s, self.distance_m) for at_s in (begin_s, end_s)]
+        doubts = [np.interp(at_s, self.t_s, self.doubtful, np.nan, np.nan) for at_s in (begin_s, end_s)]
+        return np.where(doubts[0] == doubts[1], ends[1] - ends[0], np.nan)
+
+    @cached_property
+    def _half_s(self) -> float:
+        return max(_SPEED_S, float(np.median(np.diff(self.t_s))))
+
+    def speeds(self, t_s: Floats) -> tuple[Floats, Floats]:
+        """Speed about each instant, and by rows beside these."""
+        half_s = self._half_s
+        near = self.gained(t_s - half_s, t_s + half_s) / (2.0 * half_s)
+        before, after = (self.gained(t_s + a * half_s, t_s + b * half_s) for a, b in ((-4, -2), (2, 4)))
+        return near, (before + after) / (4.0 * half_s)
+
+    @cached_property
+    def smooth(self) -> CountedRows:
+        """Rows no farther apart than `_APART_S`, by cubics through the speeds at the rows.
+
+        A straight line over a second is off by 15 cm at 1.2 m/s2: ahead of a train that starts, behind one that brakes.
+        """
+        step_s = np.diff(self.t_s)
+        parts = int(np.ceil(float(np.median(step_s)) / _APART_S - 1e-6))
+        if parts <= 1 or self.t_s.size < 3:
+            return self
+        speed = np.gradient(self.distance_m, self.t_s)
+        begin = np.repeat(np.arange(step_s.size), parts)
+        u = np.tile(np.arange(parts) / parts, step_s.size)
+        length_s, way_m = step_s[begin], np.diff(self.distance_m)[begin]
+        bent = (1.0 - u) * (speed[begin] * length_s - way_m) - u * (speed[begin + 1] * length_s - way_m)
+        distance_m = self.distance_m[begin] + u * way_m + u * (1.0 - u) * bent
+        t_s = self.t_s[begin] + u * length_s
+        doubtful = self.doubtful[begin] + u * np.diff(self.doubtful)[begin]
+        return CountedRows(
+            t_s=np.append(t_s, self.t_s[-1]),
+            distance_m=np.append(distance_m, self.distance_m[-1]),
+            doubtful=np.append(doubtful, self.doubtful[-1]),
+            row_sigma_m=self.row_sigma_m,
+        )
+
+    @property
+    def noise_m(self) -> float:
+        """Sigma of a way by the noise of its two rows."""
+        return max(self.row_sigma_m * float(np.sqrt(2.0)), _FINEST_M)
+
+    def driven(self) -> CountedRows:
+        """Way driven, to and fro."""
+        return replace(self, distance_m=np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.distance_m)))]))
+
+
+def spans_of_rows(t_s: Floats) -> tuple[Ints, Ints]:
+    """Begin and end of ways of 10 s, one every 2 s, among the rows of a recorder; none over a pause."""
+    rows = np.unique(np.searchsorted(t_s, np.arange(t_s[0], t_s[-1], WAY_EVERY_S))) if t_s.size else np.zeros(0, int)
+    ends = np.searchsorted(t_s, t_s[rows] + WAY_S)
+    inside = ends < t_s.size
+    begin, end = rows[inside], ends[inside]
+    whole = t_s[end] - t_s[begin] <= _LONGEST * WAY_S
+    return begin[whole], end[whole]
+
+
+def scale_and_lag(begin_s: Floats, end_s: Floats, way_m: Floats, counter: CountedRows) -> ScaleLag:
+    """Of the recorder that saw the ways `way_m` between its stamps, in order of time; they may overlap."""
+    if begin_s.size < FEWEST:
+        return ScaleLag()
+    ways = _Ways(begin_s, end_s, way_m, counter.smooth)
+    found = ways.refined(ways.likeliest_s)
+    if ways.count < FEWEST or (ways.count < _FEWEST_FAR and abs(found.lag_s) > _NEAR_S):
+        return ways.without_lag(LagState.TOO_FEW)
+    if not found.measured:
+        return ways.without_lag(found.state)
+    return found if ways.stands_out(found) else ways.without_lag(LagState.AMBIGUOUS)
+
+
+@dataclass(frozen=True)
+class _Ways:
+    """Ways that a recorder saw between its stamps, and the counter that counted them too."""
+
+    begin_s: Floats
+    end_s: Floats
+    way_m: Floats
+    counter: CountedRows
+
+    @property
+    def count(self) -> float:
+        """So many that do not overlap."""
+        return 1.0 + (self.begin_s.size - 1.0) / self.overlap
+
+    @cached_property
+    def overlap(self) -> int:
+        """A way overlaps so many, itself and those after it."""
+        after = np.searchsorted(self.begin_s, self.end_s - 1e-6)
+        return max(1, round(float(np.median(after - np.arange(after.size)))))
+
+    def _apart_m(self, lag_s: Floats) -> tuple[Floats, Floats]:
+        """How far ways that do not overlap are apart at each lag (lags, ways), at the scale that makes their sum least;
+        these scales.
+        """
+        some = slice(None, None, max(self.overlap, self.begin_s.size // _SEARCHED, 1))
+        begin_s, end_s, way_m = (values[some] for values in (self.begin_s, self.end_s, self.way_m))
+        counted = self.counter.gained(begin_s - lag_s[:, None], end_s - lag_s[:, None])
+        scale = _least_absolute_scale(counted, way_m)
+        return np.abs(way_m - scale[:, None] * counted), scale
+
+    @cached_property
+    def _search(self) -> tuple[Floats, Floats]:
+        return self._apart_m(_LAGS_S)
+
+    @cached_property
+    def likeliest_s(self) -> float:
+        """The lag that leaves the least mean difference, of those at which half of the ways are known."""
+        apart, _ = self._search
+        mean = np.nansum(apart, axis=1) / np.maximum(np.isfinite(apart).sum(axis=1), 1)
+        return float(_LAGS_S[np.where(_enough(apart), mean, np.inf).argmin()])
+
+    def _fits(self, lag_s: float) -> Bools:
+        """Which lags of the search fit as well as this one: what they leave more is no more than chance.
+
+        By Huber's loss. Under a lag that fits as well the sum of differences has at most twice the variance of the sum
+        of losses. Where less than half of the ways are known at both it is not said to fit.
+        """
+        here, _ = self._apart_m(np.full(1, lag_s))
+        limit_m = _USUAL * max(_robust(here[here > 0.0]), self.counter.noise_m)
+        loss, losses = (_huber(apart, limit_m) for apart in (here, self._search[0]))
+        worse = losses - loss
+        # An outlier is one at both lags: its losses differ by no more than by what noise does to it.
+        chance = _WORSE * np.sqrt(2.0 * np.nansum(np.minimum(loss, limit_m**2) ** 2))
+        fits: Bools = _enough(worse) & (np.nansum(worse, axis=1) <= chance)
+        return fits
+
+    def stands_out(self, found: ScaleLag) -> bool:
+        """No lag far from it fits as well; sigmas so large that none is far are none."""
+        far: Bools = np.abs(_LAGS_S - found.lag_s) >= max(_FAR_S, _FAR_SIGMAS * found.lag_sigma_s)
+        return bool(far.any() and not self._fits(found.lag_s)[far].any())
+
+    def without_lag(self, state: LagState) -> ScaleLag:
+        """The scale alone, as uncertain as it is over all lags that fit; not known where the ways are all noise."""
+        found = self._regression(self.likeliest_s, _FARTHEST_S)
+        if found is None:
+            return ScaleLag(state=state)
+        scale, sigma = found.with_sigmas(slice(1))
+        halves = found.halves(0.0, slice(1))
+        scales = self._search[1][self._fits(self.likeliest_s)]
+        sigma = max(float(np.hypot(sigma, 0.5 * np.ptp(scales))) if scales.size else sigma, _apart(halves))
+        if abs(scale) <= _SHOWN * sigma:
+            return ScaleLag(state=state)
+        return ScaleLag(scale, sigma, state=state, halves=halves)
+
+    def refined(self, lag_s: float) -> ScaleLag:
+        """The regression from here until it stays."""
+        doubt_s = _STEP_S
+        found = ScaleLag()
+        for _ in range(_ROUNDS):
+            regression = self._regression(lag_s, doubt_s)
+            if regression is None:
+                return ScaleLag()
+            found = regression.solved(lag_s)
+            moved_s = abs(found.lag_s - lag_s)
+            if not found.measured or abs(found.lag_s) > _FARTHEST_S:
+                return ScaleLag(state=LagState.CONSTANT_SPEED)
+            lag_s = found.lag_s
+            if moved_s <= _STAYS * found.lag_sigma_s and doubt_s <= found.lag_sigma_s:
+                return found
+            doubt_s = min(0.5 * doubt_s, 2.0 * moved_s + 0.5 * found.lag_sigma_s)
+        return replace(found, lag_sigma_s=found.lag_sigma_s + moved_s)
+
+    def _regression(self, lag_s: float, doubt_s: float) -> _Regression | None:
+        """At the lag assumed; `doubt_s`: by how much it may still be off, which makes no outlier."""
+        begin_s, end_s = self.begin_s - lag_s, self.end_s - lag_s
+        counted = self.counter.gained(begin_s, end_s)
+        (first, first_beside), (last, last_beside) = self.counter.speeds(begin_s), self.counter.speeds(end_s)
+        design = np.column_stack([counted, first - last])
+        beside = np.column_stack([counted, first_beside - last_beside])
+        known = np.asarray(np.isfinite(np.column_stack([design, beside])).all(axis=1))
+        # Where both stand there is nothing to learn, nor of the noise.
+        moving: Bools = known & (np.abs(counted) > 0.0)
+        if moving.sum() < FEWEST:
+            return None
+        design, beside = (np.where(known[:, None], values, 0.0) for values in (design, beside))
+        scale = float(_least_absolute_scale(counted[None], self.way_m)[0])
+        theta = np.array([scale, 0.0])
+        used = moving
+        for _ in range(_ROUNDS):
+            left = self.way_m - design @ theta
+            spread = max(_robust(np.abs(left[moving])), abs(scale) * self.counter.noise_m)
+            kept = moving & (np.abs(left) <= _USUAL * spread + doubt_s * np.abs(scale * design[:, 1]))
+            if kept.sum() < FEWEST:
+                return None
+            solved = _solved(design[kept], beside[kept], self.way_m[kept])
+            same = np.array_equal(kept, used) and np.allclose(solved, theta, rtol=1e-9, atol=1e-9)
+            theta, used = solved, kept
+            if same:
+                break
+        return _Regression(design, beside, self.way_m, used, theta, self.overlap, abs(scale) * self.counter.noise_m)
+
+
+@dataclass(frozen=True)
+class _Regression:
+    """way = design @ (scale, scale * rest of the lag), by the moments of `beside`, over the `used` ways."""
+
+    design: Floats
+    beside: Floats
+    way_m: Floats
+    used: Bools
+    theta: Floats
+    overlap: int
+    noise_m: float
+
+    def solved(self, assumed_s: float) -> ScaleLag:
+        """Scale and lag."""
+        if not self._changes_show():
+            return ScaleLag(state=LagState.CONSTANT_SPEED)
+        scale, sigma, rest_s, sigma_s = self.with_sigmas(slice(None))
+        halves = self.halves(assumed_s)
+        return ScaleLag(
+            scale=scale,
+            scale_sigma=max(sigma, _apart(halves)),
+            lag_s=assumed_s + rest_s / scale,
+            lag_sigma_s=sigma_s / abs(scale),
+            state=LagState.MEASURED,
+            halves=halves,
+        )
+
+    def with_sigmas(self, parts: slice) -> list[float]:
+        """Each part of the estimate, and its sigma: the largest of several ways to look at the noise."""
+        design, beside = (values[:, parts] * self.used[:, None] for values in (self.design, self.beside))
+        inverse = np.linalg.inv(beside.T @ design)
+        theta = inverse @ (beside.T @ self.way_m)
+        left = np.where(self.used, self.way_m - design @ theta, 0.0)
+        spreads = [_spread(beside, left, self.used, reach) for reach in (self.overlap, _MEMORY * self.overlap)]
+        spreads.append(_sandwich(beside, left, self.overlap))
+        # Counts of a counter do not show at one speed, and are there where it changes.
+        unseen_m2 = max(self.noise_m**2 - float(left @ left) / self.used.sum(), 0.0)
+        spreads.append(_alike(beside, unseen_m2 * (1.0 - np.arange(self.overlap) / self.overlap)))
+        variances = np.max([np.diag(inverse @ one @ inverse.T) for one in spreads], axis=0)
+        sigmas = _student(self.used.sum() / self.overlap - 2.0) * np.sqrt(np.maximum(variances, 0.0))
+        sigmas = np.maximum(sigmas, self._without_one(design, beside, theta))
+        return [float(value) for pair in zip(theta, sigmas, strict=True) for value in pair]
+
+    def _without_one(self, design: Floats, beside: Floats, theta: Floats) -> Floats:
+        """By how much each part of the estimate changes at most without the ways of a minute, or a quarter of all.
+
+        One change of speed alone looks like a step or drift of the other recorder, or a slip, that came with it.
+        """
+        moments = beside[:, :, None] * np.concatenate([design, self.way_m[:, None]], axis=1)[:, None, :]
+        sums = np.cumsum(np.concatenate([np.zeros((1, *moments.shape[1:])), moments]), axis=0)
+        reach = max(self.overlap + 1, min(_LEFT_OUT * self.overlap, len(design) // 4))
+        left = sums[-1] - (sums[reach:] - sums[:-reach])
+        normal, right = left[:, :, :-1], left[:, :, -1:]
+        if not np.all(np.linalg.det(normal)):
+            return np.full(theta.size, np.inf)
+        return np.asarray(np.abs(np.linalg.solve(normal, right)[:, :, 0] - theta).max(axis=0))
+
+    def _changes_show(self) -> bool:
+        """Two figures of each change of speed, by other rows, have in common more than their noise would by chance."""
+        if _alike_columns(self.beside[self.used].T @ self.design[self.used]):
+            return False
+        near, beside = self.design[self.used, 1], self.beside[self.used, 1]
+        noise = 0.5 * float(((near - beside) ** 2).sum()) / np.sqrt(near.size / self.overlap)
+        return bool(near @ beside > _SHOWN * noise)
+
+    def halves(self, assumed_s: float, parts: slice = slice(None)) -> tuple[tuple[float, float], ...]:
+        """Scale and lag by the first and by the second half of the ways."""
+        rows = np.flatnonzero(self.used)
+        found = []
+        for half in (rows[: rows.size // 2], rows[rows.size // 2 :]):
+            design, beside = self.design[half, parts], self.beside[half, parts]
+            if not _alike_columns(beside.T @ design):
+                scale, *rest = np.linalg.solve(beside.T @ design, beside.T @ self.way_m[half]).tolist()
+                found.append((scale, assumed_s + (rest[0] / scale if rest and scale else 0.0)))
+        return tuple(found)
+
+
+def _apart(halves: Sequence[tuple[float, float]]) -> float:
+    """Half of what the scales of both halves differ by: a drift of the other recorder is one of them for a while."""
+    return 0.5 * abs(halves[0][0] - halves[1][0]) if len(halves) == 2 else float("inf")
+
+
+def _solved(design: Floats, beside: Floats, way_m: Floats) -> Floats:
+    """Scale and scale * lag; the scale alone where nothing tells the lag."""
+    normal = beside.T @ design
+    if _alike_columns(normal):
+        return np.array([float(design[:, 0] @ way_m / (design[:, 0] @ design[:, 0])), 0.0])
+    return np.asarray(np.linalg.solve(normal, beside.T @ way_m))
+
+
+def _enough(values: Floats) -> Bools:
+    """Lags (rows) at which at least half as many ways are known as at any."""
+    counts = np.isfinite(values).sum(axis=1)
+    enough: Bools = counts >= max(0.5 * counts.max(initial=0), 3)
+    return enough
+
+
+def _alike_columns(normal: Floats) -> bool:
+    """Ways and changes of speed are proportional, or there are no changes: nothing tells the two apart."""
+    return bool(abs(np.linalg.det(normal)) <= _LEAST_INDEPENDENT * abs(float(np.prod(np.diag(normal)))))
+
+
+def _robust(size: Floats) -> float:
+    """Sigma of normal values of this size, whatever a part of them does."""
+    return _MAD * float(np.median(size)) if size.size else 0.0
+
+
+def _huber(size: Floats, limit: float) -> Floats:
+    """Square up to the limit, then straight on (Huber 1964)."""
+    return np.where(size <= limit, size**2, limit * (2.0 * size - limit))
+
+
+def _least_absolute_scale(counted: Floats, way_m: Floats) -> Floats:
+    """Per row of `counted` (lags, ways) the scale with the least sum of absolute differences: a weighted median."""
+    weight = np.nan_to_num(np.abs(counted))
+    ratio = np.where(weight > 0.0, way_m / np.where(weight > 0.0, counted, 1.0), np.inf)
+    order = np.argsort(ratio, axis=1)
+    sums = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)
+    middle = np.minimum((sums < 0.5 * sums[:, -1:]).sum(axis=1), ratio.shape[1] - 1)
+    scale = np.take_along_axis(ratio, np.take_along_axis(order, middle[:, None], axis=1), axis=1)[:, 0]
+    return np.where(np.isfinite(scale), scale, 1.0)
+
+
+def _spread(beside: Floats, left: Floats, used: Bools, reach: int) -> Floats:
+    """Variance of the moments where the noise is alike everywhere: by its autocovariance up to `reach` ways."""
+    count = min(reach + 1, left.size)
+    counts = used.astype(np.float64)
+    pairs = np.array([counts[apart:] @ counts[: left.size - apart] for apart in range(count)])
+    sums = np.array([left[apart:] @ left[: left.size - apart] for apart in range(count)])
+    share = 1.0 - np.arange(count) / (reach + 1.0)
+    return _alike(beside, share * sums / np.maximum(pairs, 1.0))
+
+
+def _alike(beside: Floats, covariance: Floats) -> Floats:
+    """Variance of the moments by the covariance of the noise of ways so many rows apart."""
+    total: Floats = covariance[0] * beside.T @ beside
+    for apart in range(1, min(covariance.size, len(beside))):
+        product = covariance[apart] * beside[apart:].T @ beside[:-apart]
+        total += product + product.T
+    return total
+
+
+def _sandwich(beside: Floats, left: Floats, reach: int) -> Floats:
+    """The same where the noise is not alike: by the moments themselves (Newey and West 1987)."""
+    moments = beside * left[:, None]
+    total = moments.T @ moments
+    for apart in range(1, min(reach + 1, left.size)):
+        product = moments[apart:].T @ moments[:-apart]
+        total += (1.0 - apart / (reach + 1.0)) * (product + product.T)
+    return total
+
+
+def _student(free: float) -> float:
+    """What makes 4 sigmas from so many degrees of freedom as sure as of a normal one (Abramowitz, Stegun 26.7.5)."""
+    free = max(free, 2.0)
+    return 1.0 + 4.25 / free + 16.0 / free**2

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.arrays import Floats
+from schemas.arrays import Bools, Floats
 
 # Numerics: how far a change may be from a multiple of the step, in steps, since written numbers are rounded.
 _TOLERANCE = 0.02
 # Fewer changes of the change are chance.
-_FEWEST_BENDS = 8
+FEWEST_BENDS = 8
 
 
 def step_of(changes: Floats, single: Floats, least: float, rounded: float) -> float:
@@ -22,7 +22,13 @@ def step_of(changes: Floats, single: Floats, least: float, rounded: float) -> fl
     single = single[single > rounded]
     if not single.size or (step := float(single.min())) < least:
         return 0.0
+    steps, multiples = multiples_of(changes, step)
+    return step if multiples.all() and np.count_nonzero(np.diff(steps)) >= FEWEST_BENDS else 0.0
+
+
+def multiples_of(changes: Floats, step: float) -> tuple[Floats, Bools]:
+    """How many steps each change is, and whether it is a whole number of them."""
     counts = changes / step
     steps = np.rint(counts)
-    multiples = (np.abs(counts - steps) < _TOLERANCE).all()
-    return step if multiples and np.count_nonzero(np.diff(steps)) >= _FEWEST_BENDS else 0.0
+    whole: Bools = np.abs(counts - steps) < _TOLERANCE
+    return steps, whole

@@ -47,15 +47,16 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Moves:
-    """`counted_m`: signed distance at each step by an odometer, NaN where unknown, comparable within one `segment`.
+    """`counted_m`: signed distance at each step by an odometer, NaN where unknown; `doubt_m`: running sum of its doubt.
 
+    Ways compare where nothing of the distance came into doubt between.
     `polarity`: its sign against each oriented element, 0 where unknown.
     """
 
     network: Network
     steps: PathSteps
     counted_m: Floats
-    segment: Ints
+    doubt_m: Floats
     polarity: Ints
     config: MatchingConfig
 
@@ -63,14 +64,14 @@ class Moves:
     def without_odometer(cls, network: Network, steps: PathSteps, config: MatchingConfig) -> Moves:
         count = len(steps)
         unknown = np.zeros(len(network.successors), dtype=np.int64)
-        return cls(network, steps, np.full(count, np.nan), np.zeros(count, dtype=np.int64), unknown, config)
+        return cls(network, steps, np.full(count, np.nan), np.zeros(count), unknown, config)
 
     def way(self, earlier: int, later: int) -> Way:
         """By the odometer where it knows it, else straight on."""
         places = self.steps.points.surface
         chord_m = float(np.linalg.norm(places[later] - places[earlier]))
         counted_m = float("nan")
-        if self._segments[later] == self._segments[earlier]:
+        if self._doubts_m[later] == self._doubts_m[earlier]:
             counted_m = self._at_m[later] - self._at_m[earlier]
         measured = bool(np.isfinite(counted_m))
         distance_m = counted_m if measured else chord_m
@@ -145,5 +146,5 @@ class Moves:
         return [float(value) for value in self.counted_m]
 
     @cached_property
-    def _segments(self) -> list[int]:
-        return [int(value) for value in self.segment]
+    def _doubts_m(self) -> list[float]:
+        return [float(value) for value in self.doubt_m]

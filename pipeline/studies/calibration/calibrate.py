@@ -13,7 +13,6 @@ from pipeline.one_run import replay
 from pipeline.results.workers import told
 from pipeline.stages.alignment.align import align
 from pipeline.stages.matching import Match
-from pipeline.stages.monitors.axis import error_model
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.monitors.single import doppler_monitor
 from pipeline.stages.odometry import Odometry
@@ -27,7 +26,7 @@ from pipeline.studies.calibration.sigmas import (
     velocity_sigma_mps,
     worst_fit,
 )
-from pipeline.studies.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
+from pipeline.studies.calibration.vehicle import RunEstimate, estimate_run, pooled
 from pipeline.studies.plausibility.fit import clock_advice, required_fit
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
@@ -101,17 +100,15 @@ def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, so
     required_fit(prepared, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m))
     match = prepared.match(solution)
     odometry = None if prepared.odometry is None else prepared.odometry.oriented(match.odometer_sign)
-    estimate = None if odometry is None else _estimate(match, odometry, config)
+    estimate = None if odometry is None else _estimate(match, odometry)
     measured = vehicle if estimate is None else _vehicle(vehicle, [estimate], config.align.latency_prior_sigma_s)
     noise_m, epochs = _monitored(match, odometry, measured, config)
     return Observed(log.run_id, estimate, noise_m, epochs, _alarms(log, site, measured, config, solution))
 
 
-def _estimate(match: Match, odometry: Odometry, config: Configuration) -> RunEstimate | None:
+def _estimate(match: Match, odometry: Odometry) -> RunEstimate | None:
     epochs = match.epochs.filter("fix_valid", "on_track")
-    t_s = odometry.seconds(times_ns(epochs))
-    seen = Observations(t_s, floats(epochs, "path_m"), floats(epochs, "sigma_along_m"))
-    return estimate_run(seen, odometry, *error_model(config.monitors), config.calibration)
+    return estimate_run(odometry.seconds(times_ns(epochs)), floats(epochs, "path_m"), odometry)
 
 
 def _monitored(
@@ -187,11 +184,11 @@ def _vehicle(base: Vehicle, runs: Sequence[RunEstimate], latency_unknown_s: floa
     A latency more than half as uncertain as `latency_unknown_s`, with which learning in a run begins, is no
     measurement: at constant speed nothing shows it.
     """
-    figures = np.array([(run.scale, run.scale_sigma, run.latency_s, run.latency_sigma_s) for run in runs]).T
-    scale = pooled(figures[0], figures[1])
-    latency = pooled(figures[2], figures[3])
+    scale = pooled(*np.array([(run.scale, run.scale_sigma) for run in runs]).T)
     measured = {"odometer_scale": scale.value, "odometer_scale_sigma": scale.sigma}
-    if latency.sigma <= 0.5 * latency_unknown_s:
+    latencies = [(run.latency_s, run.latency_sigma_s) for run in runs if run.latency_s is not None]
+    latency = pooled(*np.array(latencies, dtype=np.float64).T) if latencies else None
+    if latency is not None and latency.sigma <= 0.5 * latency_unknown_s:
         measured |= {"gnss_latency_s": latency.value, "gnss_latency_sigma_s": latency.sigma}
     return base.model_copy(update=measured)
 

@@ -8,8 +8,9 @@ from importlib.resources import files
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from pipeline.read.ingest.timescale import leap_seconds
 from pipeline.studies.plausibility.check import Cause
-from schemas.arrays import Floats
+from schemas.arrays import NS_PER_S, Floats
 from schemas.enums import MisfitCause
 
 # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; bad odometers are off by 3 %.
@@ -18,7 +19,6 @@ _UNIT_SHARE = 0.045
 _CLOCK_NEAR_S = 2.2
 # A few independent errors tell a sigma to so much.
 _ACCURACY_TIMES = 2.5
-_YEAR_S = 31_556_952
 
 
 class _Fact(BaseModel):
@@ -63,7 +63,6 @@ class KnownCauses(_Fact):
     speed_units: dict[str, float]
     way_units: dict[str, float]
     accuracy_units: dict[str, float]
-    leap_seconds: dict[float, int]
     clock_steps: tuple[ClockStep, ...]
     coordinate_mistakes: tuple[CoordinateMistake, ...]
 
@@ -100,12 +99,21 @@ def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> tuple[Cause, flo
     for step in KNOWN.clock_steps:
         count = round(abs(lag_s) / step.step_s)
         size_s = count * step.step_s
-        if 1 <= count <= step.most and abs(abs(lag_s) - size_s) <= near_s:
-            return Cause(step.code, (f"{size_s / step.unit_s:g} {step.unit}",)), float(np.copysign(size_s, lag_s))
+        beside_s = abs(lag_s) - size_s
+        leaps_s = min(_leaps_beside(step, size_s, t_ns), key=lambda known_s: abs(beside_s - known_s))
+        if 1 <= count <= step.most and abs(beside_s - leaps_s) <= near_s:
+            words = f"{size_s / step.unit_s:g} {step.unit}" + (f" and {leaps_s:+d} s" if leaps_s else "")
+            return Cause(step.code, (words,)), float(np.copysign(size_s + leaps_s, lag_s))
     return None
 
 
-def leap_seconds(t_ns: int) -> int:
-    """GPS time minus UTC at an instant [s]."""
-    year = 1970 + t_ns / 1e9 / _YEAR_S
-    return next((leap_s for since, leap_s in KNOWN.leap_seconds.items() if year >= since), 13)
+def _leaps_beside(step: ClockStep, size_s: int, t_ns: int) -> list[int]:
+    """Seconds by which a clock is off beside such a step: a receiver that is weeks behind takes the leap seconds of a
+    wrong day, or none. The recorder that `t_ns` is of may be the one of the right day or of the wrong one.
+    """
+    if step.code is not MisfitCause.GPS_WEEK:
+        return [0]
+    here_s = leap_seconds(t_ns)
+    there_s = [leap_seconds(t_ns + sign * size_s * NS_PER_S) for sign in (-1, 1)]
+    counts = {here_s, *there_s, *(here_s - other_s for other_s in there_s)} - {0}
+    return [0, *(sign * count for count in sorted(counts) for sign in (-1, 1))]

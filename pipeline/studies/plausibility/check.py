@@ -41,7 +41,8 @@ class Check:
     """One comparison: `found` in words with figures, its `causes`, and the lines that mend it.
 
     `lines` is text for a file, `into` says what to do with it; `advice` is what to do where no line mends it. A misfit
-    `of_evidence` is one of the recorders that the judge believes: nothing is proved by them.
+    `of_evidence` is one of the recorders that the judge believes: nothing is proved by them. `leap_s`: by so many whole
+    leap seconds the clock of the positions may be off against the recorder's (to be added to their stamps), 0: by none.
     """
 
     what: str
@@ -52,6 +53,7 @@ class Check:
     into: str = CONFIGURATION
     advice: str = ""
     of_evidence: bool = False
+    leap_s: int = 0
 
     @property
     def sentence(self) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from pipeline.studies.plausibility.causes import explain_lag, leap_seconds
+from pipeline.read.ingest.timescale import leap_seconds
+from pipeline.studies.plausibility.causes import explain_lag
 from pipeline.studies.plausibility.check import (
     IN_VEHICLE_FILE,
     VEHICLE_FILE,
@@ -61,7 +62,30 @@ def clock_checks(of: Recording, lags: list[StreamLag]) -> list[Check]:
     leap = _leap_of_gnss(of, lags)
     if leap is not None:
         return [_of_leap(of, lag, leap) if not lag.reason else _check(of, lag, None, known=True) for lag in lags]
-    return [_check(of, lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
+    checks = [_check(of, lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
+    return [_with_leap(check, leap_of(lag, of.epoch_ns)) for check, lag in zip(checks, lags, strict=True)]
+
+
+def _with_leap(check: Check, leap_s: int) -> Check:
+    """A lag of whole seconds that nobody puts down to one of the clocks may be of leap seconds all the same."""
+    if not leap_s or check.state is not FitState.MISFIT:
+        return replace(check, leap_s=leap_s)
+    return replace(check, leap_s=leap_s, found=f"{check.found}, as an old count of leap seconds would make them")
+
+
+def leap_of(lag: StreamLag, t_ns: int) -> int:
+    """The whole leap seconds that a sure lag is, 0 where it is none: positions late by chance are not, to a tenth.
+
+    1 to 3 s of an old count, or all of GPS - UTC by one. Positions that are exactly so old look alike: nobody knows.
+    """
+    whole = round(lag.lag_s)
+    if lag.reason or not lag.sure or not whole:
+        return 0
+    leap_s = leap_seconds(t_ns)
+    if leap_s - max(_LEAPS_S) <= abs(whole) <= leap_s and abs(lag.lag_s - whole) <= _WHOLE_NEAR_S:
+        return whole
+    old = abs(whole) <= max(_LEAPS_S) and abs(lag.lag_s - whole) <= _LEAP_NEAR_S
+    return whole if old else 0
 
 
 def _leap_of_gnss(of: Recording, lags: list[StreamLag]) -> int | None:
@@ -86,7 +110,7 @@ def _of_leap(of: Recording, lag: StreamLag, leap_s: int) -> Check:
     found = f"{lag.lag_s:+.2f} s, stamps of the {lag.name} are {later}"
     causes = (Cause(MisfitCause.LEAP_SECONDS, (f"{abs(leap_s)}",)), Cause(MisfitPlace.IN_STREAM, ("GNSS", lag.name)))
     what = f"clock of the {lag.name} against the GNSS"
-    return Check(what, FitState.MISFIT, found, causes, _lines_of_gnss(of, float(leap_s)))
+    return Check(what, FitState.MISFIT, found, causes, _lines_of_gnss(of, float(leap_s)), leap_s=leap_s)
 
 
 def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
@@ -113,7 +137,9 @@ def _large(what: str, found: str, of: Recording, lag: StreamLag, of_gnss: Stream
     cause, exact_s = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0)) or constant
     # GPS time is ahead of UTC, so where nobody else knows the stream with the later stamps holds it.
     leaps = abs(abs(lag.lag_s) - leap_seconds(of.epoch_ns)) < _SAME_CLOCK_S
-    at_gnss = of_gnss is not None or (not known and leaps and lag.lag_s < 0)
+    # A counter of weeks that begins anew shows an earlier date.
+    weeks = cause.code is MisfitCause.GPS_WEEK and lag.lag_s > 0
+    at_gnss = of_gnss is not None or (not known and ((leaps and lag.lag_s < 0) or weeks))
     pair = ("GNSS", lag.name) if at_gnss else (lag.name, "GNSS")
     whose = Cause(MisfitPlace.IN_STREAM if known else MisfitPlace.RATHER_IN_STREAM, pair)
     lines = correction(lag.stream, shift_s=-exact_s)

@@ -44,6 +44,11 @@ class Fit:
         return tuple(check for check in self.checks if check.of_evidence)
 
     @property
+    def leaps_s(self) -> tuple[int, ...]:
+        """Whole leap seconds by which the clock of the positions may be off against the judge's recorders."""
+        return tuple(sorted({check.leap_s for check in self.misfits} - {0}))
+
+    @property
     def misfits(self) -> tuple[Check, ...]:
         """What does not fit, the impossible first."""
         return (*self.impossible, *(check for check in self.checks if check.state is FitState.MISFIT))

@@ -63,9 +63,7 @@ def _lag(pair: PairFit, of: Recording) -> StreamLag:
         return StreamLag("odometer", pair.lag_s, min(pair.lag_sigma_s, 1.0), sure=True)
     if pair.clock_reason or not pair.lag_known:
         return StreamLag("odometer", reason=pair.clock_reason or "the speed changes too little")
-    from_file_s = -(of.vehicle.gnss_latency_s or 0.0)
-    small = abs(pair.lag_s - from_file_s) <= of.config.lag_limit_s
-    sure = small and pair.other_lag(from_file_s, of.config.lag_told_s)
+    sure = pair.other_lag(-(of.vehicle.gnss_latency_s or 0.0), of.config.lag_told_s)
     return StreamLag("odometer", pair.lag_s, pair.lag_sigma_s, sure)
 
 

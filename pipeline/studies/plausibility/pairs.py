@@ -1,7 +1,7 @@
 """Clock and scale of one counter against positions: robust against jumps, drifts, slips and stands.
 
 First the clocks: at which lag two records of one journey's speed agree, whatever their units; then scale and the rest
-of the lag, by the ways of windows and the equation of `scale_lag`.
+of the lag, up to half a minute, by the ways of windows and the one estimator of both (`odometry.scale_lag`).
 """
 
 from __future__ import annotations
@@ -10,41 +10,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.stages.odometry.scale_lag import ScaleLag, scale_and_lag
+from pipeline.stages.odometry.scale_lag import CountedRows, scale_and_lag
 from pipeline.studies.plausibility.records import MOVING_MPS, SPEED_S, Places, Record
-from pipeline.studies.plausibility.robust import (
-    LEAST,
-    SIGNIFICANT_SIGMAS,
-    explains,
-    halves_of,
-    regressed,
-    steady,
-    usual,
-)
+from pipeline.studies.plausibility.robust import LEAST, SIGNIFICANT_SIGMAS, explains, steady, usual
 from schemas.arrays import Floats
 
-# Windows overlap by half, which makes sigmas larger by so much; positions a step apart are no better known [m].
-_OVERLAP = 1.5
-_LEAST_SPREAD_M = 0.05
 # Windows of this length tell ways to 2 % where positions scatter by 2 m; they last neither so short that stamps tell
 # little nor so long that a train does not keep its speed.
 _WINDOW_M = 150.0
 _WINDOW_LEAST_S = 8.0
 _WINDOW_MOST_S = 60.0
+_WINDOWS_OVERLAP = 4.0
 # A window agrees on a factor within so much: positions, curves and slip together.
 _WINDOW_AGREES = 0.12
 # Below this share of the usual speed a record tells more of noise than of the scale.
 _SLOW_SHARE = 0.2
 # A lag is known where its sigma is smaller.
 _LAG_SIGMA_S = 0.5
-# Leap seconds (16, 17 and 18 since 2012) make clocks differ by 1 and 2 s, with one unknown 3 s; one more on either side
-# shows that it is none of them. Windows in which the lags differ by more than noise tell of it; so many in each half.
-_WHOLE_MOST_S = 4.0
-_WHOLE_WINDOW_S = 8.0
-_WHOLE_TELLS_M = 4.0
-_WHOLE_LEAST = 3
-_WHOLE_BETTER = 0.5
-_WHOLE_SIGMA_S = 0.3
 # With less in common, of all and of the shorter record, any two journeys look alike.
 _COMMON_S = 90.0
 _COMMON_SHARE = 0.6
@@ -124,104 +106,57 @@ def fit_pair(gnss: Places, counter: Record) -> PairFit:
     """Scale and lag of a counter against positions; first the clocks, then both at once."""
     coarse_s, clock_reason = clock_lag(gnss, counter)
     fit = _fitted(gnss, counter, coarse_s)
-    if fit.lag_known and abs(fit.lag_s - coarse_s) <= 2.0 * _SPEED_LAG_S:
-        fit = _fitted(gnss, counter, fit.lag_s)
     if coarse_s and abs(fit.lag_s - coarse_s) > _SPEED_LAG_S:
         fit = replace(fit, lag_s=coarse_s, lag_sigma_s=_SPEED_LAG_S / 2.0)
-    whole_s = 0.0 if coarse_s or fit.lag_known or not fit.known else whole_lag(gnss, counter, abs(fit.scale))
-    if whole_s:
-        fit = replace(fit, lag_s=whole_s, lag_sigma_s=_WHOLE_SIGMA_S)
-        clock_reason = ""
-    return replace(fit, shifted=coarse_s != 0.0 or whole_s != 0.0, clock_reason=clock_reason)
-
-
-def whole_lag(gnss: Places, counter: Record, scale: float) -> float:
-    """The lag by which a clock with too few or too many leap seconds is off; 0 where none shows.
-
-    Tried one by one: a fit that begins at no lag takes the few parts in which the speed changes for outliers. The ways
-    of short windows have to agree at least twice as well, in both halves of the journey.
-    """
-    begin_s, end_s = _common(gnss, counter, 0.0)
-    starts = np.arange(begin_s + _WHOLE_MOST_S, end_s - _WHOLE_WINDOW_S - _WHOLE_MOST_S, _WHOLE_WINDOW_S / 2.0)
-    ends = starts + _WHOLE_WINDOW_S
-    if starts.size < 2 * LEAST:
-        return 0.0
-    ways = gnss.way(starts, ends)
-    lags_s = np.arange(-_WHOLE_MOST_S, _WHOLE_MOST_S + 1.0)
-    apart = np.stack([np.abs(np.abs(counter.gained(starts + lag, ends + lag)) * scale - ways) for lag in lags_s])
-    spread = np.ptp(apart, axis=0)
-    telling = np.isfinite(spread) & (spread > _WHOLE_TELLS_M)
-    halves = [part[:, telling[rows]] for rows in halves_of(starts.size) if (part := apart[:, rows]).size]
-    if any(half.shape[1] < _WHOLE_LEAST for half in halves):
-        return 0.0
-    medians = np.stack([np.median(half, axis=1) for half in halves])
-    best = int(np.median(apart[:, telling], axis=1).argmin())
-    none = lags_s.size // 2
-    clear = (medians[:, best] < _WHOLE_BETTER * medians[:, none]).all() and 0 < best < lags_s.size - 1
-    if not clear:
-        return 0.0
-    # What is left grows on both sides alike, from where the lag is.
-    before, after = np.median(apart[:, telling], axis=1)[[best - 1, best + 1]]
-    return float(lags_s[best] + (before - after) / max(before + after, 1e-9))
+    return replace(fit, shifted=coarse_s != 0.0, clock_reason="" if fit.lag_known else clock_reason)
 
 
 def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
-    """Scale and lag by windows, once the clocks agree to within seconds."""
+    """Scale and lag by windows, once the clocks agree to within half a minute."""
     begin_s, end_s = _common(gnss, counter, lag_s)
     if end_s - begin_s < 3.0 * _WINDOW_LEAST_S:
         return PairFit(reason="nothing in common")
-    (way, counted, change), counts = _windows(gnss, counter, begin_s, end_s, lag_s)
-    stands = counts < 0.1
-    if way.size < LEAST:
+    starts, ends = _windows(gnss, begin_s, end_s)
+    way = gnss.way(starts, ends)
+    found = scale_and_lag(starts, ends, way, _driven(counter, lag_s))
+    counted = counter.gained(starts + lag_s - found.lag_s, ends + lag_s - found.lag_s)
+    known = np.isfinite(counted)
+    # Neither a counter that stands most of the time nor one that is reset shows what is usual.
+    counts = np.abs(counted) > _SLOW_SHARE * usual(np.abs(counted), 0.8)
+    share = float(counts[known].mean()) if known.any() else 1.0
+    stands = share < 0.1
+    if counts.sum() < LEAST or not np.isfinite(found.scale_sigma):
         reason = "the odometer stands while the positions move" if stands else "hardly any movement in common"
         return PairFit(reason=reason, stands=stands)
-    sign = -1.0 if np.median(counted) < 0 else 1.0
-    ratio = np.abs(counted) / way
-    unit = float(np.median(ratio))
-    off = np.abs(np.log(ratio / unit))
-    # A counter that is reset seems to run so far that it would weigh more than all the rest.
-    sane = off < np.log(2.0)
-    columns = (np.column_stack([counted, -change]) * np.sign(counted)[:, None])[sane]
-    way = way[sane]
-    robust = regressed(columns[:, None, :], way[:, None], _LEAST_SPREAD_M, start=(1.0 / unit, 0.0))
-
-    def solved(part: slice) -> ScaleLag | None:
-        weighted = columns[part].T * robust.weight[part]
-        return scale_and_lag(weighted @ columns[part], weighted @ way[part], _OVERLAP * robust.spread, -lag_s)
-
-    best = solved(slice(None))
-    if best is None:
-        return PairFit(reason="hardly any movement in common")
-    halves = [half for part in halves_of(way.size) if (half := solved(part)) is not None]
+    ratio = np.abs(counted[counts]) / way[counts]
+    agree = np.abs(np.log(ratio / np.median(ratio))) < _WINDOW_AGREES
     return PairFit(
-        scale=sign * best.scale,
-        scale_sigma=best.scale_sigma,
-        lag_s=-best.lag_s,
-        lag_sigma_s=best.lag_sigma_s,
-        halves=tuple((half.scale, -half.lag_s) for half in halves),
-        constant=counts * float(np.mean(off < _WINDOW_AGREES)),
+        scale=found.scale if np.median(counted[counts]) > 0 else -found.scale,
+        scale_sigma=found.scale_sigma,
+        lag_s=lag_s - found.lag_s,
+        lag_sigma_s=found.lag_sigma_s,
+        halves=tuple((scale, lag_s - rest_s) for scale, rest_s in found.halves),
+        constant=share * float(np.mean(agree)),
     )
 
 
-def _windows(gnss: Places, counter: Record, begin_s: float, end_s: float, lag_s: float) -> tuple[Floats, float]:
-    """Of windows in which both move the GNSS way [m], and the counter's signed way and change of speed (3, windows);
-    their share of those in which the positions move.
-    """
+def _driven(counter: Record, lag_s: float) -> CountedRows:
+    """The counter as way driven, by the clock of the positions: their ways have no sign. None over a pause."""
+    paused = np.diff(counter.t_s) > counter.limit_s
+    return CountedRows(counter.t_s - lag_s, counter.values, np.concatenate([[0.0], np.cumsum(paused)])).driven()
+
+
+def _windows(gnss: Places, begin_s: float, end_s: float) -> tuple[Floats, Floats]:
+    """Begins and ends of windows in which the positions move."""
     speed = gnss.speed(np.linspace(begin_s, end_s, 400))
     fast = speed[np.nan_to_num(speed) > MOVING_MPS]
     if not fast.size:
-        return np.zeros((3, 0)), 1.0
+        return np.zeros(0), np.zeros(0)
     length_s = float(np.clip(_WINDOW_M / np.median(fast), _WINDOW_LEAST_S, _WINDOW_MOST_S))
-    starts = gnss.instants(length_s / 2, begin_s, end_s - length_s)
-    ends = starts + length_s
-    change = counter.speed(ends + lag_s, 2.0) - counter.speed(starts + lag_s, 2.0)
-    windows = np.stack([gnss.way(starts, ends), counter.gained(starts + lag_s, ends + lag_s), change])
-    windows = windows[:, np.isfinite(windows).all(axis=0)]
-    windows = windows[:, windows[0] > max(_SLOW_SHARE * usual(windows[0], 0.9), MOVING_MPS * length_s)]
-    # Neither a counter that stands most of the time nor one that is reset shows what is usual.
-    size = np.abs(windows[1])
-    counts = size > _SLOW_SHARE * usual(size, 0.8)
-    return windows[:, counts], float(counts.mean()) if counts.size else 1.0
+    starts = gnss.instants(length_s / _WINDOWS_OVERLAP, begin_s, end_s - length_s)
+    way = gnss.way(starts, starts + length_s)
+    starts = starts[np.nan_to_num(way) > max(_SLOW_SHARE * usual(way, 0.9), MOVING_MPS * length_s)]
+    return starts, starts + length_s
 
 
 def clock_lag(gnss: Places, other: Record) -> tuple[float, str]:

@@ -21,9 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
+from pipeline.stages.odometry.bound import is_lost
 from pipeline.stages.odometry.recovery import RecoveryRule
 from pipeline.studies.undetected.watched import FaultWindow, Watched
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
+from schemas.arrays import NS_PER_S, Bools, Floats, floats
 from schemas.config import Configuration
 
 # The hold ends after the memory of the slowest average; growth counts from a row in its last tenth, where there is one.
@@ -41,17 +42,15 @@ class Returns:
     sigma_m: Floats
     travelled_m: Floats
     doubt_m: Floats
-    counter: Ints
     scale_sigma: float
 
     @classmethod
     def of(cls, rows: Watched, epochs: pl.DataFrame, scale_sigma: float) -> Returns:
         path_m, odometer_m, sigma_m, travelled_m, doubt_m = (
             floats(epochs, name)[rows.epoch]
-            for name in ("path_m", "odometer_m", "position_sigma_m", "travelled_m", "slip_doubt_m")
+            for name in ("path_m", "odometer_m", "position_sigma_m", "travelled_m", "odometer_doubt_m")
         )
-        counter = epochs["odometer_counter"].to_numpy().astype(np.int64)[rows.epoch]
-        return cls(path_m - odometer_m, sigma_m, travelled_m, doubt_m, counter, scale_sigma)
+        return cls(path_m - odometer_m, sigma_m, travelled_m, doubt_m, scale_sigma)
 
     def within(self, part: slice) -> Returns:
         return Returns(
@@ -59,7 +58,6 @@ class Returns:
             self.sigma_m[part],
             self.travelled_m[part],
             self.doubt_m[part],
-            self.counter[part],
             self.scale_sigma,
         )
 
@@ -119,7 +117,7 @@ class _Window:
             hold_s = 0.0
         ended_m = self._held_m(unnoticed_m, hold_s)
         most_m = np.maximum(unnoticed_m, np.maximum(held_m, self._after_m(ended_m)))
-        unknown = self.returns.counter != self.returns.counter[0]
+        unknown = is_lost(self.returns.doubt_m - self.returns.doubt_m[0])
         return np.where(unknown | np.isinf(most_m), np.nan, most_m)
 
     def _held_m(self, unnoticed_m: Floats, since_s: float) -> Floats:

@@ -110,7 +110,7 @@ def test_runs_that_cannot_be_used(bench: Bench, journey: Journey) -> None:
     with pytest.raises(BaliseError, match="holds injected faults already"):
         bench.run(RAMPS, run=journey.run.with_streams(faults=faults.with_columns(stamps)))
     slips = '[[faults]]\nkind = "slip"\nrates_mps = [0.5]\nduration_s = 20.0\n'
-    with pytest.raises(BaliseError, match="no run has an odometer"):
+    with pytest.raises(BaliseError, match="no odometer that is declared to be free of the GNSS; found no odometer"):
         bench.run("per_cell = 1\n" + slips + RAMPS, run=journey.run.with_streams(odometer=None))
     assert journey.run.odometer is not None
     unsaid = journey.run.odometer.with_columns(origin=pl.lit(None, journey.run.odometer.schema["origin"]))

@@ -272,12 +272,79 @@ def test_local_times_by_their_zone(converted, time, expected):
     assert t.dt.to_string("%Y-%m-%dT%H:%M:%S%.f").to_list() == [expected]
 
 
-@pytest.mark.parametrize("time", ["2025-10-26 02:30:00", "2025-03-30 02:30:00"])
-def test_hours_that_clocks_show_twice_or_never_are_refused(converted, time):
-    with pytest.raises(
-        InputError, match=r"not clear in Europe/Berlin; found .* 02:30:00 in row 1; expected each time once"
-    ):
+@pytest.mark.parametrize(
+    ("time", "says"),
+    [
+        (
+            "2025-10-26 02:30:00",
+            r"not clear in Europe/Berlin; found .* 02:30:00 in row 1; expected each time once.*"
+            r'time_zone = "Etc/GMT-2" or "Etc/GMT-1"',
+        ),
+        (
+            "2025-03-30 02:30:00",
+            r'clocks never show in Europe/Berlin; found .* 02:30:00 in row 1.*time_zone = "Etc/GMT-1"',
+        ),
+    ],
+)
+def test_hours_that_clocks_show_twice_or_never_are_refused(converted, time, says):
+    with pytest.raises(InputError, match=says):
         converted(f"t,lat,lon\n{time},50.5,4.5\n", **BERLIN)
+
+
+def clock_rows(*spans):
+    """Rows every 30 s over spans of a clock in the night of 2025-10-26."""
+    minutes = [begin + half / 2 for begin, end in spans for half in range(int(2 * (end - begin)))]
+    return [f"2025-10-26 {int(m // 60):02d}:{int(m % 60):02d}:{int(m * 60 % 60):02d}" for m in minutes]
+
+
+def utc_minutes(converted, rows):
+    frame = converted("t,lat,lon\n" + "".join(f"{row},50.5,4.5\n" for row in rows), **BERLIN)
+    midnight = datetime(2025, 10, 26, tzinfo=UTC)
+    return [(t - midnight).total_seconds() / 60 for t in frame["t"]]
+
+
+@pytest.mark.parametrize(
+    ("spans", "begin"),
+    [
+        # By hand: 01:50 CEST is 23:50 UTC the day before, 03:00 CET is 02:00 UTC; clocks go back at 01:00 UTC.
+        (((110, 180), (120, 190)), -10),
+        (((110, 150),), -10),  # ends in the first hour
+        (((150, 190),), 90),  # begins in the second hour
+    ],
+)
+def test_an_hour_that_clocks_show_twice_by_the_order_of_its_rows(converted, spans, begin):
+    found = utc_minutes(converted, clock_rows(*spans))
+    assert found == [begin + half / 2 for half in range(len(found))]
+
+
+@pytest.mark.parametrize(
+    "spans",
+    [
+        ((130, 170),),  # within the hour alone
+        ((110, 190),),  # over both ends without a step: a clock that was not changed, or a pause
+        ((110, 150), (155, 190)),  # a pause in which the clock may have been set
+        ((110, 180), (120, 150), (155, 190)),
+    ],
+)
+def test_rows_that_leave_such_an_hour_open_are_refused(converted, spans):
+    with pytest.raises(InputError, match="not clear in Europe/Berlin"):
+        utc_minutes(converted, clock_rows(*spans))
+
+
+def test_a_clock_that_never_changes_has_a_zone_of_its_own(converted):
+    rows = "t,lat,lon\n2025-10-26 02:30:00,50.5,4.5\n2025-10-26 03:30:00,50.5,4.5\n"
+    t = converted(rows, time_zone="Etc/GMT-1")["t"]
+    assert t.dt.to_string("%FT%T").to_list() == ["2025-10-26T01:30:00", "2025-10-26T02:30:00"]
+
+
+def test_letters_of_a_zone_in_the_cells(converted):
+    assert converted("t,lat,lon\n2025-06-01 14:00:00 UTC,50.5,4.5\n")["t"].dt.hour().to_list() == [14]
+    with pytest.raises(InputError, match=r'letters do not tell for certain.*time_zone = "Europe/Berlin"'):
+        converted("t,lat,lon\n2025-06-01 14:00:00 CEST,50.5,4.5\n")
+    assert converted("t,lat,lon\n2025-06-01 14:00:00 CEST,50.5,4.5\n", **BERLIN)["t"].dt.hour().to_list() == [12]
+    assert converted("t,lat,lon\n2025-01-01 14:00:00 MEZ,50.5,4.5\n", **BERLIN)["t"].dt.hour().to_list() == [13]
+    with pytest.raises(InputError, match="letters are not those of Europe/Berlin"):
+        converted("t,lat,lon\n2025-06-01 14:00:00 CET,50.5,4.5\n", **BERLIN)
 
 
 def test_zones_of_times_that_have_none(converted):

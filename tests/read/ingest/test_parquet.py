@@ -106,7 +106,7 @@ def test_lossless_conversions(tmp_path, column, values):
         ("fix", pl.Series(["sbas", None, "none"]), "null in row 1"),
         ("satellites", pl.Series([7.5, 8.0, 9.0]), "not 64-bit integers"),
         ("satellites", pl.Series([2**64 - 1, 1, 1], dtype=pl.UInt64), "not 64-bit integers"),
-        ("solution", pl.Series([1, 2, 3]), "Int64"),
+        ("solution", pl.Series([1.0, 2.0, 3.0]), "Float64"),
     ],
 )
 def test_what_would_lose_or_invent_is_refused(tmp_path, column, values, says):

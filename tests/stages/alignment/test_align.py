@@ -209,7 +209,9 @@ def test_a_long_stand_where_rows_scatter_with_the_speed_alone():
     t_s = np.arange(0.0, 650.0, 0.1)
     way_m = np.minimum(20.0 * t_s, 2000.0)
     odometry = odometry_from(odometer_of(t_s, way_m), Vehicle(), CONFIG)
-    scattered = replace(odometry, noise=Noise(odometry.noise.white_m2_per_s, QuantisationNoise(0.0, 1e-3)))
+    noise = Noise(odometry.noise.white_m2_per_s, QuantisationNoise(0.0, 1e-3))
+    known = replace(odometry.known_noise, moving_s2=np.full(t_s.size, 1e-3))
+    scattered = replace(odometry, noise=noise, known_noise=known)
     aligned = align(epochs_of(t_s[20:-20], way_m[20:-20]), scattered, Vehicle(), CONFIG)
     # 0.03 s at 20 m/s, 0.6 m, counts under way alone; GNSS and odometer agree, so the scale stays 1.
     rows_m = aligned["odometer_rows_m"]

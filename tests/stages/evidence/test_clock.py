@@ -1,60 +1,38 @@
-"""The lag of a recorder by what it saw between its stamps: a train whose ways are known, its recorder seconds late."""
+"""How a measured lag is taken: worked by hand with k = 3 and an assumed clock of 0.1 s (DOMAIN section 5.1)."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any, cast
-
-import numpy as np
 import pytest
 
-from pipeline.stages.evidence.clock import RecorderLag, lag_of
-from schemas.arrays import NS_PER_S, Floats, Ints
-
-
-def distance_m(t_s: Floats) -> Floats:
-    """Every minute: 30 s speeding up by 1 m/s2, 30 s slowing down; 900 m."""
-    minute, second = np.divmod(t_s, 60.0)
-    return 900.0 * minute + np.where(second < 30.0, 0.5 * second**2, 900.0 - 0.5 * (60.0 - second) ** 2)
-
-
-def speed_mps(t_s: Floats) -> Floats:
-    return 30.0 - np.abs(t_s % 60.0 - 30.0)
-
-
-def odometer() -> Any:
-    """Exact, and without an end."""
-    return SimpleNamespace(
-        odometer=SimpleNamespace(deadband_mps=0.1),
-        distance_m=lambda begin_ns, end_ns: distance_m(end_ns / NS_PER_S) - distance_m(begin_ns / NS_PER_S),
-        speed_mps=lambda t_ns: speed_mps(t_ns / NS_PER_S),
-    )
-
-
-def recorded(ways: int, late_s: float) -> tuple[Ints, Ints, Floats]:
-    """Stamps 20 s apart, each `late_s` after the moment; what was driven in between."""
-    t_s = 600.0 + 20.0 * np.arange(ways + 1)
-    stamps = np.round((t_s + late_s) * NS_PER_S).astype(np.int64)
-    return stamps[:-1], stamps[1:], np.diff(distance_m(t_s))
+from pipeline.stages.evidence.clock import RecorderClock, clock_of
+from pipeline.stages.odometry.scale_lag import LagState, ScaleLag
+from schemas.config import HazardConfig
 
 
 @pytest.mark.parametrize(
-    ("ways", "late_s", "known"),
+    ("lag_s", "sigma_s", "clock"),
     [
-        (6, 0.2, True),
-        (5, 0.2, False),  # too few
-        (12, 0.2, True),
-        (12, 8.0, True),
-        (12, -8.0, True),
-        (11, 8.0, False),  # too few for a lag of seconds
-        (60, 29.5, True),
+        (0.4, 0.01, RecorderClock(0.2, 0.23)),  # the hull of 0 +- 0.03 and 0.4 +- 0.03
+        (-0.4, 0.01, RecorderClock(-0.2, 0.23)),
+        (0.0, 0.02, RecorderClock(0.0, 0.06)),
+        (0.1, 0.06, RecorderClock(0.0, 0.1, assumed=True)),  # below two sigmas, of which three are 0.18 s
+        (0.13, 0.06, RecorderClock(0.065, 0.245)),
+        (0.05, 0.03, RecorderClock(0.025, 0.115)),  # three sigmas are no more than is assumed anyway
+        (17.0, 0.02, RecorderClock(8.5, 8.56)),
     ],
 )
-def test_a_lag_is_known_from_six_ways_and_one_of_seconds_from_twelve(ways: int, late_s: float, known: bool) -> None:
-    found = lag_of(*recorded(ways, late_s), cast(Any, odometer()))
-    assert np.isfinite(found.sigma_s) == known
-    assert found.lag_s == pytest.approx(late_s if known else 0.0, abs=0.01)
+def test_the_hull_of_no_lag_and_the_measured_one(lag_s: float, sigma_s: float, clock: RecorderClock) -> None:
+    found = clock_of([ScaleLag(1.0, 0.01, lag_s, sigma_s, LagState.MEASURED)], True, HazardConfig())
+    assert (found.shift_s, found.delta_s) == pytest.approx((clock.shift_s, clock.delta_s))
+    assert found.assumed == clock.assumed
 
 
-def test_without_an_odometer_no_lag_is_known() -> None:
-    assert lag_of(*recorded(20, 0.2), None) == RecorderLag()
+def test_what_is_not_measured_is_assumed() -> None:
+    assert clock_of([ScaleLag()], True, HazardConfig()) == RecorderClock(0.0, 0.1, assumed=True)
+
+
+@pytest.mark.parametrize(("lag_s", "lags_s"), [(0.0, (-0.1, 0.1)), (0.4, (-0.1, 0.43)), (-0.05, (-0.1, 0.1))])
+def test_by_an_odometer_that_is_not_independent_it_only_widens(lag_s: float, lags_s: tuple[float, float]) -> None:
+    found = clock_of([ScaleLag(1.0, 0.01, lag_s, 0.01, LagState.MEASURED)], False, HazardConfig())
+    assert found.lags_s == pytest.approx(lags_s)
+    assert found.assumed

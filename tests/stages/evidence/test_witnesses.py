@@ -50,8 +50,9 @@ def test_a_declared_lag_is_taken_off_the_stamps() -> None:
     assert on_time(None, 0.5) is None
 
 
-@pytest.mark.parametrize(("origin", "left"), [(Origin.WHEEL, True), (Origin.UNKNOWN, False)])
-def test_a_reference_that_stands_still_beside_an_independent_odometer_is_left_out(origin: Origin, left: bool) -> None:
+@pytest.mark.parametrize("origin", [Origin.WHEEL, Origin.UNKNOWN])
+def test_a_reference_that_stands_still_beside_an_odometer_is_left_out(origin: Origin) -> None:
+    """One of unknown origin proves nothing, but it contradicts: without its declaration nothing may become right."""
     rng = np.random.default_rng(2)
     ride = wavy(30.0)
     whole = reference(ride, rng)
@@ -60,7 +61,13 @@ def test_a_reference_that_stands_still_beside_an_independent_odometer_is_left_ou
     frozen = whole.with_columns(whole[held].select("latitude_deg", "longitude_deg"))
     moving = without_frozen(frozen, [counted(of_origin(odometer(ride, rng), origin))], HazardConfig())
     assert moving is not None
-    assert (whole.height - moving.height > 30) is left
+    assert whole.height - moving.height > 30
+    # A copy that stands with the reference confirms nothing against a wheel that counts on.
+    stands = of_origin(odometer(ride, rng), Origin.UNKNOWN).with_columns(distance_m=pl.lit(0.0))
+    both = [counted(of_origin(odometer(ride, rng), Origin.WHEEL)), counted(stands)]
+    beside_a_wheel = without_frozen(frozen, both, HazardConfig())
+    assert beside_a_wheel is not None
+    assert whole.height - beside_a_wheel.height > 30
 
 
 def test_a_train_that_stands_repeats_its_place_and_is_heard() -> None:
@@ -104,14 +111,25 @@ def test_an_odometer_that_is_not_independent_proves_nothing_between_reads(origin
     assert wheel.on_survey.mean() > 0.9
 
 
-def test_it_measures_no_clock_and_contradicts_no_reference() -> None:
+def test_it_contradicts_a_reference() -> None:
     rng = np.random.default_rng(6)
     ride = wavy(30.0)
     drift = np.clip((np.arange(4000) / 10.0 - 150.0), 0.0, 60.0)
     of_reference = reference(ride, rng, ahead_m=drift)
     found = known(GROUND, of_origin(odometer(ride, rng), Origin.UNKNOWN), of_reference=of_reference)
+    assert found.doubted > 0
+
+
+@pytest.mark.parametrize(("late_s", "least_s"), [(0.0, 0.1), (0.6, 0.69)])
+def test_its_lag_widens_what_is_assumed_of_a_clock_and_never_narrows_it(late_s: float, least_s: float) -> None:
+    rng = np.random.default_rng(6)
+    ride = wavy(30.0)
+    of_reference = reference(ride, rng, late_s=late_s)
+    found = known(GROUND, of_origin(odometer(ride, rng), Origin.UNKNOWN), of_reference=of_reference)
     assert found.clock_assumed
-    assert found.doubted == 0
+    assert 2.0 * found.clocks[0].delta_s >= least_s
+    narrower = known(GROUND, odometer(ride, rng), of_reference=of_reference)
+    assert narrower.clocks[0].delta_s < found.clocks[0].delta_s + 1e-9
 
 
 @pytest.mark.parametrize(("scale", "parted"), [(1.0, False), (1.02, False), (1.2, True)])

@@ -83,9 +83,10 @@ def epochs_of(
     path_m: Sequence[float | None],
     odometer_m: Sequence[float | None] | None = None,
     t_s: Sequence[float] | None = None,
+    doubt_m: Sequence[float] | None = None,
     **columns: Any,
 ) -> pl.DataFrame:
-    """One epoch a second unless `t_s`; the odometer reads the path unless given."""
+    """One epoch a second unless `t_s`; the odometer reads the path unless given, in doubt by the sum `doubt_m`."""
     size = len(path_m)
     times = range(size) if t_s is None else t_s
     path = pl.Series("path_m", path_m, dtype=pl.Float64)
@@ -101,9 +102,8 @@ def epochs_of(
         confidence_m=pl.lit(6.18),
         odometer_m=odometer,
         direction=pl.lit(1, pl.Int8),
-        odometer_segment=pl.lit(0, pl.Int64),
         odometer_slips=pl.lit(value=False),
-        slip_doubt_m=pl.lit(0.0),
+        odometer_rows_m=pl.lit(0.0),
     )
     series = [
         value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()
@@ -112,8 +112,7 @@ def epochs_of(
     placed, sure = pl.when("fix_valid").then("path_m"), pl.when("on_track").then("gate_probability")
     travelled_m = pl.col("odometer_m").forward_fill().diff().fill_null(0.0).abs().cum_sum()
     said = frame.with_columns(series)
-    if "odometer_counter" not in columns:
-        said = said.with_columns(odometer_counter="odometer_segment")
+    said = said.with_columns(pl.Series("odometer_doubt_m", doubt_m or [0.0] * path.len(), dtype=pl.Float64))
     return said.with_columns(path_m=placed, gate_probability=sure, travelled_m=travelled_m)
 
 

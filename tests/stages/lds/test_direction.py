@@ -87,7 +87,7 @@ def test_who_turns_just_behind_a_balise_of_the_other_direction_misses_nothing(be
 def test_no_row_is_of_a_direction_in_which_its_balise_is_not_valid(seed: int) -> None:
     chaos = Chaos(seed)
     valid = {name: (seed // 7 + number) % 3 - 1 for number, name in enumerate(chaos.places) if name[0] == "V"}
-    epochs = epochs_of(chaos.path_m, chaos.odometer_m, odometer_segment=chaos.stretch)
+    epochs = epochs_of(chaos.path_m, chaos.odometer_m, doubt_m=chaos.doubt_m)
     columns = {"kind": chaos.kinds, "valid_direction": [valid.get(name, 0) for name in chaos.places]}
     result = run(epochs, balises_at(chaos.places, **columns), ScriptedBank(chaos.fails, blind=chaos.blind))
     facing = {Direction.GROWING.value: 1, Direction.FALLING.value: -1}

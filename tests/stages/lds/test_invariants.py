@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pipeline.stages.lds import LdsResult
 from pipeline.stages.lds.machine import LocationSystem
+from pipeline.stages.odometry.odd_steps import LOST_M
 from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, reads_at, run
 
 _NOT_OFFERED = ("missed", "not_available")
@@ -39,7 +40,7 @@ class Chaos:
         if seed % 5 == 0:
             self.odometer_m[300:] = [None] * (size - 300)
         slips = sorted(dice.sample(range(size), 3)) if seed % 4 == 0 else []
-        self.stretch = [sum(slip <= k for slip in slips) for k in range(size)]
+        self.doubt_m = [LOST_M * sum(slip <= k for slip in slips) for k in range(size)]
         self.fails = {k for k in range(size) if dice.random() < 0.01}
         blind = {k for k in range(size) if self.path_m[k] is None or self.odometer_m[k] is None}
         self.blind = blind | {k + 1 for k in blind} | set(slips)
@@ -51,8 +52,7 @@ class Chaos:
 
     def replayed(self, shift_s: int = 0) -> LdsResult:
         later = pl.col("t") + pl.duration(seconds=shift_s)
-        stretch = self.stretch[: len(self.path_m)]
-        epochs = epochs_of(self.path_m, self.odometer_m, odometer_segment=stretch).with_columns(later)
+        epochs = epochs_of(self.path_m, self.odometer_m, doubt_m=self.doubt_m[: len(self.path_m)]).with_columns(later)
         balises = balises_at(self.places, kind=self.kinds, linked=self.linked)
         reads = reads_at(self.reads).with_columns(later)
         return run(epochs, balises, ScriptedBank(self.fails, blind=self.blind), reads)

@@ -12,6 +12,7 @@ from pipeline.stages.lds import LdsResult
 from pipeline.stages.lds.crossings import balises_of, reads_of
 from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.relink import Relink
+from pipeline.stages.odometry.odd_steps import LOST_M
 from schemas.enums import BaliseKind, NotEvaluated
 from tests.stages.lds.scripted import (
     K_T,
@@ -186,7 +187,7 @@ def test_no_return_through_a_lost_odometer_distance() -> None:
     true_m = steps(0.0, 20.0, 160)
     path_m = [x - (40.0 if k >= 40 else 0.0) for k, x in enumerate(true_m)]
     odometer_m = [x - (40.0 if k >= 50 else 0.0) for k, x in enumerate(true_m)]
-    epochs = epochs_of(path_m, odometer_m, odometer_segment=[int(k >= 50) for k in range(160)])
+    epochs = epochs_of(path_m, odometer_m, doubt_m=[LOST_M * (k >= 50) for k in range(160)])
     assert negations(run(epochs, balises_at(V1), ScriptedBank([40])))[0] == (40, None)
 
 
@@ -244,7 +245,7 @@ def outage(gap_s: float, offset_m: float, **settings: Any) -> LdsResult:
     path_m = [x + (offset_m if k >= BEFORE else 0.0) for k, x in enumerate(odometer_m)]
     places = {"V1": 110.0, "V2": 20.0 * (gap_s + 40.0)}
     lost = settings.pop("lost", False)
-    columns = {"odometer_segment": [int(lost and k >= BEFORE) for k in range(len(t_s))]}
+    columns = {"doubt_m": [LOST_M * (lost and k >= BEFORE) for k in range(len(t_s))]}
     balises = settings.pop("balises", balises_at(places))
     return run(epochs_of(path_m, odometer_m, t_s, **columns), balises, ScriptedBank(blind=[BEFORE]), **settings)
 

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from pipeline.stages.lds import LdsResult
+from pipeline.stages.odometry.odd_steps import LOST_M
 from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, run, steps
 
 COUNT = 120
@@ -35,8 +36,7 @@ def walk(
         [x + (offset_m if k >= 25 else 0.0) for k, x in enumerate(true_m)],
         [None if slips[k] or k in silent else x for k, x in enumerate(true_m)],
         odometer_slips=slips,
-        odometer_segment=[sum(slips[: k + 1]) + (bool(silent) and k >= silent.stop) for k in range(COUNT)],
-        odometer_counter=[int(bool(silent) and k >= silent.stop) for k in range(COUNT)],
+        doubt_m=[1e-3 * sum(slips[: k + 1]) + LOST_M * (bool(silent) and k >= silent.stop) for k in range(COUNT)],
     )
     return run(epochs, balises_at({"V1": 110.0}), ScriptedBank(**bank), **lds)
 
@@ -71,10 +71,10 @@ def test_use(given: dict[str, Any], expected: list[tuple[int, str]]) -> None:
 @pytest.mark.parametrize("offset_m", [0.0, 30.0])
 def test_distance_lost_between_two_consecutive_positions_is_watched_by_nobody(offset_m: float) -> None:
     """The counter is lost between 29 and 30 s, both of which have a position and a row."""
-    lost = [int(k >= 30) for k in range(COUNT)]
+    lost = [k >= 30 for k in range(COUNT)]
     true_m = steps(0.0, 20.0, COUNT)
     place_m = [x + offset_m * after for x, after in zip(true_m, lost, strict=True)]
-    epochs = epochs_of(place_m, true_m, odometer_segment=lost, odometer_counter=lost)
+    epochs = epochs_of(place_m, true_m, doubt_m=[LOST_M * after for after in lost])
     assert changes(run(epochs, balises_at({"V1": 110.0}), ScriptedBank(begins=[30]))) == [(1, IN_USE), (30, "relink")]
 
 
@@ -99,9 +99,7 @@ def test_a_way_guessed_over_a_pause_asks_for_a_re_link(
     epochs = epochs_of(
         [x + offset_m * (k >= 29) for k, x in enumerate(true_m)],
         [None if k in (28, 29) else x for k, x in enumerate(true_m)],
-        odometer_segment=[int(k >= 30) for k in range(COUNT)],
-        odometer_counter=[0] * COUNT,
-        slip_doubt_m=[doubt_m * (k >= 30) for k in range(COUNT)],
+        doubt_m=[(doubt_m + 1e-3) * (k >= 30) for k in range(COUNT)],
     )
     result = run(epochs, balises_at({"V1": 110.0}), ScriptedBank(begins=[30]), scale_sigma=scale_sigma)
     assert changes(result)[1:] == expected

@@ -36,10 +36,8 @@ def slipping(
         None if slips[k] else x + (slipped_m if k >= END else 0.0) for k, x in enumerate(steps(0.0, 20.0, count))
     ]
     columns: dict[str, Any] = {
-        "odometer_segment": [min(max(k - BEGIN + 1, 0), END - BEGIN) for k in range(count)],
-        "odometer_counter": [0] * count,
         "odometer_slips": slips,
-        "slip_doubt_m": [doubt_m if k >= END else 0.0 for k in range(count)],
+        "doubt_m": [max(1e-9 * min(max(k - BEGIN + 1, 0), END - BEGIN), doubt_m * (k >= END)) for k in range(count)],
     }
     bank = ScriptedBank(blind=range(BEGIN, END + 1), begins=[END], **given.pop("bank", {}))
     return run(epochs_of(path_m, odometer_m, **columns), balises_at(V), bank, **given)
@@ -120,9 +118,7 @@ def test_slips_add_up_since_the_first_tvb(later_s: int) -> None:
         steps(0.0, 20.0, count),
         odometer_m,
         odometer_slips=slips,
-        odometer_segment=list(accumulate(map(int, slips))),
-        odometer_counter=[0] * count,
-        slip_doubt_m=counted_m,
+        doubt_m=[1e-9 * slipped + more_m for slipped, more_m in zip(accumulate(slips), counted_m, strict=True)],
     )
     result = run(epochs, balises_at(V), ScriptedBank([8]))
     assert negations(result) == [(8, 38)]
@@ -143,9 +139,7 @@ def test_without_a_vehicle_file_only_a_telegram_ends_the_wait() -> None:
         path_m,
         [None if slip else x for slip, x in zip(slips, path_m, strict=True)],
         odometer_slips=slips,
-        odometer_segment=[min(max(k - BEGIN + 1, 0), END - BEGIN) for k in range(count)],
-        odometer_counter=[0] * count,
-        slip_doubt_m=[500.0 if k >= END else 0.0 for k in range(count)],
+        doubt_m=[1e-9 * min(max(k - BEGIN + 1, 0), END - BEGIN) + 500.0 * (k >= END) for k in range(count)],
     )
     bank = ScriptedBank(blind=range(BEGIN, END + 1), begins=[END])
     result = run(epochs, balises, bank, reads_at([(50.0, "P1")]), scale_sigma=None)

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.odometry.driven import driven_m, evenly_driven, under_way, with_hysteresis
+from pipeline.stages.odometry.driven import evenly_driven, travelled_m, under_way, with_hysteresis
 from schemas.config import AlignConfig, Configuration
 from tests.replay.journeys import VEHICLE, journey, replay
 from tests.stages.alignment.straight import NO_NOISE
@@ -49,7 +49,7 @@ def test_rows_that_scatter_at_a_stand_are_not_under_way():
     """Half a metre from row to row at 5 Hz looks like 2.5 m/s; from 20 s on the train drives 5 m/s."""
     t_s = np.arange(0.0, 40.0, 0.2)
     rows_m = 5.0 * np.maximum(t_s - 20.0, 0.0) + np.random.default_rng(1).normal(0.0, 0.5, t_s.size)
-    way_m = driven_m(rows_m, np.full(t_s.size, 2.5))
+    way_m = travelled_m(t_s, rows_m, np.full(t_s.size, 2.5), 0.3, 1.0)
     moving = under_way(t_s, way_m, 0.3, 1.0)
     assert not moving[t_s < 20.0].any()
     assert moving[t_s > 21.5].mean() > 0.9
@@ -64,7 +64,8 @@ def test_hysteresis_by_hand():
 def test_without_hysteresis_the_distance_is_as_it_is():
     rows = np.cumsum(np.random.default_rng(1).normal(size=50))
     np.testing.assert_array_equal(with_hysteresis(rows, np.zeros(50)), rows)
-    assert driven_m(rows, np.zeros(50))[-1] == pytest.approx(np.abs(np.diff(rows)).sum())
+    driven = travelled_m(np.arange(50.0), rows, np.zeros(50), 0.0, 1.0)
+    assert driven[-1] == pytest.approx(np.abs(np.diff(rows)).sum())
 
 
 def test_way_to_and_fro_by_hand():
@@ -72,7 +73,8 @@ def test_way_to_and_fro_by_hand():
     there, back = np.linspace(0.0, 100.0, 201), np.linspace(99.5, 60.0, 80)
     rows = np.concatenate([there, back]) + 0.8 * (-1.0) ** np.arange(281)
     # The extremes of the rows are the way: 0.8 m beyond on either side of the turn, and at the end.
-    assert driven_m(rows, np.full(281, 2.0))[-1] == pytest.approx(140.0 + 2 * 0.8 - 2.0, abs=1.7)
+    driven = travelled_m(0.1 * np.arange(281), rows, np.full(281, 2.0), 0.3, 1.0)
+    assert driven[-1] == pytest.approx(140.0 + 2 * 0.8 - 2.0, abs=1.7)
     assert np.abs(np.diff(rows)).sum() > 400.0
 
 
@@ -105,7 +107,8 @@ def test_way_turns_and_movement_are_those_of_the_train(motion, kind, size_m):
     plain = replay(run, site, VEHICLE, given)
     tables = replay(run.with_streams(odometer=scattered(run.odometer, kind, size_m)), site, VEHICLE, given)
     way, plain_way = (found.runs["distance_m"][0] for found in (tables, plain))
-    assert way == pytest.approx(plain_way, abs=10.0 * size_m + 1.0)
+    # What rows scatter by is known from those before: the first second counts what it may.
+    assert way == pytest.approx(plain_way, abs=25.0 * size_m + 1.0)
     turns, plain_turns = (found.epochs["direction"].diff().fill_null(0).ne(0).sum() for found in (tables, plain))
     assert turns == plain_turns == (0 if motion is STOPS else 2)
     moving_s, plain_s = (0.1 * found.epochs["moving"].sum() for found in (tables, plain))

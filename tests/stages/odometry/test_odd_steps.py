@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.stages.odometry.bound import is_lost
 from pipeline.stages.odometry.odd_steps import odd_runs
 from schemas.config import AlignConfig
 from tests.stages.alignment.straight import odometer_of, odometry_from
@@ -52,7 +53,7 @@ def test_a_stall_that_loses_its_way_is_no_bridged_reset() -> None:
     t = np.arange(0.0, 120.0, 0.1)
     missing = 28.0 * np.clip(t - 60.0, 0.0, 1.3)
     odometry = odometry_from(odometer_of(t, distance_m=28.0 * t - missing))
-    assert odometry.segment_at_s(np.array([59.0])) != odometry.segment_at_s(np.array([63.0]))
+    assert is_lost(np.diff(odometry.doubt_at_s(np.array([59.0, 63.0])))).all()
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
@@ -67,6 +68,6 @@ def test_what_is_bridged_or_interpolated_is_off_by_no_more_than_its_bound(rate_h
         reads = true + sum(rng.uniform(-400.0, 400.0) * (np.arange(t.size) >= row) for row in sets)
         odometry = odometry_from(odometer_of(t, distance_m=reads))
         step_m = np.diff(odometry.distance_at_s(t))
-        off_m = np.abs(step_m - np.diff(true))[np.diff(odometry.segment_at_s(t)) == 0]
+        off_m = np.abs(step_m - np.diff(true))[np.diff(odometry.doubt_at_s(t)) == 0.0]
         assert off_m.max() <= 5.0
         assert np.abs(np.diff(reads) - np.diff(true)).max() > 30.0

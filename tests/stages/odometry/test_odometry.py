@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.stages.odometry.bound import is_lost
 from pipeline.stages.odometry.driven import turns_of
+from pipeline.stages.odometry.odd_steps import LOST_M
 from pipeline.stages.odometry.odometry import Noise
 from pipeline.stages.odometry.odometry import odometry_of as odometry_of_stream
 from pipeline.stages.odometry.polarity import grows_with, polarity
@@ -33,7 +35,7 @@ def test_speed_alone_is_integrated_and_guessed_over_a_pause():
     frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], speed_mps=[10.0, 12.0, 10.0, 10.0, 10.0])
     odometry = odometry_from(frame)
     np.testing.assert_allclose(odometry.distance_m, [0.0, 5.5, 11.0, 51.0, 56.0])
-    assert odometry.segment.tolist() == [0, 0, 0, 1, 1]
+    assert odometry.doubt_m == pytest.approx([0.0, 0.0, 0.0, 7.2, 7.2])
     assert odometry.known_at_s(np.array([0.7, 1.0, 3.0, 5.0])).tolist() == [True, True, False, True]
 
 
@@ -56,15 +58,14 @@ def test_a_logger_that_writes_nothing_at_a_stand_leaves_little_in_doubt(
 ) -> None:
     t = [0.0, 0.5, 1.0, 1.5, 1.5 + pause_s, 2.0 + pause_s, 2.5 + pause_s]
     odometry = odometry_from(odometer_of(t, speed_mps=[*[before_mps] * 4, *[after_mps] * 3]))
-    assert np.diff(odometry.segment).tolist() == [0, 0, 0, 1, 0, 0]
     assert np.diff(odometry.distance_m)[3] == pytest.approx(way_m)
-    assert np.diff(odometry.slip_doubt_m) == pytest.approx([0.0, 0.0, 0.0, doubt_m, 0.0, 0.0])
+    assert np.diff(odometry.doubt_m) == pytest.approx([0.0, 0.0, 0.0, doubt_m, 0.0, 0.0])
 
 
 def test_a_cumulative_distance_carries_over_a_pause_but_not_inside_it():
     frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], distance_m=[0.0, 5.0, 10.0, 50.0, 55.0])
     odometry = odometry_from(frame)
-    assert odometry.segment.tolist() == [0, 0, 0, 0, 0]
+    assert (odometry.doubt_m == 0.0).all()
     assert odometry.known_at_s(np.array([1.0, 3.0, 5.0])).tolist() == [True, False, True]
     np.testing.assert_allclose(odometry.distance_at_s(np.array([5.0])), 50.0)
 
@@ -86,7 +87,7 @@ def test_where_distance_and_speed_by_turns_pause_the_way_is_lost():
     distance = [0.0, nan, 10.0, nan, nan, 80.0, nan]
     speed = [nan, 10.0, nan, 10.0, 12.0, nan, 12.0]
     odometry = odometry_from(odometer_of(t, distance_m=distance, speed_mps=speed))
-    assert odometry.segment[3] < odometry.segment[4]
+    assert odometry.doubt_m[3] < odometry.doubt_m[4]
     assert odometry.known_at_s(np.array([1.5, 4.0, 8.0])).tolist() == [True, False, True]
 
 
@@ -108,7 +109,7 @@ def test_reported_slip_is_no_distance():
     frame = odometer_of([0.0, 0.5, 1.0, 1.5], distance_m=[0.0, 5.0, 20.0, 25.0], slip=[False, False, True, False])
     odometry = odometry_from(frame)
     assert odometry.known_at_s(np.array([0.2, 0.7, 1.2, 1.5])).tolist() == [True, False, False, True]
-    assert odometry.segment[0] != odometry.segment[3]
+    assert odometry.doubt_m[0] < odometry.doubt_m[3]
 
 
 def test_a_noisier_odometer_than_configured_counts():
@@ -168,7 +169,7 @@ def test_a_counter_that_is_reset_or_runs_over_drives_nowhere(reads, leap, speed)
     odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=speeds))
     known = odometry.known_at_s(t[:-1] + 0.25)
     np.testing.assert_allclose(odometry.distance_m, forth * 5.0 * np.arange(6.0))
-    assert (odometry.segment == 0).all()
+    assert (odometry.doubt_m == 0.0).all()
     assert known.all()
     assert odometry.leaps_ns == (int(1e9 * t[leap]),)
 
@@ -177,8 +178,8 @@ def test_a_reset_at_the_end_or_between_rows_far_apart_loses_the_way():
     """No step after it, or 2 s between rows, in which braking at 1.8 m/s^2 changes the way by 1.8 m."""
     at_the_end = odometry_from(odometer_of(0.5 * np.arange(4.0), distance_m=[1000.0, 1005.0, 1010.0, 0.0]))
     far_apart = odometry_from(odometer_of(2.0 * np.arange(5.0), distance_m=[1000.0, 1020.0, 1040.0, 0.0, 20.0]))
-    assert at_the_end.segment.tolist() == [0, 0, 0, 1]
-    assert far_apart.segment_at_s(2.0 * np.arange(5.0)).tolist() == [0, 0, 0, 1, 1]
+    assert at_the_end.doubt_m.tolist() == [0.0, 0.0, 0.0, LOST_M]
+    assert far_apart.doubt_at_s(2.0 * np.arange(5.0)).tolist() == [0.0, 0.0, 0.0, LOST_M, LOST_M]
 
 
 @pytest.mark.parametrize(("reset_m", "step_s"), [(138.0, 1.0), (39.0, 1.0), (30.0, 0.1), (9.0, 0.1)])
@@ -189,7 +190,7 @@ def test_a_counter_that_is_reset_by_little_turns_no_train_round(reset_m, step_s,
     reads = reset_m + 20.0 * t - np.where(np.arange(60) >= 30, reset_m, 0.0)
     odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=None if speed is None else np.full(60, speed)))
     np.testing.assert_allclose(odometry.distance_m, 20.0 * t, atol=1e-9)
-    assert odometry.segment[-1] == 0
+    assert odometry.doubt_m[-1] == 0.0
     assert len(odometry.leaps_ns) == 1
 
 
@@ -199,7 +200,7 @@ def test_resets_one_after_the_other_count_nothing(turned: float) -> None:
     t = 1.5 * np.arange(10.0)
     reads = np.array([955.0, 970.0, 985.0, 1000.0, 6.0, 4.0, 9.0, 24.0, 39.0, 54.0])
     odometry = odometry_from(odometer_of(t, distance_m=turned * reads))
-    assert odometry.segment.tolist() == [0, 0, 0, 0, 1, 2, 3, 3, 3, 3]
+    assert (odometry.doubt_m / LOST_M).tolist() == [0, 0, 0, 0, 1, 2, 3, 3, 3, 3]
     np.testing.assert_allclose(np.diff(odometry.distance_m)[[0, 1, 2, 6, 7, 8]], turned * 15.0)
 
 
@@ -214,7 +215,7 @@ def test_a_wrong_row_at_a_stand_is_no_reset() -> None:
     reads = [0.0, 0.0, 0.0, 41.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 3.0, 5.0, 9.0, 13.0, 19.0]
     odometry = odometry_from(odometer_of(np.arange(17.0), distance_m=reads))
     assert odometry.leaps_ns == ()
-    assert odometry.segment.tolist() == [0] * 17
+    assert (odometry.doubt_m == 0.0).all()
 
 
 def test_a_bridged_reset_has_its_own_noise() -> None:
@@ -243,7 +244,7 @@ def test_a_counter_that_is_reset_in_a_pause_loses_the_way(speed):
     if speed == "by turns":
         reads, speeds = np.where(turns, np.nan, reads), np.where(turns, speeds, np.nan)
     odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=speeds))
-    assert odometry.segment.tolist() == [0] * 20 + [1] * 20
+    assert (odometry.doubt_m > 0.0).tolist() == [False] * 20 + [True] * 20
     assert np.diff(odometry.distance_m).min() >= 0.0
 
 
@@ -255,7 +256,7 @@ def test_a_spike_of_the_counter_is_passed_over():
         odometry = odometry_from(odometer_of(t, distance_m=spiked))
         # Between its neighbours by a straight line; all other rows count.
         np.testing.assert_allclose(odometry.distance_m, reads + 0.2 * (np.arange(7) == row))
-        assert (odometry.segment == 0).all()
+        assert (odometry.doubt_m == 0.0).all()
         assert odometry.known_at_s(t).all()
 
 
@@ -264,7 +265,7 @@ def test_what_a_fast_train_drives_over_gaps_and_bunched_stamps_is_no_leap():
     reads = np.array([0.0, 50.0, 60.0, 70.0, 150.0, 2150.0, 2200.0])
     odometry = odometry_from(odometer_of(t, distance_m=reads))
     np.testing.assert_allclose(odometry.distance_m, reads)
-    assert (odometry.segment == 0).all()
+    assert (odometry.doubt_m == 0.0).all()
 
 
 @pytest.mark.parametrize("with_speed", [False, True])
@@ -320,7 +321,7 @@ def test_a_speed_of_another_unit_or_sign_tells_no_way_over_a_leap(factor):
         for noisy in (1.1, factor):
             odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=[10.0 * noisy] * 40))
             lost = noisy == factor and counted_m is None
-            assert odometry.segment[-1] == lost
+            assert is_lost(odometry.doubt_m[-1:]).tolist() == [lost]
             if not lost:
                 expected_m = counted_m if noisy == factor else 11.0 * period_s
                 assert np.diff(odometry.distance_at_s(t[19:21])) == pytest.approx(expected_m)
@@ -339,7 +340,8 @@ def test_nothing_is_filled_in_where_the_way_is_lost():
     )
     odometry = odometry_from(frame)
     assert odometry.known_at_s(np.array([1.0, 3.0, 5.0, 16.0, 27.0])).tolist() == [True, False, False, False, True]
-    assert odometry.segment_at_s(np.array([1.0, 5.0, 27.0])).tolist() == [0, 1, 2]
+    # Slip by a tenth of 20 m twice; a pause of 20 s by 1.8 / 4 x 400 m.
+    assert odometry.doubt_at_s(np.array([1.0, 27.0])) == pytest.approx([0.0, 4.0 + 180.0])
 
 
 def test_the_variance_between_two_instants_has_the_noise_of_both_rows():

@@ -7,8 +7,9 @@ import polars as pl
 import pytest
 
 from pipeline.stages.monitors.axis import AlongEpochs, along_series, most_scatter_m, run_axis
+from pipeline.stages.odometry.counts import count_step
 from pipeline.stages.odometry.odometry import Increments
-from pipeline.stages.odometry.quantisation import QuantisationNoise, count_step_m
+from pipeline.stages.odometry.quantisation import QuantisationNoise
 from schemas.config import Configuration, threshold_factor
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 from tests.stages.alignment.straight import align_run, epochs_of, odometer_of, odometry_from
@@ -53,16 +54,29 @@ def test_counts_scatter_by_their_step_over_root_twelve(step_m, rate_hz):
 
 def test_a_counter_is_known_by_its_step():
     ways = np.concatenate([[0.0], np.cumsum(0.5 * np.tile([3, 1, 0, 3, 2, 5], 4))])
-    whole = np.ones(ways.size - 1, dtype=bool)
-    assert count_step_m(ways, whole, CONFIG.align) == 0.5
-    assert count_step_m(ways - 1000.0 * (ways > 10.0) + 1e-7 * np.sin(ways), whole, CONFIG.align) == pytest.approx(
-        0.5, rel=1e-5
-    )
-    assert count_step_m(ways / 50.0, whole, CONFIG.align) == 0.0
-    assert count_step_m(ways + 0.1 * np.sin(ways), whole, CONFIG.align) == 0.0
-    lost = ways + 0.2 * (np.arange(ways.size) > 7)
-    assert count_step_m(lost, whole, CONFIG.align) == 0.0
-    assert count_step_m(lost, whole & (np.arange(whole.size) != 7), CONFIG.align) == 0.5
+
+    def count_m(rows_m):
+        return count_step(rows_m, CONFIG.align).step_m[-1]
+
+    assert count_m(ways) == 0.5
+    assert count_m(ways - 1000.0 * (ways > 10.0) + 1e-7 * np.sin(ways)) == pytest.approx(0.5, rel=1e-5)
+    assert count_m(ways / 50.0) == 0.0
+    assert count_m(ways + 0.1 * np.sin(ways)) == 0.0
+    assert count_m(ways + 0.2 * (np.arange(ways.size) > 7)) == 0.0
+    # A leap that no train drives is no way.
+    assert count_m(ways + 300.2 * (np.arange(ways.size) > 7)) == 0.5
+
+
+def test_the_step_of_a_counter_is_known_once_enough_ways_have_shown_it():
+    """Ways of 1.5, 0.5, 0, 1.5, 1, 2.5 m by turns: each differs from the one before, so the ninth is enough."""
+    ways = np.concatenate([[0.0], np.cumsum(0.5 * np.tile([3, 1, 0, 3, 2, 5], 4))])
+    known = count_step(ways, CONFIG.align)
+    assert known.shown.tolist() == [True] * 2 + [False] * 7 + [True] * 16
+    assert known.step_m.tolist() == [0.0] * 9 + [0.5] * 16
+    rows = np.insert(ways, 12, np.nan)
+    assert count_step(rows, CONFIG.align).step_m.tolist() == [0.0] * 9 + [0.5] * 17
+    # From a way that is no multiple of it on there is none.
+    assert count_step(np.append(ways, ways[-1] + 0.7), CONFIG.align).step_m.tolist() == [0.0] * 9 + [0.5] * 16 + [0.0]
 
 
 def test_a_smooth_way_at_few_speeds_is_no_counter():
@@ -166,17 +180,36 @@ def test_a_coarse_counter_raises_no_alarm_and_hides_no_leap(step_m):
     hides_no_fault(coarse)
 
 
-@pytest.mark.parametrize("rate_mps", [None, 0.5])
-def test_by_a_counter_too_coarse_for_the_failure_limit_nothing_is_accepted_and_nothing_fails(rate_mps):
-    """Counts of 20 m, a healthy run and a drift: no monitor can tell one from the other."""
-    ramp = None if rate_mps is None else {"kind": "ramp", "rate_mps": rate_mps, "start_s": 90.0, "duration_s": 160.0}
-    run, site = journey() if ramp is None else journey(ramp)
+def by_counts_of_20_m(*faults, **settings):
+    run, site = journey(*faults, **settings)
     counts = (run.odometer["distance_m"] / 20.0).floor() * 20.0
-    tables = replay(run.with_streams(odometer=run.odometer.with_columns(counts.alias("distance_m"))), site, VEHICLE)
-    states = [name for name in tables.epochs.columns if name.startswith("along_") and name.endswith("_state")]
-    assert len(states) == 5
-    assert tables.epochs.filter(pl.any_horizontal(pl.col(name) == "fail" for name in states)).is_empty()
+    return replay(run.with_streams(odometer=run.odometer.with_columns(counts.alias("distance_m"))), site, VEHICLE)
+
+
+def reasons_of(tables):
+    """Of the epochs from the first count on, none of which passes."""
+    epochs = tables.epochs.filter(pl.col("odometer_m") > 0.0)
+    names = [name for name in epochs.columns if name.startswith("along_") and name.endswith("_state")]
+    assert len(names) == 5
+    assert "pass" not in {state for name in names for state in epochs[name].cast(pl.String)}
+    return set(epochs["along_raw_reason"].cast(pl.String))
+
+
+@pytest.mark.parametrize("sigma_m", [0.3, 1.5])
+def test_by_a_counter_too_coarse_for_the_failure_limit_a_healthy_run_has_no_alarm_and_nothing_accepted(sigma_m):
+    tables = by_counts_of_20_m(gnss={"sigma_east_m": sigma_m, "sigma_north_m": sigma_m})
+    assert "noise too large" in reasons_of(tables)
+    assert tables.alarms.height == 0
     assert tables.runs["balises_accepted"].item() == 0
+
+
+def test_by_a_counter_too_coarse_for_the_failure_limit_no_drift_is_hidden():
+    """A ramp of 80 m, which no monitor can tell from counts: no balise is accepted, and nothing calls it safe."""
+    tables = by_counts_of_20_m({"kind": "ramp", "rate_mps": 0.5, "start_s": 90.0, "duration_s": 160.0})
+    assert "noise too large" in reasons_of(tables)
+    assert tables.epochs["error_along_m"].max() > 60.0
+    assert tables.runs["balises_accepted"].item() == 0
+    assert tables.runs["verdict"].item() != "safe"
 
 
 def test_no_more_noise_enters_than_leaves_the_failure_limit_seen():

@@ -123,7 +123,7 @@ def test_sigmas_of_an_earlier_calibration_do_not_count(
 
 
 def seen(run_id: str, noise_m: dict[str, tuple[float, ...]], alarms: tuple[str, ...] = ()) -> Observed:
-    return Observed(run_id, RunEstimate(1.0, 1e-4, 0.0, 0.01, 1.0, 100), noise_m, None, alarms)
+    return Observed(run_id, RunEstimate(1.0, 1e-4, 0.0, 0.01, 100), noise_m, None, alarms)
 
 
 def test_runs_that_failed_beyond_their_noise_are_named() -> None:

@@ -99,6 +99,11 @@ def test_a_run_at_constant_speed_tells_no_clock() -> None:
         (172_800.0, ("wrong_day", "2 days")),
         (5_097_600.0, ("wrong_day", "59 days")),
         (619_315_200.0, ("gps_week", "1024 weeks")),
+        (-619_315_199.4, ("gps_week", "1024 weeks")),
+        # In March 2025 GPS is 18 s ahead of UTC, 1024 weeks before 13 s.
+        (619_315_195.3, ("gps_week", "1024 weeks and -5 s")),
+        (619_315_182.0, ("gps_week", "1024 weeks and -18 s")),
+        (-619_315_218.0, ("gps_week", "1024 weeks and +18 s")),
     ],
 )
 def test_causes_of_lags(lag_s: float, cause: tuple[str, ...]) -> None:

@@ -56,7 +56,7 @@ def rows() -> Watched:
 def returns() -> Returns:
     """Sigma 1 m, no scale error."""
     zero = np.zeros(ROWS)
-    return Returns(zero, zero + 1.0, zero, zero, zero.astype(np.int64), 0.0)
+    return Returns(zero, zero + 1.0, zero, zero, 0.0)
 
 
 def largest(
@@ -119,7 +119,7 @@ def test_a_start_of_mission_forgets_what_was_validated() -> None:
 
 
 def test_a_lost_distance_ends_the_bound() -> None:
-    lost = replace(returns(), counter=(np.arange(ROWS) >= 300).astype(np.int64))
+    lost = replace(returns(), doubt_m=1e6 * (np.arange(ROWS) >= 300))
     found = largest(lost)
     assert np.isfinite(found[FIRST + 1 : 300]).all()
     assert np.isnan(found[300:]).all()

@@ -1,0 +1,83 @@
+"""Worlds whose witnesses are crooked, against their truth: danger called health, and what healthy worlds are called.
+
+`python -m benchmarks.witnesses [SEEDS] [FAMILY...]` prints per family: worlds with danger (those in which a clock was
+assumed, and said to be, apart), verdicts, and worlds in which less evidence made something `right` or `safe`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks.results import Figure
+from pipeline.one_run import replay
+from schemas.run import RunTables
+from tests.replay.crooked import FAMILIES, WEAKER, World, danger_of, reasons_of, verdict_of, world_of
+from tests.replay.weaker import better_by_less
+
+SEEDS = 4
+
+
+@dataclass
+class Tally:
+    """What became of the worlds of one family: a line for each that is not as it should be."""
+
+    dangers: list[str] = field(default_factory=list)
+    assumed: list[str] = field(default_factory=list)
+    better: list[str] = field(default_factory=list)
+    verdicts: Counter[str] = field(default_factory=Counter)
+
+
+def tallied(family: str, seeds: int) -> Tally:
+    """The worlds of a family, each replayed whole and with each loss of evidence."""
+    tally = Tally()
+    for seed in range(seeds):
+        world = world_of(family, seed)
+        whole = _replayed(world)
+        tally.verdicts[verdict_of(whole)] += 1
+        danger = danger_of(world, whole)
+        if danger.any:
+            line = f"{seed}: {danger} {verdict_of(whole)} {reasons_of(whole)}"
+            (tally.assumed if "clock_assumed" in reasons_of(whole) else tally.dangers).append(line)
+        for name, weaken in WEAKER.items():
+            weaker = weaken(world_of(family, seed))
+            gained = better_by_less(whole, _replayed(weaker), weaker.read_ns)
+            tally.better += [f"{seed} {name}: {text}" for text in gained]
+    return tally
+
+
+def measure(out: Path | None = None, seeds: int = SEEDS) -> list[Figure]:
+    """Over all families; `out` is not needed."""
+    tallies = {family: tallied(family, seeds) for family in FAMILIES}
+    worlds = seeds * len(FAMILIES)
+    return [
+        Figure("worlds with danger called health", sum(len(tally.dangers) for tally in tallies.values()), "worlds", 0),
+        Figure("gained by less evidence", sum(len(tally.better) for tally in tallies.values()), "replays", 0),
+        Figure("honest worlds called unproven", tallies["honest"].verdicts["unproven"] / seeds, "1"),
+        Figure("worlds", worlds, "worlds"),
+    ]
+
+
+def main() -> int:
+    """Print a line per family; exit status 1 where danger was called health."""
+    given = sys.argv[1:]
+    seeds = int(given[0]) if given else SEEDS
+    worst = 0
+    for family in given[1:] or list(FAMILIES):
+        tally = tallied(family, seeds)
+        counts = f"{len(tally.dangers)} of {seeds} dangerous, {len(tally.assumed)} by an assumed clock"
+        print(f"{family}: {counts}; {dict(tally.verdicts)}; {len(tally.better)} better by less", flush=True)
+        for line in tally.dangers + tally.assumed + tally.better:
+            print("   ", line, flush=True)
+        worst += len(tally.dangers)
+    return int(worst > 0)
+
+
+def _replayed(world: World) -> RunTables:
+    return replay(world.run(), world.site(), world.vehicle, world.config())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,147 @@
+"""Counters that begin anew when their digits or bits are used up: found, and counted on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+
+from schemas.arrays import Bools, Floats, Ints
+
+# Bits and decimal digits of counters; tachographs and wheel sensors count in these.
+_SIZES = (*(2**bits for bits in (8, 10, 12, 14, 15, 16, 20, 24, 31, 32)), *(10**digits for digits in range(3, 10)))
+# What one count may be in the unit of a recorded value that is no whole number.
+_COUNTS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
+# So many of these are tried, the largest that fit.
+_TRIED = 3
+# Numerics: written values are whole counts to so much of one.
+_WHOLE = 1e-6
+# The step over the end is no longer than this share of the size, or it could as well be a reset.
+_SURE_SHARE = 0.01
+# A fall by less than this share of the size is a reset.
+_NAMED_SHARE = 0.9
+# Steps around one that show how long it may be, and by how much longer it may be.
+_AROUND = 10
+_TIMES_LONGER = 2.0
+# A recorder that paused for so many usual steps may have set its counter meanwhile.
+_PAUSE_STEPS = 2.5
+
+
+class Wrap(NamedTuple):
+    """A counter begins anew after `size` of the recorded unit, so often; `certain`: the steps go on over its end."""
+
+    size: float
+    times: int
+    certain: bool
+
+    @property
+    def line(self) -> str:
+        """The line of the mapping that says so."""
+        return f"wrap = {self.size:.10g}"
+
+
+def wrap_of(values: Floats, t_ns: Ints | None = None) -> Wrap | None:
+    """Where a counter begins anew; None where it does not. `values`: as recorded, NaN where empty, at `t_ns`."""
+    known = np.isfinite(values)
+    recorded = values[known]
+    steps = np.diff(recorded)
+    if steps.size < _AROUND or not np.any(np.abs(steps) > 0.5 * np.ptp(recorded)):
+        return None
+    paused = np.zeros(steps.size, dtype=np.bool_) if t_ns is None else _paused(t_ns[known])
+    found = [wrap for count in _counts_of(recorded) if (wrap := _wrap_by(count, recorded, paused)) is not None]
+    return next((wrap for wrap in found if wrap.certain), found[0] if found else None)
+
+
+def _counts_of(recorded: Floats) -> list[float]:
+    """What one count may be; whole numbers are counts themselves."""
+    fitting = [count for count in _COUNTS if _are_whole(recorded / count)]
+    return fitting[: 1 if 1.0 in fitting else _TRIED]
+
+
+def _wrap_by(count: float, recorded: Floats, paused: Bools) -> Wrap | None:
+    """As `wrap_of`, where one count is so much of the recorded unit."""
+    counts = recorded / count
+    moves = np.diff(counts)
+    usual = _usual(moves)
+    for size in _SIZES:
+        over = np.abs(moves) >= _NAMED_SHARE * size
+        in_range = np.ptp(counts) < size and counts.min() >= -size // 2
+        if not in_range or not over.any() or np.any(np.abs(moves[~over]) > 0.5 * size):
+            continue
+        rest = np.abs(np.abs(moves[over]) - size)
+        limit = _TIMES_LONGER * usual[over] + 2.0
+        if np.all(rest <= limit) and not paused[over].any():
+            return Wrap(size * count, int(over.sum()), certain=bool(np.all(limit <= _SURE_SHARE * size)))
+    return None
+
+
+def _are_whole(counts: Floats) -> bool:
+    return counts.size > 0 and bool(
+        np.all(np.abs(counts - np.round(counts)) <= _WHOLE * np.maximum(np.abs(counts), 1.0))
+    )
+
+
+def _usual(moves: Floats) -> Floats:
+    """The largest step near each, itself and those over the end left out."""
+    near = np.where(np.abs(moves) > 0.5 * np.abs(moves).max(), 0.0, np.abs(moves))
+    padded = np.pad(near, _AROUND)
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * _AROUND + 1).max(axis=1))
+
+
+def _paused(t_ns: Ints) -> Bools:
+    steps_ns = np.diff(t_ns)
+    return np.asarray(steps_ns > _PAUSE_STEPS * np.median(steps_ns))
+
+
+def counted_on(values: Floats, size: float) -> Floats:
+    """The values of a counter that begins anew after `size`, each step the shorter way round; NaN stays."""
+    known = np.flatnonzero(np.isfinite(values))
+    recorded = values[known]
+    turns = np.concatenate([[0.0], np.cumsum(-np.round(np.diff(recorded) / size))])
+    whole = values.copy()
+    whole[known] = recorded + size * turns[: known.size]
+    return whole
+
+
+class Counted(NamedTuple):
+    """A column that counts on, and what was found of each of its counters."""
+
+    column: pl.Series
+    found: list[Wrap]
+
+
+def with_whole_counts(
+    column: pl.Series, t_ns: Ints | None, declared: float | None, sensors: pl.Series | None = None
+) -> Counted:
+    """A recorded counter over its ends: as `declared` by its mapping, else where it is certain. `sensors`: by row."""
+    values = column.cast(pl.Float64).fill_null(float("nan")).to_numpy().copy()
+    found: list[Wrap] = []
+    for rows in _rows_of(sensors, values.size):
+        wrap = wrap_of(values[rows], None if t_ns is None else t_ns[rows]) if declared is None else None
+        if declared is not None or (wrap is not None and wrap.certain):
+            whole = counted_on(values[rows], declared or (wrap.size if wrap else 1.0))
+            turned = int(np.sum(np.abs(np.diff(whole - values[rows])) > 0.0))
+            found += [Wrap(declared, turned, certain=True)] if declared and turned else []
+            values[rows] = whole
+        found += [wrap] if wrap is not None else []
+    return Counted(pl.Series(column.name, values).fill_nan(None), found)
+
+
+def _rows_of(sensors: pl.Series | None, size: int) -> Iterable[Ints]:
+    if sensors is None:
+        return [np.arange(size)]
+    return [np.flatnonzero((sensors == name).to_numpy()) for name in sensors.drop_nulls().unique(maintain_order=True)]
+
+
+def said_of_wraps(found: Iterable[Wrap], column: str) -> dict[str, int]:
+    """For people: what was found of a counter, and how often."""
+    certain = "(put right; `{}` in its mapping says so)"
+    unsure = "(kept: it may have been reset; `{}` in its mapping counts on)"
+    said: Counter[str] = Counter()
+    for wrap in found:
+        what = (certain if wrap.certain else unsure).format(wrap.line)
+        said[f"step of {column} over the end of its counter {what}"] += wrap.times
+    return dict(said)
