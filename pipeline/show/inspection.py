@@ -150,13 +150,14 @@ def inspect_site(
     path: Address, result: Address | None = None, config: Configuration | None = None
 ) -> dict[str, pl.DataFrame]:
     """Figures and findings of a site; among these balises that linking cannot tell apart, and tracks that positions
-    cannot.
+    cannot. Neighbouring tracks, and what tells them apart at the survey's sigma.
 
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
     # What they need takes long to load, and a log needs none of it.
     from pipeline.read.site.alike import parallel_findings, window_findings
     from pipeline.read.site.describe import describe_site, elements_table, without_balises
+    from pipeline.read.site.neighbours import neighbours
     from pipeline.read.site.survey_findings import survey_findings
 
     config = config or Configuration()
@@ -166,6 +167,7 @@ def inspect_site(
     tables = {
         "Site": _figures(describe_site(site)),
         "Elements": elements_table(site),
+        "Neighbours": neighbours(site, config),
         "Findings": findings_table(findings),
     }
     if result is None:

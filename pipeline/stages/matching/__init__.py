@@ -5,7 +5,7 @@ Touches no file. The path may use the whole run; `gate_probability`, which feeds
 
 Which tracks are possible is the set of `paths`; what it lets a train claim: `claims`. `match` places the epochs on the
 path shown, which `path_search` finds within the set. What does each place cost: `path_states`. How does a train get
-from one to the next: `moves`. The least sum of both: `least_squares`. Which legs are that: `decode`. The path as a
+from one to the next: `paths`. The least sum of both: `least_squares`. Which legs are that: `decode`. The path as a
 file: `travelled_route`.
 """
 

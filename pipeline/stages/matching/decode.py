@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.stages.matching.least_squares import Course
-from pipeline.stages.matching.moves import Move, Moves
+from pipeline.stages.paths.moves import Move, Moves
 from pipeline.stages.track.leg import Leg, Visit, leg_of, segments_at, shifted
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints

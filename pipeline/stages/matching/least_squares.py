@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.stages.matching.moves import Moves, Place
 from pipeline.stages.matching.path_states import PathStates, unbroken
+from pipeline.stages.paths.moves import Moves, Place
 from schemas.arrays import Bools, Floats, Ints
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches
+from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches, off_stretches
 from pipeline.stages.matching.epochs import Assignment, Placed, epoch_frame
 from pipeline.stages.matching.fixes import Fixes, digit_noise, fixes_of
 from pipeline.stages.matching.path_search import find_path
@@ -26,7 +26,7 @@ from schemas.run import Site
 
 @dataclass(frozen=True)
 class Match:
-    """Epochs on the path, the path, and when it was in doubt.
+    """Epochs on the path, the path, when it was in doubt, and when the positions were `off` the network.
 
     `possible`: elements that no position refutes, in hindsight. `odometer_sign`: of the recorded odometer
     against growing path, set here and nowhere else.
@@ -35,6 +35,7 @@ class Match:
     epochs: pl.DataFrame
     path: TravelledPath
     ambiguous: pl.DataFrame
+    off: pl.DataFrame
     possible: Possible
     odometer_sign: int
 
@@ -68,7 +69,7 @@ def match(
         independent=odometry is not None and odometry.independent,
         pinned=_pins_of_positions(pinned, rows),
     )
-    found = path_set(steps, network, config.cross_bias_sigma_m, config.paths_alpha, config)
+    found = path_set(steps, network, config)
     path, assignment = find_path(arrays, odometry, found, config)
     placed = Placed.on(arrays, path, assignment)
     element = elements_of(arrays, path, assignment, placed)
@@ -85,7 +86,8 @@ def match(
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, assignment, placed, vehicle, config)
     epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg"), config.digits_least_m))
-    return Match(epochs, path, ambiguous, claimed.possible, sign)
+    off = off_stretches(claimed, epochs, config.paths_level_s)
+    return Match(epochs, path, ambiguous, off, claimed.possible, sign)
 
 
 def elements_of(fixes: Fixes, path: TravelledPath, assignment: Assignment, placed: Placed) -> Ints:

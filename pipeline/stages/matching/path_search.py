@@ -8,10 +8,10 @@ from pipeline.stages.matching.decode import Decoded, aligned, decode, legs_of, p
 from pipeline.stages.matching.epochs import Assignment
 from pipeline.stages.matching.fixes import Fixes
 from pipeline.stages.matching.least_squares import Course, least_squares
-from pipeline.stages.matching.moves import Moves, polarity
-from pipeline.stages.matching.path_states import PathStates, path_states
+from pipeline.stages.matching.path_states import path_states, polarity
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import grows_with
+from pipeline.stages.paths.moves import Moves
 from pipeline.stages.paths.path_set import PathSet
 from pipeline.stages.paths.path_steps import PathSteps
 from pipeline.stages.track.geodesy import points_of
@@ -31,8 +31,14 @@ def find_path(
         raise off_the_network(fixes, network.track, config)
     middle = _middle_rows(fixes, found.steps)
     states = path_states(found, fixes.height_m[middle], np.sqrt(fixes.cov_uu_m2[middle]), config)
-    signs = polarity(network, states, _counted_m(odometry, found.steps, states))
-    moves = Moves(network, found.steps, odometry, signs, config)
+    moves = Moves.without_odometer(network, found.steps, config)
+    if odometry is not None:
+        at_ns = found.steps.t_ns
+        counted_m = (odometry.scale or 1.0) * odometry.distance_at(at_ns)
+        since_m = np.full(states.step.size, np.nan)
+        since_m[1:] = odometry.distance_between(at_ns[states.step[:-1]], at_ns[states.step[1:]])
+        doubt_m = odometry.doubt_at_s(odometry.seconds(at_ns))
+        moves = Moves(network, found.steps, counted_m, doubt_m, polarity(network, states, since_m), config)
     course = least_squares(states, moves)
     decoded = aligned(moves, course, decode(course, moves))
     legs = legs_of(moves, course, decoded)
@@ -48,15 +54,6 @@ def _middle_rows(fixes: Fixes, steps: PathSteps) -> Ints:
     """The epoch with a position in the middle of each step."""
     rows = np.flatnonzero(fixes.valid)
     return np.asarray(rows[np.minimum(np.searchsorted(fixes.t_ns[rows], steps.t_ns), rows.size - 1)])
-
-
-def _counted_m(odometry: Odometry | None, steps: PathSteps, states: PathStates) -> Floats:
-    """Per step of the states the way by the odometer since the one before, NaN where it is not known [m]."""
-    at_ns = steps.t_ns[states.step]
-    counted_m = np.full(at_ns.size, np.nan)
-    if odometry is not None:
-        counted_m[1:] = odometry.distance_between(at_ns[:-1], at_ns[1:])
-    return counted_m
 
 
 def _assign(fixes: Fixes, steps: PathSteps, course: Course, decoded: Decoded, at_m: Floats) -> Assignment:

@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.stages.paths.candidates import Candidates, overtaken
 from pipeline.stages.paths.path_set import PathSet
 from pipeline.stages.paths.path_steps import PathSteps
+from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
@@ -108,3 +109,24 @@ def _height_costs(candidates: Candidates, height_m: Floats, sigma_up_m: Floats, 
     square = (height_m[candidates.step] - track_m) ** 2 / variance_m2
     counts = (apart_m >= config.clearance_m) & np.isfinite(square)
     return np.where(counts, np.minimum(square, config.outlier_sigmas**2), 0.0)
+
+
+def polarity(network: Network, states: PathStates, counted_m: Floats) -> Ints:
+    """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown.
+
+    `counted_m`: per step of the states the way since the step before, signed, NaN where unknown. The sign belongs to
+    the installation and holds for the whole run, but the orientation of a connected part of the network is arbitrary:
+    so one sign for each part, by the votes of all states that stay on one element for a step.
+    """
+    count = len(network.successors)
+    if not network.orientable:
+        return np.zeros(count, dtype=np.int64)
+    part = network.parts
+    step = np.repeat(np.arange(len(states.first) - 1), np.diff(states.first))
+    # Step and oriented element in one sorted number: the same element a step before is `count` less.
+    keys = step * count + states.oriented
+    before = np.minimum(np.searchsorted(keys, keys - count), len(keys) - 1)
+    stayed = np.flatnonzero((keys[before] == keys - count) & np.isfinite(counted_m[step]))
+    moved_m = states.place_m[stayed] - states.place_m[before[stayed]]
+    votes = np.sign(moved_m) * counted_m[step[stayed]]
+    return np.sign(np.bincount(part[states.oriented[stayed]], votes, part.max() + 1)).astype(np.int64)[part]

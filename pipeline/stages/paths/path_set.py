@@ -53,6 +53,11 @@ class Node:
     def element(self) -> int:
         return self.oriented // 2
 
+    @property
+    def origins(self) -> list[Node]:
+        """The hypotheses that it goes on from."""
+        return [*([] if self.parent is None else [self.parent]), *self.also]
+
     def since(self, step: int) -> list[Node]:
         """The hypotheses that it went through, itself the last, as far back as a step."""
         chain = [self]
@@ -125,7 +130,7 @@ class PathSet:
             node = waiting.pop()
             if id(node) not in lives:
                 lives[id(node)] = node
-                waiting += [*([] if node.parent is None else [node.parent]), *node.also]
+                waiting += node.origins
         return [Span(node, node.begin, min(node.end, node.rejected)) for node in lives.values()]
 
     def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
@@ -140,14 +145,14 @@ class PathSet:
         return found
 
 
-def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, config: MatchingConfig) -> PathSet:
+def path_set(steps: PathSteps, network: Network, config: MatchingConfig) -> PathSet:
     """Every path that begins near the first positions and goes on over navigable relations, until it is refuted.
 
-    `steps`: of positions (`path_steps`), of a solution or of a reference; `bias_m`: sigma of the offset across that
-    lasts the run, 0 for a reference; `alpha`: level of all tests of a path together in 600 s; `network`: with elements
-    that turn round in pieces (`network_in_pieces`), as `Node.element` counts them. Of the result `living` gives the set
-    of each step by what was known then, `to_the_end` in hindsight, both with the least p-value of each path, and
-    `elements` the same by net element. Without a position near the network the set is empty: off the survey.
+    `steps`: of positions (`path_steps`), of a solution or of a reference, whose own bias and level `config` holds;
+    `network`: with elements that turn round in pieces (`network_in_pieces`), as `Node.element` counts them. Of the
+    result `living` gives the set of each step by what was known then, `to_the_end` in hindsight, both with the least
+    p-value of each path, and `elements` the same by net element. Without a position near the network the set is empty:
+    off the survey.
     """
     search = search_about(steps.points.surface, network, config.reach_m)
     candidates = candidates_of(steps.points, network, search, config.reach_m)
@@ -157,7 +162,7 @@ def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, co
     lines = groups[candidates.element]
     others = candidates.step[lines != lines[:1]]
     alone = int(others[0]) if others.size else len(steps)
-    tests = PathTests.of_run(steps, alpha, bias_m, alone, config)
+    tests = PathTests.of_run(steps, alone, config)
     return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
 
 
@@ -188,9 +193,6 @@ class _Growth:
     config: MatchingConfig
 
     def __post_init__(self) -> None:
-        # Rows of the candidates of each net element, in order of steps.
-        self._order = np.lexsort((self.candidates.step, self.candidates.element))
-        self._first = np.searchsorted(self.candidates.element[self._order], np.arange(self.network.count + 1))
         self._gap = np.concatenate([[False], np.diff(self.steps.end_s) > self.config.paths_gap_s])
         self._queue: list[tuple[int, int, Node]] = []
         self._made: list[Node] = []
@@ -326,8 +328,7 @@ class _Growth:
         """Along its element up to where it leaves it or is refuted for long enough; returns what it goes on as."""
         candidates = self.candidates
         count = len(self.steps)
-        of_element = self._order[self._first[node.element] : self._first[node.element + 1]]
-        rows = of_element[np.searchsorted(candidates.step[of_element], node.begin) :]
+        rows = candidates.of(node.element, node.begin, count)
         step = candidates.step[rows]
         # Steps without a pause or a candidate missing among them, and inside the element.
         run = np.arange(node.begin, node.begin + rows.size) == step

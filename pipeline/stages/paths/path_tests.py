@@ -69,7 +69,7 @@ class Trail:
 
 @dataclass(frozen=True)
 class PathTests:
-    """The tests at one level; `bias_m`: sigma of b.
+    """The tests at one level, of one bias.
 
     `alone`: before this step no other track was near, only offsets are tested. `measured_m2`: per window and step the
     variance of a movement along the track so far, NaN where it is not known. `excess`: by how much that is larger than
@@ -77,8 +77,6 @@ class PathTests:
     step that ends it the first step of it, the step after the window before the last but one, and its first.
     """
 
-    alpha: float
-    bias_m: float
     alone: int
     measured_m2: Floats
     excess: Floats
@@ -88,19 +86,19 @@ class PathTests:
     config: MatchingConfig
 
     @classmethod
-    def of_run(cls, steps: PathSteps, alpha: float, bias_m: float, alone: int, config: MatchingConfig) -> PathTests:
+    def of_run(cls, steps: PathSteps, alone: int, config: MatchingConfig) -> PathTests:
         windows = np.array([_windows(steps.end_s, window_s) for window_s in WINDOWS_S])
         late, early_end, early = np.moveaxis(windows, 1, 0)
         measured_m2 = np.full(late.shape, np.nan)
         for number, window_s in enumerate(WINDOWS_S):
             if window_s <= _MEASURED_S:
                 measured_m2[number] = _measured_m2(steps, window_s)
-        return cls(alpha, bias_m, alone, measured_m2, _excess(steps, measured_m2), late, early_end, early, config)
+        return cls(alone, measured_m2, _excess(steps, measured_m2), late, early_end, early, config)
 
     def offset_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
         """How far beside its track a single step may lie [m]."""
-        limit = _size(self.alpha, LOOKED_S / self.config.paths_level_s)
-        return np.asarray(limit * np.sqrt(self.bias_m**2 + survey_m**2 + sigma_m**2))
+        limit = _size(self.config.paths_alpha, LOOKED_S / self.config.paths_level_s)
+        return np.asarray(limit * np.sqrt(self.config.cross_bias_sigma_m**2 + survey_m**2 + sigma_m**2))
 
     @property
     def longest_s(self) -> float:
@@ -125,7 +123,7 @@ class PathTests:
             tests.append((self._movements(steps, sums, trail, at) * apart, LOOKED_S / np.array(WINDOWS_S)))
             tests.append((self._lasting(steps, sums, trail, at)[None] * apart, np.array([_LASTING_LOOKS])))
         for sigmas, looks in tests:
-            refuted |= (sigmas > _sizes(self.alpha, looks)[:, None]).any(axis=0)
+            refuted |= (sigmas > _sizes(self.config.paths_alpha, looks)[:, None]).any(axis=0)
             p = min(p, float((_TESTS * looks * 2.0 * _tails(sigmas.max(axis=1, initial=0.0))).min()))
         first = np.flatnonzero(refuted)
         return Verdict(int(at[first[0]]) if first.size else 2**62, p)
@@ -155,7 +153,7 @@ class PathTests:
         survey_m2 = now_mean[1] ** 2 + then_mean[1] ** 2
         sigma_m2 = 0.5 * (now_mean[2] + then_mean[2])
         turned = trail.heading_rad[at - trail.start] - trail.heading_rad[np.minimum(early_end, at - trail.start)]
-        swung_m2 = (self.bias_m * 2.0 * np.sin(0.5 * turned)) ** 2
+        swung_m2 = (self.config.cross_bias_sigma_m * 2.0 * np.sin(0.5 * turned)) ** 2
         root_m = np.sqrt(np.maximum(survey_m2 + self._noise_m2(steps, sigma_m2, at) + swung_m2, 1e-12))
         spare_m = np.maximum(np.abs(now_mean[0] - then_mean[0]) - 2.0 * self.config.paths_alike_m, 0.0)
         return np.where(usable & np.isfinite(root_m), spare_m / root_m, 0.0)
@@ -192,7 +190,7 @@ class PathTests:
     def _in_sigmas(self, part: Floats, usable: Bools, share: Floats) -> Floats:
         """Mean residual over its sigma, 0 where steps are too few; `share`: of the position's variance."""
         mean = part[1:] / np.maximum(part[0], 1.0)
-        root_m = np.sqrt(self.bias_m**2 + mean[1] ** 2 + mean[2] * share)
+        root_m = np.sqrt(self.config.cross_bias_sigma_m**2 + mean[1] ** 2 + mean[2] * share)
         return np.where(usable & (root_m > 0.0), np.abs(mean[0]) / np.maximum(root_m, 1e-9), 0.0)
 
 

@@ -8,8 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.stages.matching.moves import polarity
-from pipeline.stages.matching.path_states import PathStates
+from pipeline.stages.matching.path_states import PathStates, polarity
 
 
 def signs_of(place_m: list[list[float]], odometer_m: list[float], orientable: bool = True) -> list[int]:

@@ -10,8 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.stages.matching.path_states import PathStates
-from pipeline.stages.odometry import Odometry
 from pipeline.stages.paths.path_steps import PathSteps
 from pipeline.stages.track.network import Network
 from schemas.arrays import Floats, Ints
@@ -49,21 +47,32 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Moves:
-    """`polarity`: sign of the odometer against each oriented element, 0 where unknown."""
+    """`counted_m`: signed distance at each step by an odometer, NaN where unknown; `doubt_m`: running sum of its doubt.
+
+    Ways compare where nothing of the distance came into doubt between.
+    `polarity`: its sign against each oriented element, 0 where unknown.
+    """
 
     network: Network
     steps: PathSteps
-    odometry: Odometry | None
+    counted_m: Floats
+    doubt_m: Floats
     polarity: Ints
     config: MatchingConfig
+
+    @classmethod
+    def without_odometer(cls, network: Network, steps: PathSteps, config: MatchingConfig) -> Moves:
+        count = len(steps)
+        unknown = np.zeros(len(network.successors), dtype=np.int64)
+        return cls(network, steps, np.full(count, np.nan), np.zeros(count), unknown, config)
 
     def way(self, earlier: int, later: int) -> Way:
         """By the odometer where it knows it, else straight on."""
         places = self.steps.points.surface
         chord_m = float(np.linalg.norm(places[later] - places[earlier]))
         counted_m = float("nan")
-        if self._doubt_m[later] == self._doubt_m[earlier]:
-            counted_m = self._counted_m[later] - self._counted_m[earlier]
+        if self._doubts_m[later] == self._doubts_m[earlier]:
+            counted_m = self._at_m[later] - self._at_m[earlier]
         measured = bool(np.isfinite(counted_m))
         distance_m = counted_m if measured else chord_m
         limit_m = (1.0 + self.config.detour_share) * max(chord_m, abs(distance_m)) + self.config.detour_m
@@ -133,35 +142,9 @@ class Moves:
         return min((apart_m / root_m) ** 2, self.config.outlier_sigmas**2)
 
     @cached_property
-    def _counted_m(self) -> list[float]:
-        if self.odometry is None:
-            return [float("nan")] * len(self.steps)
-        return [float(value) for value in (self.odometry.scale or 1.0) * self.odometry.distance_at(self.steps.t_ns)]
+    def _at_m(self) -> list[float]:
+        return [float(value) for value in self.counted_m]
 
     @cached_property
-    def _doubt_m(self) -> list[float]:
-        """Ways compare where nothing of the distance came into doubt between."""
-        if self.odometry is None:
-            return [0.0] * len(self.steps)
-        return [float(value) for value in self.odometry.doubt_at_s(self.odometry.seconds(self.steps.t_ns))]
-
-
-def polarity(network: Network, states: PathStates, counted_m: Floats) -> Ints:
-    """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown.
-
-    `counted_m`: per step of the states the way since the step before, signed, NaN where unknown. The sign belongs to
-    the installation and holds for the whole run, but the orientation of a connected part of the network is arbitrary:
-    so one sign for each part, by the votes of all states that stay on one element for a step.
-    """
-    count = len(network.successors)
-    if not network.orientable:
-        return np.zeros(count, dtype=np.int64)
-    part = network.parts
-    step = np.repeat(np.arange(len(states.first) - 1), np.diff(states.first))
-    # Step and oriented element in one sorted number: the same element a step before is `count` less.
-    keys = step * count + states.oriented
-    before = np.minimum(np.searchsorted(keys, keys - count), len(keys) - 1)
-    stayed = np.flatnonzero((keys[before] == keys - count) & np.isfinite(counted_m[step]))
-    moved_m = states.place_m[stayed] - states.place_m[before[stayed]]
-    votes = np.sign(moved_m) * counted_m[step[stayed]]
-    return np.sign(np.bincount(part[states.oriented[stayed]], votes, part.max() + 1)).astype(np.int64)[part]
+    def _doubts_m(self) -> list[float]:
+        return [float(value) for value in self.doubt_m]
