@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -100,9 +101,13 @@ class CountedRows:
 
     def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
         """Way between instants [m]; NaN outside the recording and over a step in doubt."""
-        ends = [np.interp(at_s, self.t_s, self.distance_m) for at_s in (begin_s, end_s)]
-        doubts = [np.interp(at_s, self.t_s, self.doubtful, np.nan, np.nan) for at_s in (begin_s, end_s)]
-        return np.where(doubts[0] == doubts[1], ends[1] - ends[0], np.nan)
+        way_m = self._at(end_s, self.distance_m) - self._at(begin_s, self.distance_m)
+        if self.doubtful[-1] == self.doubtful[0]:
+            return way_m
+        return np.where(self._at(begin_s, self.doubtful) == self._at(end_s, self.doubtful), way_m, np.nan)
+
+    def _at(self, at_s: Floats, values: Floats) -> Floats:
+        return np.interp(at_s, self.t_s, values, np.nan, np.nan)
 
     @cached_property
     def _half_s(self) -> float:
@@ -148,6 +153,14 @@ class CountedRows:
     def driven(self) -> CountedRows:
         """Way driven, to and fro."""
         return replace(self, distance_m=np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.distance_m)))]))
+
+
+_Figure = TypeVar("_Figure", float, Floats)
+
+
+def slopes(way_m: _Figure, speed_mps: _Figure, scale: float = 1.0) -> tuple[_Figure, _Figure]:
+    """By how much the way of the other changes with scale and with lag; with scale * lag at a `scale` of 1."""
+    return way_m, -scale * speed_mps
 
 
 def spans_of_rows(t_s: Floats) -> tuple[Ints, Ints]:
@@ -270,8 +283,8 @@ class _Ways:
         begin_s, end_s = self.begin_s - lag_s, self.end_s - lag_s
         counted = self.counter.gained(begin_s, end_s)
         (first, first_beside), (last, last_beside) = self.counter.speeds(begin_s), self.counter.speeds(end_s)
-        design = np.column_stack([counted, first - last])
-        beside = np.column_stack([counted, first_beside - last_beside])
+        design = np.column_stack(slopes(counted, last - first))
+        beside = np.column_stack(slopes(counted, last_beside - first_beside))
         known = np.asarray(np.isfinite(np.column_stack([design, beside])).all(axis=1))
         # Where both stand there is nothing to learn, nor of the noise.
         moving: Bools = known & (np.abs(counted) > 0.0)
