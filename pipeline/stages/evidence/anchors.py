@@ -691,7 +691,7 @@ def shown_on_its_track(stretch: ReferenceStretch, config: Configuration) -> Bool
 
 def median_about(values: Floats, way_m: Floats, window_m: float) -> Floats:
     """Median over `window_m` of the way about each sample, taken every quarter of it; over 5 samples at least."""
-    if values.size == 0:
+    if not np.any(values != values[:1]):
         return values
     places_m = np.arange(way_m[0], way_m[-1] + 0.25 * window_m, 0.25 * window_m)
     first = np.searchsorted(way_m, places_m - 0.5 * window_m)
@@ -699,9 +699,16 @@ def median_about(values: Floats, way_m: Floats, window_m: float) -> Floats:
     short = np.maximum(_FEWEST_IN_WINDOW - (last - first), 0)
     first = np.maximum(first - short, 0)
     last = np.minimum(last + short, values.size)
-    medians = [float(np.median(values[low:high])) for low, high in zip(first.tolist(), last.tolist(), strict=True)]
+    medians = [_median(values[low:high]) for low, high in zip(first.tolist(), last.tolist(), strict=True)]
     nearest = np.rint((way_m - way_m[0]) / (0.25 * window_m)).astype(np.int64).clip(0, places_m.size - 1)
     return np.asarray(np.array(medians)[nearest])
+
+
+def _median(values: Floats) -> float:
+    """As `np.median` of finite values, ten times faster for as few as lie in a window."""
+    half = values.size // 2
+    ordered = np.partition(values, (half - 1, half) if values.size > 1 else half)
+    return ordered.item(half) if values.size % 2 else 0.5 * (ordered.item(half - 1) + ordered.item(half))
 
 
 def read_anchors(
