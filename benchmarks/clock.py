@@ -141,7 +141,7 @@ def counted(
 
 
 def noise(rng: np.random.Generator, t_s: np.ndarray) -> np.ndarray:
-    """White, correlated over 20 to 100 s, and now and then a step [m]."""
+    """White, correlated over 20 to 100 s, and now and then a step, or a drift of up to 2 m/s [m]."""
     from scipy.signal import lfilter  # takes long to load
 
     keep = float(np.exp(-float(np.median(np.diff(t_s))) / float(rng.uniform(20.0, 100.0))))
@@ -149,8 +149,13 @@ def noise(rng: np.random.Generator, t_s: np.ndarray) -> np.ndarray:
     shocks[1:] *= np.sqrt(1.0 - keep**2)
     slow = float(np.exp(rng.uniform(np.log(0.02), np.log(4.0)))) * lfilter([1.0], [1.0, -keep], shocks)
     white = float(np.exp(rng.uniform(np.log(0.003), np.log(1.0)))) * rng.normal(size=t_s.size)
-    step = float(rng.uniform(-32.0, 32.0)) * (t_s > float(rng.uniform(t_s[0], t_s[-1]))) if rng.random() < 0.1 else 0.0
-    return np.asarray(slow + white + step)
+    begun_s, fault = float(rng.uniform(t_s[0], t_s[-1])), rng.random()
+    if fault < 0.1:
+        return np.asarray(slow + white + float(rng.uniform(-32.0, 32.0)) * (t_s > begun_s))
+    if fault < 0.2:
+        most_m, rate_mps = float(rng.uniform(-80.0, 80.0)), float(rng.uniform(0.15, 2.0))
+        return np.asarray(slow + white + most_m * np.clip((t_s - begun_s) * rate_mps / abs(most_m), 0.0, 1.0))
+    return np.asarray(slow + white)
 
 
 def estimate(drawn: Drawn) -> ScaleLag:

@@ -174,7 +174,7 @@ def speeds(with_shapely: bool) -> list[Figure]:
 
 
 def whole_s(site: Site, fixes: pl.DataFrame, odometer: pl.DataFrame) -> float:
-    """Path, posterior, projection and all columns."""
+    """Path, claims, projection and all columns."""
     return best_of(
         3,
         lambda: match(

@@ -8,12 +8,13 @@ nothing here uses the program's geometry. A claim is right or wrong where tracks
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import polars as pl
+from scipy.signal import lfilter
 
 from benchmarks.calibration import degrees, fixes_at, noise, odometer_at
 from benchmarks.results import Figure
@@ -34,6 +35,8 @@ from benchmarks.topologies import (
 )
 from pipeline.stages.matching import match
 from pipeline.stages.odometry import odometry_of
+from pipeline.stages.reference import ReferencePath, reference_stretches
+from pipeline.stages.track.network import network_in_pieces, site_network
 from schemas.arrays import floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.conform import conform
@@ -203,6 +206,67 @@ def outcome(family: str, seed: int) -> Outcome:
     return Outcome(seconds[0], seconds[1], seconds[2], seconds[3], count / rate_hz)
 
 
+@dataclass(frozen=True)
+class Known:
+    """Of a reference the share of samples with a set, with one element in it, and without the truth."""
+
+    heard: float
+    resolved: float
+    lost: float
+
+
+def known_by_reference(family: str, seed: int) -> Known:
+    """One world by chance, and a reference that states its sigma, 0.05 to 0.5 m, correlated over 10 to 60 s."""
+    rng = np.random.default_rng([seed, list(FAMILIES).index(family), 1])
+    world = FAMILIES[family](rng)
+    survey_m = float(rng.choice([0.1, 0.3, 0.5, 1.0]))
+    truth = drive(world, rng, 1.0)
+    sigma_m = float(rng.choice([0.05, 0.2, 0.5]))
+    keep = np.exp(-1.0 / rng.uniform(10.0, 60.0))
+    shocks = rng.normal(size=(len(truth.t_s), 2)) * sigma_m * np.sqrt(1.0 - keep**2)
+    shocks[0] = rng.normal(size=2) * sigma_m
+    error_m = lfilter([1.0], [1.0, -keep], shocks, axis=0)
+    latitude, longitude = degrees(*(truth.place[:, :2] + error_m).T)
+    t = pl.Series("t", np.round(truth.t_s * 1e9).astype(np.int64)).cast(pl.Datetime("ns", "UTC"))
+    place = site_of(world, survey_m, str(rng.choice(["exact", "track", "element"])), rng)
+    network = site_network(place)
+    columns = {"t": t, "latitude_deg": latitude, "longitude_deg": longitude, "sigma_m": sigma_m}
+    found, _ = reference_stretches(
+        pl.DataFrame(columns), network_in_pieces(place), network.track.index, Configuration()
+    )
+    heard = resolved = lost = 0
+    for stretch in found:
+        rows = np.searchsorted(t.to_physical().to_numpy(), stretch.t_ns)
+        named = [[names_at(path, sample, network.track.ids) for path in stretch.paths] for sample in range(rows.size)]
+        for row, names in zip(rows.tolist(), named, strict=True):
+            heard += 1
+            resolved += len(set(names)) == 1
+            near = (apart_m(world, name, truth.place[row]) <= ONE_TRACK_M for name in set(names))
+            lost += truth.element[row] not in names and not any(near)
+    count = len(truth.t_s)
+    return Known(heard / count, resolved / count, lost / count)
+
+
+def names_at(path: ReferencePath, sample: int, ids: Sequence[str]) -> str:
+    """The net element of a way at a sample."""
+    route = path.legs[int(path.leg[sample])]
+    return ids[int(route.locate(path.at_m[[sample]])[0][0])]
+
+
+def figures_of_references(runs: int, seed: int, families: list[str]) -> list[Figure]:
+    """Per family: references that lost their track, at most one in a hundred; shares of time known and resolved."""
+    out = []
+    for name in families:
+        found = [known_by_reference(name, seed * 100_000 + number) for number in range(runs)]
+        lost = float(sum(one.lost > 0.0 for one in found))
+        out += [
+            Figure(f"{name}, reference: runs of {runs} whose track is not in the set", lost, "", 0.01 * runs),
+            Figure(f"{name}, reference: share of time with a set", float(np.mean([one.heard for one in found])), ""),
+            Figure(f"{name}, reference: share with one element", float(np.mean([one.resolved for one in found])), ""),
+        ]
+    return out
+
+
 def figures(runs: int, seed: int, families: list[str]) -> list[Figure]:
     """Per family: runs with claims and wrong ones of 5 s or more, at most one in a hundred; share of time claimed."""
     out = []
@@ -223,7 +287,7 @@ def figures(runs: int, seed: int, families: list[str]) -> list[Figure]:
 
 def measure(out: Path) -> list[Figure]:
     """All figures over 300 runs of each; nothing is written."""
-    return figures(300, 1, list(FAMILIES))
+    return figures(300, 1, list(FAMILIES)) + figures_of_references(300, 1, list(FAMILIES))
 
 
 def main() -> None:
@@ -231,8 +295,10 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--family", choices=FAMILIES, action="append", help="these families only")
+    parser.add_argument("--reference", action="store_true", help="what a reference says of its track")
     options = parser.parse_args()
-    for figure in figures(options.runs, options.seed, options.family or list(FAMILIES)):
+    made = figures_of_references if options.reference else figures
+    for figure in made(options.runs, options.seed, options.family or list(FAMILIES)):
         print(f"{figure.name:<60} {figure.value:8.3f}", flush=True)
 
 

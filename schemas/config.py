@@ -174,109 +174,58 @@ class FixSigma(Settings):
 
 
 class MatchingConfig(Settings):
-    """Map matching (DOMAIN section 2; Newson & Krumm 2009)."""
+    """Which paths positions do not reject, and which of them is shown (DOMAIN section 2)."""
 
     # Farther than any sigma that can still tell tracks apart; DOMAIN section 2.
     reach_m: Positive = 50.0
-    # Positions off every track are compared with tracks within so many times the reach: one that drifts away slowly
-    # still shows by its movement which way the train turned.
-    far_reach_factor: Annotated[Number, Field(ge=1)] = 3.0
     # A position is on the track within so many standard deviations of position, survey and bias together.
     on_track_sigmas: Positive = 3.0
     # The bias in that. Not `cross_bias_sigma_m`: an exact reference 0.3 m off the axis is on the track.
     on_track_bias_m: NonNegative = 1.5
     # DIAG, error models: track survey 1 m.
     survey_sigma_default_m: Positive = 1.0
-    # DOMAIN section 2: the distance of two tracks tells nothing by changing within so many sigmas of its mean, which is
-    # that over so much of the way.
-    survey_sigmas: Positive = 3.0
-    survey_mean_m: Positive = 3000.0
     # Of one run, the same on every element: antenna beside the middle of the vehicle, datum (DOMAIN section 2).
     cross_bias_sigma_m: Positive = 1.5
-    # Part of the variance that outlasts minutes: ionosphere, troposphere, orbit and clock (DIAG Table 1 at 45°).
-    slow_share: Annotated[Number, Field(ge=0, lt=1)] = 0.247
-    # The truth may be so many times the stated sigma: of a receiver's own, and of a table's by kind of fix.
-    sigma_doubt: Annotated[Number, Field(ge=1)] = 2.0
-    table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
     # Level of the nine tests of a path together, in 600 s: measured, the true path is rejected in 1 % or less.
     paths_alpha: Probability = 0.05
     # So long the test of a position waits for those after it, which say whether it is an outlier.
     paths_delay_s: NonNegative = 3.0
-    # An empty set begins anew within the first minute: the first positions of a receiver settle.
+    # By so much the variance of a movement, measured along the track, may be too small: it is one of few windows.
+    paths_measured_factor: Annotated[Number, Field(ge=1)] = 1.5
+    # An empty set begins anew within the first minute: the first positions of a receiver settle. As long before the end
+    # of a stretch that ends off the network, refuted paths are alike.
     paths_anew_s: NonNegative = 60.0
-    # Later it begins anew where the mean over so long lies beside the track as it did before, within so many sigmas.
+    # A mean over so long is an offset. Later a set begins anew where such a mean lies beside the track as before,
+    # within so many sigmas.
     paths_level_s: Positive = 8.0
     paths_back_sigmas: Positive = 1.0
     # Two paths to one element with residuals as near each other as this cannot be told apart.
     paths_alike_m: NonNegative = 0.1
-    # Past an open end a path goes on within so many sigmas and 10 m.
-    paths_open_sigmas: Positive = 3.0
-    # Of a place near a branch nobody knows on which side it is, within so many sigmas along the track.
-    paths_border_sigmas: NonNegative = 3.0
-    # More hypotheses than any run had (14 in the prototype's): beyond them nothing is claimed.
+    # A place is known within so many sigmas along the track: near a branch nobody knows on which side of it the train
+    # is, and past an open end a path goes on for as much, and for this much more. So far before an element may begin.
+    paths_along_sigmas: NonNegative = 3.0
+    paths_end_m: NonNegative = 10.0
+    # Over a longer step the train may have taken any way of at most this share and margin more than the distance. Of
+    # several the one is shown that agrees with it best; the margin is ten sigmas of that: 5 m and 2 % of an odometer.
+    paths_gap_s: Positive = 3.5
+    detour_share: NonNegative = 0.2
+    detour_m: Positive = 50.0
+    # More hypotheses than began in 600 s of any run (200 beside a double track): beyond them nothing is claimed.
     paths_limit: Annotated[int, Field(strict=True, gt=0)] = 5000
-    # Where tracks part or cross they are beside each other for less: that is told of no site.
-    parallel_least_m: NonNegative = 100.0
-    # Noise of 0.35 m/s across the track at the slowest speed that counts.
-    heading_sigma_deg: Positive = 10.0
-    # At lower speed the heading is mostly noise of the velocity.
-    heading_min_speed_mps: Positive = 2.0
+    # Reflections follow no error model: a position counts as one of so many sigmas at most, or one decides the track.
+    outlier_sigmas: Positive = 4.0
+    # The path shown goes over to a track that no relation leads to, or against navigability, only where positions off
+    # it would last longer than this: receivers that are lost show another track for seconds.
+    break_s: Positive = 30.0
     # Heights tell tracks apart that lie over each other by so much: a train needs a clearance of 4.5 m and more.
     # The bias is that of datum and antenna: one that the vehicle file does not know stands some 4 m over the rail.
     clearance_m: Positive = 3.0
     height_bias_sigma_m: Positive = 2.0
-    # So much at most: no single direction or height decides (3,000 to 1).
-    direct_limit: Positive = 8.0
-    # Newson & Krumm 2009, eq. 2, for ways by odometer, whose scale is wrong by some percent.
-    transition_scale_m: Positive = 5.0
-    transition_share: NonNegative = 0.01
-    # Limited, since a position that jumps along the track must not lead the path over a detour.
-    mismatch_limit: Positive = 12.0
-    # Log-probability that each relation costs which is passed against its navigability.
-    barred_cost: NonNegative = 20.0
     # DOMAIN section 2: the noise of a standing train is no turn; the first 20 m of net movement orient the path.
     deadband_mps: Positive = 0.3
     orientation_distance_m: Positive = 20.0
-    # The rest of a position's error: DIAG Table 1, user.
-    noise_tau_s: Positive = 100.0
-    # A position carried on without satellites drifts aside by this share of the way (a heading wrong by 6 degrees).
-    estimated_drift: NonNegative = 0.1
-    # Reflections follow no error model: one of them must not decide the track.
-    outlier_sigmas: Positive = 4.0
-    outlier_scale_m: Positive = 10.0
-    # Positions closer together give the same information on the path.
-    step_distance_m: Positive = 10.0
-    step_time_s: Positive = 10.0
-    # Over a longer step the train may have passed a whole element unseen, and come to another of the same candidates.
-    long_step_m: NonNegative = 60.0
-    # Ways between two steps are looked for up to this share and margin longer than the distance: longer ones are worse
-    # than a break, and the search grows with them.
-    detour_share: NonNegative = 0.5
-    detour_m: Positive = 100.0
     # Coordinates written down in finer steps add nothing: those drown in the noise of any receiver.
     digits_least_m: NonNegative = 0.02
-    # Rounding of surveys and positions; a table's sigma knows nothing of this receiver's noise.
-    offset_floor_m: Positive = 0.02
-    table_floor_m: Positive = 0.1
-    # Off an element by what no error explains costs by the time, or a run elsewhere for a minute, which is paid for
-    # twice, would be put on a track far aside.
-    off_track_s: Positive = 8.0
-    # An impossible jump is not used to find the track; after half a minute the odometer may be the wrong one.
-    jump_hold_s: Positive = 30.0
-    # Farther than the odometer (or without one speed and its change; no train brakes or turns by 5 m/s²) by this share,
-    # so many standard deviations and this margin.
-    jump_odometer_share: NonNegative = 0.05
-    jump_sigmas: Positive = 5.0
-    jump_margin_m: NonNegative = 10.0
-    jump_speed_mps: Positive = 100.0
-    jump_acceleration_mps2: Positive = 5.0
-    # That velocity is told by positions at least and at most so far apart: over less it is mostly noise, over more a
-    # train has changed it.
-    jump_speed_least_s: Positive = 1.0
-    jump_speed_most_s: Positive = 5.0
-    # For so long before and after a jump the train may be on a track as far aside as that, and as it was long.
-    jump_aside_s: NonNegative = 120.0
-    jump_aside_m: NonNegative = 500.0
 
 
 class AlignConfig(Settings):
@@ -303,8 +252,8 @@ class AlignConfig(Settings):
     # Over a reset between two rows the speed about it counts where braking x dt^2 / 4 is no more than this, as at 1 Hz:
     # a tenth of the odometer's fixed error.
     reset_doubt_m: NonNegative = 0.5
-    # Speeds give the distance over such a jump if, over the whole run, they differ from it by a smaller share:
-    # another unit or sign differs by more than a half, slip and scale by some percent.
+    # Speeds give the distance over such a jump if, so far, they differed from it by a smaller share: another unit or
+    # sign differs by more than a half, slip and scale by some percent. Once they agree, more contradicts it.
     speed_agreement: Probability = 0.2
     # Between rows no farther apart a straight line is within 0.5 m of a train that brakes as hard as this, which
     # is an emergency brake.
@@ -505,6 +454,8 @@ class HazardConfig(Settings):
     # Half-width of evidence in its sigmas, and the sigma of a reference that states none (DOMAIN section 5.1).
     evidence_factor: Positive = 3.0
     reference_sigma_m: Positive = 1.0
+    # Level of the tests of a path against the reference, in 600 s: a true track that is lost makes a false `wrong`.
+    reference_alpha: Probability = 0.001
     # Of a survey that states no sigma (DOMAIN section 5.1).
     survey_sigma_m: Positive = 1.0
     # A lag between recorders that is known less closely counts as not measured (DOMAIN section 5.1): 2 m for a tram.
@@ -632,6 +583,8 @@ class SiteConfig(Settings):
     beyond_area_deg: Positive = 3.0
     # Balises are announced from so far back: more than twice their longest spacing (DOMAIN section 4).
     announced_m: Positive = 6000.0
+    # Where tracks part or cross they are beside each other for less: that is told of no site.
+    parallel_least_m: NonNegative = 100.0
 
 
 class SurveyConfig(Settings):

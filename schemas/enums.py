@@ -259,6 +259,7 @@ class Note(StrEnum):
     ODOMETER_REVERSED = "odometer_reversed"
     COVARIANCE = "covariance"
     AMBIGUOUS = "ambiguous"
+    OFF_NETWORK = "off_network"
     UNLINKED = "unlinked"
     UNKNOWN_TELEGRAMS = "unknown_telegrams"
     READS_DISPUTED = "reads_disputed"

@@ -186,7 +186,7 @@ class _EpochsBeforeMonitors(dy.Schema):
     cross_track_m = real("m", "position left of growing path")
     vertical_m = real("m", "position above the track")
     on_track = flag("a net element of the path is within reach")
-    path_probability = real("1", "posterior probability of the path (forward-backward)", min=0, max=1)
+    path_probability = real("1", "confidence in the track by the whole run; null off the network", min=0, max=1)
     odometer_m = real("m", "odometer distance along growing path, scale corrected, 0 at the first epoch")
     speed_mps = real("m/s", "speed along growing path by the odometer, by GNSS where there is none or it is frozen")
     sigma_along_m = real("m", "standard deviation of the position along the track", min=0)
@@ -228,7 +228,7 @@ class _EpochsAfterMonitors(dy.Schema):
         description="direction of travel along growing path: 1 or -1; without an odometer that of the evidence",
         metadata={"unit": "1"},
     )
-    gate_probability = real("1", "causal probability of the path, used for detection", min=0, max=1)
+    gate_probability = real("1", "the same by what was known then, which detection uses", min=0, max=1)
     odometer_scale = real("1", "scale in use at this epoch (true over odometer distance)")
     latency_s = real("s", "GNSS latency in use at this epoch")
     hpl_m = real("m", "horizontal protection level of the receiver", min=0)

@@ -150,28 +150,30 @@ def inspect_site(
     path: Address, result: Address | None = None, config: Configuration | None = None
 ) -> dict[str, pl.DataFrame]:
     """Figures and findings of a site; among these balises that linking cannot tell apart, and tracks that positions
-    cannot.
+    cannot. Neighbouring tracks, and what tells them apart at the survey's sigma.
 
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
     # What they need takes long to load, and a log needs none of it.
     from pipeline.read.site.alike import parallel_findings, window_findings
     from pipeline.read.site.describe import describe_site, elements_table, without_balises
+    from pipeline.read.site.neighbours import neighbours
     from pipeline.read.site.survey_findings import survey_findings
 
     config = config or Configuration()
     site = read_site(path, config.site)
-    alike = (*window_findings(site, config.lds, config.site), *parallel_findings(site, config.matching))
+    alike = (*window_findings(site, config.lds, config.site), *parallel_findings(site, config))
     findings = (*site.findings, *without_balises(site.balises), *alike)
     tables = {
         "Site": _figures(describe_site(site)),
         "Elements": elements_table(site),
+        "Neighbours": neighbours(site, config),
         "Findings": findings_table(findings),
     }
     if result is None:
         return tables
     epochs = (store.read_table(result, "epochs", run).collect() for run in store.complete_runs(result))
-    return {**tables, "Survey": survey_findings(epochs, site.track, config.matching)}
+    return {**tables, "Survey": survey_findings(epochs, site.track, config)}
 
 
 def inspect_result(path: Address) -> dict[str, pl.DataFrame]:

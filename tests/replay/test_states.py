@@ -1,4 +1,4 @@
-"""States of the LDS through the whole replay: P2 negated, P3 diagnosis faulty, P1 wrong, P0, the first that applies."""
+"""States of the LDS through the whole replay, the first that applies: P1 wrong in use, P2 negated, P3 faulty, P0."""
 
 from __future__ import annotations
 

@@ -12,11 +12,11 @@ from pipeline.make.receivers.convert import UnknownError
 from pipeline.make.survey.geojson_lines import read_geojson
 from pipeline.make.survey.map_files import MAP_SUFFIXES, read_map
 from pipeline.make.survey.pieces import Survey, piece_of, refuse_large, with_own_names
+from pipeline.make.survey.reachable import reachable
 from pipeline.make.survey.tables import read_points
 from pipeline.make.survey.xml_lines import read_kmz, read_xml
 from pipeline.read.ingest.run import read_run
 from pipeline.stages.matching.fixes import fixes_of
-from pipeline.stages.matching.steps import believable, travelled
 from schemas.config import Configuration, SurveyConfig, Vehicle
 from schemas.enums import Fix
 from schemas.errors import SiteError
@@ -115,7 +115,7 @@ def _of_run(run: RunLog, path: Path, vehicle: Vehicle, config: Configuration) ->
         raise SiteError("has no position better than GNSS alone", place=str(path), expected=expected)
     survey = Survey()
     fixes = fixes_of(_as_fixes(points, config.hazards.reference_sigma_m), config.fix_sigma)
-    reached = believable(fixes, fixes.valid, travelled(fixes, None), config.matching)
+    reached = reachable(fixes)
     if (jumped := points.height - len(reached)) > 0:
         text = f"{jumped} positions to which no train can have come are left out"
         survey.report("warning", f"track: {run.run_id}", text, "Look at the recording there.")

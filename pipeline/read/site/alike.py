@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -16,12 +17,13 @@ from pipeline.stages.track.network import Network, network_of, surveyed
 from pipeline.stages.track.path import valid_along_measure
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import SurveyedTrack, places_along
-from schemas.arrays import Floats
-from schemas.config import LdsConfig, MatchingConfig, SiteConfig
+from schemas.arrays import Floats, Ints
+from schemas.config import Configuration, LdsConfig, MatchingConfig, SiteConfig
 from schemas.enums import BaliseKind
 from schemas.run import Finding, Site
 
 _DEFAULTS = SiteConfig()
+_WHOLE = Configuration()
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ class _ParallelStretch:
     apart_m: float
 
 
-def parallel_findings(site: Site, config: MatchingConfig) -> list[Finding]:
+def parallel_findings(site: Site, config: Configuration = _WHOLE) -> list[Finding]:
     """One warning per pair of elements and stretch; nothing where a route is given.
 
     The bias of the run and the survey alone decide here, as for a receiver without any noise: offsets tell tracks apart
@@ -135,21 +137,49 @@ def parallel_findings(site: Site, config: MatchingConfig) -> list[Finding]:
         return []
     network = network_of(surveyed(site), site.links)
     return [
-        _finding(site, network, stretch, config)
-        for stretch in _stretches(network, config)
-        if stretch.end_m - stretch.begin_m >= config.parallel_least_m
+        _finding(site, network, stretch, config.matching)
+        for stretch in _stretches(network, config.matching)
+        if stretch.end_m - stretch.begin_m >= config.site.parallel_least_m
     ]
 
 
-def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelStretch]:
-    """Per pair of elements the parts of the first that lie too near the second."""
-    track = network.track
-    along = places_along(track, SAMPLE_SPACING_M)
-    element = along.element
-    measure_m = along.measure_m
+class TracksTold(NamedTuple):
+    """Per net element how far aside another track has to lie to be told from it with exact positions [m]."""
+
+    survey_m: Floats
+    by_offset_m: Floats
+    by_switch_m: Floats
+
+
+def tracks_told(track: SurveyedTrack, config: MatchingConfig) -> TracksTold:
+    """By a lasting offset, and by a switch taken, at the survey's stated sigma."""
     survey_m = _survey_m(track, config)
-    by_offset_m = told_by_offset_m(survey_m, config.paths_alpha, config.cross_bias_sigma_m)
-    limit_m = np.fmax(by_offset_m, told_by_a_switch_m(survey_m, config.paths_alpha, config.paths_alike_m))
+    return TracksTold(
+        survey_m,
+        told_by_offset_m(survey_m, config.paths_alpha, config.cross_bias_sigma_m),
+        told_by_a_switch_m(survey_m, config.paths_alpha, config.paths_alike_m),
+    )
+
+
+class Beside(NamedTuple):
+    """Places along elements with another one beside them, by pair of elements and then along the first."""
+
+    pair: Ints
+    row: Ints
+    measure_m: Floats
+    apart_m: Floats
+
+    def parts(self) -> Iterator[Beside]:
+        """Stretches of one pair without a place missing."""
+        cuts = np.flatnonzero((np.diff(self.pair) != 0) | (np.diff(self.row) > 1)) + 1
+        for rows in np.split(np.arange(self.row.size), cuts) if self.row.size else ():
+            yield Beside(self.pair[rows], self.row[rows], self.measure_m[rows], self.apart_m[rows])
+
+
+def tracks_beside(network: Network, limit_m: Floats, config: MatchingConfig) -> Beside:
+    """Where another track lies nearer than the limit of an element; each pair once, as places of the first."""
+    along = places_along(network.track, SAMPLE_SPACING_M)
+    element = along.element
     points = points_of(along.latitude_deg, along.longitude_deg)
     reach_m = float(limit_m.max())
     near_track = candidates_of(points, network, search_about(points.surface, network, reach_m), reach_m)
@@ -159,18 +189,18 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelSt
     near &= near_track.distance_m < limit_m[of_sample]
     pairs = of_sample[near] * network.count + near_track.element[near]
     row = near_track.step[near]
-    apart_m = near_track.distance_m[near]
     order = np.lexsort((row, pairs))
-    pairs = pairs[order]
     row = row[order]
-    apart_m = apart_m[order]
-    cuts = np.flatnonzero((np.diff(pairs) != 0) | (np.diff(row) > 1)) + 1
-    for part in np.split(np.arange(len(row)), cuts):
-        if len(part):
-            element_a, element_b = divmod(int(pairs[part[0]]), network.count)
-            at_m = measure_m[row[part]]
-            median_m = float(np.median(apart_m[part]))
-            yield _ParallelStretch(element_a, element_b, float(at_m[0]), float(at_m[-1]), median_m)
+    return Beside(pairs[order], row, along.measure_m[row], near_track.distance_m[near][order])
+
+
+def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelStretch]:
+    """Per pair of elements the parts of the first that lie too near the second."""
+    told = tracks_told(network.track, config)
+    for part in tracks_beside(network, np.fmax(told.by_offset_m, told.by_switch_m), config).parts():
+        one, other = divmod(int(part.pair[0]), network.count)
+        ends_m = float(part.measure_m[0]), float(part.measure_m[-1])
+        yield _ParallelStretch(one, other, *ends_m, float(np.median(part.apart_m)))
 
 
 def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: MatchingConfig) -> Finding:

@@ -6,14 +6,14 @@ from collections.abc import Iterable
 
 import polars as pl
 
-from schemas.config import MatchingConfig
+from schemas.config import Configuration
 
-_DEFAULTS = MatchingConfig()
+_DEFAULTS = Configuration()
 _AXES = {"cross": ("cross_track_m", "sigma_cross_m"), "vertical": ("vertical_m", "sigma_up_m")}
 
 
 def survey_findings(
-    epochs: Iterable[pl.DataFrame], track: pl.DataFrame | None = None, config: MatchingConfig = _DEFAULTS
+    epochs: Iterable[pl.DataFrame], track: pl.DataFrame | None = None, config: Configuration = _DEFAULTS
 ) -> pl.DataFrame:
     """Residuals per net element and axis over many runs, those that do not fit their sigma marked.
 
@@ -45,7 +45,7 @@ def survey_findings(
     return (
         merged.with_columns(variance.sqrt().alias("sigma_m"))
         .with_columns((pl.col("residual_m").abs() / pl.col("sigma_m")).alias("ratio"))
-        .with_columns((pl.col("ratio") > config.on_track_sigmas).alias("inconsistent"))
+        .with_columns((pl.col("ratio") > config.matching.on_track_sigmas).alias("inconsistent"))
         .sort("ratio", "netelement_id", "axis", descending=[True, False, False])
         .select(*SURVEY_COLUMNS)
     )
@@ -63,10 +63,10 @@ SURVEY_COLUMNS: dict[str, type[pl.DataType]] = {
 }
 
 
-def _passages(epochs: pl.DataFrame, config: MatchingConfig) -> pl.DataFrame:
+def _passages(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """Median residual of one run on each element, with its variance.
 
-    A passage shorter than `noise_tau_s` is one observation, and so are several solutions: they share the sky, the
+    A passage shorter than `user_tau_s` is one observation, and so are several solutions: they share the sky, the
     antenna and mostly the ranges.
     """
     used = epochs.filter(pl.col("on_track") & pl.col("netelement_id").is_not_null())
@@ -81,7 +81,7 @@ def _passages(epochs: pl.DataFrame, config: MatchingConfig) -> pl.DataFrame:
             pl.lit(axis).alias("axis"),
             pl.len().cast(pl.Int64).alias("epochs"),
             (pl.col(residual).median() * turn).alias("residual_m"),
-            ((pl.col(sigma) ** 2).mean() / (1.0 + seconds / (2.0 * config.noise_tau_s))).alias("variance_m2"),
+            ((pl.col(sigma) ** 2).mean() / (1.0 + seconds / (2.0 * config.monitors.user_tau_s))).alias("variance_m2"),
         )
         parts.append(part)
     return (

@@ -20,8 +20,8 @@ class Journey:
 
     `refusal`: why a detection here would not count, None where it would. `direction` of travel (+1/-1 along growing
     path) as known at that epoch. `doubt_m`: in the odometer's distance, a sum; the epochs between which it stays the
-    same compare. `gap_ns`: the longest step to the epoch that a crossing is interpolated over; `blind`: no position for
-    longer.
+    same compare; `rows_m`: noise of its rows. `gap_ns`: the longest step to the epoch that a crossing is interpolated
+    over; `blind`: no position for longer.
     """
 
     def __init__(self, epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> None:
@@ -37,6 +37,7 @@ class Journey:
         self.odometer_m = floats(epochs, "odometer_m")
         self.doubt_m = floats(epochs, "odometer_doubt_m")
         self.slips = flags(epochs, "odometer_slips")
+        self.rows_m = np.nan_to_num(floats(epochs, "odometer_rows_m"))
         self.scale_sigma = scale_sigma
         self.direction = _direction(self.odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
         self.travelled_m = floats(epochs, "travelled_m")

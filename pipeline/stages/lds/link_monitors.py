@@ -19,6 +19,7 @@ from pipeline.stages.epochs.verdicts import (
 from pipeline.stages.lds.crossings import Crossing
 from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.relink import Anchor, Comparison
+from pipeline.stages.monitors.axis import most_scatter_m
 from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
@@ -38,7 +39,8 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Co
     after = offered[0].epoch
     odometer_step_m = journey.odometer_m[after] - journey.odometer_m[before]
     excess_m = abs(journey.path_m[after] - journey.path_m[before] - odometer_step_m)
-    noise_m = config.monitors.threshold_factor * sqrt(journey.sigma_m[before] ** 2 + journey.sigma_m[after] ** 2)
+    ends = [before, after]
+    noise_m = config.monitors.threshold_factor * sqrt((journey.sigma_m[ends] ** 2 + journey.rows_m[ends] ** 2).sum())
     unexplained = excess_m > noise_m + config.lds.odometer_share * abs(odometer_step_m)
     backwards = offered[0].sense != journey.direction[after]
     return len(offered) if unexplained and (len(offered) > 1 or backwards) else overdue
@@ -48,7 +50,7 @@ class LinkOrder:
     """Order of identities, step by step."""
 
     def __init__(self, journey: Journey, config: Configuration) -> None:
-        self._reason = _order_reasons(journey, "link_order" in config.monitors.disabled)
+        self._reason = _order_reasons(journey, "link_order" in config.monitors.disabled, config)
         self._evaluated: Bools = self._reason.is_null().to_numpy()
         self._value = np.zeros(journey.t_ns.size)
 
@@ -66,15 +68,15 @@ class LinkOrder:
 class LinkDistance:
     """GNSS against odometer distance since the LRVB, or since the TVB that began the chain.
 
-    Bounds: 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of both positions at k_T. After an outage and for a while
-    after a return it is the distance since the re-link anchor, within the bound of a re-link.
+    Bounds: 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of both positions and of the odometer's rows at k_T. After an
+    outage and for a while after a return it is the distance since the re-link anchor, within the bound of a re-link.
     """
 
     def __init__(self, journey: Journey, config: Configuration) -> None:
         self._journey = journey
         self._config = config.lds
         self._factor = config.monitors.threshold_factor
-        reasons = _distance_reasons(journey, "link_distance" in config.monitors.disabled)
+        reasons = _distance_reasons(journey, "link_distance" in config.monitors.disabled, config)
         self._possible: Bools = reasons.is_null().to_numpy()
         self._reason = reasons.to_numpy().astype(np.object_)  # None where it is evaluated
         self._offset_m = journey.path_m - journey.odometer_m
@@ -122,7 +124,8 @@ class LinkDistance:
         self._done = min(epoch + _BLOCK, self._fails.size)
         ahead = slice(epoch, self._done)
         way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
-        noise_m = self._factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
+        rows_m2 = self._journey.rows_m[ahead] ** 2 + self._journey.rows_m[anchor.epoch] ** 2
+        noise_m = self._factor * np.sqrt(self._journey.sigma_m[ahead] ** 2 + anchor.sigma_m**2 + rows_m2)
         threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
         lost = self._possible[ahead] & (self._journey.doubt_m[ahead] != self._journey.doubt_m[anchor.epoch])
         known = self._possible[ahead] & ~lost
@@ -157,7 +160,7 @@ class LinkDistance:
         return of_monitor("link_distance", verdicts(self._value, self._threshold, reasons))
 
 
-def _order_reasons(journey: Journey, disabled: bool) -> pl.Series:
+def _order_reasons(journey: Journey, disabled: bool, config: Configuration) -> pl.Series:
     """Per step: both its ends must be good for it."""
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
@@ -172,14 +175,22 @@ def _order_reasons(journey: Journey, disabled: bool) -> pl.Series:
         (~odometer[before], NO_ODOMETER),
         (journey.ambiguous | journey.ambiguous[before], NotEvaluated.AMBIGUOUS_OR_OFF),
         (~(sigma & sigma[before]), NO_SIGMA),
+        (_is_coarse(journey, config), NotEvaluated.NOISE_TOO_LARGE),
     )
 
 
-def _distance_reasons(journey: Journey, disabled: bool) -> pl.Series:
+def _distance_reasons(journey: Journey, disabled: bool, config: Configuration) -> pl.Series:
     return first_reason(
         (np.full(journey.t_ns.size, disabled), DISABLED),
         (~np.isfinite(journey.odometer_m), NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
         (journey.ambiguous, NotEvaluated.AMBIGUOUS_OR_OFF),
         (~np.isfinite(journey.sigma_m), NO_SIGMA),
+        (_is_coarse(journey, config), NotEvaluated.NOISE_TOO_LARGE),
     )
+
+
+def _is_coarse(journey: Journey, config: Configuration) -> Bools:
+    """Rows of the odometer scatter by as much as thresholds allow for, or more: no threshold would hold."""
+    coarse: Bools = journey.rows_m >= most_scatter_m(config)
+    return coarse

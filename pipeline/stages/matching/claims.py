@@ -32,6 +32,15 @@ AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "resolved_by": pl.Enum(RESOLVED_BY),
 }
 
+OFF_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
+    "t_start": pl.Datetime("ns", "UTC"),
+    "t_end": pl.Datetime("ns", "UTC"),
+    "netelement_id": pl.String,
+    "from_m": pl.Float64,
+    "to_m": pl.Float64,
+    "offset_m": pl.Float64,
+}
+
 
 @dataclass(frozen=True)
 class Possible:
@@ -94,7 +103,7 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
     about = np.clip(np.searchsorted(steps.end_s, t_s, side="left"), 0, count - 1)
     speed_mps = steps.way_m / np.maximum(np.diff(steps.end_s, prepend=steps.begin_s[0]), 1e-3)
     since_s = np.where(before >= 0, t_s - steps.end_s[np.maximum(before, 0)], 0.0)
-    carried_m = 1.2 * speed_mps[np.maximum(before, 0)] * since_s + config.paths_border_sigmas * np.nan_to_num(sigma_m)
+    carried_m = 1.2 * speed_mps[np.maximum(before, 0)] * since_s + config.paths_along_sigmas * np.nan_to_num(sigma_m)
     group = np.where(element >= 0, found.groups[np.maximum(element, 0)], -1)
     alone = _alone(found)
     live = _left(found, found.living(config.paths_delay_s))
@@ -132,6 +141,34 @@ def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, 
         confidences = (float(np.nan_to_num(values[part]).min()) for values in (claimed.live, claimed.hindsight))
         rows.append((*here, *confidences, ended))
     return pl.DataFrame(rows, schema=AMBIGUOUS_COLUMNS, orient="row")
+
+
+def off_stretches(claimed: Claims, epochs: pl.DataFrame, least_s: float) -> pl.DataFrame:
+    """Where the positions were on no path of the network, by what was known then; shorter ones are jumps.
+
+    Named by the element beside which most of them lay; `offset_m` left of its own sense.
+    """
+    off = np.isnan(claimed.live) & epochs["near_track"].to_numpy() & epochs["netelement_id"].is_not_null().to_numpy()
+    parts = []
+    for begin, last in spans_of(off):
+        part = epochs[begin : last + 1]
+        if (part["t"][-1] - part["t"][0]).total_seconds() < least_s:
+            continue
+        name = part["netelement_id"].mode().sort()[0]
+        beside = part.filter(pl.col("netelement_id") == name)
+        turned = pl.cov("measure_m", "path_m").sign().fill_nan(1.0).fill_null(1.0)
+        side = pl.when(turned < 0).then(-1.0).otherwise(1.0)
+        parts.append(
+            beside.select(
+                t_start=pl.lit(part["t"][0]),
+                t_end=pl.lit(part["t"][-1]),
+                netelement_id=pl.lit(name),
+                from_m=pl.col("measure_m").min(),
+                to_m=pl.col("measure_m").max(),
+                offset_m=pl.col("cross_track_m").median() * side,
+            )
+        )
+    return pl.concat(parts) if parts else pl.DataFrame(schema=OFF_COLUMNS)
 
 
 def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:

@@ -1,4 +1,4 @@
-"""From the best sequence of states to the legs of the path."""
+"""From the course of the path over oriented elements to its legs."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.stages.matching.moves import Move, best_moves
-from pipeline.stages.matching.trellis import Trellis
+from pipeline.stages.matching.least_squares import Course
+from pipeline.stages.paths.moves import Move, Moves
 from pipeline.stages.track.leg import Leg, Visit, leg_of, segments_at, shifted
 from pipeline.stages.track.network import Network
-from schemas.arrays import Floats, Ints
+from schemas.arrays import Bools, Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -58,40 +58,41 @@ class Decoded:
         return Decoded(chains, self.leg, number, np.where(inside, length - self.place_m, self.place_m))
 
 
-def decode(trellis: Trellis, best: Ints) -> Decoded:
-    """Follow the best states over the network, elements without any fix included."""
-    oriented = trellis.oriented[best]
-    place = trellis.place_m[best]
+def decode(course: Course, moves: Moves) -> Decoded:
+    """Follow the course over the network, elements without any fix included."""
+    oriented = course.oriented
     chains = [LegElements((int(oriented[0]),), 0)]
-    leg = np.zeros(len(best), dtype=np.int64)
-    number = np.zeros(len(best), dtype=np.int64)
+    leg = np.zeros(len(oriented), dtype=np.int64)
+    number = np.zeros(len(oriented), dtype=np.int64)
     at = 0
     before = 0
-    steps = np.flatnonzero(oriented[1:] != oriented[:-1]) + 1
-    places = oriented[steps - 1], place[steps - 1], oriented[steps], place[steps]
-    moves = best_moves(trellis.network, *places, trellis.ways.along(steps, places[0]), trellis.config)
-    for step, move in zip(steps.tolist(), moves, strict=True):
-        leg[before:step] = len(chains) - 1
-        number[before:step] = at
-        before = step
-        at = _follow(chains, at, move, int(oriented[step]))
+    for row in np.flatnonzero(_to_be_asked(course)).tolist():
+        leg[before:row] = len(chains) - 1
+        number[before:row] = at
+        before = row
+        at = _follow(chains, at, moves.best(course.place(row - 1), course.place(row)), int(oriented[row]))
     leg[before:] = len(chains) - 1
     number[before:] = at
-    return Decoded(tuple(chains), leg, number, place)
+    return Decoded(tuple(chains), leg, number, course.place_m)
 
 
-def legs_of(trellis: Trellis, decoded: Decoded) -> list[Leg]:
+def _to_be_asked(course: Course) -> Bools:
+    """Rows at which the course comes to another element."""
+    return np.concatenate([[False], course.oriented[1:] != course.oriented[:-1]])
+
+
+def legs_of(moves: Moves, course: Course, decoded: Decoded) -> list[Leg]:
     """Legs with one path position: equal on what two legs share, carried on by distance over a break."""
     legs: list[Leg] = []
     for index, chain in enumerate(decoded.chains):
         visits = [Visit(oriented // 2, oriented % 2 == 0) for oriented in chain.oriented]
-        leg = leg_of(trellis.network.track, visits)
+        leg = leg_of(moves.network.track, visits)
         if legs and chain.shared is not None:
             before = decoded.chains[index - 1]
             there = legs[-1].entry_m(chain.shared - before.low)
             leg = shifted(leg, there - leg.entry_m(chain.shared - chain.low))
         elif legs:
-            leg = shifted(leg, _over_break(trellis, decoded, legs[-1], leg, index))
+            leg = shifted(leg, _over_break(moves, course, decoded, legs[-1], leg, index))
         legs.append(leg)
     return legs
 
@@ -109,14 +110,14 @@ def positions_m(decoded: Decoded, legs: list[Leg]) -> Floats:
     )
 
 
-def aligned(trellis: Trellis, decoded: Decoded) -> Decoded:
+def aligned(moves: Moves, course: Course, decoded: Decoded) -> Decoded:
     """After a break the path goes on in the direction it had: legs beyond it are turned where needed."""
     for index, chain in enumerate(decoded.chains):
         if index and chain.shared is None:
-            legs = legs_of(trellis, decoded)
+            legs = legs_of(moves, course, decoded)
             turn = _heading_at(decoded, legs, index) - _heading_at(decoded, legs, index, before=True)
             if np.cos(np.radians(turn)) < 0:
-                decoded = decoded.turned(trellis.network, range(index, _next_break(decoded, index)))
+                decoded = decoded.turned(moves.network, range(index, _next_break(decoded, index)))
     return decoded
 
 
@@ -168,10 +169,11 @@ def _heading_at(decoded: Decoded, legs: list[Leg], index: int, before: bool = Fa
     return float(leg.heading_deg[segment[0]])
 
 
-def _over_break(trellis: Trellis, decoded: Decoded, before: Leg, after: Leg, index: int) -> float:
+def _over_break(moves: Moves, course: Course, decoded: Decoded, before: Leg, after: Leg, index: int) -> float:
     """Shift of a leg beyond a break, so that path position grows by the distance in between."""
     step = _border(decoded, index)
     last = decoded.chains[index - 1]
     there = before.entry_m(int(decoded.number[step - 1]) - last.low) + float(decoded.place_m[step - 1])
     here = after.entry_m(int(decoded.number[step]) - decoded.chains[index].low) + float(decoded.place_m[step])
-    return there + abs(float(trellis.ways.distance_m[step])) - here
+    way = moves.way(int(course.step[step - 1]), int(course.step[step]))
+    return there + abs(way.distance_m) - here

@@ -14,6 +14,7 @@ import polars as pl
 from pipeline.stages.matching.fixes import Fixes
 from pipeline.stages.track.leg import segments_at
 from pipeline.stages.track.path import TravelledPath
+from pipeline.stages.track.segments import Feet
 from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig, Vehicle
 from schemas.enums import SigmaSource
@@ -27,6 +28,20 @@ class Assignment:
     near_path_m: Floats
     path_probability: Floats
     gate_probability: Floats
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Every epoch on its leg: its foot, path position of the antenna and height over the track [m], NaN if unknown."""
+
+    feet: Feet
+    antenna_m: Floats
+    vertical_m: Floats
+
+    @classmethod
+    def on(cls, fixes: Fixes, path: TravelledPath, assignment: Assignment) -> Placed:
+        feet = path.feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
+        return cls(feet, *path.places(assignment.leg, feet, fixes.height_m))
 
 
 @dataclass(frozen=True)
@@ -51,6 +66,7 @@ def epoch_frame(
     solution: pl.Series,
     path: TravelledPath,
     assignment: Assignment,
+    placed: Placed,
     vehicle: Vehicle,
     config: MatchingConfig,
 ) -> pl.DataFrame:
@@ -59,8 +75,8 @@ def epoch_frame(
     `path_m` is the raw position projected, never smoothed: a jump of the GNSS stays a jump. It is given off
     track too (`on_track` false), and goes on straight beyond the ends of the path.
     """
-    feet = path.feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
-    antenna_m, vertical_m = path.places(assignment.leg, feet, fixes.height_m)
+    feet = placed.feet
+    antenna_m = placed.antenna_m
     path_m = antenna_m - vehicle.gnss_antenna_ahead_m
     element, measure_m = path.locate_index(assignment.leg, path_m)
     # The track's direction counts where the GNSS antenna is, not the balise antenna.
@@ -76,7 +92,7 @@ def epoch_frame(
         "measure_m": measure_m,
         "path_m": path_m,
         "cross_track_m": feet.offset_m,
-        "vertical_m": vertical_m,
+        "vertical_m": placed.vertical_m,
         "on_track": on_track,
         "near_track": fixes.valid & (distance_m <= config.reach_m),
         "path_probability": np.where(on_track, assignment.path_probability, np.nan),

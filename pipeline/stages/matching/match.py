@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches
-from pipeline.stages.matching.epochs import Assignment, epoch_frame
+from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches, off_stretches
+from pipeline.stages.matching.epochs import Assignment, Placed, epoch_frame
 from pipeline.stages.matching.fixes import Fixes, digit_noise, fixes_of
 from pipeline.stages.matching.path_search import find_path
 from pipeline.stages.odometry import Odometry
@@ -18,7 +18,7 @@ from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.track.network import network_in_pieces
 from pipeline.stages.track.path import TravelledPath
 from pipeline.stages.track.survey import SurveyedTrack
-from schemas.arrays import Ints, floats, ints, times_ns
+from schemas.arrays import NS_PER_S, Ints, floats, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import Site
@@ -26,7 +26,7 @@ from schemas.run import Site
 
 @dataclass(frozen=True)
 class Match:
-    """Epochs on the path, the path, and when it was in doubt.
+    """Epochs on the path, the path, when it was in doubt, and when the positions were `off` the network.
 
     `possible`: elements that no position refutes, in hindsight. `odometer_sign`: of the recorded odometer
     against growing path, set here and nowhere else.
@@ -35,6 +35,7 @@ class Match:
     epochs: pl.DataFrame
     path: TravelledPath
     ambiguous: pl.DataFrame
+    off: pl.DataFrame
     possible: Possible
     odometer_sign: int
 
@@ -68,29 +69,31 @@ def match(
         independent=odometry is not None and odometry.independent,
         pinned=_pins_of_positions(pinned, rows),
     )
-    found = path_set(steps, network, config.cross_bias_sigma_m, config.paths_alpha, config)
-    path, assignment = find_path(arrays, odometry, network, pinned, found, config)
-    element = elements_of(arrays, path, assignment)
-    claimed = claims(found, arrays.t_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
+    found = path_set(steps, network, config)
+    path, assignment = find_path(arrays, odometry, found, config)
+    placed = Placed.on(arrays, path, assignment)
+    element = elements_of(arrays, path, assignment, placed)
+    # The set counts from the first position, not from the first epoch.
+    since_s = (arrays.t_ns - arrays.t_ns[rows[0]]) / NS_PER_S
+    claimed = claims(found, since_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
     assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
     ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, pinned >= 0, network)
-    epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)
+    epochs = epoch_frame(arrays, fixes["solution"], path, assignment, placed, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
     if sign < 0 and vehicle.gnss_antenna_ahead_m:
         # The odometer falls when reversing (CONTRACT section 1): the leading end faces against growing path, and the
         # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
-        epochs = epoch_frame(arrays, fixes["solution"], path, assignment, vehicle, config)
+        epochs = epoch_frame(arrays, fixes["solution"], path, assignment, placed, vehicle, config)
     epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg"), config.digits_least_m))
-    return Match(epochs, path, ambiguous, claimed.possible, sign)
+    off = off_stretches(claimed, epochs, config.paths_level_s)
+    return Match(epochs, path, ambiguous, off, claimed.possible, sign)
 
 
-def elements_of(fixes: Fixes, path: TravelledPath, assignment: Assignment) -> Ints:
+def elements_of(fixes: Fixes, path: TravelledPath, assignment: Assignment, placed: Placed) -> Ints:
     """The net element of each epoch on the path, -1 without a position."""
-    feet = path.feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
-    place_m, _ = path.places(assignment.leg, feet, fixes.height_m)
-    element, _ = path.locate_index(assignment.leg, place_m)
-    return np.where(fixes.valid & np.isfinite(place_m), element, -1)
+    element, _ = path.locate_index(assignment.leg, placed.antenna_m)
+    return np.where(fixes.valid & np.isfinite(placed.antenna_m), element, -1)
 
 
 def _pins_of_positions(pinned: Ints, rows: Ints) -> Ints:

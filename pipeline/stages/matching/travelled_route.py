@@ -93,9 +93,9 @@ def _rivals(match: Match, rows: Ints, least: float) -> str:
     return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in on_path)
 
 
-def _highest(posterior: Possible, first: int, last: int) -> dict[int, float]:
-    """The highest probability of each element at the steps from one epoch to another."""
-    begin, end = np.searchsorted(posterior.epoch, [first, last + 1])
-    part = slice(int(posterior.first[max(int(begin) - 1, 0)]), int(posterior.first[int(end)]))
-    possible = pl.DataFrame({"element": posterior.element[part], "probability": posterior.confidence[part]})
-    return dict(possible.group_by("element").agg(pl.col("probability").max()).iter_rows())
+def _highest(possible: Possible, first: int, last: int) -> dict[int, float]:
+    """The highest confidence in each element at the steps from one epoch to another."""
+    begin, end = np.searchsorted(possible.epoch, [first, last + 1])
+    part = slice(int(possible.first[max(int(begin) - 1, 0)]), int(possible.first[int(end)]))
+    found = pl.DataFrame({"element": possible.element[part], "probability": possible.confidence[part]})
+    return dict(found.group_by("element").agg(pl.col("probability").max()).iter_rows())

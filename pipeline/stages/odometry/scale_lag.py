@@ -14,9 +14,11 @@ nearly as well, or where the changes of speed are noise.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -43,8 +45,10 @@ _SPEED_S = 0.5
 _APART_S = 0.25
 # Outliers, in robust standard deviations: slip, or a step of the other recorder.
 _USUAL = 4.5
-# Quantiles of absolute values of a normal distribution: half of the counts of a counter are off by nothing.
-_QUANTILES, _OF_NORMAL = np.array([0.5, 0.9]), np.array([0.6745, 1.6449])
+# 1.4826 MAD is the sigma of normal residuals, whatever less than half of them do.
+_MAD = 1.4826
+# So many lengths of a way are left out to see how much depends on them.
+_LEFT_OUT = 6
 # Numerics: with less independent information about scale and lag, as a share of the whole, they are not told apart.
 _LEAST_INDEPENDENT = 1e-12
 # Numerics: ways are not written finer than this [m].
@@ -97,9 +101,13 @@ class CountedRows:
 
     def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
         """Way between instants [m]; NaN outside the recording and over a step in doubt."""
-        ends = [np.interp(at_s, self.t_s, self.distance_m) for at_s in (begin_s, end_s)]
-        doubts = [np.interp(at_s, self.t_s, self.doubtful, np.nan, np.nan) for at_s in (begin_s, end_s)]
-        return np.where(doubts[0] == doubts[1], ends[1] - ends[0], np.nan)
+        way_m = self._at(end_s, self.distance_m) - self._at(begin_s, self.distance_m)
+        if self.doubtful[-1] == self.doubtful[0]:
+            return way_m
+        return np.where(self._at(begin_s, self.doubtful) == self._at(end_s, self.doubtful), way_m, np.nan)
+
+    def _at(self, at_s: Floats, values: Floats) -> Floats:
+        return np.interp(at_s, self.t_s, values, np.nan, np.nan)
 
     @cached_property
     def _half_s(self) -> float:
@@ -138,6 +146,11 @@ class CountedRows:
         )
 
     @property
+    def least_change_mps(self) -> float:
+        """A change of speed, by four rows at each end over 4 half spans, is noise of the rows up to 3 of its sigmas."""
+        return 3.0 * float(np.sqrt(8.0)) * self.row_sigma_m / (4.0 * self._half_s)
+
+    @property
     def noise_m(self) -> float:
         """Sigma of a way by the noise of its two rows."""
         return max(self.row_sigma_m * float(np.sqrt(2.0)), _FINEST_M)
@@ -145,6 +158,14 @@ class CountedRows:
     def driven(self) -> CountedRows:
         """Way driven, to and fro."""
         return replace(self, distance_m=np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.distance_m)))]))
+
+
+_Figure = TypeVar("_Figure", float, Floats)
+
+
+def slopes(way_m: _Figure, speed_mps: _Figure, scale: float = 1.0) -> tuple[_Figure, _Figure]:
+    """By how much the way of the other changes with scale and with lag; with scale * lag at a `scale` of 1."""
+    return way_m, -scale * speed_mps
 
 
 def spans_of_rows(t_s: Floats) -> tuple[Ints, Ints]:
@@ -187,8 +208,8 @@ class _Ways:
     @cached_property
     def overlap(self) -> int:
         """A way overlaps so many, itself and those after it."""
-        step_s = max(float(np.median(np.diff(self.begin_s))), 1e-9)
-        return int(np.ceil(float(np.median(self.end_s - self.begin_s)) / step_s - 1e-6))
+        after = np.searchsorted(self.begin_s, self.end_s - 1e-6)
+        return max(1, round(float(np.median(after - np.arange(after.size)))))
 
     def _apart_m(self, lag_s: Floats) -> tuple[Floats, Floats]:
         """How far ways that do not overlap are apart at each lag (lags, ways), at the scale that makes their sum least;
@@ -221,7 +242,8 @@ class _Ways:
         limit_m = _USUAL * max(_robust(here[here > 0.0]), self.counter.noise_m)
         loss, losses = (_huber(apart, limit_m) for apart in (here, self._search[0]))
         worse = losses - loss
-        chance = _WORSE * np.sqrt(2.0 * np.nansum(loss**2))
+        # An outlier is one at both lags: its losses differ by no more than by what noise does to it.
+        chance = _WORSE * np.sqrt(2.0 * np.nansum(np.minimum(loss, limit_m**2) ** 2))
         fits: Bools = _enough(worse) & (np.nansum(worse, axis=1) <= chance)
         return fits
 
@@ -236,11 +258,12 @@ class _Ways:
         if found is None:
             return ScaleLag(state=state)
         scale, sigma = found.with_sigmas(slice(1))
+        halves = found.halves(0.0, slice(1))
         scales = self._search[1][self._fits(self.likeliest_s)]
-        sigma = float(np.hypot(sigma, 0.5 * np.ptp(scales))) if scales.size else sigma
+        sigma = max(float(np.hypot(sigma, 0.5 * np.ptp(scales))) if scales.size else sigma, _apart(halves))
         if abs(scale) <= _SHOWN * sigma:
             return ScaleLag(state=state)
-        return ScaleLag(scale, sigma, state=state, halves=found.halves(0.0, slice(1)))
+        return ScaleLag(scale, sigma, state=state, halves=halves)
 
     def refined(self, lag_s: float) -> ScaleLag:
         """The regression from here until it stays."""
@@ -265,8 +288,11 @@ class _Ways:
         begin_s, end_s = self.begin_s - lag_s, self.end_s - lag_s
         counted = self.counter.gained(begin_s, end_s)
         (first, first_beside), (last, last_beside) = self.counter.speeds(begin_s), self.counter.speeds(end_s)
-        design = np.column_stack([counted, first - last])
-        beside = np.column_stack([counted, first_beside - last_beside])
+        design = np.column_stack(slopes(counted, last - first))
+        change_mps = last_beside - first_beside
+        # The counts of a coarse counter at one speed have a rhythm, in speeds as in ways: no changes of speed.
+        change_mps = np.where(np.abs(change_mps) <= self.counter.least_change_mps, 0.0, change_mps)
+        beside = np.column_stack(slopes(counted, change_mps))
         known = np.asarray(np.isfinite(np.column_stack([design, beside])).all(axis=1))
         # Where both stand there is nothing to learn, nor of the noise.
         moving: Bools = known & (np.abs(counted) > 0.0)
@@ -307,8 +333,14 @@ class _Regression:
         if not self._changes_show():
             return ScaleLag(state=LagState.CONSTANT_SPEED)
         scale, sigma, rest_s, sigma_s = self.with_sigmas(slice(None))
+        halves = self.halves(assumed_s)
         return ScaleLag(
-            scale, sigma, assumed_s + rest_s / scale, sigma_s / abs(scale), LagState.MEASURED, self.halves(assumed_s)
+            scale=scale,
+            scale_sigma=max(sigma, _apart(halves)),
+            lag_s=assumed_s + rest_s / scale,
+            lag_sigma_s=max(sigma_s / abs(scale), self._lags_apart(halves)),
+            state=LagState.MEASURED,
+            halves=halves,
         )
 
     def with_sigmas(self, parts: slice) -> list[float]:
@@ -328,13 +360,13 @@ class _Regression:
         return [float(value) for pair in zip(theta, sigmas, strict=True) for value in pair]
 
     def _without_one(self, design: Floats, beside: Floats, theta: Floats) -> Floats:
-        """By how much each part of the estimate changes at most without the ways over one instant.
+        """By how much each part of the estimate changes at most without the ways of a minute, or a quarter of all.
 
-        One change of speed alone looks like a step of the other recorder, or a slip, that came with it.
+        One change of speed alone looks like a step or drift of the other recorder, or a slip, that came with it.
         """
         moments = beside[:, :, None] * np.concatenate([design, self.way_m[:, None]], axis=1)[:, None, :]
         sums = np.cumsum(np.concatenate([np.zeros((1, *moments.shape[1:])), moments]), axis=0)
-        reach = min(self.overlap + 1, len(sums) - 1)
+        reach = max(self.overlap + 1, min(_LEFT_OUT * self.overlap, len(design) // 4))
         left = sums[-1] - (sums[reach:] - sums[:-reach])
         normal, right = left[:, :, :-1], left[:, :, -1:]
         if not np.all(np.linalg.det(normal)):
@@ -349,6 +381,12 @@ class _Regression:
         noise = 0.5 * float(((near - beside) ** 2).sum()) / np.sqrt(near.size / self.overlap)
         return bool(near @ beside > _SHOWN * noise)
 
+    def _lags_apart(self, halves: Sequence[tuple[float, float]]) -> float:
+        """Half of what the lags of both halves differ by, where neither tells much less than the other."""
+        told = np.cumsum(np.where(self.used, self.beside[:, 1] * self.design[:, 1], 0.0))
+        share = float(told[np.flatnonzero(self.used)[: int(self.used.sum()) // 2][-1]] / told[-1])
+        return 0.5 * abs(halves[0][1] - halves[1][1]) if len(halves) == 2 and 0.2 <= share <= 0.8 else 0.0
+
     def halves(self, assumed_s: float, parts: slice = slice(None)) -> tuple[tuple[float, float], ...]:
         """Scale and lag by the first and by the second half of the ways."""
         rows = np.flatnonzero(self.used)
@@ -359,6 +397,11 @@ class _Regression:
                 scale, *rest = np.linalg.solve(beside.T @ design, beside.T @ self.way_m[half]).tolist()
                 found.append((scale, assumed_s + (rest[0] / scale if rest and scale else 0.0)))
         return tuple(found)
+
+
+def _apart(halves: Sequence[tuple[float, float]]) -> float:
+    """Half of what the scales of both halves differ by: a drift of the other recorder is one of them for a while."""
+    return 0.5 * abs(halves[0][0] - halves[1][0]) if len(halves) == 2 else float("inf")
 
 
 def _solved(design: Floats, beside: Floats, way_m: Floats) -> Floats:
@@ -382,8 +425,8 @@ def _alike_columns(normal: Floats) -> bool:
 
 
 def _robust(size: Floats) -> float:
-    """Sigma of normal values of this size, whatever a tenth of them do; the larger by two quantiles."""
-    return float((np.quantile(size, _QUANTILES) / _OF_NORMAL).max()) if size.size else 0.0
+    """Sigma of normal values of this size, whatever a part of them does."""
+    return _MAD * float(np.median(size)) if size.size else 0.0
 
 
 def _huber(size: Floats, limit: float) -> Floats:

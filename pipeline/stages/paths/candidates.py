@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -95,6 +96,19 @@ class Candidates:
     past: Ints
     linked_start: Bools
     linked_end: Bools
+
+    def of(self, element: int, begin: int, end: int) -> Ints:
+        """Rows of an element at the steps from `begin` on, before `end`, in their order."""
+        order, first = self._by_element
+        rows = order[first[element] : first[element + 1]] if element + 1 < first.size else order[:0]
+        low, high = np.searchsorted(self.step[rows], [begin, end]).tolist()
+        return rows[low:high]
+
+    @cached_property
+    def _by_element(self) -> tuple[Ints, Ints]:
+        order = np.lexsort((self.step, self.element))
+        most = int(self.element.max(initial=-1))
+        return order, np.searchsorted(self.element[order], np.arange(most + 2))
 
     def take(self, rows: Ints, steps: int) -> Candidates:
         """Some of the candidates, in the same order."""

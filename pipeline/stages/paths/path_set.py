@@ -7,6 +7,7 @@ overbound, the true path is rejected in at most alpha per 600 s, in any network,
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -16,22 +17,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
 from pipeline.stages.paths.path_steps import PathSteps
-from pipeline.stages.paths.path_tests import PathTests
+from pipeline.stages.paths.path_tests import LOOKED_S, NO_STEPS, PathTests, Totals, Trail
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
-
-# DOMAIN section 2: over gaps every way of at most so many times the distance, and so much more [m].
-_DETOUR = 1.2
-_DETOUR_M = 50.0
-# Behind an open end a path goes on for so much more than the noise [m].
-_OPEN_M = 10.0
-# Before a position is on the element that it goes over to, it may lie so far before its end [m].
-_LATE_M = 10.0
-# Where a stretch ends off the network, paths refuted in its last seconds are equal [s].
-_LAST_S = 60.0
-# A longer step is a gap: the train may have taken any way meanwhile [s].
-_GAP_S = 3.5
 
 
 @dataclass
@@ -39,26 +28,52 @@ class Node:
     """One hypothesis while it is on one net element, oriented as its path began.
 
     Covers the steps from `begin` on, before `end`; `rejected`: the step at which its residuals refuted it, a large
-    number if none did; `residual_m` of its whole path, NaN before its begin; `p`: least p-value of its tests so far.
+    number if none did; `residual_m`, `survey_m`, `heading_rad`, `left_m` (to both ends of the element): of its own
+    steps; `before`: what its whole path comes to before `begin`; `p`: least p-value of its tests so far.
+    `also`: hypotheses that came to it later, and have been one with it since.
     """
 
     oriented: int
     begin: int
-    residual_m: Floats
-    survey_m: Floats
-    heading_rad: Floats
+    stretch: int
     parent: Node | None = None
+    before: Totals = NO_STEPS
     p: float = 1.0
     end: int = 0
     rejected: int = 2**62
     barred: int = 2**62
-    left_m: Floats = field(default_factory=lambda: np.zeros(0))
+    residual_m: Floats = field(default_factory=lambda: np.zeros(0))
+    survey_m: Floats = field(default_factory=lambda: np.zeros(0))
+    heading_rad: Floats = field(default_factory=lambda: np.zeros(0))
+    left_m: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     followed: bool = False
-    stretch: int = 0
+    also: list[Node] = field(default_factory=list)
 
     @property
     def element(self) -> int:
         return self.oriented // 2
+
+    @property
+    def origins(self) -> list[Node]:
+        """The hypotheses that it goes on from."""
+        return [*([] if self.parent is None else [self.parent]), *self.also]
+
+    def since(self, step: int) -> list[Node]:
+        """The hypotheses that it went through, itself the last, as far back as a step."""
+        chain = [self]
+        while chain[-1].begin > step and chain[-1].parent is not None:
+            chain.append(chain[-1].parent)
+        return chain[::-1]
+
+    def residuals_m(self, first: int, last: int) -> Floats:
+        """Of its path over the steps from `first` on, before `last`; NaN before its beginning."""
+        chain = self.since(first)
+        known = np.concatenate([node.residual_m for node in chain])
+        whole_m = np.full(last - first, np.nan)
+        begin = max(chain[0].begin, first)
+        part = known[begin - chain[0].begin : last - chain[0].begin]
+        whole_m[begin - first : begin - first + part.size] = part
+        return whole_m
 
 
 class Span(NamedTuple):
@@ -74,6 +89,7 @@ class PathSet:
     """All hypotheses of a run with what became of each; `groups`: lines without a branch, per net element.
 
     `overflow`: step from which on there were more hypotheses than are followed; nothing is claimed after it.
+    `last_s`: where a stretch ends off the network, paths refuted in its last seconds are equal.
     """
 
     nodes: tuple[Node, ...]
@@ -82,6 +98,7 @@ class PathSet:
     network: Network
     candidates: Candidates
     overflow: int
+    last_s: float
 
     def living(self, delay_s: float) -> list[Span]:
         """The hypotheses, each over the steps at which nothing up to `delay_s` before their end had refuted it."""
@@ -101,18 +118,19 @@ class PathSet:
             refuted = [node for node in nodes if node.rejected < count]
             if not alive and refuted:
                 latest_s = self.steps.end_s[max(node.rejected for node in refuted)]
-                alive = [node for node in refuted if self.steps.end_s[node.rejected] >= latest_s - _LAST_S]
+                alive = [node for node in refuted if self.steps.end_s[node.rejected] >= latest_s - self.last_s]
             found += alive
         return found
 
     def to_the_end(self) -> list[Span]:
         """The hypotheses that live to the end of their stretch, or through one that does."""
         lives: dict[int, Node] = {}
-        for node in self.survivors():
-            at: Node | None = node
-            while at is not None and id(at) not in lives:
-                lives[id(at)] = at
-                at = at.parent
+        waiting = self.survivors()
+        while waiting:
+            node = waiting.pop()
+            if id(node) not in lives:
+                lives[id(node)] = node
+                waiting += node.origins
         return [Span(node, node.begin, min(node.end, node.rejected)) for node in lives.values()]
 
     def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
@@ -127,14 +145,14 @@ class PathSet:
         return found
 
 
-def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, config: MatchingConfig) -> PathSet:
+def path_set(steps: PathSteps, network: Network, config: MatchingConfig) -> PathSet:
     """Every path that begins near the first positions and goes on over navigable relations, until it is refuted.
 
-    `steps`: of positions (`path_steps`), of a solution or of a reference; `bias_m`: sigma of the offset across that
-    lasts the run, 0 for a reference; `alpha`: level of all tests of a path together in 600 s; `network`: with elements
-    that turn round in pieces (`network_in_pieces`), as `Node.element` counts them. Of the result `living` gives the set
-    of each step by what was known then, `to_the_end` in hindsight, both with the least p-value of each path, and
-    `elements` the same by net element. Without a position near the network the set is empty: off the survey.
+    `steps`: of positions (`path_steps`), of a solution or of a reference, whose own bias and level `config` holds;
+    `network`: with elements that turn round in pieces (`network_in_pieces`), as `Node.element` counts them. Of the
+    result `living` gives the set of each step by what was known then, `to_the_end` in hindsight, both with the least
+    p-value of each path, and `elements` the same by net element. Without a position near the network the set is empty:
+    off the survey.
     """
     search = search_about(steps.points.surface, network, config.reach_m)
     candidates = candidates_of(steps.points, network, search, config.reach_m)
@@ -144,7 +162,7 @@ def path_set(steps: PathSteps, network: Network, bias_m: float, alpha: float, co
     lines = groups[candidates.element]
     others = candidates.step[lines != lines[:1]]
     alone = int(others[0]) if others.size else len(steps)
-    tests = PathTests.of_run(steps, alpha, bias_m, config.paths_alike_m, alone)
+    tests = PathTests.of_run(steps, alone, config)
     return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
 
 
@@ -175,12 +193,10 @@ class _Growth:
     config: MatchingConfig
 
     def __post_init__(self) -> None:
-        # Rows of the candidates of each net element, in order of steps.
-        self._order = np.lexsort((self.candidates.step, self.candidates.element))
-        self._first = np.searchsorted(self.candidates.element[self._order], np.arange(self.network.count + 1))
-        self._gap = np.concatenate([[False], np.diff(self.steps.end_s) > _GAP_S])
+        self._gap = np.concatenate([[False], np.diff(self.steps.end_s) > self.config.paths_gap_s])
         self._queue: list[tuple[int, int, Node]] = []
         self._made: list[Node] = []
+        self._begun_s: deque[float] = deque()
         self._by_element: dict[int, list[Node]] = {}
 
     def grown(self) -> PathSet:
@@ -192,14 +208,23 @@ class _Growth:
             self._push_all(start)
             while self._queue:
                 _, _, node = heapq.heappop(self._queue)
-                if len(self._made) > self.config.paths_limit:
+                if self._too_many(node):
                     overflow = min(overflow, node.begin)
                     self._queue.clear()
                     break
                 for child in self._follow(node):
                     self._push(child)
             start = count if overflow < count else self._anew(self._made[first:])
-        return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow)
+        last_s = self.config.paths_anew_s
+        return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow, last_s)
+
+    def _too_many(self, node: Node) -> bool:
+        """More hypotheses have begun of late than are followed."""
+        now_s = float(self.steps.end_s[node.begin])
+        self._begun_s.append(now_s)
+        while self._begun_s[0] < now_s - LOOKED_S:
+            self._begun_s.popleft()
+        return len(self._begun_s) > self.config.paths_limit
 
     def _anew(self, nodes: list[Node]) -> int:
         """Where the set begins anew once these are all refuted: at once in the first minute, later where it came back.
@@ -225,18 +250,19 @@ class _Growth:
         the survey lacks. Beside the nearest element then, as long as positions lie within reach of one.
         """
         steps = self.steps
-        known = np.flatnonzero(np.isfinite(node.residual_m[:died]) & steps.counted[:died])
-        before = known[steps.end_s[known] <= steps.end_s[died] - self.config.paths_level_s]
-        before = before[steps.end_s[before] > steps.end_s[died] - 3.0 * self.config.paths_level_s]
-        if not before.size:
+        level_s = self.config.paths_level_s
+        first, last = np.searchsorted(steps.end_s, steps.end_s[died] - level_s * np.array([3.0, 1.0]), side="right")
+        residual_m = node.residuals_m(int(first), int(last))
+        before = np.isfinite(residual_m) & steps.counted[first:last]
+        if not before.any():
             return len(steps)
-        level_m = float(np.mean(node.residual_m[before]))
+        level_m = float(np.mean(residual_m[before]))
         beside_m = self._nearest_m[died:]
-        window = max(1, round(self.config.paths_level_s / steps.period_s))
+        window = max(1, round(level_s / float(steps.period_s[died])))
         if beside_m.size < window:
             return len(steps)
         means_m = sliding_window_view(beside_m, window).mean(axis=1)
-        root_m = np.hypot(steps.sigma_m[died:], float(np.nanmedian(node.survey_m[before])))[window - 1 :]
+        root_m = np.hypot(steps.sigma_m[died:], float(np.median(node.survey_m)))[window - 1 :]
         signs = (level_m, -level_m)  # the nearest element may run the other way
         off_m = np.minimum(*(np.abs(means_m - sign) for sign in signs))
         back = np.flatnonzero(np.nan_to_num(off_m, nan=np.inf) <= self.config.paths_back_sigmas * root_m)
@@ -262,7 +288,7 @@ class _Growth:
         candidates = self.candidates
         limit_m = self.tests.offset_m(self.steps.sigma_m[candidates.step], self.survey_m)
         near: Bools = (np.abs(candidates.offset_m) <= limit_m) & (
-            self._inside(np.arange(len(candidates.step))) | (candidates.beyond_m <= _LATE_M)
+            self._inside(np.arange(len(candidates.step))) | (candidates.beyond_m <= self.config.paths_end_m)
         )
         return near
 
@@ -274,9 +300,7 @@ class _Growth:
         """Begin with every element near a step."""
         rows = np.arange(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
         for row in rows[self._near[rows]].tolist():
-            none = np.full(len(self.steps), np.nan)
-            oriented = 2 * int(self.candidates.element[row])
-            self._push(Node(oriented, step, none, none.copy(), none.copy(), stretch=step))
+            self._push(Node(2 * int(self.candidates.element[row]), step, stretch=step))
 
     def _push(self, node: Node) -> None:
         same = self._by_element.setdefault(node.oriented, [])
@@ -285,6 +309,8 @@ class _Growth:
             if covers and other.rejected >= node.rejected and self._alike(other, node):
                 # Their tests cannot differ by more than the bounds allow for (rule 8).
                 other.p = max(other.p, node.p)
+                if node.parent is not None:
+                    other.also.append(node.parent)
                 return
         same.append(node)
         self._made.append(node)
@@ -294,25 +320,23 @@ class _Growth:
         """Two paths that lead to one element with the same residuals as far back as any test looks."""
         last = other.begin
         first = int(np.searchsorted(self.steps.end_s, self.steps.end_s[last] - self.tests.longest_s))
-        apart = one.residual_m[first:last] - other.residual_m[first:last]
-        known = np.isfinite(one.residual_m[first:last]) == np.isfinite(other.residual_m[first:last])
-        return bool(known.all()) and bool(np.nanmax(np.abs(apart), initial=0.0) <= self.config.paths_alike_m)
+        one_m, other_m = (node.residuals_m(first, last) for node in (one, other))
+        known = np.isfinite(one_m) == np.isfinite(other_m)
+        return bool(known.all()) and bool(np.nanmax(np.abs(one_m - other_m), initial=0.0) <= self.config.paths_alike_m)
 
     def _follow(self, node: Node) -> list[Node]:
         """Along its element up to where it leaves it or is refuted for long enough; returns what it goes on as."""
         candidates = self.candidates
         count = len(self.steps)
-        of_element = self._order[self._first[node.element] : self._first[node.element + 1]]
-        rows = of_element[np.searchsorted(candidates.step[of_element], node.begin) :]
+        rows = candidates.of(node.element, node.begin, count)
         step = candidates.step[rows]
         # Steps without a pause or a candidate missing among them, and inside the element.
         run = np.arange(node.begin, node.begin + rows.size) == step
         run &= ~self._gap[np.minimum(step, count - 1)] | (step == node.begin)
         inside = self._inside(rows)
         # Not yet on it, by the noise along the track or of an offset at a bend: it came in over that end.
-        late = np.logical_and.accumulate(inside | (candidates.beyond_m[rows] <= _LATE_M)) & ~np.logical_or.accumulate(
-            inside
-        )
+        near = inside | (candidates.beyond_m[rows] <= self.config.paths_end_m)
+        late = np.logical_and.accumulate(near) & ~np.logical_or.accumulate(inside)
         run &= inside | late
         stays = int(rows.size if run.all() else np.argmin(run))
         rows = rows[:stays]
@@ -320,15 +344,13 @@ class _Growth:
         node.end = node.begin + stays
         if stays:
             sense = 1.0 - 2.0 * (node.oriented % 2)
-            part = slice(node.begin, node.end)
-            node.residual_m[part] = sense * candidates.offset_m[rows]
-            node.survey_m[part] = self.survey_m[rows]
-            node.heading_rad[part] = candidates.heading_rad[rows] + np.pi * (node.oriented % 2)
-            ends_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
-            node.left_m = ends_m
+            node.residual_m = sense * candidates.offset_m[rows]
+            node.survey_m = self.survey_m[rows]
+            node.heading_rad = candidates.heading_rad[rows] + np.pi * (node.oriented % 2)
+            node.left_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
             node.barred = min(node.barred, self._unread(node))
             node.rejected = min(node.rejected, node.barred)
-            verdict = self.tests.of(self.steps, node.residual_m, node.survey_m, node.heading_rad, node.begin, node.end)
+            verdict = self.tests.of(self.steps, self._trail(node))
             node.p = min(node.p, verdict.p)
             node.rejected = min(node.rejected, verdict.rejected)
         if node.rejected < count:
@@ -339,6 +361,15 @@ class _Growth:
                 return self._onward(node)
             return []
         return self._onward(node) if node.end < count else []
+
+    def _trail(self, node: Node) -> Trail:
+        """Its path as far back as any test looks."""
+        end_s = self.steps.end_s
+        chain = node.since(int(np.searchsorted(end_s, end_s[node.begin] - self.tests.longest_s)))
+        residual_m, survey_m, heading_rad = (
+            np.concatenate([getattr(one, name) for one in chain]) for name in ("residual_m", "survey_m", "heading_rad")
+        )
+        return Trail(node.stretch, chain[0].begin, node.begin, residual_m, survey_m, heading_rad, node.before)
 
     def _unread(self, node: Node) -> int:
         """The first step of the node at which a balise was read that is on no element that joins its own."""
@@ -355,7 +386,7 @@ class _Growth:
         past = candidates.past[rows]
         linked = np.where(past < 0, candidates.linked_start[rows], candidates.linked_end[rows])
         sigma_m = np.hypot(self.steps.sigma_m[candidates.step[rows]], self.survey_m[rows])
-        near = candidates.beyond_m[rows] <= self.config.paths_open_sigmas * sigma_m + _OPEN_M
+        near = candidates.beyond_m[rows] <= self.config.paths_along_sigmas * sigma_m + self.config.paths_end_m
         inside: Bools = (past == 0) | (~linked & near)
         return inside
 
@@ -366,8 +397,8 @@ class _Growth:
             return []
         candidates = self.candidates
         rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
-        inside = rows[self._inside(rows) | (candidates.beyond_m[rows] <= _LATE_M)]
-        way_m = _DETOUR * float(self.steps.way_m[step]) + _DETOUR_M
+        inside = rows[self._inside(rows) | (candidates.beyond_m[rows] <= self.config.paths_end_m)]
+        way_m = (1.0 + self.config.detour_share) * float(self.steps.way_m[step]) + self.config.detour_m
         reached: dict[int, int] = {}
         for leaving in (node.oriented, node.oriented ^ 1):
             for to, reach in self.network.reach(leaving, way_m).items():
@@ -395,22 +426,24 @@ class _Growth:
             rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
             (row,) = rows[candidates.element[rows] == node.element][:1].tolist()
             sigma_m = float(np.hypot(self.steps.sigma_m[step], self.survey_m[row]))
-            if candidates.beyond_m[row] > self.config.paths_open_sigmas * sigma_m + _OPEN_M:
+            if candidates.beyond_m[row] > self.config.paths_along_sigmas * sigma_m + self.config.paths_end_m:
                 node.rejected = min(node.rejected, step)
                 return []
             child = children[0]
-            sense = 1.0 - 2.0 * (node.oriented % 2)
-            child.residual_m[step] = sense * candidates.offset_m[row]
-            child.survey_m[step] = self.survey_m[row]
-            child.heading_rad[step] = child.heading_rad[step - 1]
             if not self._inside(np.array([row]))[0]:
-                child.begin = step + 1
+                sense = 1.0 - 2.0 * (node.oriented % 2)
+                node.residual_m = np.append(node.residual_m, sense * candidates.offset_m[row])
+                node.survey_m = np.append(node.survey_m, self.survey_m[row])
+                node.heading_rad = np.append(node.heading_rad, node.heading_rad[-1:] if node.heading_rad.size else 0.0)
+                node.left_m = np.vstack([node.left_m, [candidates.along_m[row], candidates.left_m[row]]])
                 node.end = step + 1
+                child = self._child(node, node.oriented, step + 1)
                 return [child] if child.begin < len(self.steps) else []
         return children
 
     def _child(self, node: Node, oriented: int, step: int) -> Node:
-        copies = (node.residual_m.copy(), node.survey_m.copy(), node.heading_rad.copy())
-        child = Node(oriented, step, *copies, parent=node, p=node.p, stretch=node.stretch)
+        own = self.tests.totals(self.steps, node.begin, node.residual_m, node.survey_m)
+        before = Totals(*(one + other for one, other in zip(node.before, own, strict=True)))
+        child = Node(oriented, step, node.stretch, node, before, node.p)
         child.rejected, child.barred = node.rejected, node.barred
         return child

@@ -14,6 +14,8 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
 # Steps on each side with which one is compared before it counts.
 _NEIGHBOURS = 3
+# The usual time between steps is that of so many before.
+_PERIOD_STEPS = 31
 # The direction of the way is that over so many steps before.
 _HEADING_STEPS = 5
 
@@ -22,11 +24,14 @@ _HEADING_STEPS = 5
 class PathSteps:
     """Means of a second of positions, shapes (n,); `points` (n, 3).
 
-    `begin_s`, `end_s`: times of its first and last position; `sigma_m` of the position across; `way_m`: since the step
-    before, the larger of odometer and positions; `counted`: it moved by a metre, and is no outlier; `along_m`: position
-    along the track minus an independent odometer, NaN without one; `pinned`: element of a balise read then, else -1.
+    `t_ns`: mean time; `begin_s`, `end_s`: of its first and last position, since `start_ns`, the first of all;
+    `sigma_m` of the position across; `way_m`: since the step before, the larger of odometer and positions; `counted`:
+    it moved by a metre, and is no outlier; `along_m`: position along the track minus an independent odometer, NaN
+    without one; `pinned`: element of a balise read then, else -1.
     """
 
+    t_ns: Ints
+    start_ns: int
     begin_s: Floats
     end_s: Floats
     points: Points
@@ -39,10 +44,28 @@ class PathSteps:
     def __len__(self) -> int:
         return len(self.end_s)
 
+    @property
+    def begin_ns(self) -> Ints:
+        return np.round(self.begin_s * NS_PER_S).astype(np.int64) + self.start_ns
+
     @cached_property
-    def period_s(self) -> float:
-        """Usual time from one to the next, a second at least [s]."""
-        return max(float(np.median(np.diff(self.end_s))), 1.0) if len(self.end_s) > 1 else 1.0
+    def measured(self) -> Bools:
+        """Steps by which an independent odometer has told of the noise along the track."""
+        return np.asarray(np.logical_or.accumulate(np.isfinite(self.along_m)))
+
+    @cached_property
+    def period_s(self) -> Floats:
+        """Usual time from one to the next, a second at least: median of the last half minute of steps [s].
+
+        Of those before alone: what feeds detection knows nothing of later ones.
+        """
+        since_s = np.diff(self.end_s)
+        period_s = np.ones(len(self.end_s))
+        for step in range(1, min(_PERIOD_STEPS, len(period_s))):
+            period_s[step] = np.median(since_s[:step])
+        if since_s.size >= _PERIOD_STEPS:
+            period_s[_PERIOD_STEPS:] = np.median(sliding_window_view(since_s, _PERIOD_STEPS), axis=1)
+        return np.maximum(period_s, 1.0)
 
 
 def path_steps(
@@ -69,8 +92,9 @@ def path_steps(
     means = Points(*(mean(vectors) for vectors in (points.surface, points.east, points.north)))
     chord_m = np.linalg.norm(np.diff(means.surface, axis=0, prepend=means.surface[:1]), axis=1)
     counted_m = np.full(len(means), np.nan)
+    start_ns = int(t_ns[0]) if t_ns.size else 0
+    middle_ns = np.round(mean(t_s) * NS_PER_S).astype(np.int64) + start_ns
     if way is not None:
-        middle_ns = np.round(mean(t_s) * NS_PER_S).astype(np.int64) + t_ns[0]
         counted_m[1:] = way(middle_ns[:-1], middle_ns[1:])
     known = np.isfinite(counted_m)
     moved_m = np.where(known, np.abs(counted_m), chord_m)
@@ -81,6 +105,8 @@ def path_steps(
         read = np.flatnonzero(pinned >= 0)
         pins[np.searchsorted(first, read, side="right") - 1] = pinned[read]
     return PathSteps(
+        t_ns=middle_ns,
+        start_ns=start_ns,
         begin_s=t_s[first],
         end_s=t_s[first + size - 1],
         points=means,

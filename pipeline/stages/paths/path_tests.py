@@ -7,27 +7,29 @@ receiver. Tested are movements over several windows, the offset, and the lasting
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.stages.paths.path_steps import PathSteps
 from schemas.arrays import Bools, Floats, Ints
+from schemas.config import MatchingConfig
 
-# Windows of the movements, and of the offset [s].
+# Windows of the movements [s].
 WINDOWS_S = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0)
-OFFSET_S = 8.0
-# The nine tests share the level; looks of each in 600 s, of the lasting offset three.
-_LOOKED_S = 600.0
-_LASTING_LOOKS = 3.0
+# The nine tests share the level; looks of each in 600 s, of the lasting offset three, after ten steps.
+_TESTS = 9.0
+LOOKED_S = 600.0
+_LASTING_LOOKS, _LASTING_STEPS = 3.0, 10.0
 # A window counts with so many of its steps.
 _WHOLE = 0.6
 # Correlation times of the noise that are thought of, up to the slowest part of DIAG Table 1 [s].
 _TAUS_S = np.array([10.0, 20.0, 50.0, 75.0, 100.0, 150.0, 200.0, 300.0, 400.0, 600.0, 1000.0, 2000.0])
 # Part of the variance that lasts, and how fast the rest of it averages (DIAG Table 1 at 45 degrees).
 _SLOW, _AVERAGED_S = 0.247, 400.0
-# By so much the variance measured along the track may be too small; windows up to so long are measured, after so many.
-_MEASURED, _MEASURED_S, _MEASURED_WINDOWS = 1.5, 48.0, 6.0
+# Windows up to so long are measured along the track, after so many.
+_MEASURED_S, _MEASURED_WINDOWS = 48.0, 6.0
 
 
 class Verdict(NamedTuple):
@@ -37,166 +39,164 @@ class Verdict(NamedTuple):
     p: float
 
 
-@dataclass(frozen=True)
-class PathTests:
-    """The tests at one level; `bias_m`: sigma of b; `merged_m`: by so much merged paths may differ.
+class Totals(NamedTuple):
+    """Over the steps of a path that count: how many, residuals [m], survey's sigmas [m], squares of sigmas [m2]."""
 
-    `measured_m2`: per window the variance of a movement along the track so far, NaN where it is not known yet.
-    `excess`: by how much that is larger than the stated sigma has it, 1 at least: stated sigmas may be too small.
-    `windows`: per window the steps at which those that end at a step begin (`_windows`).
+    number: float
+    residual_m: float
+    survey_m: float
+    sigma_m2: float
+
+
+NO_STEPS = Totals(0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Trail:
+    """A path as far back as any test looks: from step `start` on, those from `begin` on being new.
+
+    `before`: over all of its steps before `begin`, since its very first one.
     """
 
-    alpha: float
-    bias_m: float
-    merged_m: float
+    first: int
+    start: int
+    begin: int
+    residual_m: Floats
+    survey_m: Floats
+    heading_rad: Floats
+    before: Totals
+
+
+@dataclass(frozen=True)
+class PathTests:
+    """The tests at one level, of one bias.
+
+    `alone`: before this step no other track was near, only offsets are tested. `measured_m2`: per window and step the
+    variance of a movement along the track so far, NaN where it is not known. `excess`: by how much that is larger than
+    the stated sigma has it, 1 at least: stated sigmas may be too small. `late`, `early_end`, `early`: per window and
+    step that ends it the first step of it, the step after the window before the last but one, and its first.
+    """
+
     alone: int
-    measured_m2: dict[float, Floats]
-    windows: dict[float, tuple[Ints, Ints, Ints]]
+    measured_m2: Floats
     excess: Floats
+    late: Ints
+    early_end: Ints
+    early: Ints
+    config: MatchingConfig
 
     @classmethod
-    def of_run(cls, steps: PathSteps, alpha: float, bias_m: float, merged_m: float, alone: int) -> PathTests:
-        """Tests of the paths of a run; `alone`: before this step no other track was near, only offsets are tested."""
-        measured = {window_s: _measured_m2(steps, window_s) for window_s in WINDOWS_S if window_s <= _MEASURED_S}
-        windows = {window_s: _windows(steps.end_s, window_s) for window_s in WINDOWS_S}
-        return cls(alpha, bias_m, merged_m, alone, measured, windows, _excess(steps, measured))
+    def of_run(cls, steps: PathSteps, alone: int, config: MatchingConfig) -> PathTests:
+        windows = np.array([_windows(steps.end_s, window_s) for window_s in WINDOWS_S])
+        late, early_end, early = np.moveaxis(windows, 1, 0)
+        measured_m2 = np.full(late.shape, np.nan)
+        for number, window_s in enumerate(WINDOWS_S):
+            if window_s <= _MEASURED_S:
+                measured_m2[number] = _measured_m2(steps, window_s)
+        return cls(alone, measured_m2, _excess(steps, measured_m2), late, early_end, early, config)
 
     def offset_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
         """How far beside its track a single step may lie [m]."""
-        limit = _size(self.alpha, _LOOKED_S / OFFSET_S)
-        return np.asarray(limit * np.sqrt(self.bias_m**2 + survey_m**2 + sigma_m**2))
+        limit = _size(self.config.paths_alpha, LOOKED_S / self.config.paths_level_s)
+        return np.asarray(limit * np.sqrt(self.config.cross_bias_sigma_m**2 + survey_m**2 + sigma_m**2))
 
     @property
     def longest_s(self) -> float:
         """As far back as a movement looks."""
         return 3.0 * WINDOWS_S[-1]
 
-    def of(
-        self, steps: PathSteps, residual_m: Floats, survey_m: Floats, heading_rad: Floats, begin: int, end: int
-    ) -> Verdict:
-        """Test the steps from `begin` on, before `end`, of a path with these residuals since its beginning."""
-        counted = steps.counted[:end] & np.isfinite(residual_m[:end])
-        sums = _Sums.of(steps, counted, residual_m[:end], survey_m[:end])
-        at = np.arange(begin, end)
+    def totals(self, steps: PathSteps, begin: int, residual_m: Floats, survey_m: Floats) -> Totals:
+        """Over the steps from `begin` on."""
+        return Totals(*(float(value) for value in self._counted(steps, begin, residual_m, survey_m).sum(axis=1)))
+
+    def of(self, steps: PathSteps, trail: Trail) -> Verdict:
+        """Test the new steps of a path."""
+        values = self._counted(steps, trail.start, trail.residual_m, trail.survey_m)
+        sums = np.zeros((values.shape[0], values.shape[1] + 1))
+        np.cumsum(values, axis=1, out=sums[:, 1:])
+        at = np.arange(trail.begin, trail.start + values.shape[1])
         refuted = np.zeros(at.size, dtype=np.bool_)
         p = 1.0
-        for z, limit, looks in self._statistics(steps, sums, heading_rad[:end], at):
-            refuted |= z > limit
-            most = float(z.max(initial=0.0))
-            p = min(p, 9.0 * looks * 2.0 * _tail(most))
+        offset_looks = LOOKED_S / self.config.paths_level_s
+        tests = [(self._offset(steps, sums, trail, at)[None], np.array([offset_looks]))]
+        if (apart := at >= self.alone).any():
+            tests.append((self._movements(steps, sums, trail, at) * apart, LOOKED_S / np.array(WINDOWS_S)))
+            tests.append((self._lasting(steps, sums, trail, at)[None] * apart, np.array([_LASTING_LOOKS])))
+        for sigmas, looks in tests:
+            refuted |= (sigmas > _sizes(self.config.paths_alpha, looks)[:, None]).any(axis=0)
+            p = min(p, float((_TESTS * looks * 2.0 * _tails(sigmas.max(axis=1, initial=0.0))).min()))
         first = np.flatnonzero(refuted)
         return Verdict(int(at[first[0]]) if first.size else 2**62, p)
 
-    def _statistics(
-        self, steps: PathSteps, sums: _Sums, heading_rad: Floats, at: Ints
-    ) -> list[tuple[Floats, float, float]]:
-        """Per test its size in sigmas at each step (0 where it cannot be made), its limit, its looks."""
-        found: list[tuple[Floats, float, float]] = []
-        apart = at >= self.alone
-        for window_s in WINDOWS_S if apart.any() else ():
-            if window_s < 2.0 * steps.period_s:
-                continue
-            moved = self._movement(steps, sums, heading_rad, at, window_s)
-            found.append((np.where(apart, moved, 0.0), *self._limit(_LOOKED_S / window_s)))
-        found.append((self._offset(steps, sums, at), *self._limit(_LOOKED_S / OFFSET_S)))
-        if apart.any():
-            lasting = np.where(apart, self._lasting(steps, sums, at), 0.0)
-            found.append((lasting, *self._limit(_LASTING_LOOKS)))
-        return found
+    def _counted(self, steps: PathSteps, begin: int, residual_m: Floats, survey_m: Floats) -> Floats:
+        """Per step 1, residual, sigma of the survey and square of that of the position; zeros where it does not count.
 
-    def _limit(self, looks: float) -> tuple[float, float]:
-        return _size(self.alpha, looks), looks
+        Shape (4, n).
+        """
+        part = slice(begin, begin + residual_m.size)
+        counted = steps.counted[part] & np.isfinite(residual_m)
+        values = np.stack([np.ones(residual_m.size), residual_m, survey_m, steps.sigma_m[part] ** 2])
+        return np.where(counted, values, 0.0)
 
-    def _movement(self, steps: PathSteps, sums: _Sums, heading_rad: Floats, at: Ints, window_s: float) -> Floats:
-        """Mean of the last window less that of the window before the last but one."""
-        late, early_end, early = (begin[at] for begin in self.windows[window_s])
-        whole = _WHOLE * window_s / steps.period_s
-        usable = (sums.count(late, at + 1) >= whole) & (sums.count(early, early_end) >= whole)
-        moved_m = sums.residual(late, at + 1) - sums.residual(early, early_end)
-        survey_m2 = sums.survey(late, at + 1) ** 2 + sums.survey(early, early_end) ** 2
-        sigma_m2 = 0.5 * (sums.sigma2(late, at + 1) + sums.sigma2(early, early_end))
-        turned = heading_rad[at] - heading_rad[np.minimum(early_end, at)]
-        swung_m2 = (self.bias_m * 2.0 * np.sin(0.5 * turned)) ** 2
-        root_m = np.sqrt(np.maximum(survey_m2 + self._noise_m2(steps, sigma_m2, at, window_s) + swung_m2, 1e-12))
-        spare_m = np.maximum(np.abs(moved_m) - 2.0 * self.merged_m, 0.0)
-        return np.where(usable & np.isfinite(spare_m) & np.isfinite(root_m), spare_m / root_m, 0.0)
+    def _movements(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> Floats:
+        """Mean of each last window less that of the window before the last but one, in sigmas: shape (windows, n)."""
+        late, early_end, early = (
+            np.maximum(begin[:, at] - trail.start, 0) for begin in (self.late, self.early_end, self.early)
+        )
+        now = sums[:, None, at + 1 - trail.start] - sums[:, late]
+        then = sums[:, early_end] - sums[:, early]
+        window_s = np.array(WINDOWS_S)[:, None]
+        period_s = steps.period_s[at]
+        whole = _WHOLE * window_s / period_s
+        usable = (now[0] >= whole) & (then[0] >= whole) & (window_s >= 2.0 * period_s)
+        now_mean, then_mean = (part[1:] / np.maximum(part[0], 1.0) for part in (now, then))
+        survey_m2 = now_mean[1] ** 2 + then_mean[1] ** 2
+        sigma_m2 = 0.5 * (now_mean[2] + then_mean[2])
+        turned = trail.heading_rad[at - trail.start] - trail.heading_rad[np.minimum(early_end, at - trail.start)]
+        swung_m2 = (self.config.cross_bias_sigma_m * 2.0 * np.sin(0.5 * turned)) ** 2
+        root_m = np.sqrt(np.maximum(survey_m2 + self._noise_m2(steps, sigma_m2, at) + swung_m2, 1e-12))
+        spare_m = np.maximum(np.abs(now_mean[0] - then_mean[0]) - 2.0 * self.config.paths_alike_m, 0.0)
+        return np.where(usable & np.isfinite(root_m), spare_m / root_m, 0.0)
 
-    def _noise_m2(self, steps: PathSteps, sigma_m2: Floats, at: Ints, window_s: float) -> Floats:
+    def _noise_m2(self, steps: PathSteps, sigma_m2: Floats, at: Ints) -> Floats:
         """Variance of a movement by the receiver: by its sigma, and no less than an odometer shows along the track.
 
         What is not measured yet, or never, may be correlated for less.
         """
-        long_m2 = sigma_m2 * _greatest_share(window_s, 50.0)
-        if window_s > _MEASURED_S:
-            return long_m2 * self.excess[at]
-        seen_m2 = self.measured_m2[window_s][at]
-        soonest_s = 20.0 if np.isfinite(steps.along_m).any() else 10.0
-        short_m2 = sigma_m2 * _greatest_share(window_s, soonest_s)
-        return np.where(np.isfinite(seen_m2), np.fmax(long_m2, _MEASURED * seen_m2), short_m2)
+        long, short, shortest = (_greatest_shares(tau_s)[:, None] for tau_s in (50.0, 20.0, 10.0))
+        measured_m2 = self.measured_m2[:, at]
+        by_odometer_m2 = np.fmax(sigma_m2 * long, self.config.paths_measured_factor * measured_m2)
+        soon = np.where(steps.measured[at], short, shortest)
+        noise_m2 = np.where(np.isfinite(measured_m2), by_odometer_m2, sigma_m2 * soon)
+        lasting = np.array(WINDOWS_S)[:, None] > _MEASURED_S
+        return np.where(lasting, sigma_m2 * long * self.excess[at], noise_m2)
 
-    def _offset(self, steps: PathSteps, sums: _Sums, at: Ints) -> Floats:
-        late = np.searchsorted(steps.end_s, steps.end_s[at] - OFFSET_S, side="right")
-        late = np.minimum(late, at)
-        usable = sums.count(late, at + 1) >= min(_WHOLE * OFFSET_S / steps.period_s, 1.0)
-        root_m = np.sqrt(self.bias_m**2 + sums.survey(late, at + 1) ** 2 + sums.sigma2(late, at + 1) * self.excess[at])
-        mean_m = np.abs(sums.residual(late, at + 1))
-        return np.where(usable & np.isfinite(mean_m) & (root_m > 0.0), mean_m / np.maximum(root_m, 1e-9), 0.0)
+    def _offset(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> Floats:
+        """The mean of the last seconds, in sigmas."""
+        late = np.searchsorted(steps.end_s, steps.end_s[at] - self.config.paths_level_s, side="right")
+        late = np.maximum(np.minimum(late, at) - trail.start, 0)
+        part = sums[:, at + 1 - trail.start] - sums[:, late]
+        least = np.minimum(_WHOLE * self.config.paths_level_s / steps.period_s[at], 1.0)
+        return self._in_sigmas(part, part[0] >= least, self.excess[at])
 
-    def _lasting(self, steps: PathSteps, sums: _Sums, at: Ints) -> Floats:
-        start = np.full(at.size, sums.first)
-        usable = sums.count(start, at + 1) >= 10
-        lasted_s = np.maximum(steps.end_s[at] - steps.end_s[start], 1e-9)
+    def _lasting(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> Floats:
+        """The mean of the whole way, in sigmas."""
+        own = sums[:, at + 1 - trail.start] - sums[:, [trail.begin - trail.start]]
+        part = own + np.array(trail.before)[:, None]
+        lasted_s = np.maximum(steps.end_s[at] - steps.end_s[trail.first], 1e-9)
         share = _SLOW + (1.0 - _SLOW) * np.minimum(1.0, _AVERAGED_S / lasted_s)
-        sigma_m2 = sums.sigma2(start, at + 1) * share * self.excess[at]
-        root_m = np.sqrt(self.bias_m**2 + sums.survey(start, at + 1) ** 2 + sigma_m2)
-        mean_m = np.abs(sums.residual(start, at + 1))
-        return np.where(usable & np.isfinite(mean_m) & (root_m > 0.0), mean_m / np.maximum(root_m, 1e-9), 0.0)
+        return self._in_sigmas(part, part[0] >= _LASTING_STEPS, share * self.excess[at])
 
-
-@dataclass(frozen=True)
-class _Sums:
-    """Running sums over the steps that count, so that any window is a difference of two."""
-
-    counts: Floats
-    residuals: Floats
-    surveys: Floats
-    sigmas2: Floats
-    first: int
-
-    @classmethod
-    def of(cls, steps: PathSteps, counted: Bools, residual_m: Floats, survey_m: Floats) -> _Sums:
-        def summed(values: Floats) -> Floats:
-            return np.concatenate([[0.0], np.cumsum(np.where(counted, np.nan_to_num(values), 0.0))])
-
-        known = np.flatnonzero(np.isfinite(residual_m))
-        return cls(
-            summed(np.ones(counted.size)),
-            summed(residual_m),
-            summed(survey_m),
-            summed(steps.sigma_m[: counted.size] ** 2),
-            int(known[0]) if known.size else 0,
-        )
-
-    def count(self, begin: Ints, end: Ints) -> Floats:
-        return np.asarray(self.counts[end] - self.counts[begin])
-
-    def _mean(self, sums: Floats, begin: Ints, end: Ints) -> Floats:
-        count = self.count(begin, end)
-        return np.where(count > 0, (sums[end] - sums[begin]) / np.maximum(count, 1.0), np.nan)
-
-    def residual(self, begin: Ints, end: Ints) -> Floats:
-        return self._mean(self.residuals, begin, end)
-
-    def survey(self, begin: Ints, end: Ints) -> Floats:
-        return self._mean(self.surveys, begin, end)
-
-    def sigma2(self, begin: Ints, end: Ints) -> Floats:
-        return self._mean(self.sigmas2, begin, end)
+    def _in_sigmas(self, part: Floats, usable: Bools, share: Floats) -> Floats:
+        """Mean residual over its sigma, 0 where steps are too few; `share`: of the position's variance."""
+        mean = part[1:] / np.maximum(part[0], 1.0)
+        root_m = np.sqrt(self.config.cross_bias_sigma_m**2 + mean[1] ** 2 + mean[2] * share)
+        return np.where(usable & (root_m > 0.0), np.abs(mean[0]) / np.maximum(root_m, 1e-9), 0.0)
 
 
 def told_by_a_switch_m(survey_m: Floats, alpha: float, merged_m: float) -> Floats:
     """How far apart tracks have to be for a movement from one to the other to be seen, with exact positions [m]."""
-    return np.asarray(_size(alpha, _LOOKED_S / WINDOWS_S[0]) * np.sqrt(2.0) * survey_m + 2.0 * merged_m)
+    return np.asarray(_size(alpha, LOOKED_S / WINDOWS_S[0]) * np.sqrt(2.0) * survey_m + 2.0 * merged_m)
 
 
 def told_by_offset_m(survey_m: Floats, alpha: float, bias_m: float) -> Floats:
@@ -205,33 +205,38 @@ def told_by_offset_m(survey_m: Floats, alpha: float, bias_m: float) -> Floats:
 
 
 def _size(alpha: float, looks: float) -> float:
-    """Limit of a test in sigmas: the level is shared by nine tests, each with so many looks."""
+    return float(_sizes(alpha, np.array([looks]))[0])
+
+
+def _sizes(alpha: float, looks: Floats) -> Floats:
+    """Limits of tests in sigmas: the level is shared by nine tests, each with so many looks."""
     from scipy.special import ndtri
 
-    return float(-ndtri(alpha / (9.0 * looks * 2.0)))
+    return np.asarray(-ndtri(alpha / (_TESTS * looks * 2.0)))
 
 
-def _tail(z: float) -> float:
+def _tails(sigmas: Floats) -> Floats:
     from scipy.special import ndtr
 
-    return float(ndtr(-z))
+    return np.asarray(ndtr(-sigmas))
 
 
-_SHARES: dict[tuple[float, float], float] = {}
+@cache
+def _greatest_shares(tau_s: float) -> Floats:
+    """Per window the variance of a movement over that of the noise, the greatest over all noises of at least `tau_s`.
 
-
-def _greatest_share(window_s: float, tau_s: float) -> float:
-    """Variance of a movement over that of the noise, the greatest over Gauss-Markov noises of at least `tau_s`."""
-    key = (window_s, tau_s)
-    if key not in _SHARES:
+    Of Gauss-Markov noises with these correlation times.
+    """
+    taus_s = _TAUS_S[tau_s <= _TAUS_S]
+    shares = []
+    for window_s in WINDOWS_S:
         samples = max(4, min(int(window_s), 24))
         times = (np.arange(samples) + 0.5) * window_s / samples
         times = np.concatenate([times, times + 2.0 * window_s])
         weights = np.concatenate([np.full(samples, 1.0), np.full(samples, -1.0)]) / samples
         lags = np.abs(times[:, None] - times[None, :])
-        shares = [float(weights @ np.exp(-lags / tau) @ weights) for tau in _TAUS_S if tau >= tau_s]
-        _SHARES[key] = max(shares)
-    return _SHARES[key]
+        shares.append(max(float(weights @ np.exp(-lags / tau) @ weights) for tau in taus_s))
+    return np.array(shares)
 
 
 def _windows(t_s: Floats, window_s: float) -> tuple[Ints, Ints, Ints]:
@@ -240,12 +245,11 @@ def _windows(t_s: Floats, window_s: float) -> tuple[Ints, Ints, Ints]:
     return late, early_end, early
 
 
-def _excess(steps: PathSteps, measured_m2: dict[float, Floats]) -> Floats:
+def _excess(steps: PathSteps, measured_m2: Floats) -> Floats:
     """Variance along the track over what the stated sigma gives, of all windows that are known the middle one."""
     stated_m2 = np.cumsum(steps.sigma_m**2) / np.arange(1, len(steps) + 1)
-    ratios = np.sort(
-        [seen / (stated_m2 * _greatest_share(window, 50.0)) for window, seen in measured_m2.items()], axis=0
-    )
+    shares = _greatest_shares(50.0)[:, None]
+    ratios = np.sort(measured_m2 / (stated_m2 * shares), axis=0)
     known = np.isfinite(ratios).sum(axis=0)
     middle = ratios[np.maximum(known - 1, 0) // 2, np.arange(len(steps))]
     return np.where(known > 0, np.fmax(middle, 1.0), 1.0)
@@ -261,17 +265,18 @@ def _measured_m2(steps: PathSteps, window_s: float) -> Floats:
         return np.full(len(steps), np.nan)
     rows = np.arange(len(steps))
     late, early_end, early = _windows(steps.end_s, window_s)
+    period_s = steps.period_s
     counts = np.concatenate([[0], np.cumsum(known)])
     sums = np.concatenate([[0.0], np.cumsum(np.where(known, steps.along_m, 0.0))])
     late_count = counts[rows + 1] - counts[late]
     early_count = counts[early_end] - counts[early]
     with np.errstate(invalid="ignore", divide="ignore"):
         moved_m = (sums[rows + 1] - sums[late]) / late_count - (sums[early_end] - sums[early]) / early_count
-    least = _WHOLE * window_s / steps.period_s
+    least = _WHOLE * window_s / period_s
     whole = (late_count >= least) & (early_count >= least)
     moved_m = np.where(whole, moved_m, 0.0)
     number = np.cumsum(whole)
     mean_m = np.cumsum(moved_m) / np.maximum(number, 1)
     variance_m2 = np.cumsum(moved_m**2) / np.maximum(number, 1) - mean_m**2
-    enough = number >= _MEASURED_WINDOWS * window_s / steps.period_s
+    enough = number >= _MEASURED_WINDOWS * window_s / period_s
     return np.where(enough, np.maximum(variance_m2, 0.0), np.nan)

@@ -1,32 +1,24 @@
-"""The tracks that a reference may have run along: a set by distance, without a favourite (DOMAIN section 5.1)."""
+"""The tracks that a reference may have run along: a set without a favourite (DOMAIN section 5.1)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from math import dist
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.reference.moves import Moves
-from pipeline.stages.reference.near import Foot, Near, near_elements
+from pipeline.stages.paths.path_set import path_set
+from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.reference.open_ends import off_the_survey
-from pipeline.stages.reference.visits import ElementStay, Node, Transition, nodes_of, pieces_of, ways_over
+from pipeline.stages.reference.samples import Samples, samples_of
+from pipeline.stages.reference.visits import ElementStay
+from pipeline.stages.reference.ways import ways_of
 from pipeline.stages.track.chain import Chain
-from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration
-
-# Numerics: between steps so far apart the search asks where the train may have gone [m].
-_STEP_M = 10.0
-# A way along the track is at most so many times the straight line between two steps: no railway curve is sharper.
-_CURVED = 1.5
-# ... and no train comes farther between two samples of a stretch; the search ends there [m].
-_FARTHEST_M = 600.0
 
 
 @dataclass(frozen=True)
@@ -63,32 +55,24 @@ def reference_stretches(
     """Stretches of the reference with their ways, and the times at which samples exist but lie on no track [ns].
 
     `network`: with elements that turn round in pieces; `numbers`: net elements as the caller counts them. An element is
-    in the set if a navigable way through the whole stretch runs over it, whose median distance from the samples is
-    within k roots on each piece between places where ways part.
+    in the set if a navigable way through the whole stretch runs over it that the samples do not refute: the set of
+    `paths` with the reference's own sigma and level, and no bias.
     """
     if reference is None or reference.is_empty():
         return [], []
     hazards = config.hazards
-    t_ns = times_ns(reference)
-    sigma_m = reference["sigma_m"].fill_null(hazards.reference_sigma_m).to_numpy()
-    points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))
+    samples = samples_of(reference, network, config)
     # A sample beyond k_T roots of every track is no sample of the track.
-    # A track whose samples lie a little farther at some steps is still asked for: its median decides.
-    near = near_elements(points, sigma_m, network, 2.0 * config.align.sure_sigmas, hazards.survey_sigma_m)
-    placed = np.flatnonzero(
-        near.placed(config.align.sure_sigmas, sigma_m) & ~off_the_survey(points, sigma_m, near, network, hazards)
-    )
-    search = _Search(points, sigma_m, near, network, numbers, config)
+    near = samples.placed(config.align.sure_sigmas) & ~off_the_survey(samples, network, hazards)
+    search = _Search(samples, network.unsearched(), numbers, config)
     stretches: list[ReferenceStretch] = []
-    covered = np.zeros(t_ns.size, dtype=np.bool_)
-    for rows in _between_gaps(t_ns, placed, hazards.reference_gap_s):
-        part = search.passable(rows)
-        paths = search.paths(part)
-        if paths:
-            inside = slice(part.begin, part.end + 1)
-            stretches.append(ReferenceStretch(t_ns[inside], sigma_m[inside], paths))
-            covered[inside] = True
-    return stretches, _silent_spans(t_ns, covered, hazards.reference_gap_s)
+    covered = np.zeros(samples.t_ns.size, dtype=np.bool_)
+    for rows in _between_gaps(samples.t_ns, np.flatnonzero(near), hazards.reference_gap_s):
+        if paths := search.paths(rows):
+            part = slice(int(rows[0]), int(rows[-1]) + 1)
+            stretches.append(ReferenceStretch(samples.t_ns[part], samples.sigma_m[part], paths))
+            covered[part] = True
+    return stretches, _silent_spans(samples.t_ns, covered, hazards.reference_gap_s)
 
 
 def _between_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
@@ -116,165 +100,62 @@ def _silent_spans(t_ns: Ints, covered: Bools, gap_s: float) -> list[tuple[int, i
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Samples some metres apart (`steps`, by their numbers) with a way through: oriented elements at the first, and the
-    moves to each next one.
-    """
-
-    steps: Ints
-    starts: set[int]
-    layers: list[list[Transition]]
-
-    @property
-    def begin(self) -> int:
-        return int(self.steps[0])
-
-    @property
-    def end(self) -> int:
-        return int(self.steps[-1])
-
-    @cached_property
-    def nodes(self) -> list[Node]:
-        return nodes_of(self.starts, self.layers)
-
-
-@dataclass(frozen=True)
 class _Search:
     """The samples of a run, and where they may lie on the network."""
 
-    points: Points
-    sigma_m: Floats
-    near: Near
+    samples: Samples
     network: Network
     numbers: dict[str, int]
     config: Configuration
 
-    def passable(self, rows: Ints) -> _Part:
-        """The longest part of samples without a gap among them that a train can have run.
+    def paths(self, rows: Ints) -> tuple[ReferencePath, ...]:
+        """All ways through samples without a gap; none where they are more than `routes_limit`, or all are refuted."""
+        hazards = self.config.hazards
+        law = self.config.matching.model_copy(
+            update={
+                "cross_bias_sigma_m": 0.0,
+                "paths_alpha": hazards.reference_alpha,
+                "survey_sigma_default_m": hazards.survey_sigma_m,
+            }
+        )
+        samples = self.samples
+        steps = path_steps(samples.t_ns[rows], samples.points.take(rows), samples.sigma_m[rows])
+        found = path_set(steps, self.network, law)
+        begins = rows[0] + np.searchsorted(samples.t_ns[rows], steps.begin_ns)
+        ends = np.append(begins[1:], rows[-1] + 1)
+        return tuple(self._path(stays, begins, ends) for stays in ways_of(found, law, hazards.routes_limit))
 
-        Where no move leads on, the reference leapt to another track: of the other parts nobody knows.
+    def _path(self, stays: Sequence[ElementStay], begins: Ints, ends: Ints) -> ReferencePath:
+        """A way with coordinates: each sample on the nearest of the elements that the way visits about then.
+
+        `begins`, `ends`: of each step the first sample, and that after its last.
         """
-        return max(self._parts(self._steps(rows)), key=lambda part: len(part.layers))
-
-    def _steps(self, rows: Ints) -> Ints:
-        """Samples some metres apart, those where the train turned, the first and the last."""
-        places = self.points.surface[rows].tolist()
-        steps = [0]
-        far = 0
-        far_m = 0.0
-        for number, apart_m in enumerate(np.maximum(_STEP_M, 6.0 * self.sigma_m[rows]).tolist()):
-            away_m = dist(places[number], places[steps[-1]])
-            turned = far_m - away_m > 0.5 * apart_m
-            if turned or away_m >= apart_m:
-                steps.append(far if turned else number)
-                far = number
-                far_m = dist(places[number], places[steps[-1]])
-            elif away_m > far_m:
-                far = number
-                far_m = away_m
-        if steps[-1] != rows.size - 1:
-            steps.append(rows.size - 1)
-        return rows[steps]
-
-    def _parts(self, steps: Ints) -> Iterator[_Part]:
-        """The parts of the steps; a new one begins where no move leads on."""
-        places = [self._inside(feet) for feet in self.near.feet(steps)]
-        apart_m = np.linalg.norm(np.diff(self.points.surface[steps], axis=0), axis=1)
-        noise_m = np.maximum(_STEP_M, 6.0 * self.sigma_m[steps[1:]])
-        moves = Moves(self.network)
-        first = 0
-        layers: list[list[Transition]] = []
-        alive = starts = {2 * element for element in places[0]}
-        for step, limit_m in enumerate(np.minimum(_CURVED * apart_m + noise_m, _FARTHEST_M).tolist()):
-            here = places[step]
-            there = places[step + 1]
-            onward = [move for start in sorted(alive) for move in moves.onward(start, here, there, limit_m)]
-            if onward:
-                layers.append(onward)
-                alive = {move.to for move in onward}
-            else:
-                yield _Part(steps[first : step + 1], starts, layers)
-                first = step + 1
-                layers = []
-                alive = starts = {2 * element for element in there}
-        yield _Part(steps[first:], starts, layers)
-
-    def _inside(self, feet: Sequence[Foot]) -> dict[int, float]:
-        """Net elements of one sample and its measure on each, without those past whose end it is nearer to the next."""
-        distances = {foot.element: foot.distance_m for foot in feet}
-
-        def beyond(foot: Foot) -> bool:
-            following = () if foot.end is None else self.network.successors[2 * foot.element + 1 - foot.end]
-            return any(distances.get(edge.to // 2, np.inf) < foot.distance_m for edge in following)
-
-        return {foot.element: foot.measure_m for foot in feet if not beyond(foot)}
-
-    def paths(self, part: _Part) -> tuple[ReferencePath, ...]:
-        """All ways through a part that do not fail; none where they are more than `routes_limit`."""
-        last = len(part.layers)
-        ways = ways_over(part.nodes, last, self._failed(part), self.config.hazards.routes_limit)
-        return tuple(self._path(stays, part) for stays in ways)
-
-    def _failed(self, part: _Part) -> set[Node]:
-        """Visits of pieces that lie farther from the samples than k roots, by the median; without samples none does.
-
-        The root is that of the sample and of the survey, of all elements compared the one that is known worst.
-        """
-        near = self.near
-        survey_m = np.zeros(part.end - part.begin + 1)
-        for node in part.nodes:
-            pairs = near.of(node.oriented // 2, int(part.steps[node.first]), int(part.steps[node.last]))
-            row = near.sample[pairs] - part.begin
-            survey_m[row] = np.maximum(survey_m[row], near.survey_sigma_m[pairs])
-        sigma_m = self.sigma_m[part.begin : part.end + 1]
-        root_m = self.config.hazards.evidence_factor * np.hypot(sigma_m, survey_m)
-        failed: set[Node] = set()
-        for piece in pieces_of(part.nodes):
-            sampled = [node for node in piece if node.sampled]
-            if not sampled:
-                continue
-            begin = int(part.steps[min(node.first for node in sampled)])
-            end = int(part.steps[max(node.last for node in sampled)])
-            distance_m = np.full(end - begin + 1, np.inf)
-            for element in {node.oriented // 2 for node in piece}:
-                pairs = near.of(element, begin, end)
-                row = near.sample[pairs] - begin
-                distance_m[row] = np.minimum(distance_m[row], near.distance_m[pairs])
-            if np.median(distance_m / root_m[begin - part.begin : end - part.begin + 1]) > 1.0:
-                failed |= set(piece)
-        return failed
-
-    def _path(self, stays: Sequence[ElementStay], part: _Part) -> ReferencePath:
-        """A way with coordinates: each sample on the nearest of the elements that the way visits about then."""
-        near = self.near
-        track = self.network.track
-        count = part.end - part.begin + 1
+        samples = self.samples
+        near = samples.near
+        begin = int(begins[0])
+        count = int(ends[-1]) - begin
         nearest_m = np.full(count, np.inf)
         at_m = np.full(count, np.nan)
         leg = np.full(count, -1)
         survey_m = np.zeros(count)
         legs, placed = _legs(stays, self.network)
         for stay, (number, entry_m) in zip(stays, placed, strict=True):
-            element = stay.oriented // 2
-            low = part.steps[max(stay.first - 1, 0)]
-            high = part.steps[min(stay.last + 1, part.steps.size - 1)]
-            pairs = near.of(element, int(low), int(high))
-            sample = near.sample[pairs] - part.begin
-            nearer = near.distance_m[pairs] < nearest_m[sample]
-            sample = sample[nearer]
-            measure_m = near.measure_m[pairs][nearer]
-            against = stay.oriented % 2
-            along_m = track.end_m[element] - measure_m if against else measure_m - track.begin_m[element]
-            nearest_m[sample] = near.distance_m[pairs][nearer]
+            low = int(begins[max(stay.first - 1, 0)])
+            high = int(ends[min(stay.last + 1, ends.size - 1)])
+            rows = near.of(stay.oriented // 2, low, high)
+            sample = near.step[rows] - begin
+            nearer = near.distance_m[rows] < nearest_m[sample]
+            sample, rows = sample[nearer], rows[nearer]
+            nearest_m[sample] = near.distance_m[rows]
             leg[sample] = number
-            at_m[sample] = entry_m + along_m
-            survey_m[sample] = near.survey_sigma_m[pairs][nearer]
+            at_m[sample] = entry_m + (near.left_m[rows] if stay.oriented % 2 else near.along_m[rows])
+            survey_m[sample] = samples.survey_m[rows]
         on_way = np.flatnonzero(leg >= 0)
-        samples = np.arange(count)
-        leg = leg[on_way[np.maximum(np.searchsorted(on_way, samples, side="right") - 1, 0)]]
+        every = np.arange(count)
+        leg = leg[on_way[np.maximum(np.searchsorted(on_way, every, side="right") - 1, 0)]]
         routes = tuple(chain.route(self.network, self.numbers) for chain in legs)
-        root_m = np.hypot(self.sigma_m[part.begin : part.end + 1], survey_m)
-        return ReferencePath(leg, np.interp(samples, on_way, at_m[on_way]), routes, nearest_m, root_m)
+        root_m = np.hypot(samples.sigma_m[begin : begin + count], survey_m)
+        return ReferencePath(leg, np.interp(every, on_way, at_m[on_way]), routes, nearest_m, root_m)
 
 
 def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:

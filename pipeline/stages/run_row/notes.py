@@ -56,12 +56,19 @@ def ride_notes(ride: Ride, evidence: TrainEvidence) -> list[Remark]:
             Note.ODOMETER_REVERSED: ride.match.odometer_sign < 0 and prepared.vehicle.gnss_antenna_ahead_m,
             Note.COVARIANCE: contradictory_covariances(ride.solution.fixes),
             Note.AMBIGUOUS: ", ".join(say("ambiguity", "stretch", **row) for row in doubtful),
+            Note.OFF_NETWORK: _few([_off(row) for row in ride.match.off.iter_rows(named=True)]),
             Note.UNLINKED: _unlinked(ride.lds.epochs["link_distance_reason"]),
             Note.UNKNOWN_TELEGRAMS: ", ".join(sorted(set(ride.lds.unknown_reads["balise_id"]))),
             Note.READS_DISPUTED: evidence.disputed,
             Note.READS_UNREACHABLE: evidence.unreachable,
         }
     )
+
+
+def _off(stretch: Mapping[str, Any]) -> str:
+    """One stretch off the network, with its place and how far aside."""
+    side = "left" if stretch["offset_m"] > 0.0 else "right"
+    return say("off_network", side, **{**stretch, "offset_m": abs(stretch["offset_m"])})
 
 
 def _few(names: list[str]) -> str:

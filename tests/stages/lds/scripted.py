@@ -103,6 +103,7 @@ def epochs_of(
         odometer_m=odometer,
         direction=pl.lit(1, pl.Int8),
         odometer_slips=pl.lit(value=False),
+        odometer_rows_m=pl.lit(0.0),
     )
     series = [
         value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()

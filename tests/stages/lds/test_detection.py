@@ -269,6 +269,21 @@ def test_jump_over_two_balises_offers_both_in_order() -> None:
     assert [first for first, _ in negations(result)] == [15]
 
 
+@pytest.mark.parametrize(
+    ("rows_m", "disordered", "reason"), [(0.0, 2.0, None), (2.3, 0.0, None), (3.0, None, "noise too large")]
+)
+def test_a_coarse_count_over_two_balises_near_each_other_is_no_disorder(
+    rows_m: float, disordered: float | None, reason: str | None
+) -> None:
+    """At 2 m/s the position passes V1 and V2, half a metre apart, just when the counter counts on by 16 m."""
+    path_m = [2.0 * k for k in range(40)]
+    odometer_m = [16.0 * ((k + 5) // 8) for k in range(40)]
+    epochs = epochs_of(path_m, odometer_m, odometer_rows_m=[rows_m] * 40)
+    result = run(epochs, balises_at({"V1": 37.0, "V2": 37.5}), disabled=["link_distance"]).epochs
+    assert (result["link_order_value"][19], result["link_order_reason"][19]) == (disordered, reason)
+    assert result["alarm"].any() == (disordered == 2.0)
+
+
 def test_the_same_jump_seen_by_the_bank_is_rejected_by_it() -> None:
     odometer_m = steps(0.0, 20.0, 30)
     path_m = [value + (120.0 if k >= 15 else 0.0) for k, value in enumerate(odometer_m)]

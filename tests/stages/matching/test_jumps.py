@@ -8,6 +8,7 @@ import pytest
 
 from schemas.run import Site
 from tests.stages.matching.builders import line, matched, odometer, run, site
+from tests.stages.matching.test_network import SWITCH, SWITCH_LINKS, along, branch
 
 # Two tracks 20 m apart, each in two elements; the far one has a third track 200 m beside it.
 TRACKS = site(
@@ -126,3 +127,24 @@ def test_how_a_lost_position_moves_does_not_choose_between_parallel_tracks(seed:
     found = matched(run(x, y, 2.5, sigma_m=None, fix=["rtk_fixed"] * len(x)), place)
     assert found.path.elements() == ["a"]
     assert found.epochs["gate_probability"].to_numpy()[-8:].min() > 0.5
+
+
+def test_a_train_that_turns_back_in_a_pause_of_the_odometer_keeps_its_sense() -> None:
+    """The odometer falls from 2 s on: the run began by reversing, whatever of its first metres is not known."""
+    t = np.arange(0.0, 200.0)
+    x = 1000.0 - 10.0 * np.minimum(t, 20.0) + 10.0 * np.clip(t - 40.0, 0.0, None)
+    stream = odometer(x).with_columns(slip=pl.Series((t < 2.0) | ((t > 8.0) & (t < 15.0))))
+    epochs = matched(run(x, 0.0 * x, sigma_m=0.1), site({"a": line((0, 0), (6000, 0))}), stream).epochs
+    assert epochs["path_m"][19] > epochs["path_m"][2]
+    assert epochs["gate_probability"].min() == 1.0
+
+
+def test_epochs_before_the_first_position_put_no_claim_forward() -> None:
+    """For 40 s the receiver has no fix; at the switch it knows no sooner which way it went than one that had."""
+    distance = np.arange(500.0, 1500.0, 5.0)
+    x, y = along(branch("d"), distance)
+    late = matched(run(x, y, fix=np.where(distance < 700.0, "none", "sbas")), site(SWITCH, SWITCH_LINKS)).epochs
+    whole = matched(run(x, y)[40:], site(SWITCH, SWITCH_LINKS)).epochs
+    assert late["gate_probability"][:40].fill_null(0.0).max() == 0.0
+    assert late["gate_probability"][40:].to_list() == whole["gate_probability"].to_list()
+    assert (whole["gate_probability"] < 0.99).any()

@@ -8,21 +8,22 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.stages.matching.trellis import States, _polarity
+from pipeline.stages.matching.path_states import PathStates, polarity
 
 
-def polarity(place_m: list[list[float]], odometer_m: list[float], orientable: bool = True) -> list[int]:
+def signs_of(place_m: list[list[float]], odometer_m: list[float], orientable: bool = True) -> list[int]:
     """Two elements of a part each, 0 and 1, 2 and 3 along and against; at each step a state along either."""
     network = SimpleNamespace(successors=[None] * 4, parts=np.array([0, 0, 1, 1]), orientable=orientable)
     steps = len(place_m)
-    states = States(
+    states = PathStates(
+        step=np.arange(steps),
         first=2 * np.arange(steps + 1),
         oriented=np.array([0, 2] * steps),
-        candidate=np.arange(2 * steps),
         place_m=np.ravel(place_m),
-        offset_m=np.zeros(2 * steps),
+        cost=np.zeros(2 * steps),
+        refuted=np.zeros(2 * steps, dtype=np.bool_),
     )
-    return _polarity(cast(Any, network), cast(Any, SimpleNamespace(odometer_m=np.array(odometer_m))), states).tolist()
+    return polarity(cast(Any, network), states, np.array(odometer_m)).tolist()
 
 
 @pytest.mark.parametrize(
@@ -40,5 +41,5 @@ def polarity(place_m: list[list[float]], odometer_m: list[float], orientable: bo
 def test_each_part_of_the_network_has_the_sign_that_its_states_moved_by(
     place_m: list[list[float]], odometer_m: list[float], signs: list[int]
 ) -> None:
-    assert polarity(place_m, odometer_m) == signs
-    assert polarity(place_m, odometer_m, orientable=False) == [0] * 4
+    assert signs_of(place_m, odometer_m) == signs
+    assert signs_of(place_m, odometer_m, orientable=False) == [0] * 4

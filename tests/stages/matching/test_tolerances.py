@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -14,8 +13,6 @@ from pipeline.stages.matching import match
 from pipeline.stages.matching.epochs import on_track_limit_m
 from pipeline.stages.matching.fixes import contradictory_covariances
 from pipeline.stages.matching.match import pins_of
-from pipeline.stages.matching.steps import spaced
-from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.survey import track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from tests.stages.matching.builders import line, run, site
@@ -57,17 +54,6 @@ def test_an_element_shorter_than_positions_scatter_is_the_same_way() -> None:
     )
     assert found.epochs["path_probability"].min() >= 0.99
     assert found.epochs["gate_probability"].min() >= 0.99
-
-
-def test_steps_are_a_distance_or_a_time_apart() -> None:
-    """4 m each second for 6 s, then a stand to 30 s: every 10 m, every 10 s, and the last; the fifth is left out."""
-    t_s = np.array([*range(7), *range(8, 31, 2)], dtype=float)
-    points = points_of(np.zeros(len(t_s)), np.degrees(np.minimum(4.0 * t_s, 24.0) / 6378137.0))
-    rows = np.delete(np.arange(len(t_s)), 5)
-    fixes = SimpleNamespace(points=points, t_s=t_s)
-    found = spaced(cast(Any, fixes), rows, MatchingConfig(step_distance_m=10.0, step_time_s=10.0))
-    assert t_s[found].tolist() == [0.0, 3.0, 6.0, 10.0, 20.0, 30.0]
-    assert t_s[spaced(cast(Any, fixes), rows[:-1], MatchingConfig(step_time_s=100.0))].tolist() == [0.0, 3.0, 6.0, 28.0]
 
 
 def test_balises_beyond_an_end_by_what_lists_round_lie_where_their_measure_says() -> None:

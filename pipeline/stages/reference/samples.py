@@ -1,0 +1,47 @@
+"""The samples of a reference, and the nearest place of each on every net element within reach."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
+from pipeline.stages.track.geodesy import Points, points_of
+from pipeline.stages.track.network import Network
+from schemas.arrays import Bools, Floats, Ints, floats, times_ns
+from schemas.config import Configuration
+
+
+@dataclass(frozen=True)
+class Samples:
+    """`sigma_m` of each; `near`: places by sample, `survey_m` the survey's sigma at each of these, `root_m` of both."""
+
+    t_ns: Ints
+    points: Points
+    sigma_m: Floats
+    near: Candidates
+    survey_m: Floats
+
+    @property
+    def root_m(self) -> Floats:
+        return np.hypot(self.sigma_m[self.near.step], self.survey_m)
+
+    def placed(self, factor: float) -> Bools:
+        """Samples with an element within `factor` roots."""
+        placed = np.zeros(self.t_ns.size, dtype=np.bool_)
+        placed[self.near.step[self.near.distance_m <= factor * self.root_m]] = True
+        return placed
+
+
+def samples_of(reference: pl.DataFrame, network: Network, config: Configuration) -> Samples:
+    """Of a reference stream; places twice as far off as any that can be a sample's."""
+    hazards = config.hazards
+    sigma_m = reference["sigma_m"].fill_null(hazards.reference_sigma_m).to_numpy()
+    points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))
+    most_m = float(np.hypot(sigma_m, network.most_survey_sigma_m(hazards.survey_sigma_m)).max())
+    reach_m = 2.0 * config.align.sure_sigmas * most_m
+    near = candidates_of(points, network, search_about(points.surface, network, reach_m), reach_m)
+    survey_m = network.survey_sigmas_m(hazards.survey_sigma_m, near.vertex)
+    return Samples(times_ns(reference), points, sigma_m, near, survey_m)

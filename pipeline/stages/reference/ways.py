@@ -1,0 +1,95 @@
+"""The ways of a reference: what lives of a set of paths, as visits of net elements with the links between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+from pipeline.stages.paths.moves import Moves, Place
+from pipeline.stages.paths.path_set import Node, PathSet
+from pipeline.stages.reference.visits import ElementStay, Link, Visit, ways_over
+from schemas.config import MatchingConfig
+
+
+def ways_of(found: PathSet, config: MatchingConfig, most: int) -> list[list[ElementStay]]:
+    """Ways from the first step to the last that together run over every hypothesis that nothing refutes.
+
+    None where there are more than `most`, and none where every path is refuted: a set that began anew knows nothing of
+    what went wrong before.
+    """
+    last = len(found.steps) - 1
+    if found.overflow <= last:
+        return []
+    nodes = {id(node): node for node in _living(found)}
+    visits = {key: Visit(node.oriented, node.begin, node.end - 1) for key, node in nodes.items() if _lasts(node)}
+    moves = Moves.without_odometer(found.network, found.steps, config)
+    every = list(visits.values())
+    for key, visit in visits.items():
+        node = nodes[key]
+        for origin, end in _origins(node):
+            every += _linked(moves, visits[id(origin)], visit, origin, node, end)
+    return [_without_cuts(way) for way in ways_over(every, last, most)]
+
+
+def _living(found: PathSet) -> Iterator[Node]:
+    """The hypotheses that lived from the first step to the last, and all that they went through."""
+    count = len(found.steps)
+    waiting = [node for node in found.nodes if node.stretch == 0 and node.end >= count and node.rejected >= count]
+    known: set[int] = set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) not in known:
+            known.add(id(node))
+            yield node
+            waiting += node.origins
+
+
+def _lasts(node: Node) -> bool:
+    """It covers a step: others only led from one element to the next."""
+    return node.end > node.begin
+
+
+def _origins(node: Node) -> Iterator[tuple[Node, int]]:
+    """What a hypothesis came from, and the step before which it did."""
+    waiting = [(origin, node.begin if origin is node.parent else origin.end) for origin in node.origins]
+    while waiting:
+        origin, step = waiting.pop()
+        if _lasts(origin):
+            yield origin, step
+        else:
+            waiting += [(further, step) for further in origin.origins]
+
+
+def _linked(moves: Moves, here: Visit, there: Visit, origin: Node, node: Node, step: int) -> list[Visit]:
+    """Link two visits behind the step before `step`; returns visits of elements between, on which no sample lies."""
+    begin = _place(origin, step - 1)
+    end = _place(node, step)
+    move = moves.best(begin, end)
+    if move is None or moves.cost(begin, end, moves.way(begin.step, end.step)) >= moves.break_cost:
+        return []
+    at = step - 1
+    sense = move.sense or 1
+    between = [Visit(oriented, at, at, sampled=False) for oriented in move.between]
+    for one, other in pairwise([here, *between, there]):
+        link = Link(one, other, at, sense < 0)
+        one.after.append(link)
+        other.before.append(link)
+    return between
+
+
+def _place(node: Node, step: int) -> Place:
+    """Where a path was at one of its steps."""
+    row = min(max(step - node.begin, 0), node.end - node.begin - 1)
+    return Place(step, node.oriented, float(node.left_m[row, node.oriented % 2]))
+
+
+def _without_cuts(stays: list[ElementStay]) -> list[ElementStay]:
+    """Stays on one element after each other are one: a pause of the samples was between them."""
+    kept = [stays[0]]
+    for stay in stays[1:]:
+        before = kept[-1]
+        if stay.oriented == before.oriented:
+            kept[-1] = ElementStay(before.oriented, before.first, stay.last, before.back)
+        else:
+            kept.append(stay)
+    return kept
