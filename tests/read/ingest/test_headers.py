@@ -168,3 +168,27 @@ def test_units_behind_names_without_brackets(tmp_path: Path) -> None:
 )
 def test_names_of_latitudes(name: str) -> None:
     assert columns_in("gnss", {name: word_of(name)}) == {"latitude_deg": name}
+
+
+@pytest.mark.parametrize(
+    "above",
+    [
+        "Logger X v1.2\nSerial, 123\n\n",
+        "Logger X\n",
+        "Start: 2025-06-03 08:00:00\nInterval; 100 ms\n\n\n",
+        "a,b\n1,2\n",
+    ],
+)
+def test_what_a_logger_writes_above_the_header(tmp_path: Path, above: str) -> None:
+    rows = "".join(f"{TIME.format(n)},50.1,14.2\n" for n in range(3))
+    assert times_by_draft(tmp_path, f"{above}time,lat,lon\n{rows}") == [f"2025-06-03T08:00:0{n}" for n in range(3)]
+    units = f"{above}time,lat,lon\n,deg,deg\n{rows}"
+    assert len(times_by_draft(tmp_path, units)) == 3
+    mapping = settings_from(drafted(tmp_path, units), IngestConfig, "draft")
+    assert convert([tmp_path / "log.csv"], "r", mapping).dropped["line above the header"] == above.count("\n")
+
+
+def test_a_header_that_is_shorter_than_its_rows_is_none_above_one(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("time,lat\n" + "".join(f"{TIME.format(n)},50.1,14.2\n" for n in range(3)))
+    with pytest.raises(InputError, match="has more values than the header"):
+        draft_mapping(tmp_path / "log.csv")
