@@ -252,8 +252,8 @@ class AlignConfig(Settings):
     # Over a reset between two rows the speed about it counts where braking x dt^2 / 4 is no more than this, as at 1 Hz:
     # a tenth of the odometer's fixed error.
     reset_doubt_m: NonNegative = 0.5
-    # Speeds give the distance over such a jump if, over the whole run, they differ from it by a smaller share:
-    # another unit or sign differs by more than a half, slip and scale by some percent.
+    # Speeds give the distance over such a jump if, so far, they differed from it by a smaller share: another unit or
+    # sign differs by more than a half, slip and scale by some percent. Once they agree, more contradicts it.
     speed_agreement: Probability = 0.2
     # Between rows no farther apart a straight line is within 0.5 m of a train that brakes as hard as this, which
     # is an emergency brake.

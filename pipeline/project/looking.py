@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ class StreamSpan:
 @dataclass(frozen=True)
 class SeenLog:
     """A log and what it feeds; `mapping`: of a table, by stream; `is_run`: needs no conversion; `parts`: what it
-    consists of.
+    consists of; `assumed`: what was taken for granted where its header leaves it open.
     """
 
     path: Path
@@ -49,6 +49,7 @@ class SeenLog:
     is_run: bool = False
     mostly_fixed: bool = False
     parts: tuple[LogPart, ...] = ()
+    assumed: tuple[str, ...] = ()
 
     @property
     def has_positions(self) -> bool:
@@ -155,7 +156,9 @@ def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> S
     except InputError as error:
         raise _undecided(path, error.message, error) from None
     own = {name: [{k: v for k, v in entry.items() if k != "topic"} for entry in of] for name, of in mapping.items()}
-    return _seen(path, found.streams, own, parts=found.parts)
+    assumed = ('its GPS times are taken for UTC; `time_scale = "gps"` in its mapping if they are 18 s ahead',)
+    seen = _seen(path, found.streams, own, parts=found.parts)
+    return replace(seen, assumed=assumed) if "\n# time_scale = " in text else seen
 
 
 def _undecided(path: Path, why: str, error: InputError | None = None) -> InputError:

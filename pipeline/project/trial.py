@@ -86,6 +86,7 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     remarks: list[str] = []
     logs, unread = _looked_at(wanted, base.given_config().ingest, recordings, remarks)
     remarks += _passed_over(wanted)
+    remarks += [f"{log.path.name}: {text}" for log in logs for text in log.assumed]
     rides, alone = rides_of(logs, [path.absolute() for path in wanted.references])
     if not rides and logs:
         # Why the log that does could not be read is what has to be mended.

@@ -36,6 +36,16 @@ def test_a_clock_off_by_leap_seconds_is_unproven_and_said(kept: str, leap_s: int
     assert "leap second" in row["notes"] or "GPS time" in row["notes"]
 
 
+@pytest.mark.parametrize("leap_s", [-2, 1, 3, 18])
+def test_the_clock_of_an_odometer_alone_is_no_doubt_of_the_positions(leap_s: int) -> None:
+    run, site = journey()
+    assert run.odometer is not None
+    late = run.with_streams(odometer=run.odometer.with_columns(pl.col("t") + pl.duration(seconds=leap_s)))
+    (row,) = replay(late, site, Vehicle(), WARN).runs.to_dicts()
+    assert row["verdict"] != "unsafe"
+    assert "input_doubtful" not in row["reasons"]
+
+
 def test_a_lag_that_no_leap_second_makes_stays_a_failure() -> None:
     run, site = journey()
     late = _shifted(run, 1.5).with_streams(odometer=None, balise_reads=None)

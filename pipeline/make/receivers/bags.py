@@ -117,7 +117,8 @@ def files_of(folder: Path, declared: Declared) -> list[Path]:
 
     Raises `InputError` where none of them is there.
     """
-    found = [folder / name for name in declared.files if (folder / name).is_file()]
+    files = [folder / name for name in declared.files]
+    found = [file for file in files if file.is_file() and file.stat().st_size]
     if not found:
         raise InputError(
             "holds none of the files that its metadata.yaml declares",
@@ -139,11 +140,18 @@ def _read_parts(folder: Path, declared: Declared, config: IngestConfig) -> tuple
 
 
 def _absent(folder: Path, declared: Declared, found: Sequence[Path]) -> Iterator[str]:
-    """Files that are declared and not there, and those that are there and not declared."""
+    """Files that are declared and not there, or hold nothing, and those that are there and not declared."""
     names = [path.name for path in found]
-    yield from (f"{name} is declared and not there" for name in declared.files if name not in names)
+    for name in declared.files:
+        if name not in names:
+            yield f"{name} is declared and {'empty' if (folder / name).is_file() else 'not there'}"
+    yield from _undeclared(folder, declared)
+
+
+def _undeclared(folder: Path, declared: Declared) -> Iterator[str]:
     beside = sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
-    yield from (f"{name} is not declared, and not read" for name in beside if name not in declared.files)
+    known = {name.removesuffix(".zstd") for name in declared.files}
+    yield from (f"{name} is not declared, and not read" for name in beside if name not in known)
 
 
 def _fewer(declared: Declared, counts: Mapping[str, int]) -> Iterator[str]:
@@ -164,7 +172,8 @@ def _with_rest(run: RunLog, left: dict[str, int]) -> tuple[RunLog, dict[str, int
 def _held_against(run: RunLog, path: Path, counts: Mapping[str, int]) -> RunLog:
     """What the folder of a bag declares and its files lack makes the run partial."""
     declared = declared_of(path) if path.is_dir() else None
-    if declared is None or not (damages := list(_fewer(declared, counts))):
+    damages = [] if declared is None else [*_undeclared(path, declared), *_fewer(declared, counts)]
+    if not damages:
         return run
     return replace(run, notes=replace(run.notes, damage="; ".join(damages)))
 

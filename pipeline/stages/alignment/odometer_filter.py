@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.stages.odometry.odometry import Odometry
+from pipeline.stages.odometry.scale_lag import slopes
 from schemas.arrays import Floats, Ints
 from schemas.config import AlignConfig, Vehicle
 
@@ -187,8 +188,7 @@ class ScaleLatencyFilter:
         scale = 1.0 + joint.item(_SCALE, -1)
         latency_s = joint.item(_LATENCY, -1)
         way_m, speed_mps = self._odometer_at(now_s - latency_s, origin_m)
-        row[_SCALE] = way_m
-        row[_LATENCY] = -scale * speed_mps
+        row[_SCALE], row[_LATENCY] = slopes(way_m, speed_mps, scale)
         seen: Floats = row.dot(joint)
         seen[-1] += way_m + scale * speed_mps * latency_s - place_m
         return seen, speed_mps

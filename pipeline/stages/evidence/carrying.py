@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -22,11 +22,10 @@ Interval = tuple[Floats, Floats]
 
 @dataclass(frozen=True)
 class TrueAnchor:
-    """At an instant the train was at one of `places`; `clock_m`: what the clock may add [m].
+    """At an instant of the odometer's clock the train was at one of `places`.
 
-    `proved`: it shows that the track is one of the survey (DOMAIN section 5.0). `lags_s`: least and largest stamp of
-    its recorder less that of the odometer, of which `t_ns` has the middle taken off; `open_m`: what of `clock_m` is no
-    clock's.
+    `clock_m`: what is not known of the recorder's clock, `delta_s`, may add at the speed there, and `open_m`, what a
+    step left open [m]. `proved`: it shows that the track is one of the survey (DOMAIN section 5.0).
     """
 
     t_ns: int
@@ -35,18 +34,8 @@ class TrueAnchor:
     kind: Evidence
     clock_m: float = 0.0
     proved: bool = True
-    lags_s: tuple[float, float] = (0.0, 0.0)
+    delta_s: float = 0.0
     open_m: float = 0.0
-
-    def lag_s(self, share: float) -> float:
-        """A possible lag: from the least (0) to the largest (1)."""
-        return self.lags_s[0] + share * (self.lags_s[1] - self.lags_s[0])
-
-    def at_lag(self, share: float) -> TrueAnchor:
-        """As it is if its recorder's lag is that one, on the odometer's clock."""
-        middle_s = 0.5 * (self.lags_s[0] + self.lags_s[1])
-        later_ns = round((middle_s - self.lag_s(share)) * NS_PER_S)
-        return replace(self, t_ns=self.t_ns + later_ns, clock_m=self.open_m, lags_s=(0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -125,20 +114,27 @@ def beside_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
     return np.asarray(max(config.lds.odometer_fixed_m, known_m) + config.lds.odometer_share * driven_m)
 
 
+def _doubt_m(counter: Counter, anchor: TrueAnchor, t_ns: Ints) -> Floats:
+    """What the anchor's clock, and steps, may add at some instants: by the speed there or at the anchor [m]."""
+    if anchor.delta_s == 0.0:
+        return np.full(t_ns.size, anchor.clock_m)
+    there_m = anchor.open_m + anchor.delta_s * np.abs(counter.odometer.speed_about(t_ns))
+    return np.asarray(np.maximum(there_m, anchor.clock_m))
+
+
 def carried(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
     """On one side of an anchor at `at_m`; the fixed 5 m hold what may be off at the anchor itself."""
-    known_m = max(config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m, config.lds.odometer_fixed_m)
-    return _carried_from(counter, anchor.t_ns, at_m, t_ns, known_m, config)
-
-
-def carried_closely(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
-    """The same without the fixed 5 m: what is known of the anchor, and 5 % of the way."""
-    known_m = config.hazards.evidence_factor * anchor.sigma_m + anchor.clock_m
-    return _carried_from(counter, anchor.t_ns, at_m, t_ns, known_m, config)
+    known_m = config.hazards.evidence_factor * anchor.sigma_m + _doubt_m(counter, anchor, t_ns)
+    return _carried_from(counter, anchor.t_ns, at_m, t_ns, np.maximum(known_m, config.lds.odometer_fixed_m), config)
 
 
 def _carried_from(
-    counter: Counter, since_ns: Ints | int, at_m: Floats | float, t_ns: Ints, known_m: float, config: Configuration
+    counter: Counter,
+    since_ns: Ints | int,
+    at_m: Floats | float,
+    t_ns: Ints,
+    known_m: Floats | float,
+    config: Configuration,
 ) -> Interval:
     """Places at some instants, known to `known_m`, plus the distance since, +- (5 % + bound)."""
     way = counter.between(since_ns, t_ns)
@@ -161,7 +157,7 @@ def between_anchors(
     the gap closes with it and the less doubtful anchor alone tells more, it does.
     """
     factor = config.hazards.evidence_factor
-    clock_m = [anchor.clock_m for anchor in anchors]
+    clock_m = [_doubt_m(counter, anchor, t_ns) for anchor in anchors]
     ways = [counter.between(anchor.t_ns, t_ns) for anchor in anchors]
     places = [at + way.distance_m for at, way in zip(at_m, ways, strict=True)]
     variances = [anchor.sigma_m**2 + way.variance_m2 for anchor, way in zip(anchors, ways, strict=True)]

@@ -16,35 +16,66 @@ from schemas.config import HazardConfig
 _SHOWN_SIGMAS = 2.0
 # Two lags of one recorder differ beyond so many.
 _DIFFER_SIGMAS = 4.0
+# Numerics: steps over possible lags [s].
+_LAG_STEP_S = 1.0
 
 
 @dataclass(frozen=True)
 class RecorderClock:
-    """How a recorder's clock is taken: its stamps less `shift_s`, +- `delta_s`; `assumed`: it could not be measured."""
+    """How a recorder is put on the odometer's clock: its stamps less `shift_s`, +- `delta_s`.
+
+    `assumed`: that could not be measured.
+    """
 
     shift_s: float
     delta_s: float
     assumed: bool = False
 
-    @property
-    def lags_s(self) -> tuple[float, float]:
-        """Least and largest lag that it leaves possible."""
-        return self.shift_s - self.delta_s, self.shift_s + self.delta_s
-
 
 def clock_of(lags: Sequence[ScaleLag], independent: bool, config: HazardConfig) -> RecorderClock:
-    """DOMAIN section 5.1: the hull of no lag and the measured ones, each +- k sigma.
+    """The measured lags, each +- k sigma (DOMAIN section 5.1).
 
-    A measured lag belongs to nobody: odometer and GNSS may share it, or the recorder has it. By odometers that are not
-    `independent` it may widen what is assumed, and never narrow it.
+    By odometers that are not `independent` a lag may widen what is assumed of a clock, and never narrow it.
     """
     measured = [lag for lag in lags if _measured(lag, config)]
-    noises_s = [config.evidence_factor * lag.lag_sigma_s for lag in measured]
-    least_s = 0.0 if measured and independent else config.evidence_clock_s
-    lows = [min(lag.lag_s, 0.0) - noise_s for lag, noise_s in zip(measured, noises_s, strict=True)]
-    highs = [max(lag.lag_s, 0.0) + noise_s for lag, noise_s in zip(measured, noises_s, strict=True)]
-    low_s, high_s = min([-least_s, *lows]), max([least_s, *highs])
-    return RecorderClock(0.5 * (low_s + high_s), 0.5 * (high_s - low_s), assumed=not (measured and independent))
+    if not measured:
+        return RecorderClock(0.0, config.evidence_clock_s, assumed=True)
+    low_s = min(lag.lag_s - config.evidence_factor * lag.lag_sigma_s for lag in measured)
+    high_s = max(lag.lag_s + config.evidence_factor * lag.lag_sigma_s for lag in measured)
+    least_s = 0.0 if independent else config.evidence_clock_s
+    if low_s <= 0.0 <= high_s:
+        # There may be none.
+        return RecorderClock(0.0, max(-low_s, high_s, least_s), assumed=not independent)
+    return RecorderClock(0.5 * (low_s + high_s), max(0.5 * (high_s - low_s), least_s), assumed=not independent)
+
+
+def clocks_of(
+    lags: tuple[Sequence[ScaleLag], Sequence[ScaleLag]], independent: bool, config: HazardConfig
+) -> tuple[RecorderClock, RecorderClock]:
+    """Those of two recorders. One that cannot be measured may have the odometer's clock or that of the other."""
+    first, second = (clock_of(of_one, independent, config) for of_one in lags)
+    return _beside(first, second, config), _beside(second, first, config)
+
+
+def _beside(clock: RecorderClock, other: RecorderClock, config: HazardConfig) -> RecorderClock:
+    if not clock.assumed or other.shift_s == 0.0:
+        return clock
+    middle_s = 0.5 * other.shift_s
+    delta_s = abs(clock.shift_s - middle_s) + abs(middle_s) + config.evidence_clock_s
+    return RecorderClock(middle_s, delta_s, assumed=True)
+
+
+def true_clocks_s(clocks: Sequence[RecorderClock]) -> tuple[float, ...]:
+    """By how much the odometer's stamps may be early, least to largest [s]: a measured lag belongs to nobody.
+
+    If a recorder has it the odometer's own stamps are true, else odometer and GNSS share it, and what the odometer
+    stamped one lag before is true: that of any recorder, and all between.
+    """
+    shifts_s = [0.0, *(clock.shift_s for clock in clocks)]
+    low_s, high_s = min(shifts_s), max(shifts_s)
+    if low_s == high_s:
+        return (low_s,)
+    return tuple(float(lag_s) for lag_s in np.linspace(low_s, high_s, 2 + int((high_s - low_s) / _LAG_STEP_S)))
 
 
 def _measured(lag: ScaleLag, config: HazardConfig) -> bool:

@@ -11,8 +11,8 @@ import polars as pl
 
 from pipeline.stages.evidence import anchors
 from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
-from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried, carried_closely
-from pipeline.stages.evidence.clock import RecorderClock, clock_of, lags_of
+from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried
+from pipeline.stages.evidence.clock import RecorderClock, clocks_of, lags_of, true_clocks_s
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
 from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
 from pipeline.stages.odometry import Odometry
@@ -29,9 +29,10 @@ KINDS = tuple(Kind)
 NOTHING = -1
 Span = tuple[int, int]
 
-# Numerics: ways over which two odometers are compared, and steps over the possible lags of a recorder [s].
+# Numerics: ways over which two odometers are compared [s].
 _PARTED_S = 60.0
-_LAG_STEP_S = 1.0
+# Two intervals agree from this share of the narrower one on.
+_AGREES = 1.0 - 1.0 / np.sqrt(2.0)
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,9 @@ class TrainEvidence:
     the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
     odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
     of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer
-    or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed.
+    or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed;
+    `disputes`: times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps may be
+    early.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -108,6 +111,8 @@ class TrainEvidence:
     parted: bool = False
     doubted: int = 0
     unsure: tuple[Span, ...] = ()
+    disputes: tuple[Span, ...] = ()
+    true_clocks_s: tuple[float, ...] = (0.0,)
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
@@ -151,11 +156,19 @@ class TrainEvidence:
         return (min(times), max(times)) if times else None
 
     def at(self, t_ns: Ints) -> EvidenceSet:
-        """Evidence at these instants; nothing is carried from one side over a stand of the odometer (`stood`).
+        """Evidence at these instants of the GNSS's stamps, whichever of the clocks is the true one.
 
-        Up to a second after a recording that ended in a stand the train is taken to stand on.
+        Nothing is carried from one side over a stand of the odometer (`stood`). Up to a second after a recording that
+        ended in a stand the train is taken to stand on.
         """
-        held_ns, slack_m = still_standing(t_ns, self.stands, self.config)
+        return either([self._by_clock(t_ns, early_s) for early_s in self.true_clocks_s])
+
+    def _by_clock(self, t_ns: Ints, early_s: float) -> EvidenceSet:
+        at_ns, beyond_m = t_ns, np.zeros(t_ns.size)
+        if early_s and self.carried:
+            at_ns, beyond_m = self.carried[0].counter.within(t_ns - round(early_s * NS_PER_S), abs(early_s))
+        held_ns, slack_m = still_standing(at_ns, self.stands, self.config)
+        slack_m = slack_m + beyond_m
         found = self._at(held_ns)
         widened = tuple(there.loosened(slack_m) for there in found.alternatives)
         return replace(found, alternatives=widened) if slack_m.any() else found
@@ -174,9 +187,11 @@ class TrainEvidence:
             of_reads = _Shown(np.full(t_ns.size, NOTHING), *np.zeros((2, t_ns.size), dtype=np.bool_))
             # A reference that drifted by nobody knows how much leaves the reads what they prove without it.
             by_reads = self._carried(self.by_reads, t_ns, on_track, of_reads)
+            disputed = within_spans(t_ns, self.disputes)
+            both = (kind != NOTHING) & (of_reads.kind != NOTHING)
             narrows = self.by_reads[0].counter.odometer.independent
-            alternatives, _ = common(alternatives, by_reads, t_ns.size, narrows)
-            kind = np.where(kind == NOTHING, of_reads.kind, kind)
+            alternatives = _with_reads(alternatives, by_reads, (both, disputed), narrows)
+            kind = np.where(disputed & ~both, NOTHING, np.where(kind == NOTHING, of_reads.kind, kind))
             proves |= of_reads.proves
             on_survey |= of_reads.on_survey
         complete = self.config.evidence.survey_complete
@@ -228,34 +243,9 @@ class TrainEvidence:
         return alternatives
 
     def _interval(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints) -> Interval:
-        """By the anchors of the gap, whatever the clocks leave open.
-
-        A lag belongs to nobody: if the recorder of the anchor has it the odometer's own stamps count, else odometer and
-        GNSS share it, and the train was at an instant where the odometer had it one lag before. What that is in metres
-        hangs on the speed at the instant, not at the anchor.
-        """
-        most_s = max(abs(lag_s) for anchor in gap.anchors for lag_s in anchor.lags_s)
-        low_m, high_m = self._together(counter, gap, way, t_ns)
-        if most_s == 0.0:
-            return low_m, high_m
-        for share in np.linspace(0.0, 1.0, 2 + int(most_s / _LAG_STEP_S)).tolist():
-            known = replace(
-                gap,
-                begin=gap.begin and gap.begin.at_lag(share),
-                end=gap.end and gap.end.at_lag(share),
-            )
-            for lag_s in sorted({0.0, *(anchor.lag_s(share) for anchor in gap.anchors)}):
-                at_ns, beyond_m = counter.within(t_ns - round(lag_s * NS_PER_S), abs(lag_s))
-                low, high = self._together(counter, known, way, at_ns, closely=True)
-                low_m = np.minimum(low_m, low - beyond_m)
-                high_m = np.maximum(high_m, high + beyond_m)
-        return low_m, high_m
-
-    def _together(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints, closely: bool = False) -> Interval:
         if gap.begin is not None and gap.end is not None:
             return between_anchors(counter, (gap.begin, gap.end), (way.at_m[0], way.at_m[1]), t_ns, self.config)
-        from_one = carried_closely if closely else carried
-        return from_one(counter, gap.anchors[0], way.at_m[0], t_ns, self.config)
+        return carried(counter, gap.anchors[0], way.at_m[0], t_ns, self.config)
 
 
 def _on_path(stretch: KnownStretch, path: KnownPath, rows: Ints, t_ns: Ints, factor: float) -> list[Alternative]:
@@ -294,6 +284,21 @@ def common(
     return together + alone, np.flatnonzero(_spoken(first, size) & _spoken(second, size) & ~agreed)
 
 
+def _with_reads(
+    alternatives: list[Alternative], by_reads: list[Alternative], where: tuple[Bools, Bools], narrows: bool
+) -> list[Alternative]:
+    """The reference and what is carried, with the reads; `where`: both speak, and they are in dispute.
+
+    Within a dispute either may be right, and one alone says nothing: it is as if the reference had stepped.
+    """
+    both, disputed = where
+    left = [there.where(~disputed[there.rows]) for there in alternatives]
+    right = [there.where(~disputed[there.rows]) for there in by_reads]
+    together, _ = common(left, right, both.size, narrows)
+    apart = both & disputed
+    return together + [there.where(apart[there.rows]) for there in (*alternatives, *by_reads)]
+
+
 def _spoken(alternatives: Sequence[Alternative], size: int) -> Bools:
     spoken = np.zeros(size, dtype=np.bool_)
     for alternative in alternatives:
@@ -302,7 +307,11 @@ def _spoken(alternatives: Sequence[Alternative], size: int) -> Bools:
 
 
 def _narrowed(first: Alternative, second: Alternative) -> Alternative:
-    """Where the intervals of both overlap, at the instants of both; in coordinates of the first's route."""
+    """Where the intervals of both agree, at the instants of both; in coordinates of the first's route.
+
+    What hardly touches excludes the other: of two intervals alike, each +- k sigma, middles k sigmas of their
+    difference apart leave a share of 1 - 1/sqrt(2).
+    """
     _, in_first, in_second = np.intersect1d(first.rows, second.rows, assume_unique=True, return_indices=True)
     first = first.where(in_first)
     second = second.where(in_second)
@@ -311,7 +320,9 @@ def _narrowed(first: Alternative, second: Alternative) -> Alternative:
     ends_m = [first.middle_m + sense * along * (end_m - at_m) for end_m in (second.low_m, second.high_m)]
     low_m = np.maximum(first.low_m, np.minimum(*ends_m))
     high_m = np.minimum(first.high_m, np.maximum(*ends_m))
-    return Alternative(first.rows, first.route, low_m, high_m).where(low_m <= high_m)
+    narrower_m = np.minimum(first.high_m - first.low_m, np.abs(ends_m[1] - ends_m[0]))
+    agree: Bools = (low_m <= high_m) & (high_m - low_m >= _AGREES * narrower_m)
+    return Alternative(first.rows, first.route, low_m, high_m).where(agree)
 
 
 def either(sets: Sequence[EvidenceSet]) -> EvidenceSet:
@@ -375,13 +386,14 @@ def evidence_of(
     turned = any(min(side.with_m, side.against_m) >= least_m for side in sides)
     searches = [GapSearch(counter, network, config, facing, turned) for counter in counters]
     lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
-    of_reference = clock_of([lag for of_one in lags for lag in of_one], bool(independent), hazards)
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
     found = [anchors.Witness.of(counter, of_one, config) for counter, of_one in zip(counters, lags, strict=True)]
     held_against = anchors.Witnesses(tuple(found), not turned)
     read = anchors.read_anchors(reads, balises, network.track, hazards)
     lags_of_reads = [lag for search in searches for lag in _lags_of_reads(search.carried(_points(read)))]
-    of_reads = clock_of(lags_of_reads, bool(independent), hazards)
+    of_reference, of_reads = clocks_of(
+        ([lag for of_one in lags for lag in of_one], lags_of_reads), bool(independent), hazards
+    )
     clocked = anchors.on_clock(read, of_reads, main)
     recorded, unclosed = _known_stretches(sides, of_reference, held_against, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
@@ -400,8 +412,11 @@ def evidence_of(
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
         unsure=tuple(unsure),
+        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + (of_reads,) * bool(clocked)),
+        disputes=tuple(span for stretch in recorded for span in stretch.disputed),
         doubted=unclosed
-        + sum(stretch.levels.doubts + stretch.refuted for stretch in recorded)
+        + sum(stretch.levels.doubts for stretch in recorded)
+        + (0 if counters else sum(len(stretch.disputed) for stretch in recorded))
         + sum(len(of_one) > 1 for of_one in lags),
     )
 
@@ -423,7 +438,11 @@ def _known_stretches(
     search = searches[0]
     order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
     borders = [known[number].ends(search.counter) for number in order]
-    steps_m = [search.misclosure_m(before[1], after[0]) for before, after in pairwise(borders)]
+    witness = witnesses.all[0]
+    steps_m = [
+        search.misclosure_m(before[1], after[0], witness.scale, witness.scale_sigma)
+        for before, after in pairwise(borders)
+    ]
     levels = [known[number].levels for number in order]
     if len(known) < 2 or not (any(steps_m) or any(of.doubts for of in levels)):
         return known, 0

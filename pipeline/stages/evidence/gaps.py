@@ -155,23 +155,28 @@ class GapSearch:
         gaps = self._between(begin, end)
         return gaps[0].only_length_m if len(gaps) == 1 else []
 
-    def misclosure_m(self, begin: TrueAnchor, end: TrueAnchor) -> float:
+    def misclosure_m(self, begin: TrueAnchor, end: TrueAnchor, scale: float, scale_sigma: float) -> float:
         """How much farther apart the anchors are than the odometer counted [m].
 
-        0 where a way closes within k_T sigmas (at k = 3 a reference of few samples would step every few minutes), or
-        none leads.
+        `scale`: true over counted distance beyond a vehicle file, with its sigma. 0 where a way closes within k_T
+        sigmas (at k = 3 a reference of few samples would step every few minutes), or none leads; NaN where ways differ.
         """
         gaps = self._between(begin, end)
-        if len(gaps) != 1 or not gaps[0].ways or gaps[0].closed:
+        if len(gaps) != 1 or not gaps[0].ways:
             return 0.0
-        end_ns = np.array([end.t_ns])
-        counted = self.counter.between(begin.t_ns, end_ns)
-        limit_m = self.config.align.sure_sigmas * np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + counted.variance_m2)
+        counted = self.counter.between(begin.t_ns, np.array([end.t_ns]))
+        counted_m = float(counted.distance_m[0])
+        variance_m2 = begin.sigma_m**2 + end.sigma_m**2 + float(counted.variance_m2[0])
+        allowed_m = self.config.align.sure_sigmas * float(np.sqrt(variance_m2 + (scale_sigma * counted_m) ** 2))
+        allowed_m += float(counted.bound_m[0]) + begin.clock_m + end.clock_m
         if not self.counter.by_file:
-            limit_m = beside_m(self.counter.driven_m(begin.t_ns, end_ns), 0.0, self.config)
-        apart_m = min((way.apart_m - float(counted.distance_m[0]) for way in gaps[0].ways), key=abs)
-        allowed_m = float((limit_m + counted.bound_m)[0]) + begin.clock_m + end.clock_m
-        return apart_m if abs(apart_m) > allowed_m else 0.0
+            allowed_m += self.config.lds.odometer_fixed_m
+        off_m = sorted((way.apart_m - scale * counted_m for way in gaps[0].ways), key=abs)
+        if abs(off_m[0]) <= allowed_m:
+            return 0.0
+        # At a stand a way leads there and one back: nobody knows which.
+        other = any(abs(off) <= abs(off_m[0]) + allowed_m and abs(off - off_m[0]) > allowed_m for off in off_m)
+        return float("nan") if other else off_m[0]
 
     def _ways_of_length(
         self, first: TrueAnchor, second: TrueAnchor, length_m: float, slack_m: float

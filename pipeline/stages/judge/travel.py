@@ -42,9 +42,7 @@ def odometer_steps(case: Case) -> OdometerSteps:
         places_m = path_m[rows][np.isfinite(path_m[rows])]
         if np.abs(places_m - places_m[:1]).max(initial=0.0) > case.config.hazards.failure_limit_m:
             stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
-    # What may be made of the positions tells no motion (DOMAIN section 5.0), but it may contradict them.
-    told = odometry.independent
-    return OdometerSteps(moves & told, counts & told, tuple(stood))
+    return OdometerSteps(moves, counts, tuple(stood))
 
 
 def travel_direction(

@@ -211,10 +211,9 @@ class _Sampler:
         self._t_s = np.cumsum(series.dt_s) - series.dt_s[:1]
         self.renewal: Ints = (self._t_s // config.noise_renewal_s).astype(np.int64)
         # Only of the time before the noise is first known: later rows must not change the lags (causal).
-        steps_s = series.dt_s[1:][self._t_s[1:] <= config.noise_first_s]
-        self.period_s = (
-            round(float(np.median(steps_s if steps_s.size else series.dt_s)), 6) if series.dt_s.size else 0.0
-        )
+        steps_s = series.dt_s[1:]
+        first_s = steps_s[: max(int(np.searchsorted(self._t_s[1:], config.noise_first_s, side="right")), 1)]
+        self.period_s = round(float(np.median(first_s)), 6) if first_s.size else 0.0
         unknown = ~np.isfinite(series.rate_mps + series.sigma_m.sum(axis=1))
         self._countable = moving & ~unknown
         self._piece = np.cumsum(series.fresh | unknown)  # the same number for rows joined by increments

@@ -440,10 +440,10 @@ def _noise(
         white_m2_per_s=float(np.median(white_m2_per_s)),
         quantisation=of_the_run(pieces, align).of_counter(float(counts.step_m[-1])),
     )
-    first_m2 = first_scatter_m2(distance_m, period_s, white_m2_per_s, align)
-    known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)
     # Rows far apart, or of speeds alone, have no such noise.
     none = (period_s > align.straight_s) | ~np.concatenate([whole[:1], whole])
+    first_m2 = np.where(none, 0.0, first_scatter_m2(distance_m, period_s, white_m2_per_s, align))
+    known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)
     return noise, KnownNoise(
         white_m2_per_s=white_m2_per_s,
         still_m2=np.maximum(known.still_m2, counts.step_m**2 / 12.0),

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -100,9 +101,13 @@ class CountedRows:
 
     def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
         """Way between instants [m]; NaN outside the recording and over a step in doubt."""
-        ends = [np.interp(at_s, self.t_s, self.distance_m) for at_s in (begin_s, end_s)]
-        doubts = [np.interp(at_s, self.t_s, self.doubtful, np.nan, np.nan) for at_s in (begin_s, end_s)]
-        return np.where(doubts[0] == doubts[1], ends[1] - ends[0], np.nan)
+        way_m = self._at(end_s, self.distance_m) - self._at(begin_s, self.distance_m)
+        if self.doubtful[-1] == self.doubtful[0]:
+            return way_m
+        return np.where(self._at(begin_s, self.doubtful) == self._at(end_s, self.doubtful), way_m, np.nan)
+
+    def _at(self, at_s: Floats, values: Floats) -> Floats:
+        return np.interp(at_s, self.t_s, values, np.nan, np.nan)
 
     @cached_property
     def _half_s(self) -> float:
@@ -141,6 +146,11 @@ class CountedRows:
         )
 
     @property
+    def least_change_mps(self) -> float:
+        """A change of speed, by four rows at each end over 4 half spans, is noise of the rows up to 3 of its sigmas."""
+        return 3.0 * float(np.sqrt(8.0)) * self.row_sigma_m / (4.0 * self._half_s)
+
+    @property
     def noise_m(self) -> float:
         """Sigma of a way by the noise of its two rows."""
         return max(self.row_sigma_m * float(np.sqrt(2.0)), _FINEST_M)
@@ -148,6 +158,14 @@ class CountedRows:
     def driven(self) -> CountedRows:
         """Way driven, to and fro."""
         return replace(self, distance_m=np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.distance_m)))]))
+
+
+_Figure = TypeVar("_Figure", float, Floats)
+
+
+def slopes(way_m: _Figure, speed_mps: _Figure, scale: float = 1.0) -> tuple[_Figure, _Figure]:
+    """By how much the way of the other changes with scale and with lag; with scale * lag at a `scale` of 1."""
+    return way_m, -scale * speed_mps
 
 
 def spans_of_rows(t_s: Floats) -> tuple[Ints, Ints]:
@@ -270,8 +288,11 @@ class _Ways:
         begin_s, end_s = self.begin_s - lag_s, self.end_s - lag_s
         counted = self.counter.gained(begin_s, end_s)
         (first, first_beside), (last, last_beside) = self.counter.speeds(begin_s), self.counter.speeds(end_s)
-        design = np.column_stack([counted, first - last])
-        beside = np.column_stack([counted, first_beside - last_beside])
+        design = np.column_stack(slopes(counted, last - first))
+        change_mps = last_beside - first_beside
+        # The counts of a coarse counter at one speed have a rhythm, in speeds as in ways: no changes of speed.
+        change_mps = np.where(np.abs(change_mps) <= self.counter.least_change_mps, 0.0, change_mps)
+        beside = np.column_stack(slopes(counted, change_mps))
         known = np.asarray(np.isfinite(np.column_stack([design, beside])).all(axis=1))
         # Where both stand there is nothing to learn, nor of the noise.
         moving: Bools = known & (np.abs(counted) > 0.0)
@@ -317,7 +338,7 @@ class _Regression:
             scale=scale,
             scale_sigma=max(sigma, _apart(halves)),
             lag_s=assumed_s + rest_s / scale,
-            lag_sigma_s=sigma_s / abs(scale),
+            lag_sigma_s=max(sigma_s / abs(scale), self._lags_apart(halves)),
             state=LagState.MEASURED,
             halves=halves,
         )
@@ -359,6 +380,12 @@ class _Regression:
         near, beside = self.design[self.used, 1], self.beside[self.used, 1]
         noise = 0.5 * float(((near - beside) ** 2).sum()) / np.sqrt(near.size / self.overlap)
         return bool(near @ beside > _SHOWN * noise)
+
+    def _lags_apart(self, halves: Sequence[tuple[float, float]]) -> float:
+        """Half of what the lags of both halves differ by, where neither tells much less than the other."""
+        told = np.cumsum(np.where(self.used, self.beside[:, 1] * self.design[:, 1], 0.0))
+        share = float(told[np.flatnonzero(self.used)[: int(self.used.sum()) // 2][-1]] / told[-1])
+        return 0.5 * abs(halves[0][1] - halves[1][1]) if len(halves) == 2 and 0.2 <= share <= 0.8 else 0.0
 
     def halves(self, assumed_s: float, parts: slice = slice(None)) -> tuple[tuple[float, float], ...]:
         """Scale and lag by the first and by the second half of the ways."""

@@ -66,6 +66,9 @@ def reasons_of(run: Row, allowed_s: float, undiagnosed_share: float) -> list[Rea
         Reason.NOTHING_ACCEPTED: run["balises_accepted"] == 0,
         **{reason: reason in (run["reasons"] or ()) for reason in _LASTING},
     }
+    # What is assumed of the track matters where something is unknown by it; an epoch or two at the end do not.
+    unknown = (Reason.ACCEPTED_UNKNOWN, Reason.BUDGET_UNKNOWN, Reason.UNKNOWN_IN_USE, Reason.NOTHING_ACCEPTED)
+    applies[Reason.TRACK_ASSUMED] &= any(applies[reason] for reason in unknown)
     return [reason for reason in Reason if applies[reason]]
 
 

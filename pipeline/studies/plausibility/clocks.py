@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from pipeline.read.ingest.timescale import leap_seconds
@@ -63,7 +64,14 @@ def clock_checks(of: Recording, lags: list[StreamLag]) -> list[Check]:
     if leap is not None:
         return [_of_leap(of, lag, leap) if not lag.reason else _check(of, lag, None, known=True) for lag in lags]
     checks = [_check(of, lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
-    return [_with_leap(check, leap_of(lag, of.epoch_ns)) for check, lag in zip(checks, lags, strict=True)]
+    leaps = [0 if _is_own_clock(lag, lags) else leap_of(lag, of.epoch_ns) for lag in lags]
+    return [_with_leap(check, leap_s) for check, leap_s in zip(checks, leaps, strict=True)]
+
+
+def _is_own_clock(lag: StreamLag, lags: Sequence[StreamLag]) -> bool:
+    """The clock of an odometer alone is off where a recorder of places agrees with that of the positions."""
+    places = [other for other in lags if other.stream != "odometer" and not other.reason]
+    return lag.stream == "odometer" and any(abs(other.lag_s) <= _WHOLE_NEAR_S for other in places)
 
 
 def _with_leap(check: Check, leap_s: int) -> Check:

@@ -168,6 +168,18 @@ def test_what_a_bag_declares_and_lacks(
     assert says in (found.run.notes.damage or "")
 
 
+def test_files_of_a_bag_that_were_cut_or_never_written(tmp_path: Path) -> None:
+    """What the second file still holds is read; a third that is empty is said."""
+    whole_log = part(20, 40)
+    bag = bag_of(tmp_path / "bag", [part(0, 20), whole_log[: len(whole_log) * 2 // 3], b""], {"/gnss": 60})
+    run = convert([bag], "r", MAPPED).run
+    assert run.gnss["t"].to_list() == samples.run().gnss["t"][: run.gnss.height].to_list()
+    damage = run.notes.damage or ""
+    assert "bag_1.mcap: cut off at byte" in damage
+    assert "bag_2.mcap is declared and empty" in damage
+    assert f"holds {run.gnss.height} of 60 messages of /gnss" in damage
+
+
 def test_older_writers_name_the_folder_too(tmp_path: Path) -> None:
     parts = [part(0, 20), part(20, 40)]
     bag = bag_of(tmp_path / "bag", parts, {"/gnss": 40}, ["bag/bag_0.mcap", "bag/bag_1.mcap"])

@@ -142,3 +142,12 @@ def test_other_streams(tmp_path: Path, header: str, stream: str, fields: dict[st
     columns = header.count(";")
     text = header + "".join(f"\n2025-03-03 08:00:0{n}" + f";{n}" * columns for n in range(3))
     assert drafted(tmp_path, text)[stream][0]["fields"] == fields
+
+
+def test_times_called_gps_are_said_to_be_taken_for_utc(tmp_path: Path) -> None:
+    rows = "".join(f"{TIME.format(n)},50.1,14.2\n" for n in range(2))
+    nothing = Recordings(known=lambda _: None, write=lambda *_: None)
+    for name, said in (("GPS time", 1), ("Time (UTC)", 0)):
+        (tmp_path / "log.csv").write_text(f"{name},lat,lon\n{rows}")
+        seen = look_at(tmp_path / "log.csv", IngestConfig(), None, nothing)
+        assert sum('time_scale = "gps"' in text for text in seen.assumed) == said

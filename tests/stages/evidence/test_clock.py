@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.stages.evidence.clock import RecorderClock, clock_of
+from pipeline.stages.evidence.clock import RecorderClock, clock_of, true_clocks_s
 from pipeline.stages.odometry.scale_lag import LagState, ScaleLag
 from schemas.config import HazardConfig
 
@@ -12,16 +12,16 @@ from schemas.config import HazardConfig
 @pytest.mark.parametrize(
     ("lag_s", "sigma_s", "clock"),
     [
-        (0.4, 0.01, RecorderClock(0.2, 0.23)),  # the hull of 0 +- 0.03 and 0.4 +- 0.03
-        (-0.4, 0.01, RecorderClock(-0.2, 0.23)),
+        (0.4, 0.01, RecorderClock(0.4, 0.03)),
+        (-0.4, 0.01, RecorderClock(-0.4, 0.03)),
         (0.0, 0.02, RecorderClock(0.0, 0.06)),
         (0.1, 0.06, RecorderClock(0.0, 0.1, assumed=True)),  # below two sigmas, of which three are 0.18 s
-        (0.13, 0.06, RecorderClock(0.065, 0.245)),
-        (0.05, 0.03, RecorderClock(0.025, 0.115)),  # three sigmas are no more than is assumed anyway
-        (17.0, 0.02, RecorderClock(8.5, 8.56)),
+        (0.13, 0.06, RecorderClock(0.0, 0.31)),  # it may be none: 0.13 - 0.18 < 0
+        (0.05, 0.03, RecorderClock(0.0, 0.14)),  # three sigmas are no more than is assumed anyway
+        (17.0, 0.02, RecorderClock(17.0, 0.06)),
     ],
 )
-def test_the_hull_of_no_lag_and_the_measured_one(lag_s: float, sigma_s: float, clock: RecorderClock) -> None:
+def test_a_recorder_is_put_on_the_clock_of_the_odometer(lag_s: float, sigma_s: float, clock: RecorderClock) -> None:
     found = clock_of([ScaleLag(1.0, 0.01, lag_s, sigma_s, LagState.MEASURED)], True, HazardConfig())
     assert (found.shift_s, found.delta_s) == pytest.approx((clock.shift_s, clock.delta_s))
     assert found.assumed == clock.assumed
@@ -31,8 +31,16 @@ def test_what_is_not_measured_is_assumed() -> None:
     assert clock_of([ScaleLag()], True, HazardConfig()) == RecorderClock(0.0, 0.1, assumed=True)
 
 
-@pytest.mark.parametrize(("lag_s", "lags_s"), [(0.0, (-0.1, 0.1)), (0.4, (-0.1, 0.43)), (-0.05, (-0.1, 0.1))])
-def test_by_an_odometer_that_is_not_independent_it_only_widens(lag_s: float, lags_s: tuple[float, float]) -> None:
+@pytest.mark.parametrize(("lag_s", "clock"), [(0.0, (0.0, 0.1)), (0.4, (0.4, 0.1)), (-0.05, (-0.05, 0.1))])
+def test_by_an_odometer_that_is_not_independent_it_only_widens(lag_s: float, clock: tuple[float, float]) -> None:
     found = clock_of([ScaleLag(1.0, 0.01, lag_s, 0.01, LagState.MEASURED)], False, HazardConfig())
-    assert found.lags_s == pytest.approx(lags_s)
+    assert (found.shift_s, found.delta_s) == pytest.approx(clock)
     assert found.assumed
+
+
+def test_any_clock_may_be_the_true_one() -> None:
+    clocks = [RecorderClock(0.4, 0.1), RecorderClock(-0.2, 0.02)]
+    assert true_clocks_s(clocks) == pytest.approx((-0.2, 0.4))
+    assert true_clocks_s([RecorderClock(0.0, 0.1)]) == (0.0,)
+    # Seconds of lag are gone through in steps of a second or less: the train may have sped up and braked within.
+    assert true_clocks_s([RecorderClock(3.5, 0.1)]) == pytest.approx((0.0, 0.875, 1.75, 2.625, 3.5))

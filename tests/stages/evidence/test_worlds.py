@@ -41,8 +41,9 @@ def test_clocks_that_are_off_leave_the_truth_inside(top_mps: float, late_s: floa
     assert holds.all()
     (clock,) = found.clocks
     assert not clock.assumed
-    assert clock.shift_s == pytest.approx(0.5 * late_s, abs=0.02)
-    assert 0.5 * abs(late_s) <= clock.delta_s < 0.5 * abs(late_s) + 0.04
+    # A lag that may be none is none, and its doubt the wider for it.
+    assert clock.shift_s == pytest.approx(late_s if abs(late_s) > 0.1 else 0.0, abs=0.02) or abs(late_s) < 0.1
+    assert abs(late_s - clock.shift_s) <= clock.delta_s < 0.04 + abs(late_s) * (clock.shift_s == 0.0)
     assert (high - low).max() < 2.0 * (0.15 + top_mps * (0.5 * abs(late_s) + 0.04) + 0.5)
 
 
@@ -105,8 +106,8 @@ def test_a_lag_of_seconds_is_found() -> None:
     rng = np.random.default_rng(4)
     ride = wavy(40.0)
     (clock,) = known(GROUND, odometer(ride, rng), of_reference=reference(ride, rng, late_s=17.0)).clocks
-    assert clock.shift_s == pytest.approx(8.5, abs=0.1)
-    assert clock.delta_s == pytest.approx(8.5, abs=0.1)
+    assert clock.shift_s == pytest.approx(17.0, abs=0.1)
+    assert clock.delta_s < 0.1
 
 
 @pytest.mark.parametrize("file", FILES)

@@ -13,6 +13,7 @@ from pipeline.stages.odometry.quantisation import QuantisationNoise
 from schemas.config import Configuration, threshold_factor
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 from tests.stages.alignment.straight import align_run, epochs_of, odometer_of, odometry_from
+from tests.stages.odometry.drives import recorded
 
 WHITE_MPS = 0.05
 CONFIG = Configuration()
@@ -288,3 +289,33 @@ def test_between_rows_a_straight_line_changes_with_the_square_of_the_step():
     at = np.cumsum([0.0, 0.1, 0.5, 1.0, 3.0])
     series = along_series(standing(at, np.zeros(5), 1.0), Increments(np.zeros(5), np.zeros(5)), CONFIG)
     np.testing.assert_allclose(series.decorrelation[1:, -1], [0.02, 0.25, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("rate_hz", [1, 10])
+@pytest.mark.parametrize(("kind", "size"), [("counts", 0.5), ("counts", 5.0), ("noise", 0.3), ("jitter", 0.03)])
+def test_what_is_known_of_the_rows_does_not_depend_on_later_ones(kind, size, rate_hz):
+    """Half of the drive at another rate, so that the period, too, is what the rows before show."""
+    t, reads, _ = recorded(np.random.default_rng(11), kind, size, rate_hz)
+    kept = (t < 300.0) | (np.arange(t.size) % 3 == 0)
+    t, reads = t[kept], reads[kept]
+    declared = np.where(t < 200.0, 0.05, 0.4)
+    frame = odometer_of(t, distance_m=reads).with_columns(sigma_speed_mps=pl.Series(declared))
+    whole = odometry_from(frame)
+    for rows in np.random.default_rng(rate_hz).integers(40, t.size, 6).tolist():
+        cut = odometry_from(frame.head(rows))
+        assert cut.t_s.size <= whole.t_s.size
+        at_s = t[: rows - 4] - t[0]
+        found, expected = cut.noise_at_s(at_s), whole.noise_at_s(at_s)
+        for name in ("white_m2_per_s", "still_m2", "moving_s2", "period_s", "shown"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+        at_ns = whole.epoch_ns + np.round(1e9 * at_s).astype(np.int64)
+        np.testing.assert_array_equal(cut.travelled_at(at_ns)[:-20], whole.travelled_at(at_ns)[:-20])
+
+
+def test_speeds_alone_and_rows_far_apart_have_no_such_noise():
+    t = np.arange(0.0, 200.0, 0.1)
+    speeds = odometry_from(odometer_of(t, speed_mps=np.round(np.gradient(way(t), t)))).known_noise
+    sparse = odometry_from(odometer_of(t[::30], distance_m=np.floor(way(t[::30])))).known_noise
+    for known in (speeds, sparse):
+        assert known.shown.all()
+    assert not speeds.still_m2.any()
