@@ -5,7 +5,7 @@ Touches no file, and knows no position: only the sign against the path is set fr
 
 Where it comes from, as declared: `origin`. From one row to the next: `rows`. Over all rows: `odometry`, over slip by
 another one: `over_slip`. What is movement and what noise of the rows: `driven`, `quantisation`, `written_steps`. Shared
-with evidence, plausibility, calibration and alignment: `scale_lag`, scale and lag of a counter against another recorder;
+with evidence, plausibility, calibration and alignment: `scale_lag`, a counter against another recorder;
 with the LDS and alignment: `recovery`, when a position may return after an alarm.
 """
 
