@@ -93,7 +93,7 @@ def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence
     fit = required_fit(prepared, solution, prepared.vehicle)
     ride = ride_of(prepared, solution, _with_match(beside, prepared, solution), evidence)
     unnoticed = unnoticed_of(ride)
-    judged = judge(_case(ride, unnoticed, evidence, fit.leaps_s))
+    judged = judge(_case(ride, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
     epochs = pl.concat([judged.epochs, ride.solution.fixes.select("satellites")], how="horizontal")
     results = _results(ride, judged, epochs, unnoticed, fit, evidence)
     tables = {
@@ -156,7 +156,7 @@ def _results(
         Reason.EVIDENCE_CONTRADICTED: evidence.doubted > 0,
         Reason.TRACK_ASSUMED: _track_assumed(judged),
         Reason.SIGMA_DOUBTFUL: refuted(accuracy),
-        Reason.INPUT_DOUBTFUL: bool(fit.unproving or fit.leaps_s or counts.contradicting),
+        Reason.INPUT_DOUBTFUL: bool(fit.unproving or fit.leaps_s(evidence.in_step) or counts.contradicting),
         Reason.CLOCK_ASSUMED: evidence.clock_assumed,
     }
     return SolutionResults(

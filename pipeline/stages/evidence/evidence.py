@@ -31,6 +31,8 @@ Span = tuple[int, int]
 
 # Numerics: ways over which two odometers are compared [s].
 _PARTED_S = 60.0
+# Clocks within this of each other are no whole seconds apart [s].
+_IN_STEP_S = 0.5
 # Two intervals agree from this share of the narrower one on.
 _AGREES = 1.0 - 1.0 / np.sqrt(2.0)
 
@@ -147,6 +149,12 @@ class TrainEvidence:
     def clock_assumed(self) -> bool:
         """The clock of reference or reads against the odometer's could not be measured."""
         return any(clock.assumed for clock in self.clocks)
+
+    @property
+    def in_step(self) -> bool:
+        """All its recorders have the clock of the odometer, as measured to half a second."""
+        near = (not of.assumed and abs(of.shift_s) + of.delta_s < _IN_STEP_S for of in self.clocks)
+        return bool(self.clocks) and all(near)
 
     @property
     def anchored_ns(self) -> Span | None:

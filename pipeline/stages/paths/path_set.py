@@ -71,6 +71,8 @@ class Node:
         known = np.concatenate([node.residual_m for node in chain])
         whole_m = np.full(last - first, np.nan)
         begin = max(chain[0].begin, first)
+        if begin >= last:
+            return whole_m
         part = known[begin - chain[0].begin : last - chain[0].begin]
         whole_m[begin - first : begin - first + part.size] = part
         return whole_m

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from schemas.enums import MisfitCause, MisfitPlace
+from schemas.run import Stream
 from schemas.words import CAUSES, MISFIT_PLACES
 
 CONFIGURATION = "append to the configuration file"
@@ -43,6 +44,7 @@ class Check:
     `lines` is text for a file, `into` says what to do with it; `advice` is what to do where no line mends it. A misfit
     `of_evidence` is one of the recorders that the judge believes: nothing is proved by them. `leap_s`: by so many whole
     leap seconds the clock of the positions may be off against the recorder's (to be added to their stamps), 0: by none.
+    `in_time`: the stream whose clock is that of the positions.
     """
 
     what: str
@@ -54,6 +56,7 @@ class Check:
     advice: str = ""
     of_evidence: bool = False
     leap_s: int = 0
+    in_time: Stream | None = None
 
     @property
     def sentence(self) -> str:

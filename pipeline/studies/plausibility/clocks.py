@@ -21,6 +21,7 @@ from pipeline.studies.plausibility.check import (
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.robust import SIGNIFICANT_SIGMAS
 from schemas.enums import MisfitCause, MisfitPlace
+from schemas.run import Stream
 
 # Two lags so near to each other are of one clock.
 _SAME_CLOCK_S = 1.5
@@ -38,7 +39,7 @@ class StreamLag:
     `sure`: its noise is far below it, and no part of the run contradicts it.
     """
 
-    stream: str
+    stream: Stream
     lag_s: float = 0.0
     sigma_s: float = float("inf")
     sure: bool = False
@@ -65,7 +66,11 @@ def clock_checks(of: Recording, lags: list[StreamLag]) -> list[Check]:
         return [_of_leap(of, lag, leap) if not lag.reason else _check(of, lag, None, known=True) for lag in lags]
     checks = [_check(of, lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
     leaps = [0 if _is_own_clock(lag, lags) else leap_of(lag, of.epoch_ns) for lag in lags]
-    return [_with_leap(check, leap_s) for check, leap_s in zip(checks, leaps, strict=True)]
+    checks = [_with_leap(check, leap_s) for check, leap_s in zip(checks, leaps, strict=True)]
+    return [
+        replace(check, in_time=None if lag.reason or abs(lag.lag_s) > _WHOLE_NEAR_S else lag.stream)
+        for check, lag in zip(checks, lags, strict=True)
+    ]
 
 
 def _is_own_clock(lag: StreamLag, lags: Sequence[StreamLag]) -> bool:

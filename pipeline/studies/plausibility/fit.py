@@ -43,9 +43,14 @@ class Fit:
         """Evidence that contradicts itself, or is none: nothing is proved by it (DOMAIN section 5.4)."""
         return tuple(check for check in self.checks if check.of_evidence)
 
-    @property
-    def leaps_s(self) -> tuple[int, ...]:
-        """Whole leap seconds by which the clock of the positions may be off against the judge's recorders."""
+    def leaps_s(self, in_step: bool) -> tuple[int, ...]:
+        """Whole leap seconds by which the clock of the positions may be off against the judge's recorders.
+
+        `in_step`: these and the odometer have one clock, by their ways. If that is the clock of the positions too, as
+        their ways show, a lag of their places is an error along the track: 60 m at 20 m/s look like three seconds.
+        """
+        if in_step and any(check.in_time == "odometer" for check in self.checks):
+            return ()
         return tuple(sorted({check.leap_s for check in self.misfits} - {0}))
 
     @property

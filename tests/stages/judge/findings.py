@@ -281,7 +281,8 @@ def _decided(rung: Rung) -> list[str]:
         return []
     kind, reference = rung.epochs, rung.journey.run.reference
     assert reference is not None
-    band = 6 * (better.sigma_m if better.stated else 1.0) + 1.0
+    # With 0.08 s of its clock at 30 m/s.
+    band = 6 * (better.sigma_m if better.stated else 1.0) + 2.4
     heard, at = seconds(reference["t"]), rung.journey.judged_at_s(kind.time_s)
     after = np.clip(np.searchsorted(heard, at), 1, len(heard) - 1)
     covered = (heard[after] - heard[after - 1] < 2.0) & (at >= heard[0]) & (at <= heard[-1]) & kind.sure & ~kind.beside
