@@ -27,6 +27,7 @@ from schemas.run import STREAMS, Stream
 
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
 _UNITS_ROW = "row of units"
+_BEFORE = "line above the header"
 _SHORT_ROW = "end of a row, which is missing (taken as empty)"
 # What rows of a stream are for.
 _VALUES: dict[Stream, tuple[str, ...]] = {
@@ -67,7 +68,7 @@ def read_csv(path: Path, config: IngestConfig) -> CsvLog:
         )
     table = _with_ids(table, mappings, path)
     streams: dict[Stream, pl.DataFrame] = {}
-    left = Counter({CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short})
+    left = Counter({CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short, _BEFORE: log.before})
     for name, mapping in mappings:
         mapped = _mapped(table, mapping, name, path, left)
         frame = mapped.filter(_recorded(mapped, name, "fix" in mapping.fields))

@@ -19,6 +19,8 @@ from schemas.errors import InputError
 
 CUT_ROW = "row that breaks off at the end of the file"
 _SEPARATORS = (",", ";", "\t")
+# A logger writes no more lines above its header.
+_HEAD_LINES = 60
 _NO_ROW = r"#|sep=.$"  # a comment; Excel's own line, which names the separator
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # Without a byte order mark: every other byte of European text is zero.
@@ -29,7 +31,7 @@ _MARKS = {",": "[.'\u2019 \u00a0\u202f]", ".": "[,'\u2019 \u00a0\u202f]"}
 
 class LogTable(NamedTuple):
     """A table of a log, with its row of units. `cut`: rows that break off at the end (0 or 1), `short`: rows with fewer
-    values than the header.
+    values than the header, `before`: lines of a logger above the header.
     """
 
     table: pl.DataFrame
@@ -37,6 +39,7 @@ class LogTable(NamedTuple):
     short: int
     units: tuple[str, ...]
     separator: str
+    before: int = 0
 
 
 def read_table(data: bytes, infer: bool) -> pl.DataFrame:
@@ -64,14 +67,39 @@ def read_log_table(log: Path, infer: bool) -> LogTable:
 
 
 def _whole_rows(data: bytes, infer: bool) -> LogTable:
-    lines = _lines(data)
+    written = _lines(data)
+    lines = _from_header(written)
     separator = _separator(lines)
     fields = _header(lines).count(separator)
     ended = data.rstrip(b" \0").endswith((b"\n", b"\r"))
+    whole = lines
     cut = len(lines) > 1 and not ended and lines[-1].count(separator) < fields
     lines, units = _without_units(lines[:-1] if cut else lines, separator)
     short = sum(0 < line.count(separator) < fields for line in lines)
-    return LogTable(_table(lines, infer), int(cut), short, units, separator)
+    return LogTable(_table(lines, infer), int(cut), short, units, separator, len(written) - len(whole))
+
+
+def _from_header(lines: list[str]) -> list[str]:
+    """Without what a logger writes above the header: lines with fewer values than the rows have.
+
+    The header is the first line that has as many values as the row behind it, none of them a number.
+    """
+    head = [number for number, line in enumerate(lines[:_HEAD_LINES]) if line.strip()]
+    for separator in _SEPARATORS:
+        counts = {number: lines[number].count(separator) for number in head}
+        most = max(counts.values(), default=0)
+        tops = [number for number in head if counts[number] == most]
+        if most < 1 or len(tops) < 2 or tops[0] == head[0]:
+            continue
+        header, *rows = csv.reader([lines[number] for number in tops[:3]], delimiter=separator)
+        if all(cell.strip() for cell in header[:-1]) and not any(map(_has_number, header)) and _are_rows(rows):
+            return lines[tops[0] :]
+    return lines
+
+
+def _are_rows(rows: list[list[str]]) -> bool:
+    """Numbers in the first row, or behind a row of units in the second."""
+    return any(sum(map(_has_number, row)) * 2 > len(row) for row in rows[:2])
 
 
 def _refuse_long_rows(lines: list[str], log: Path) -> None:

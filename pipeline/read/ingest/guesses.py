@@ -87,7 +87,7 @@ def columns_in(stream: Stream, words: Mapping[str, str]) -> dict[str, str]:
 
 def unit_in(name: str) -> str | None:
     """The unit in brackets, or at the end of a name."""
-    patterns = (r"[\[(<]\s*([^\])>]+?)\s*[\])>]", r"_(kmh|kph|mps|mph|km|mm|cm|m|ms|s|ft|kn|knots)$")
+    patterns = (r"[\[(<]\s*([^\])>]+?)\s*[\])>]", r"[\s_](km/h|m/s|kmh|kph|mps|mph|km|mm|cm|m|ms|s|ft|kn|knots)$")
     written = re.sub(r"(?<=[a-z])(Kmh|Kph|Mps|Mph|Knots)$", r"_\1", name)
     found = next((match[1] for pattern in patterns if (match := re.search(pattern, written.lower()))), None)
     # A column that is called by its unit alone: kilometres.

@@ -16,11 +16,13 @@ _SIZES = (*(2**bits for bits in (8, 10, 12, 14, 15, 16, 20, 24, 31, 32)), *(10**
 # What one count may be in the unit of a recorded value that is no whole number.
 _COUNTS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 # So many of these are tried, the largest that fit.
-_TRIED = 3
+_TRIED = 2
 # Numerics: written values are whole counts to so much of one.
 _WHOLE = 1e-6
 # The step over the end is no longer than this share of the size, or it could as well be a reset.
 _SURE_SHARE = 0.01
+# Of 1,000 random resets 4 look like the end of a counter of 1,000 or 10,000, hardly one like that of a larger one.
+_SURE_SIZE = 2**14
 # A fall by less than this share of the size is a reset.
 _NAMED_SHARE = 0.9
 # Steps around one that show how long it may be, and by how much longer it may be.
@@ -74,7 +76,8 @@ def _wrap_by(count: float, recorded: Floats, paused: Bools) -> Wrap | None:
         rest = np.abs(np.abs(moves[over]) - size)
         limit = _TIMES_LONGER * usual[over] + 2.0
         if np.all(rest <= limit) and not paused[over].any():
-            return Wrap(size * count, int(over.sum()), certain=bool(np.all(limit <= _SURE_SHARE * size)))
+            sure = size >= _SURE_SIZE and bool(np.all(limit <= _SURE_SHARE * size))
+            return Wrap(size * count, int(over.sum()), certain=sure)
     return None
 
 

@@ -65,7 +65,7 @@ def _beside(clock: RecorderClock, other: RecorderClock, config: HazardConfig) ->
     return RecorderClock(middle_s, delta_s, assumed=True)
 
 
-def true_clocks_s(clocks: Sequence[RecorderClock]) -> list[float]:
+def true_clocks_s(clocks: Sequence[RecorderClock]) -> tuple[float, ...]:
     """By how much the odometer's stamps may be early, least to largest [s]: a measured lag belongs to nobody.
 
     If a recorder has it the odometer's own stamps are true, else odometer and GNSS share it, and what the odometer
@@ -74,8 +74,8 @@ def true_clocks_s(clocks: Sequence[RecorderClock]) -> list[float]:
     shifts_s = [0.0, *(clock.shift_s for clock in clocks)]
     low_s, high_s = min(shifts_s), max(shifts_s)
     if low_s == high_s:
-        return [low_s]
-    return [float(lag_s) for lag_s in np.linspace(low_s, high_s, 2 + int((high_s - low_s) / _LAG_STEP_S))]
+        return (low_s,)
+    return tuple(float(lag_s) for lag_s in np.linspace(low_s, high_s, 2 + int((high_s - low_s) / _LAG_STEP_S)))
 
 
 def _measured(lag: ScaleLag, config: HazardConfig) -> bool:

@@ -94,7 +94,8 @@ class TrainEvidence:
     odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
     of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer
     or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed;
-    `disputes`: times about reads that exclude the reference.
+    `disputes`: times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps may be
+    early.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -111,6 +112,7 @@ class TrainEvidence:
     doubted: int = 0
     unsure: tuple[Span, ...] = ()
     disputes: tuple[Span, ...] = ()
+    true_clocks_s: tuple[float, ...] = (0.0,)
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
@@ -154,12 +156,12 @@ class TrainEvidence:
         return (min(times), max(times)) if times else None
 
     def at(self, t_ns: Ints) -> EvidenceSet:
-        """Evidence at these instants of the GNSS's stamps, whichever of the clocks is the true one (`true_clocks_s`).
+        """Evidence at these instants of the GNSS's stamps, whichever of the clocks is the true one.
 
         Nothing is carried from one side over a stand of the odometer (`stood`). Up to a second after a recording that
         ended in a stand the train is taken to stand on.
         """
-        return either([self._by_clock(t_ns, early_s) for early_s in true_clocks_s(self.clocks)])
+        return either([self._by_clock(t_ns, early_s) for early_s in self.true_clocks_s])
 
     def _by_clock(self, t_ns: Ints, early_s: float) -> EvidenceSet:
         at_ns, beyond_m = t_ns, np.zeros(t_ns.size)
@@ -410,6 +412,7 @@ def evidence_of(
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
         unsure=tuple(unsure),
+        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + (of_reads,) * bool(clocked)),
         disputes=tuple(span for stretch in recorded for span in stretch.disputed),
         doubted=unclosed
         + sum(stretch.levels.doubts for stretch in recorded)

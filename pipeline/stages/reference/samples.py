@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
+from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about, segments_of
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network
+from pipeline.stages.track.segments import box_about
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
 
@@ -40,8 +41,14 @@ def samples_of(reference: pl.DataFrame, network: Network, config: Configuration)
     hazards = config.hazards
     sigma_m = reference["sigma_m"].fill_null(hazards.reference_sigma_m).to_numpy()
     points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))
+    factor = 2.0 * config.align.sure_sigmas
+    # Long chords are far off their curves: only those count that the run may be near.
     most_m = float(np.hypot(sigma_m, network.most_survey_sigma_m(hazards.survey_sigma_m)).max())
-    reach_m = 2.0 * config.align.sure_sigmas * most_m
+    segments = segments_of(network.track)
+    box = box_about(points.surface, factor * most_m)
+    vertex = segments.vertex[box.touched_by(segments.start, segments.end)]
+    survey_m = network.survey_sigmas_m(hazards.survey_sigma_m, vertex).max(initial=hazards.survey_sigma_m)
+    reach_m = factor * float(np.hypot(sigma_m, survey_m).max())
     near = candidates_of(points, network, search_about(points.surface, network, reach_m), reach_m)
-    survey_m = network.survey_sigmas_m(hazards.survey_sigma_m, near.vertex)
-    return Samples(times_ns(reference), points, sigma_m, near, survey_m)
+    near_survey_m = network.survey_sigmas_m(hazards.survey_sigma_m, near.vertex)
+    return Samples(times_ns(reference), points, sigma_m, near, near_survey_m)

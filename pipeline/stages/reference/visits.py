@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass(eq=False)
-class Visit:
+class VisitNode:
     """A visit of an oriented element, at steps `first` to `last`; `sampled`: some sample lies on it."""
 
     oriented: int
@@ -22,8 +22,8 @@ class Visit:
 class Link:
     """From one visit to the next, behind the step `at`."""
 
-    here: Visit
-    there: Visit
+    here: VisitNode
+    there: VisitNode
     at: int
     back: bool
 
@@ -38,7 +38,7 @@ class ElementStay:
     back: bool
 
 
-def ways_over(nodes: Sequence[Visit], last: int, most: int) -> list[list[ElementStay]]:
+def ways_over(nodes: Sequence[VisitNode], last: int, most: int) -> list[list[ElementStay]]:
     """Ways from the first step to the last that together run over every link between visits.
 
     Nothing where there are more than `most`.
@@ -59,9 +59,9 @@ def ways_over(nodes: Sequence[Visit], last: int, most: int) -> list[list[Element
     return ways
 
 
-def _closure(start: set[Visit], forward: bool) -> set[Visit]:
+def _closure(start: set[VisitNode], forward: bool) -> set[VisitNode]:
     """All visits reachable from `start`, forward or backward in time."""
-    seen: set[Visit] = set()
+    seen: set[VisitNode] = set()
     to_visit = list(start)
     while to_visit:
         node = to_visit.pop()
@@ -72,7 +72,7 @@ def _closure(start: set[Visit], forward: bool) -> set[Visit]:
 
 
 def _way_over(
-    link: Link, begins: set[Visit], ends: set[Visit], alive: set[Visit], covered: set[Link]
+    link: Link, begins: set[VisitNode], ends: set[VisitNode], alive: set[VisitNode], covered: set[Link]
 ) -> list[Link] | None:
     """A whole way over a link, grown at both ends; each next link is the nearest in time, then one not yet covered."""
 
@@ -95,7 +95,7 @@ def _way_over(
     return links
 
 
-def _stays(start: Visit, links: Sequence[Link], last: int) -> list[ElementStay]:
+def _stays(start: VisitNode, links: Sequence[Link], last: int) -> list[ElementStay]:
     """The elements that a way from a visit over these links runs over, in order of time; `last`: the last step."""
     stays: list[ElementStay] = []
     node = start

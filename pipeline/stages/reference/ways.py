@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from pipeline.stages.paths.moves import Moves, Place
 from pipeline.stages.paths.path_set import Node, PathSet
-from pipeline.stages.reference.visits import ElementStay, Link, Visit, ways_over
+from pipeline.stages.reference.visits import ElementStay, Link, VisitNode, ways_over
 from schemas.config import MatchingConfig
 
 
@@ -21,7 +21,7 @@ def ways_of(found: PathSet, config: MatchingConfig, most: int) -> list[list[Elem
     if found.overflow <= last:
         return []
     nodes = {id(node): node for node in _living(found)}
-    visits = {key: Visit(node.oriented, node.begin, node.end - 1) for key, node in nodes.items() if _lasts(node)}
+    visits = {key: VisitNode(node.oriented, node.begin, node.end - 1) for key, node in nodes.items() if _lasts(node)}
     moves = Moves.without_odometer(found.network, found.steps, config)
     every = list(visits.values())
     for key, visit in visits.items():
@@ -60,7 +60,7 @@ def _origins(node: Node) -> Iterator[tuple[Node, int]]:
             waiting += [(further, step) for further in origin.origins]
 
 
-def _linked(moves: Moves, here: Visit, there: Visit, origin: Node, node: Node, step: int) -> list[Visit]:
+def _linked(moves: Moves, here: VisitNode, there: VisitNode, origin: Node, node: Node, step: int) -> list[VisitNode]:
     """Link two visits behind the step before `step`; returns visits of elements between, on which no sample lies."""
     begin = _place(origin, step - 1)
     end = _place(node, step)
@@ -69,7 +69,7 @@ def _linked(moves: Moves, here: Visit, there: Visit, origin: Node, node: Node, s
         return []
     at = step - 1
     sense = move.sense or 1
-    between = [Visit(oriented, at, at, sampled=False) for oriented in move.between]
+    between = [VisitNode(oriented, at, at, sampled=False) for oriented in move.between]
     for one, other in pairwise([here, *between, there]):
         link = Link(one, other, at, sense < 0)
         one.after.append(link)

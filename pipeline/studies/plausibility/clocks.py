@@ -84,7 +84,8 @@ def _with_leap(check: Check, leap_s: int) -> Check:
 def leap_of(lag: StreamLag, t_ns: int) -> int:
     """The whole leap seconds that a sure lag is, 0 where it is none: positions late by chance are not, to a tenth.
 
-    1 to 3 s of an old count, or all of GPS - UTC by one. Positions that are exactly so old look alike: nobody knows.
+    2 or 3 s of an old count, or all of GPS - UTC by one. Positions that are exactly so old look alike: nobody knows.
+    One second is the age of positions as often.
     """
     whole = round(lag.lag_s)
     if lag.reason or not lag.sure or not whole:
@@ -92,7 +93,7 @@ def leap_of(lag: StreamLag, t_ns: int) -> int:
     leap_s = leap_seconds(t_ns)
     if leap_s - max(_LEAPS_S) <= abs(whole) <= leap_s and abs(lag.lag_s - whole) <= _WHOLE_NEAR_S:
         return whole
-    old = abs(whole) <= max(_LEAPS_S) and abs(lag.lag_s - whole) <= _LEAP_NEAR_S
+    old = abs(whole) in _LEAPS_S and abs(lag.lag_s - whole) <= _LEAP_NEAR_S
     return whole if old else 0
 
 

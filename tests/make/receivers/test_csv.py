@@ -197,9 +197,12 @@ def test_rows_that_do_not_fit_the_header(tmp_path):
     assert found.dropped == {
         "end of a row, which is missing (taken as empty)": 1, "row without a value of odometer": 2,
     }  # fmt: skip
-    log.write_text("Logger 7\nt,d,v\n1,10,1\n")
+    log.write_text("Logger 7\nt,d,v\n1,10,1\n2,11,1\n")
+    found = gather([log], config)
+    assert (found.streams["odometer"].height, found.dropped) == (2, {"line above the header": 1})
+    log.write_text("t,d\n1,10,1\n")
     with pytest.raises(
-        InputError, match=r"line 2, .*more values than the header; found 3: t, d, v; expected at most 1"
+        InputError, match=r"line 2, .*more values than the header; found 3: 1, 10, 1; expected at most 2"
     ):
         gather([log], config)
 

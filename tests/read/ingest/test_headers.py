@@ -12,7 +12,7 @@ from pipeline.project.convert import Recordings
 from pipeline.project.found import look_around
 from pipeline.project.looking import look_at
 from pipeline.read.ingest.csv_draft import draft_mapping
-from pipeline.read.ingest.guesses import zone_in
+from pipeline.read.ingest.guesses import columns_in, word_of, zone_in
 from schemas.config import IngestConfig, settings_from, toml_of
 from schemas.errors import InputError
 
@@ -135,6 +135,8 @@ def test_a_comment_that_names_no_columns_is_none(tmp_path: Path) -> None:
         ("Horodatage;Identifiant balise", "balise_reads", {"balise_id": "Identifiant balise"}),
         ("czas;Droga [m]", "odometer", {"distance_m": "Droga [m]"}),
         ("czas;Przebieg [m];Prędkość [m/s]", "odometer", {"distance_m": "Przebieg [m]", "speed_mps": "Prędkość [m/s]"}),
+        ("Temps;Odomètre (m)", "odometer", {"distance_m": "Odomètre (m)"}),
+        ("Data pomiaru;NID_BG", "balise_reads", {"balise_id": "NID_BG"}),
         ("horodatage;Distance parcourue (m)", "odometer", {"distance_m": "Distance parcourue (m)"}),
     ],
 )
@@ -151,3 +153,42 @@ def test_times_called_gps_are_said_to_be_taken_for_utc(tmp_path: Path) -> None:
         (tmp_path / "log.csv").write_text(f"{name},lat,lon\n{rows}")
         seen = look_at(tmp_path / "log.csv", IngestConfig(), None, nothing)
         assert sum('time_scale = "gps"' in text for text in seen.assumed) == said
+
+
+def test_units_behind_names_without_brackets(tmp_path: Path) -> None:
+    """36 km/h are 10 m/s."""
+    rows = "".join(f"{TIME.format(n)};36,0\n" for n in range(3))
+    for name in ("Vitesse km/h", "Predkosc_kmh", "v [km/h]"):
+        (entry,) = drafted(tmp_path, f"Temps;{name}\n{rows}")["odometer"]
+        assert entry["factors"]["speed_mps"] == pytest.approx(10.0 / 36.0)
+
+
+@pytest.mark.parametrize(
+    "name", ["Latitude N", "pos_lat", "geogr. Breite", "szerokosc_geo", "lat_dd", "LatitudeDegrees"]
+)
+def test_names_of_latitudes(name: str) -> None:
+    assert columns_in("gnss", {name: word_of(name)}) == {"latitude_deg": name}
+
+
+@pytest.mark.parametrize(
+    "above",
+    [
+        "Logger X v1.2\nSerial, 123\n\n",
+        "Logger X\n",
+        "Start: 2025-06-03 08:00:00\nInterval; 100 ms\n\n\n",
+        "a,b\n1,2\n",
+    ],
+)
+def test_what_a_logger_writes_above_the_header(tmp_path: Path, above: str) -> None:
+    rows = "".join(f"{TIME.format(n)},50.1,14.2\n" for n in range(3))
+    assert times_by_draft(tmp_path, f"{above}time,lat,lon\n{rows}") == [f"2025-06-03T08:00:0{n}" for n in range(3)]
+    units = f"{above}time,lat,lon\n,deg,deg\n{rows}"
+    assert len(times_by_draft(tmp_path, units)) == 3
+    mapping = settings_from(drafted(tmp_path, units), IngestConfig, "draft")
+    assert convert([tmp_path / "log.csv"], "r", mapping).dropped["line above the header"] == above.count("\n")
+
+
+def test_a_header_that_is_shorter_than_its_rows_is_none_above_one(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("time,lat\n" + "".join(f"{TIME.format(n)},50.1,14.2\n" for n in range(3)))
+    with pytest.raises(InputError, match="has more values than the header"):
+        draft_mapping(tmp_path / "log.csv")

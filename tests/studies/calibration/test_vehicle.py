@@ -99,7 +99,7 @@ def with_rows(track: Odometry, kind: str, size_m: float, seed: int) -> Odometry:
     return odometry_from(odometer_of(track.t_s, distance_m=rows))
 
 
-ROWS = [("counts", 5.0), ("noise", 0.5)]
+ROWS = [("counts", 2.0), ("noise", 0.5)]
 
 
 @pytest.mark.parametrize(("kind", "size_m"), ROWS)
@@ -121,3 +121,12 @@ def test_rows_that_scatter_tell_no_latency_at_constant_speed(kind: str, size_m: 
         assert one is not None
         assert one.latency_s is None
         assert abs(one.scale - SCALE) < 4.0 * one.scale_sigma
+
+
+def test_counts_as_coarse_as_its_changes_of_speed_tell_no_latency() -> None:
+    """5 m at 10 Hz: a change of 5 m/s in 10 s is not told from the rhythm of the counts; the scale is."""
+    t_s, path_m, track = simulated_run(0, 600)
+    one = estimate_run(t_s, path_m, with_rows(track, "counts", 5.0, 50))
+    assert one is not None
+    assert one.latency_s is None
+    assert abs(one.scale - SCALE) < 4.0 * one.scale_sigma
