@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.stages.odometry.odometry import Odometry
+from pipeline.stages.odometry.odometry import KnownNoise, Odometry
 from pipeline.stages.odometry.scale_lag import slopes
 from schemas.arrays import Floats, Ints
 from schemas.config import AlignConfig, Vehicle
@@ -89,6 +89,20 @@ def estimates_of(joints: Floats) -> Estimates:
     return Estimates(1.0 + means[..., _SCALE], deviations[..., _SCALE], means[..., _LATENCY], deviations[..., _LATENCY])
 
 
+class _Scatter(NamedTuple):
+    """Of stamps and of the odometer's rows at one epoch (`KnownNoise`)."""
+
+    still_m2: float
+    moving_s2: float
+    faster_s2: float
+    seen_mps: float
+
+
+def _scatters(known: KnownNoise, jitter_s: Floats) -> list[_Scatter]:
+    columns = known.still_m2, jitter_s**2 + known.moving_s2, known.faster_s2, known.seen_mps
+    return [_Scatter(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+
+
 @dataclass(frozen=True)
 class ScaleLatencyFilter:
     """States are passed in and out."""
@@ -129,7 +143,7 @@ class ScaleLatencyFilter:
         walked_m2 = state.unsettled_m2 - left_m2 + known.white_m2_per_s.item() * step_ns * 1e-9
         self._predict(state.joint, step_ns, walked_m2, joint)
         seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
-        scatter = known.still_m2.item(), jitter_s**2 + known.moving_s2.item()
+        (scatter,) = _scatters(known, np.array([jitter_s]))
         variance_m2 = row.dot(seen[:-1]).item() + self.config.white_share * sigma_m**2
         variance_m2 += self._scatter_m2(scatter, speed_mps)
         probability = self.config.break_moved_probability * -math.expm1((state.t_s - t_s) / self.config.break_moving_s)
@@ -154,7 +168,7 @@ class ScaleLatencyFilter:
         walked_m2 = bridged_m2 + known.white_m2_per_s * dt_s - np.diff(unsettled_m2, prepend=state.unsettled_m2)
         white_m2 = (self.config.white_share * sigma_m**2).tolist()
         before = state.joint
-        scatters = list(zip(known.still_m2.tolist(), (jitter_s**2 + known.moving_s2).tolist(), strict=True))
+        scatters = _scatters(known, jitter_s)
         walks_m2 = walked_m2.tolist()
         epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, scatters, steps_ns, walks_m2, strict=True)
         for joint, row, now_s, place_m, noise_m2, scatter, step_ns, walk_m2 in epochs:
@@ -194,10 +208,10 @@ class ScaleLatencyFilter:
         return seen, speed_mps
 
     @staticmethod
-    def _scatter_m2(scatter: tuple[float, float], speed_mps: float) -> float:
+    def _scatter_m2(scatter: _Scatter, speed_mps: float) -> float:
         """Variance of stamps and of the odometer's rows, both without memory [m^2]."""
-        still_m2, moving_s2 = scatter
-        return still_m2 + moving_s2 * speed_mps**2
+        faster = max(speed_mps**2 - scatter.seen_mps**2, 0.0)
+        return scatter.still_m2 + scatter.moving_s2 * speed_mps**2 + scatter.faster_s2 * faster
 
     def _unsettled_m2(self, state: FilterState, t_s: float) -> float:
         return state.unsettled_m2 * math.exp((state.t_s - t_s) / self.config.settling_tau_s)

@@ -65,12 +65,15 @@ class Noise:
 class KnownNoise:
     """The same as the rows up to each sample show it, and the period of the rows [s].
 
-    `still_m2`, `moving_s2`: of `QuantisationNoise`; a first figure where too few rows show them yet (not `shown`).
+    `still_m2`, `moving_s2`: of `QuantisationNoise`; a first figure where too few rows show them yet (not `shown`). What
+    shows at one speed may be noise of the stamps: beyond `seen_mps` it grows by `faster_s2` with the speed squared.
     """
 
     white_m2_per_s: Floats
     still_m2: Floats
     moving_s2: Floats
+    faster_s2: Floats
+    seen_mps: Floats
     period_s: Floats
     shown: Bools
 
@@ -79,7 +82,8 @@ class KnownNoise:
 
     def row_m2(self, speed_mps: Floats) -> Floats:
         """Variance of a row [m^2]."""
-        return np.asarray(self.still_m2 + self.moving_s2 * speed_mps**2)
+        faster = np.maximum(speed_mps**2 - self.seen_mps**2, 0.0)
+        return np.asarray(self.still_m2 + self.moving_s2 * speed_mps**2 + self.faster_s2 * faster)
 
 
 @dataclass(frozen=True)
@@ -442,12 +446,15 @@ def _noise(
     )
     # Rows far apart, or of speeds alone, have no such noise.
     none = (period_s > align.straight_s) | ~np.concatenate([whole[:1], whole])
-    first_m2 = np.where(none, 0.0, first_scatter_m2(distance_m, period_s, white_m2_per_s, align))
+    first_m2 = np.where(none, 0.0, first_scatter_m2(t_s, distance_m, period_s, white_m2_per_s, align))
     known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)
     return noise, KnownNoise(
         white_m2_per_s=white_m2_per_s,
         still_m2=np.maximum(known.still_m2, counts.step_m**2 / 12.0),
         moving_s2=known.moving_s2,
+        # Twice what the counts explain are still the counts.
+        faster_s2=np.maximum(known.still_m2 - counts.step_m**2 / 6.0, 0.0) / known.seen_mps**2,
+        seen_mps=known.seen_mps,
         period_s=period_s,
         shown=known.shown | none | counts.shown,
     )

@@ -23,8 +23,8 @@ _DEGREE = 3
 # Enough for the median, however long the run is; with fewer it is chance.
 _PIECES = 400
 _FEWEST_PIECES = 8
-# Of third differences so many show a first figure; a normal distribution's median of |x|, in sigmas.
-_THIRD_ROWS, _FEWEST_THIRD = 100, 5
+# So many rows, at most and at least, show a first figure; a normal distribution's median of |x|, in sigmas.
+_FIRST_ROWS, _FEWEST_FIRST = 100, 5
 _MEDIAN_SIGMAS = 0.6745
 
 
@@ -96,10 +96,14 @@ def of_the_run(pieces: ScatterPieces, config: AlignConfig) -> QuantisationNoise:
 
 
 class KnownScatter(NamedTuple):
-    """Per row the terms of `QuantisationNoise`; `shown`: enough pieces before it show them."""
+    """Per row the terms of `QuantisationNoise`; `shown`: enough pieces before it show them.
+
+    `seen_mps`: the one speed at which they do, infinite where they tell noise of the stamps from that of the reading.
+    """
 
     still_m2: Floats
     moving_s2: Floats
+    seen_mps: Floats
     shown: Bools
 
 
@@ -107,11 +111,14 @@ def known_at_rows(
     pieces: ScatterPieces, first_m2: Floats, renewal_s: float, t_s: Floats, config: AlignConfig
 ) -> KnownScatter:
     """As the last pieces before each row show it; `first_m2`: of each row until there are enough of them."""
-    known = KnownScatter(first_m2.copy(), np.zeros(t_s.size), np.zeros(t_s.size, dtype=np.bool_))
+    size = t_s.size
+    known = KnownScatter(first_m2.copy(), np.zeros(size), np.full(size, np.inf), np.zeros(size, dtype=np.bool_))
     renewed_s = -np.inf
     for number, end in enumerate(pieces.end.tolist(), start=1):
         if number >= _FEWEST_PIECES and t_s[end] - renewed_s >= renewal_s:
-            found = _fit(pieces.take(slice(max(number - _PIECES, 0), number)), config)
+            last = pieces.take(slice(max(number - _PIECES, 0), number))
+            found = _fit(last, config)
+            known.seen_mps[end:] = np.inf if _speeds(last, config).differ else float(np.median(last.speed_mps))
             known.still_m2[end:] = found.still_m2
             known.moving_s2[end:] = found.moving_s2
             known.shown[end:] = True
@@ -119,18 +126,24 @@ def known_at_rows(
     return known
 
 
-def first_scatter_m2(distance_m: Floats, period_s: Floats, white_m2_per_s: Floats, config: AlignConfig) -> Floats:
-    """Variance of a row [m^2] by third differences of the rows up to each, which constant braking has not.
+def first_scatter_m2(
+    t_s: Floats, distance_m: Floats, period_s: Floats, white_m2_per_s: Floats, config: AlignConfig
+) -> Floats:
+    """Variance of a row [m^2] by the rows up to each: how far each lies beside the straight line of its neighbours.
 
-    White noise of the increments has 6 r dt of their 20 sigma^2. A median of few is uncertain: by 3 / root of their
-    number more.
+    Less the same of the row before, which constant braking leaves as it is: noise of rows has 5 sigma^2 of that, white
+    noise of the increments 1.5 r dt. A median of few is uncertain: by 3 / root of their number more.
     """
-    third_m = np.abs(np.diff(distance_m, 3))
-    median_m = pl.Series(third_m).rolling_median(_THIRD_ROWS, min_samples=_FEWEST_THIRD).fill_null(0.0).to_numpy()
-    count = np.minimum(np.arange(1, third_m.size + 1), _THIRD_ROWS)
+    if t_s.size < 4:
+        return np.zeros(t_s.size)
+    share = np.diff(t_s)[:-1] / np.maximum(t_s[2:] - t_s[:-2], 1e-9)
+    beside_m = distance_m[1:-1] - distance_m[:-2] - share * (distance_m[2:] - distance_m[:-2])
+    changes_m = np.abs(np.diff(beside_m))
+    median_m = pl.Series(changes_m).rolling_median(_FIRST_ROWS, min_samples=_FEWEST_FIRST).fill_null(0.0).to_numpy()
+    count = np.minimum(np.arange(1, changes_m.size + 1), _FIRST_ROWS)
     sigma_m = median_m / _MEDIAN_SIGMAS * (1.0 + 3.0 / np.sqrt(count))
-    scatter_m2 = np.concatenate([np.zeros(min(3, distance_m.size)), sigma_m**2 / 20.0])
-    explained_m2 = 6.0 / 20.0 * white_m2_per_s * period_s
+    scatter_m2 = np.concatenate([np.zeros(3), sigma_m**2 / 5.0])
+    explained_m2 = 0.3 * white_m2_per_s * period_s
     beyond = (scatter_m2 > config.quantisation_factor * explained_m2) & (period_s <= config.straight_s)
     return np.where(beyond, scatter_m2 - explained_m2, 0.0)
 
@@ -144,13 +157,28 @@ def _fit(pieces: ScatterPieces, config: AlignConfig) -> QuantisationNoise:
     if pieces.end.size < _FEWEST_PIECES:
         return NO_QUANTISATION
     scatter, explained = pieces.scatter_m2, pieces.explained_m2
-    fast = pieces.speed_mps > np.median(pieces.speed_mps)
-    low_mps, high_mps = (float(np.median(pieces.speed_mps[part])) if part.any() else 0.0 for part in (~fast, fast))
-    if fast.sum() < _FEWEST_PIECES or high_mps**2 < config.quantisation_factor * low_mps**2:
+    fast, low_mps, high_mps, differ = _speeds(pieces, config)
+    if not differ:
         return QuantisationNoise(_beyond(scatter, explained, config))
     low_m2, high_m2 = (_beyond(scatter[part], explained[part], config) for part in (~fast, fast))
     moving_s2 = max(high_m2 - low_m2, 0.0) / (high_mps**2 - low_mps**2)
     return QuantisationNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
+
+
+class _Speeds(NamedTuple):
+    """The pieces above the median speed, the medians of both halves, and whether these differ enough."""
+
+    fast: Bools
+    low_mps: float
+    high_mps: float
+    differ: bool
+
+
+def _speeds(pieces: ScatterPieces, config: AlignConfig) -> _Speeds:
+    fast: Bools = pieces.speed_mps > np.median(pieces.speed_mps)
+    low_mps, high_mps = (float(np.median(pieces.speed_mps[part])) if part.any() else 0.0 for part in (~fast, fast))
+    differ = bool(fast.sum() >= _FEWEST_PIECES) and high_mps**2 >= config.quantisation_factor * low_mps**2
+    return _Speeds(fast, low_mps, high_mps, differ)
 
 
 class _Shapes(NamedTuple):
