@@ -15,6 +15,9 @@ from pipeline.stages.matching.path_states import PathStates, unbroken
 from pipeline.stages.paths.moves import Moves, Place
 from schemas.arrays import Bools, Floats, Ints
 
+# Numerics: more than a step that no error explains costs one that is left out, in squares of sigmas.
+_LEFT_OUT = 1.0
+
 
 @dataclass(frozen=True, eq=False)
 class _Reached:
@@ -90,7 +93,8 @@ def _entered(
         after[here] = _Reached(least + sums[number], block, number, place, before)
     # A path that costs more than to break off the cheapest has lost.
     most = min(reached.cost for reached in after.values()) + moves.break_cost
-    missed = moves.config.outlier_sigmas**2 * (end - begin)
+    # To leave a step out costs more than to explain it by nothing: positions off the network stay on the path.
+    missed = (moves.config.outlier_sigmas**2 + _LEFT_OUT) * (end - begin)
     for here, reached in alive.items():
         if here not in after and reached.cost + missed < most:
             carried = _Reached(reached.cost + missed, reached.block, reached.number, reached.place, reached.before)
