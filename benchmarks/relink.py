@@ -136,7 +136,7 @@ def outcome(made: Journey, config: Configuration) -> Outcome:
 
 
 def unused_s(made: Journey, config: Configuration) -> float:
-    """For how long the position of a sound journey is out of use from 1,000 s on: beyond recovery from its event [s]."""
+    """For how long the position of a sound journey is out of use from 1,000 s on, when its event is over [s]."""
     aligned, lds = lds_of(made, config)
     t_s = (aligned["t"] - aligned["t"][0]).dt.total_seconds().to_numpy()
     unused = lds.epochs["negated"].to_numpy() | lds.epochs["withheld"].to_numpy()
