@@ -30,7 +30,7 @@ _SAME_CLOCK_S = 1.5
 # of reads and odometers are known to so much beside their noise [s].
 _LEAPS_S = (2, 3)
 # By one second positions are old as often: only an odometer that is free of the GNSS and a recorder of places together
-# show that the clock is off by it, as an error along the track of constant size would show to the recorder of places only.
+# show that the clock is off by it. A constant error along the track shows to the recorder of places alone.
 _ONE_S = 1
 _WHOLE_NEAR_S = 0.3
 _LEAP_NEAR_S = 0.12
@@ -109,7 +109,8 @@ def leap_of(lag: StreamLag, t_ns: int) -> int:
 def _leap_of_gnss(of: Recording, lags: list[StreamLag]) -> int | None:
     """The whole seconds by which two recorders and more say that the clock of the GNSS is off; none where they do not.
 
-    One second may be the age of positions: motion and places have to show it. A misfit, not an impossibility: a slow fault of the GNSS can look like it.
+    One second may be the age of positions: motion and places have to show it. A misfit, not an impossibility: a slow
+    fault of the GNSS can look like it.
     """
     known = [lag for lag in lags if not lag.reason]
     sure = [lag for lag in known if lag.sure]
