@@ -195,7 +195,7 @@ def _frames(
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
     breaches: list[InputError] = []
     remarks: list[str] = []
-    frames = stream_frames(decoded if len(logs) == 1 else _joined(decoded), breaches, config.wrong_dates_share, remarks)
+    frames = stream_frames(decoded if len(logs) == 1 else _joined(decoded), breaches, config, remarks)
     if "gnss" not in frames:
         breaches.append(_no_gnss(logs, left_over))
     refuse(breaches)
