@@ -146,7 +146,10 @@ class IngestConfig(Settings):
     def _one_table_or_many(cls, data: object) -> object:
         if not isinstance(data, Mapping):
             return data
-        return {key: [value] if isinstance(value, Mapping) else value for key, value in data.items()}
+        alone = {"wraps"}
+        return {
+            key: [value] if isinstance(value, Mapping) and key not in alone else value for key, value in data.items()
+        }
 
 
 class PlausibilityConfig(Settings):
