@@ -288,7 +288,7 @@ def _checked(
     if ride.is_ready:
         run = read_run(ride.logs[0].path, config.ingest, with_digest=False)
     else:
-        run = run_of_logs(base, entry, config, recordings).run
+        run = run_of_logs(base, entry, config.ingest, config.fix_sigma, recordings).run
     corrections: list[StreamCorrection] = []
     found: list[str] = []
     for _ in range(_ROUNDS):

@@ -177,8 +177,8 @@ def test_killed_before_it_is_noted_a_product_is_made_again(tmp_path: Path, known
         Record(tmp_path).bring(Product("run a", made, "old"), make(b"old"))
     with pytest.raises(Killed):
         Record(tmp_path).bring(Product("run a", made, "new"), make(b"ha", Killed()))
-    assert Record(tmp_path).bring(Product("run a", made, "new"), make(b"half"))
-    assert not Record(tmp_path).bring(Product("run a", made, "new"), make(b"no"))
+    assert Record(tmp_path).bring(Product("run a", made, "new"), make(b"half")).made
+    assert not Record(tmp_path).bring(Product("run a", made, "new"), make(b"no")).made
     with pytest.raises(InputError):
         Record(tmp_path).bring(Product("run a", made, "third"), make(b"", InputError("damaged", place="log")))
     made.write_bytes(b"by hand")
@@ -197,10 +197,10 @@ def test_a_file_that_was_added_to_a_run_is_not_removed(tmp_path: Path) -> None:
 
     Record(tmp_path).bring(Product("run a", run, "old"), make)
     (run / "reference.parquet").write_bytes(b"added")
-    assert not Record(tmp_path).bring(Product("run a", run, "old"), make)
+    assert not Record(tmp_path).bring(Product("run a", run, "old"), make).made
     with pytest.raises(UsageError, match="was added"):
         Record(tmp_path).bring(Product("run a", run, "new"), make)
-    assert Record(tmp_path, force=True).bring(Product("run a", run, "new"), make)
+    assert Record(tmp_path, force=True).bring(Product("run a", run, "new"), make).made
 
 
 def test_unknown_keys_are_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -274,3 +274,19 @@ def test_remedies_of_a_project_name_its_keys() -> None:
     assert "week12/balise.toml" in words
     assert words.endswith("`balise run --project week12`")
     assert "balise replay" not in "".join(remedy_words(remedy, **places) for remedy in Remedy)
+
+
+def test_a_site_is_made_again_for_any_setting(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A survey may be a recorded run: its line depends on settings of more than the survey."""
+    drive = project / "drive"
+    shutil.copytree(project / "runs/run0", drive)
+    file = drive / "gnss.parquet"
+    pl.read_parquet(file).with_columns(fix=pl.lit("rtk_fixed")).write_parquet(file)
+    shutil.rmtree(project / "site")
+    text = 'config = "settings.toml"\n[track]\nsurvey = ["drive"]\n[replay]\nruns = ["runs/run0"]\n'
+    (project / "balise.toml").write_text(text)
+    for reach_m in (50, 60):
+        (project / "settings.toml").write_text(f"[matching]\nreach_m = {reach_m}\n")
+        for made in (True, False):
+            call("run")
+            assert ("site: made of drive" in capsys.readouterr().err) == made
