@@ -289,4 +289,4 @@ def test_a_site_is_made_again_for_any_setting(project: Path, capsys: pytest.Capt
         (project / "settings.toml").write_text(f"[matching]\nreach_m = {reach_m}\n")
         for made in (True, False):
             call("run")
-            assert ("site: made of drive" in capsys.readouterr().err) == made
+            assert ("made of drive" in capsys.readouterr().err) == made
