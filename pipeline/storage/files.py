@@ -96,7 +96,8 @@ def require_regular(path: Address) -> None:
 
 def _regular(path: Path) -> Path:
     """The file, unless it is a pipe or a device: reading one can last for ever."""
-    if path.exists() and not (path.is_file() or path.is_dir()):
+    path.stat()  # a link to nothing, or to itself, is an error
+    if not (path.is_file() or path.is_dir()):
         raise InputError("is no regular file", place=str(path), expected="a file or folder")
     return path
 
