@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.campaign import CampaignSummary, Interrupted, Plan
+    from pipeline.campaign.verify import Verification
     from pipeline.project.trial import Wanted
     from schemas.config import Configuration, StreamCorrection, Vehicle
     from schemas.run import RunLog
@@ -315,6 +316,7 @@ def run(
     from pipeline.campaign import Interrupted
     from pipeline.project.opened import open_project
     from pipeline.project.run import Call, run_project
+    from pipeline.results.manifest import anchor, anchor_words
     from pipeline.show.progress import show_summary, summary_answer, watches
     from pipeline.show.terminal import how_far
 
@@ -331,7 +333,9 @@ def run(
     except Interrupted as interrupted:
         raise _stopped(interrupted, out, quiet, as_json, places) from None
     if as_json:
-        made = {"page": ended.page, "changed": ended.changed, "unread": ended.unread}
+        digest, runs = anchor(out)
+        manifest = {"sha256": digest, "runs": runs}
+        made = {"page": ended.page, "changed": ended.changed, "unread": ended.unread, "manifest": manifest}
         _print_json({**summary_answer(ended.summary, out), **made})
     else:
         show_summary(ended.summary, out, quiet, False, has_pages=ended.page is not None, **places)
@@ -339,6 +343,7 @@ def run(
             print(line, file=sys.stderr if quiet else sys.stdout)
     if not (quiet or as_json):
         print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
+        print(anchor_words(*anchor(out)))
     raise Exit(_status_of(ended.summary, options.fail_on) or (RUNS_NOT_OK if ended.unread else OK))
 
 
@@ -857,29 +862,50 @@ def verify(
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     route: RouteFiles = None,
+    expect: Annotated[str | None, Option("--expect", help="SHA-256 of manifest.json as it was kept elsewhere.")] = None,
     jobs: Jobs = 0,
     quiet: Quiet = False,
     as_json: Json = False,
     project: OfProject = None,
 ) -> None:
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
-    from pipeline.campaign.verify import recompute
+    from pipeline.campaign.verify import as_kept, recompute
     from pipeline.campaign.verify import verify as compare
+    from pipeline.results.manifest import anchor, anchor_words
     from pipeline.show.progress import progress_watch
 
+    found = [as_kept(out, expect)] if expect else []
     with _telling("runs", quiet):
-        found = [compare(out)]
+        found.append(compare(out))
     if logs:
         settings = _configuration(config) if config else None
         shown = [] if quiet else [progress_watch()]
+        found += _from_raw_logs(logs, project)
         found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs, shown))
     if as_json:
         compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
-        _print_json({"agrees": not any(one.problems for one in found), "comparisons": compared})
+        digest, runs = anchor(out)
+        manifest = {"sha256": digest, "runs": runs}
+        _print_json({"agrees": not any(one.problems for one in found), "manifest": manifest, "comparisons": compared})
     for one in found if not as_json else []:
         if one.problems or not quiet:
             _tell(False, None, {"": one.table} if one.problems else {}, one.sentence)
+    if not (as_json or quiet):
+        print(anchor_words(*anchor(out)))
     raise Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
+
+
+def _from_raw_logs(logs: list[str], project: Path | None) -> list[Verification]:
+    """In a project: whether the raw logs of these runs give them again."""
+    from datasets.recordings import recordings
+    from pipeline.campaign import find_runs
+    from pipeline.project.opened import project_here
+    from pipeline.project.reconvert import reconverted
+
+    opened = project_here(project)
+    if opened is None or not opened.project.convert:
+        return []
+    return [reconverted(opened, recordings(), find_runs(logs).values())]
 
 
 @_command("balise compact week12", "balise compact s3://trial/week12 --runs-per-file 5000")

@@ -14,7 +14,7 @@ from pipeline.make.receivers import Converted, Gatherings, Purpose, as_run, exte
 from pipeline.project.opened import Opened
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected, corrected_further
-from pipeline.storage.noted import note_all_below
+from pipeline.storage.noted import note_all_below, noting
 from schemas.config import FixSigma, IngestConfig
 from schemas.errors import UsageError
 from schemas.project import ConvertEntry, LogEntry
@@ -46,7 +46,8 @@ def run_of_logs(
     opened: Opened, entry: ConvertEntry, ingest: IngestConfig, sigmas: FixSigma, recordings: Recordings
 ) -> Converted:
     """The run, corrected as the project says; raises `InputError` for logs that cannot be read."""
-    parts = _parts(opened, entry, ingest, recordings)
+    with noting() as noted:
+        parts = _parts(opened, entry, ingest, recordings)
     parts.sort(key=lambda part: part.purpose.stream != "gnss" or "gnss" not in part.found.streams)
     first = parts[0]
     common = ingest.correct
@@ -60,7 +61,7 @@ def run_of_logs(
     run = corrected(made.run, common)
     # A log that is a run of this program may have been corrected so when it was written.
     own = [correction for correction in entry.correct if correction not in run.notes.corrections]
-    return Converted(corrected_further(run, own), dict(dropped), tuple(listed))
+    return Converted(corrected_further(run, own), dict(dropped), tuple(listed)).made_of(noted.listing())
 
 
 def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: Recordings) -> list[_Part]:

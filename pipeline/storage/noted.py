@@ -16,7 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from pipeline.storage.address import Address, is_url
-from pipeline.storage.identity import file_digest, signature, version
+from pipeline.storage.identity import FileDigest, file_digest, file_digests, signature, version
 from schemas.errors import BaliseError
 
 NO_DIGEST = ""
@@ -26,17 +26,22 @@ NO_DIGEST = ""
 class Noted:
     """The inputs of a step: places on this machine, absolute and not resolved, and addresses."""
 
-    def __init__(self) -> None:
+    def __init__(self, around: Noted | None = None) -> None:
+        self._around = around
         self._states: dict[str, object] = {}
         self._scratch: list[str] = []
 
     def note(self, place: Address) -> None:
+        if self._around is not None:
+            self._around.note(place)
         text = str(place) if is_url(place) else str(Path(place).absolute())
         if text not in self._states and not any(text.startswith(folder) for folder in self._scratch):
             self._states[text] = _state(text)
 
     def leave_out(self, folder: Path) -> None:
         """What is made of inputs and read in turn is none itself."""
+        if self._around is not None:
+            self._around.leave_out(folder)
         self._scratch.append(f"{folder.absolute()}{os.sep}")
 
     def digests(self) -> dict[str, str]:
@@ -45,9 +50,10 @@ class Noted:
             place: digest_now(place) if state == _state(place) else NO_DIGEST for place, state in self._states.items()
         }
 
-    def files(self) -> list[Path]:
-        """The files among them that are there, in the order in which they were first read."""
-        return [Path(place) for place in self._states if not is_url(place) and Path(place).is_file()]
+    def listing(self) -> tuple[FileDigest, ...]:
+        """The files among them that are there; their names alone, for results hold no paths."""
+        files = [Path(place) for place in self._states if not is_url(place) and Path(place).is_file()]
+        return tuple(sorted(file_digests(file)[0] for file in files))
 
 
 _NOTED: ContextVar[Noted | None] = ContextVar("inputs of the step under way", default=None)
@@ -55,8 +61,8 @@ _NOTED: ContextVar[Noted | None] = ContextVar("inputs of the step under way", de
 
 @contextmanager
 def noting() -> Iterator[Noted]:
-    """Note every input that is opened in this block."""
-    noted = Noted()
+    """Note every input that is opened in this block, for whoever notes around it as well."""
+    noted = Noted(_NOTED.get())
     before = _NOTED.set(noted)
     try:
         yield noted
