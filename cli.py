@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import io
 import json
 import os
 import re
@@ -16,7 +17,7 @@ from dataclasses import asdict
 from datetime import datetime
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TextIO, TypeVar
 
 from typer import Argument, Exit, Option, Typer, confirm
 from typer.core import TyperCommand
@@ -106,6 +107,10 @@ ResultFolder = Annotated[Path, _place(help="A result of `balise replay`.")]
 Run = Annotated[str, Argument(help="A recorded run.")]
 Site = Annotated[str, Option(help="Site: a folder with track, links, balises and route, or a GeoJSON file.")]
 LogsAgain = Annotated[list[str] | None, Option("--logs", help="Logs to replay again: paths, folders, patterns.")]
+Guard = Annotated[
+    bool,
+    Option("--guard/--no-guard", help="CSV: an apostrophe before texts that spreadsheets would run (=, +, -, @)."),
+]
 LogsSite = Annotated[str | None, Option("--site", help="Site of these logs.")]
 OutFolder = Annotated[Path, _file("--out", help="Folder to write.")]
 VehicleFile = Annotated[Path | None, _file("--vehicle", help="Vehicle file (TOML).")]
@@ -744,6 +749,7 @@ def sql(
         Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
     ] = None,
     csv: Annotated[Path | None, _file("--csv", metavar="FILE", help=_CSV)] = None,
+    guard: Guard = True,
     parquet: Annotated[Path | None, _file(metavar="FILE", help="Write Parquet.")] = None,
     xlsx: Annotated[Path | None, _file(metavar="FILE", help="Write an Excel workbook (extra `excel`).")] = None,
     as_json: Json = False,
@@ -758,7 +764,7 @@ def sql(
     from pipeline.results.query import named_results, run_sql
 
     answer = run_sql(out, query, allow_files, named_results(beside or []))
-    written = write_answer(answer, csv, parquet, xlsx, file)
+    written = write_answer(answer, csv, parquet, xlsx, file, guard)
     for name in written:
         _say(f"{answer.height} rows in {name}")
     if as_json or not (written or csv):
@@ -782,11 +788,14 @@ def report(
 
     Pages of runs that have not changed since the last report are left as they are.
     """
+    from pipeline.results.packs import steady
     from pipeline.show.report import write_page, write_report
 
     ground = _ground(site, _used(out)) if site else None
     with _telling("pages", quiet):
-        pages = write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
+        pages = steady(
+            lambda: write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
+        )
     if as_json or not quiet:
         _tell(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
 
@@ -843,11 +852,13 @@ def export(
     project: OfProject = None,
 ) -> None:
     """Export one run with its results to MCAP viewers (Foxglove, Lichtblick, Rerun) or maps."""
+    from pipeline.results.packs import steady
     from pipeline.show.export import export_run
 
     recorded = _log(log, _configuration(config), True) if log else None
     ground = _ground(site, _used(out)) if site else None
-    files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
+    layout: Literal["ros", "foxglove"] = "ros" if ros else "foxglove"
+    files, missing = steady(lambda: export_run(out, run, to, ground, recorded, layout))
     words = ["Wrote " + " and ".join(map(str, files)), *(f"Without {text}" for text in missing)]
     _tell(as_json, {"files": files, "missing": missing}, {}, *words)
 
@@ -950,10 +961,30 @@ def diff(
 
 def main() -> None:
     """Entry point of the program: turns whatever happens into one message and an exit status."""
+    sys.stdout, sys.stderr = _unbroken(sys.stdout), _unbroken(sys.stderr)
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     status = _guarded(arguments, debug="--debug" in sys.argv[1:])
     gc.freeze()
     sys.exit(status)
+
+
+class _Unbroken(io.FileIO):
+    """What is written where nobody reads any more (`| head`) is lost, and changes neither the work nor its status."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            return len(data)
+
+
+def _unbroken(stream: TextIO) -> TextIO:
+    try:
+        raw = _Unbroken(stream.fileno(), "w", closefd=False)
+    except (OSError, ValueError, AttributeError):  # there is none
+        return stream
+    at_once = stream is sys.stderr or raw.isatty()
+    return io.TextIOWrapper(io.BufferedWriter(raw), stream.encoding, stream.errors, line_buffering=at_once)
 
 
 @cache
@@ -975,10 +1006,6 @@ def _guarded(arguments: list[str], debug: bool) -> int:
     except KeyboardInterrupt:
         _complain("interrupted", debug)
         return 128 + signal.SIGINT
-    except BrokenPipeError:
-        # The reader of our output has gone (`| head`): nothing more to say, not even on closing.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
     except BaseException as error:  # panics of libraries are no `Exception`
         _complain(f"a defect of this program: {type(error).__name__}: {error}", debug)
         print("Please report it with the output of the same command and --debug.", file=sys.stderr)
