@@ -243,9 +243,14 @@ def test_killed_worker_is_tried_once_more(small_trial: SmallTrial, undisturbed: 
     assert result_bytes(tmp_path) == result_bytes(undisturbed)
 
 
-@pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize(("signum", "strikes"), [(signal.SIGKILL, 3), (signal.SIGSTOP, 1)])
 def test_a_worker_that_dies_or_stays_while_it_starts_costs_no_attempt(
-    small_trial: SmallTrial, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signum: int
+    small_trial: SmallTrial,
+    undisturbed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    signum: int,
+    strikes: int,
 ) -> None:
     """Also where the site is larger than a pipe: nobody waits for a dead process to read it. Workers that stay (a disk
     that does not answer) are given up."""
@@ -254,7 +259,7 @@ def test_a_worker_that_dies_or_stays_while_it_starts_costs_no_attempt(
 
     def start(process: SpawnProcess) -> None:
         begin(process)
-        if len(struck) < 3 and process.pid:
+        if len(struck) < strikes and process.pid:
             os.kill(process.pid, signum)
             struck.append(process.pid)
 
@@ -262,9 +267,10 @@ def test_a_worker_that_dies_or_stays_while_it_starts_costs_no_attempt(
     monkeypatch.setattr(SpawnProcess, "start", start)
     large = Site(pl.DataFrame({"x": range(10**5)}), pl.DataFrame(), None)
     monkeypatch.setattr(ground, "_held", {**ground._held, ("other", SiteConfig()): large})
-    monkeypatch.setattr(WAITS, "start_s", 3.0)
+    if signum == signal.SIGSTOP:
+        monkeypatch.setattr(WAITS, "start_s", 8.0)
     summary = run_campaign(plan, jobs=2)
-    assert len(struck) == 3
+    assert len(struck) == strikes
     assert [outcome.attempts for outcome in summary.outcomes] == [1] * 4
     assert result_bytes(tmp_path) == result_bytes(undisturbed)
 
