@@ -203,6 +203,9 @@ _TAKEN_FOR: Mapping[Kind, str] = {
 }
 
 
+_OF_A_RIDE = "; of positions of a ride make a CSV of time, latitude and longitude"
+
+
 def _passed_over(wanted: Wanted) -> list[str]:
     """What lies in folders of logs, is no log by its kind, and is named nowhere else."""
     own = [wanted.vehicle, wanted.config, *wanted.track, *([Path(wanted.balises)] if wanted.balises else [])]
@@ -210,7 +213,7 @@ def _passed_over(wanted: Wanted) -> list[str]:
     folders = [raw for raw in _expanded(wanted.raws) if raw.is_dir() and not is_one_log(raw)]
     found = [(kind, path) for folder in folders for kind, paths in look_around(folder).items() for path in paths]
     return [
-        f"not used: {path}: taken for {_TAKEN_FOR[kind]}"
+        f"not used: {path}: taken for {_TAKEN_FOR[kind]}" + (_OF_A_RIDE if kind == "surveys" else "")
         for kind, path in found
         if kind in _TAKEN_FOR and path.absolute() not in named
     ]
