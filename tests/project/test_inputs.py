@@ -30,7 +30,8 @@ from schemas.config import Configuration, Vehicle
 from schemas.errors import BaliseError
 from schemas.project import Project
 from tests.conftest import SmallTrial
-from tests.make.receivers.messages import pvt_geodetic
+from tests.make.receivers.messages import nav_pvt, pvt_geodetic
+from tests.make.receivers.test_corrections import POS
 from tests.make.survey.test_map_files import belgian, line_wkb, write
 from tests.project.test_run import nmea
 from tests.read.ingest.test_declared import bag_of, part
@@ -96,6 +97,21 @@ def kmz(folder: Path, trial: SmallTrial) -> Reading:
     return survey(folder / "line.kmz")
 
 
+def kml(folder: Path, trial: SmallTrial) -> Reading:
+    placed = "<Placemark><LineString><coordinates>14,50 14,50.01</coordinates></LineString></Placemark>"
+    (folder / "line.kml").write_text(f"<kml><Document>{placed}</Document></kml>")
+    return survey(folder / "line.kml")
+
+
+def points(folder: Path, trial: SmallTrial) -> Reading:
+    (folder / "line.csv").write_text("latitude,longitude\n50.0,14.0\n50.01,14.0\n")
+    return survey(folder / "line.csv")
+
+
+def flatgeobuf(folder: Path, trial: SmallTrial) -> Reading:
+    return survey(write(folder / "line.fgb", [line_wkb(belgian())]))
+
+
 def shapefile(folder: Path, trial: SmallTrial) -> Reading:
     return survey(write(folder / "line.shp", [line_wkb(belgian())]))
 
@@ -122,6 +138,37 @@ def septentrio(folder: Path, trial: SmallTrial) -> Reading:
     return logs(folder, "one.sbf")
 
 
+def ublox(folder: Path, trial: SmallTrial) -> Reading:
+    (folder / "one.ubx").write_bytes(b"".join(nav_pvt(1000 * n, (2025, 6, 1, 12, 0, n)) for n in range(5)))
+    return logs(folder, "one.ubx")
+
+
+def rtklib(folder: Path, trial: SmallTrial) -> Reading:
+    (folder / "one.pos").write_text(POS)
+    return logs(folder, "one.pos")
+
+
+def gpsd(folder: Path, trial: SmallTrial) -> Reading:
+    said = (
+        '{"class":"TPV","mode":3,"time":"2025-03-03T08:00:0%d.5Z","lat":50.0,"lon":14.0,"alt":200.0}\n' % n
+        for n in range(5)
+    )
+    (folder / "one.json").write_text("".join(said))
+    return logs(folder, "one.json")
+
+
+def table(folder: Path, trial: SmallTrial) -> Reading:
+    rows = "".join(f"2025-03-03T08:00:0{n}Z;50.0;14.0\n" for n in range(5))
+    (folder / "one.csv").write_text(f"stamp;lat;lon\n{rows}")
+    fields = {"latitude_deg": "lat", "longitude_deg": "lon"}
+    return logs(folder, "one.csv", gnss=[{"time": "field:stamp", "fields": fields}])
+
+
+def mcap(folder: Path, trial: SmallTrial) -> Reading:
+    (folder / "one.mcap").write_bytes(part(0, 30))
+    return logs(folder, "one.mcap")
+
+
 def archive(folder: Path, trial: SmallTrial) -> Reading:
     with zipfile.ZipFile(folder / "logs.zip", "w") as packed:
         packed.writestr("one.nmea.gz", gzip.compress(nmea().encode(), mtime=0))
@@ -139,7 +186,8 @@ def run_folder(folder: Path, trial: SmallTrial) -> Reading:
 
 
 KINDS = [
-    *(geojson, gpx, kmz, shapefile, geopackage, recorded_line, sentences, septentrio, archive, bag, run_folder),
+    *(geojson, gpx, kml, kmz, points, shapefile, geopackage, flatgeobuf, recorded_line),
+    *(sentences, ublox, septentrio, rtklib, gpsd, table, mcap, archive, bag, run_folder),
 ]
 
 
