@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import json
 import os
 import shutil
 import sqlite3
@@ -149,11 +150,9 @@ def rtklib(folder: Path, trial: SmallTrial) -> Reading:
 
 
 def gpsd(folder: Path, trial: SmallTrial) -> Reading:
-    said = (
-        '{"class":"TPV","mode":3,"time":"2025-03-03T08:00:0%d.5Z","lat":50.0,"lon":14.0,"alt":200.0}\n' % n
-        for n in range(5)
-    )
-    (folder / "one.json").write_text("".join(said))
+    said = {"class": "TPV", "mode": 3, "lat": 50.0, "lon": 14.0, "alt": 200.0}
+    lines = [json.dumps(said | {"time": f"2025-03-03T08:00:0{n}.5Z"}) + "\n" for n in range(5)]
+    (folder / "one.json").write_text("".join(lines))
     return logs(folder, "one.json")
 
 
