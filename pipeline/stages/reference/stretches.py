@@ -14,7 +14,7 @@ from pipeline.stages.reference.open_ends import off_the_survey
 from pipeline.stages.reference.samples import Samples, samples_of
 from pipeline.stages.reference.visits import ElementStay
 from pipeline.stages.reference.ways import ways_of
-from pipeline.stages.track.chain import Chain
+from pipeline.stages.track.chain import Chain, moved_on
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
@@ -159,34 +159,11 @@ class _Search:
 
 
 def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
-    """The way as chains of one coordinate, and of each visit its chain and where it is entered [m].
-
-    A new chain begins where the train, having turned, takes another branch than that which it came from.
-    """
+    """The way as chains of one coordinate, and of each visit its chain and where it is entered [m]."""
     chains = [Chain((stays[0].oriented,), (0.0,))]
     placed = [(0, 0.0)]
-    here = 0
+    at = 0
     for stay in stays[1:]:
-        chain = chains[-1]
-        last = chain.oriented[here]
-        onward = here + (-1 if stay.back else 1)
-        if 0 <= onward < len(chain.oriented) and chain.oriented[onward] == stay.oriented:
-            here = onward
-        elif stay.back:
-            entry_m = chain.entry_m[here] - _gap_m(network, stay.oriented, last) - network.length_m(stay.oriented)
-            grown = Chain((stay.oriented, *chain.oriented[here:]), (entry_m, *chain.entry_m[here:]))
-            # At its first element the chain itself grows backwards; further on another branch begins.
-            chains = [*chains[: None if here else -1], grown]
-            here = 0
-        else:
-            entry_m = chain.entry_m[here] + network.length_m(last) + _gap_m(network, last, stay.oriented)
-            grown = Chain((*chain.oriented[:onward], stay.oriented), (*chain.entry_m[:onward], entry_m))
-            chains = [*chains[: None if onward < len(chain.oriented) else -1], grown]
-            here = onward
-        placed.append((len(chains) - 1, chains[-1].entry_m[here]))
+        at = moved_on(chains, network, at, stay.oriented, -1 if stay.back else 1)
+        placed.append((len(chains) - 1, chains[-1].entry_m[at - chains[-1].low]))
     return chains, placed
-
-
-def _gap_m(network: Network, from_oriented: int, to_oriented: int) -> float:
-    """Way between the ends of two linked net elements [m]."""
-    return next(edge.gap_m for edge in network.successors[from_oriented] if edge.to == to_oriented)

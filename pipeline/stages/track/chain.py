@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -21,15 +21,25 @@ BARRED_DETOUR_M = 10_000.0
 
 @dataclass(frozen=True)
 class Chain:
-    """Oriented net elements in order, and the coordinate [m] at which each is entered."""
+    """Oriented net elements in order, and the coordinate [m] at which each is entered.
+
+    Elements are numbered on from `low`: their numbers stay while the chain grows at both ends, and go on over chains
+    that share an element. `shared`: the number of the one in common with the chain before, none where there is none.
+    """
 
     oriented: tuple[int, ...]
     entry_m: tuple[float, ...]
+    low: int = 0
+    shared: int | None = None
 
     @classmethod
     def behind(cls, network: Network, oriented: int) -> Chain:
         """One element whose exit is at 0."""
         return cls((oriented,), (-network.length_m(oriented),))
+
+    @property
+    def high(self) -> int:
+        return self.low + len(self.oriented) - 1
 
     @property
     def between(self) -> tuple[int, ...]:
@@ -41,13 +51,25 @@ class Chain:
 
     def after(self, network: Network, edge: Edge) -> Chain:
         """The chain carried on over a way from its last element."""
-        return Chain((*self.oriented, edge.to), (*self.entry_m, self.exit_m(network) + edge.gap_m))
+        entry_m = self.exit_m(network) + edge.gap_m
+        return replace(self, oriented=(*self.oriented, edge.to), entry_m=(*self.entry_m, entry_m))
+
+    def before(self, network: Network, oriented: int) -> Chain:
+        """The chain with an element before its first, that leads to it."""
+        entry_m = self.entry_m[0] - network.way(oriented, self.oriented[0]).gap_m - network.length_m(oriented)
+        return Chain((oriented, *self.oriented), (entry_m, *self.entry_m), self.low - 1, self.shared)
+
+    def part(self, first: int, last: int, shared: int) -> Chain:
+        """Its elements of some numbers, as the beginning of a chain after this one."""
+        inside = slice(first - self.low, last - self.low + 1)
+        return Chain(self.oriented[inside], self.entry_m[inside], first, shared)
 
     def turned(self, network: Network) -> Chain:
-        """The same elements run the other way round; the coordinate changes its sign."""
-        pairs = zip(reversed(self.oriented), reversed(self.entry_m), strict=True)
-        left = [(oriented ^ 1, -(entry_m + network.length_m(oriented))) for oriented, entry_m in pairs]
-        return Chain(*zip(*left, strict=True))
+        """The same elements run the other way round; coordinate and numbers change their signs."""
+        pairs = zip(self.oriented, self.entry_m, strict=True)
+        entry_m = [-(entry_m + network.length_m(oriented)) for oriented, entry_m in pairs]
+        around = tuple(oriented ^ 1 for oriented in reversed(self.oriented))
+        return Chain(around, tuple(reversed(entry_m)), -self.high, None if self.shared is None else -self.shared)
 
     def route(self, network: Network, numbers: dict[str, int] | None = None) -> RoutePath:
         """`numbers`: net elements as the caller counts them, where the network has them in pieces."""
@@ -62,6 +84,25 @@ class Chain:
             low_m=track.begin_m[element],
             high_m=track.end_m[element],
         )
+
+
+def moved_on(chains: list[Chain], network: Network, at: int, oriented: int, sense: int) -> int:
+    """The number of the element on the last chain that a train comes to from number `at`, ahead (+1) or behind (-1).
+
+    The chain grows at its ends; where the train, having turned, takes another branch than that which it came from, a
+    new chain begins: the element that it is on and what lies behind it, then the other way on.
+    """
+    chain = chains[-1]
+    number = at + sense
+    inside = chain.low <= number <= chain.high
+    if inside and chain.oriented[number - chain.low] == oriented:
+        return number
+    if inside:
+        chain = chain.part(chain.low, at, at) if sense > 0 else chain.part(at, chain.high, at)
+        chains.append(chain)
+    last = chain.oriented[-1]
+    chains[-1] = chain.after(network, network.way(last, oriented)) if sense > 0 else chain.before(network, oriented)
+    return number
 
 
 class Reach(NamedTuple):

@@ -156,6 +156,10 @@ class Network:
             edge.to == there for here, there in ((first, second), (second, first)) for edge in self.successors[here]
         )
 
+    def way(self, here: int, to: int) -> Edge:
+        """The way from an oriented element to a successor."""
+        return next(edge for edge in self.successors[here] if edge.to == to)
+
     def linked_ends(self) -> Bools:
         """Per element, whether a relation leads on from its start and from its end."""
         onward = np.diff(self.successors.first) > 0
