@@ -246,38 +246,56 @@ class _Growth:
         return self._begin(self._came_back(last, died))
 
     def _came_back(self, node: Node, died: int) -> int:
-        """The first step after a rejection at which the positions lie beside the track as they did before it.
+        """The first step after a rejection at which a movement of equal size has led back to the path refuted last.
 
-        A movement of equal size leads back: a start anew by itself would claim the surveyed track from a siding that
-        the survey lacks. Beside the nearest element then, as long as positions lie within reach of one.
+        The nearest track would not do: a fault across the tracks, or a siding that the survey lacks, leads beside
+        another one. So the path is carried on as far as no switch leaves a choice, and the positions have to have moved
+        back to where they lay beside it, by more than noise and survey explain.
         """
         steps = self.steps
         level_s = self.config.paths_level_s
         first, last = np.searchsorted(steps.end_s, steps.end_s[died] - level_s * np.array([3.0, 1.0]), side="right")
         residual_m = node.residuals_m(int(first), int(last))
         before = np.isfinite(residual_m) & steps.counted[first:last]
-        if not before.any():
-            return len(steps)
-        level_m = float(np.mean(residual_m[before]))
-        beside_m = self._nearest_m[died:]
+        beside_m = self._beside_line_m(node.oriented, died)
         window = max(1, round(level_s / float(steps.period_s[died])))
-        if beside_m.size < window:
+        if not before.any() or beside_m.size < window:
             return len(steps)
-        means_m = sliding_window_view(beside_m, window).mean(axis=1)
-        root_m = np.hypot(steps.sigma_m[died:], float(np.median(node.survey_m)))[window - 1 :]
-        signs = (level_m, -level_m)  # the nearest element may run the other way
-        off_m = np.minimum(*(np.abs(means_m - sign) for sign in signs))
-        back = np.flatnonzero(np.nan_to_num(off_m, nan=np.inf) <= self.config.paths_back_sigmas * root_m)
+        windows_m = sliding_window_view(beside_m, window)
+        means_m = windows_m.mean(axis=1) - float(np.mean(residual_m[before]))
+        sigma_m = steps.sigma_m[died + window - 1 :]
+        survey_m = np.full(sigma_m.size, float(np.median(node.survey_m)))
+        farthest_m = np.fmax(np.fmax.accumulate(means_m) - means_m, means_m - np.fmin.accumulate(means_m))
+        # Out of reach for a whole window it was farther away than any measured offset.
+        farthest_m[np.logical_or.accumulate(np.isnan(windows_m).all(axis=1))] = np.inf
+        near = np.abs(means_m) <= self.config.paths_back_sigmas * np.hypot(sigma_m, survey_m)
+        back = np.flatnonzero(near & (farthest_m > self.tests.moved_m(sigma_m, survey_m)))
         return int(died + back[0] + window) if back.size else len(steps)
 
-    @cached_property
-    def _nearest_m(self) -> Floats:
-        """Per step the offset from the nearest element, NaN where none is within reach [m]."""
-        nearest_m = np.full(len(self.steps), np.nan)
-        order = np.lexsort((self.candidates.distance_m, self.candidates.step))
-        first = order[np.unique(self.candidates.step[order], return_index=True)[1]]
-        nearest_m[self.candidates.step[first]] = self.candidates.offset_m[first]
-        return nearest_m
+    def _beside_line_m(self, oriented: int, begin: int) -> Floats:
+        """Per step from one on the offset from a line without a choice, in its sense; NaN where it is not within reach.
+
+        The line goes on from an element, ahead and behind, as long as one way alone leads on.
+        """
+        ahead, behind = (self._without_choice(side) for side in (oriented, oriented ^ 1))
+        count = len(self.steps)
+        nearest_m = np.full(count, np.inf)
+        beside_m = np.full(count, np.nan)
+        for one in {*ahead, *(other ^ 1 for other in behind)}:
+            rows = self.candidates.of(one // 2, begin, count)
+            rows = rows[self.candidates.beyond_m[rows] <= self.config.paths_end_m]
+            rows = rows[self.candidates.distance_m[rows] < nearest_m[self.candidates.step[rows]]]
+            step = self.candidates.step[rows]
+            nearest_m[step] = self.candidates.distance_m[rows]
+            beside_m[step] = self.candidates.offset_m[rows] * (1.0 - 2.0 * (one % 2))
+        return beside_m[begin:]
+
+    def _without_choice(self, oriented: int) -> list[int]:
+        """An oriented element and those after it, up to the first switch that leaves a choice, or an open end."""
+        line = [oriented]
+        while len(onward := self.network.successors[line[-1]]) == 1 and onward[0].to not in line:
+            line.append(onward[0].to)
+        return line
 
     def _begin(self, step: int) -> int:
         """The first step from this one on with an element that its offset does not refute, else the number of steps."""

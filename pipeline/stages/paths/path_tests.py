@@ -100,6 +100,11 @@ class PathTests:
         limit = _size(self.config.paths_alpha, LOOKED_S / self.config.paths_level_s)
         return np.asarray(limit * np.sqrt(self.config.cross_bias_sigma_m**2 + survey_m**2 + sigma_m**2))
 
+    def moved_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
+        """By more than so much two means of `paths_level_s`, a while apart, differ on no path [m]."""
+        limit = _size(self.config.paths_alpha, LOOKED_S / self.config.paths_level_s)
+        return np.asarray(limit * np.sqrt(2.0) * np.hypot(sigma_m, survey_m))
+
     @property
     def longest_s(self) -> float:
         """As far back as a movement looks."""
