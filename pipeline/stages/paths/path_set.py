@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
 from pipeline.stages.paths.path_steps import PathSteps
-from pipeline.stages.paths.path_tests import LOOKED_S, NO_STEPS, PathTests, Totals, Trail
+from pipeline.stages.paths.path_tests import LOOKED_S, NO_STEPS, WINDOWS_S, PathTests, Totals, Trail
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
@@ -337,12 +337,24 @@ class _Growth:
         heapq.heappush(self._queue, (node.begin, len(self._made), node))
 
     def _alike(self, one: Node, other: Node) -> bool:
-        """Two paths that lead to one element with the same residuals as far back as any test looks."""
-        last = other.begin
-        first = int(np.searchsorted(self.steps.end_s, self.steps.end_s[last] - self.tests.longest_s))
-        one_m, other_m = (node.residuals_m(first, last) for node in (one, other))
-        known = np.isfinite(one_m) == np.isfinite(other_m)
-        return bool(known.all()) and bool(np.nanmax(np.abs(one_m - other_m), initial=0.0) <= self.config.paths_alike_m)
+        """Two paths to one element that no test can tell apart by more than it allows for, whatever comes (rule 8).
+
+        Their means agree over every window that a later test may still look at, and over the whole way.
+        """
+        last, alike_m = other.begin, self.config.paths_alike_m
+        begins = np.searchsorted(self.steps.end_s, self.steps.end_s[last] - 3.0 * np.array(WINDOWS_S))
+        for window_s, begin in zip(WINDOWS_S, begins.tolist(), strict=True):
+            one_m, other_m = (node.residuals_m(begin, last) for node in (one, other))
+            if (np.isfinite(one_m) != np.isfinite(other_m)).any():
+                return False
+            apart_m = np.where(self.steps.counted[begin:last], np.nan_to_num(one_m - other_m), 0.0)
+            if self.tests.farthest_m(self.steps, apart_m, last, window_s) > alike_m:
+                return False
+        own = self.tests.totals(
+            self.steps, one.begin, *(of[: last - one.begin] for of in (one.residual_m, one.survey_m))
+        )
+        sums = one.before.residual_m + own.residual_m, other.before.residual_m
+        return abs(sums[0] - sums[1]) <= alike_m * max(one.before.number + own.number, 1.0)
 
     def _follow(self, node: Node) -> list[Node]:
         """Along its element up to where it leaves it or is refuted for long enough; returns what it goes on as."""

@@ -114,6 +114,17 @@ class PathTests:
         """Over the steps from `begin` on."""
         return Totals(*(float(value) for value in self._counted(steps, begin, residual_m, survey_m).sum(axis=1)))
 
+    def farthest_m(self, steps: PathSteps, apart_m: Floats, last: int, window_s: float) -> float:
+        """Of differences at the steps before `last`, 0 where none counts, the largest mean over any window [m].
+
+        Windows may end later, where nothing differs; none counts with fewer than `_WHOLE` of its steps.
+        """
+        size = max(round(window_s / float(steps.period_s[last])), 1)
+        sums = np.cumsum(np.concatenate([np.zeros(1), apart_m, np.zeros(size)]))
+        counts = np.cumsum(np.concatenate([np.zeros(1), steps.counted[last - apart_m.size : last], np.ones(size)]))
+        number = np.maximum(counts[size:] - counts[:-size], _WHOLE * size)
+        return float((np.abs(sums[size:] - sums[:-size]) / number).max(initial=0.0))
+
     def of(self, steps: PathSteps, trail: Trail) -> Verdict:
         """Test the new steps of a path."""
         values = self._counted(steps, trail.start, trail.residual_m, trail.survey_m)
