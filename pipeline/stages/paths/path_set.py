@@ -46,6 +46,7 @@ class Node:
     survey_m: Floats = field(default_factory=lambda: np.zeros(0))
     heading_rad: Floats = field(default_factory=lambda: np.zeros(0))
     left_m: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    p_by_step: Floats = field(default_factory=lambda: np.ones(1))
     followed: bool = False
     also: list[Node] = field(default_factory=list)
 
@@ -79,18 +80,20 @@ class Node:
 
 
 class Span(NamedTuple):
-    """A hypothesis at the steps from `begin` on, before `end`."""
+    """A hypothesis at the steps from `begin` on, before `end`; `p`: at each of them what speaks against it least."""
 
     node: Node
     begin: int
     end: int
+    p: Floats
 
 
 @dataclass(frozen=True)
 class PathSet:
     """All hypotheses of a run with what became of each; `groups`: lines without a branch, per net element.
 
-    `overflow`: step from which on there were more hypotheses than are followed; nothing is claimed after it.
+    `overflow`: step from which on there were more hypotheses than are followed; `unclaimed`: steps after it, and those
+    of the first minute of a set that began anew though no movement had led back: its errors may be larger than stated.
     `last_s`: where a stretch ends off the network, paths refuted in its last seconds are equal.
     """
 
@@ -99,16 +102,20 @@ class PathSet:
     groups: Ints
     network: Network
     candidates: Candidates
+    unclaimed: Bools
     overflow: int
     last_s: float
 
     def living(self, delay_s: float) -> list[Span]:
         """The hypotheses, each over the steps at which nothing up to `delay_s` before their end had refuted it."""
         known = np.searchsorted(self.steps.end_s, self.steps.end_s - delay_s, side="right") - 1
-        return [
-            Span(node, node.begin, min(node.end, node.barred, int(np.searchsorted(known, node.rejected))))
-            for node in self.nodes
-        ]
+        spans = []
+        for node in self.nodes:
+            end = min(node.end, node.barred, int(np.searchsorted(known, node.rejected)))
+            if end > node.begin:
+                tested = np.clip(known[node.begin : end] + 1 - node.begin, 0, node.p_by_step.size - 1)
+                spans.append(Span(node, node.begin, end, node.p_by_step[tested]))
+        return spans
 
     def survivors(self) -> list[Node]:
         """Those that live to the last step; of one that ends off the network, those refuted in its last minute."""
@@ -125,15 +132,16 @@ class PathSet:
         return found
 
     def to_the_end(self) -> list[Span]:
-        """The hypotheses that live to the end of their stretch, or through one that does."""
-        lives: dict[int, Node] = {}
-        waiting = self.survivors()
+        """The hypotheses that live to the end of their stretch, or through one that does, with its p-value there."""
+        lives: dict[int, tuple[Node, float]] = {}
+        waiting = [(node, min(node.p, 1.0)) for node in self.survivors()]
         while waiting:
-            node = waiting.pop()
-            if id(node) not in lives:
-                lives[id(node)] = node
-                waiting += node.origins
-        return [Span(node, node.begin, min(node.end, node.rejected)) for node in lives.values()]
+            node, p = waiting.pop()
+            if id(node) not in lives or lives[id(node)][1] < p:
+                lives[id(node)] = node, p
+                waiting += [(origin, p) for origin in node.origins]
+        ends = [(node, min(node.end, node.rejected), p) for node, p in lives.values()]
+        return [Span(node, node.begin, end, np.full(end - node.begin, p)) for node, end, p in ends if end > node.begin]
 
     def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
         """Per step the net elements that no rejection rules out, each with the largest p-value of a path over it.
@@ -141,9 +149,9 @@ class PathSet:
         In hindsight, or by what was known `delay_s` before the end of each step. Empty: off the network.
         """
         found: list[dict[int, float]] = [{} for _ in range(len(self.steps))]
-        for node, begin, end in self.to_the_end() if delay_s is None else self.living(delay_s):
-            for best in found[begin:end]:
-                best[node.element] = max(best.get(node.element, 0.0), min(node.p, 1.0))
+        for node, begin, end, p in self.to_the_end() if delay_s is None else self.living(delay_s):
+            for best, value in zip(found[begin:end], p.tolist(), strict=True):
+                best[node.element] = max(best.get(node.element, 0.0), value)
         return found
 
 
@@ -200,6 +208,7 @@ class _Growth:
         self._made: list[Node] = []
         self._begun_s: deque[float] = deque()
         self._by_element: dict[int, list[Node]] = {}
+        self._unclaimed = np.zeros(len(self.steps), dtype=np.bool_)
 
     def grown(self) -> PathSet:
         count = len(self.steps)
@@ -217,8 +226,17 @@ class _Growth:
                 for child in self._follow(node):
                     self._push(child)
             start = count if overflow < count else self._anew(self._made[first:])
-        last_s = self.config.paths_anew_s
-        return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow, last_s)
+        self._unclaimed[overflow:] = True
+        return PathSet(
+            tuple(self._made),
+            self.steps,
+            self.groups,
+            self.network,
+            self.candidates,
+            self._unclaimed,
+            overflow,
+            self.config.paths_anew_s,
+        )
 
     def _too_many(self, node: Node) -> bool:
         """More hypotheses have begun of late than are followed."""
@@ -242,7 +260,10 @@ class _Growth:
         last = max(refuted, key=lambda node: node.rejected)
         died = last.rejected
         if self.steps.end_s[died] - self.steps.begin_s[self._made[0].begin] <= self.config.paths_anew_s:
-            return self._begin(died + 1)
+            begin = self._begin(died + 1)
+            since_s = self.steps.end_s - self.steps.end_s[min(begin, count - 1)]
+            self._unclaimed |= (since_s >= 0.0) & (since_s < self.config.paths_anew_s)
+            return begin
         return self._begin(self._came_back(last, died))
 
     def _came_back(self, node: Node, died: int) -> int:
@@ -329,6 +350,8 @@ class _Growth:
             if covers and other.rejected >= node.rejected and self._alike(other, node):
                 # Their tests cannot differ by more than the bounds allow for (rule 8).
                 other.p = max(other.p, node.p)
+                later = other.p_by_step[1 + node.begin - other.begin :]
+                np.maximum(later, node.p, out=later)
                 if node.parent is not None:
                     other.also.append(node.parent)
                 return
@@ -383,7 +406,8 @@ class _Growth:
             node.barred = min(node.barred, self._unread(node))
             node.rejected = min(node.rejected, node.barred)
             verdict = self.tests.of(self.steps, self._trail(node))
-            node.p = min(node.p, verdict.p)
+            node.p_by_step = np.minimum(node.p, np.concatenate([np.ones(1), verdict.p]))
+            node.p = float(node.p_by_step[-1])
             node.rejected = min(node.rejected, verdict.rejected)
         if node.rejected < count:
             # Refuted: live it counts for as long as that is not known yet.
@@ -467,6 +491,7 @@ class _Growth:
                 node.residual_m = np.append(node.residual_m, sense * candidates.offset_m[row])
                 node.survey_m = np.append(node.survey_m, self.survey_m[row])
                 node.heading_rad = np.append(node.heading_rad, node.heading_rad[-1:] if node.heading_rad.size else 0.0)
+                node.p_by_step = np.append(node.p_by_step, node.p)
                 node.left_m = np.vstack([node.left_m, [candidates.along_m[row], candidates.left_m[row]]])
                 node.end = step + 1
                 child = self._child(node, node.oriented, step + 1)

@@ -33,10 +33,10 @@ _MEASURED_S, _MEASURED_WINDOWS = 48.0, 6.0
 
 
 class Verdict(NamedTuple):
-    """The first step at which a path is refuted (a large number: at none), and its least p-value."""
+    """The first step at which a path is refuted (a large number: at none); the least p-value up to each new step."""
 
     rejected: int
-    p: float
+    p: Floats
 
 
 class Totals(NamedTuple):
@@ -132,7 +132,7 @@ class PathTests:
         np.cumsum(values, axis=1, out=sums[:, 1:])
         at = np.arange(trail.begin, trail.start + values.shape[1])
         refuted = np.zeros(at.size, dtype=np.bool_)
-        p = 1.0
+        p = np.ones(at.size)
         offset_looks = LOOKED_S / self.config.paths_level_s
         tests = [(self._offset(steps, sums, trail, at)[None], np.array([offset_looks]))]
         if (apart := at >= self.alone).any():
@@ -140,9 +140,9 @@ class PathTests:
             tests.append((self._lasting(steps, sums, trail, at)[None] * apart, np.array([_LASTING_LOOKS])))
         for sigmas, looks in tests:
             refuted |= (sigmas > _sizes(self.config.paths_alpha, looks)[:, None]).any(axis=0)
-            p = min(p, float((_TESTS * looks * 2.0 * _tails(sigmas.max(axis=1, initial=0.0))).min()))
+            p = np.minimum(p, (_TESTS * looks[:, None] * 2.0 * _tails(sigmas)).min(axis=0))
         first = np.flatnonzero(refuted)
-        return Verdict(int(at[first[0]]) if first.size else 2**62, p)
+        return Verdict(int(at[first[0]]) if first.size else 2**62, np.minimum.accumulate(p))
 
     def _counted(self, steps: PathSteps, begin: int, residual_m: Floats, survey_m: Floats) -> Floats:
         """Per step 1, residual, sigma of the survey and square of that of the position; zeros where it does not count.
