@@ -93,8 +93,8 @@ class PathSet:
     """All hypotheses of a run with what became of each; `groups`: lines without a branch, per net element.
 
     `overflow`: step from which on there were more hypotheses than are followed; `unclaimed`: steps after it, and those
-    of the first minute of a set that began anew though no movement had led back: its errors may be larger than stated.
-    `last_s`: where a stretch ends off the network, paths refuted in its last seconds are equal.
+    of the first minute of a set that began anew though no movement had led back: its errors may be larger than stated;
+    `returned`: steps at which it began anew after such a movement. `last_s`: where a stretch ends off the network, paths refuted in its last seconds are equal.
     """
 
     nodes: tuple[Node, ...]
@@ -103,6 +103,7 @@ class PathSet:
     network: Network
     candidates: Candidates
     unclaimed: Bools
+    returned: tuple[int, ...]
     overflow: int
     last_s: float
 
@@ -209,6 +210,7 @@ class _Growth:
         self._begun_s: deque[float] = deque()
         self._by_element: dict[int, list[Node]] = {}
         self._unclaimed = np.zeros(len(self.steps), dtype=np.bool_)
+        self._returned: list[int] = []
 
     def grown(self) -> PathSet:
         count = len(self.steps)
@@ -234,6 +236,7 @@ class _Growth:
             self.network,
             self.candidates,
             self._unclaimed,
+            tuple(self._returned),
             overflow,
             self.config.paths_anew_s,
         )
@@ -264,7 +267,8 @@ class _Growth:
             since_s = self.steps.end_s - self.steps.end_s[min(begin, count - 1)]
             self._unclaimed |= (since_s >= 0.0) & (since_s < self.config.paths_anew_s)
             return begin
-        return self._begin(self._came_back(last, died))
+        self._returned.append(self._begin(self._came_back(last, died)))
+        return self._returned[-1]
 
     def _came_back(self, node: Node, died: int) -> int:
         """The first step after a rejection at which a movement of equal size has led back to the path refuted last.

@@ -68,7 +68,8 @@ def reference_stretches(
     stretches: list[ReferenceStretch] = []
     covered = np.zeros(samples.t_ns.size, dtype=np.bool_)
     for rows in _between_gaps(samples.t_ns, np.flatnonzero(near), hazards.reference_gap_s):
-        if paths := search.paths(rows):
+        rows, paths = search.paths(rows)
+        if paths:
             part = slice(int(rows[0]), int(rows[-1]) + 1)
             stretches.append(ReferenceStretch(samples.t_ns[part], samples.sigma_m[part], paths))
             covered[part] = True
@@ -108,8 +109,12 @@ class _Search:
     numbers: dict[str, int]
     config: Configuration
 
-    def paths(self, rows: Ints) -> tuple[ReferencePath, ...]:
-        """All ways through samples without a gap; none where they are more than `routes_limit`, or all are refuted."""
+    def paths(self, rows: Ints) -> tuple[Ints, tuple[ReferencePath, ...]]:
+        """All ways through samples without a gap, and those they run through.
+
+        None where they are more than `routes_limit`, or all are refuted; where a movement led back from aside, those
+        through the samples after it.
+        """
         hazards = self.config.hazards
         law = self.config.matching.model_copy(
             update={
@@ -123,7 +128,9 @@ class _Search:
         found = path_set(steps, self.network, law)
         begins = rows[0] + np.searchsorted(samples.t_ns[rows], steps.begin_ns)
         ends = np.append(begins[1:], rows[-1] + 1)
-        return tuple(self._path(stays, begins, ends) for stays in ways_of(found, law, hazards.routes_limit))
+        first, ways = ways_of(found, law, hazards.routes_limit)
+        begins, ends = begins[first:], ends[first:]
+        return rows[int(begins[0] - rows[0]) :], tuple(self._path(stays, begins, ends) for stays in ways)
 
     def _path(self, stays: Sequence[ElementStay], begins: Ints, ends: Ints) -> ReferencePath:
         """A way with coordinates: each sample on the nearest of the elements that the way visits about then.
