@@ -94,8 +94,8 @@ class PathSet:
 
     `overflow`: step from which on there were more hypotheses than are followed; `unclaimed`: steps after it, and those
     of the first minute of a set that began anew though no movement had led back: its errors may be larger than stated;
-    `returned`: steps at which it began anew after such a movement. `last_s`: where a stretch ends off the network, paths
-    refuted in its last seconds are equal.
+    `returned`: steps at which it began anew after such a movement. `last_s`: where a stretch ends off the network,
+    those refuted in its last seconds are equal.
     """
 
     nodes: tuple[Node, ...]
