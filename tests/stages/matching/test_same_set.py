@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from datetime import timedelta
 
 import numpy as np
 import polars as pl
@@ -27,7 +26,7 @@ class Drawn:
     x_m: Floats
     y_m: Floats
     way_m: Floats
-    begin: timedelta = timedelta()
+    begin_ns: int = 0
     first_names: dict[str, str] = field(default_factory=dict)
 
     def first(self, name: str) -> str:
@@ -56,7 +55,7 @@ def drawn(seed: int) -> Drawn:
 def replayed(world: Drawn) -> Match:
     fixes, way = run(world.x_m, world.y_m, sigma_m=0.3), odometer(world.way_m)
     place = site(world.elements, world.links, sigma_m=0.3)
-    later = pl.col("t") + world.begin
+    later = (pl.col("t").cast(pl.Int64) + world.begin_ns).cast(pl.Datetime("ns", "UTC"))
     return matched(fixes.with_columns(later), place, way.with_columns(later))
 
 
@@ -91,7 +90,7 @@ def mirrored(world: Drawn) -> Drawn:
 
 
 def shifted_in_time(world: Drawn) -> Drawn:
-    return replace(world, begin=timedelta(days=1234, seconds=7))
+    return replace(world, begin_ns=106_617_607_000_000_000)
 
 
 def shifted_in_place(world: Drawn) -> Drawn:
