@@ -59,6 +59,24 @@ def test_a_movement_back_of_equal_size_is_one_with_a_bias_too() -> None:
     assert gate[260:].min() >= 0.99
 
 
+@pytest.mark.parametrize("turn_deg", [20.0, 60.0, 90.0])
+@pytest.mark.parametrize("bias_m", [(0.0, 1.5), (1.5, 0.0), (1.0, -1.0)])
+def test_a_bias_that_turns_with_the_heading_in_a_curve_refutes_no_path(
+    turn_deg: float, bias_m: tuple[float, float]
+) -> None:
+    """One sigma of it, with exact positions and survey; the curve lies within the windows of the movements."""
+    turn = np.radians(turn_deg)
+    bent = round(700.0 * turn)
+    heading = np.interp(np.arange(1500), [600, 600 + bent], [0.0, turn])
+    points = np.vstack([np.zeros(2), np.cumsum(np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)])
+    normal = np.column_stack([-np.sin(np.append(heading, heading[-1])), np.cos(np.append(heading, heading[-1]))])
+    place = site({"a": points[::5], "b": (points + 5.0 * normal)[::5]}, sigma_m=0.05)
+    way = np.arange(20.0, 1480.0, 10.0)
+    x, y = (np.interp(way, np.arange(1501), points[:, axis]) + bias_m[axis] for axis in (0, 1))
+    gate = matched(run(x, y, sigma_m=0.05), place, odometer(way)).epochs["gate_probability"]
+    assert gate.null_count() == 0
+
+
 def test_what_refutes_all_tracks_in_the_first_minute_claims_none_for_a_minute() -> None:
     """9 m aside of a stated 1 m after 20 s, on a line beside another: errors are larger than stated."""
     place = site({"a": line((0.0, 0.0), (6000.0, 0.0)), "b": line((0.0, 9.0), (6000.0, 9.0))}, sigma_m=0.3)
