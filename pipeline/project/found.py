@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 from pipeline.campaign.plan import is_run
 from pipeline.make.receivers.bags import is_bag
+from pipeline.make.receivers.gpsd import HEAD, is_gpsd
 from pipeline.make.survey.map_files import MAP_SUFFIXES
 from pipeline.read.ingest.csv_text import read_log_table
 from pipeline.read.ingest.guesses import POSITION, WORDS, columns_in, first, word_of, words_of_times
@@ -76,8 +77,14 @@ def _kind_of(path: Path) -> Kind | None:
     if suffix == ".toml":
         return _kind_of_settings(path)
     if suffix in _LINES:
-        return "surveys"
+        return "logs" if suffix == ".json" and _holds_gpsd(path) else "surveys"
     return _kind_of_table(path) if suffix == ".csv" and path.is_file() else "logs"
+
+
+def _holds_gpsd(path: Path) -> bool:
+    """What gpsd reported is a log, though its name ends like that of a map."""
+    with path.open("rb") as stream:
+        return is_gpsd(stream.read(HEAD))
 
 
 def _kind_of_settings(path: Path) -> Kind | None:

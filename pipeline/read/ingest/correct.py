@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.read.ingest.conform import conform, refuse
+from pipeline.read.ingest.wraps import counted_on
 from pipeline.stages.track.geodesy import moved_deg
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import IngestConfig, StreamCorrection, settings_from
@@ -113,6 +114,7 @@ def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -
     if correction.exchange is not None:
         first, second = correction.exchange
         mended = mended.with_columns(pl.col(second).alias(first), pl.col(first).alias(second))
+    mended = _counted_on(mended, correction.wrap) if correction.wrap is not None else mended
     mended = mended.with_columns(pl.col(name) * factor for name, factor in correction.factors.items())
     mended = _later(mended, correction.shift_s) if correction.shift_s else mended
     if correction.moves:
@@ -124,6 +126,15 @@ def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -
     conformed = conform(mended, correction.stream, f"{run_id}: {correction.stream} after [[ingest.correct]]", breaches)
     refuse(breaches)
     return conformed
+
+
+def _counted_on(odometer: pl.DataFrame, size: float) -> pl.DataFrame:
+    """Distances of counters that begin anew after so much, by sensor."""
+    distance = floats(odometer, "distance_m").copy()
+    for sensor in odometer["sensor"].unique():
+        rows = np.flatnonzero((odometer["sensor"] == sensor).to_numpy())
+        distance[rows] = counted_on(distance[rows], size)
+    return odometer.with_columns(pl.Series("distance_m", distance).fill_nan(None))
 
 
 def _later(frame: pl.DataFrame, shift_s: float) -> pl.DataFrame:
@@ -149,6 +160,7 @@ def _moved(frame: pl.DataFrame, correction: StreamCorrection) -> pl.DataFrame:
 def unknown_columns(correction: StreamCorrection) -> list[str]:
     """The columns that it names and that cannot be corrected: only numbers can be multiplied, only places be moved."""
     names = [*correction.factors, *(correction.exchange or ()), *([*_PLACE, "height_m"] if correction.moves else [])]
+    names += [] if correction.wrap is None else ["distance_m"]
     return sorted(set(names) - set(_numbers(correction.stream)))
 
 

@@ -8,6 +8,7 @@ import polars as pl
 
 from pipeline.read.ingest.conform import conform, refuse, refuse_too_many
 from pipeline.read.ingest.correct import read_corrections, read_damage
+from pipeline.read.ingest.wraps import whole_stream
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
 from pipeline.storage.described import notes_of
@@ -41,6 +42,9 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
         recorded = _read(content, stream, str(file), config, breaches)
         if recorded is not None:
             frames[stream] = conform(recorded, stream, str(file), breaches)
+            if stream == "odometer" and not breaches:
+                frames[stream], wraps = whole_stream(frames[stream], config)
+                skipped += [f"odometer.parquet: {said}" for said in wraps]
             said = notes_of(content)
             held += read_corrections(said, stream, str(file))
             damages += [*filter(None, [read_damage(said)]), *_lost(stream, content, recorded)]
