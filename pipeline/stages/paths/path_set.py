@@ -433,13 +433,18 @@ class _Growth:
         return Trail(node.stretch, chain[0].begin, node.begin, residual_m, survey_m, heading_rad, node.before)
 
     def _unread(self, node: Node) -> int:
-        """The first step of the node at which a balise was read that is on no element that joins its own."""
+        """The first step of the node at which a balise was read on an element that the train cannot have come from."""
         for step in (node.begin + np.flatnonzero(self.steps.pinned[node.begin : node.end] >= 0)).tolist():
-            element = int(self.steps.pinned[step])
-            sides = ((2 * node.element + a, 2 * element + b) for a in (0, 1) for b in (0, 1))
-            if element != node.element and not any(self.network.linked(*pair) for pair in sides):
+            # A read belongs to the step after it: in the meantime the train went on.
+            way_m = (1.0 + self.config.detour_share) * float(self.steps.way_m[step]) + self.config.paths_end_m
+            if not self._within(node.element, int(self.steps.pinned[step]), way_m):
                 return int(step)
         return 2**62
+
+    def _within(self, one: int, other: int, way_m: float) -> bool:
+        """Two elements are the same, or not so far apart along the network."""
+        reached = (self.network.reach(2 * one + side, way_m).get(2 * other + to) for side in (0, 1) for to in (0, 1))
+        return one == other or any(reach is not None and reach.distance_m <= way_m for reach in reached)
 
     def _inside(self, rows: Ints) -> Bools:
         """Places on the element; past an open end as far as the noise may lead."""

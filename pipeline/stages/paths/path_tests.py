@@ -196,7 +196,7 @@ class PathTests:
         late = np.searchsorted(steps.end_s, steps.end_s[at] - self.config.paths_level_s, side="right")
         late = np.maximum(np.minimum(late, at) - trail.start, 0)
         part = sums[:, at + 1 - trail.start] - sums[:, late]
-        least = np.minimum(_WHOLE * self.config.paths_level_s / steps.period_s[at], 1.0)
+        least = _WHOLE * self.config.paths_level_s / steps.period_s[at]
         return self._in_sigmas(part, part[0] >= least, self.excess[at])
 
     def _lasting(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> Floats:
