@@ -295,7 +295,9 @@ class _Growth:
         # Out of reach for a whole window it was farther away than any measured offset.
         farthest_m[np.logical_or.accumulate(np.isnan(windows_m).all(axis=1))] = np.inf
         near = np.abs(means_m) <= self.config.paths_back_sigmas * np.hypot(sigma_m, survey_m)
-        back = np.flatnonzero(near & (farthest_m > self.tests.moved_m(sigma_m, survey_m)))
+        # It stays there as long again: what only passes on its way to somewhere else does not.
+        stays = np.convolve(near, np.ones(window + 1))[: near.size] > window
+        back = np.flatnonzero(stays & (farthest_m > self.tests.moved_m(sigma_m, survey_m)))
         return int(died + back[0] + window) if back.size else len(steps)
 
     def _beside_line_m(self, oriented: int, begin: int) -> Floats:
