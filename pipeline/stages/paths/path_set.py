@@ -115,7 +115,8 @@ class PathSet:
         for node in self.nodes:
             end = min(node.end, node.barred, int(np.searchsorted(known, node.rejected)))
             if end > node.begin:
-                tested = np.clip(known[node.begin : end] + 1 - node.begin, 0, node.p_by_step.size - 1)
+                tested = known[node.begin : end] + 1 - node.begin
+                tested = np.minimum(np.maximum(tested, 0), node.p_by_step.size - 1)
                 spans.append(Span(node, node.begin, end, node.p_by_step[tested]))
         return spans
 

@@ -141,7 +141,8 @@ class PathTests:
             tests.append((self._lasting(steps, sums, trail, at)[None] * apart, np.array([_LASTING_LOOKS])))
         for sigmas, looks in tests:
             refuted |= (sigmas > _sizes(self.config.paths_alpha, looks)[:, None]).any(axis=0)
-            p = np.minimum(p, (_TESTS * looks[:, None] * 2.0 * _tails(sigmas)).min(axis=0))
+            if (_TESTS * looks * 2.0 * _tails(sigmas.max(axis=1, initial=0.0))).min() < 1.0:
+                p = np.minimum(p, (_TESTS * looks[:, None] * 2.0 * _tails(sigmas)).min(axis=0))
         first = np.flatnonzero(refuted)
         return Verdict(int(at[first[0]]) if first.size else 2**62, np.minimum.accumulate(p))
 
