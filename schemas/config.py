@@ -765,6 +765,8 @@ _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
     """A TOML file as a mapping, or one error."""
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device may be read for ever
+            raise kind("is no regular file", place=str(path), expected="a TOML file")
         return toml_of(path.read_bytes(), str(path), kind)
     except OSError as error:
         raise kind(f"cannot be read: {error.strerror}", place=str(path)) from None

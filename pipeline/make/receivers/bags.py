@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from pipeline.make.receivers.bag_budget import Unpack, budget_of_bag, unpacker_of
@@ -21,6 +20,7 @@ from pipeline.read.ingest.describe import (
 )
 from pipeline.read.ingest.run import read_part
 from pipeline.storage.budget import Budget
+from pipeline.storage.noted import scratch_folder
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
 from schemas.run import RunLog
@@ -50,8 +50,8 @@ def read_bag(path: Path, config: IngestConfig, partly: bool = False) -> Bag:
         return Bag(*_with_rest(run, {}), topics_in([census], config))
     if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
         return _read_parts(path, declared, config, partly)
-    with TemporaryDirectory() as folder:
-        log = Path(folder) / "bag.mcap"
+    with scratch_folder() as folder:
+        log = folder / "bag.mcap"
         left, counts = _transcribe(path, log, config)
         census = Census()
         try:
@@ -79,8 +79,8 @@ def _topics_alone(path: Path, config: IngestConfig) -> tuple[TopicSummary, ...]:
     try:
         if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
             return topics_of(files_of(path, declared), config)
-        with TemporaryDirectory() as folder:
-            log = Path(folder) / "bag.mcap"
+        with scratch_folder() as folder:
+            log = folder / "bag.mcap"
             _transcribe(path, log, config)
             return topics_of([log], config)
     except BaliseError:

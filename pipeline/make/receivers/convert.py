@@ -28,7 +28,7 @@ from pipeline.read.ingest.correct import corrected, corrections_of
 from pipeline.read.ingest.mapping import mappings_of
 from pipeline.read.ingest.parts import LogPart, parts_of_messages, parts_of_topics
 from pipeline.read.ingest.plan import absent_topics
-from pipeline.storage import files
+from pipeline.storage import FileDigest, files
 from schemas.config import FixSigma, IngestConfig, StreamCorrection
 from schemas.errors import InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -41,6 +41,11 @@ class Converted:
     run: RunLog
     dropped: Mapping[str, int]
     parts: tuple[LogPart, ...] = ()
+
+    def made_of(self, logs: Sequence[FileDigest]) -> Converted:
+        """The run with the logs that were read for it, beside those that it was made of before."""
+        listed = dict.fromkeys([*self.run.notes.raw_logs, *((log.name, log.size_bytes, log.sha256) for log in logs)])
+        return replace(self, run=replace(self.run, notes=replace(self.run.notes, raw_logs=tuple(listed))))
 
     def gathered(self) -> Gatherings:
         """The streams, and the corrections that they hold."""

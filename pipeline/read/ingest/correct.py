@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
+from pydantic import TypeAdapter, ValidationError
 
 from pipeline.read.ingest.conform import conform, refuse
 from pipeline.read.ingest.wraps import counted_on
@@ -22,6 +23,8 @@ RECORDED = "corrections"
 """In the metadata of a stream that was written: the corrections that it holds already."""
 
 _DAMAGE = "damage"
+_RAW_LOGS = "raw_logs"
+_LISTING = TypeAdapter(tuple[tuple[str, int, str], ...])
 _PLACE = ("latitude_deg", "longitude_deg")
 
 
@@ -75,15 +78,27 @@ def corrections_of(run: RunLog, stream: Stream) -> list[StreamCorrection]:
 
 
 def recorded_notes(run: RunLog, stream: Stream) -> dict[str, str]:
-    """What a written stream says of its corrections and, of positions, of what its log lacked, for its metadata."""
+    """What a written stream says of its corrections and, of positions, of the logs of the run, for its metadata."""
     held = [correction.model_dump(mode="json", exclude_defaults=True) for correction in corrections_of(run, stream)]
-    lost = run.notes.damage if stream == "gnss" else None
-    return ({RECORDED: json.dumps(held)} if held else {}) | ({_DAMAGE: lost} if lost else {})
+    said = {RECORDED: json.dumps(held)} if held else {}
+    if stream == "gnss" and run.notes.damage:
+        said[_DAMAGE] = run.notes.damage
+    if stream == "gnss" and run.notes.raw_logs:
+        said[_RAW_LOGS] = json.dumps(run.notes.raw_logs)
+    return said
 
 
 def read_damage(metadata: Mapping[str, str]) -> str | None:
     """What the log lacked that a stream was written of."""
     return metadata.get(_DAMAGE)
+
+
+def read_raw_logs(metadata: Mapping[str, str]) -> tuple[tuple[str, int, str], ...]:
+    """The logs that a stream says its run was converted from; none where this program did not write that."""
+    try:
+        return _LISTING.validate_json(metadata.get(_RAW_LOGS, "[]"))
+    except ValidationError:
+        return ()
 
 
 def read_corrections(metadata: Mapping[str, str], stream: Stream, place: str) -> tuple[StreamCorrection, ...]:

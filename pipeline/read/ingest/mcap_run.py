@@ -14,7 +14,7 @@ import polars as pl
 
 from pipeline.read.ingest.assemble import DecodedRows, stream_frames
 from pipeline.read.ingest.conform import refuse
-from pipeline.read.ingest.correct import read_corrections, read_damage
+from pipeline.read.ingest.correct import read_corrections, read_damage, read_raw_logs
 from pipeline.read.ingest.fields import fields_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel, DamageError
@@ -137,10 +137,17 @@ def read_mcaps(
             skipped_topics=left_over,
             corrections=held,
             messages=dict(messages),
+            raw_logs=_raw_logs(logs),
         ),
         input_digest=logs[0].digest,
         gnss=frames["gnss"],
     ).with_streams(**frames)
+
+
+def _raw_logs(logs: Sequence[_WalkedLog]) -> tuple[tuple[str, int, str], ...]:
+    """What the topics say that the run was converted from."""
+    said = dict.fromkeys(channel.notes for log in logs for channel in log.walk.channels.values())
+    return tuple(file for notes in said for file in read_raw_logs(dict(notes)))
 
 
 def _damages(logs: Sequence[_WalkedLog]) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.stages.evidence.anchors import Sided, Witness, Witnesses, known_stretch, reference_ways, sided
+from pipeline.stages.evidence.anchors import Sided, Witness, known_stretch, reference_ways, sided
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
 from pipeline.stages.evidence.clock import RecorderClock, lag_of
 from pipeline.stages.odometry import odometry_of
@@ -33,15 +33,15 @@ def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch
     return ReferenceStretch(ns(t_s), np.full(t_s.size, 0.1), (path,))
 
 
-def against(*counters: Counter) -> Witnesses:
+def against(*counters: Counter) -> tuple[Witness, ...]:
     """These odometers on the reference's clock, their scale within 5 %."""
-    return Witnesses(tuple(Witness.of(counter, [], CONFIG) for counter in counters))
+    return tuple(Witness.of(counter, [], CONFIG) for counter in counters)
 
 
 def counter(at_m: Floats, rate_hz: float) -> Counter:
     found = odometry_of(odometer(at_m, rate_hz), Vehicle(), CONFIG)
     assert found is not None
-    return Counter.of(found)
+    return Counter(found)
 
 
 @pytest.mark.parametrize("forward", [True, False])
