@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +13,9 @@ import polars as pl
 from pipeline.stages.lds.windows import DEFAULTS, minimal_spacing_m, window_m
 from pipeline.stages.paths.candidates import candidates_of, search_about
 from pipeline.stages.paths.path_tests import told_by_a_switch_m, told_by_offset_m
+from pipeline.stages.track.chain import Chain, search
 from pipeline.stages.track.geodesy import points_of
-from pipeline.stages.track.network import Network, network_of, surveyed
+from pipeline.stages.track.network import Edge, Network, network_of, surveyed
 from pipeline.stages.track.path import valid_along_measure
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import SurveyedTrack, places_along
@@ -83,20 +85,26 @@ def _ahead(
 ) -> Iterator[tuple[_Met, _Met]]:
     """The next two balises on each way ahead of one, as far as it is announced."""
     reference = points[oriented][index]
-    waiting: list[tuple[int, float, int, tuple[_Met, ...]]] = [(oriented, -reference.at_m, index + 1, ())]
-    seen: set[tuple[int, tuple[str, ...]]] = set()
-    while waiting:
-        here, entry_m, first, met = waiting.pop()
-        key = here, tuple(point.balise_id for point, _ in met)
-        if key in seen or entry_m > announced_m:
-            continue
-        seen.add(key)
-        met = (*met, *((point, entry_m + point.at_m) for point in points.get(here, [])[first:]))[:2]
-        if len(met) == 2:
-            yield met[0], met[1]
-            continue
-        exit_m = entry_m + network.length_m(here)
-        waiting += [(edge.to, exit_m + edge.gap_m, 0, met) for edge in network.successors[here] if edge.forward]
+
+    def met(chain: Chain) -> tuple[_Met, ...]:
+        entered = zip(chain.oriented, chain.entry_m, strict=True)
+        on_way = (
+            (point, entry_m + point.at_m)
+            for number, (here, entry_m) in enumerate(entered)
+            for point in points.get(here, [])[0 if number else index + 1 :]
+        )
+        return tuple(islice(on_way, 2))
+
+    def onward(chain: Chain) -> list[Edge]:
+        return [edge for edge in network.successors[chain.oriented[-1]] if edge.forward and len(met(chain)) < 2]
+
+    def same(chain: Chain) -> tuple[int, tuple[str, ...]]:
+        return chain.oriented[-1], tuple(point.balise_id for point, _ in met(chain))
+
+    begin = Chain((oriented,), (-reference.at_m,))
+    for found in search(network, begin, announced_m, onward, same):
+        if len(pair := met(found.chain)) == 2:
+            yield pair[0], pair[1]
 
 
 def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Finding | None:

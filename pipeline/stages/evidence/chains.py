@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import numpy as np
 
-from pipeline.stages.track.chain import Chain
+from pipeline.stages.track.chain import Chain, search
 from pipeline.stages.track.network import Edge, Network
 from pipeline.stages.track.path import Place
 
@@ -17,26 +17,21 @@ def chains_between(
     `back`: the train runs them from the goal to the begin. None where there are more than `most`.
     """
     shortest_m, longest_m = lengths_m
+    first = Chain((start,), (-network.track.along_m(start, begin.measure_m),))
+
+    def onward(chain: Chain) -> list[Edge]:
+        edges = network.successors[chain.oriented[-1]]
+        return [edge for edge in edges if (edge.backward if back else edge.forward)]
+
     chains: list[Chain] = []
-    open_chains = [Chain((start,), (-network.track.along_m(start, begin.measure_m),))]
-    steps = 0
-    while open_chains:
-        chain = open_chains.pop()
-        last = chain.oriented[-1]
-        entry_m = chain.entry_m[-1]
+    for steps, found in enumerate(search(network, first, longest_m, onward), 1):
+        last = found.chain.oriented[-1]
         if last // 2 == goal.element:
-            at_m = entry_m + network.track.along_m(last, goal.measure_m)
+            at_m = found.distance_m + network.track.along_m(last, goal.measure_m)
             if shortest_m <= at_m <= longest_m:
-                chains.append(chain)
-        exit_m = entry_m + network.length_m(last)
-        steps += 1
+                chains.append(found.chain)
         if len(chains) > most or steps > most**2:
             return None
-        open_chains += [
-            Chain((*chain.oriented, edge.to), (*chain.entry_m, exit_m + edge.gap_m))
-            for edge in network.successors[last]
-            if exit_m + edge.gap_m <= longest_m and (edge.backward if back else edge.forward)
-        ]
     return chains
 
 
@@ -46,31 +41,26 @@ def extended(network: Network, chain: Chain, least_m: float, most_m: float, most
     Where the track ends before, it ends. None where there are more than `most` chains.
     """
     done: list[Chain] = []
-    growing = [chain]
-    while growing:
-        chain = growing.pop()
-        further = _onward(network, chain, most_m) or _before(network, chain, least_m)
-        growing += further
-        done += [] if further else [chain]
-        if len(done) + len(growing) > most:
+    for ahead in _whole(network, chain, most_m, most):
+        done += [whole.turned(network) for whole in _whole(network, ahead.turned(network), -least_m, most)]
+        if len(done) > most:
             return None
-    return done
+    return done or None
 
 
-def _onward(network: Network, chain: Chain, until_m: float) -> list[Chain]:
-    exit_m = chain.entry_m[-1] + network.length_m(chain.oriented[-1])
-    edges = _runnable(network.successors[chain.oriented[-1]]) if exit_m < until_m else []
-    return [Chain((*chain.oriented, edge.to), (*chain.entry_m, exit_m + edge.gap_m)) for edge in edges]
+def _whole(network: Network, chain: Chain, until_m: float, most: int) -> list[Chain]:
+    """The chain carried on over every branch up to a coordinate, or the end of the track; none where too many."""
 
+    def onward(chain: Chain) -> list[Edge]:
+        edges = network.successors[chain.oriented[-1]] if chain.exit_m(network) < until_m else ()
+        return [edge for edge in edges if edge.forward or edge.backward]
 
-def _before(network: Network, chain: Chain, until_m: float) -> list[Chain]:
-    entry_m = chain.entry_m[0]
-    edges = _runnable(network.successors[chain.oriented[0] ^ 1]) if entry_m > until_m else []
-    return [
-        Chain((edge.to ^ 1, *chain.oriented), (entry_m - edge.gap_m - network.length_m(edge.to), *chain.entry_m))
-        for edge in edges
-    ]
-
-
-def _runnable(edges: Sequence[Edge]) -> list[Edge]:
-    return [edge for edge in edges if edge.forward or edge.backward]
+    whole: list[Chain] = []
+    number = 1
+    for found in search(network, chain, np.inf, onward):
+        branches = len(onward(found.chain))
+        whole += [] if branches else [found.chain]
+        number += max(branches - 1, 0)
+        if number > most:
+            return []
+    return whole

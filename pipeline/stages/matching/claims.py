@@ -109,10 +109,12 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
     live = _left(found, found.living(config.paths_delay_s))
     at = np.maximum(before, 0)
     gate = _confidence(live, at, group, carried_m, alone)
-    gate[(before < 0) | (before >= found.overflow)] = 0.0
+    gate[before < 0] = 0.0
+    gate[found.unclaimed[at]] = np.minimum(gate[found.unclaimed[at]], MOST_IN_DOUBT)
     spans = found.to_the_end()
     left = _left(found, spans)
     later = _hindsight(left, about, group, alone)
+    later[found.unclaimed[about]] = np.minimum(later[found.unclaimed[about]], MOST_IN_DOUBT)
     now, p_now = live.rival(at, group)
     then, p_then = left.rival(about, group)
     rival = np.where((now >= 0) & (p_now >= p_then), now, then)
@@ -174,7 +176,7 @@ def off_stretches(claimed: Claims, epochs: pl.DataFrame, least_s: float) -> pl.D
 def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:
     count = len(found.steps)
     elements = found.network.count
-    keys = [np.arange(begin, end) * elements + node.element for node, begin, end in spans]
+    keys = [np.arange(begin, end) * elements + node.element for node, begin, end, _ in spans]
     step, element = np.divmod(np.unique(np.concatenate([*keys, np.zeros(0, dtype=np.int64)])), elements)
     lines = np.unique(step * elements + found.groups[element]) // elements
     number = np.bincount(lines, minlength=count)[step]
@@ -183,7 +185,7 @@ def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:
 
 
 def _left(found: PathSet, spans: list[Span]) -> _Left:
-    """What the sets come to, the likeliest path first."""
+    """What the sets come to, the likeliest line first; of equal ones that found first."""
     count = len(found.steps)
     ends = {2 * node.element + side for node, *_ in spans for side in (0, 1)}
     beyond_m = branches_beyond_m(found.network, ends)
@@ -191,21 +193,28 @@ def _left(found: PathSet, spans: list[Span]) -> _Left:
     element = np.full((count, 2), -1)
     p = np.zeros((count, 2))
     branch_m = np.full(count, np.inf)
-    for node, begin, end in sorted(spans, key=lambda span: -span.node.p):
-        if end <= begin:
-            continue
+    for node, begin, end, value in spans:
         own = int(found.groups[node.element])
-        rows = np.arange(begin, end)
-        for place in (0, 1):
-            free = rows[line[rows, place] < 0]
-            line[free, place], element[free, place], p[free, place] = own, node.element, min(node.p, 1.0)
-            rows = rows[line[rows, place] != own]
-        beyond = [beyond_m[2 * node.element + 1], beyond_m[2 * node.element]]
+        _put(line[begin:end], element[begin:end], p[begin:end], (own, node.element), value)
+        beyond = np.array([beyond_m[2 * node.element + 1], beyond_m[2 * node.element]])
         ends_m = node.left_m[: end - begin] + beyond
         part = slice(begin, begin + len(ends_m))
         branch_m[part] = np.minimum(branch_m[part], ends_m.min(axis=1))
     group = np.where(line[:, 1] < 0, line[:, 0], -2)
     return _Left(group, line, element, p, branch_m)
+
+
+def _put(line: Ints, element: Ints, p: Floats, one: tuple[int, int], value: Floats) -> None:
+    """Enter a path over a line and element with its p-values among the two likeliest lines of each step."""
+    for place in (0, 1):
+        better = (line[:, place] < 0) | (value > p[:, place])
+        if place == 0:
+            # What it puts out of the first place goes to the second, but for its own line.
+            moved = better & (line[:, 0] >= 0) & (line[:, 0] != one[0])
+            for column in (line, element, p):
+                column[moved, 1] = column[moved, 0]
+        better &= (line[:, 0] != one[0]) if place else True
+        line[better, place], element[better, place], p[better, place] = *one, value[better]
 
 
 def _confidence(left: _Left, step: Ints, group: Ints, carried_m: Floats, alone: Floats) -> Floats:

@@ -2,51 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.stages.matching.least_squares import Course
 from pipeline.stages.paths.moves import Move, Moves
+from pipeline.stages.track.chain import Chain, moved_on
 from pipeline.stages.track.leg import Leg, Visit, leg_of, segments_at, shifted
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 
 
 @dataclass(frozen=True)
-class LegElements:
-    """Oriented elements of one leg, numbered on from `low`; numbers go on over legs that share an element.
-
-    `shared` is the number of the element in common with the leg before; none at the start and where the
-    network does not lead from one leg to the next.
-    """
-
-    oriented: tuple[int, ...]
-    low: int
-    shared: int | None = None
-
-    @property
-    def high(self) -> int:
-        return self.low + len(self.oriented) - 1
-
-    def turned(self) -> LegElements:
-        """The same leg run the other way round."""
-        around = tuple(oriented ^ 1 for oriented in reversed(self.oriented))
-        return LegElements(around, -self.high, None if self.shared is None else -self.shared)
-
-
-@dataclass(frozen=True)
 class Decoded:
     """Legs, and for each step its leg, element number in it and place from that element's entry [m]."""
 
-    chains: tuple[LegElements, ...]
+    chains: tuple[Chain, ...]
     leg: Ints
     number: Ints
     place_m: Floats
 
     def turned(self, network: Network, legs: range) -> Decoded:
         """Some legs run the other way round."""
-        chains = tuple(chain.turned() if index in legs else chain for index, chain in enumerate(self.chains))
+        chains = tuple(chain.turned(network) if index in legs else chain for index, chain in enumerate(self.chains))
         inside = (self.leg >= legs.start) & (self.leg < legs.stop)
         length = np.array(
             [
@@ -61,7 +40,7 @@ class Decoded:
 def decode(course: Course, moves: Moves) -> Decoded:
     """Follow the course over the network, elements without any fix included."""
     oriented = course.oriented
-    chains = [LegElements((int(oriented[0]),), 0)]
+    chains = [Chain((int(oriented[0]),), (0.0,))]
     leg = np.zeros(len(oriented), dtype=np.int64)
     number = np.zeros(len(oriented), dtype=np.int64)
     at = 0
@@ -70,7 +49,8 @@ def decode(course: Course, moves: Moves) -> Decoded:
         leg[before:row] = len(chains) - 1
         number[before:row] = at
         before = row
-        at = _follow(chains, at, moves.best(course.place(row - 1), course.place(row)), int(oriented[row]))
+        move = moves.best(course.place(row - 1), course.place(row))
+        at = _follow(chains, moves.network, at, move, int(oriented[row]))
     leg[before:] = len(chains) - 1
     number[before:] = at
     return Decoded(tuple(chains), leg, number, course.place_m)
@@ -121,35 +101,15 @@ def aligned(moves: Moves, course: Course, decoded: Decoded) -> Decoded:
     return decoded
 
 
-def _follow(chains: list[LegElements], at: int, move: Move | None, to: int) -> int:
-    """Extend the legs by one move; where the last leg does not lead there, begin a new one."""
+def _follow(chains: list[Chain], network: Network, at: int, move: Move | None, to: int) -> int:
+    """Extend the legs by one move; where the network does not lead there, begin a new one."""
     if move is None:
         number = chains[-1].high + 1
-        chains.append(LegElements((to,), number))
+        chains.append(Chain((to,), (0.0,), number))
         return number
     for oriented in (*move.between, to) if move.sense else ():
-        chain = chains[-1]
-        number = at + move.sense
-        if not chain.low <= number <= chain.high:
-            chains[-1] = _extended(chain, oriented, move.sense)
-        elif chain.oriented[number - chain.low] != oriented:
-            chains.append(_branched(chain, at, oriented, move.sense))
-        at = number
+        at = moved_on(chains, network, at, oriented, move.sense)
     return at
-
-
-def _extended(chain: LegElements, oriented: int, sense: int) -> LegElements:
-    if sense > 0:
-        return replace(chain, oriented=(*chain.oriented, oriented))
-    return replace(chain, oriented=(oriented, *chain.oriented), low=chain.low - 1)
-
-
-def _branched(chain: LegElements, at: int, oriented: int, sense: int) -> LegElements:
-    """A new leg: the element the train is on and what lies behind it, then the other way on."""
-    here = at - chain.low
-    if sense > 0:
-        return LegElements((*chain.oriented[: here + 1], oriented), chain.low, at)
-    return LegElements((oriented, *chain.oriented[here:]), at - 1, at)
 
 
 def _next_break(decoded: Decoded, index: int) -> int:

@@ -83,12 +83,13 @@ def _refuted(found: PathSet, candidates: Candidates) -> Bools:
     """Candidates on an element that the whole run refutes; none where every path is refuted."""
     count = len(found.steps)
     elements = found.network.count
+    lives = found.to_the_end()
     # Between two elements a step belongs to either.
-    spans = [(node.element, max(begin - 1, 0), min(end + 1, count)) for node, begin, end in found.to_the_end()]
+    spans = [(node.element, max(begin - 1, 0), min(end + 1, count)) for node, begin, end, _ in lives]
     keys = [np.arange(begin, end) * elements + element for element, begin, end in spans]
     possible = np.unique(np.concatenate([*keys, np.zeros(0, dtype=np.int64)]))
     known = np.zeros(count, dtype=np.bool_)
-    for _, begin, end in found.to_the_end():
+    for _, begin, end, _ in lives:
         known[begin:end] = True
     step = candidates.step
     return np.asarray(known[step] & ~np.isin(step * elements + candidates.element, possible))

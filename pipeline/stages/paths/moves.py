@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.stages.paths.path_steps import PathSteps
-from pipeline.stages.track.network import Network
+from pipeline.stages.track.chain import Chain, search
+from pipeline.stages.track.network import Edge, Network
 from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig
 
@@ -112,27 +113,28 @@ class Moves:
             driven_m = sense * (ends_m + found.distance_m)
             cost = self._mismatch(driven_m, here.oriented, way)
             barred = found.barred_forward if sense > 0 else found.barred_backward
-            yield cost + (self.break_cost if barred else 0.0), sense, found.between
+            yield cost + (self.break_cost if barred else 0.0), sense, found.chain.between
             if cost > 1.0 and way.measured and abs(driven_m) < abs(way.distance_m):
                 # Another way may be as long as the odometer says.
-                for longer_m, between in self._longer(first.oriented, last.oriented, sense, way.limit_m - ends_m):
-                    yield self._mismatch(sense * (ends_m + longer_m), here.oriented, way), sense, between
+                for chain in self._longer(first.oriented, last.oriented, sense, way.limit_m - ends_m):
+                    driven_m = sense * (ends_m + chain.entry_m[-1])
+                    yield self._mismatch(driven_m, here.oriented, way), sense, chain.between
 
-    def _longer(self, first: int, last: int, sense: int, limit_m: float) -> Iterator[tuple[float, tuple[int, ...]]]:
+    def _longer(self, first: int, last: int, sense: int, limit_m: float) -> Iterator[Chain]:
         """Ways from the exit of an element to the entry of another, of those as long as each other the first found."""
-        waiting: list[tuple[float, int, tuple[int, ...]]] = [(0.0, first, ())]
-        known: set[tuple[int, int]] = set()
-        while waiting:
-            gone_m, oriented, between = heapq.heappop(waiting)
-            for edge in self.network.successors[oriented]:
-                entry_m = gone_m + edge.gap_m
-                alike = edge.to, round(entry_m / (self.config.detour_m / _MARGIN_SIGMAS))
-                if entry_m > limit_m or alike in known or not (edge.forward if sense > 0 else edge.backward):
-                    continue
-                known.add(alike)
-                if edge.to == last:
-                    yield entry_m, between
-                heapq.heappush(waiting, (entry_m + self.network.length_m(edge.to), edge.to, (*between, edge.to)))
+        apart_m = self.config.detour_m / _MARGIN_SIGMAS
+        found = search(
+            self.network,
+            Chain.behind(self.network, first),
+            limit_m,
+            lambda chain: self._allowed(chain, sense),
+            lambda chain: (len(chain.oriented) > 1, chain.oriented[-1], round(chain.entry_m[-1] / apart_m)),
+        )
+        return (reach.chain for reach in islice(found, 1, None) if reach.chain.oriented[-1] == last)
+
+    def _allowed(self, chain: Chain, sense: int) -> Iterator[Edge]:
+        onward = self.network.successors[chain.oriented[-1]]
+        return (edge for edge in onward if (edge.forward if sense > 0 else edge.backward))
 
     def _mismatch(self, driven_m: float, oriented: int, way: Way) -> float:
         """Square of the difference from the way made over its own sigma, limited as that of every position."""

@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
 from pipeline.stages.paths.path_steps import PathSteps
-from pipeline.stages.paths.path_tests import LOOKED_S, NO_STEPS, PathTests, Totals, Trail
+from pipeline.stages.paths.path_tests import LOOKED_S, NO_STEPS, WINDOWS_S, PathTests, Totals, Trail
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
@@ -46,6 +46,7 @@ class Node:
     survey_m: Floats = field(default_factory=lambda: np.zeros(0))
     heading_rad: Floats = field(default_factory=lambda: np.zeros(0))
     left_m: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    p_by_step: Floats = field(default_factory=lambda: np.ones(1))
     followed: bool = False
     also: list[Node] = field(default_factory=list)
 
@@ -79,19 +80,22 @@ class Node:
 
 
 class Span(NamedTuple):
-    """A hypothesis at the steps from `begin` on, before `end`."""
+    """A hypothesis at the steps from `begin` on, before `end`; `p`: at each of them what speaks against it least."""
 
     node: Node
     begin: int
     end: int
+    p: Floats
 
 
 @dataclass(frozen=True)
 class PathSet:
     """All hypotheses of a run with what became of each; `groups`: lines without a branch, per net element.
 
-    `overflow`: step from which on there were more hypotheses than are followed; nothing is claimed after it.
-    `last_s`: where a stretch ends off the network, paths refuted in its last seconds are equal.
+    `overflow`: step from which on there were more hypotheses than are followed; `unclaimed`: steps after it, and those
+    of the first minute of a set that began anew though no movement had led back: its errors may be larger than stated;
+    `returned`: steps at which it began anew after such a movement. `last_s`: where a stretch ends off the network,
+    those refuted in its last seconds are equal.
     """
 
     nodes: tuple[Node, ...]
@@ -99,16 +103,22 @@ class PathSet:
     groups: Ints
     network: Network
     candidates: Candidates
+    unclaimed: Bools
+    returned: tuple[int, ...]
     overflow: int
     last_s: float
 
     def living(self, delay_s: float) -> list[Span]:
         """The hypotheses, each over the steps at which nothing up to `delay_s` before their end had refuted it."""
         known = np.searchsorted(self.steps.end_s, self.steps.end_s - delay_s, side="right") - 1
-        return [
-            Span(node, node.begin, min(node.end, node.barred, int(np.searchsorted(known, node.rejected))))
-            for node in self.nodes
-        ]
+        spans = []
+        for node in self.nodes:
+            end = min(node.end, node.barred, int(np.searchsorted(known, node.rejected)))
+            if end > node.begin:
+                tested = known[node.begin : end] + 1 - node.begin
+                tested = np.minimum(np.maximum(tested, 0), node.p_by_step.size - 1)
+                spans.append(Span(node, node.begin, end, node.p_by_step[tested]))
+        return spans
 
     def survivors(self) -> list[Node]:
         """Those that live to the last step; of one that ends off the network, those refuted in its last minute."""
@@ -125,15 +135,16 @@ class PathSet:
         return found
 
     def to_the_end(self) -> list[Span]:
-        """The hypotheses that live to the end of their stretch, or through one that does."""
-        lives: dict[int, Node] = {}
-        waiting = self.survivors()
+        """The hypotheses that live to the end of their stretch, or through one that does, with its p-value there."""
+        lives: dict[int, tuple[Node, float]] = {}
+        waiting = [(node, min(node.p, 1.0)) for node in self.survivors()]
         while waiting:
-            node = waiting.pop()
-            if id(node) not in lives:
-                lives[id(node)] = node
-                waiting += node.origins
-        return [Span(node, node.begin, min(node.end, node.rejected)) for node in lives.values()]
+            node, p = waiting.pop()
+            if id(node) not in lives or lives[id(node)][1] < p:
+                lives[id(node)] = node, p
+                waiting += [(origin, p) for origin in node.origins]
+        ends = [(node, min(node.end, node.rejected), p) for node, p in lives.values()]
+        return [Span(node, node.begin, end, np.full(end - node.begin, p)) for node, end, p in ends if end > node.begin]
 
     def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
         """Per step the net elements that no rejection rules out, each with the largest p-value of a path over it.
@@ -141,9 +152,9 @@ class PathSet:
         In hindsight, or by what was known `delay_s` before the end of each step. Empty: off the network.
         """
         found: list[dict[int, float]] = [{} for _ in range(len(self.steps))]
-        for node, begin, end in self.to_the_end() if delay_s is None else self.living(delay_s):
-            for best in found[begin:end]:
-                best[node.element] = max(best.get(node.element, 0.0), min(node.p, 1.0))
+        for node, begin, end, p in self.to_the_end() if delay_s is None else self.living(delay_s):
+            for best, value in zip(found[begin:end], p.tolist(), strict=True):
+                best[node.element] = max(best.get(node.element, 0.0), value)
         return found
 
 
@@ -200,6 +211,8 @@ class _Growth:
         self._made: list[Node] = []
         self._begun_s: deque[float] = deque()
         self._by_element: dict[int, list[Node]] = {}
+        self._unclaimed = np.zeros(len(self.steps), dtype=np.bool_)
+        self._returned: list[int] = []
 
     def grown(self) -> PathSet:
         count = len(self.steps)
@@ -217,8 +230,18 @@ class _Growth:
                 for child in self._follow(node):
                     self._push(child)
             start = count if overflow < count else self._anew(self._made[first:])
-        last_s = self.config.paths_anew_s
-        return PathSet(tuple(self._made), self.steps, self.groups, self.network, self.candidates, overflow, last_s)
+        self._unclaimed[overflow:] = True
+        return PathSet(
+            tuple(self._made),
+            self.steps,
+            self.groups,
+            self.network,
+            self.candidates,
+            self._unclaimed,
+            tuple(self._returned),
+            overflow,
+            self.config.paths_anew_s,
+        )
 
     def _too_many(self, node: Node) -> bool:
         """More hypotheses have begun of late than are followed."""
@@ -242,42 +265,66 @@ class _Growth:
         last = max(refuted, key=lambda node: node.rejected)
         died = last.rejected
         if self.steps.end_s[died] - self.steps.begin_s[self._made[0].begin] <= self.config.paths_anew_s:
-            return self._begin(died + 1)
-        return self._begin(self._came_back(last, died))
+            begin = self._begin(died + 1)
+            since_s = self.steps.end_s - self.steps.end_s[min(begin, count - 1)]
+            self._unclaimed |= (since_s >= 0.0) & (since_s < self.config.paths_anew_s)
+            return begin
+        self._returned.append(self._begin(self._came_back(last, died)))
+        return self._returned[-1]
 
     def _came_back(self, node: Node, died: int) -> int:
-        """The first step after a rejection at which the positions lie beside the track as they did before it.
+        """The first step after a rejection at which a movement of equal size has led back to the path refuted last.
 
-        A movement of equal size leads back: a start anew by itself would claim the surveyed track from a siding that
-        the survey lacks. Beside the nearest element then, as long as positions lie within reach of one.
+        The nearest track would not do: a fault across the tracks, or a siding that the survey lacks, leads beside
+        another one. So the path is carried on as far as no switch leaves a choice, and the positions have to have moved
+        back to where they lay beside it, by more than noise and survey explain.
         """
         steps = self.steps
         level_s = self.config.paths_level_s
         first, last = np.searchsorted(steps.end_s, steps.end_s[died] - level_s * np.array([3.0, 1.0]), side="right")
         residual_m = node.residuals_m(int(first), int(last))
         before = np.isfinite(residual_m) & steps.counted[first:last]
-        if not before.any():
-            return len(steps)
-        level_m = float(np.mean(residual_m[before]))
-        beside_m = self._nearest_m[died:]
+        beside_m = self._beside_line_m(node.oriented, died)
         window = max(1, round(level_s / float(steps.period_s[died])))
-        if beside_m.size < window:
+        if not before.any() or beside_m.size < window:
             return len(steps)
-        means_m = sliding_window_view(beside_m, window).mean(axis=1)
-        root_m = np.hypot(steps.sigma_m[died:], float(np.median(node.survey_m)))[window - 1 :]
-        signs = (level_m, -level_m)  # the nearest element may run the other way
-        off_m = np.minimum(*(np.abs(means_m - sign) for sign in signs))
-        back = np.flatnonzero(np.nan_to_num(off_m, nan=np.inf) <= self.config.paths_back_sigmas * root_m)
+        windows_m = sliding_window_view(beside_m, window)
+        means_m = windows_m.mean(axis=1) - float(np.mean(residual_m[before]))
+        sigma_m = steps.sigma_m[died + window - 1 :]
+        survey_m = np.full(sigma_m.size, float(np.median(node.survey_m)))
+        farthest_m = np.fmax(np.fmax.accumulate(means_m) - means_m, means_m - np.fmin.accumulate(means_m))
+        # Out of reach for a whole window it was farther away than any measured offset.
+        farthest_m[np.logical_or.accumulate(np.isnan(windows_m).all(axis=1))] = np.inf
+        near = np.abs(means_m) <= self.config.paths_back_sigmas * np.hypot(sigma_m, survey_m)
+        # It stays there as long again: what only passes on its way to somewhere else does not.
+        stays = np.convolve(near, np.ones(window + 1))[: near.size] > window
+        back = np.flatnonzero(stays & (farthest_m > self.tests.moved_m(sigma_m, survey_m)))
         return int(died + back[0] + window) if back.size else len(steps)
 
-    @cached_property
-    def _nearest_m(self) -> Floats:
-        """Per step the offset from the nearest element, NaN where none is within reach [m]."""
-        nearest_m = np.full(len(self.steps), np.nan)
-        order = np.lexsort((self.candidates.distance_m, self.candidates.step))
-        first = order[np.unique(self.candidates.step[order], return_index=True)[1]]
-        nearest_m[self.candidates.step[first]] = self.candidates.offset_m[first]
-        return nearest_m
+    def _beside_line_m(self, oriented: int, begin: int) -> Floats:
+        """Per step from one on the offset from a line without a choice, in its sense; NaN where it is not within reach.
+
+        The line goes on from an element, ahead and behind, as long as one way alone leads on.
+        """
+        ahead, behind = (self._without_choice(side) for side in (oriented, oriented ^ 1))
+        count = len(self.steps)
+        nearest_m = np.full(count, np.inf)
+        beside_m = np.full(count, np.nan)
+        for one in {*ahead, *(other ^ 1 for other in behind)}:
+            rows = self.candidates.of(one // 2, begin, count)
+            rows = rows[self.candidates.beyond_m[rows] <= self.config.paths_end_m]
+            rows = rows[self.candidates.distance_m[rows] < nearest_m[self.candidates.step[rows]]]
+            step = self.candidates.step[rows]
+            nearest_m[step] = self.candidates.distance_m[rows]
+            beside_m[step] = self.candidates.offset_m[rows] * (1.0 - 2.0 * (one % 2))
+        return beside_m[begin:]
+
+    def _without_choice(self, oriented: int) -> list[int]:
+        """An oriented element and those after it, up to the first switch that leaves a choice, or an open end."""
+        line = [oriented]
+        while len(onward := self.network.successors[line[-1]]) == 1 and onward[0].to not in line:
+            line.append(onward[0].to)
+        return line
 
     def _begin(self, step: int) -> int:
         """The first step from this one on with an element that its offset does not refute, else the number of steps."""
@@ -311,6 +358,8 @@ class _Growth:
             if covers and other.rejected >= node.rejected and self._alike(other, node):
                 # Their tests cannot differ by more than the bounds allow for (rule 8).
                 other.p = max(other.p, node.p)
+                later = other.p_by_step[1 + node.begin - other.begin :]
+                np.maximum(later, node.p, out=later)
                 if node.parent is not None:
                     other.also.append(node.parent)
                 return
@@ -319,12 +368,24 @@ class _Growth:
         heapq.heappush(self._queue, (node.begin, len(self._made), node))
 
     def _alike(self, one: Node, other: Node) -> bool:
-        """Two paths that lead to one element with the same residuals as far back as any test looks."""
-        last = other.begin
-        first = int(np.searchsorted(self.steps.end_s, self.steps.end_s[last] - self.tests.longest_s))
-        one_m, other_m = (node.residuals_m(first, last) for node in (one, other))
-        known = np.isfinite(one_m) == np.isfinite(other_m)
-        return bool(known.all()) and bool(np.nanmax(np.abs(one_m - other_m), initial=0.0) <= self.config.paths_alike_m)
+        """Two paths to one element that no test can tell apart by more than it allows for, whatever comes (rule 8).
+
+        Their means agree over every window that a later test may still look at, and over the whole way.
+        """
+        last, alike_m = other.begin, self.config.paths_alike_m
+        begins = np.searchsorted(self.steps.end_s, self.steps.end_s[last] - 3.0 * np.array(WINDOWS_S))
+        for window_s, begin in zip(WINDOWS_S, begins.tolist(), strict=True):
+            one_m, other_m = (node.residuals_m(begin, last) for node in (one, other))
+            if (np.isfinite(one_m) != np.isfinite(other_m)).any():
+                return False
+            apart_m = np.where(self.steps.counted[begin:last], np.nan_to_num(one_m - other_m), 0.0)
+            if self.tests.farthest_m(self.steps, apart_m, last, window_s) > alike_m:
+                return False
+        own = self.tests.totals(
+            self.steps, one.begin, *(of[: last - one.begin] for of in (one.residual_m, one.survey_m))
+        )
+        sums = one.before.residual_m + own.residual_m, other.before.residual_m
+        return abs(sums[0] - sums[1]) <= alike_m * max(one.before.number + own.number, 1.0)
 
     def _follow(self, node: Node) -> list[Node]:
         """Along its element up to where it leaves it or is refuted for long enough; returns what it goes on as."""
@@ -353,7 +414,8 @@ class _Growth:
             node.barred = min(node.barred, self._unread(node))
             node.rejected = min(node.rejected, node.barred)
             verdict = self.tests.of(self.steps, self._trail(node))
-            node.p = min(node.p, verdict.p)
+            node.p_by_step = np.minimum(node.p, np.concatenate([np.ones(1), verdict.p]))
+            node.p = float(node.p_by_step[-1])
             node.rejected = min(node.rejected, verdict.rejected)
         if node.rejected < count:
             # Refuted: live it counts for as long as that is not known yet.
@@ -374,13 +436,18 @@ class _Growth:
         return Trail(node.stretch, chain[0].begin, node.begin, residual_m, survey_m, heading_rad, node.before)
 
     def _unread(self, node: Node) -> int:
-        """The first step of the node at which a balise was read that is on no element that joins its own."""
+        """The first step of the node at which a balise was read on an element that the train cannot have come from."""
         for step in (node.begin + np.flatnonzero(self.steps.pinned[node.begin : node.end] >= 0)).tolist():
-            element = int(self.steps.pinned[step])
-            sides = ((2 * node.element + a, 2 * element + b) for a in (0, 1) for b in (0, 1))
-            if element != node.element and not any(self.network.linked(*pair) for pair in sides):
+            # A read belongs to the step after it: in the meantime the train went on.
+            way_m = (1.0 + self.config.detour_share) * float(self.steps.way_m[step]) + self.config.paths_end_m
+            if not self._within(node.element, int(self.steps.pinned[step]), way_m):
                 return int(step)
         return 2**62
+
+    def _within(self, one: int, other: int, way_m: float) -> bool:
+        """Two elements are the same, or not so far apart along the network."""
+        reached = (self.network.reach(2 * one + side, way_m).get(2 * other + to) for side in (0, 1) for to in (0, 1))
+        return one == other or any(reach is not None and reach.distance_m <= way_m for reach in reached)
 
     def _inside(self, rows: Ints) -> Bools:
         """Places on the element; past an open end as far as the noise may lead."""
@@ -437,6 +504,7 @@ class _Growth:
                 node.residual_m = np.append(node.residual_m, sense * candidates.offset_m[row])
                 node.survey_m = np.append(node.survey_m, self.survey_m[row])
                 node.heading_rad = np.append(node.heading_rad, node.heading_rad[-1:] if node.heading_rad.size else 0.0)
+                node.p_by_step = np.append(node.p_by_step, node.p)
                 node.left_m = np.vstack([node.left_m, [candidates.along_m[row], candidates.left_m[row]]])
                 node.end = step + 1
                 child = self._child(node, node.oriented, step + 1)

@@ -33,10 +33,10 @@ _MEASURED_S, _MEASURED_WINDOWS = 48.0, 6.0
 
 
 class Verdict(NamedTuple):
-    """The first step at which a path is refuted (a large number: at none), and its least p-value."""
+    """The first step at which a path is refuted (a large number: at none); the least p-value up to each new step."""
 
     rejected: int
-    p: float
+    p: Floats
 
 
 class Totals(NamedTuple):
@@ -100,6 +100,11 @@ class PathTests:
         limit = _size(self.config.paths_alpha, LOOKED_S / self.config.paths_level_s)
         return np.asarray(limit * np.sqrt(self.config.cross_bias_sigma_m**2 + survey_m**2 + sigma_m**2))
 
+    def moved_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
+        """By more than so much two means of `paths_level_s`, a while apart, differ on no path [m]."""
+        limit = _size(self.config.paths_alpha, LOOKED_S / self.config.paths_level_s)
+        return np.asarray(limit * np.sqrt(2.0) * np.hypot(sigma_m, survey_m))
+
     @property
     def longest_s(self) -> float:
         """As far back as a movement looks."""
@@ -107,16 +112,28 @@ class PathTests:
 
     def totals(self, steps: PathSteps, begin: int, residual_m: Floats, survey_m: Floats) -> Totals:
         """Over the steps from `begin` on."""
-        return Totals(*(float(value) for value in self._counted(steps, begin, residual_m, survey_m).sum(axis=1)))
+        counted = self._counted(steps, begin, residual_m, survey_m, np.zeros(residual_m.size))
+        return Totals(*(float(value) for value in counted[: len(NO_STEPS)].sum(axis=1)))
+
+    def farthest_m(self, steps: PathSteps, apart_m: Floats, last: int, window_s: float) -> float:
+        """Of differences at the steps before `last`, 0 where none counts, the largest mean over any window [m].
+
+        Windows may end later, where nothing differs; none counts with fewer than `_WHOLE` of its steps.
+        """
+        size = max(round(window_s / float(steps.period_s[last])), 1)
+        sums = np.cumsum(np.concatenate([np.zeros(1), apart_m, np.zeros(size)]))
+        counts = np.cumsum(np.concatenate([np.zeros(1), steps.counted[last - apart_m.size : last], np.ones(size)]))
+        number = np.maximum(counts[size:] - counts[:-size], _WHOLE * size)
+        return float((np.abs(sums[size:] - sums[:-size]) / number).max(initial=0.0))
 
     def of(self, steps: PathSteps, trail: Trail) -> Verdict:
         """Test the new steps of a path."""
-        values = self._counted(steps, trail.start, trail.residual_m, trail.survey_m)
+        values = self._counted(steps, trail.start, trail.residual_m, trail.survey_m, trail.heading_rad)
         sums = np.zeros((values.shape[0], values.shape[1] + 1))
         np.cumsum(values, axis=1, out=sums[:, 1:])
         at = np.arange(trail.begin, trail.start + values.shape[1])
         refuted = np.zeros(at.size, dtype=np.bool_)
-        p = 1.0
+        p = np.ones(at.size)
         offset_looks = LOOKED_S / self.config.paths_level_s
         tests = [(self._offset(steps, sums, trail, at)[None], np.array([offset_looks]))]
         if (apart := at >= self.alone).any():
@@ -124,18 +141,22 @@ class PathTests:
             tests.append((self._lasting(steps, sums, trail, at)[None] * apart, np.array([_LASTING_LOOKS])))
         for sigmas, looks in tests:
             refuted |= (sigmas > _sizes(self.config.paths_alpha, looks)[:, None]).any(axis=0)
-            p = min(p, float((_TESTS * looks * 2.0 * _tails(sigmas.max(axis=1, initial=0.0))).min()))
+            if (_TESTS * looks * 2.0 * _tails(sigmas.max(axis=1, initial=0.0))).min() < 1.0:
+                p = np.minimum(p, (_TESTS * looks[:, None] * 2.0 * _tails(sigmas)).min(axis=0))
         first = np.flatnonzero(refuted)
-        return Verdict(int(at[first[0]]) if first.size else 2**62, p)
+        return Verdict(int(at[first[0]]) if first.size else 2**62, np.minimum.accumulate(p))
 
-    def _counted(self, steps: PathSteps, begin: int, residual_m: Floats, survey_m: Floats) -> Floats:
-        """Per step 1, residual, sigma of the survey and square of that of the position; zeros where it does not count.
+    def _counted(
+        self, steps: PathSteps, begin: int, residual_m: Floats, survey_m: Floats, heading_rad: Floats
+    ) -> Floats:
+        """Per step 1, residual, sigma of the survey, square of that of the position, and its normal (north, east).
 
-        Shape (4, n).
+        Zeros where it does not count; shape (6, n).
         """
         part = slice(begin, begin + residual_m.size)
         counted = steps.counted[part] & np.isfinite(residual_m)
-        values = np.stack([np.ones(residual_m.size), residual_m, survey_m, steps.sigma_m[part] ** 2])
+        normal = np.sin(heading_rad), -np.cos(heading_rad)
+        values = np.stack([np.ones(residual_m.size), residual_m, survey_m, steps.sigma_m[part] ** 2, *normal])
         return np.where(counted, values, 0.0)
 
     def _movements(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> Floats:
@@ -152,8 +173,8 @@ class PathTests:
         now_mean, then_mean = (part[1:] / np.maximum(part[0], 1.0) for part in (now, then))
         survey_m2 = now_mean[1] ** 2 + then_mean[1] ** 2
         sigma_m2 = 0.5 * (now_mean[2] + then_mean[2])
-        turned = trail.heading_rad[at - trail.start] - trail.heading_rad[np.minimum(early_end, at - trail.start)]
-        swung_m2 = (self.config.cross_bias_sigma_m * 2.0 * np.sin(0.5 * turned)) ** 2
+        # A bias of any direction moves the mean of a window by its part along the mean normal there.
+        swung_m2 = self.config.cross_bias_sigma_m**2 * ((now_mean[3:] - then_mean[3:]) ** 2).sum(axis=0)
         root_m = np.sqrt(np.maximum(survey_m2 + self._noise_m2(steps, sigma_m2, at) + swung_m2, 1e-12))
         spare_m = np.maximum(np.abs(now_mean[0] - then_mean[0]) - 2.0 * self.config.paths_alike_m, 0.0)
         return np.where(usable & np.isfinite(root_m), spare_m / root_m, 0.0)
@@ -176,13 +197,13 @@ class PathTests:
         late = np.searchsorted(steps.end_s, steps.end_s[at] - self.config.paths_level_s, side="right")
         late = np.maximum(np.minimum(late, at) - trail.start, 0)
         part = sums[:, at + 1 - trail.start] - sums[:, late]
-        least = np.minimum(_WHOLE * self.config.paths_level_s / steps.period_s[at], 1.0)
+        least = _WHOLE * self.config.paths_level_s / steps.period_s[at]
         return self._in_sigmas(part, part[0] >= least, self.excess[at])
 
     def _lasting(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> Floats:
         """The mean of the whole way, in sigmas."""
         own = sums[:, at + 1 - trail.start] - sums[:, [trail.begin - trail.start]]
-        part = own + np.array(trail.before)[:, None]
+        part = own[: len(NO_STEPS)] + np.array(trail.before)[:, None]
         lasted_s = np.maximum(steps.end_s[at] - steps.end_s[trail.first], 1e-9)
         share = _SLOW + (1.0 - _SLOW) * np.minimum(1.0, _AVERAGED_S / lasted_s)
         return self._in_sigmas(part, part[0] >= _LASTING_STEPS, share * self.excess[at])

@@ -14,7 +14,7 @@ from pipeline.stages.reference.open_ends import off_the_survey
 from pipeline.stages.reference.samples import Samples, samples_of
 from pipeline.stages.reference.visits import ElementStay
 from pipeline.stages.reference.ways import ways_of
-from pipeline.stages.track.chain import Chain
+from pipeline.stages.track.chain import Chain, moved_on
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
@@ -68,7 +68,8 @@ def reference_stretches(
     stretches: list[ReferenceStretch] = []
     covered = np.zeros(samples.t_ns.size, dtype=np.bool_)
     for rows in _between_gaps(samples.t_ns, np.flatnonzero(near), hazards.reference_gap_s):
-        if paths := search.paths(rows):
+        rows, paths = search.paths(rows)
+        if paths:
             part = slice(int(rows[0]), int(rows[-1]) + 1)
             stretches.append(ReferenceStretch(samples.t_ns[part], samples.sigma_m[part], paths))
             covered[part] = True
@@ -108,8 +109,12 @@ class _Search:
     numbers: dict[str, int]
     config: Configuration
 
-    def paths(self, rows: Ints) -> tuple[ReferencePath, ...]:
-        """All ways through samples without a gap; none where they are more than `routes_limit`, or all are refuted."""
+    def paths(self, rows: Ints) -> tuple[Ints, tuple[ReferencePath, ...]]:
+        """All ways through samples without a gap, and those they run through.
+
+        None where they are more than `routes_limit`, or all are refuted; where a movement led back from aside, those
+        through the samples after it.
+        """
         hazards = self.config.hazards
         law = self.config.matching.model_copy(
             update={
@@ -123,7 +128,9 @@ class _Search:
         found = path_set(steps, self.network, law)
         begins = rows[0] + np.searchsorted(samples.t_ns[rows], steps.begin_ns)
         ends = np.append(begins[1:], rows[-1] + 1)
-        return tuple(self._path(stays, begins, ends) for stays in ways_of(found, law, hazards.routes_limit))
+        first, ways = ways_of(found, law, hazards.routes_limit)
+        begins, ends = begins[first:], ends[first:]
+        return rows[int(begins[0] - rows[0]) :], tuple(self._path(stays, begins, ends) for stays in ways)
 
     def _path(self, stays: Sequence[ElementStay], begins: Ints, ends: Ints) -> ReferencePath:
         """A way with coordinates: each sample on the nearest of the elements that the way visits about then.
@@ -159,34 +166,11 @@ class _Search:
 
 
 def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
-    """The way as chains of one coordinate, and of each visit its chain and where it is entered [m].
-
-    A new chain begins where the train, having turned, takes another branch than that which it came from.
-    """
+    """The way as chains of one coordinate, and of each visit its chain and where it is entered [m]."""
     chains = [Chain((stays[0].oriented,), (0.0,))]
     placed = [(0, 0.0)]
-    here = 0
+    at = 0
     for stay in stays[1:]:
-        chain = chains[-1]
-        last = chain.oriented[here]
-        onward = here + (-1 if stay.back else 1)
-        if 0 <= onward < len(chain.oriented) and chain.oriented[onward] == stay.oriented:
-            here = onward
-        elif stay.back:
-            entry_m = chain.entry_m[here] - _gap_m(network, stay.oriented, last) - network.length_m(stay.oriented)
-            grown = Chain((stay.oriented, *chain.oriented[here:]), (entry_m, *chain.entry_m[here:]))
-            # At its first element the chain itself grows backwards; further on another branch begins.
-            chains = [*chains[: None if here else -1], grown]
-            here = 0
-        else:
-            entry_m = chain.entry_m[here] + network.length_m(last) + _gap_m(network, last, stay.oriented)
-            grown = Chain((*chain.oriented[:onward], stay.oriented), (*chain.entry_m[:onward], entry_m))
-            chains = [*chains[: None if onward < len(chain.oriented) else -1], grown]
-            here = onward
-        placed.append((len(chains) - 1, chains[-1].entry_m[here]))
+        at = moved_on(chains, network, at, stay.oriented, -1 if stay.back else 1)
+        placed.append((len(chains) - 1, chains[-1].entry_m[at - chains[-1].low]))
     return chains, placed
-
-
-def _gap_m(network: Network, from_oriented: int, to_oriented: int) -> float:
-    """Way between the ends of two linked net elements [m]."""
-    return next(edge.gap_m for edge in network.successors[from_oriented] if edge.to == to_oriented)

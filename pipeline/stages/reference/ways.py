@@ -11,30 +11,36 @@ from pipeline.stages.reference.visits import ElementStay, Link, VisitNode, ways_
 from schemas.config import MatchingConfig
 
 
-def ways_of(found: PathSet, config: MatchingConfig, most: int) -> list[list[ElementStay]]:
-    """Ways from the first step to the last that together run over every hypothesis that nothing refutes.
+def ways_of(found: PathSet, config: MatchingConfig, most: int) -> tuple[int, list[list[ElementStay]]]:
+    """Ways to the last step that together run over every hypothesis that nothing refutes, and the step they begin at.
 
-    None where there are more than `most`, and none where every path is refuted: a set that began anew knows nothing of
-    what went wrong before.
+    Steps of stays count from there: the first one, or where a movement led back after every path was refuted. No ways
+    where there are more than `most`, and where every path is refuted: a set that began anew without such a movement
+    knows nothing of what went wrong before.
     """
-    last = len(found.steps) - 1
-    if found.overflow <= last:
-        return []
-    nodes = {id(node): node for node in _living(found)}
-    visits = {key: VisitNode(node.oriented, node.begin, node.end - 1) for key, node in nodes.items() if _lasts(node)}
+    count = len(found.steps)
+    first = max((node.stretch for node in found.nodes), default=0)
+    if found.overflow < count or first not in (0, *found.returned):
+        return first, []
+    nodes = {id(node): node for node in _living(found, first)}
+    visits = {
+        key: VisitNode(node.oriented, node.begin - first, node.end - 1 - first)
+        for key, node in nodes.items()
+        if _lasts(node)
+    }
     moves = Moves.without_odometer(found.network, found.steps, config)
     every = list(visits.values())
     for key, visit in visits.items():
         node = nodes[key]
         for origin, end in _origins(node):
-            every += _linked(moves, visits[id(origin)], visit, origin, node, end)
-    return [_without_cuts(way) for way in ways_over(every, last, most)]
+            every += _linked(moves, visits[id(origin)], visit, origin, node, end, first)
+    return first, [_without_cuts(way) for way in ways_over(every, count - 1 - first, most)]
 
 
-def _living(found: PathSet) -> Iterator[Node]:
-    """The hypotheses that lived from the first step to the last, and all that they went through."""
+def _living(found: PathSet, stretch: int) -> Iterator[Node]:
+    """The hypotheses of a stretch that lived to the last step, and all that they went through."""
     count = len(found.steps)
-    waiting = [node for node in found.nodes if node.stretch == 0 and node.end >= count and node.rejected >= count]
+    waiting = [node for node in found.nodes if node.stretch == stretch and node.end >= count and node.rejected >= count]
     known: set[int] = set()
     while waiting:
         node = waiting.pop()
@@ -60,14 +66,19 @@ def _origins(node: Node) -> Iterator[tuple[Node, int]]:
             waiting += [(further, step) for further in origin.origins]
 
 
-def _linked(moves: Moves, here: VisitNode, there: VisitNode, origin: Node, node: Node, step: int) -> list[VisitNode]:
-    """Link two visits behind the step before `step`; returns visits of elements between, on which no sample lies."""
+def _linked(
+    moves: Moves, here: VisitNode, there: VisitNode, origin: Node, node: Node, step: int, first: int
+) -> list[VisitNode]:
+    """Link two visits behind the step before `step`; returns visits of elements between, on which no sample lies.
+
+    Visits count steps from `first` on.
+    """
     begin = _place(origin, step - 1)
     end = _place(node, step)
     move = moves.best(begin, end)
     if move is None or moves.cost(begin, end, moves.way(begin.step, end.step)) >= moves.break_cost:
         return []
-    at = step - 1
+    at = step - 1 - first
     sense = move.sense or 1
     between = [VisitNode(oriented, at, at, sampled=False) for oriented in move.between]
     for one, other in pairwise([here, *between, there]):

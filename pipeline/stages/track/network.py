@@ -8,7 +8,6 @@ a switch comes out on another predecessor. So direction of travel is no state of
 from __future__ import annotations
 
 import copy
-import heapq
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
+from pipeline.stages.track.chain import Chain, Reach, search
 from pipeline.stages.track.chords import Chords
 from pipeline.stages.track.leg import Visit
 from pipeline.stages.track.once import Once
@@ -42,15 +42,6 @@ class Edge(NamedTuple):
     gap_m: float
     forward: bool
     backward: bool
-
-
-class Reach(NamedTuple):
-    """Network distance [m] from an element's exit to another's entry, what lies between, moves not allowed."""
-
-    distance_m: float
-    between: tuple[int, ...]
-    barred_forward: int
-    barred_backward: int
 
 
 @dataclass(frozen=True)
@@ -140,11 +131,22 @@ class Network:
         return float(self.track.length_m[oriented // 2])
 
     def reach(self, oriented: int, limit_m: float) -> dict[int, Reach]:
-        """Everything whose entry lies within `limit_m` beyond the exit of an oriented element."""
+        """Everything whose entry lies within `limit_m` beyond the exit of an oriented element, each by its nearest way.
+
+        An element is reached from itself over a loop.
+        """
         known = self._known.get(oriented)
         if known is None or known[0] < limit_m:
             limit_m = max(limit_m, MIN_REACH_M)
-            known = (limit_m, self._search(oriented, limit_m))
+            begin = Chain.behind(self, oriented)
+            found = search(
+                self,
+                begin,
+                limit_m,
+                lambda chain: self.successors[chain.oriented[-1]],
+                lambda chain: None if chain is begin else chain.oriented[-1],
+            )
+            known = (limit_m, {reach.chain.oriented[-1]: reach for reach in itertools.islice(found, 1, None)})
             self._known[oriented] = known
         return known[1]
 
@@ -154,43 +156,19 @@ class Network:
             edge.to == there for here, there in ((first, second), (second, first)) for edge in self.successors[here]
         )
 
+    def way(self, here: int, to: int) -> Edge:
+        """The way from an oriented element to a successor."""
+        return next(edge for edge in self.successors[here] if edge.to == to)
+
     def linked_ends(self) -> Bools:
         """Per element, whether a relation leads on from its start and from its end."""
         onward = np.diff(self.successors.first) > 0
         return onward.reshape(-1, 2)[:, ::-1]
 
-    def _search(self, source: int, limit_m: float) -> dict[int, Reach]:
-        """Dijkstra; a move that is not allowed counts as a long detour, so an allowed way is preferred."""
-        settled: dict[int, Reach] = {}
-        queue: list[tuple[float, int, Reach]] = []
-        self._push(queue, source, Reach(0.0, (), 0, 0))
-        while queue:
-            _, oriented, so_far = heapq.heappop(queue)
-            if oriented in settled or so_far.distance_m > limit_m:
-                continue
-            settled[oriented] = so_far
-            through = (*so_far.between, oriented)
-            onward = so_far._replace(distance_m=so_far.distance_m + self.length_m(oriented), between=through)
-            self._push(queue, oriented, onward)
-        return settled
-
-    def _push(self, queue: list[tuple[float, int, Reach]], oriented: int, so_far: Reach) -> None:
-        for edge in self.successors[oriented]:
-            reach = Reach(
-                so_far.distance_m + edge.gap_m,
-                so_far.between,
-                so_far.barred_forward + (not edge.forward),
-                so_far.barred_backward + (not edge.backward),
-            )
-            barred = min(reach.barred_forward, reach.barred_backward)
-            heapq.heappush(queue, (reach.distance_m + barred * BARRED_DETOUR_M, edge.to, reach))
-
 
 # Numerics: searches go at least so far, so that one of them answers for several. What is found farther away than asked
 # competes by its length as every way does.
 MIN_REACH_M = 150.0
-# Only the order of the search: longer than any allowed way between two steps, so that an allowed one is found first.
-BARRED_DETOUR_M = 10_000.0
 
 
 def network_of(track: SurveyedTrack, links: pl.DataFrame) -> Network:
