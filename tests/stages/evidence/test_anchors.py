@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.stages.evidence.anchors import Sided, Witness, Witnesses, known_stretch, reference_ways, sided
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
-from pipeline.stages.evidence.clock import RecorderClock, lag_of
+from pipeline.stages.evidence.clock import Lags, RecorderClock, lags_of
 from pipeline.stages.odometry import odometry_of
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place, RoutePath
@@ -35,7 +35,7 @@ def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch
 
 def against(*counters: Counter) -> Witnesses:
     """These odometers on the reference's clock, their scale within 5 %."""
-    return Witnesses(tuple(Witness.of(counter, [], CONFIG) for counter in counters))
+    return Witnesses(tuple(Witness.of(counter, Lags(), False, CONFIG) for counter in counters))
 
 
 def counter(at_m: Floats, rate_hz: float) -> Counter:
@@ -77,12 +77,13 @@ def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     t_s = np.arange(0.0, 71.0, 0.1)
     late = stretch(t_s + 0.4, np.interp(t_s, fine_s, way_m))
     counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, way_m), 10.0)
-    found = lag_of(*reference_ways([Sided(late, 1, 1.0, 0.0)], no_gaps), counted)
+    (found,) = lags_of(*reference_ways([Sided(late, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
     assert found.lag_s == pytest.approx(0.4, abs=0.03)
     assert found.lag_sigma_s < 0.05
     cut = late.t_ns <= 60 * NS_PER_S
     few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (late.paths[0].part(slice(int(cut.sum()))),))
-    assert not lag_of(*reference_ways([Sided(few, 1, 1.0, 0.0)], no_gaps), counted).measured
+    (unsure,) = lags_of(*reference_ways([Sided(few, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
+    assert not unsure.measured
 
 
 def test_a_clock_counts_by_the_greatest_speed_that_it_leaves_possible() -> None:
