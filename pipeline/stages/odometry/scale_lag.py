@@ -41,6 +41,8 @@ _STAYS = 0.05
 # Least number of ways for a lag, and for one of more than a second; no more are looked at in the search.
 FEWEST, _FEWEST_FAR = 6, 12
 _NEAR_S = 1.0
+# Two ways fit some scale and lag.
+_FEWEST_TELLING = 2
 _SEARCHED = 800
 # A speed is taken over so much on both sides of an instant, and beside it from twice to four times that, so that the
 # rows whose noise is in one are not in the other [s].
@@ -202,7 +204,8 @@ def possible_lags(
 
     A set of confidence at `factor` sigmas by the sum of squares, of ways with errors of `sigma_m` each or of what the
     best lag leaves, if that is more, with the scale within 1 +- `scale_off`. They tell nothing where ways without any
-    error would not refute a lag at an end of the search: noise widens the set, and never makes it nothing.
+    error would not refute a lag at an end of the search: noise widens the set, and never makes it nothing. One or two
+    ways that tell nothing are too few to show that it is the journey, at one speed, that hides a lag: any is possible.
     """
     begin_s, end_s, way_m = ways
     if begin_s.size == 0:
@@ -216,7 +219,7 @@ def possible_lags(
     likeliest = int((left + counts.max() - counts).argmin())
     exact = np.where(np.isfinite(counted[likeliest]), counted[likeliest], seen)
     if (_left_over(counted[[0, -1]], exact, scale_off) <= factor**2).any():
-        return None
+        return None if counts.max() > _FEWEST_TELLING else (-_FARTHEST_S, _FARTHEST_S)
     best = float(left[likeliest] + counts.max() - counts[likeliest])
     # Two ways fit some lag and scale whatever their noise is.
     free = max(float(counts[likeliest]) - 2.0, 0.0)
