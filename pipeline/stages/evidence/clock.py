@@ -46,17 +46,25 @@ class Lags:
     def range_s(self, declared: bool, config: HazardConfig) -> tuple[float, float] | None:
         """Least and largest lag that the recorder may have; None where it is what is assumed of a clock.
 
-        `declared`: its lag is in the vehicle file and taken off, which holds where the ways refute it not.
+        `declared`: its lag is in the vehicle file and taken off, which holds unless the ways refute it.
         """
         measured = [lag for lag in self.found if _measured(lag, config)]
         if not measured:
-            low_s, high_s = self.possible_s or (0.0, 0.0)
-            holds = low_s <= config.evidence_clock_s and high_s >= -config.evidence_clock_s
-            return None if declared and holds else self.possible_s
+            return self._unproved_s(declared, config)
         noises_s = [config.evidence_factor * lag.lag_sigma_s for lag in measured]
         lows_s = [lag.lag_s - noise_s for lag, noise_s in zip(measured, noises_s, strict=True)]
         highs_s = [lag.lag_s + noise_s for lag, noise_s in zip(measured, noises_s, strict=True)]
         return min(lows_s), max(highs_s)
+
+    def _unproved_s(self, declared: bool, config: HazardConfig) -> tuple[float, float] | None:
+        """About none, as far as it may reach: what is not measured moves nothing, it may be a slip."""
+        if self.possible_s is None:
+            return None
+        low_s, high_s = self.possible_s
+        if declared and low_s <= config.evidence_clock_s and high_s >= -config.evidence_clock_s:
+            return None
+        reach_s = max(-low_s, high_s)
+        return -reach_s, reach_s
 
 
 def clock_of(lags: Sequence[Lags], independent: bool, declared: bool, config: HazardConfig) -> RecorderClock:

@@ -224,7 +224,10 @@ def possible_lags(
     # Two ways fit some lag and scale whatever their noise is.
     free = max(float(counts[likeliest]) - 2.0, 0.0)
     noise = max(_student(free) ** 2 * float(left[likeliest]) / free, 1.0) if free else 1.0
-    lags_s = _FINE_LAGS_S[left - best <= factor**2 * noise]
+    possible = left - best <= factor**2 * noise
+    # One or two ways leave nothing over that would show that a slip was it, and no lag.
+    possible[_FINE_LAGS_S.size // 2] |= free == 0.0
+    lags_s = _FINE_LAGS_S[possible]
     return float(lags_s[0] - _FINE_S), float(lags_s[-1] + _FINE_S)
 
 
