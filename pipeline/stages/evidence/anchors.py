@@ -25,6 +25,8 @@ from schemas.enums import BaliseKind, Evidence
 # DOMAIN section 5.1: the reference is held against the odometer over so long; a spike is no longer [s].
 _WINDOW_S = 10.0
 _LONG_WINDOW_S = 100.0
+# Long windows begin again half-way: a drift that two of them share lies within one of the others.
+_BEGUN_S = (0.0, 0.5 * _LONG_WINDOW_S)
 # Least number of samples for a median.
 _FEWEST_IN_WINDOW = 5
 # Numerics: before and after all runs [ns].
@@ -433,8 +435,11 @@ def contradictions(
     over_windows = witnesses
     if not witnesses.signed:
         over_windows = replace(witnesses, all=tuple(witness.without_sign() for witness in witnesses.all))
-    for window_s, fixed_m in ((_WINDOW_S, 0.0), (_LONG_WINDOW_S, config.lds.odometer_fixed_m)):
-        found = _drifts(known, stretch, over_windows, np.cumsum(gathered_m), (window_s, fixed_m), config)
+    for window in (
+        (_WINDOW_S, 0.0, 0.0),
+        *((_LONG_WINDOW_S, late_s, config.lds.odometer_fixed_m) for late_s in _BEGUN_S),
+    ):
+        found = _drifts(known, stretch, over_windows, np.cumsum(gathered_m), window, config)
         for step in found:
             gathered_m[step.sample + 1] += step.step_m
         steps += found
@@ -446,13 +451,17 @@ def _drifts(
     stretch: ReferenceStretch,
     witnesses: Witnesses,
     explained_m: Floats,
-    window: tuple[float, float],
+    window: tuple[float, float, float],
     config: Configuration,
 ) -> list[ReferenceStep]:
-    """Windows (length [s], fixed error of odometers [m]) that an odometer contradicts beyond `explained_m` of steps."""
+    """Windows that an odometer contradicts beyond `explained_m` of steps.
+
+    `window`: length, first begin [s], and what an odometer may be off whatever it counted [m].
+    """
     t_ns = stretch.t_ns
-    window_s, fixed_m = window
-    ends = np.unique(np.searchsorted(t_ns, np.arange(int(t_ns[0]), int(t_ns[-1]), round(window_s * NS_PER_S))))
+    window_s, late_s, fixed_m = window
+    begin_ns = int(t_ns[0]) + round(late_s * NS_PER_S)
+    ends = np.unique(np.searchsorted(t_ns, np.arange(begin_ns, int(t_ns[-1]), round(window_s * NS_PER_S))))
     begin = ends[:-1]
     end = ends[1:]
     if begin.size == 0:
