@@ -3,10 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # Test processes with threads of linear algebra each wait for one another and spend twenty times the processor time.
-# One for each of two cores: each takes seconds to start. Compiled modules are kept, or each of the many processes
-# compiles the program and the tests again.
+# One for each of two cores, and one that works while others wait for stores, workers and signals: each takes ten seconds
+# to start. Folders in the order of their names: campaigns, whose files take longest, come first, and short files last.
+# Compiled modules are kept, or each of the many processes compiles the program and the tests again.
 TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 POLARS_MAX_THREADS=1 \
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 STAMP := $(VENV)/.balise-installed
 
 .PHONY: install demo test quick stress check lint types bench docs mutations dictionary lock clean

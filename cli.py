@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import io
 import json
 import os
 import re
@@ -16,7 +17,7 @@ from dataclasses import asdict
 from datetime import datetime
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TextIO, TypeVar
 
 from typer import Argument, Exit, Option, Typer, confirm
 from typer.core import TyperCommand
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.campaign import CampaignSummary, Interrupted, Plan
+    from pipeline.campaign.verify import Verification
     from pipeline.project.trial import Wanted
     from schemas.config import Configuration, StreamCorrection, Vehicle
     from schemas.run import RunLog
@@ -105,6 +107,10 @@ ResultFolder = Annotated[Path, _place(help="A result of `balise replay`.")]
 Run = Annotated[str, Argument(help="A recorded run.")]
 Site = Annotated[str, Option(help="Site: a folder with track, links, balises and route, or a GeoJSON file.")]
 LogsAgain = Annotated[list[str] | None, Option("--logs", help="Logs to replay again: paths, folders, patterns.")]
+Guard = Annotated[
+    bool,
+    Option("--guard/--no-guard", help="CSV: an apostrophe before texts that spreadsheets would run (=, +, -, @)."),
+]
 LogsSite = Annotated[str | None, Option("--site", help="Site of these logs.")]
 OutFolder = Annotated[Path, _file("--out", help="Folder to write.")]
 VehicleFile = Annotated[Path | None, _file("--vehicle", help="Vehicle file (TOML).")]
@@ -315,6 +321,7 @@ def run(
     from pipeline.campaign import Interrupted
     from pipeline.project.opened import open_project
     from pipeline.project.run import Call, run_project
+    from pipeline.results.manifest import anchor, anchor_words
     from pipeline.show.progress import show_summary, summary_answer, watches
     from pipeline.show.terminal import how_far
 
@@ -331,7 +338,9 @@ def run(
     except Interrupted as interrupted:
         raise _stopped(interrupted, out, quiet, as_json, places) from None
     if as_json:
-        made = {"page": ended.page, "changed": ended.changed, "unread": ended.unread}
+        digest, runs = anchor(out)
+        manifest = {"sha256": digest, "runs": runs}
+        made = {"page": ended.page, "changed": ended.changed, "unread": ended.unread, "manifest": manifest}
         _print_json({**summary_answer(ended.summary, out), **made})
     else:
         show_summary(ended.summary, out, quiet, False, has_pages=ended.page is not None, **places)
@@ -339,6 +348,7 @@ def run(
             print(line, file=sys.stderr if quiet else sys.stdout)
     if not (quiet or as_json):
         print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
+        print(anchor_words(*anchor(out)))
     raise Exit(_status_of(ended.summary, options.fail_on) or (RUNS_NOT_OK if ended.unread else OK))
 
 
@@ -739,6 +749,7 @@ def sql(
         Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
     ] = None,
     csv: Annotated[Path | None, _file("--csv", metavar="FILE", help=_CSV)] = None,
+    guard: Guard = True,
     parquet: Annotated[Path | None, _file(metavar="FILE", help="Write Parquet.")] = None,
     xlsx: Annotated[Path | None, _file(metavar="FILE", help="Write an Excel workbook (extra `excel`).")] = None,
     as_json: Json = False,
@@ -753,7 +764,7 @@ def sql(
     from pipeline.results.query import named_results, run_sql
 
     answer = run_sql(out, query, allow_files, named_results(beside or []))
-    written = write_answer(answer, csv, parquet, xlsx, file)
+    written = write_answer(answer, csv, parquet, xlsx, file, guard)
     for name in written:
         _say(f"{answer.height} rows in {name}")
     if as_json or not (written or csv):
@@ -777,11 +788,14 @@ def report(
 
     Pages of runs that have not changed since the last report are left as they are.
     """
+    from pipeline.results.packs import steady
     from pipeline.show.report import write_page, write_report
 
     ground = _ground(site, _used(out)) if site else None
     with _telling("pages", quiet):
-        pages = write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
+        pages = steady(
+            lambda: write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
+        )
     if as_json or not quiet:
         _tell(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
 
@@ -838,11 +852,13 @@ def export(
     project: OfProject = None,
 ) -> None:
     """Export one run with its results to MCAP viewers (Foxglove, Lichtblick, Rerun) or maps."""
+    from pipeline.results.packs import steady
     from pipeline.show.export import export_run
 
     recorded = _log(log, _configuration(config), True) if log else None
     ground = _ground(site, _used(out)) if site else None
-    files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
+    layout: Literal["ros", "foxglove"] = "ros" if ros else "foxglove"
+    files, missing = steady(lambda: export_run(out, run, to, ground, recorded, layout))
     words = ["Wrote " + " and ".join(map(str, files)), *(f"Without {text}" for text in missing)]
     _tell(as_json, {"files": files, "missing": missing}, {}, *words)
 
@@ -857,29 +873,50 @@ def verify(
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     route: RouteFiles = None,
+    expect: Annotated[str | None, Option("--expect", help="SHA-256 of manifest.json as it was kept elsewhere.")] = None,
     jobs: Jobs = 0,
     quiet: Quiet = False,
     as_json: Json = False,
     project: OfProject = None,
 ) -> None:
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
-    from pipeline.campaign.verify import recompute
+    from pipeline.campaign.verify import as_kept, recompute
     from pipeline.campaign.verify import verify as compare
+    from pipeline.results.manifest import anchor, anchor_words
     from pipeline.show.progress import progress_watch
 
+    found = [as_kept(out, expect)] if expect else []
     with _telling("runs", quiet):
-        found = [compare(out)]
+        found.append(compare(out))
     if logs:
         settings = _configuration(config) if config else None
         shown = [] if quiet else [progress_watch()]
+        found += _from_raw_logs(logs, project)
         found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs, shown))
     if as_json:
         compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
-        _print_json({"agrees": not any(one.problems for one in found), "comparisons": compared})
+        digest, runs = anchor(out)
+        manifest = {"sha256": digest, "runs": runs}
+        _print_json({"agrees": not any(one.problems for one in found), "manifest": manifest, "comparisons": compared})
     for one in found if not as_json else []:
         if one.problems or not quiet:
             _tell(False, None, {"": one.table} if one.problems else {}, one.sentence)
+    if not (as_json or quiet):
+        print(anchor_words(*anchor(out)))
     raise Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
+
+
+def _from_raw_logs(logs: list[str], project: Path | None) -> list[Verification]:
+    """In a project: whether the raw logs of these runs give them again."""
+    from datasets.recordings import recordings
+    from pipeline.campaign import find_runs
+    from pipeline.project.opened import project_here
+    from pipeline.project.reconvert import reconverted
+
+    opened = project_here(project)
+    if opened is None or not opened.project.convert:
+        return []
+    return [reconverted(opened, recordings(), find_runs(logs).values())]
 
 
 @_command("balise compact week12", "balise compact s3://trial/week12 --runs-per-file 5000")
@@ -924,10 +961,30 @@ def diff(
 
 def main() -> None:
     """Entry point of the program: turns whatever happens into one message and an exit status."""
+    sys.stdout, sys.stderr = _unbroken(sys.stdout), _unbroken(sys.stderr)
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     status = _guarded(arguments, debug="--debug" in sys.argv[1:])
     gc.freeze()
     sys.exit(status)
+
+
+class _Unbroken(io.FileIO):
+    """What is written where nobody reads any more (`| head`) is lost, and changes neither the work nor its status."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            return len(data)
+
+
+def _unbroken(stream: TextIO) -> TextIO:
+    try:
+        raw = _Unbroken(stream.fileno(), "w", closefd=False)
+    except (OSError, ValueError, AttributeError):  # there is none
+        return stream
+    at_once = stream is sys.stderr or raw.isatty()
+    return io.TextIOWrapper(io.BufferedWriter(raw), stream.encoding, stream.errors, line_buffering=at_once)
 
 
 @cache
@@ -949,10 +1006,6 @@ def _guarded(arguments: list[str], debug: bool) -> int:
     except KeyboardInterrupt:
         _complain("interrupted", debug)
         return 128 + signal.SIGINT
-    except BrokenPipeError:
-        # The reader of our output has gone (`| head`): nothing more to say, not even on closing.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
     except BaseException as error:  # panics of libraries are no `Exception`
         _complain(f"a defect of this program: {type(error).__name__}: {error}", debug)
         print("Please report it with the output of the same command and --debug.", file=sys.stderr)

@@ -1,4 +1,5 @@
-"""What a return costs: slow drifts of the position, and how long they are in use beyond the failure limit after it.
+"""What a return costs: slow drifts of the position, and how long they are in use beyond the failure limit after it; and
+how long sound positions are out of use again after a jump or an outage.
 
 The noise is made here and shares nothing with the generator of synthetic trials: Gauss-Markov errors of the position
 with the shares and times of DIAG Table 1, an odometer with a random walk of 0.05 m over one second and a scale error
@@ -30,6 +31,8 @@ from schemas.inputs import Balises, Gnss, Links, Odometer, Track
 from schemas.run import RunLog, Site
 
 CASES = 50
+# Sound journeys with one jump of 3 s, and with one outage of 90 s, in the middle of 2,400 s.
+JUMPED, INTERRUPTED = 24, 40
 RADIUS_M = 6_378_137.0
 SPEED_MPS = 30.0
 SCALE_SIGMA = 1e-4
@@ -68,6 +71,14 @@ def ramp(seed: int, sigma_m: float) -> Journey:
     t_s = np.arange(onset_s + SIZE_M / abs(rate_mps) + 600.0)
     drift_m = np.clip(rate_mps * np.maximum(t_s - onset_s, 0.0), -SIZE_M, SIZE_M)
     return replace(journey(dice, t_s, drift_m, sigma_m), drift_mps=rate_mps)
+
+
+def sound(seed: int, sigma_m: float, jump: bool) -> Journey:
+    """Healthy but for a jump of 40 m for 3 s, or an outage of 90 s, after 800 s of 2,400 s."""
+    t_s = np.arange(2_400.0)
+    event = (t_s >= 800.0) & (t_s < 800.0 + (3.0 if jump else 90.0))
+    fault_m = np.where(event, SIZE_M if jump else np.nan, 0.0)
+    return journey(np.random.default_rng([seed, 7]), t_s, fault_m, sigma_m)
 
 
 def journey(dice: np.random.Generator, t_s: Floats, fault_m: Floats, sigma_m: float) -> Journey:
@@ -124,6 +135,14 @@ def outcome(made: Journey, config: Configuration) -> Outcome:
     return Outcome(made.drift_mps, bool(negated.any()), bool(returns.size), beyond_s)
 
 
+def unused_s(made: Journey, config: Configuration) -> float:
+    """For how long the position of a sound journey is out of use from 1,000 s on, when its event is over [s]."""
+    aligned, lds = lds_of(made, config)
+    t_s = (aligned["t"] - aligned["t"][0]).dt.total_seconds().to_numpy()
+    unused = lds.epochs["negated"].to_numpy() | lds.epochs["withheld"].to_numpy()
+    return float((unused & (t_s >= 1_000.0)).sum())
+
+
 def measure(out: Path, cases: int = CASES) -> list[Figure]:
     """Figures at 1 and 2 m sigma; beside the rule: the last TVB as anchor after an alarm too, and no re-link at all."""
     rule = Configuration()
@@ -134,6 +153,13 @@ def measure(out: Path, cases: int = CASES) -> list[Figure]:
         with _anchored(first):
             found = [outcome(ramp(seed, 1.0 + seed % 2), config) for seed in range(cases)]
         figures += _figures(name, found, (0.0, 0.0) if name == "re-link" else None)
+    for name, count, jump in (("a jump of 3 s", JUMPED, True), ("an outage of 90 s", INTERRUPTED, False)):
+        times_s = [unused_s(sound(seed, 1.0 + seed % 2, jump), rule) for seed in range(count)]
+        figures += [
+            Figure(f"sound, {name}: journeys", count, "cases"),
+            Figure(f"sound, {name}: out of use again", sum(time_s > 0 for time_s in times_s), "cases"),
+            Figure(f"sound, {name}: longest of 1,400 s", max(times_s), "s"),
+        ]
     return figures
 
 

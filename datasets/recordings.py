@@ -14,6 +14,7 @@ from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.parts import LogPart, drafts_of, lines_of_parts
+from pipeline.storage.noted import note_all_below, noting
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import visible
@@ -53,14 +54,18 @@ def convert_logs(
     With a configuration no log is taken for a public recording.
     """
     settings = given or Configuration()
-    recording = known_recording(logs[0]) if len(logs) == 1 and given is None else None
-    found = gather(logs, settings.ingest, day, purpose.solution) if recording is None else recording.gathered()
+    with noting() as noted:
+        recording = known_recording(logs[0]) if len(logs) == 1 and given is None else None
+        found = gather(logs, settings.ingest, day, purpose.solution) if recording is None else recording.gathered()
+        if recording is not None:
+            note_all_below(logs[0])
     if to.is_file() or (to / "gnss.parquet").is_file():
         run = read_run(to, IngestConfig(), with_digest=False)
         converted = extended(run, to, found, purpose, settings.fix_sigma, force, settings.ingest.correct)
     else:
         name = to.name.removesuffix(".mcap")
         converted = as_run(found, name, purpose, settings.fix_sigma, settings.ingest.correct)
+    converted = converted.made_of(noted.listing())
     write_run_as(converted.run, to)
     made = tuple(f"{correction.stream}: {correction.changes}" for correction in converted.run.notes.corrections)
     return Conversion(

@@ -60,19 +60,35 @@ class StreamMapping(Settings):
     solution: str = "primary"
 
 
+class WrapsConfig(Settings):
+    """When a fall of a counter is the end of its bits or digits, and no reset."""
+
+    # Steps over the end that are longer than this share of the counter could as well be a reset.
+    sure_share: Probability = 0.01
+    # Of 1,000 random resets 4 look like the end of a counter of 1,000 or 10,000 counts, hardly one like a larger one's.
+    sure_size: Positive = 16_384.0
+    # A counter that falls by less than this share of its counts was set.
+    named_share: Probability = 0.9
+    # Trains brake and accelerate within ten rows by less than this.
+    times_longer: Annotated[Number, Field(ge=1)] = 2.0
+    # A recorder that paused for so many usual steps may have set its counter meanwhile.
+    pause_steps: Annotated[Number, Field(gt=1)] = 2.5
+
+
 Shift = Annotated[Number, Field(ge=-1e6, le=1e6)]  # [m]
 
 
 class StreamCorrection(Settings):
     """Corrections of a recorded stream, made right after reading, for any kind of file.
 
-    First two columns are exchanged, then `factors` multiply, `shift_s` is added to the times and `shift_*_m` to the
-    positions. `solution`: of GNSS and satellites only this one.
+    First two columns are exchanged, a distance that begins anew after `wrap` is counted on, then `factors` multiply,
+    `shift_s` is added to the times and `shift_*_m` to the positions. `solution`: of GNSS and satellites only this one.
     """
 
     stream: Literal["gnss", "odometer", "satellites", "reference", "balise_reads"]
     solution: str | None = None
     exchange: tuple[str, str] | None = None
+    wrap: Positive | None = None
     factors: dict[str, Number] = {}
     shift_s: Annotated[Number, Field(ge=-9e9, le=9e9)] = 0.0  # what 64 bits of nanoseconds hold
     shift_east_m: Shift = 0.0
@@ -113,6 +129,7 @@ class IngestConfig(Settings):
     longest_journey_h: Annotated[Number, Field(gt=0, le=8_784)] = 168.0
     # A receiver before its first fix, or a week rollover, affects few rows; more is another recording. Ours.
     wrong_dates_share: Annotated[Number, Field(ge=0, lt=1)] = 0.1
+    wraps: WrapsConfig = WrapsConfig()
     correct: tuple[StreamCorrection, ...] = ()
     # Impossible values of a known cause fail a run (`fail`), or are reported and leave it unproven (`warn`).
     plausibility: Literal["fail", "warn"] = "fail"
@@ -129,7 +146,10 @@ class IngestConfig(Settings):
     def _one_table_or_many(cls, data: object) -> object:
         if not isinstance(data, Mapping):
             return data
-        return {key: [value] if isinstance(value, Mapping) else value for key, value in data.items()}
+        alone = {"wraps"}
+        return {
+            key: [value] if isinstance(value, Mapping) and key not in alone else value for key, value in data.items()
+        }
 
 
 class PlausibilityConfig(Settings):
@@ -745,6 +765,8 @@ _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
     """A TOML file as a mapping, or one error."""
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device may be read for ever
+            raise kind("is no regular file", place=str(path), expected="a TOML file")
         return toml_of(path.read_bytes(), str(path), kind)
     except OSError as error:
         raise kind(f"cannot be read: {error.strerror}", place=str(path)) from None

@@ -11,7 +11,7 @@ from datetime import date as day
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from schemas.config import (
     Configuration,
@@ -29,6 +29,30 @@ from schemas.errors import ConfigError
 FILE_NAME = "balise.toml"
 NO_VEHICLE = "none"
 _REMEDY = "docs/project.md explains every key."
+# Of a file and of a path, on every common file system.
+_LONGEST_NAME_BYTES = 255
+_LONGEST_PATH_BYTES = 4000
+
+
+def _possible(path: str) -> str:
+    """A path that a file system can have. Raises `ValueError`."""
+    if hidden := next((sign for sign in path if ord(sign) < 32 or ord(sign) == 127), None):
+        raise ValueError(f"holds the character {hidden!r}, which no path here may have")
+    if any(len(part.encode()) > _LONGEST_NAME_BYTES for part in path.split("/")):
+        raise ValueError(f"holds a name longer than {_LONGEST_NAME_BYTES} bytes")
+    if len(path.encode()) > _LONGEST_PATH_BYTES:
+        raise ValueError(f"is longer than {_LONGEST_PATH_BYTES} bytes")
+    return path
+
+
+def _naming(path: str) -> str:
+    if Path(path).name in ("", ".."):
+        raise ValueError("names no run")
+    return path
+
+
+PathText = Annotated[str, Field(min_length=1), AfterValidator(_possible)]
+"""A path relative to the project file, or an address."""
 
 
 class LogMapping(StreamMapping):
@@ -40,7 +64,7 @@ class LogMapping(StreamMapping):
 class LogEntry(Settings):
     """Logs of one recorder: `files` follow each other in time. `stream`: what their positions are for."""
 
-    files: Annotated[tuple[str, ...], Field(min_length=1)]
+    files: Annotated[tuple[PathText, ...], Field(min_length=1)]
     stream: Literal["gnss", "reference"] = "gnss"
     solution: str | None = None
     date: day | None = None
@@ -67,7 +91,7 @@ class LogEntry(Settings):
 class ConvertEntry(Settings):
     """One run of receivers' logs (`balise convert`); `correct` as `[[ingest.correct]]`, of this run alone."""
 
-    to: Annotated[str, Field(min_length=1)]
+    to: Annotated[PathText, AfterValidator(_naming)]
     logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)]
     correct: tuple[StreamCorrection, ...] = ()
 
@@ -79,8 +103,8 @@ class ConvertEntry(Settings):
 class TrackEntry(Settings):
     """A site made of surveys (`balise site`)."""
 
-    survey: Annotated[tuple[str, ...], Field(min_length=1)]
-    balises: str | None = None
+    survey: Annotated[tuple[PathText, ...], Field(min_length=1)]
+    balises: PathText | None = None
     direction: TravelAlong = TravelAlong.BOTH
     epsg: int | None = None
     join_m: NonNegative | None = None
@@ -94,7 +118,7 @@ class CalibrateEntry(Settings):
     `monitors`: also the monitors' noise and sigmas, in place of those of the configuration.
     """
 
-    runs: Annotated[tuple[str, ...], Field(min_length=1)]
+    runs: Annotated[tuple[PathText, ...], Field(min_length=1)]
     solution: str = "primary"
     monitors: bool = False
 
@@ -102,11 +126,11 @@ class CalibrateEntry(Settings):
 class ReplayEntry(Settings):
     """Options of `balise replay`; `runs`: those that need no conversion, beside the converted ones."""
 
-    runs: tuple[str, ...] = ()
-    route: str | None = None
-    write_route: str | None = None
+    runs: tuple[PathText, ...] = ()
+    route: PathText | None = None
+    write_route: PathText | None = None
     undetected: bool = False
-    calibrate: tuple[str, ...] = ()
+    calibrate: tuple[PathText, ...] = ()
     jobs: Annotated[int, Field(ge=0)] = 0
     scheduler: str | None = None
     time_limit_s: Annotated[float, Field(ge=0.1)] = 3600.0
@@ -116,27 +140,27 @@ class ReplayEntry(Settings):
 class ClaimEntry(Settings):
     """Options of `balise claim`."""
 
-    profile: str | None = None
+    profile: PathText | None = None
     front_ahead_m: float | None = None
 
 
 class LineEntry(Settings):
     """Options of `balise line`."""
 
-    criteria: str | None = None
-    points: str | None = None
+    criteria: PathText | None = None
+    points: PathText | None = None
     solution: str | None = None
-    out: str | None = None
+    out: PathText | None = None
 
 
 class Project(Settings):
     """The whole of a project file. `unread`: logs that could not be read when it was written; no run has them."""
 
-    site: str = "site"
-    out: str = "result"
-    vehicle: str | None = None
-    vehicles: dict[str, str] = Field(default={})
-    config: str | None = None
+    site: PathText = "site"
+    out: PathText = "result"
+    vehicle: PathText | None = None
+    vehicles: dict[str, PathText] = Field(default={})
+    config: PathText | None = None
     service_level: str | None = None
     unread: tuple[str, ...] = ()
     track: TrackEntry | None = None

@@ -28,6 +28,7 @@ class IngestNotes:
 
     `partial_until_ns` is set when the log is damaged at its end and read up to there; `corrections`: those that
     its streams hold already, made when it was read or when it was written. `messages`: how many a log holds, by topic.
+    `raw_logs`: of a converted run the files that it was made of: name, size [bytes], SHA-256.
     """
 
     partial_until_ns: int | None = None
@@ -38,6 +39,7 @@ class IngestNotes:
     skipped_topics: tuple[str, ...] = ()
     corrections: tuple[StreamCorrection, ...] = ()
     messages: Mapping[str, int] = field(default_factory=dict)
+    raw_logs: tuple[tuple[str, int, str], ...] = ()
 
 
 @dataclass(frozen=True)

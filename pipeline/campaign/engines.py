@@ -6,14 +6,19 @@ All of them give `concurrent.futures` futures, so that the campaign loop is the 
 from __future__ import annotations
 
 import contextlib
+import math
 import multiprocessing
-import multiprocessing.process
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from multiprocessing.context import SpawnContext, SpawnProcess
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
+from typing import Any
 
 from pipeline.campaign.ground import held, hold
 from pipeline.campaign.interruption import StopRun, answered
@@ -34,6 +39,8 @@ class Engine:
 
     in_process = False
     name = "this machine"
+    start_limit_s = math.inf
+    """For how long a worker may start before it is given up [s]."""
 
     def capacity(self) -> int:
         """How many runs may be under way at once."""
@@ -107,8 +114,14 @@ class LocalEngine(Engine):
     """Processes of this machine, each in an executor of its own, so that the loss of one touches no other."""
 
     def __init__(self, jobs: int) -> None:
-        self._idle = [_WorkerSlot() for _ in range(jobs)]
+        # What is handed over at the start of a process goes through a pipe that nobody reads once the process is dead,
+        # and a start with more than the pipe takes would wait for ever: the site goes through a file.
+        self._folder = TemporaryDirectory(prefix="balise-")
+        ground = Path(self._folder.name) / "ground"
+        ground.write_bytes(pickle.dumps(held()))
+        self._idle = [_WorkerSlot(ground) for _ in range(jobs)]
         self._busy: dict[Result, _WorkerSlot] = {}
+        self.start_limit_s = WAITS.start_s
 
     def capacity(self) -> int:
         return len(self._idle) + len(self._busy)
@@ -136,6 +149,7 @@ class LocalEngine(Engine):
     def close(self) -> None:
         for slot in (*self._idle, *self._busy.values()):
             slot.kill()
+        self._folder.cleanup()
 
 
 def _was_without_memory(result: Result) -> bool:
@@ -145,9 +159,10 @@ def _was_without_memory(result: Result) -> bool:
 class _WorkerSlot:
     """One worker process, started when first needed and again after it was lost."""
 
-    def __init__(self) -> None:
+    def __init__(self, ground: Path) -> None:
+        self._ground = ground
         self._executor: ProcessPoolExecutor | None = None
-        self._process: multiprocessing.process.BaseProcess | None = None
+        self._process: SpawnProcess | None = None
         self._answer: Future[int] | None = None
         self._runs = 0
 
@@ -155,17 +170,21 @@ class _WorkerSlot:
         self._runs += 1
         if self._runs > WAITS.runs_per_process:
             self.kill()
+        with contextlib.suppress(BrokenExecutor):
+            return self._started().submit(replay_one, job)
+        # It died while it was idle: that costs no run.
+        self.kill()
         try:
             return self._started().submit(replay_one, job)
-        except BrokenExecutor:
-            # It died while it was idle: that costs no run.
-            self.kill()
-            return self._started().submit(replay_one, job)
+        except BrokenExecutor as error:
+            lost: Result = Future()
+            lost.set_exception(error)
+            return lost
 
     @property
     def is_ready(self) -> bool:
         """Whether the process has started and answered."""
-        return self._answer is not None and self._answer.done()
+        return self._answer is not None and self._answer.done() and self._answer.exception() is None
 
     def kill(self) -> None:
         """End the process, also one that is still starting."""
@@ -182,22 +201,49 @@ class _WorkerSlot:
         if self._process is not None and not self._process.is_alive():
             self.kill()
         if self._executor is None:
-            context = multiprocessing.get_context("spawn")
-            self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin_worker, initargs=(held(),))
-            before = set(multiprocessing.active_children())
-            # Deaf to Ctrl-C from its start on: that is the parent's to answer.
-            with single_threaded_children(), answered([signal.SIGINT], signal.SIG_IGN):
+            context = _KnownProcesses()
+            self._executor = ProcessPoolExecutor(
+                1, mp_context=context, initializer=_begin_worker, initargs=(self._ground,)
+            )
+            # Deaf to Ctrl-C from its start on: that is the parent's to answer, who hears it once the start is over.
+            with single_threaded_children(), _held_back(signal.SIGINT):
                 self._answer = self._executor.submit(os.getpid)
-            (self._process,) = set(multiprocessing.active_children()) - before
+            self._process = context.made[-1]
         return self._executor
 
 
-def _begin_worker(sites: list[tuple[Site, SiteConfig]]) -> None:
+class _KnownProcesses(SpawnContext):
+    """Keeps the processes that it makes: one that dies at once is no longer listed among the living."""
+
+    def __init__(self) -> None:
+        self.made: list[SpawnProcess] = []
+
+    def Process(self, *args: Any, **kwargs: Any) -> SpawnProcess:  # type: ignore[override]  # noqa: N802
+        self.made.append(SpawnProcess(*args, **kwargs))
+        return self.made[-1]
+
+
+@contextlib.contextmanager
+def _held_back(signum: int) -> Iterator[None]:
+    """The signal reaches this thread after the block; processes that it starts never hear it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        with answered([signum], signal.SIG_IGN):
+            yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signum])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin_worker(ground: Path) -> None:
     """Runs first in a worker: leave Ctrl-C to the parent, go when the parent goes, hold what the parent has read."""
-    for site, config in sites:
-        hold(site, config)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_go_with_parent, daemon=True).start()
+    sites: list[tuple[Site, SiteConfig]] = pickle.loads(ground.read_bytes())
+    for site, config in sites:
+        hold(site, config)
 
 
 def _go_with_parent() -> None:

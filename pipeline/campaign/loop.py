@@ -37,7 +37,9 @@ class _Attempt:
 class _RunUnderWay:
     attempt: _Attempt
     since_s: float
+    handed_s: float
     overdue: bool = False
+    never_started: bool = False
 
 
 class CampaignLoop:
@@ -97,7 +99,8 @@ class CampaignLoop:
         capacity = self._engine.capacity()
         while self._waiting and len(self._under_way) < capacity and self._stop is None:
             attempt = self._waiting.popleft()
-            self._under_way[self._engine.submit(attempt.job)] = _RunUnderWay(attempt, time.monotonic())
+            now = time.monotonic()
+            self._under_way[self._engine.submit(attempt.job)] = _RunUnderWay(attempt, now, now)
 
     def _note(self, outcome: RunOutcome | None) -> None:
         if outcome is not None:
@@ -115,6 +118,8 @@ class CampaignLoop:
                 return replace(result.result(), attempts=attempt.number)
             if item.overdue:
                 return _failed(attempt, RunFailure(overdue(self._limit_s), lasting=False))
+            if item.never_started:
+                return self._after_loss(attempt, begun=False)
             if isinstance(error, CancelledError):
                 raise UsageError(
                     "the cluster cancelled this campaign", remedy="Repeat the command: complete runs are skipped."
@@ -146,8 +151,13 @@ class CampaignLoop:
     def _end_overdue(self) -> None:
         now = time.monotonic()
         for result, item in self._under_way.items():
+            if result.done():
+                continue
             if not self._engine.has_begun(result):
                 item.since_s = now
+                if now - item.handed_s > self._engine.start_limit_s and not item.never_started:
+                    item.never_started = True
+                    self._engine.kill(result)
             if now - item.since_s > self._limit_s and not item.overdue:
                 item.overdue = True
                 self._disturbed = True

@@ -22,7 +22,8 @@ from schemas.run import RunLog
 class RecordedLog:
     """`digest` is empty until somebody has read the content: until then no failure is the log's own.
 
-    `files` lists them as the manifest does; `state` is that of its files before anybody read them.
+    `files` lists them as the manifest does, `raw_files` the raw logs that it was converted from; `state` is that of its
+    files before anybody read them.
 
     An object store gives each object an entity tag that changes with its content. Beside the result stands which
     content (SHA-256 of the files) stood behind which tag of this run: `OUT/.catalogue/inputs`. That stays true whatever
@@ -30,7 +31,7 @@ class RecordedLog:
     """
 
     def __init__(self, job: RunJob) -> None:
-        self.digest = self.files = ""
+        self.digest = self.files = self.raw_files = ""
         self._job = job
         self._version: str | None = None
         self.state: tuple[storage.FileState, ...] = ()
@@ -74,6 +75,7 @@ class RecordedLog:
             self.digest_at(path)
             raise
         self.digest_at(path, run.input_digest)
+        self.raw_files = manifest.listing(run.notes.raw_logs) if run.notes.raw_logs else ""
         return run
 
     def digest_at(self, path: Path, known: str = "") -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,13 +20,13 @@ from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import run_campaign
 from pipeline.campaign.watch import Follower
 from pipeline.results import catalogue, packs, store
-from pipeline.results.manifest import NAME, Manifest, earlier, gathered, read_manifest
+from pipeline.results.manifest import NAME, Manifest, anchor, earlier, gathered, read_manifest
 from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.packing import not_as_marked
 from pipeline.results.software import software_digest
 from pipeline.results.workers import tell, told
-from pipeline.storage.address import Address, join, redacted
+from pipeline.storage.address import Address, join
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
@@ -173,6 +174,7 @@ def _parts(run: dict[str, Any]) -> dict[str, str | None]:
     """All that made a run."""
     made = {"site": run["site"], "route": run["route_sha256"], "status": run["status"], "software": run["software"]}
     made |= {"program": run["software_digest"], "settings": run["config_digest"]}
+    made |= {f"raw log {file['name']}": file["sha256"] for file in run.get("raw", [])}
     return made | {f"log {file['name']}": file["sha256"] for file in run["log"]}
 
 
@@ -184,13 +186,19 @@ def _digests(files: dict[str, Any]) -> dict[str, str]:
     return {name: file["sha256"] for name, file in files.items()}
 
 
+def as_kept(out: Address, digest: str) -> Verification:
+    """Hold the manifest against its SHA-256 as somebody kept it elsewhere. Raises `UsageError` for what is none."""
+    if not re.fullmatch("[0-9a-fA-F]{64}", digest):
+        raise UsageError("is no SHA-256", place=f"--expect {digest}", expected="64 hexadecimal digits")
+    present, runs = anchor(out)
+    differences = _differences("", {NAME: present}, {NAME: digest.lower()})
+    return Verification(f"{NAME} of {runs} runs against the digest that was kept", tuple(differences))
+
+
 def _manifest(out: Address) -> Manifest:
     store.complete_runs(out)
-    manifest = read_manifest(out)
-    if manifest is None:
-        remedy = "Results of an earlier version have none: replay them again."
-        raise UsageError(f"has no {NAME}", place=redacted(str(out)), remedy=remedy)
-    return manifest
+    anchor(out)  # there is one
+    return read_manifest(out) or {}
 
 
 def _packs(out: Address) -> Iterator[Problem]:

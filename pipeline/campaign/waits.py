@@ -15,6 +15,8 @@ class Waits:
     """At a run whose worker died over it."""
     starts: int = 10
     """Of workers that die before they begin a run."""
+    start_s: float = 60.0
+    """For a process of this machine to start, which takes some seconds; until it counts as dead."""
     lonely_said_s: float = 4.0
     """Without any worker, until that is said."""
     lonely_s: float = 300.0

@@ -157,4 +157,5 @@ def _write_travelled_route(job: RunJob, run: RunLog, site: Site) -> None:
 
 def _metadata(job: RunJob, log: RecordedLog | None, status: RunStatus) -> dict[str, str]:
     digest, listed = ("", "") if log is None else (log.digest, log.files)
-    return {**digests(job, digest), "log_files": listed, "site_files": job.site_files, "status": status.value}
+    raw = {"raw_files": log.raw_files} if log is not None and log.raw_files else {}
+    return {**digests(job, digest), "log_files": listed, **raw, "site_files": job.site_files, "status": status.value}

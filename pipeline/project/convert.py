@@ -14,7 +14,8 @@ from pipeline.make.receivers import Converted, Gatherings, Purpose, as_run, exte
 from pipeline.project.opened import Opened
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected, corrected_further
-from schemas.config import Configuration, IngestConfig
+from pipeline.storage.noted import note_all_below, noting
+from schemas.config import FixSigma, IngestConfig
 from schemas.errors import UsageError
 from schemas.project import ConvertEntry, LogEntry
 from schemas.run import RunLog
@@ -41,23 +42,26 @@ def logs_of(opened: Opened, entry: ConvertEntry) -> list[Path]:
     return [path for log in entry.logs for path in _paths(opened, log, entry)]
 
 
-def run_of_logs(opened: Opened, entry: ConvertEntry, config: Configuration, recordings: Recordings) -> Converted:
+def run_of_logs(
+    opened: Opened, entry: ConvertEntry, ingest: IngestConfig, sigmas: FixSigma, recordings: Recordings
+) -> Converted:
     """The run, corrected as the project says; raises `InputError` for logs that cannot be read."""
-    parts = _parts(opened, entry, config.ingest, recordings)
+    with noting() as noted:
+        parts = _parts(opened, entry, ingest, recordings)
     parts.sort(key=lambda part: part.purpose.stream != "gnss" or "gnss" not in part.found.streams)
     first = parts[0]
-    common = config.ingest.correct
-    made = as_run(first.found, entry.run_id, first.purpose, config.fix_sigma, common)
+    common = ingest.correct
+    made = as_run(first.found, entry.run_id, first.purpose, sigmas, common)
     dropped = Counter(made.dropped)
     listed = list(made.parts)
     for part in parts[1:]:
-        made = extended(made.run, Path(entry.to), part.found, part.purpose, config.fix_sigma, False, common)
+        made = extended(made.run, Path(entry.to), part.found, part.purpose, sigmas, False, common)
         dropped.update(made.dropped)
         listed += made.parts
     run = corrected(made.run, common)
     # A log that is a run of this program may have been corrected so when it was written.
     own = [correction for correction in entry.correct if correction not in run.notes.corrections]
-    return Converted(corrected_further(run, own), dict(dropped), tuple(listed))
+    return Converted(corrected_further(run, own), dict(dropped), tuple(listed)).made_of(noted.listing())
 
 
 def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: Recordings) -> list[_Part]:
@@ -80,6 +84,7 @@ def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: 
 
 def _known(path: Path, config: IngestConfig, recordings: Recordings) -> Converted | None:
     """A public recording, or a folder that is a run already."""
+    note_all_below(path)
     if (path / "gnss.parquet").is_file():
         return Converted(read_run(path, config, with_digest=False), {})
     return recordings.known(path)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, get_args
 
 from pipeline.campaign.plan import is_run
 from pipeline.make.receivers.bags import is_bag
+from pipeline.make.receivers.gpsd import HEAD, is_gpsd
 from pipeline.make.survey.map_files import MAP_SUFFIXES
 from pipeline.read.ingest.csv_text import read_log_table
 from pipeline.read.ingest.guesses import POSITION, WORDS, columns_in, first, word_of, words_of_times
 from schemas.config import Configuration, Settings, Vehicle, read_toml, settings_from
-from schemas.errors import BaliseError
+from schemas.errors import BaliseError, UsageError
 from schemas.project import FILE_NAME
 
 _SITE_FILES = ("track.parquet", "track.csv", "track.geojson")
@@ -60,13 +62,48 @@ def look_around(folder: Path) -> Found:
 
 
 def _walk(folder: Path) -> Iterator[Path]:
+    """Regular files, and folders that are one thing, each once: by its own name rather than by that of a link."""
+    seen = {os.path.realpath(folder)}
+    links: list[Path] = []
+    yield from _inside(folder, seen, links)
+    while links:
+        link = links.pop(0)
+        if _is_new(link, seen):
+            yield from _at(link, seen, links)
+
+
+def _inside(folder: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
-        if path.name.startswith(".") or path.name == FILE_NAME or (path / "manifest.json").is_file():
-            continue
-        if path.is_dir() and not is_site(path) and not is_one_log(path):
-            yield from _walk(path)
-        elif path.is_dir() or path.suffix.lower() not in _BESIDE:
-            yield path
+        if path.is_symlink():
+            links.append(path)
+        elif _is_new(path, seen):
+            yield from _at(path, seen, links)
+
+
+def _is_new(path: Path, seen: set[str]) -> bool:
+    real = os.path.realpath(path)
+    is_new = real not in seen
+    seen.add(real)
+    return is_new
+
+
+def _at(path: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
+    if path.name.startswith(".") or path.name == FILE_NAME or (path / "manifest.json").is_file():
+        return
+    require_name(path)
+    if path.is_dir() and not is_site(path) and not is_one_log(path):
+        yield from _inside(path, seen, links)
+    elif path.is_dir() or (path.is_file() and path.suffix.lower() not in _BESIDE):
+        yield path
+
+
+def require_name(path: Path) -> None:
+    """Raise `UsageError` for a name that no text can hold."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        remedy = "Rename it: it could be named in no project file."
+        raise UsageError("has a name that is not UTF-8", place=str(path), remedy=remedy) from None
 
 
 def _kind_of(path: Path) -> Kind | None:
@@ -76,8 +113,14 @@ def _kind_of(path: Path) -> Kind | None:
     if suffix == ".toml":
         return _kind_of_settings(path)
     if suffix in _LINES:
-        return "surveys"
+        return "logs" if suffix == ".json" and _holds_gpsd(path) else "surveys"
     return _kind_of_table(path) if suffix == ".csv" and path.is_file() else "logs"
+
+
+def _holds_gpsd(path: Path) -> bool:
+    """What gpsd reported is a log, though its name ends like that of a map."""
+    with path.open("rb") as stream:
+        return is_gpsd(stream.read(HEAD))
 
 
 def _kind_of_settings(path: Path) -> Kind | None:

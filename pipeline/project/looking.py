@@ -13,13 +13,14 @@ import polars as pl
 
 from pipeline.campaign.plan import is_run
 from pipeline.make.receivers import gather
-from pipeline.make.receivers.convert import UnknownError
+from pipeline.make.receivers.convert import UnknownError, of_topics
 from pipeline.make.receivers.csv import TABLES, names_file
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.csv_draft import draft_mapping
-from pipeline.read.ingest.describe import topics_of
+from pipeline.read.ingest.describe import Census, topics_in
 from pipeline.read.ingest.parts import LogPart, parts_of_topics
+from pipeline.read.ingest.run import read_part
 from schemas.config import IngestConfig, settings_from, toml_of
 from schemas.enums import Fix
 from schemas.errors import BaliseError, InputError
@@ -90,9 +91,7 @@ def look_at_dates(path: Path, config: IngestConfig, others: Sequence[SeenLog]) -
 def look_at(path: Path, config: IngestConfig, day: date | None, recordings: Recordings) -> SeenLog:
     """Read a log to see what it feeds. Raises `InputError` where nothing can be made of it."""
     if is_run(path):
-        run = read_run(path, config, with_digest=False)
-        streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
-        return _seen(path, streams, is_run=True, parts=_parts_of_run(path, config, run))
+        return _run(path, config)
     known = None if names_file(config, path) else recordings.known(path)
     if known is not None:
         return _seen(path, known.gathered().streams, parts=known.parts)
@@ -107,10 +106,22 @@ def look_at(path: Path, config: IngestConfig, day: date | None, recordings: Reco
         return _table(path, config)
 
 
-def _parts_of_run(path: Path, config: IngestConfig, run: RunLog) -> tuple[LogPart, ...]:
-    """The topics of an MCAP log; of a folder the columns and files that are none of the contract's."""
+def _run(path: Path, config: IngestConfig) -> SeenLog:
+    """A run; an MCAP log without positions is a log that another one needs."""
     if path.suffix.lower() == ".mcap":
-        return tuple(parts_of_topics(path.name, topics_of([path], config), run.notes.skipped_topics))
+        own = of_topics(config, path)
+        census = Census()
+        run = read_part([path], own, partly=True, beside=[census])
+        parts = tuple(parts_of_topics(path.name, topics_in([census], own), run.notes.skipped_topics))
+    else:
+        run = read_run(path, config, with_digest=False)
+        parts = _parts_of_folder(path, run)
+    streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None and frame.height}
+    return _seen(path, streams, is_run="gnss" in streams, parts=parts)
+
+
+def _parts_of_folder(path: Path, run: RunLog) -> tuple[LogPart, ...]:
+    """The columns and files of a run's folder that are none of the contract's, beside those that are."""
     used = [(name, frame.height) for name in STREAMS if (frame := run.stream(name)) is not None]
     whole = [LogPart(path.name, "file", f"{name}.parquet", rows, name) for name, rows in used]
     return (*whole, *(LogPart(path.name, "file", name, 0) for name in run.notes.skipped_topics))

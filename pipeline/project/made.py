@@ -4,24 +4,33 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from pipeline import storage
-from pipeline.project.opened import RECORD
+from pipeline.project.opened import RECORD, named_from
 from pipeline.results.software import software_digest
+from pipeline.storage.address import is_url
+from pipeline.storage.noted import NO_DIGEST, digest_now, noting
+from schemas.config import Settings
 from schemas.errors import UsageError
 
 _NAME = "made.json"
 
 
 class _Made(BaseModel):
-    """SHA-256 of what a product was made of, and of each of its files. `begun`: nobody knows whether it is whole."""
+    """SHA-256 of the settings that a product was made with, of what was read for it, and of each of its files.
+
+    `begun`: nobody knows whether it is whole.
+    """
 
     of: str
+    read: dict[str, str] = {}
     files: dict[str, str]
     begun: bool = False
 
@@ -31,11 +40,11 @@ _RECORD = TypeAdapter(dict[str, _Made])
 
 @dataclass(frozen=True)
 class Product:
-    """What a step makes: a file or a folder of files, and the SHA-256 over all that decides them."""
+    """What a step makes: a file or a folder of files, and the SHA-256 over the settings that decide them."""
 
     name: str
     place: Path
-    made_of: str
+    settings: str
 
     @property
     def above(self) -> Path:
@@ -43,10 +52,20 @@ class Product:
         return self.place.parent
 
 
+class Brought(NamedTuple):
+    """Whether a product was made; `undigested`: inputs that changed while they were read, or cannot be digested, so
+    that the next call makes it again.
+    """
+
+    made: bool
+    undigested: tuple[str, ...] = ()
+
+
 class Record:
     """Knows which products are as they were made; written after each, so that an interrupted call loses one at most."""
 
     def __init__(self, folder: Path, force: bool = False) -> None:
+        self._folder = folder.absolute()
         self._file = folder / RECORD / _NAME
         self._force = force
         try:
@@ -54,29 +73,45 @@ class Record:
         except ValidationError:
             self._made = {}
 
-    def bring(self, product: Product, make: Callable[[], Sequence[Path]]) -> bool:
-        """Make a product unless it is up to date; whether it was made.
+    def bring(self, product: Product, make: Callable[[], Sequence[Path]]) -> Brought:
+        """Make a product unless it is up to date: unless settings, all that was read for it, and its files are equal.
 
         Raises `UsageError` where its files are there and this project did not make them, or they were changed since.
         """
         known = self._made.get(product.name)
         if not self._force:
-            if known is not None and known == _Made(of=product.made_of, files=_digests(product.above, known.files)):
-                return False
+            if known is not None and self._is_up_to_date(product, known):
+                return Brought(made=False)
             if known is None or not known.begun:
                 _refuse_foreign(product, known)
         before = _digests(product.above, _names(product))
         # Whoever is killed now leaves files that the next call must not take for somebody else's.
-        self._note(product, _Made(of=product.made_of, files={} if known is None else known.files, begun=True))
+        self._note(product, _Made(of=product.settings, files={} if known is None else known.files, begun=True))
         try:
-            files = make()
+            with noting() as noted:
+                files = make()
         except Exception:
             if _digests(product.above, _names(product)) == before:
                 self._note(product, known)
             raise
         names = [file.relative_to(product.above).as_posix() for file in files]
-        self._note(product, _Made(of=product.made_of, files=_digests(product.above, names)))
-        return True
+        read = {self._named(place): digest for place, digest in sorted(noted.digests().items())}
+        self._note(product, _Made(of=product.settings, read=read, files=_digests(product.above, names)))
+        return Brought(True, tuple(place for place, digest in read.items() if digest == NO_DIGEST))
+
+    def _is_up_to_date(self, product: Product, known: _Made) -> bool:
+        """What cannot be digested has no equal."""
+        if known.begun or known.of != product.settings or known.files != _digests(product.above, known.files):
+            return False
+        return NO_DIGEST not in known.read.values() and all(
+            digest_now(self._place(name)) == digest for name, digest in known.read.items()
+        )
+
+    def _named(self, place: str) -> str:
+        return place if is_url(place) else named_from(Path(place), self._folder)
+
+    def _place(self, name: str) -> str:
+        return name if is_url(name) else os.path.normpath(self._folder / name)
 
     def _note(self, product: Product, made: _Made | None) -> None:
         self._made.pop(product.name, None)
@@ -127,15 +162,8 @@ def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
     return {name: storage.file_digests(path)[0].sha256 if path.is_file() else "" for name, path in places.items()}
 
 
-def digest_over(settings: object, files: Iterable[Path]) -> str:
-    """SHA-256 over settings, the content of files and folders, and the build of the program."""
-    parts = [json.dumps(settings, sort_keys=True, default=str), software_digest()]
-    parts += [f"{path.name} {storage.digest_of_files(_all_files(path))}" for path in files]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
-def _all_files(path: Path) -> list[storage.FileDigest]:
-    if path.is_file():
-        return list(storage.file_digests(path))
-    inside = (file for file in sorted(path.rglob("*")) if file.is_file())
-    return [storage.file_digests(file)[0]._replace(name=file.relative_to(path).as_posix()) for file in inside]
+def digest_over(*settings: Settings | Sequence[str]) -> str:
+    """SHA-256 over settings, names of inputs, and the build of the program."""
+    plain = [one.model_dump(mode="json") if isinstance(one, Settings) else list(one) for one in settings]
+    text = json.dumps([software_digest(), *plain], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -31,8 +31,14 @@ class Opened:
         return self.file.parent
 
     def place(self, named: str) -> str:
-        """A path of the file, or an address. `..` is taken off by name, as `named_from` puts it there."""
-        return named if is_url(named) else os.path.normpath(self.folder / Path(named).expanduser())
+        """A path of the file, or an address. `..` is taken off by name, as `named_from` puts it there.
+
+        `~` alone is the home of whoever calls; `~morning.csv` is a name like others.
+        """
+        if is_url(named):
+            return named
+        path = Path(named)
+        return os.path.normpath(self.folder / (path.expanduser() if path.parts[:1] == ("~",) else path))
 
     def path(self, named: str | None) -> Path | None:
         return None if named is None else Path(self.place(named))

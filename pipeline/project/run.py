@@ -14,7 +14,7 @@ from pipeline.make.receivers import said_of
 from pipeline.make.survey.make import Wish, make_site, wish_of, write_made
 from pipeline.project.convert import Recordings, logs_of, run_of_logs
 from pipeline.project.made import Product, Record, digest_over
-from pipeline.project.opened import MEASURED_CONFIG, MEASURED_VEHICLE, RECORD, Opened
+from pipeline.project.opened import MEASURED_CONFIG, MEASURED_VEHICLE, RECORD, Opened, named_from
 from pipeline.read.ingest import read_run
 from pipeline.read.site.read import read_site
 from pipeline.results import store
@@ -76,10 +76,13 @@ class _Steps:
     changed: list[str] = field(default_factory=list)
 
     def bring(self, product: Product, make: Callable[[], Sequence[Path]]) -> bool:
-        made = self.record.bring(product, make)
-        if made:
+        brought = self.record.bring(product, make)
+        if brought.made:
             self.changed.append(product.name)
-        return made
+        for place in brought.undigested:
+            why = "changed while it was read, or has no digest; the next call does this again"
+            self.call.said(product.name, f"{place} {why}")
+        return brought.made
 
 
 def run_project(opened: Opened, recordings: Recordings, call: Call) -> Ended:
@@ -157,15 +160,15 @@ def _convert(steps: _Steps) -> None:
 
 
 def _run_product(steps: _Steps, entry: ConvertEntry, config: Configuration) -> Product:
-    settings = [part.model_dump(mode="json") for part in (entry, config.ingest, config.fix_sigma)]
-    made_of = digest_over(settings, logs_of(steps.opened, entry))
-    return Product(f"run {entry.to}", Path(steps.opened.place(entry.to)), made_of)
+    logs = [named_from(log.absolute(), steps.opened.folder.absolute()) for log in logs_of(steps.opened, entry)]
+    settings = digest_over(entry, config.ingest, config.fix_sigma, logs)
+    return Product(f"run {entry.to}", Path(steps.opened.place(entry.to)), settings)
 
 
 def _write_run(steps: _Steps, entry: ConvertEntry, config: Configuration) -> list[Path]:
     logs = sum(len(log.files) for log in entry.logs)
     steps.call.said("convert", f"{entry.run_id}: {logs} {'log' if logs == 1 else 'logs'}")
-    converted = run_of_logs(steps.opened, entry, config, steps.recordings)
+    converted = run_of_logs(steps.opened, entry, config.ingest, config.fix_sigma, steps.recordings)
     for reason, count in sorted(converted.dropped.items()):
         steps.call.said("convert", f"{entry.run_id}: {said_of(reason)}: {count} x {reason}")
     place = Path(steps.opened.place(entry.to))
@@ -195,9 +198,8 @@ def _make_site(steps: _Steps) -> None:
     sources = [*wish.surveys, *([wish.balise_list] if wish.balise_list else [])]
     _require_there(sources, steps.opened)
     site = Path(steps.opened.place(steps.opened.project.site))
-    settings = [part.model_dump(mode="json") for part in (entry, vehicle, config.survey, config.site, config.ingest)]
-    product = Product(f"site {steps.opened.project.site}", site, digest_over(settings, sources))
-    if not steps.bring(product, lambda: _write_site(steps, wish, site)):
+    product = Product(f"site {steps.opened.project.site}", site, digest_over(entry, vehicle, config))
+    if not steps.bring(product, lambda: _write_site(steps, wish, site, vehicle, config)):
         steps.call.said("site", "up to date")
 
 
@@ -212,9 +214,9 @@ def _require_there(sources: Sequence[Path], opened: Opened) -> None:
             )
 
 
-def _write_site(steps: _Steps, wish: Wish, site: Path) -> list[Path]:
+def _write_site(steps: _Steps, wish: Wish, site: Path, vehicle: Vehicle, config: Configuration) -> list[Path]:
     steps.call.said("site", f"made of {', '.join(path.name for path in wish.surveys)}")
-    made = make_site(wish, steps.opened.given_vehicle(), steps.opened.given_config())
+    made = make_site(wish, vehicle, config)
     write_made(made, site_page(site.resolve().name, made), site, True)
     count = len(made.findings)
     steps.call.said("site", f"{count} findings in {site / 'findings.csv'}; look at {site / 'site.html'}")
@@ -238,13 +240,8 @@ def _calibrate(steps: _Steps) -> None:
     config = steps.opened.given_config()
     vehicle = steps.opened.given_vehicle()
     runs = find_runs(map(steps.opened.place, entry.runs))
-    site = Path(steps.opened.place(steps.opened.project.site))
-    settings = [part.model_dump(mode="json") for part in (entry, vehicle, config)]
-    product = Product(
-        "calibration",
-        steps.opened.folder / RECORD / MEASURED_VEHICLE,
-        digest_over(settings, [*map(Path, runs.values()), site]),
-    )
+    settings = digest_over(entry, vehicle, config, list(runs))
+    product = Product("calibration", steps.opened.folder / RECORD / MEASURED_VEHICLE, settings)
     measured = steps.bring(product, lambda: _measure(steps, entry, runs, config, vehicle))
     if not measured:
         steps.call.said("calibrate", "up to date")

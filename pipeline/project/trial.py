@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -14,7 +15,7 @@ import tomli_w
 
 from pipeline.make.survey.make import make_site
 from pipeline.project.convert import Recordings, run_of_logs
-from pipeline.project.found import Kind, is_one_log, is_prose, is_site, logs_below, look_around
+from pipeline.project.found import Kind, is_one_log, is_prose, is_site, logs_below, look_around, require_name
 from pipeline.project.looking import SeenLog, look_at, look_at_dates
 from pipeline.project.opened import Opened, named_from
 from pipeline.project.rides import Ride, rides_of, stem_of
@@ -23,6 +24,7 @@ from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected_further
 from pipeline.read.ingest.parts import LogPart, lines_of_parts
 from pipeline.read.site.read import read_site
+from pipeline.storage.files import require_regular
 from pipeline.studies.plausibility.check import CONFIGURATION, FitState
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import IngestConfig, StreamCorrection, settings_from, toml_of
@@ -184,7 +186,7 @@ def _named_logs(wanted: Wanted) -> dict[Path, tuple[Path, bool]]:
     """By its place each log as it was named, or lies in a folder; and whether it is an error that it cannot be read."""
     surveys = {path.absolute() for path in wanted.track} | {Path(wanted.balises or "").absolute()}
     named: dict[Path, tuple[Path, bool]] = {}
-    for raw in [*_expanded(wanted.raws), *wanted.references]:
+    for raw in [*_expanded(wanted.raws), *_expanded(wanted.references)]:
         is_log = is_one_log(raw)
         for path in [raw] if is_log else logs_below(raw):
             if path.absolute() not in surveys:
@@ -201,6 +203,9 @@ _TAKEN_FOR: Mapping[Kind, str] = {
 }
 
 
+_OF_A_RIDE = "; of positions of a ride make a CSV of time, latitude and longitude"
+
+
 def _passed_over(wanted: Wanted) -> list[str]:
     """What lies in folders of logs, is no log by its kind, and is named nowhere else."""
     own = [wanted.vehicle, wanted.config, *wanted.track, *([Path(wanted.balises)] if wanted.balises else [])]
@@ -208,7 +213,7 @@ def _passed_over(wanted: Wanted) -> list[str]:
     folders = [raw for raw in _expanded(wanted.raws) if raw.is_dir() and not is_one_log(raw)]
     found = [(kind, path) for folder in folders for kind, paths in look_around(folder).items() for path in paths]
     return [
-        f"not used: {path}: taken for {_TAKEN_FOR[kind]}"
+        f"not used: {path}: taken for {_TAKEN_FOR[kind]}" + (_OF_A_RIDE if kind == "surveys" else "")
         for kind, path in found
         if kind in _TAKEN_FOR and path.absolute() not in named
     ]
@@ -218,9 +223,12 @@ def _expanded(raws: Sequence[Path]) -> list[Path]:
     """The files and folders that were named; patterns too, which not every shell resolves."""
     found: list[Path] = []
     for raw in raws:
-        matches = [raw] if raw.exists() else sorted(map(Path, glob.glob(str(raw), recursive=True)))
+        matches = [raw] if os.path.lexists(raw) else sorted(map(Path, glob.glob(str(raw), recursive=True)))
         if not matches:
             raise UsageError("does not exist", place=str(raw), expected="a log, a folder of logs, or a pattern")
+        for match in matches:
+            require_name(match)
+            require_regular(match)
         found += matches
     return found
 
@@ -288,7 +296,7 @@ def _checked(
     if ride.is_ready:
         run = read_run(ride.logs[0].path, config.ingest, with_digest=False)
     else:
-        run = run_of_logs(base, entry, config, recordings).run
+        run = run_of_logs(base, entry, config.ingest, config.fix_sigma, recordings).run
     corrections: list[StreamCorrection] = []
     found: list[str] = []
     for _ in range(_ROUNDS):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import polars as pl
@@ -22,12 +23,18 @@ Writer = Callable[[pl.DataFrame, Path], None]
 
 
 def write_answer(
-    answer: pl.DataFrame, csv: Path | None, parquet: Path | None, xlsx: Path | None, by_suffix: Path | None = None
+    answer: pl.DataFrame,
+    csv: Path | None,
+    parquet: Path | None,
+    xlsx: Path | None,
+    by_suffix: Path | None = None,
+    guard: bool = True,
 ) -> list[Path]:
-    """Write the formats that are asked for; returns the files, without standard output."""
-    formats: dict[Path | None, Writer] = {csv: write_csv, parquet: write_parquet, xlsx: write_xlsx}
+    """Write the formats that are asked for; returns the files, without standard output. `guard`: see `write_csv`."""
+    as_csv = partial(write_csv, guard=guard)
+    formats: dict[Path | None, Writer] = {csv: as_csv, parquet: write_parquet, xlsx: write_xlsx}
     if by_suffix is not None:
-        formats[by_suffix] = _writer_for(by_suffix)
+        formats[by_suffix] = as_csv if by_suffix.suffix.lower() == ".csv" else _writer_for(by_suffix)
     for file, write in formats.items():
         if file is not None:
             write(answer, file)
@@ -41,9 +48,19 @@ def _writer_for(file: Path) -> Writer:
     return writers[file.suffix.lower()]
 
 
-def write_csv(answer: pl.DataFrame, file: Path) -> None:
-    """Comma-separated text with a heading; lists as words with blanks between them. `-` is standard output."""
-    text = _flat(answer).write_csv(datetime_format="%Y-%m-%dT%H:%M:%S%.9fZ")
+def write_csv(answer: pl.DataFrame, file: Path, guard: bool = True) -> None:
+    """Comma-separated text with a heading; lists as words with blanks between them. `-` is standard output.
+
+    `guard`: texts that a spreadsheet would run get an apostrophe in front
+    (https://owasp.org/www-community/attacks/CSV_Injection).
+    """
+    flat = _flat(answer)
+    if guard:
+        text_columns = pl.col(pl.String)
+        runs = text_columns.str.contains(r"^[=+\-@\t\r]")
+        flat = flat.with_columns(pl.when(runs).then("'" + text_columns).otherwise(text_columns).name.keep())
+        flat.columns = [f"'{name}" if name[:1] in set("=+-@\t\r") else name for name in flat.columns]
+    text = flat.write_csv(datetime_format="%Y-%m-%dT%H:%M:%S%.9fZ")
     if str(file) == "-":
         sys.stdout.write(text)
     else:

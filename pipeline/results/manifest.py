@@ -56,6 +56,7 @@ class _Run(_Strict):
     software_digest: str | None
     config_digest: str | None
     log: list[_File]
+    raw: list[_File] = []
     site: str
     route_sha256: str | None
     tables: dict[str, str | None]
@@ -177,6 +178,23 @@ def read_manifest(out: Address) -> Manifest | None:
     return dict(json.loads(content))
 
 
+def anchor(out: Address) -> tuple[str, int]:
+    """SHA-256 of the manifest as it lies there, and of how many runs it is: what a signed report can name.
+
+    Whoever keeps it elsewhere finds any later change of the result. Raises `UsageError` as `read_manifest`.
+    """
+    manifest = read_manifest(out)
+    content = storage.content_of(join(out, NAME))
+    if manifest is None or content is None:
+        remedy = "Results of an earlier version have none: replay them again."
+        raise UsageError(f"has no {NAME}", place=redacted(str(out)), remedy=remedy)
+    return sha256(content), len(manifest["runs"])
+
+
+def anchor_words(digest: str, runs: int) -> str:
+    return f"{NAME}: sha256 {digest} of {runs} {'run' if runs == 1 else 'runs'}"
+
+
 def earlier(out: Address) -> Manifest:
     """The manifest as earlier calls left it; one that cannot be read is written anew."""
     try:
@@ -230,6 +248,7 @@ def _run(metadata: Mapping[str, str], runs_sha256: str) -> dict[str, Any]:
         "software_digest": metadata.get("software_digest"),
         "config_digest": metadata.get("config_digest"),
         "log": _files(metadata.get("log_files")),
+        **({"raw": raw} if (raw := _files(metadata.get("raw_files"))) else {}),
         "site": site,
         "route_sha256": route or None,
         "tables": {name: digests.get(name) for name in TABLES},

@@ -11,10 +11,10 @@ step. Of several packs with the same run the last one counts, and before any pac
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import groupby
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,11 +23,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from pipeline import storage
 from pipeline.results.marker import Marker, sha256
-from pipeline.storage import parquet
+from pipeline.storage import files, parquet
 from pipeline.storage.address import Address, join, redacted
 from pipeline.storage.parquet import Span
 from schemas.errors import UsageError
 from schemas.tables import TABLES
+
+T = TypeVar("T")
 
 FOLDER = "compact"
 LIST = f"{FOLDER}/packs.json"
@@ -192,8 +194,24 @@ def sweep(out: Address) -> None:
             storage.remove_folder(folder)
 
 
+class GoneError(UsageError):
+    """A file of the result was listed and is not there: it is lost, or `compact` took its rows elsewhere meanwhile."""
+
+
+def steady(read: Callable[[], T]) -> T:
+    """What is read of a result, once more where `compact` has moved rows between two looks.
+
+    Raises `GoneError` where a file is gone the second time as well.
+    """
+    try:
+        return read()
+    except GoneError:
+        return read()
+
+
 def unusable(out: Address, file: str, reason: str) -> UsageError:
-    return UsageError(
+    kind = UsageError if files.exists(join(out, file)) else GoneError
+    return kind(
         f"cannot be read, and many runs are in it: {reason}",
         place=redacted(str(join(out, file))),
         remedy="Take the file from a copy of the result, or replay into another --out.",

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import partial
 
 import dataframely as dy
 import polars as pl
 
 from pipeline import storage
-from pipeline.results import store
+from pipeline.results import packs, store
 from pipeline.results.source import source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, join
@@ -48,13 +49,17 @@ def run_sql(
     `others`: more results by name; `{"old": OUT}` adds the tables `old_runs`, `old_hazards` and so on.
     `allow_files`: the query may also read other files of this machine (`read_csv` and its like).
     """
+    return packs.steady(partial(_answered, out, sql, allow_files, others or {}))
+
+
+def _answered(out: Address, sql: str, allow_files: bool, others: Mapping[str, Address]) -> pl.DataFrame:
     if _SHOW.fullmatch(sql):
-        return _tables_there_are(others or {})
+        return _tables_there_are(others)
     if described := _DESCRIBE.fullmatch(sql):
-        return _columns_of(described[1], others or {})
+        return _columns_of(described[1], others)
     _check_query(sql, allow_files)
     tables = _tables(out, sql)
-    for name, address in (others or {}).items():
+    for name, address in others.items():
         tables |= _tables(address, sql, f"{name}_")
     try:
         return pl.SQLContext(tables).execute(sql).collect()

@@ -172,9 +172,8 @@ def _read_own(
             yield dict(zip(runs, reader.heights, strict=True)), reader.frame()
     except parquet.ParquetError as error:
         where = f"run {run}, table `{table}`"
-        raise UsageError(
-            f"cannot be read: {error}", place=where, remedy="Replay this run again with --force."
-        ) from None
+        kind = UsageError if exists(table_address(out, table, run)) else packs.GoneError
+        raise kind(f"cannot be read: {error}", place=where, remedy="Replay this run again with --force.") from None
 
 
 def _check_columns(table: str, run_id: str, recorded: Mapping[str, pl.DataType]) -> None:

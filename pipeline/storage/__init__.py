@@ -4,8 +4,9 @@ In: paths and addresses. Out: their content, listed, read, written whole or not 
 Touches files and stores, and knows nothing of what they hold.
 
 `address` is how places are named; `files` reads one file; `fetching` lists, and reads many; `writing` puts files there
-whole or not at all; `identity` tells whether content is still the same; `object_store` opens the stores, and is the
-patience with those that fail; `objects` is what they say of an object, and whether what came is that.
+whole or not at all; `identity` tells whether content is still the same; `noted` knows what a step has read;
+`object_store` opens the stores, and is the patience with those that fail; `objects` is what they say of an object, and
+whether what came is that.
 """
 
 from pipeline.storage.fetching import (
@@ -17,6 +18,7 @@ from pipeline.storage.fetching import (
     reach,
     read_many,
     require_match,
+    sizes,
 )
 from pipeline.storage.identity import (
     FileDigest,
@@ -24,7 +26,6 @@ from pipeline.storage.identity import (
     digest_of_files,
     file_digests,
     signature,
-    sizes,
     version,
 )
 from pipeline.storage.writing import (

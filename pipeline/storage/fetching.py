@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.storage.address import Address, check_public, is_url, name_of, redacted
+from pipeline.storage.noted import note, scratch_folder
 from pipeline.storage.object_store import arrivals, on_store, opened
 from pipeline.storage.objects import AlteredError, Listing, check_copy, entries_of, kind_of, objects_at, version_in
 from schemas.errors import InputError, OutputError, UsageError
@@ -35,6 +36,15 @@ def folders_in(address: Address) -> list[str]:
             raise OutputError(f"cannot be listed: {error.strerror}", place=str(address)) from None
     entries = on_store(address, entries_of)
     return sorted(name_of(entry["name"]) for entry in entries if entry["type"] == "directory")
+
+
+def sizes(folder: Address, name: str) -> dict[str, int]:
+    """The size [bytes] of `folder/*/name`, by the folder between."""
+    if is_url(folder):
+        listed = on_store(folder, lambda store, path: store.find(path, detail=True))
+        return {place.split("/")[-2]: info["size"] for place, info in listed.items() if place.endswith(f"/{name}")}
+    places = ((part, Path(folder, part, name)) for part in folders_in(folder))
+    return {part: place.stat().st_size for part, place in places if place.exists()}
 
 
 def files_below(address: Address) -> list[str]:
@@ -145,11 +155,12 @@ def local_copy(address: Address, version: str | None = None) -> Iterator[Path]:
 
     What came is held against names, sizes and digests that the store lists, and the list against `version`, if given.
     """
+    note(address)
     if not is_url(address):
         yield Path(address)
         return
-    with tempfile.TemporaryDirectory(prefix="balise-") as folder:
-        yield on_store(address, lambda store, path: _fetched(store, path, Path(folder), version), kind=InputError)
+    with scratch_folder() as folder:
+        yield on_store(address, lambda store, path: _fetched(store, path, folder, version), kind=InputError)
 
 
 def _fetched(store: Any, path: str, folder: Path, version: str | None) -> Path:

@@ -12,6 +12,7 @@ from typing import IO, Any, TypeVar
 
 from pipeline.storage.address import Address, is_url, name_of
 from pipeline.storage.fetching import local_copy
+from pipeline.storage.noted import note
 from pipeline.storage.object_store import on_store
 from pipeline.storage.objects import kind_of
 from schemas.errors import InputError
@@ -52,6 +53,7 @@ def read_bytes(path: Address) -> bytes:
 
 def in_parts(path: Address) -> Path | io.BufferedReader:
     """What a reader takes that asks for parts of a file; of an address those parts alone are fetched."""
+    note(path)
     return io.BufferedReader(_Parts(str(path)), _LEAST_PART) if is_url(path) else Path(path)
 
 
@@ -94,7 +96,8 @@ def require_regular(path: Address) -> None:
 
 def _regular(path: Path) -> Path:
     """The file, unless it is a pipe or a device: reading one can last for ever."""
-    if path.exists() and not (path.is_file() or path.is_dir()):
+    path.stat()  # a link to nothing, or to itself, is an error
+    if not (path.is_file() or path.is_dir()):
         raise InputError("is no regular file", place=str(path), expected="a file or folder")
     return path
 
@@ -104,6 +107,7 @@ def size_of(path: Address) -> int:
 
 
 def _either(path: Address, local: Callable[[Path], T], remote: Callable[[Any, str], T]) -> T:
+    note(path)
     return on_store(path, remote, kind=InputError) if is_url(path) else _local(path, local)
 
 

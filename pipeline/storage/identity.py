@@ -9,19 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.storage.address import Address, is_url
-from pipeline.storage.fetching import folders_in
 from pipeline.storage.object_store import on_store
 from pipeline.storage.objects import objects_at, version_in
 from schemas.errors import InputError
-
-
-def sizes(folder: Address, name: str) -> dict[str, int]:
-    """The size [bytes] of `folder/*/name`, by the folder between."""
-    if is_url(folder):
-        listed = on_store(folder, lambda store, path: store.find(path, detail=True))
-        return {place.split("/")[-2]: info["size"] for place, info in listed.items() if place.endswith(f"/{name}")}
-    places = ((part, Path(folder, part, name)) for part in folders_in(folder))
-    return {part: place.stat().st_size for part, place in places if place.exists()}
 
 
 def version(address: Address) -> str | None:
@@ -44,8 +34,8 @@ def file_digests(path: Path, known: str = "") -> tuple[FileDigest, ...]:
     """
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if file.is_file()]
-        return tuple(FileDigest(file.name, file.stat().st_size, _file_digest(file)) for file in files)
-    return (FileDigest(path.name, path.stat().st_size, known or _file_digest(path)),)
+        return tuple(FileDigest(file.name, file.stat().st_size, file_digest(file)) for file in files)
+    return (FileDigest(path.name, path.stat().st_size, known or file_digest(path)),)
 
 
 def digest_of_files(files: Iterable[FileDigest]) -> str:
@@ -53,7 +43,8 @@ def digest_of_files(files: Iterable[FileDigest]) -> str:
     return hashlib.sha256("".join(f"{file.name} {file.sha256}\n" for file in files).encode()).hexdigest()
 
 
-def _file_digest(file: Path) -> str:
+def file_digest(file: Path) -> str:
+    """SHA-256 of what a file holds."""
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,13 +19,47 @@ from schemas.errors import InputError, OutputError, SiteError, UsageError
 from tests.campaign.compare import by_run, plan_of
 from tests.conftest import SmallTrial
 
-_PATIENCE_S = 1.5
+_PATIENCE_S = 0.5
 # Clients that ask again by themselves wait for 60 s, five times over. A busy machine takes nothing like that.
 _SOON_S = 150.0
-# Of a store that is slow and no more: a busy machine must not make it look dead.
+# Of a store that is slow and no more, by a clock that stands but in its pauses: no busy machine makes it look dead.
 _LONG_PATIENCE_S, _PAUSE_S = 15.0, 3.3
+# Of real time in each pause: the campaign looks several times.
+_REAL_PAUSE_S, _LOOK_S = 0.1, 0.02
 _BLOCKS, _BLOCK = 6, b"x" * (1 << 16)
 _LISTING = b"<ListBucketResult><Name>b</Name><IsTruncated>false</IsTruncated></ListBucketResult>"
+
+
+class Pauses:
+    """The clock of a store's client: it stands, but for the pauses of the store."""
+
+    def __init__(self) -> None:
+        self.now_s, self.silences_s, self._came = 0.0, list[float](), threading.Event()
+
+    def use(self, patch: pytest.MonkeyPatch) -> None:
+        arrived, silence_s = object_store._PatientStore.arrived, object_store._PatientStore.silence_s
+
+        def arrives(store: object_store._PatientStore, *_: object) -> None:
+            arrived(store)
+            self._came.set()
+
+        def silent_s(store: object_store._PatientStore) -> float:
+            self.silences_s.append(silence_s.fget(store))  # type: ignore[attr-defined]
+            return self.silences_s[-1]
+
+        patch.setattr(object_store, "time", SimpleNamespace(monotonic=lambda: self.now_s, sleep=time.sleep))
+        patch.setattr(object_store, "_LOOK_S", _LOOK_S)
+        patch.setattr(object_store._PatientStore, "arrived", arrives)
+        patch.setattr(object_store._PatientStore, "silence_s", property(silent_s))
+
+    def pause(self) -> None:
+        self.now_s += _PAUSE_S
+        time.sleep(_REAL_PAUSE_S)
+        self._came.clear()
+
+    def wait_until_it_came(self) -> None:
+        """What was sent: the next pause begins then, or at last where a client does not notice what comes."""
+        self._came.wait(10.0)
 
 
 class Ill(BaseHTTPRequestHandler):
@@ -34,6 +69,7 @@ class Ill(BaseHTTPRequestHandler):
     ailment = ""
     well = threading.Event()
     turn = threading.Lock()
+    pauses = Pauses()
 
     def do_GET(self) -> None:
         if self.ailment == "busy":
@@ -43,8 +79,9 @@ class Ill(BaseHTTPRequestHandler):
             self.close_connection = True
         elif self.ailment == "one by one":
             with self.turn:
-                time.sleep(_PAUSE_S)
-            self._answer(200, _BLOCK)
+                self.pauses.pause()
+                self._answer(200, _BLOCK)
+                self.pauses.wait_until_it_came()
         elif self.ailment == "slow":
             self._answer(200, _LISTING) if "list-type" in self.path else self._drip()
         else:
@@ -61,8 +98,9 @@ class Ill(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(_BLOCKS * len(_BLOCK)))
         self.end_headers()
         for _ in range(0 if self.command == "HEAD" else _BLOCKS):
-            time.sleep(_PAUSE_S)
+            self.pauses.pause()
             self.wfile.write(_BLOCK)
+            self.pauses.wait_until_it_came()
 
     def _answer(self, status: int, content: bytes) -> None:
         self.rfile.read(int(self.headers.get("Content-Length") or 0))
@@ -112,7 +150,7 @@ def test_run_in_a_dead_store_is_given_up(ill: str, small_trial: SmallTrial, tmp_
     assert time.monotonic() - begun_s < _SOON_S
     outcomes = by_run(summary)
     assert outcomes["far"].status is RunStatus.FAILED
-    assert "far.mcap: the store gave no usable answer for 1.5 s: " in (outcomes["far"].error or "")
+    assert "far.mcap: the store gave no usable answer for 0.5 s: " in (outcomes["far"].error or "")
     assert outcomes["far"].defect is False
     assert outcomes["run0"].status is RunStatus.OK
 
@@ -147,23 +185,31 @@ def test_reading_by_address_is_as_patient(
     assert time.monotonic() - begun_s < _SOON_S
 
 
-@pytest.mark.parametrize("ill", ["slow"], indirect=True)
-def test_slow_is_not_dead(ill: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A download may take longer than the patience as long as something arrives."""
+@pytest.fixture
+def pauses(monkeypatch: pytest.MonkeyPatch) -> Pauses:
+    """The clock that the client of this test goes by."""
     monkeypatch.setenv("BALISE_STORE_PATIENCE_S", str(_LONG_PATIENCE_S))
-    begun_s = time.monotonic()
+    pauses = Pauses()
+    monkeypatch.setattr(Ill, "pauses", pauses)
+    pauses.use(monkeypatch)
+    return pauses
+
+
+@pytest.mark.parametrize("ill", ["slow"], indirect=True)
+def test_slow_is_not_dead(ill: str, pauses: Pauses) -> None:
+    """A download may take longer than the patience as long as something arrives."""
     with storage.local_copy(f"{ill}/far.mcap") as path:
         assert path.read_bytes() == _BLOCKS * _BLOCK
-    assert time.monotonic() - begun_s > _LONG_PATIENCE_S
+    assert pauses.now_s > _LONG_PATIENCE_S
+    assert max(pauses.silences_s) >= _PAUSE_S, "the campaign did not look in a pause"
 
 
 @pytest.mark.parametrize("ill", ["one by one"], indirect=True)
-def test_many_objects_may_take_longer_than_the_patience(ill: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("BALISE_STORE_PATIENCE_S", str(_LONG_PATIENCE_S))
-    begun_s = time.monotonic()
+def test_many_objects_may_take_longer_than_the_patience(ill: str, pauses: Pauses) -> None:
     addresses = [f"s3://bucket/{name}" for name in range(5)]
     assert storage.read_many(addresses) == dict.fromkeys(addresses, _BLOCK)
-    assert time.monotonic() - begun_s > _LONG_PATIENCE_S
+    assert pauses.now_s > _LONG_PATIENCE_S
+    assert max(pauses.silences_s) >= _PAUSE_S, "the campaign did not look in a pause"
 
 
 def test_patience_is_under_a_minute_unless_set(monkeypatch: pytest.MonkeyPatch) -> None:

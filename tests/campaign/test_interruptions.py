@@ -227,3 +227,14 @@ def test_read_only_output(small_trial: SmallTrial, tmp_path: Path, capfd: pytest
     with tmpfs(tmp_path / "disk", "ro,size=1m") as disk:
         assert of_this_process(command(small_trial, disk / "out")) == 2
     assert "cannot be written: Read-only file system" in capfd.readouterr().err
+
+
+def test_output_that_nobody_reads_changes_no_status(small_trial: SmallTrial, tmp_path: Path) -> None:
+    """`replay ... 2>&1 | head -1`: the status is that of the runs."""
+    words = command(small_trial, tmp_path, "--jobs", "1", runs=small_trial.paths[:1])
+    process = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(timeout=300) == 0
+    assert len(store.run_ids(tmp_path)) == 1

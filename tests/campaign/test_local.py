@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 from collections.abc import Callable, Sequence
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import polars as pl
@@ -16,17 +17,21 @@ import pytest
 
 from datasets.mcap_log import write_mcap
 from pipeline import storage
-from pipeline.campaign import CampaignSummary, RunOutcome, make_plan, recorded_log, run_campaign
-from pipeline.campaign.outcome import lost
+from pipeline.campaign import CampaignSummary, RunOutcome, ground, make_plan, recorded_log, run_campaign
+from pipeline.campaign.outcome import lost, never_begun
+from pipeline.campaign.waits import WAITS
 from pipeline.read.ingest import read_run
 from pipeline.results import store
 from pipeline.show.progress import LogWatch
-from schemas.config import Configuration, IngestConfig, LdsConfig
+from schemas.config import Configuration, IngestConfig, LdsConfig, SiteConfig
 from schemas.enums import RunStatus
 from schemas.errors import OutputError, UsageError
-from schemas.run import RunLog
+from schemas.run import RunLog, Site
 from tests.campaign.compare import Hurried, by_run, campaign_bytes, endless, plan_of, result_bytes
 from tests.conftest import SmallTrial
+
+BEGUN_S = 0.1
+"""Between two looks (0.2 s): until a worker has begun the run, its age begins anew at each."""
 
 
 class Spy:
@@ -219,14 +224,14 @@ def test_our_own_defect_is_told_apart(small_trial: SmallTrial, tmp_path: Path, m
 def test_killed_worker_is_tried_once_more(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
     killed: list[int] = []
 
-    def kill_first(run_id: str, _: float) -> None:
-        if not killed:
+    def kill_first(run_id: str, age_s: float) -> None:
+        if age_s > BEGUN_S and not killed:
             killed.extend(child.pid or 0 for child in multiprocessing.active_children()[:1])
             for pid in killed:
                 os.kill(pid, signal.SIGKILL)
 
     spy = Spy(kill_first)
-    summary = run_campaign(plan_of(small_trial, tmp_path), jobs=2, watches=[spy, LogWatch()])
+    summary = run_campaign(plan_of(small_trial, tmp_path), jobs=1, watches=[spy, LogWatch()])
     assert killed
     ((unlucky, attempt),) = spy.losses
     assert attempt == 1
@@ -238,12 +243,60 @@ def test_killed_worker_is_tried_once_more(small_trial: SmallTrial, undisturbed: 
     assert result_bytes(tmp_path) == result_bytes(undisturbed)
 
 
+@pytest.mark.parametrize(("signum", "strikes"), [(signal.SIGKILL, 3), (signal.SIGSTOP, 1)])
+def test_a_worker_that_dies_or_stays_while_it_starts_costs_no_attempt(
+    small_trial: SmallTrial,
+    undisturbed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    signum: int,
+    strikes: int,
+) -> None:
+    """Also where the site is larger than a pipe: nobody waits for a dead process to read it. Workers that stay (a disk
+    that does not answer) are given up."""
+    begin = SpawnProcess.start
+    struck: list[int] = []
+
+    def start(process: SpawnProcess) -> None:
+        begin(process)
+        if len(struck) < strikes and process.pid:
+            os.kill(process.pid, signum)
+            struck.append(process.pid)
+
+    plan = plan_of(small_trial, tmp_path)
+    monkeypatch.setattr(SpawnProcess, "start", start)
+    large = Site(pl.DataFrame({"x": range(10**5)}), pl.DataFrame(), None)
+    monkeypatch.setattr(ground, "_held", {**ground._held, ("other", SiteConfig()): large})
+    if signum == signal.SIGSTOP:
+        monkeypatch.setattr(WAITS, "start_s", 8.0)
+    summary = run_campaign(plan, jobs=2)
+    assert len(struck) == strikes
+    assert [outcome.attempts for outcome in summary.outcomes] == [1] * 4
+    assert result_bytes(tmp_path) == result_bytes(undisturbed)
+
+
+def test_workers_that_never_start_fail_their_runs(
+    small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = SpawnProcess.start
+
+    def start(process: SpawnProcess) -> None:
+        begin(process)
+        os.kill(process.pid or 0, signal.SIGKILL)
+
+    plan = plan_of(small_trial, tmp_path, small_trial.paths[:2])
+    monkeypatch.setattr(SpawnProcess, "start", start)
+    summary = run_campaign(plan, jobs=2)
+    assert [outcome.error for outcome in summary.outcomes] == [never_begun(WAITS.starts)] * 2
+    assert run_campaign(plan).count(RunStatus.FAILED) == 2
+
+
 def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_path: Path) -> None:
     endless(tmp_path / "deadly.mcap")
     deaths: set[int] = set()
 
-    def kill_it(run_id: str, _: float) -> None:
-        if run_id == "deadly":
+    def kill_it(run_id: str, age_s: float) -> None:
+        if run_id == "deadly" and age_s > BEGUN_S:
             for child in multiprocessing.active_children():
                 deaths.add(child.pid or 0)
                 child.kill()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import shutil
 import signal
@@ -10,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import cli
@@ -177,8 +181,8 @@ def test_killed_before_it_is_noted_a_product_is_made_again(tmp_path: Path, known
         Record(tmp_path).bring(Product("run a", made, "old"), make(b"old"))
     with pytest.raises(Killed):
         Record(tmp_path).bring(Product("run a", made, "new"), make(b"ha", Killed()))
-    assert Record(tmp_path).bring(Product("run a", made, "new"), make(b"half"))
-    assert not Record(tmp_path).bring(Product("run a", made, "new"), make(b"no"))
+    assert Record(tmp_path).bring(Product("run a", made, "new"), make(b"half")).made
+    assert not Record(tmp_path).bring(Product("run a", made, "new"), make(b"no")).made
     with pytest.raises(InputError):
         Record(tmp_path).bring(Product("run a", made, "third"), make(b"", InputError("damaged", place="log")))
     made.write_bytes(b"by hand")
@@ -197,10 +201,10 @@ def test_a_file_that_was_added_to_a_run_is_not_removed(tmp_path: Path) -> None:
 
     Record(tmp_path).bring(Product("run a", run, "old"), make)
     (run / "reference.parquet").write_bytes(b"added")
-    assert not Record(tmp_path).bring(Product("run a", run, "old"), make)
+    assert not Record(tmp_path).bring(Product("run a", run, "old"), make).made
     with pytest.raises(UsageError, match="was added"):
         Record(tmp_path).bring(Product("run a", run, "new"), make)
-    assert Record(tmp_path, force=True).bring(Product("run a", run, "new"), make)
+    assert Record(tmp_path, force=True).bring(Product("run a", run, "new"), make).made
 
 
 def test_unknown_keys_are_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -274,3 +278,53 @@ def test_remedies_of_a_project_name_its_keys() -> None:
     assert "week12/balise.toml" in words
     assert words.endswith("`balise run --project week12`")
     assert "balise replay" not in "".join(remedy_words(remedy, **places) for remedy in Remedy)
+
+
+def test_a_site_is_made_again_for_any_setting(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A survey may be a recorded run: its line depends on settings of more than the survey."""
+    drive = project / "drive"
+    shutil.copytree(project / "runs/run0", drive)
+    file = drive / "gnss.parquet"
+    pl.read_parquet(file).with_columns(fix=pl.lit("rtk_fixed")).write_parquet(file)
+    shutil.rmtree(project / "site")
+    text = 'config = "settings.toml"\n[track]\nsurvey = ["drive"]\n[replay]\nruns = ["runs/run0"]\n'
+    (project / "balise.toml").write_text(text)
+    for reach_m in (50, 60):
+        (project / "settings.toml").write_text(f"[matching]\nreach_m = {reach_m}\n")
+        for made in (True, False):
+            call("run")
+            assert ("made of drive" in capsys.readouterr().err) == made
+
+
+def test_a_verdict_is_held_against_raw_logs(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A converted run that somebody moved, its new digest in the project's own record, is not what its logs say."""
+    (project / "still.nmea").write_text(nmea())
+    (project / "balise.toml").write_text('[[convert]]\nto = "made/still"\n[[convert.logs]]\nfiles = ["still.nmea"]\n')
+    call("run", "-q")
+    manifest = json.loads((project / "result/manifest.json").read_text())
+    raw = hashlib.sha256((project / "still.nmea").read_bytes()).hexdigest()
+    assert [(file["name"], file["sha256"]) for file in manifest["runs"]["still"]["raw"]] == [("still.nmea", raw)]
+    assert call("verify", "--logs", "made/still") == 0
+    assert "1 run converted again from raw logs: all agree" in capsys.readouterr().out
+    file = project / "made/still/gnss.parquet"
+    metadata = pq.read_metadata(file).metadata
+    table = pa.table(pl.read_parquet(file).with_columns(pl.col("latitude_deg") + 1e-4).to_arrow())
+    pq.write_table(table.replace_schema_metadata(metadata), file)
+    record = json.loads((project / ".balise/made.json").read_text())
+    record["run made/still"]["files"]["still/gnss.parquet"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    (project / ".balise/made.json").write_text(json.dumps(record))
+    call("run", "-q")
+    assert call("verify", "-q") == 0
+    assert call("verify", "--logs", "made/still") == 1
+    assert "run still, gnss" in capsys.readouterr().out
+
+
+def test_the_digest_of_the_manifest_is_told_and_expected(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("run") == 0
+    digest = hashlib.sha256((project / "result/manifest.json").read_bytes()).hexdigest()
+    assert f"manifest.json: sha256 {digest} of 1 run\n" in capsys.readouterr().out
+    assert call("verify") == 0
+    assert capsys.readouterr().out.endswith(f"manifest.json: sha256 {digest} of 1 run\n")
+    assert call("verify", "--expect", digest.upper()) == 0
+    assert call("verify", "--expect", "0" * 64) == 1
+    assert call("verify", "--expect", digest[:12]) == 2

@@ -6,6 +6,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from pipeline.results.answer_files import write_answer
 from pipeline.results.query import run_sql
 from pipeline.results.store import table_address, write_run
 from schemas.errors import UsageError
@@ -114,3 +115,12 @@ def test_a_result_of_another_build_is_named(out: Path, tmp_path: Path) -> None:
     pl.read_parquet(file).drop("speed_mps").write_parquet(file)
     with pytest.raises(UsageError, match=r"table `passages`: .* another build .* found speed_mps missing or"):
         run_sql(tmp_path / "old", "SELECT max(speed_mps) FROM passages")
+
+
+def test_texts_that_a_spreadsheet_would_run_are_guarded(tmp_path: Path) -> None:
+    answer = pl.DataFrame({"=A": ["=1+2", "@x", "-3", "+4", "\tx", "x=1", None], "number": [-1.5] * 7})
+    write_answer(answer, tmp_path / "a.csv", None, None)
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    assert lines == ["'=A,number", "'=1+2,-1.5", "'@x,-1.5", "'-3,-1.5", "'+4,-1.5", "'\tx,-1.5", "x=1,-1.5", ",-1.5"]
+    write_answer(answer, tmp_path / "a.csv", None, None, guard=False)
+    assert (tmp_path / "a.csv").read_text().splitlines()[:2] == ["=A,number", "=1+2,-1.5"]

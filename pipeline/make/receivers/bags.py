@@ -7,15 +7,20 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from pipeline.make.receivers.bag_budget import Unpack, budget_of_bag, unpacker_of
-from pipeline.read.ingest.correct import corrected
-from pipeline.read.ingest.describe import LogDescription, TopicSummary, description_of, topics_of
-from pipeline.read.ingest.mcap_run import read_mcaps
-from pipeline.read.ingest.run import read_run
+from pipeline.read.ingest.describe import (
+    Census,
+    LogDescription,
+    TopicSummary,
+    description_of,
+    topics_in,
+    topics_of,
+)
+from pipeline.read.ingest.run import read_part
 from pipeline.storage.budget import Budget
+from pipeline.storage.noted import scratch_folder
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
 from schemas.run import RunLog
@@ -37,18 +42,21 @@ class Bag(NamedTuple):
     topics: tuple[TopicSummary, ...]
 
 
-def read_bag(path: Path, config: IngestConfig) -> Bag:
-    """The streams of a bag, by schema name or as `[ingest]` maps its topics."""
+def read_bag(path: Path, config: IngestConfig, partly: bool = False) -> Bag:
+    """The streams of a bag, by schema name or as `[ingest]` maps its topics; `partly`: of one of several of a run."""
     if path.suffix.lower() == ".mcap":
-        return Bag(*_with_rest(read_run(path, config, with_digest=False), {}), topics_of([path], config))
+        census = Census()
+        run = read_part([path], config, partly, [census])
+        return Bag(*_with_rest(run, {}), topics_in([census], config))
     if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
-        return Bag(*_read_parts(path, declared, config), topics_of(files_of(path, declared), config))
-    with TemporaryDirectory() as folder:
-        log = Path(folder) / "bag.mcap"
+        return _read_parts(path, declared, config, partly)
+    with scratch_folder() as folder:
+        log = folder / "bag.mcap"
         left, counts = _transcribe(path, log, config)
+        census = Census()
         try:
-            run, rest = _with_rest(_held_against(read_run(log, config, with_digest=False), path, counts), left)
-            return Bag(run, rest, topics_of([log], config))
+            run = read_part([log], config, partly, [census])
+            return Bag(*_with_rest(_held_against(run, path, counts), left), topics_in([census], config))
         except BaliseError as error:
             error.place = None if error.place is None else error.place.replace(str(log), str(path))
             error.message = error.message.replace(str(log), str(path))
@@ -71,8 +79,8 @@ def _topics_alone(path: Path, config: IngestConfig) -> tuple[TopicSummary, ...]:
     try:
         if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
             return topics_of(files_of(path, declared), config)
-        with TemporaryDirectory() as folder:
-            log = Path(folder) / "bag.mcap"
+        with scratch_folder() as folder:
+            log = folder / "bag.mcap"
             _transcribe(path, log, config)
             return topics_of([log], config)
     except BaliseError:
@@ -129,14 +137,15 @@ def files_of(folder: Path, declared: Declared) -> list[Path]:
     return found
 
 
-def _read_parts(folder: Path, declared: Declared, config: IngestConfig) -> tuple[RunLog, dict[str, int]]:
+def _read_parts(folder: Path, declared: Declared, config: IngestConfig, partly: bool) -> Bag:
     """The MCAP files of a bag folder as one run; what is missing makes it partial."""
     found = files_of(folder, declared)
-    run = read_mcaps(found, config)
+    counted = [Census() for _ in found]
+    run = read_part(found, config, partly, counted)
     damages = [*filter(None, [run.notes.damage]), *_absent(folder, declared, found)]
     damages += _fewer(declared, run.notes.messages)
     whole = replace(run, notes=replace(run.notes, damage="; ".join(damages) or None))
-    return _with_rest(corrected(whole, config.correct), {})
+    return Bag(*_with_rest(whole, {}), topics_in(counted, config))
 
 
 def _absent(folder: Path, declared: Declared, found: Sequence[Path]) -> Iterator[str]:

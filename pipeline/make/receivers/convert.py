@@ -27,7 +27,8 @@ from pipeline.read.ingest.conform import conform, refuse
 from pipeline.read.ingest.correct import corrected, corrections_of
 from pipeline.read.ingest.mapping import mappings_of
 from pipeline.read.ingest.parts import LogPart, parts_of_messages, parts_of_topics
-from pipeline.storage import files
+from pipeline.read.ingest.plan import absent_topics
+from pipeline.storage import FileDigest, files
 from schemas.config import FixSigma, IngestConfig, StreamCorrection
 from schemas.errors import InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -40,6 +41,11 @@ class Converted:
     run: RunLog
     dropped: Mapping[str, int]
     parts: tuple[LogPart, ...] = ()
+
+    def made_of(self, logs: Sequence[FileDigest]) -> Converted:
+        """The run with the logs that were read for it, beside those that it was made of before."""
+        listed = dict.fromkeys([*self.run.notes.raw_logs, *((log.name, log.size_bytes, log.sha256) for log in logs)])
+        return replace(self, run=replace(self.run, notes=replace(self.run.notes, raw_logs=tuple(listed))))
 
     def gathered(self) -> Gatherings:
         """The streams, and the corrections that they hold."""
@@ -118,7 +124,8 @@ class Gatherings:
     """The streams of all logs, as the contract has them, and what could not be used: reason to number.
 
     `corrections`: those that the streams hold already, of logs that are runs of this program; `damage`: what the logs
-    lack; `parts`: what they consist of, and what of it is used.
+    lack; `parts`: what they consist of, and what of it is used; `topics`: of
+    a bag, those that it holds.
     """
 
     streams: Streams
@@ -126,6 +133,7 @@ class Gatherings:
     corrections: tuple[StreamCorrection, ...] = ()
     damage: str | None = None
     parts: tuple[LogPart, ...] = ()
+    topics: tuple[str, ...] = ()
 
     def corrections_as(self, purpose: Purpose) -> tuple[StreamCorrection, ...]:
         """Those of the streams as they are meant: positions that become the reference are no stream `gnss` any more."""
@@ -165,6 +173,7 @@ def gather(
                     error.place = str(error.place).replace(str(plain), str(place))
                     unread.append(error)
     _refuse_unread(unread, parts)
+    _refuse_absent(parts, config or IngestConfig())
     names = {NoEpochError: "log without an epoch", UnknownError: "file of an archive that is no log"}
     dropped.update(names[type(error)] for error in unread)
     _refuse_overlaps(parts)
@@ -179,6 +188,16 @@ def _refuse_unread(unread: list[NoEpochError | UnknownError], parts: list[tuple[
     for error in unread:
         if not parts or (isinstance(error, NoEpochError) and not found):
             raise error
+
+
+def _refuse_absent(parts: list[tuple[Path, Gatherings]], config: IngestConfig) -> None:
+    """A topic that is mapped is in one of the bags, or its mapping is of a table."""
+    bags = [(log, gathered.topics) for log, gathered in parts if gathered.topics]
+    if not bags:
+        return
+    tables = {name for log, gathered in parts if not gathered.topics for name in (log.name, log.stem, "*")}
+    held = {name for log, topics in bags for topic in topics for name in (topic, f"{log.name}:{topic}")}
+    refuse(absent_topics(held | tables, of_topics(config), ", ".join(str(log) for log, _ in bags)))
 
 
 def _common(parts: list[tuple[Path, Gatherings]]) -> tuple[StreamCorrection, ...]:
@@ -233,7 +252,7 @@ _RECORDERS: dict[Stream, tuple[str, tuple[str, ...], str, str]] = {
         "sensor",
         ("distance_m", "speed_mps"),
         "odometer values",
-        "Leave one of them out, or name its `sensor` in the mapping.",
+        'Leave one of them out, or name its `sensor` in the mapping; `topic = "LOG.mcap:TOPIC"` is that of one log.',
     ),
 }
 
@@ -270,10 +289,14 @@ def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -
 def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: str | None) -> Gatherings:
     if is_bag(log):
         # Corrections are made of the whole, once.
-        bag = read_bag(log, _of_topics(config).model_copy(update={"correct": ()}))
+        own = of_topics(config, log)
+        bag = read_bag(log, own.model_copy(update={"correct": ()}), partly=True)
+        gathered = gathered_of(bag.run, bag.left)
         return replace(
-            gathered_of(bag.run, bag.left),
+            gathered,
+            streams={name: frame for name, frame in gathered.streams.items() if frame.height},
             parts=tuple(parts_of_topics(log.name, bag.topics, bag.run.notes.skipped_topics)),
+            topics=tuple(topic.topic for topic in bag.topics),
         )
     if log.suffix.lower() == ".csv" or names_file(config, log):
         table = read_csv(log, config)
@@ -291,10 +314,15 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: s
     return _read(content, log, date, solution)
 
 
-def _of_topics(config: IngestConfig) -> IngestConfig:
-    """Without the mappings of tables, whose names are no topics of a bag."""
+def of_topics(config: IngestConfig, log: Path | None = None) -> IngestConfig:
+    """Without the mappings of tables, whose names are no topics of a bag; `LOG:TOPIC` of this log is its topic."""
+    prefix = "" if log is None else f"{log.name}:"
     kept: dict[str, object] = {
-        stream: tuple(m for m in mappings_of(config, stream) if not m.topic.lower().endswith(TABLES))
+        stream: tuple(
+            m.model_copy(update={"topic": m.topic.removeprefix(prefix)})
+            for m in mappings_of(config, stream)
+            if not m.topic.lower().endswith(TABLES)
+        )
         for stream in STREAMS
         if stream != "faults"
     }

@@ -70,7 +70,7 @@ def read_csv(path: Path, config: IngestConfig) -> CsvLog:
     streams: dict[Stream, pl.DataFrame] = {}
     left = Counter({CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short, _BEFORE: log.before})
     for name, mapping in mappings:
-        mapped = _mapped(table, mapping, name, path, left)
+        mapped = _mapped(table, mapping, name, path, left, config)
         frame = mapped.filter(_recorded(mapped, name, "fix" in mapping.fields))
         left[f"row without a value of {name}"] += mapped.height - frame.height
         streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
@@ -117,7 +117,7 @@ def _recorded(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
 
 
 def _mapped(
-    table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path, left: Counter[str]
+    table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path, left: Counter[str], config: IngestConfig
 ) -> pl.DataFrame:
     if not mapping.time.startswith("field:"):
         raise InputError("a CSV has no log time", place=str(path), expected='time = "field:COLUMN"')
@@ -132,9 +132,8 @@ def _mapped(
     counter = mapping.fields.get("distance_m") if stream == "odometer" else None
     if counter in fields.columns:
         sensors = fields[mapping.fields["sensor"]] if "sensor" in mapping.fields else None
-        whole, found = with_whole_counts(
-            fields[counter], times.to_physical().fill_null(0).to_numpy(), mapping.wrap, sensors
-        )
+        t_ns = times.to_physical().fill_null(0).to_numpy()
+        whole, found = with_whole_counts(fields[counter], t_ns, mapping.wrap, sensors, config.wraps)
         fields = fields.with_columns(whole) if found else fields
         left.update(said_of_wraps(found, counter))
     columns = {name: _not_nan(expression, fields) for name, expression in source.columns.items()}

@@ -23,7 +23,7 @@ from schemas.enums import Fix
 from schemas.run import Stream
 
 _OBJECT = re.compile(rb'(?m)^\s*\{\s*"class"\s*:\s*"(?:TPV|SKY|VERSION|DEVICES?|WATCH|GST|PPS|TOFF)"')
-_HEAD = 1024 * 1024
+HEAD = 1024 * 1024
 # `status` of gpsd_json(5); what it does not tell is a fix of its own.
 _STATUS = {
     2: Fix.DIFFERENTIAL, 3: Fix.RTK_FIXED, 4: Fix.RTK_FLOAT, 5: Fix.ESTIMATED, 6: Fix.AUTONOMOUS, 7: Fix.NONE,
@@ -37,7 +37,7 @@ _PRNS = ((1, 32, "G", 1), (33, 64, "S", 120), (65, 96, "R", 1), (120, 158, "S", 
 
 def is_gpsd(content: bytes) -> bool:
     """Whether a log holds objects of gpsd near its begin."""
-    return _OBJECT.search(content[:_HEAD]) is not None
+    return _OBJECT.search(content[:HEAD]) is not None
 
 
 def read_gpsd(

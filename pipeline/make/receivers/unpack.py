@@ -11,12 +11,12 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import IO, Any
 
 import pyarrow as pa
 
 from pipeline.storage.budget import UNPACKING, Budget
+from pipeline.storage.noted import note_all_below, scratch_folder
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 
@@ -30,14 +30,15 @@ def unpacked(log: Path, config: IngestConfig) -> Iterator[list[Path]]:
 
     A folder is one log (a bag of ROS 2), in an archive as well. Errors name the archive, not where it was unpacked.
     """
+    note_all_below(log)
     if not is_packed(log):
         yield [log]
         return
-    with TemporaryDirectory() as folder:
+    with scratch_folder() as folder:
         try:
-            yield _all_logs(log, Path(folder), Budget(str(log), log.stat().st_size, config))
+            yield _all_logs(log, folder, Budget(str(log), log.stat().st_size, config))
         except InputError as error:
-            error.place = str(error.place).replace(folder, str(log))
+            error.place = str(error.place).replace(str(folder), str(log))
             raise
 
 

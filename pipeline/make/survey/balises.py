@@ -11,8 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from pipeline.make.survey.network import SurveyNetwork
-from pipeline.make.survey.pieces import Survey, measures_at
-from pipeline.make.survey.sources import content_of_survey
+from pipeline.make.survey.pieces import Survey, content_of_survey, measures_at
 from pipeline.make.survey.tables import placed_table
 from pipeline.read.ingest.guesses import BALISE_KINDS, BALISE_LIST, first, word_of
 from pipeline.read.site.tables import RawTable, typed_table

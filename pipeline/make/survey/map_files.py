@@ -5,25 +5,32 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.make.survey.geojson_lines import Feature, survey_of_features
-from pipeline.make.survey.pieces import Survey
+from pipeline.make.survey.pieces import Survey, content_of_survey
+from pipeline.storage.files import exists
+from pipeline.storage.noted import scratch_folder
+from schemas.config import SurveyConfig
 from schemas.errors import SiteError
 
 # First bytes of each format. GDAL picks its driver by content, and some of its drivers follow links in a file to other
 # files or hosts: a file that only has the suffix must not reach them.
 _BEGINNINGS = {".gpkg": b"SQLite format 3\0", ".shp": b"\x00\x00\x27\x0a", ".fgb": b"fgb"}
+# Files beside it that decide what a map says, by what stands in place of its suffix or after it: index, attributes,
+# coordinate system and code page of a shapefile; edits that are not yet in the database
+# (https://sqlite.org/walformat.html).
+_COMPANIONS = {".shp": (".shx", ".dbf", ".prj", ".cpg"), ".gpkg": ("-wal", "-journal"), ".fgb": ()}
 MAP_SUFFIXES = tuple(_BEGINNINGS)
 _POINT, _LINE_STRING, _MULTI_LINE_STRING = 1, 2, 5
 
 
-def read_map(path: Path, data: bytes, id_field: str | None = None) -> Survey:
+def read_map(path: Path, data: bytes, config: SurveyConfig, id_field: str | None = None) -> Survey:
     """Each line of each layer a piece, in WGS 84, named by `id_field` if given. Raises `SiteError`."""
     try:
         import pyogrio
@@ -34,22 +41,49 @@ def read_map(path: Path, data: bytes, id_field: str | None = None) -> Survey:
     if not data.startswith(_BEGINNINGS[path.suffix.lower()]):
         raise SiteError(f"is no {path.suffix} file", place=str(path), found=repr(data[:16]))
     try:
-        layers = [str(layer) for layer, _ in pyogrio.list_layers(path)]
-        _refuse_computed(path, layers)
-        # Room is made for as many as the file declares; each takes some bytes of it.
-        if sum(abs(pyogrio.read_info(path, layer=layer)["features"]) for layer in layers) > len(data):
-            raise ValueError("it declares more features than it has bytes")
-        features = [feature for layer in layers for feature in _features(path, layer)]
+        with _copied(path, data, config) as copy:
+            layers = [str(layer) for layer, _ in pyogrio.list_layers(copy.file)]
+            _refuse_computed(copy.file, layers)
+            # Room is made for as many as the file declares; each takes some bytes of it.
+            if sum(abs(pyogrio.read_info(copy.file, layer=layer)["features"]) for layer in layers) > copy.size_bytes:
+                raise ValueError("it declares more features than it has bytes")
+            features = [feature for layer in layers for feature in _features(copy.file, layer)]
     except (ValueError, RuntimeError, OSError, struct.error, sqlite3.Error) as error:
         raise SiteError(f"cannot be read ({str(error).splitlines()[0]})", place=str(path)) from None
     return survey_of_features(str(path), path.stem, features, id_field)
+
+
+class _Copy(NamedTuple):
+    """A map with its companions where nobody else writes, and the size of them all."""
+
+    file: Path
+    size_bytes: int
+
+
+@contextmanager
+def _copied(path: Path, data: bytes, config: SurveyConfig) -> Iterator[_Copy]:
+    """Copies alone are read: what GDAL opens beside a map is what was noted, and it leaves no file beside the map."""
+    with scratch_folder() as folder:
+        file = folder / f"map{path.suffix.lower()}"
+        file.write_bytes(data)
+        size_bytes = len(data)
+        for ending in _COMPANIONS[file.suffix]:
+            beside = [_companion(path, one) for one in (ending, ending.upper())]
+            found = [one for one in beside if exists(one)]
+            if found:
+                size_bytes += _companion(file, ending).write_bytes(content_of_survey(found[0], config))
+        yield _Copy(file, size_bytes)
+
+
+def _companion(path: Path, ending: str) -> Path:
+    return path.with_suffix(ending) if ending.startswith(".") else path.with_name(path.name + ending)
 
 
 def _refuse_computed(path: Path, layers: list[str]) -> None:
     """A layer of a GeoPackage may be a query over nothing that never ends; a survey is a table."""
     if path.suffix.lower() != ".gpkg":
         return
-    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
         views = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'view'")}
     for layer in sorted(views & set(layers)):
         raise ValueError(f"its layer {layer} is a view; expected a table: export it as a file of its own")

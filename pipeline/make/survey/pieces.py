@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.stages.track.geodesy import earth_centred_m, points_of
+from pipeline.storage.noted import note
 from schemas.arrays import Floats, Ints
 from schemas.config import SurveyConfig
 from schemas.errors import SiteError
@@ -24,6 +26,18 @@ def refuse_large(size: int, place: str, config: SurveyConfig) -> None:
             expected=f"at most {config.size_limit_mb:g} MB",
             remedy="Cut it to the line, or write a larger `size_limit_mb` under [survey] in the configuration file.",
         )
+
+
+def content_of_survey(path: Path, config: SurveyConfig) -> bytes:
+    """The file, unless it is too large to be one."""
+    note(path)
+    try:
+        if not path.is_file():
+            raise SiteError("is no regular file", place=str(path))
+        refuse_large(path.stat().st_size, str(path), config)
+        return path.read_bytes()
+    except OSError as error:
+        raise SiteError(f"cannot be read: {error.strerror}", place=str(path)) from None
 
 
 @dataclass(frozen=True)

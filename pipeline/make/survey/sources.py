@@ -11,13 +11,13 @@ from pipeline.make.receivers import as_run, gather
 from pipeline.make.receivers.convert import UnknownError
 from pipeline.make.survey.geojson_lines import read_geojson
 from pipeline.make.survey.map_files import MAP_SUFFIXES, read_map
-from pipeline.make.survey.pieces import Survey, piece_of, refuse_large, with_own_names
+from pipeline.make.survey.pieces import Survey, content_of_survey, piece_of, with_own_names
 from pipeline.make.survey.reachable import reachable
 from pipeline.make.survey.tables import read_points
 from pipeline.make.survey.xml_lines import read_kmz, read_xml
 from pipeline.read.ingest.run import read_run
 from pipeline.stages.matching.fixes import fixes_of
-from schemas.config import Configuration, SurveyConfig, Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.enums import Fix
 from schemas.errors import SiteError
 from schemas.run import RunLog
@@ -67,7 +67,7 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration,
         case ".csv" | ".txt" | ".parquet":
             return read_points(place, path.stem, data, epsg, config.site)
         case _ if suffix in MAP_SUFFIXES:
-            return read_map(path, data, id_field)
+            return read_map(path, data, config.survey, id_field)
     return _of_receiver(path, vehicle, config)
 
 
@@ -81,17 +81,6 @@ def _of_receiver(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
             "is no survey that is known", place=str(path), found=found, expected=_KINDS, remedy=_RECORDED
         ) from None
     return _of_run(run, path, vehicle, config)
-
-
-def content_of_survey(path: Path, config: SurveyConfig) -> bytes:
-    """The file, unless it is too large to be one."""
-    try:
-        if not path.is_file():
-            raise SiteError("is no regular file", place=str(path))
-        refuse_large(path.stat().st_size, str(path), config)
-        return path.read_bytes()
-    except OSError as error:
-        raise SiteError(f"cannot be read: {error.strerror}", place=str(path)) from None
 
 
 def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:

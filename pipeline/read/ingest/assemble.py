@@ -10,7 +10,8 @@ import polars as pl
 from pipeline.read.ingest.conform import DEFAULTS, conform
 from pipeline.read.ingest.plan import Source, is_world_frame, missing_field, world_frame
 from pipeline.read.ingest.reader import ORDINAL
-from pipeline.read.ingest.wraps import said_of_wraps, with_whole_counts
+from pipeline.read.ingest.wraps import said_of_wraps, whole_stream, with_whole_counts
+from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
@@ -26,22 +27,19 @@ class DecodedRows:
 
 
 def stream_frames(
-    decoded: Sequence[DecodedRows], breaches: list[InputError], few: float, remarks: list[str]
+    decoded: Sequence[DecodedRows], breaches: list[InputError], config: IngestConfig, remarks: list[str]
 ) -> dict[str, pl.DataFrame]:
-    """One frame per stream that has a source, rows in order of the file; `remarks` tells what was left out.
-
-    `few`: share of the messages that may be left out for their date.
-    """
+    """One frame per stream that has a source, rows in order of the file; `remarks` tells what was left out."""
     frames: dict[str, pl.DataFrame] = {}
     for stream in STREAMS:
         parts = [part for part in decoded if part.source.recipe.stream == stream]
         if parts:
-            frames[stream] = _stream(stream, parts, breaches, few, remarks)
+            frames[stream] = _stream(stream, parts, breaches, config, remarks)
     return frames
 
 
 def _stream(
-    stream: Stream, parts: Sequence[DecodedRows], breaches: list[InputError], few: float, remarks: list[str]
+    stream: Stream, parts: Sequence[DecodedRows], breaches: list[InputError], config: IngestConfig, remarks: list[str]
 ) -> pl.DataFrame:
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
     breaches += [
@@ -51,10 +49,16 @@ def _stream(
         if part.frame[path].null_count() == part.frame.height
     ]
     supplements = [part for part in parts if part.source.recipe.supplement]
-    rows = [_rows(part, supplements, few, remarks) for part in parts if not part.source.recipe.supplement]
+    rows = [_rows(part, supplements, config, remarks) for part in parts if not part.source.recipe.supplement]
     joined = pl.concat(rows, how="diagonal_relaxed")
     frame = joined if len(rows) == 1 else joined.sort(ORDINAL, maintain_order=True)
-    return conform(frame, stream, place, breaches)
+    conformed = conform(frame, stream, place, breaches)
+    if stream != "odometer" or breaches or any(part.source.mapping is not None for part in parts):
+        return conformed
+    whole, wraps = whole_stream(conformed, config)
+    topics = ", ".join(dict.fromkeys(part.source.channel.topic for part in parts))
+    remarks += [f"{topics}: {said}" for said in wraps]
+    return whole
 
 
 def _supplemented(frame: pl.DataFrame, part: DecodedRows, supplements: Sequence[DecodedRows]) -> pl.DataFrame:
@@ -75,7 +79,9 @@ def _same_receiver(part: DecodedRows, supplement: DecodedRows) -> bool:
     return part.source.channel.topic.rpartition("/")[0] == supplement.source.channel.topic.rpartition("/")[0]
 
 
-def _rows(part: DecodedRows, supplements: Sequence[DecodedRows], few: float, remarks: list[str]) -> pl.DataFrame:
+def _rows(
+    part: DecodedRows, supplements: Sequence[DecodedRows], config: IngestConfig, remarks: list[str]
+) -> pl.DataFrame:
     source = part.source
     _refuse_world_frame(part)
     try:
@@ -83,12 +89,12 @@ def _rows(part: DecodedRows, supplements: Sequence[DecodedRows], few: float, rem
     except (ValueError, pl.exceptions.PolarsError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
-    part = replace(part, frame=_counted_on(part, times, remarks))
+    part = replace(part, frame=_counted_on(part, times, config, remarks))
     columns = _explicit(part.frame.select(ORDINAL, **source.columns), source)
     frame = _supplemented(_named(columns.with_columns(times), part), part, supplements)
     if "t" not in source.times:
         return frame
-    if frame["t"].null_count() and _may_be_left_out(part, frame["t"].is_null(), few, remarks):
+    if frame["t"].null_count() and _may_be_left_out(part, frame["t"].is_null(), config.wrong_dates_share, remarks):
         frame = frame.drop_nulls("t")
     return _stamped(frame, source, remarks)
 
@@ -104,7 +110,9 @@ def _refuse_world_frame(part: DecodedRows) -> None:
             raise world_frame(source.channel, path, frame)
 
 
-def _counted_on(part: DecodedRows, times: Sequence[pl.Series], remarks: list[str]) -> pl.DataFrame:
+def _counted_on(
+    part: DecodedRows, times: Sequence[pl.Series], config: IngestConfig, remarks: list[str]
+) -> pl.DataFrame:
     """The fields with a mapped counter counted on where it begins anew."""
     mapping = part.source.mapping
     if mapping is None or part.source.recipe.stream != "odometer" or "distance_m" not in mapping.fields:
@@ -114,7 +122,7 @@ def _counted_on(part: DecodedRows, times: Sequence[pl.Series], remarks: list[str
         return part.frame
     t_ns = times[0].to_physical().fill_null(0).to_numpy()
     sensors = part.frame[mapping.fields["sensor"]] if mapping.fields.get("sensor") in part.frame.columns else None
-    whole, found = with_whole_counts(part.frame[path], t_ns, mapping.wrap, sensors)
+    whole, found = with_whole_counts(part.frame[path], t_ns, mapping.wrap, sensors, config.wraps)
     topic = part.source.channel.topic
     remarks += [f"{topic}: {times} x {said}" for said, times in said_of_wraps(found, path).items()]
     return part.frame.with_columns(whole) if found else part.frame

@@ -8,8 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
+from pydantic import TypeAdapter, ValidationError
 
 from pipeline.read.ingest.conform import conform, refuse
+from pipeline.read.ingest.wraps import counted_on
 from pipeline.stages.track.geodesy import moved_deg
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import IngestConfig, StreamCorrection, settings_from
@@ -21,6 +23,8 @@ RECORDED = "corrections"
 """In the metadata of a stream that was written: the corrections that it holds already."""
 
 _DAMAGE = "damage"
+_RAW_LOGS = "raw_logs"
+_LISTING = TypeAdapter(tuple[tuple[str, int, str], ...])
 _PLACE = ("latitude_deg", "longitude_deg")
 
 
@@ -74,15 +78,27 @@ def corrections_of(run: RunLog, stream: Stream) -> list[StreamCorrection]:
 
 
 def recorded_notes(run: RunLog, stream: Stream) -> dict[str, str]:
-    """What a written stream says of its corrections and, of positions, of what its log lacked, for its metadata."""
+    """What a written stream says of its corrections and, of positions, of the logs of the run, for its metadata."""
     held = [correction.model_dump(mode="json", exclude_defaults=True) for correction in corrections_of(run, stream)]
-    lost = run.notes.damage if stream == "gnss" else None
-    return ({RECORDED: json.dumps(held)} if held else {}) | ({_DAMAGE: lost} if lost else {})
+    said = {RECORDED: json.dumps(held)} if held else {}
+    if stream == "gnss" and run.notes.damage:
+        said[_DAMAGE] = run.notes.damage
+    if stream == "gnss" and run.notes.raw_logs:
+        said[_RAW_LOGS] = json.dumps(run.notes.raw_logs)
+    return said
 
 
 def read_damage(metadata: Mapping[str, str]) -> str | None:
     """What the log lacked that a stream was written of."""
     return metadata.get(_DAMAGE)
+
+
+def read_raw_logs(metadata: Mapping[str, str]) -> tuple[tuple[str, int, str], ...]:
+    """The logs that a stream says its run was converted from; none where this program did not write that."""
+    try:
+        return _LISTING.validate_json(metadata.get(_RAW_LOGS, "[]"))
+    except ValidationError:
+        return ()
 
 
 def read_corrections(metadata: Mapping[str, str], stream: Stream, place: str) -> tuple[StreamCorrection, ...]:
@@ -113,6 +129,7 @@ def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -
     if correction.exchange is not None:
         first, second = correction.exchange
         mended = mended.with_columns(pl.col(second).alias(first), pl.col(first).alias(second))
+    mended = _counted_on(mended, correction.wrap) if correction.wrap is not None else mended
     mended = mended.with_columns(pl.col(name) * factor for name, factor in correction.factors.items())
     mended = _later(mended, correction.shift_s) if correction.shift_s else mended
     if correction.moves:
@@ -124,6 +141,15 @@ def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -
     conformed = conform(mended, correction.stream, f"{run_id}: {correction.stream} after [[ingest.correct]]", breaches)
     refuse(breaches)
     return conformed
+
+
+def _counted_on(odometer: pl.DataFrame, size: float) -> pl.DataFrame:
+    """Distances of counters that begin anew after so much, by sensor."""
+    distance = floats(odometer, "distance_m").copy()
+    for sensor in odometer["sensor"].unique():
+        rows = np.flatnonzero((odometer["sensor"] == sensor).to_numpy())
+        distance[rows] = counted_on(distance[rows], size)
+    return odometer.with_columns(pl.Series("distance_m", distance).fill_nan(None))
 
 
 def _later(frame: pl.DataFrame, shift_s: float) -> pl.DataFrame:
@@ -149,6 +175,7 @@ def _moved(frame: pl.DataFrame, correction: StreamCorrection) -> pl.DataFrame:
 def unknown_columns(correction: StreamCorrection) -> list[str]:
     """The columns that it names and that cannot be corrected: only numbers can be multiplied, only places be moved."""
     names = [*correction.factors, *(correction.exchange or ()), *([*_PLACE, "height_m"] if correction.moves else [])]
+    names += [] if correction.wrap is None else ["distance_m"]
     return sorted(set(names) - set(_numbers(correction.stream)))
 
 

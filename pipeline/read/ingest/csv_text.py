@@ -21,6 +21,8 @@ CUT_ROW = "row that breaks off at the end of the file"
 _SEPARATORS = (",", ";", "\t")
 # A logger writes no more lines above its header.
 _HEAD_LINES = 60
+# Loggers of whole trains write some thousands; each column takes kilobytes, however few rows it has.
+_MOST_COLUMNS = 10_000
 _NO_ROW = r"#|sep=.$"  # a comment; Excel's own line, which names the separator
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # Without a byte order mark: every other byte of European text is zero.
@@ -77,6 +79,12 @@ def _whole_rows(data: bytes, infer: bool) -> LogTable:
     lines, units = _without_units(lines[:-1] if cut else lines, separator)
     short = sum(0 < line.count(separator) < fields for line in lines)
     return LogTable(_table(lines, infer), int(cut), short, units, separator, len(written) - len(whole))
+
+
+def _refuse_wide(lines: list[str]) -> None:
+    widest = max((line.count(separator) for line in lines[:_HEAD_LINES] for separator in _SEPARATORS), default=0)
+    if widest >= _MOST_COLUMNS:
+        raise ValueError(f"it has {widest + 1} columns; at most {_MOST_COLUMNS} are read")
 
 
 def _from_header(lines: list[str]) -> list[str]:
@@ -171,6 +179,7 @@ def _separator(lines: list[str]) -> str:
 
 
 def _table(lines: list[str], infer: bool) -> pl.DataFrame:
+    _refuse_wide(lines)
     separator = _separator(lines)
     body = "\n".join(lines).lstrip("\n")
     length = None if infer else 0

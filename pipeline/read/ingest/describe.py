@@ -159,7 +159,7 @@ class _ChannelCounts:
     span_ns: list[int] = field(default_factory=list)
 
 
-class _Census:
+class Census:
     """Counts messages of all channels and looks at the first of each."""
 
     def __init__(self) -> None:
@@ -188,7 +188,11 @@ def _fields(channel: Channel, messages: Messages) -> Mapping[str, str]:
 
 def topics_of(paths: Sequence[Address], config: IngestConfig) -> tuple[TopicSummary, ...]:
     """All topics of a log, in one or several files, as far as it can be read; of damage it says nothing."""
-    logs = [_census_of(path, config) for path in paths]
+    return topics_in([_census_of(path, config) for path in paths], config)
+
+
+def topics_in(logs: Sequence[Census], config: IngestConfig) -> tuple[TopicSummary, ...]:
+    """All topics that were counted, in one or several files of a log."""
     if len(logs) == 1:
         return tuple(_topic(logs[0].met[channel_id], config) for channel_id in sorted(logs[0].met))
     joined: dict[tuple[str, str, str], _ChannelCounts] = {}
@@ -200,8 +204,8 @@ def topics_of(paths: Sequence[Address], config: IngestConfig) -> tuple[TopicSumm
     return tuple(_topic(joined[key], config) for key in sorted(joined))
 
 
-def _census_of(path: Address, config: IngestConfig) -> _Census:
-    census = _Census()
+def _census_of(path: Address, config: IngestConfig) -> Census:
+    census = Census()
     with suppress(InputError):
         walk_log(path, config, census)
     return census

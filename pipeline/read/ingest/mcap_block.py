@@ -110,13 +110,22 @@ class Allowance:
     left: int
 
 
+def _refuse(damage: DamageError) -> None:
+    raise damage
+
+
 def piece_of_chunk(
-    content: Any, offset: int, on_record: OnRecord, allowance: Allowance, indexes: Sequence[tuple[int, bytes]] = ()
+    content: Any,
+    offset: int,
+    on_record: OnRecord,
+    allowance: Allowance,
+    indexes: Sequence[tuple[int, bytes]] = (),
+    on_odd_index: Callable[[DamageError], None] = _refuse,
 ) -> Piece:
     """The messages of a chunk, which its records must fill exactly; other records go to `on_record`.
 
     `indexes`: its message indexes, channel and entries. Where all records from the first listed one on are the listed
-    messages, these are not walked.
+    messages, these are not walked. `on_odd_index`: of an index that disagrees with the chunk.
     """
     view = memoryview(content)
     starts = array("q")
@@ -131,11 +140,12 @@ def piece_of_chunk(
         how = "is cut off by" if at < len(view) else "runs past"
         raise DamageError(offset, f"a record {how} the end of its chunk")
     piece = _walked(content, starts, offset)
-    _check_indexes(piece, indexes)
+    if not _agree(piece, indexes):
+        on_odd_index(DamageError(offset, "a message index disagrees with its chunk"))
     return piece
 
 
-def _check_indexes(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> None:
+def _agree(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> bool:
     """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
     order = np.argsort(piece.heads["channel"], kind="stable")
     channels = piece.heads["channel"][order]
@@ -144,7 +154,8 @@ def _check_indexes(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> None:
         first, end = np.searchsorted(channels, np.array([channel, channel + 1]))
         listed = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
         if not np.array_equal(listed[np.argsort(listed[:, 1], kind="stable")], messages[first:end]):
-            raise DamageError(piece.offset, "a message index disagrees with its chunk")
+            return False
+    return True
 
 
 def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> Piece | None:

@@ -14,7 +14,7 @@ import polars as pl
 
 from pipeline.read.ingest.assemble import DecodedRows, stream_frames
 from pipeline.read.ingest.conform import refuse
-from pipeline.read.ingest.correct import read_corrections, read_damage
+from pipeline.read.ingest.correct import read_corrections, read_damage, read_raw_logs
 from pipeline.read.ingest.fields import fields_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel, DamageError
@@ -27,6 +27,7 @@ from pipeline.storage.budget import most_unpacked
 from schemas.arrays import times_ns
 from schemas.config import IngestConfig, StreamCorrection
 from schemas.errors import InputError
+from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import IngestNotes, RunLog
 
 _MIB = 1024 * 1024
@@ -103,18 +104,26 @@ def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> 
     return read_mcaps([path], config, with_digest)
 
 
-def read_mcaps(paths: Sequence[Address], config: IngestConfig, with_digest: bool = False) -> RunLog:
+def read_mcaps(
+    paths: Sequence[Address],
+    config: IngestConfig,
+    with_digest: bool = False,
+    partly: bool = False,
+    beside: Sequence[BlockSink] = (),
+) -> RunLog:
     """All streams of a log that a recorder split into several files, in order; the digest is of the first.
 
-    A topic need not be in each of them.
+    A topic need not be in each of them. `partly`: the log is one of several of a run; it need not hold positions, nor
+    all topics that are mapped. `beside`: by file, what else looks at its messages on the same walk.
     """
     logs: list[_WalkedLog] = []
-    for path in paths:
+    for number, path in enumerate(paths):
         streams = McapStreams(config)
         ordinal = logs[-1].walk.next_ordinal if logs else 0
-        walk, digest = walk_log(path, config, streams, with_digest, ordinal)
+        sink = _Sinks([streams, *beside[number : number + 1]])
+        walk, digest = walk_log(path, config, sink, with_digest, ordinal)
         logs.append(_WalkedLog(path, walk, streams, digest))
-    frames, held, slow_messages, left_over, damage = _frames(logs, config)
+    frames, held, slow_messages, left_over, damage = _frames(logs, config, partly)
     messages: Counter[str] = Counter()
     for log in logs:
         messages.update(log.walk.message_counts())
@@ -128,10 +137,17 @@ def read_mcaps(paths: Sequence[Address], config: IngestConfig, with_digest: bool
             skipped_topics=left_over,
             corrections=held,
             messages=dict(messages),
+            raw_logs=_raw_logs(logs),
         ),
         input_digest=logs[0].digest,
         gnss=frames["gnss"],
     ).with_streams(**frames)
+
+
+def _raw_logs(logs: Sequence[_WalkedLog]) -> tuple[tuple[str, int, str], ...]:
+    """What the topics say that the run was converted from."""
+    said = dict.fromkeys(channel.notes for log in logs for channel in log.walk.channels.values())
+    return tuple(file for notes in said for file in read_raw_logs(dict(notes)))
 
 
 def _damages(logs: Sequence[_WalkedLog]) -> list[str]:
@@ -145,6 +161,8 @@ def _partial_until_ns(logs: Sequence[_WalkedLog], gnss: pl.DataFrame) -> int | N
     cut = [log for log in logs if log.walk.cut_at is not None]
     if not cut:
         return None
+    if gnss.is_empty():
+        return max((span_ns[1] for log in cut if (span_ns := log.walk.met.span_ns) is not None), default=None)
     last_ns: int = times_ns(gnss).max().item()
     ends_ns = [span_ns[1] for log in cut if log is not logs[-1] and (span_ns := log.walk.met.span_ns) is not None]
     return min(last_ns, *ends_ns) if ends_ns else last_ns
@@ -152,6 +170,17 @@ def _partial_until_ns(logs: Sequence[_WalkedLog], gnss: pl.DataFrame) -> int | N
 
 class BlockSink(Protocol):
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None: ...
+
+
+class _Sinks:
+    """Several that look at the same messages."""
+
+    def __init__(self, sinks: Sequence[BlockSink]) -> None:
+        self._sinks = sinks
+
+    def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        for sink in self._sinks:
+            sink.add(block, channels)
 
 
 def walk_log(
@@ -179,7 +208,7 @@ def walk_log(
 
 
 def _frames(
-    logs: Sequence[_WalkedLog], config: IngestConfig
+    logs: Sequence[_WalkedLog], config: IngestConfig, partly: bool
 ) -> tuple[dict[str, pl.DataFrame], tuple[StreamCorrection, ...], int, tuple[str, ...], list[str]]:
     """Frames of all streams, corrections that they hold, messages decoded one by one, the topics that fed none, and
     what was lost when the log was written.
@@ -187,7 +216,7 @@ def _frames(
     place = str(logs[0].path) if len(logs) == 1 else ", ".join(str(log.path) for log in logs)
     readers = [reader for log in logs for of_channel in log.streams.readers.values() for reader in of_channel]
     met = [log.walk.channels[channel_id] for log in logs for channel_id in log.streams.readers]
-    settled = settle([reader.source for reader in readers], [c.topic for c in met], config, place)
+    settled = settle([reader.source for reader in readers], [c.topic for c in met], config, place, partly)
     chosen = [reader for reader in readers if any(reader.source is source for source in settled)]
     decoded = [DecodedRows(r.source, solution_of(r.source, settled), r.frame()) for r in chosen]
     used = {source.channel.topic for source in settled}
@@ -195,10 +224,11 @@ def _frames(
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
     breaches: list[InputError] = []
     remarks: list[str] = []
-    frames = stream_frames(decoded if len(logs) == 1 else _joined(decoded), breaches, config.wrong_dates_share, remarks)
-    if "gnss" not in frames:
+    frames = stream_frames(decoded if len(logs) == 1 else _joined(decoded), breaches, config, remarks)
+    if "gnss" not in frames and not (partly and frames):
         breaches.append(_no_gnss(logs, left_over))
     refuse(breaches)
+    frames.setdefault("gnss", STREAM_SCHEMAS["gnss"].create_empty())
     slow_messages = sum(reader.slow_messages for reader in chosen)
     held = _held([*settled], place)
     damage = [text for source in settled if (text := read_damage(dict(source.channel.notes)))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,27 +15,87 @@ from pipeline.read.ingest.mcap_records import HEAD_SIZE, Channel, DamageError, p
 
 
 @dataclass
+class ChunkList:
+    """Chunks in order: where each begins, its length (of an index: with its message indexes), a hash of the rest."""
+
+    offsets: array[int] = field(default_factory=lambda: array("q"))
+    lengths: array[int] = field(default_factory=lambda: array("q"))
+    contents: array[int] = field(default_factory=lambda: array("q"))
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    def add(self, of: Chunk | ChunkIndex, offset: int, record: int, with_indexes: int) -> None:
+        """A chunk whose record has this offset and length."""
+        packed = len(of.data) if isinstance(of, Chunk) else of.compressed_size
+        content = (of.message_start_time, of.message_end_time, record, packed, of.uncompressed_size, of.compression)
+        self.offsets.append(offset)
+        self.lengths.append(with_indexes)
+        self.contents.append(hash(content))
+
+    def is_same(self, other: ChunkList) -> bool:
+        return (self.offsets, self.contents) == (other.offsets, other.contents)
+
+    def sorted(self) -> ChunkList:
+        order = sorted(range(len(self)), key=self.offsets.__getitem__)
+        columns = (self.offsets, self.lengths, self.contents)
+        return ChunkList(*(array("q", map(column.__getitem__, order)) for column in columns))
+
+    def lost_of(self, listed: ChunkList, missing: int) -> set[int] | None:
+        """Before which of these chunks others of a list were lost, when the file became `missing` bytes shorter.
+
+        None where these are not chunks of the list, in its order, each as far ahead of its place as was lost before it.
+        """
+        before: set[int] = set()
+        ahead = room = number = end = 0
+        for offset, length, content in zip(listed.offsets, listed.lengths, listed.contents, strict=True):
+            if offset < end:
+                return None
+            end = offset + length
+            there = number < len(self) and content == self.contents[number]
+            if there and ahead <= offset - self.offsets[number] <= ahead + room:
+                ahead = offset - self.offsets[number]
+                room = 0
+                number += 1
+            else:
+                before.add(number)
+                room += length
+        return before if number == len(self) and ahead <= missing <= ahead + room else None
+
+
+@dataclass
 class WalkCounts:
     """What the walk counted on its way.
 
-    `chunk_sum` adds up what a chunk index must say of each chunk, in any order: a log may have a million of them.
+    `chunks`: what a chunk index must say of each, in few bytes: a log may have a million of them. `orphans`: indexes
+    without their chunk, by how many chunks were met before. `checksum`: that of the data does not match. `undefined`:
+    a channel is defined in the summary alone.
     """
 
     message_counts: Counter[int] = field(default_factory=Counter)
-    chunks: int = 0
-    chunk_sum: int = 0
+    chunks: ChunkList = field(default_factory=ChunkList)
+    orphans: list[tuple[int, DamageError]] = field(default_factory=list)
+    checksum: DamageError | None = None
+    undefined: DamageError | None = None
     attachments: int = 0
     metadata: int = 0
     span_ns: tuple[int, int] | None = None
 
-    def add_chunk(self, chunk: Chunk, offset: int, length: int) -> None:
-        """A chunk whose record has this offset and length."""
-        start_ns = chunk.message_start_time
-        end_ns = chunk.message_end_time
-        self.chunks += 1
-        self.chunk_sum += hash(
-            (start_ns, end_ns, offset, length, len(chunk.data), chunk.uncompressed_size, chunk.compression)
-        )
+    @property
+    def unexplained(self) -> list[DamageError]:
+        """What no lost chunk explains so far."""
+        return [*filter(None, [self.undefined, self.checksum]), *(damage for _, damage in self.orphans)]
+
+    def explain(self, lost_before: set[int]) -> None:
+        """Chunks were lost before these, with definitions; the checksum cannot match, indexes there have no chunk."""
+        if lost_before:
+            self.orphans = [orphan for orphan in self.orphans if orphan[0] not in lost_before]
+            self.checksum = None
+            self.undefined = None
+
+    def add_orphan(self, damage: DamageError) -> None:
+        """What contradicts the log, unless it turns out that a chunk was lost there."""
+        self.orphans.append((len(self.chunks), damage))
 
     def add_times(self, low_ns: int, high_ns: int) -> None:
         old = self.span_ns or (low_ns, high_ns)
@@ -52,21 +113,17 @@ class Summary:
         self._start = start
         self._met = met
         self._channels = channels
-        self._stated_chunks = 0
+        self._stated_chunks: int | None = None
         self._crc = 0
-        self._indexed = 0
-        self._index_sum = 0
+        self._listed = ChunkList()
 
     def add(self, opcode: int, whole: bytes, position: int) -> None:
         """A record before the footer."""
         self._crc = crc32(whole, self._crc)
         if opcode == Opcode.CHUNK_INDEX:
             index = parse(ChunkIndex, whole[HEAD_SIZE:], position)
-            span_ns = (index.message_start_time, index.message_end_time)
-            place = (index.chunk_start_offset, index.chunk_length)
-            content = (index.compressed_size, index.uncompressed_size, index.compression)
-            self._indexed += 1
-            self._index_sum += hash((*span_ns, *place, *content))
+            length = index.chunk_length + index.message_index_length
+            self._listed.add(index, index.chunk_start_offset, index.chunk_length, length)
         elif opcode == Opcode.STATISTICS:
             self._check_statistics(parse(Statistics, whole[HEAD_SIZE:], position), position)
 
@@ -86,7 +143,7 @@ class Summary:
             pairs.append(("messages per channel", per_channel, counts))
         for name, held, count in (
             ("messages", met.message_counts.total(), stated.message_count),
-            ("chunks", met.chunks, stated.chunk_count),
+            ("chunks", len(met.chunks), stated.chunk_count),
         ):
             if held < count:
                 self.lost += [_loss(name, held, count)] if name == "chunks" or not self.lost else []
@@ -110,15 +167,28 @@ class Summary:
         """The footer. A chunk index lists every chunk once, or there is none."""
         stated = parse(Footer, footer[HEAD_SIZE:], position)
         start = self._start if position != self._start else 0
-        if stated.summary_start != start:
-            raise DamageError(position, f"the footer places the summary at {stated.summary_start}, it is at {start}")
         if stated.summary_crc and crc32(footer[:-4], self._crc) != stated.summary_crc:
             raise DamageError(position, "the checksum of the summary does not match")
-        all_indexed = (self._indexed, self._index_sum) == (self._met.chunks, self._met.chunk_sum)
-        # Chunks that the statistics miss too are lost; without them the sum shows nothing of the others.
-        known = bool(self.lost) and self._met.chunks < self._indexed == self._stated_chunks
-        if self._indexed and not (all_indexed or known):
+        missing = stated.summary_start - start
+        elsewhere = DamageError(position, f"the footer places the summary at {stated.summary_start}, it is at {start}")
+        if missing < 0 or (missing and not start):
+            raise elsewhere
+        lost_before = self._lost_before(missing, position)
+        if missing and not self.lost:
+            raise elsewhere
+        self._met.explain(lost_before)
+
+    def _lost_before(self, missing: int, position: int) -> set[int]:
+        """Before which chunks others were lost, as the chunk index shows; `lost` names them where nothing else did."""
+        met = self._met.chunks
+        listed = self._listed.sorted()
+        if not len(listed) or listed.is_same(met):
+            return set()
+        lost_before = met.lost_of(listed, missing)
+        if not lost_before or self._stated_chunks not in (None, len(listed)):
             raise DamageError(position, "the chunk index disagrees with the chunks")
+        self.lost = self.lost or [_loss("chunks", len(met), len(listed))]
+        return lost_before
 
 
 def _is_less(counts: Mapping[int, int], stated: Mapping[int, int]) -> bool:

@@ -99,8 +99,8 @@ class McapWalk:
             damage = error
         if self._pieces:
             yield self._block()
-        if damage is not None:
-            raise damage
+        for contradiction in [*self.met.unexplained, *filter(None, [damage])]:
+            raise contradiction
 
     def _walked(self) -> Iterator[Block]:
         position = self._first_record()
@@ -159,7 +159,7 @@ class McapWalk:
     def _record(self, opcode: int, length: int, position: int) -> int:
         """Meet one record of the data section; the position of the next."""
         if opcode == Opcode.MESSAGE_INDEX:
-            raise DamageError(position, "a message index does not follow a chunk")
+            self.met.add_orphan(DamageError(position, "a message index does not follow a chunk"))
         if opcode == Opcode.MESSAGE:
             return self._loose_messages(length, position)
         if opcode == Opcode.CHUNK:
@@ -230,10 +230,11 @@ class McapWalk:
             raise DamageError(
                 position, "the chunks unpack to too many times the size of the file ([ingest] unpacked_ratio_limit)"
             )
-        self.met.add_chunk(chunk, position, HEAD_SIZE + len(body))
+        record = HEAD_SIZE + len(body)
         content = unpacked(chunk, position)
         indexes, end = self._indexes(end, position, size)
-        self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes))
+        self.met.chunks.add(chunk, position, record, record)
+        self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes, self.met.add_orphan))
         return end
 
     def _indexes(self, position: int, chunk: int, room: int) -> tuple[list[tuple[int, bytes]], int]:
@@ -279,13 +280,30 @@ class McapWalk:
         block = block_of(pieces, self._ordinal)
         for channel_id, messages in block.items():
             if channel_id not in self.channels:
-                raise DamageError(pieces[0].offset, f"a message behind it belongs to the unknown channel {channel_id}")
+                self._define_lost(channel_id, pieces[0].offset)
             self.met.message_counts[channel_id] += len(messages)
             if messages.log_time.min() < 0:
                 raise DamageError(pieces[0].offset, "a log time behind it is beyond the year 2262")
             self.met.add_times(int(messages.log_time.min()), int(messages.log_time.max()))
         self._ordinal += sum(len(piece.data) for piece in pieces)
         return block
+
+    def _define_lost(self, channel_id: int, offset: int) -> None:
+        """A channel that was defined in a chunk that is lost: the summary repeats all definitions."""
+        unknown = DamageError(offset, f"a message behind it belongs to the unknown channel {channel_id}")
+        position = len(MAGIC)
+        in_summary = False
+        while position + HEAD_SIZE <= self._size:
+            opcode, length = HEAD.unpack(self._read(position, HEAD_SIZE))
+            if length > self._size - position - HEAD_SIZE:
+                break
+            if in_summary and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._definition(opcode, self._body(opcode, length, position), position)
+            in_summary = in_summary or opcode == Opcode.DATA_END
+            position += HEAD_SIZE + length
+        if channel_id not in self.channels:
+            raise unknown
+        self.met.undefined = unknown
 
     def _data_end(self, crc: int, end: int) -> None:
         """The checksum over the whole data section, which few recorders write.
@@ -299,7 +317,7 @@ class McapWalk:
         elif self._bare_chunks and self._crc_of(end, self._bare_chunks) == crc:
             self.without_crc = len(self._bare_chunks) // 2
         else:
-            raise DamageError(end, "the checksum of the data section does not match")
+            self.met.checksum = DamageError(end, "the checksum of the data section does not match")
 
     def _crc_of(self, end: int, left_out: array[int]) -> int:
         """CRC-32 of the file up to `end`, without some parts (each from and to)."""

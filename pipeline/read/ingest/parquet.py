@@ -7,7 +7,8 @@ import hashlib
 import polars as pl
 
 from pipeline.read.ingest.conform import conform, refuse, refuse_too_many
-from pipeline.read.ingest.correct import read_corrections, read_damage
+from pipeline.read.ingest.correct import read_corrections, read_damage, read_raw_logs
+from pipeline.read.ingest.wraps import whole_stream
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
 from pipeline.storage.described import notes_of
@@ -30,6 +31,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
     unproved: list[str] = []
     held: list[StreamCorrection] = []
     damages: list[str] = []
+    raw_logs: tuple[tuple[str, int, str], ...] = ()
     for stream in STREAMS:
         if f"{stream}.parquet" not in present:
             continue
@@ -41,8 +43,12 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
         recorded = _read(content, stream, str(file), config, breaches)
         if recorded is not None:
             frames[stream] = conform(recorded, stream, str(file), breaches)
+            if stream == "odometer" and not breaches:
+                frames[stream], wraps = whole_stream(frames[stream], config)
+                skipped += [f"odometer.parquet: {said}" for said in wraps]
             said = notes_of(content)
             held += read_corrections(said, stream, str(file))
+            raw_logs += read_raw_logs(said)
             damages += [*filter(None, [read_damage(said)]), *_lost(stream, content, recorded)]
             unproved += [f"{stream}.parquet"] if without_checksums(content) else []
             skipped += [f"{stream}.parquet: column {name}" for name in recorded.columns if not _is_known(name, stream)]
@@ -55,6 +61,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
             skipped_topics=tuple(skipped),
             files_without_crc=tuple(unproved),
             corrections=tuple(held),
+            raw_logs=raw_logs,
         ),
         input_digest=digest.hexdigest() if with_digest else "",
         gnss=frames["gnss"],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import polars as pl
@@ -232,9 +232,14 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
     return log_time
 
 
-def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfig, file: str) -> list[Source]:
-    """The sources that stand, once all channels are known; raises for what is missing or in doubt."""
-    breaches = _absent_topics(topics, config, file)
+def settle(
+    sources: Sequence[Source], topics: Sequence[str], config: IngestConfig, file: str, partly: bool = False
+) -> list[Source]:
+    """The sources that stand, once all channels are known; raises for what is missing or in doubt.
+
+    `partly`: of one of several logs, in which not every topic need be.
+    """
+    breaches = [] if partly else absent_topics(topics, config, file)
     kept: list[Source] = []
     for stream in STREAMS:
         chosen = _preferred([s for s in sources if s.recipe.stream == stream and not s.dropped])
@@ -248,7 +253,8 @@ def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfi
     return kept
 
 
-def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[InputError]:
+def absent_topics(topics: Collection[str], config: IngestConfig, file: str) -> list[InputError]:
+    """Mappings whose topic is not among those of the log."""
     return [
         InputError(
             f"is configured for {stream} but has no messages",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from pipeline.read.ingest.conform import refuse_too_many
 from pipeline.read.ingest.correct import corrected
-from pipeline.read.ingest.mcap_run import MOST_TOPICS, read_mcap
+from pipeline.read.ingest.mcap_run import MOST_TOPICS, BlockSink, read_mcap, read_mcaps
 from pipeline.read.ingest.parquet import read_folder
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, shown
@@ -24,7 +26,19 @@ def read_run(path: Address, config: IngestConfig = _DEFAULTS, with_digest: bool 
     included. Raises one `InputError` that lists all breaches; a log that is cut off is read up to the
     damage and says so in `notes`. What the configuration corrects in the streams is corrected (`[[ingest.correct]]`).
     """
-    run = _recorded(path, config, with_digest)
+    return corrected(_limited(_recorded(path, config, with_digest), path, config), config.correct)
+
+
+def read_part(
+    paths: Sequence[Address], config: IngestConfig, partly: bool = False, beside: Sequence[BlockSink] = ()
+) -> RunLog:
+    """As `read_run` of the MCAP files of one log, which may be one of several of a run (`read_mcaps`)."""
+    run = read_mcaps(paths, config, partly=partly, beside=beside)
+    return corrected(_limited(run, paths[0], config), config.correct, later=partly)
+
+
+def _limited(run: RunLog, path: Address, config: IngestConfig) -> RunLog:
+    """The same run; raises `InputError` where it has more rows or solutions than any journey."""
     for stream in STREAMS:
         if (frame := run.stream(stream)) is not None:
             refuse_too_many(frame.height, f"{shown(path)}: {stream}", config)
@@ -35,7 +49,7 @@ def read_run(path: Address, config: IngestConfig = _DEFAULTS, with_digest: bool 
             found=str(count),
             expected=f"at most {MOST_TOPICS}",
         )
-    return corrected(run, config.correct)
+    return run
 
 
 def _recorded(path: Address, config: IngestConfig, with_digest: bool) -> RunLog:

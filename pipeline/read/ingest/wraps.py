@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, times_ns
+from schemas.config import IngestConfig, WrapsConfig
 
 # Bits and decimal digits of counters; tachographs and wheel sensors count in these.
 _SIZES = (*(2**bits for bits in (8, 10, 12, 14, 15, 16, 20, 24, 31, 32)), *(10**digits for digits in range(3, 10)))
@@ -19,17 +20,10 @@ _COUNTS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 _TRIED = 2
 # Numerics: written values are whole counts to so much of one.
 _WHOLE = 1e-6
-# The step over the end is no longer than this share of the size, or it could as well be a reset.
-_SURE_SHARE = 0.01
-# Of 1,000 random resets 4 look like the end of a counter of 1,000 or 10,000, hardly one like that of a larger one.
-_SURE_SIZE = 2**14
-# A fall by less than this share of the size is a reset.
-_NAMED_SHARE = 0.9
-# Steps around one that show how long it may be, and by how much longer it may be.
+# Numerics: rows before and behind one that show how long its step may be.
 _AROUND = 10
-_TIMES_LONGER = 2.0
-# A recorder that paused for so many usual steps may have set its counter meanwhile.
-_PAUSE_STEPS = 2.5
+# For drafts, which are checked by hand.
+_USUAL = WrapsConfig()
 
 
 class Wrap(NamedTuple):
@@ -45,15 +39,16 @@ class Wrap(NamedTuple):
         return f"wrap = {self.size:.10g}"
 
 
-def wrap_of(values: Floats, t_ns: Ints | None = None) -> Wrap | None:
+def wrap_of(values: Floats, t_ns: Ints | None = None, config: WrapsConfig = _USUAL) -> Wrap | None:
     """Where a counter begins anew; None where it does not. `values`: as recorded, NaN where empty, at `t_ns`."""
     known = np.isfinite(values)
     recorded = values[known]
     steps = np.diff(recorded)
     if steps.size < _AROUND or not np.any(np.abs(steps) > 0.5 * np.ptp(recorded)):
         return None
-    paused = np.zeros(steps.size, dtype=np.bool_) if t_ns is None else _paused(t_ns[known])
-    found = [wrap for count in _counts_of(recorded) if (wrap := _wrap_by(count, recorded, paused)) is not None]
+    paused = np.zeros(steps.size, dtype=np.bool_) if t_ns is None else _paused(t_ns[known], config)
+    tried = (_wrap_by(count, recorded, paused, config) for count in _counts_of(recorded))
+    found = [wrap for wrap in tried if wrap is not None]
     return next((wrap for wrap in found if wrap.certain), found[0] if found else None)
 
 
@@ -63,20 +58,20 @@ def _counts_of(recorded: Floats) -> list[float]:
     return fitting[: 1 if 1.0 in fitting else _TRIED]
 
 
-def _wrap_by(count: float, recorded: Floats, paused: Bools) -> Wrap | None:
+def _wrap_by(count: float, recorded: Floats, paused: Bools, config: WrapsConfig) -> Wrap | None:
     """As `wrap_of`, where one count is so much of the recorded unit."""
     counts = recorded / count
     moves = np.diff(counts)
     usual = _usual(moves)
     for size in _SIZES:
-        over = np.abs(moves) >= _NAMED_SHARE * size
+        over = np.abs(moves) >= config.named_share * size
         in_range = np.ptp(counts) < size and counts.min() >= -size // 2
         if not in_range or not over.any() or np.any(np.abs(moves[~over]) > 0.5 * size):
             continue
         rest = np.abs(np.abs(moves[over]) - size)
-        limit = _TIMES_LONGER * usual[over] + 2.0
+        limit = config.times_longer * usual[over] + 2.0
         if np.all(rest <= limit) and not paused[over].any():
-            sure = size >= _SURE_SIZE and bool(np.all(limit <= _SURE_SHARE * size))
+            sure = size >= config.sure_size and bool(np.all(limit <= config.sure_share * size))
             return Wrap(size * count, int(over.sum()), certain=sure)
     return None
 
@@ -94,9 +89,9 @@ def _usual(moves: Floats) -> Floats:
     return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * _AROUND + 1).max(axis=1))
 
 
-def _paused(t_ns: Ints) -> Bools:
+def _paused(t_ns: Ints, config: WrapsConfig) -> Bools:
     steps_ns = np.diff(t_ns)
-    return np.asarray(steps_ns > _PAUSE_STEPS * np.median(steps_ns))
+    return np.asarray(steps_ns > config.pause_steps * np.median(steps_ns))
 
 
 def counted_on(values: Floats, size: float) -> Floats:
@@ -117,13 +112,13 @@ class Counted(NamedTuple):
 
 
 def with_whole_counts(
-    column: pl.Series, t_ns: Ints | None, declared: float | None, sensors: pl.Series | None = None
+    column: pl.Series, t_ns: Ints | None, declared: float | None, sensors: pl.Series | None, config: WrapsConfig
 ) -> Counted:
-    """A recorded counter over its ends: as `declared` by its mapping, else where it is certain. `sensors`: by row."""
+    """A recorded counter over its ends: as `declared`, else where it is certain. `sensors`: by row."""
     values = column.cast(pl.Float64).fill_null(float("nan")).to_numpy().copy()
     found: list[Wrap] = []
     for rows in _rows_of(sensors, values.size):
-        wrap = wrap_of(values[rows], None if t_ns is None else t_ns[rows]) if declared is None else None
+        wrap = wrap_of(values[rows], None if t_ns is None else t_ns[rows], config) if declared is None else None
         if declared is not None or (wrap is not None and wrap.certain):
             whole = counted_on(values[rows], declared or (wrap.size if wrap else 1.0))
             turned = int(np.sum(np.abs(np.diff(whole - values[rows])) > 0.0))
@@ -139,10 +134,27 @@ def _rows_of(sensors: pl.Series | None, size: int) -> Iterable[Ints]:
     return [np.flatnonzero((sensors == name).to_numpy()) for name in sensors.drop_nulls().unique(maintain_order=True)]
 
 
-def said_of_wraps(found: Iterable[Wrap], column: str) -> dict[str, int]:
-    """For people: what was found of a counter, and how often."""
-    certain = "(put right; `{}` in its mapping says so)"
-    unsure = "(kept: it may have been reset; `{}` in its mapping counts on)"
+_IN_MAPPING = "`{}` in its mapping"
+_IN_RUN = '`[[ingest.correct]] stream = "odometer", {}` in the configuration'
+
+
+def whole_stream(odometer: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataFrame, list[str]]:
+    """The odometer of a run over the ends of its counters where that is certain, and what was found, for people.
+
+    Left as it is where the configuration corrects that itself (`[[ingest.correct]] wrap`).
+    """
+    if odometer.is_empty() or any(made.stream == "odometer" and made.wrap for made in config.correct):
+        return odometer, []
+    t_ns = times_ns(odometer)
+    whole, found = with_whole_counts(odometer["distance_m"], t_ns, None, odometer["sensor"], config.wraps)
+    said = [f"{times} x {text}" for text, times in said_of_wraps(found, whole.name, _IN_RUN).items()]
+    return odometer.with_columns(whole) if any(wrap.certain for wrap in found) else odometer, said
+
+
+def said_of_wraps(found: Iterable[Wrap], column: str, how: str = _IN_MAPPING) -> dict[str, int]:
+    """For people: what was found of a counter, and how often; `how` the line is written that counts on."""
+    certain = f"(put right; {how} says so)"
+    unsure = f"(kept: it may have been reset; {how} counts on)"
     said: Counter[str] = Counter()
     for wrap in found:
         what = (certain if wrap.certain else unsure).format(wrap.line)

@@ -237,7 +237,7 @@ def reference_ways(
 def known_stretch(
     side: Sided,
     clock: RecorderClock,
-    witnesses: Witnesses,
+    witnesses: Sequence[Witness],
     reads: Sequence[TrueAnchor],
     ahead_m: float,
     config: Configuration,
@@ -270,13 +270,13 @@ def known_stretch(
         paths.append(opened)
         possible_ns |= set(_confirming_ns(opened, stretch, clock_m, reads, config.align.sure_sigmas, np.inf))
     disputed = _disputed(t_ns, reads, possible_ns)
-    for first_ns, last_ns in [] if witnesses.all else disputed:
+    for first_ns, last_ns in [] if witnesses else disputed:
         # Nothing is carried from the reads, so nobody knows since when the reference has been off.
         open_m = np.where((t_ns >= first_ns) & (t_ns <= last_ns), np.inf, 0.0)
         paths = [replace(known, low_m=known.low_m - open_m, high_m=known.high_m + open_m) for known in paths]
-    if t_ns.size == 1 and witnesses.all:
+    if t_ns.size == 1 and witnesses:
         # One sample shows no speed.
-        speed_mps = np.abs(witnesses.all[0].counter.odometer.speed_about(t_ns))
+        speed_mps = np.abs(witnesses[0].counter.odometer.speed_about(t_ns))
     since_s = (t_ns - t_ns[0]) / NS_PER_S
     lates_s = np.linspace(-clock.delta_s, clock.delta_s, 3 + 2 * int(clock.delta_s / _EVEN_S))
     around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in lates_s.tolist()]
@@ -397,23 +397,9 @@ class Witness:
         # At k_T sigmas the 5 % of an odometer of which nothing is known.
         return cls(counter, clock.shift_s, clock.delta_s, 1.0, share / config.align.sure_sigmas)
 
-    def without_sign(self) -> Self:
-        """It says nothing of a way over a stand, at which the train may have turned."""
-        return replace(self, counter=self.counter.without_sign())
-
-
-@dataclass(frozen=True)
-class Witnesses:
-    """The odometers that may contradict a reference, any one of them; `signed`: they count down when the train goes
-    back.
-    """
-
-    all: tuple[Witness, ...]
-    signed: bool = True
-
 
 def contradictions(
-    known: KnownPath, stretch: ReferenceStretch, witnesses: Witnesses, config: Configuration
+    known: KnownPath, stretch: ReferenceStretch, witnesses: Sequence[Witness], config: Configuration
 ) -> list[ReferenceStep]:
     """Steps that an odometer contradicts by more than k_T sigmas: between samples, over 10 s and over 100 s.
 
@@ -422,7 +408,7 @@ def contradictions(
     the fixed 5 m of an odometer, its slip, are allowed too: so drifts of 0.1 m/s show.
     """
     t_ns = stretch.t_ns
-    if t_ns.size < 2 or not witnesses.all:
+    if t_ns.size < 2 or not witnesses:
         return []
     rows = np.arange(t_ns.size)
     nothing_m = np.zeros(t_ns.size - 1)
@@ -431,15 +417,11 @@ def contradictions(
     steps = [ReferenceStep(row, float(step_m[row]), float(limit_m[row])) for row in stepped.tolist()]
     gathered_m = np.zeros(t_ns.size)
     gathered_m[1:][stepped] = step_m[stepped]
-    # Without a sign nothing is said of a window in which the train may have turned.
-    over_windows = witnesses
-    if not witnesses.signed:
-        over_windows = replace(witnesses, all=tuple(witness.without_sign() for witness in witnesses.all))
     for window in (
         (_WINDOW_S, 0.0, 0.0),
         *((_LONG_WINDOW_S, late_s, config.lds.odometer_fixed_m) for late_s in _BEGUN_S),
     ):
-        found = _drifts(known, stretch, over_windows, np.cumsum(gathered_m), window, config)
+        found = _drifts(known, stretch, witnesses, np.cumsum(gathered_m), window, config)
         for step in found:
             gathered_m[step.sample + 1] += step.step_m
         steps += found
@@ -449,7 +431,7 @@ def contradictions(
 def _drifts(
     known: KnownPath,
     stretch: ReferenceStretch,
-    witnesses: Witnesses,
+    witnesses: Sequence[Witness],
     explained_m: Floats,
     window: tuple[float, float, float],
     config: Configuration,
@@ -642,7 +624,7 @@ def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
 def _contradicted(
     known: KnownPath,
     stretch: ReferenceStretch,
-    witnesses: Witnesses,
+    witnesses: Sequence[Witness],
     ways: tuple[Ints, Ints],
     explained_m: Floats,
     config: Configuration,
@@ -660,14 +642,14 @@ def _contradicted(
     allowed_m = np.full(begin.size, np.inf)
     excess_m = np.full(begin.size, -np.inf)
     whole = known.path.leg[begin] == known.path.leg[end]
-    for number, witness in enumerate(witnesses.all):
+    for number, witness in enumerate(witnesses):
         t_ns = stretch.t_ns - round(witness.lag_s * NS_PER_S)
         way = witness.counter.between(t_ns[begin], t_ns[end])
         # Others may count the other way round.
         least_m = config.matching.orientation_distance_m
         sense = sense_of_ways(way.distance_m, way_m, least_m) if number else known.sense
         counted_m = sense * witness.scale * way.distance_m
-        if not witnesses.signed:
+        if not witness.counter.signed:
             counted_m = np.where(way_m * counted_m < 0.0, -counted_m, counted_m)
         variance_m2 = stretch.sigma_m[end] ** 2 + stretch.sigma_m[begin] ** 2 + way.variance_m2
         root_m = np.sqrt(variance_m2 + (witness.scale_sigma * way.distance_m) ** 2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -40,20 +40,21 @@ class TrueAnchor:
 
 @dataclass(frozen=True)
 class Counter:
-    """An odometer as evidence: silent over `breaks_ns`, and where its distance is in doubt by more than `silent_m`."""
+    """An odometer as evidence, silent where its distance is in doubt by more than `silent_m`.
+
+    Without a sign (not `signed`: it counts up when the train goes back) also over a stand, which may hide a turn.
+    """
 
     odometer: Odometry
-    breaks_ns: Ints
     silent_m: float = 0.0
-
-    @classmethod
-    def of(cls, odometer: Odometry, silent_m: float = 0.0, without_sign: bool = False) -> Counter:
-        """Silent over more than `silent_m` of doubt and over a stand without a sign, which may hide a turn."""
-        return cls(odometer, _stands_ns(odometer) if without_sign else np.zeros(0, dtype=np.int64), silent_m)
+    signed: bool = True
 
     def without_sign(self) -> Counter:
-        """The same odometer, that says nothing over a stand."""
-        return Counter.of(self.odometer, self.silent_m, without_sign=True)
+        return replace(self, signed=False)
+
+    @cached_property
+    def _breaks_ns(self) -> Ints:
+        return np.zeros(0, dtype=np.int64) if self.signed else _stands_ns(self.odometer)
 
     @property
     def by_file(self) -> bool:
@@ -93,7 +94,7 @@ class Counter:
         return np.where(near, held_ns, t_ns), np.where(near, beyond_m, 0.0)
 
     def _same(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
-        breaks = [np.searchsorted(self.breaks_ns, t_ns, side="right") for t_ns in (begin_ns, end_ns)]
+        breaks = [np.searchsorted(self._breaks_ns, t_ns, side="right") for t_ns in (begin_ns, end_ns)]
         return np.asarray(breaks[0] == breaks[1])
 
     def driven_m(self, since_ns: Ints | int, t_ns: Ints) -> Floats:
@@ -226,7 +227,7 @@ def carried_forward(
     NaN before the first balise, over a break and over a stand in `stood`. `accepted_ns` in order, at `path_m` of the
     solution's own path, with which the odometer grows.
     """
-    counter = Counter.of(odometer, config.hazards.failure_limit_m)
+    counter = Counter(odometer, config.hazards.failure_limit_m)
     used = _consistent(accepted_ns, path_m, counter, config)
     low, high = np.full((2, t_ns.size), np.nan)
     if used.size:

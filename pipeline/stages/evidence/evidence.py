@@ -384,24 +384,24 @@ def evidence_of(
     """
     hazards = config.hazards
     independent = [odometer for odometer in odometers if odometer.independent]
-    counters = [Counter.of(odometer, config.hazards.failure_limit_m) for odometer in independent or odometers]
+    counters = [Counter(odometer, config.hazards.failure_limit_m) for odometer in independent or odometers]
     main = counters[0] if counters else None
     least_m = config.matching.orientation_distance_m
     stretches, silent = reference
     sides = [anchors.sided(stretch, main, least_m) for stretch in stretches]
     facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
-    turned = any(min(side.with_m, side.against_m) >= least_m for side in sides)
-    searches = [GapSearch(counter, network, config, facing, turned) for counter in counters]
+    if any(min(side.with_m, side.against_m) >= least_m for side in sides):
+        counters = [counter.without_sign() for counter in counters]
+    searches = [GapSearch(counter, network, config, facing) for counter in counters]
     lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
     declared = vehicle.reference_latency_s is not None
     found = [anchors.Witness.of(*of_one, declared, config) for of_one in zip(counters, lags, strict=True)]
-    held_against = anchors.Witnesses(tuple(found), not turned)
     read = anchors.read_anchors(reads, balises, network.track, hazards)
     lags_of_reads = [_lags_of_reads(search.carried(_points(read)), config) for search in searches]
     of_reference, of_reads = clocks_of((lags, lags_of_reads), bool(independent), vehicle, hazards)
     clocked = anchors.on_clock(read, of_reads, main)
-    recorded, unclosed = _known_stretches(sides, of_reference, held_against, clocked, searches, vehicle, config)
+    recorded, unclosed = _known_stretches(sides, of_reference, found, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
     unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
     apart = anchors.outside(clocked, known)
@@ -430,7 +430,7 @@ def evidence_of(
 def _known_stretches(
     sides: Sequence[anchors.Sided],
     clock: RecorderClock,
-    witnesses: anchors.Witnesses,
+    witnesses: Sequence[anchors.Witness],
     reads: Sequence[TrueAnchor],
     searches: Sequence[GapSearch],
     vehicle: Vehicle,
@@ -439,12 +439,12 @@ def _known_stretches(
     """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
     ahead_m = vehicle.gnss_antenna_ahead_m
     known = [anchors.known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
-    if not witnesses.all:
+    if not witnesses:
         return known, 0
     search = searches[0]
     order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
     borders = [known[number].ends(search.counter) for number in order]
-    witness = witnesses.all[0]
+    witness = witnesses[0]
     steps_m = [
         search.misclosure_m(before[1], after[0], witness.scale, witness.scale_sigma)
         for before, after in pairwise(borders)
@@ -474,9 +474,8 @@ def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch,
     """
     sides = [anchors.sided(stretch, search.counter, least_m) for stretch in stretches]
     begin_ns, end_ns, way_m, sigma_m = anchors.reference_ways(sides, search.only_length_m)
-    if not search.turned:
-        return lags_of(begin_ns, end_ns, way_m, sigma_m, search.counter, search.config)
-    return lags_of(begin_ns, end_ns, np.abs(way_m), sigma_m, search.counter.without_sign(), search.config)
+    way_m = way_m if search.counter.signed else np.abs(way_m)
+    return lags_of(begin_ns, end_ns, way_m, sigma_m, search.counter, search.config)
 
 
 def _lags_of_reads(source: Carried, config: Configuration) -> Lags:

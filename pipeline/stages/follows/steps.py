@@ -1,4 +1,10 @@
-"""Steps of an odometer and of positions from one common stamp to the next."""
+"""Steps of an odometer and of positions from one common stamp to the next.
+
+Of the rows as they were written, not of `Odometry`: what that bridges, interpolates or takes from another sensor is
+predicted by its neighbours, and would be taken for a copy of the positions or hide one. So a break is any missing row
+here, of either recorder, where `Odometry` asks whether the distance went on; and movement is what gives the positions a
+direction, where `Odometry` asks whether the train left its place.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Did the train move, which way, does its odometer count wrong: by odometer and evidence, never by the positions."""
+"""Did the train move, which way, does its odometer count wrong: by odometer and evidence, never by the positions.
+
+What an odometer says of motion and continuity is asked of `Odometry` (`moved`, `steps_m`). Here stands what a reference
+says of the same, and the odometer as the LDS used it held against the evidence.
+"""
 
 from __future__ import annotations
 
@@ -126,7 +130,7 @@ def beyond_confidence(
 
 
 def speed_at(epochs: pl.DataFrame, t_ns: Ints) -> Floats:
-    """Speed [m/s] by the epochs around each instant; NaN where no epoch knows it."""
+    """Speed [m/s] as the epochs around each instant show it, the train's own; NaN where no epoch knows it."""
     known = epochs.filter(pl.col("speed_mps").is_not_null())
     if known.is_empty():
         return np.full(t_ns.size, np.nan)

@@ -8,7 +8,7 @@ from pipeline.stages.matching.decode import Decoded, aligned, decode, legs_of, p
 from pipeline.stages.matching.epochs import Assignment
 from pipeline.stages.matching.fixes import Fixes
 from pipeline.stages.matching.least_squares import Course, least_squares
-from pipeline.stages.matching.path_states import path_states, polarity
+from pipeline.stages.matching.path_states import path_states, polarity_of_parts
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import grows_with
 from pipeline.stages.paths.moves import Moves
@@ -38,7 +38,7 @@ def find_path(
         since_m = np.full(states.step.size, np.nan)
         since_m[1:] = odometry.distance_between(at_ns[states.step[:-1]], at_ns[states.step[1:]])
         doubt_m = odometry.doubt_at_s(odometry.seconds(at_ns))
-        moves = Moves(network, found.steps, counted_m, doubt_m, polarity(network, states, since_m), config)
+        moves = Moves(network, found.steps, counted_m, doubt_m, polarity_of_parts(network, states, since_m), config)
     course = least_squares(states, moves)
     decoded = aligned(moves, course, decode(course, moves))
     legs = legs_of(moves, course, decoded)

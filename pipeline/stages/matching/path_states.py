@@ -111,12 +111,13 @@ def _height_costs(candidates: Candidates, height_m: Floats, sigma_up_m: Floats, 
     return np.where(counts, np.minimum(square, config.outlier_sigmas**2), 0.0)
 
 
-def polarity(network: Network, states: PathStates, counted_m: Floats) -> Ints:
+def polarity_of_parts(network: Network, states: PathStates, counted_m: Floats) -> Ints:
     """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown.
 
     `counted_m`: per step of the states the way since the step before, signed, NaN where unknown. The sign belongs to
     the installation and holds for the whole run, but the orientation of a connected part of the network is arbitrary:
-    so one sign for each part, by the votes of all states that stay on one element for a step.
+    so one sign for each part, by the votes of all states that stay on one element for a step. Of the path shown, which
+    looks back; the sign that the train counts with is `odometry.polarity`, by the first metres on that path.
     """
     count = len(network.successors)
     if not network.orientable:

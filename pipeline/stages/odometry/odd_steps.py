@@ -85,11 +85,11 @@ def odd_runs(t_s: Floats, distance_m: Floats, counts_m: Floats | float, config: 
     leaps, _ = _places(counted, config)
     # Near ones are for evidence, which may look back: a counter whose step is not yet known is healthy all the same.
     _, near = _places(counted._replace(counts_m=np.maximum(before_m, counts_m[-1])), config)
-    stalls = _stalls(counted, config)
+    stalls, near_stalls = _stalls(counted, config)
     odd = _between_places(leaps, t_s.size, config) | stalls | _too_far(t_s, distance_m, config)
     odd |= _set_in_a_hole(counted, stalls, config)
     close = _between_places(leaps | near, t_s.size, config) | _beside_lone(leaps | near, t_s.size, config)
-    close &= ~odd
+    close = (close | near_stalls) & ~odd
     found = _runs(counted, odd, odd, config)
     small = _runs(counted, close, odd, config)
     return OddRuns([_in_all_rows(run, rows) for run in found], [_in_all_rows(run, rows) for run in small])
@@ -185,12 +185,15 @@ def _too_far(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
     return far
 
 
-def _stalls(counted: _Counted, config: AlignConfig) -> Bools:
-    """Repeated rows while the train drove on, with the step after them."""
+def _stalls(counted: _Counted, config: AlignConfig) -> tuple[Bools, Bools]:
+    """Repeated rows while the train drove on, with the step after them; and those where it may have stood but for
+    `near_leap_m`.
+    """
     t_s, distance_m = counted.t_s, counted.distance_m
-    stalls = np.zeros(t_s.size - 1, dtype=np.bool_)
+    stalls, nears = np.zeros((2, t_s.size - 1), dtype=np.bool_)
     repeats = np.diff(distance_m) == 0.0
     sums = _Sums.of(t_s, distance_m, np.zeros_like(repeats))
+    last_counts_m = float(counted.counts_m[-1])  # as for near leaps: evidence may look back
     for begin, last in spans_of(repeats):
         end = last + 1
         time_s = float(t_s[end] - t_s[begin])
@@ -201,10 +204,10 @@ def _stalls(counted: _Counted, config: AlignConfig) -> Bools:
         beside = sums.beside(t_s, begin, end, config)
         missing_m = abs(beside.mean_mps) * time_s - driven_within_m(time_s, config, beside.about_s)
         counts_m = float(counted.counts_m[begin])
-        tolerance_m = config.leap_m + 2.0 * counts_m + config.sure_sigmas * float(counted.scatter_m[end - 1])
-        if missing_m > tolerance_m:
-            stalls[begin : end + 1] = True
-    return stalls
+        scatter_m = config.sure_sigmas * float(counted.scatter_m[end - 1])
+        stalls[begin : end + 1] = missing_m > config.leap_m + 2.0 * counts_m + scatter_m
+        nears[begin : end + 1] = missing_m > config.near_leap_m + 2.0 * max(counts_m, last_counts_m) + scatter_m
+    return stalls, nears
 
 
 def _set_in_a_hole(counted: _Counted, odd: Bools, config: AlignConfig) -> Bools:

@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.odometry.bound import LEAST_DOUBT_M, Bound, is_lost
-from pipeline.stages.odometry.contradicted import contradicted_by_speeds
+from pipeline.stages.odometry.contradicted import Contradiction, contradicted_by_speeds
 from pipeline.stages.odometry.counts import CountStep, count_step
 from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_steps, travelled_m
 from pipeline.stages.odometry.odd_steps import LOST_M
@@ -24,7 +24,7 @@ from pipeline.stages.odometry.quantisation import (
     of_the_run,
     scatter_pieces,
 )
-from pipeline.stages.odometry.rows import filled_in, ways_between
+from pipeline.stages.odometry.rows import Ways, filled_in, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
@@ -349,8 +349,6 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     counts = count_step(distance_m, align)
     ways = ways_between(t_s, distance_m, speed, counts.step_m, limit_s, align)
     way_m, counted, bridged_m = ways.way_m, ways.counted, ways.bridged_m
-    recorded_m = np.where(counted & ~ways.odd, way_m, np.nan)
-    parts = contradicted_by_speeds(t_s, recorded_m, ways.driven_m, counts.step_m, config.matching.deadband_mps, align)
     unknown = np.isnan(way_m)
     pause = unknown | (dt_s > limit_s)
     slip = _slips(stream, align)
@@ -360,11 +358,12 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     guess_m, guess_doubt_m = _guessed_ways(way_m, dt_s, speed, period_s[1:], config)
     way_m = np.where(guessed, guess_m, way_m)
     distance_m = _sums(np.where(unknown, 0.0, way_m))
+    whole = counted & ~lost & ~pause
+    noise, known_noise = _noise(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
+    parts = _contradicted(t_s, distance_m, ways, known_noise, config)
     doubt_m = _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
     doubt_m += np.where(guessed, guess_doubt_m, parts.doubt_m)
     doubt_m = _sums(np.where(silent & unknown, LOST_M, doubt_m))
-    whole = counted & ~lost & ~pause
-    noise, known_noise = _noise(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
     doubtful = ways.odd | pause | slip[:-1] | slip[1:] | parts.steps
     bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, parts.off_m, align) if doubtful.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
@@ -395,6 +394,18 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         config=align,
         origin=declared_origin(stream, vehicle),
     )
+
+
+def _contradicted(
+    t_s: Floats, distance_m: Floats, ways: Ways, noise: KnownNoise, config: Configuration
+) -> Contradiction:
+    """Where the speeds contradict the counted distance beyond the noise of its rows, at their speed by the distance."""
+    align = config.align
+    begin_s = np.maximum(t_s - align.speed_window_s, t_s[0])
+    speed_mps = (distance_m - np.interp(begin_s, t_s, distance_m)) / np.maximum(t_s - begin_s, 1e-9)
+    rows_m = align.sure_sigmas * np.sqrt(2.0 * noise.row_m2(speed_mps))
+    recorded_m = np.where(ways.counted & ~ways.odd, ways.way_m, np.nan)
+    return contradicted_by_speeds(t_s, recorded_m, ways.driven_m, rows_m, config.matching.deadband_mps, align)
 
 
 def _guessed_ways(

@@ -50,7 +50,11 @@ def sense_of_ways(counted_m: Floats, other_m: Floats, distance_m: float) -> int:
 
 
 def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distance_m: float) -> bool:
-    """Whether the first `distance_m` of net movement went with the positions."""
+    """Whether these positions grew over the first `distance_m` of net movement: which way the path is to grow.
+
+    By the odometer where there is one, as votes: its sign against them (`polarity`) and its own movement. A question
+    about the path, not about the counter; without an odometer the positions alone answer it.
+    """
     known = np.isfinite(position_m)
     if not known.any():
         return True

@@ -33,7 +33,7 @@ def estimate_run(t_s: Floats, path_m: Floats, odometry: Odometry) -> RunEstimate
     `odometry` grows with the path.
     """
     begin, end = spans_of_rows(t_s)
-    found = scale_and_lag(t_s[begin], t_s[end], path_m[end] - path_m[begin], Counter.of(odometry).rows)
+    found = scale_and_lag(t_s[begin], t_s[end], path_m[end] - path_m[begin], Counter(odometry).rows)
     if not np.isfinite(found.scale_sigma):
         return None
     return RunEstimate(

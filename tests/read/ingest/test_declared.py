@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+import json
 import struct
 from pathlib import Path
+from typing import NamedTuple
 
 import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from datasets.mcap_log import write_mcap
 from datasets.recordings import convert_logs
@@ -226,5 +230,76 @@ def test_a_lost_chunk_that_statistics_and_index_declare(tmp_path: Path) -> None:
     assert run.notes.damage == (
         "holds 1 of 2 messages of /gnss that are declared; holds 1 of 2 chunks that are declared"
     )
+    run = read_run(samples.save(tmp_path, data + indexes + end), IngestConfig())
+    assert run.notes.damage == "holds 1 of 2 chunks that are declared"
+    other = indexes.replace(struct.pack("<Q", START_NS), struct.pack("<Q", START_NS - 1))
     with pytest.raises(InputError, match="chunk index"):
-        read_run(samples.save(tmp_path, data + indexes + end), IngestConfig())
+        read_run(samples.save(tmp_path, data + other + end), IngestConfig())
+
+
+class CutLog(NamedTuple):
+    """A log of seven chunks by the `mcap` package: where each begins and ends, and its indexes end; fixes of each."""
+
+    content: bytes
+    chunks: list[tuple[int, int, int]]
+    fixes: list[int]
+
+
+def log_of_seven(checksum: bool) -> CutLog:
+    """100 fixes; `checksum`: over the data too."""
+    stream = io.BytesIO()
+    writer = Writer(stream, chunk_size=2000, enable_data_crcs=checksum)
+    writer.start()
+    channel = writer.register_channel(
+        "/gnss", "json", writer.register_schema("foxglove.LocationFix", "jsonschema", b"{}")
+    )
+    for number in range(100):
+        t_ns = START_NS + number * SECOND
+        stamp = {"sec": t_ns // SECOND, "nsec": 0}
+        fix = {"timestamp": stamp, "latitude": 50.0 + number * 1e-5, "longitude": 14.0, "altitude": 200.0}
+        writer.add_message(channel, t_ns, json.dumps(fix).encode(), t_ns)
+    writer.finish()
+    content = stream.getvalue()
+    summary = make_reader(io.BytesIO(content)).get_summary()
+    assert summary is not None
+    indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
+    starts = [index.chunk_start_offset for index in indexes]
+    ends = [start + index.chunk_length for start, index in zip(starts, indexes, strict=True)]
+    behind = [end + index.message_index_length for end, index in zip(ends, indexes, strict=True)]
+    counts = [round((index.message_end_time - index.message_start_time) / SECOND) + 1 for index in indexes]
+    return CutLog(content, list(zip(starts, ends, behind, strict=True)), counts)
+
+
+@pytest.mark.parametrize("checksum", [False, True])
+@pytest.mark.parametrize("keeps_indexes", [False, True])
+@pytest.mark.parametrize("cut", [(0,), (3,), (6,), (2, 3), (1, 5)])
+def test_chunks_cut_out_of_a_log_are_said_and_the_others_read(
+    tmp_path: Path, cut: tuple[int, ...], keeps_indexes: bool, checksum: bool
+) -> None:
+    log = log_of_seven(checksum)
+    assert len(log.chunks) == 7
+    content = log.content
+    for number in reversed(cut):
+        start, end, behind = log.chunks[number]
+        content = content[:start] + content[end if keeps_indexes else behind :]
+    run = read_run(samples.save(tmp_path, content), IngestConfig())
+    chunk_of = [number for number, count in enumerate(log.fixes) for _ in range(count)]
+    kept = [fix for fix, number in enumerate(chunk_of) if number not in cut]
+    assert run.gnss["latitude_deg"].to_list() == pytest.approx([50.0 + fix * 1e-5 for fix in kept], abs=1e-9)
+    assert f"holds {len(kept)} of 100 messages of /gnss that are declared" in (run.notes.damage or "")
+    assert f"holds {7 - len(cut)} of 7 chunks that are declared" in (run.notes.damage or "")
+
+
+def test_what_no_lost_chunk_explains_stays_damage(tmp_path: Path) -> None:
+    """A chunk moved behind another, written twice, or cut in the middle; indexes exchanged."""
+    log = log_of_seven(checksum=True)
+    (a, a_end, b), (_, b_end, c) = log.chunks[2:4]
+    content = log.content
+    for changed in (
+        content[:a] + content[b:c] + content[a:b] + content[c:],
+        content[:c] + content[a:],
+        content[: a + 40] + content[a_end:],
+        content[:a_end] + content[b_end:c] + content[b:b_end] + content[a_end:b] + content[c:],
+    ):
+        with pytest.raises(InputError, match="damaged"):
+            read_run(samples.save(tmp_path, changed), IngestConfig())

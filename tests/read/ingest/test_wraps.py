@@ -9,12 +9,16 @@ import numpy as np
 import polars as pl
 import pytest
 
+from datasets.mcap_log import write_mcap
 from pipeline.make.receivers import convert
 from pipeline.make.receivers.convert import said_of
 from pipeline.read.ingest import read_run
+from pipeline.read.ingest.conform import conform
 from pipeline.read.ingest.csv_draft import draft_mapping
 from pipeline.read.ingest.wraps import counted_on, wrap_of
 from schemas.config import Configuration, IngestConfig, settings_from
+from schemas.errors import ConfigError
+from schemas.run import RunLog
 from tests.read.ingest import samples
 from tests.read.ingest.samples import START_NS, channel, message, position, schema, whole
 
@@ -172,3 +176,59 @@ def test_the_draft_names_the_line(tmp_path: Path) -> None:
     (_, log) = tables(tmp_path, distance(start=60_000.0) % 65536)
     log.write_text(log.read_text().replace("count", "distance [m]"))
     assert "\nwrap = 65536\n" in draft_mapping(log)
+
+
+def counted_run(folder: Path, shown: np.ndarray, as_log: bool) -> Path:
+    """A run of the contract whose distances are these [m]."""
+    t = pl.Series("t", START_NS + np.arange(shown.size) * SECOND).cast(pl.Datetime("ns", "UTC"))
+    odometer = pl.DataFrame({"t": t, "distance_m": shown})
+    positions = pl.DataFrame({"t": t, "latitude_deg": 50.0, "longitude_deg": 4.0, "fix": "sbas"})
+    if not as_log:
+        (folder / "run").mkdir()
+        odometer.write_parquet(folder / "run" / "odometer.parquet")
+        positions.write_parquet(folder / "run" / "gnss.parquet")
+        return folder / "run"
+    frames = {
+        "gnss": conform(positions, "gnss", "test", []),
+        "odometer": conform(odometer, "odometer", "test", []),
+    }
+    with (folder / "run.mcap").open("wb") as stream:
+        write_mcap(RunLog("run", frames["gnss"], odometer=frames["odometer"]), stream, "json")
+    return folder / "run.mcap"
+
+
+@pytest.mark.parametrize("as_log", [False, True])
+def test_a_run_is_counted_on_where_that_is_certain_and_says_so(tmp_path: Path, as_log: bool) -> None:
+    true = distance(start=60_000.0)
+    run = read_run(counted_run(tmp_path, (true % 65536) * 0.05, as_log))
+    assert run.odometer is not None
+    counted = run.odometer["distance_m"].to_numpy()
+    assert counted - counted[0] == pytest.approx((true - true[0]) * 0.05, abs=1e-6)
+    (said,) = [text for text in run.notes.skipped_topics if "counter" in text]
+    assert '`[[ingest.correct]] stream = "odometer", wrap = 3276.8` in the configuration says so' in said
+
+
+def test_what_may_be_a_reset_is_counted_on_by_a_correction_alone(tmp_path: Path) -> None:
+    """A counter of 1,000: of its one fall nobody knows."""
+    true = distance(step=5.0, start=900.0)[:200]
+    path = counted_run(tmp_path, true % 1000, as_log=False)
+    run = read_run(path)
+    assert run.odometer is not None
+    assert run.odometer["distance_m"].to_list() == (true % 1000).tolist()
+    assert any("may have been reset" in text and "wrap = 1000" in text for text in run.notes.skipped_topics)
+    correction = {"ingest": {"correct": [{"stream": "odometer", "wrap": 1000.0}]}}
+    mended = read_run(path, settings_from(correction, Configuration, "test").ingest)
+    assert mended.odometer is not None
+    assert mended.odometer["distance_m"].to_list() == true.tolist()
+    assert not any("counter" in text for text in mended.notes.skipped_topics)
+    other = {"ingest": {"correct": [{"stream": "gnss", "wrap": 1000.0}]}}
+    with pytest.raises(ConfigError, match="distance_m"):
+        read_run(path, settings_from(other, Configuration, "test").ingest)
+
+
+def test_what_makes_it_certain_is_configured(tmp_path: Path) -> None:
+    path = counted_run(tmp_path, distance(start=60_000.0) % 65536, as_log=False)
+    cautious = settings_from({"ingest": {"wraps": {"sure_size": 1e6}}}, Configuration, "test").ingest
+    run = read_run(path, cautious)
+    assert run.odometer is not None
+    assert np.diff(run.odometer["distance_m"].to_numpy()).min() < 0

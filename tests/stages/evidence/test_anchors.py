@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.stages.evidence.anchors import Sided, Witness, Witnesses, known_stretch, reference_ways, sided
+from pipeline.stages.evidence.anchors import Sided, Witness, known_stretch, reference_ways, sided
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
 from pipeline.stages.evidence.clock import Lags, RecorderClock, lags_of
 from pipeline.stages.odometry import odometry_of
@@ -33,15 +33,15 @@ def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch
     return ReferenceStretch(ns(t_s), np.full(t_s.size, 0.1), (path,))
 
 
-def against(*counters: Counter) -> Witnesses:
+def against(*counters: Counter) -> tuple[Witness, ...]:
     """These odometers on the reference's clock, their scale within 5 %."""
-    return Witnesses(tuple(Witness.of(counter, Lags(), False, CONFIG) for counter in counters))
+    return tuple(Witness.of(counter, Lags(), False, CONFIG) for counter in counters)
 
 
 def counter(at_m: Floats, rate_hz: float) -> Counter:
     found = odometry_of(odometer(at_m, rate_hz), Vehicle(), CONFIG)
     assert found is not None
-    return Counter.of(found)
+    return Counter(found)
 
 
 @pytest.mark.parametrize("forward", [True, False])
@@ -130,7 +130,7 @@ def test_a_drift_is_seen_wherever_long_windows_begin(begun_s: float) -> None:
     sigma_m = np.full(t_s.size, 0.4)
     seen = replace(stretch(t_s, 20.0 * t_s + drift_m), sigma_m=sigma_m)
     witness = Witness(counter(20.0 * np.arange(0.0, 261.0, 0.5), 2.0))
-    found = known_stretch(Sided(seen, 1, 1.0, 0.0), SURE, Witnesses((witness,)), [], 0.0, CONFIG)
+    found = known_stretch(Sided(seen, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG)
     assert found.levels.doubts == 1
     honest = replace(stretch(t_s, 20.0 * t_s), sigma_m=sigma_m)
-    assert known_stretch(Sided(honest, 1, 1.0, 0.0), SURE, Witnesses((witness,)), [], 0.0, CONFIG).levels.doubts == 0
+    assert known_stretch(Sided(honest, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG).levels.doubts == 0

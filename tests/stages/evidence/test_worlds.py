@@ -298,6 +298,22 @@ def test_nothing_is_carried_over_a_stand_of_a_counter_without_sign() -> None:
     assert found.kind.tolist() == [KINDS.index(Kind.REFERENCE), NOTHING, NOTHING]
 
 
+def test_a_counter_without_sign_has_no_sense_from_another_movement() -> None:
+    """Back, then to and fro: the counter grows both ways, and only the second part has a reference of any length."""
+    rng = np.random.default_rng(14)
+    knots_s = (0.0, 20.0, 60.0, 80.0, 100.0, 120.0, 200.0, 220.0, 240.0, 260.0, 300.0)
+    ride = Ride(knots_s, (0.0, -20.0, -20.0, 0.0, 0.0, 25.0, 25.0, 0.0, 0.0, -25.0, -25.0), from_m=20_000.0)
+    counted = odometer(ride, rng)
+    grown = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(ride.at(np.arange(counted.height) / 10.0))))])
+    without = counted.with_columns(distance_m=pl.Series(grown))
+    at_ms = pl.col("t").is_between(*stamps(np.array([5.0, 130.0])), closed="none")
+    truth = reference(ride, rng).filter(~at_ms)
+    at_s = np.arange(6.0, 70.0, 1.0)
+    found = known(GROUND, without, of_reference=truth).at(ns(at_s))
+    assert bounds(found, ride.at(at_s))[2][found.kind != NOTHING].all()
+    assert (found.kind != NOTHING).any()
+
+
 def test_less_evidence_leaves_no_less() -> None:
     """Reference and reads, the reference alone, the reads alone: each interval holds that of both, where they agree."""
     rng = np.random.default_rng(13)

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.stages.matching.path_states import PathStates, polarity
+from pipeline.stages.matching.path_states import PathStates, polarity_of_parts
 
 
 def signs_of(place_m: list[list[float]], odometer_m: list[float], orientable: bool = True) -> list[int]:
@@ -23,7 +23,7 @@ def signs_of(place_m: list[list[float]], odometer_m: list[float], orientable: bo
         cost=np.zeros(2 * steps),
         refuted=np.zeros(2 * steps, dtype=np.bool_),
     )
-    return polarity(cast(Any, network), states, np.array(odometer_m)).tolist()
+    return polarity_of_parts(cast(Any, network), states, np.array(odometer_m)).tolist()
 
 
 @pytest.mark.parametrize(

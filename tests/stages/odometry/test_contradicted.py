@@ -54,6 +54,16 @@ def test_speeds_that_agree_leave_no_doubt(late_s: float) -> None:
     assert odometry.doubt_m[-1] == 0.0
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_speeds_do_not_contradict_a_distance_that_is_read_with_noise(seed: int) -> None:
+    """2 m of noise a row at 20 Hz, on a train that drives slowly and stands at times."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(0.0, 400.0, 0.05)
+    mps = np.interp(t_s, [0.0, 20.0, 60.0, 80.0, 100.0, 140.0, 400.0], [0.0, 12.0, 12.0, 0.0, 0.0, 16.0, 9.0])
+    way_m = np.cumsum(mps) * 0.05 + rng.normal(0.0, 2.0, t_s.size)
+    assert odometry_from(odometer_of(t_s, distance_m=way_m, speed_mps=mps)).doubt_m[-1] == 0.0
+
+
 def test_what_is_known_of_it_does_not_depend_on_later_rows() -> None:
     speeds_mps = np.full(T_S.size, 20.0)
     whole = sliding(speeds_mps).doubt_m

@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.stages.odometry.bound import is_lost
 from pipeline.stages.odometry.odd_steps import odd_runs
+from schemas.arrays import NS_PER_S
 from schemas.config import AlignConfig
 from tests.stages.alignment.straight import odometer_of, odometry_from
 from tests.stages.odometry.drives import drive, recorded
@@ -46,6 +47,26 @@ def test_a_logger_that_stalls_neither_stands_nor_leaps(rate_hz, stall_s) -> None
     odometry = odometry_from(odometer_of(t, distance_m=held))
     assert odometry.leaps_ns == ()
     np.testing.assert_allclose(odometry.distance_m, true, atol=0.01)
+
+
+@pytest.mark.parametrize("rate_hz", [5, 10, 20])
+def test_short_stalls_at_low_speed_add_up_within_the_bound(rate_hz) -> None:
+    """About 3.5 m/s: ten stalls of 1.2 s lose 4 m each, too little for a leap; all together they are twice the limit.
+
+    Of each, braking and acceleration explain less than that.
+    """
+    t = np.arange(0.0, 400.0, 1.0 / rate_hz)
+    true = 3.5 * t + np.sin(t / 6.0)
+    missing = np.zeros(t.size)
+    for at_s in np.arange(30.0, 330.0, 30.0):
+        begin_m, end_m = np.interp([at_s, at_s + 1.2], t, true)
+        missing += np.clip(true, begin_m, end_m) - begin_m
+    odometry = odometry_from(odometer_of(t, distance_m=true - missing))
+    at_ns = odometry.epoch_ns + np.array([20, 350]) * NS_PER_S
+    way = odometry.between(at_ns[:1], at_ns[1:])
+    assert odometry.leaps_ns == ()
+    assert missing[-1] == pytest.approx(42.0, abs=1.0)
+    assert missing[-1] <= way.bound_m[0] < missing[-1] + 10 * 4.0
 
 
 def test_a_stall_that_loses_its_way_is_no_bridged_reset() -> None:
