@@ -12,7 +12,7 @@ import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
-from pipeline.stages.evidence.clock import RecorderClock
+from pipeline.stages.evidence.clock import Lags, RecorderClock, clock_of
 from pipeline.stages.odometry.polarity import sense_of_ways, shared_ways_m
 from pipeline.stages.odometry.scale_lag import ScaleLag, spans_of_rows
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
@@ -25,6 +25,8 @@ from schemas.enums import BaliseKind, Evidence
 # DOMAIN section 5.1: the reference is held against the odometer over so long; a spike is no longer [s].
 _WINDOW_S = 10.0
 _LONG_WINDOW_S = 100.0
+# Long windows begin again half-way: a drift that two of them share lies within one of the others.
+_BEGUN_S = (0.0, 0.5 * _LONG_WINDOW_S)
 # Least number of samples for a median.
 _FEWEST_IN_WINDOW = 5
 # Numerics: before and after all runs [ns].
@@ -211,24 +213,25 @@ def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, I
 
 def reference_ways(
     sides: Sequence[Sided], lengths_m: Callable[[TrueAnchor, TrueAnchor], list[float]]
-) -> tuple[Ints, Ints, Floats]:
-    """Ways of the reference between its stamps, as the odometer counts up: begin and end [ns], length [m].
+) -> tuple[Ints, Ints, Floats, Floats]:
+    """Ways of the reference between its stamps, as the odometer counts up: begin and end [ns], length and sigma [m].
 
     Of ten seconds, and from stretch to stretch where `lengths_m` knows one: a slow reference is all gaps.
     """
     nothing = np.zeros(0, dtype=np.int64)
-    ways: list[tuple[Ints, Ints, Floats]] = [(nothing, nothing, np.zeros(0))]
+    ways: list[tuple[Ints, Ints, Floats, Floats]] = [(nothing, nothing, np.zeros(0), np.zeros(0))]
     for side in sides:
         t_ns = side.stretch.t_ns
         begin, end, way_m = _ways_of(side.stretch, *spans_of_rows((t_ns - t_ns[0]) / NS_PER_S))
-        ways.append((t_ns[begin], t_ns[end], side.sense * way_m))
+        sigma_m = np.hypot(side.stretch.sigma_m[begin], side.stretch.sigma_m[end])
+        ways.append((t_ns[begin], t_ns[end], side.sense * way_m, sigma_m))
     for before, after in pairwise(sorted(sides, key=lambda side: int(side.stretch.t_ns[0]))):
         begin_at, end_at = before.anchor(-1), after.anchor(0)
         across_m = np.array(lengths_m(begin_at, end_at), dtype=np.float64)
-        ends_ns = [np.full(across_m.size, anchor.t_ns, dtype=np.int64) for anchor in (begin_at, end_at)]
-        ways.append((ends_ns[0], ends_ns[1], across_m))
-    begins, ends, lengths = (np.concatenate(column) for column in zip(*ways, strict=True))
-    return begins, ends, lengths
+        from_ns, to_ns = (np.full(across_m.size, anchor.t_ns, dtype=np.int64) for anchor in (begin_at, end_at))
+        ways.append((from_ns, to_ns, across_m, np.full(across_m.size, np.hypot(begin_at.sigma_m, end_at.sigma_m))))
+    begins, ends, lengths, sigmas = (np.concatenate(column) for column in zip(*ways, strict=True))
+    return begins, ends, lengths, sigmas
 
 
 def known_stretch(
@@ -378,21 +381,21 @@ class Witness:
     scale_sigma: float = 0.0
 
     @classmethod
-    def of(cls, counter: Counter, lags: Sequence[ScaleLag], config: Configuration) -> Self:
-        """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1)."""
+    def of(cls, counter: Counter, lags: Lags, declared: bool, config: Configuration) -> Self:
+        """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1).
+
+        `declared`: the lag of the reference is in the vehicle file.
+        """
         factor = config.hazards.evidence_factor
         share = config.lds.odometer_share
-        known = [lag for lag in lags if np.isfinite(lag.lag_sigma_s)]
-        low_s = min((lag.lag_s - factor * lag.lag_sigma_s for lag in known), default=-config.hazards.evidence_clock_s)
-        high_s = max((lag.lag_s + factor * lag.lag_sigma_s for lag in known), default=config.hazards.evidence_clock_s)
-        middle_s, half_s = 0.5 * (low_s + high_s), 0.5 * (high_s - low_s)
+        clock = clock_of([lags], independent=True, declared=declared, config=config.hazards)
         if counter.by_file:
-            return cls(counter, middle_s, half_s)  # the variance of a way holds that of the file's scale
-        best = min(lags, key=lambda lag: lag.scale_sigma, default=ScaleLag())
+            return cls(counter, clock.shift_s, clock.delta_s)  # the variance of a way holds that of the file's scale
+        best = min(lags.found, key=lambda lag: lag.scale_sigma, default=ScaleLag())
         if factor * best.scale_sigma < share:
-            return cls(counter, middle_s, half_s, best.scale, best.scale_sigma)
+            return cls(counter, clock.shift_s, clock.delta_s, best.scale, best.scale_sigma)
         # At k_T sigmas the 5 % of an odometer of which nothing is known.
-        return cls(counter, middle_s, half_s, 1.0, share / config.align.sure_sigmas)
+        return cls(counter, clock.shift_s, clock.delta_s, 1.0, share / config.align.sure_sigmas)
 
 
 def contradictions(
@@ -414,8 +417,11 @@ def contradictions(
     steps = [ReferenceStep(row, float(step_m[row]), float(limit_m[row])) for row in stepped.tolist()]
     gathered_m = np.zeros(t_ns.size)
     gathered_m[1:][stepped] = step_m[stepped]
-    for window_s, fixed_m in ((_WINDOW_S, 0.0), (_LONG_WINDOW_S, config.lds.odometer_fixed_m)):
-        found = _drifts(known, stretch, witnesses, np.cumsum(gathered_m), (window_s, fixed_m), config)
+    for window in (
+        (_WINDOW_S, 0.0, 0.0),
+        *((_LONG_WINDOW_S, late_s, config.lds.odometer_fixed_m) for late_s in _BEGUN_S),
+    ):
+        found = _drifts(known, stretch, witnesses, np.cumsum(gathered_m), window, config)
         for step in found:
             gathered_m[step.sample + 1] += step.step_m
         steps += found
@@ -427,13 +433,17 @@ def _drifts(
     stretch: ReferenceStretch,
     witnesses: Sequence[Witness],
     explained_m: Floats,
-    window: tuple[float, float],
+    window: tuple[float, float, float],
     config: Configuration,
 ) -> list[ReferenceStep]:
-    """Windows (length [s], fixed error of odometers [m]) that an odometer contradicts beyond `explained_m` of steps."""
+    """Windows that an odometer contradicts beyond `explained_m` of steps.
+
+    `window`: length, first begin [s], and what an odometer may be off whatever it counted [m].
+    """
     t_ns = stretch.t_ns
-    window_s, fixed_m = window
-    ends = np.unique(np.searchsorted(t_ns, np.arange(int(t_ns[0]), int(t_ns[-1]), round(window_s * NS_PER_S))))
+    window_s, late_s, fixed_m = window
+    begin_ns = int(t_ns[0]) + round(late_s * NS_PER_S)
+    ends = np.unique(np.searchsorted(t_ns, np.arange(begin_ns, int(t_ns[-1]), round(window_s * NS_PER_S))))
     begin = ends[:-1]
     end = ends[1:]
     if begin.size == 0:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.stages.evidence.carrying import Counter
-from pipeline.stages.odometry.scale_lag import ScaleLag, scale_and_lag
+from pipeline.stages.odometry.scale_lag import ScaleLag, possible_lags, scale_and_lag
 from schemas.arrays import Floats, Ints
-from schemas.config import HazardConfig
+from schemas.config import Configuration, HazardConfig, Vehicle
 
 # A lag of less than so many of its sigmas may be none.
 _SHOWN_SIGMAS = 2.0
@@ -32,16 +32,50 @@ class RecorderClock:
     assumed: bool = False
 
 
-def clock_of(lags: Sequence[ScaleLag], independent: bool, config: HazardConfig) -> RecorderClock:
-    """The measured lags, each +- k sigma (DOMAIN section 5.1).
+@dataclass(frozen=True)
+class Lags:
+    """What the ways of a recorder say of its lag behind one odometer: `found`, and the least and largest `possible_s`.
+
+    `found`: one of the run, or two where its halves disagree. `possible_s`: what the ways do not refute where no lag
+    stands out; None where they say nothing of it.
+    """
+
+    found: tuple[ScaleLag, ...] = ()
+    possible_s: tuple[float, float] | None = None
+
+    def range_s(self, declared: bool, config: HazardConfig) -> tuple[float, float] | None:
+        """Least and largest lag that the recorder may have; None where it is what is assumed of a clock.
+
+        `declared`: its lag is in the vehicle file and taken off, which holds unless the ways refute it.
+        """
+        measured = [lag for lag in self.found if _measured(lag, config)]
+        if not measured:
+            return self._unproved_s(declared, config)
+        noises_s = [config.evidence_factor * lag.lag_sigma_s for lag in measured]
+        lows_s = [lag.lag_s - noise_s for lag, noise_s in zip(measured, noises_s, strict=True)]
+        highs_s = [lag.lag_s + noise_s for lag, noise_s in zip(measured, noises_s, strict=True)]
+        return min(lows_s), max(highs_s)
+
+    def _unproved_s(self, declared: bool, config: HazardConfig) -> tuple[float, float] | None:
+        """About none, as far as it may reach: what is not measured moves nothing, it may be a slip."""
+        if self.possible_s is None:
+            return None
+        low_s, high_s = self.possible_s
+        if declared and low_s <= config.evidence_clock_s and high_s >= -config.evidence_clock_s:
+            return None
+        reach_s = max(-low_s, high_s)
+        return -reach_s, reach_s
+
+
+def clock_of(lags: Sequence[Lags], independent: bool, declared: bool, config: HazardConfig) -> RecorderClock:
+    """All lags that a recorder may have, by several odometers (DOMAIN section 5.1).
 
     By odometers that are not `independent` a lag may widen what is assumed of a clock, and never narrow it.
     """
-    measured = [lag for lag in lags if _measured(lag, config)]
-    if not measured:
+    ranges_s = [range_s for of_one in lags if (range_s := of_one.range_s(declared, config)) is not None]
+    if not ranges_s:
         return RecorderClock(0.0, config.evidence_clock_s, assumed=True)
-    low_s = min(lag.lag_s - config.evidence_factor * lag.lag_sigma_s for lag in measured)
-    high_s = max(lag.lag_s + config.evidence_factor * lag.lag_sigma_s for lag in measured)
+    low_s, high_s = min(low for low, _ in ranges_s), max(high for _, high in ranges_s)
     least_s = 0.0 if independent else config.evidence_clock_s
     if low_s <= 0.0 <= high_s:
         # There may be none.
@@ -50,10 +84,11 @@ def clock_of(lags: Sequence[ScaleLag], independent: bool, config: HazardConfig) 
 
 
 def clocks_of(
-    lags: tuple[Sequence[ScaleLag], Sequence[ScaleLag]], independent: bool, config: HazardConfig
+    lags: tuple[Sequence[Lags], Sequence[Lags]], independent: bool, vehicle: Vehicle, config: HazardConfig
 ) -> tuple[RecorderClock, RecorderClock]:
-    """Those of two recorders. One that cannot be measured may have the odometer's clock or that of the other."""
-    first, second = (clock_of(of_one, independent, config) for of_one in lags)
+    """Those of reference and reads. One that cannot be measured may have the odometer's clock or that of the other."""
+    declared = vehicle.reference_latency_s is not None, vehicle.reads_latency_s is not None
+    first, second = (clock_of(*of_one, config) for of_one in zip(lags, [independent] * 2, declared, strict=True))
     return _beside(first, second, config), _beside(second, first, config)
 
 
@@ -84,23 +119,33 @@ def _measured(lag: ScaleLag, config: HazardConfig) -> bool:
     return abs(lag.lag_s) >= _SHOWN_SIGMAS * lag.lag_sigma_s or noise_s <= config.evidence_clock_s
 
 
-def lags_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter) -> list[ScaleLag]:
-    """The lags of a recorder by the ways that it saw: one of the run, or two where its halves disagree.
+def lags_of(
+    begin_ns: Ints, end_ns: Ints, way_m: Floats, sigma_m: Floats, counter: Counter, config: Configuration
+) -> Lags:
+    """The lag of a recorder by the ways that it saw between its stamps, positive as the odometer counts up.
 
-    A clock that changes in the middle of a run, at a stand or after a restart, has no lag of the run.
+    A clock that changes in the middle of a run, at a stand or after a restart, has no lag of the run. `sigma_m`: of a
+    way by the recorder's own noise.
     """
     order = begin_ns.argsort(kind="stable")
-    begin_ns, end_ns, way_m = begin_ns[order], end_ns[order], way_m[order]
+    begin_ns, end_ns = begin_ns[order], end_ns[order]
+    way_m, sigma_m = way_m[order], sigma_m[order]
+    begin_s, end_s = (counter.odometer.seconds(t_ns) for t_ns in (begin_ns, end_ns))
     half = begin_ns.size // 2
-    halves = [lag_of(begin_ns[part], end_ns[part], way_m[part], counter) for part in (slice(half), slice(half, None))]
-    sigma_s = float(np.hypot(halves[0].lag_sigma_s, halves[1].lag_sigma_s))
-    if abs(halves[0].lag_s - halves[1].lag_s) > _DIFFER_SIGMAS * sigma_s:
-        return halves
-    return [lag_of(begin_ns, end_ns, way_m, counter)]
-
-
-def lag_of(begin_ns: Ints, end_ns: Ints, way_m: Floats, counter: Counter) -> ScaleLag:
-    """The lag of a recorder by the ways that it saw between its stamps, positive as the odometer counts up."""
-    order = begin_ns.argsort(kind="stable")
-    begin_s, end_s = (counter.odometer.seconds(t_ns[order]) for t_ns in (begin_ns, end_ns))
-    return scale_and_lag(begin_s, end_s, way_m[order], counter.rows)
+    halves = [
+        scale_and_lag(begin_s[part], end_s[part], way_m[part], counter.rows)
+        for part in (slice(half), slice(half, None))
+    ]
+    apart_sigma_s = float(np.hypot(halves[0].lag_sigma_s, halves[1].lag_sigma_s))
+    if abs(halves[0].lag_s - halves[1].lag_s) > _DIFFER_SIGMAS * apart_sigma_s:
+        return Lags(tuple(halves))
+    found = scale_and_lag(begin_s, end_s, way_m, counter.rows)
+    if _measured(found, config.hazards):
+        return Lags((found,))
+    # Ways that follow one another share the noise of the place between them: together as if each had twice its
+    # variance.
+    variance_m2 = 2.0 * sigma_m**2 + np.nan_to_num(counter.between(begin_ns, end_ns).variance_m2)
+    factor = config.hazards.evidence_factor
+    scale_off = factor * (counter.odometer.scale_sigma or 0.0) if counter.by_file else config.lds.odometer_share
+    possible_s = possible_lags((begin_s, end_s, way_m), counter.rows, np.sqrt(variance_m2), scale_off, factor)
+    return Lags((found,), possible_s)

@@ -12,11 +12,10 @@ import polars as pl
 from pipeline.stages.evidence import anchors
 from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
 from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried
-from pipeline.stages.evidence.clock import RecorderClock, clocks_of, lags_of, true_clocks_s
+from pipeline.stages.evidence.clock import Lags, RecorderClock, clocks_of, lags_of, true_clocks_s
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
 from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.odometry.scale_lag import ScaleLag
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
@@ -396,12 +395,11 @@ def evidence_of(
     searches = [GapSearch(counter, network, config, facing) for counter in counters]
     lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
-    found = [anchors.Witness.of(counter, of_one, config) for counter, of_one in zip(counters, lags, strict=True)]
+    declared = vehicle.reference_latency_s is not None
+    found = [anchors.Witness.of(*of_one, declared, config) for of_one in zip(counters, lags, strict=True)]
     read = anchors.read_anchors(reads, balises, network.track, hazards)
-    lags_of_reads = [lag for search in searches for lag in _lags_of_reads(search.carried(_points(read)))]
-    of_reference, of_reads = clocks_of(
-        ([lag for of_one in lags for lag in of_one], lags_of_reads), bool(independent), hazards
-    )
+    lags_of_reads = [_lags_of_reads(search.carried(_points(read)), config) for search in searches]
+    of_reference, of_reads = clocks_of((lags, lags_of_reads), bool(independent), vehicle, hazards)
     clocked = anchors.on_clock(read, of_reads, main)
     recorded, unclosed = _known_stretches(sides, of_reference, found, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
@@ -425,7 +423,7 @@ def evidence_of(
         doubted=unclosed
         + sum(stretch.levels.doubts for stretch in recorded)
         + (0 if counters else sum(len(stretch.disputed) for stretch in recorded))
-        + sum(len(of_one) > 1 for of_one in lags),
+        + sum(len(of_one.found) > 1 for of_one in lags),
     )
 
 
@@ -469,21 +467,27 @@ def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
     return [(anchor, anchor) for anchor in known]
 
 
-def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> list[ScaleLag]:
+def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> Lags:
     """Its clock against that of one odometer, in the sense in which that one counts.
 
     One that counts up both ways is compared where the train cannot have turned.
     """
     sides = [anchors.sided(stretch, search.counter, least_m) for stretch in stretches]
-    begin_ns, end_ns, way_m = anchors.reference_ways(sides, search.only_length_m)
-    return lags_of(begin_ns, end_ns, way_m if search.counter.signed else np.abs(way_m), search.counter)
+    begin_ns, end_ns, way_m, sigma_m = anchors.reference_ways(sides, search.only_length_m)
+    way_m = way_m if search.counter.signed else np.abs(way_m)
+    return lags_of(begin_ns, end_ns, way_m, sigma_m, search.counter, search.config)
 
 
-def _lags_of_reads(source: Carried) -> list[ScaleLag]:
+def _lags_of_reads(source: Carried, config: Configuration) -> Lags:
     """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
-    ways = [(gap.begin_ns, gap.end_ns, apart_m) for gap in source.gaps for apart_m in gap.only_length_m]
-    begins, ends, lengths = zip(*ways, strict=True) if ways else ((), (), ())
-    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), np.array(lengths, np.float64), source.counter)
+    ways = [
+        (gap.begin_ns, gap.end_ns, apart_m, float(np.linalg.norm([anchor.sigma_m for anchor in gap.anchors])))
+        for gap in source.gaps
+        for apart_m in gap.only_length_m
+    ]
+    begins, ends, *lengths = zip(*ways, strict=True) if ways else ((), (), (), ())
+    way_m, sigma_m = (np.array(values, np.float64) for values in lengths)
+    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), way_m, sigma_m, source.counter, config)
 
 
 def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:

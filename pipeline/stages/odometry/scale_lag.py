@@ -31,12 +31,18 @@ _LONGEST = 1.5
 # Numerics: range and step of the search [s].
 _FARTHEST_S, _STEP_S = 30.0, 0.5
 _LAGS_S: Floats = np.linspace(-_FARTHEST_S, _FARTHEST_S, 2 * round(_FARTHEST_S / _STEP_S) + 1)
+# Of the lags that few ways leave, where the noise is known.
+_FINE_S = 0.1
+_FINE_LAGS_S: Floats = np.linspace(-_FARTHEST_S, _FARTHEST_S, 2 * round(_FARTHEST_S / _FINE_S) + 1)
 _ROUNDS = 20
+_SCALES = 3
 # A lag stays where it moves by less than this share of its sigma.
 _STAYS = 0.05
 # Least number of ways for a lag, and for one of more than a second; no more are looked at in the search.
 FEWEST, _FEWEST_FAR = 6, 12
 _NEAR_S = 1.0
+# Two ways fit some scale and lag.
+_FEWEST_TELLING = 2
 _SEARCHED = 800
 # A speed is taken over so much on both sides of an instant, and beside it from twice to four times that, so that the
 # rows whose noise is in one are not in the other [s].
@@ -191,6 +197,56 @@ def scale_and_lag(begin_s: Floats, end_s: Floats, way_m: Floats, counter: Counte
     return found if ways.stands_out(found) else ways.without_lag(LagState.AMBIGUOUS)
 
 
+def possible_lags(
+    ways: tuple[Floats, Floats, Floats], counter: CountedRows, sigma_m: Floats, scale_off: float, factor: float
+) -> tuple[float, float] | None:
+    """Least and largest lag [s] that the ways (begin, end [s], length [m]) do not refute; None if they tell nothing.
+
+    A set of confidence at `factor` sigmas by the sum of squares, of ways with errors of `sigma_m` each or of what the
+    best lag leaves, if that is more, with the scale within 1 +- `scale_off`. They tell nothing where ways without any
+    error would not refute a lag at an end of the search: noise widens the set, and never makes it nothing. One or two
+    ways that tell nothing are too few to show that it is the journey, at one speed, that hides a lag: any is possible.
+    """
+    begin_s, end_s, way_m = ways
+    if begin_s.size == 0:
+        return None
+    apart = slice(None, None, _Ways(begin_s, end_s, way_m, counter).step)
+    begin_s, end_s, seen, sigma_m = begin_s[apart], end_s[apart], way_m[apart] / sigma_m[apart], sigma_m[apart]
+    counted = counter.smooth.gained(begin_s - _FINE_LAGS_S[:, None], end_s - _FINE_LAGS_S[:, None]) / sigma_m
+    left = _left_over(counted, seen, scale_off)
+    # A way not counted at a lag does not refute it; where the best one is looked for it counts as one that fits.
+    counts = np.isfinite(counted).sum(axis=1)
+    likeliest = int((left + counts.max() - counts).argmin())
+    exact = np.where(np.isfinite(counted[likeliest]), counted[likeliest], seen)
+    if (_left_over(counted[[0, -1]], exact, scale_off) <= factor**2).any():
+        return None if counts.max() > _FEWEST_TELLING else (-_FARTHEST_S, _FARTHEST_S)
+    best = float(left[likeliest] + counts.max() - counts[likeliest])
+    # Two ways fit some lag and scale whatever their noise is.
+    free = max(float(counts[likeliest]) - 2.0, 0.0)
+    noise = max(_student(free) ** 2 * float(left[likeliest]) / free, 1.0) if free else 1.0
+    possible = left - best <= factor**2 * noise
+    # One or two ways leave nothing over that would show that a slip was it, and no lag.
+    possible[_FINE_LAGS_S.size // 2] |= free == 0.0
+    lags_s = _FINE_LAGS_S[possible]
+    return float(lags_s[0] - _FINE_S), float(lags_s[-1] + _FINE_S)
+
+
+def _left_over(counted: Floats, seen: Floats, scale_off: float) -> Floats:
+    """What the ways seen leave of those counted at each lag (rows), both in sigmas, at the scale that fits best.
+
+    Sum of squares; of each no more than that of an outlier, a slip.
+    """
+    known = np.isfinite(counted) & np.isfinite(seen)
+    counted, seen = np.where(known, counted, 0.0), np.where(known, seen, 0.0)
+    limits = 1.0 - scale_off, 1.0 + scale_off
+    scale = np.clip(_least_absolute_scale(counted, seen), *limits)
+    for _ in range(_SCALES):
+        used = np.where(np.abs(seen - scale[:, None] * counted) <= _USUAL, counted, 0.0)
+        squares = (used * counted).sum(axis=1)
+        scale = np.where(squares > 0.0, np.clip((used * seen).sum(axis=1) / np.maximum(squares, 1e-9), *limits), scale)
+    return np.asarray(np.minimum((seen - scale[:, None] * counted) ** 2, _USUAL**2).sum(axis=1))
+
+
 @dataclass(frozen=True)
 class _Ways:
     """Ways that a recorder saw between its stamps, and the counter that counted them too."""
@@ -211,11 +267,16 @@ class _Ways:
         after = np.searchsorted(self.begin_s, self.end_s - 1e-6)
         return max(1, round(float(np.median(after - np.arange(after.size)))))
 
+    @property
+    def step(self) -> int:
+        """Of so many ways one is looked at in a search: they do not overlap."""
+        return max(self.overlap, self.begin_s.size // _SEARCHED, 1)
+
     def _apart_m(self, lag_s: Floats) -> tuple[Floats, Floats]:
         """How far ways that do not overlap are apart at each lag (lags, ways), at the scale that makes their sum least;
         these scales.
         """
-        some = slice(None, None, max(self.overlap, self.begin_s.size // _SEARCHED, 1))
+        some = slice(None, None, self.step)
         begin_s, end_s, way_m = (values[some] for values in (self.begin_s, self.end_s, self.way_m))
         counted = self.counter.gained(begin_s - lag_s[:, None], end_s - lag_s[:, None])
         scale = _least_absolute_scale(counted, way_m)

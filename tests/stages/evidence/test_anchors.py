@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.stages.evidence.anchors import Sided, Witness, known_stretch, reference_ways, sided
 from pipeline.stages.evidence.carrying import Counter, TrueAnchor
-from pipeline.stages.evidence.clock import RecorderClock, lag_of
+from pipeline.stages.evidence.clock import Lags, RecorderClock, lags_of
 from pipeline.stages.odometry import odometry_of
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place, RoutePath
@@ -35,7 +35,7 @@ def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch
 
 def against(*counters: Counter) -> tuple[Witness, ...]:
     """These odometers on the reference's clock, their scale within 5 %."""
-    return tuple(Witness.of(counter, [], CONFIG) for counter in counters)
+    return tuple(Witness.of(counter, Lags(), False, CONFIG) for counter in counters)
 
 
 def counter(at_m: Floats, rate_hz: float) -> Counter:
@@ -77,12 +77,13 @@ def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     t_s = np.arange(0.0, 71.0, 0.1)
     late = stretch(t_s + 0.4, np.interp(t_s, fine_s, way_m))
     counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, way_m), 10.0)
-    found = lag_of(*reference_ways([Sided(late, 1, 1.0, 0.0)], no_gaps), counted)
+    (found,) = lags_of(*reference_ways([Sided(late, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
     assert found.lag_s == pytest.approx(0.4, abs=0.03)
     assert found.lag_sigma_s < 0.05
     cut = late.t_ns <= 60 * NS_PER_S
     few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (late.paths[0].part(slice(int(cut.sum()))),))
-    assert not lag_of(*reference_ways([Sided(few, 1, 1.0, 0.0)], no_gaps), counted).measured
+    (unsure,) = lags_of(*reference_ways([Sided(few, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
+    assert not unsure.measured
 
 
 def test_a_clock_counts_by_the_greatest_speed_that_it_leaves_possible() -> None:
@@ -119,3 +120,17 @@ def test_a_step_leaves_both_sides_open_where_no_read_confirms(
     assert np.flatnonzero(path.step_m).tolist() == [17]
     assert (path.at_m - path.low_m).tolist() == pytest.approx([0.0] * 18 + [behind_m] * 23)
     assert (path.high_m - path.at_m).tolist() == pytest.approx([ahead_m] * 18 + [0.0] * 23)
+
+
+@pytest.mark.parametrize("begun_s", [20.0, 80.0, 130.0])
+def test_a_drift_is_seen_wherever_long_windows_begin(begun_s: float) -> None:
+    """11 m off within 40 s at sigma 0.4 m: 5.33 roots of two samples are 3 m, not reached in 10 s, and with 5 m 8 m."""
+    t_s = np.arange(0.0, 260.0, 0.5)
+    drift_m = 11.0 * np.clip((t_s - begun_s) / 40.0, 0.0, 1.0)
+    sigma_m = np.full(t_s.size, 0.4)
+    seen = replace(stretch(t_s, 20.0 * t_s + drift_m), sigma_m=sigma_m)
+    witness = Witness(counter(20.0 * np.arange(0.0, 261.0, 0.5), 2.0))
+    found = known_stretch(Sided(seen, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG)
+    assert found.levels.doubts == 1
+    honest = replace(stretch(t_s, 20.0 * t_s), sigma_m=sigma_m)
+    assert known_stretch(Sided(honest, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG).levels.doubts == 0

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.clock import draw, estimate
-from pipeline.stages.odometry.scale_lag import CountedRows, LagState, scale_and_lag
+from pipeline.stages.odometry.scale_lag import CountedRows, LagState, possible_lags, scale_and_lag
 from schemas.arrays import Floats
 
 
@@ -117,3 +117,54 @@ def test_where_the_speed_changes_the_lag_is_measured(family: str, least: int) ->
     """A shuttle that stops once in its five minutes may have been cut there by a step of the other recorder."""
     found = [estimate(draw(seed, family)) for seed in range(40)]
     assert sum(one.measured for one in found) >= least
+
+
+@pytest.mark.parametrize("late_s", [0.0, 1.2, -7.0])
+def test_three_ways_refute_all_lags_but_few(late_s: float) -> None:
+    """Speeds at the ends of ways differ by 10 to 20 m/s, so that a lag of 1 s makes them so many metres longer."""
+    ways = recorded(3, late_s)
+    low_s, high_s = possible_lags(ways, counter(), np.full(3, 1.0), 0.05, 3.0) or (0.0, 0.0)
+    assert low_s < late_s < high_s
+    assert high_s - low_s < 2.0
+    # Ways ten times as noisy refute no more.
+    wider = possible_lags(ways, counter(), np.full(3, 10.0), 0.05, 3.0)
+    assert wider is None or (wider[0] <= low_s and wider[1] >= high_s)
+
+
+def test_ways_at_one_speed_say_nothing_of_a_lag() -> None:
+    t_s = np.arange(0.0, 1200.0, 0.1)
+    counted = CountedRows(t_s, 30.0 * t_s, np.zeros(t_s.size))
+    begin_s = np.arange(100.0, 1000.0, 60.0)
+    ways = begin_s, begin_s + 60.0, np.full(begin_s.size, 1800.0)
+    assert possible_lags(ways, counted, np.ones(begin_s.size), 0.05, 3.0) is None
+    # Of so few nobody can say that their speed was one: any lag is possible.
+    two = ways[0][:2], ways[1][:2], ways[2][:2]
+    assert possible_lags(two, counted, np.ones(2), 0.05, 3.0) == (-30.0, 30.0)
+
+
+def test_a_slip_widens_what_is_possible() -> None:
+    """Of eight ways one is 12 m too long: it hides the lag, and is no reason to believe in none."""
+    begin_s, end_s, way_m = recorded(8, 1.2)
+    slipped = way_m + 12.0 * (np.arange(8) == 3)
+    clean, wide = (possible_lags((begin_s, end_s, way), counter(), np.ones(8), 0.05, 3.0) for way in (way_m, slipped))
+    assert clean is not None
+    assert wide is not None
+    assert wide[1] - wide[0] > clean[1] - clean[0]
+    assert wide[0] < 1.2 < wide[1]
+
+
+def test_the_true_lag_is_hardly_ever_refuted() -> None:
+    """White places of 1 m, 1,000 draws of 3 to 11 ways: at 3 sigmas 1 in 370 of a normal figure."""
+    dice = np.random.default_rng(7)
+    missed = 0
+    for _ in range(1000):
+        count, late_s, scale = (
+            int(dice.integers(3, 12)),
+            float(dice.uniform(-3.0, 3.0)),
+            float(dice.uniform(0.96, 1.04)),
+        )
+        begin_s, end_s, way_m = recorded(count, late_s, float(dice.uniform(200.0, 3000.0)))
+        noisy = scale * way_m + np.diff(dice.normal(0.0, 1.0, count + 1))
+        found = possible_lags((begin_s, end_s, noisy), counter(), np.full(count, 2.0), 0.05, 3.0)
+        missed += found is not None and not found[0] <= late_s <= found[1]
+    assert missed <= 3
