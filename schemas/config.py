@@ -741,10 +741,9 @@ class Vehicle(Settings):
     gnss_latency_sigma_s: Annotated[Number, Field(ge=0, le=10)] | None = None
     # Of odometers whose stream does not say it (DOMAIN section 5.0).
     odometer_origin: Origin | None = None
-    # Declared lags of these recorders: their stamps are so much later than what they stamp. One that is declared, if
-    # only as 0, is believed where the run cannot measure it (DOMAIN section 5.1).
-    reference_latency_s: Annotated[Number, Field(ge=-60, le=60)] | None = None
-    reads_latency_s: Annotated[Number, Field(ge=-60, le=60)] | None = None
+    # Declared lags of these recorders: their stamps are so much later than what they stamp.
+    reference_latency_s: Annotated[Number, Field(ge=-60, le=60)] = 0.0
+    reads_latency_s: Annotated[Number, Field(ge=-60, le=60)] = 0.0
 
 
 S = TypeVar("S", bound=Settings)

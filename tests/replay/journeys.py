@@ -18,9 +18,7 @@ from schemas.config import Configuration, Vehicle
 from schemas.inputs import BaliseReads
 from schemas.run import RunLog, RunTables, Site
 
-VEHICLE = Vehicle(
-    odometer_scale=1.0, odometer_scale_sigma=1e-4, gnss_latency_s=0.0, gnss_latency_sigma_s=0.002, reads_latency_s=0.0
-)
+VEHICLE = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4, gnss_latency_s=0.0, gnss_latency_sigma_s=0.002)
 PLACES_M = (900.0, 1700.0, 2500.0, 3400.0, 4300.0, 5300.0, 6200.0, 7100.0)
 LINE: dict[str, Any] = {
     "heading_deg": 70.0,

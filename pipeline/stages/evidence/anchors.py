@@ -381,14 +381,11 @@ class Witness:
     scale_sigma: float = 0.0
 
     @classmethod
-    def of(cls, counter: Counter, lags: Lags, declared: bool, config: Configuration) -> Self:
-        """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1).
-
-        `declared`: the lag of the reference is in the vehicle file.
-        """
+    def of(cls, counter: Counter, lags: Lags, config: Configuration) -> Self:
+        """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1)."""
         factor = config.hazards.evidence_factor
         share = config.lds.odometer_share
-        clock = clock_of([lags], independent=True, declared=declared, config=config.hazards)
+        clock = clock_of([lags], independent=True, config=config.hazards)
         if counter.by_file:
             return cls(counter, clock.shift_s, clock.delta_s)  # the variance of a way holds that of the file's scale
         best = min(lags.found, key=lambda lag: lag.scale_sigma, default=ScaleLag())

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.stages.evidence.carrying import Counter
 from pipeline.stages.odometry.scale_lag import ScaleLag, possible_lags, scale_and_lag
 from schemas.arrays import Floats, Ints
-from schemas.config import Configuration, HazardConfig, Vehicle
+from schemas.config import Configuration, HazardConfig
 
 # A lag of less than so many of its sigmas may be none.
 _SHOWN_SIGMAS = 2.0
@@ -36,43 +36,38 @@ class RecorderClock:
 class Lags:
     """What the ways of a recorder say of its lag behind one odometer: `found`, and the least and largest `possible_s`.
 
-    `found`: one of the run, or two where its halves disagree. `possible_s`: what the ways do not refute where no lag
-    stands out; None where they say nothing of it.
+    `found`: one of the run, or two where its halves disagree. `possible_s`: what the ways do not refute where none is
+    measured and they refute that there is none; None where there may be none, or they say nothing of it.
     """
 
     found: tuple[ScaleLag, ...] = ()
     possible_s: tuple[float, float] | None = None
 
-    def range_s(self, declared: bool, config: HazardConfig) -> tuple[float, float] | None:
-        """Least and largest lag that the recorder may have; None where it is what is assumed of a clock.
-
-        `declared`: its lag is in the vehicle file and taken off, which holds unless the ways refute it.
-        """
+    def range_s(self, config: HazardConfig) -> tuple[float, float] | None:
+        """Least and largest lag that the recorder may have; None where it is what is assumed of a clock."""
         measured = [lag for lag in self.found if _measured(lag, config)]
         if not measured:
-            return self._unproved_s(declared, config)
+            return self._unproved_s()
         noises_s = [config.evidence_factor * lag.lag_sigma_s for lag in measured]
         lows_s = [lag.lag_s - noise_s for lag, noise_s in zip(measured, noises_s, strict=True)]
         highs_s = [lag.lag_s + noise_s for lag, noise_s in zip(measured, noises_s, strict=True)]
         return min(lows_s), max(highs_s)
 
-    def _unproved_s(self, declared: bool, config: HazardConfig) -> tuple[float, float] | None:
+    def _unproved_s(self) -> tuple[float, float] | None:
         """About none, as far as it may reach: what is not measured moves nothing, it may be a slip."""
         if self.possible_s is None:
             return None
         low_s, high_s = self.possible_s
-        if declared and low_s <= config.evidence_clock_s and high_s >= -config.evidence_clock_s:
-            return None
         reach_s = max(-low_s, high_s)
         return -reach_s, reach_s
 
 
-def clock_of(lags: Sequence[Lags], independent: bool, declared: bool, config: HazardConfig) -> RecorderClock:
+def clock_of(lags: Sequence[Lags], independent: bool, config: HazardConfig) -> RecorderClock:
     """All lags that a recorder may have, by several odometers (DOMAIN section 5.1).
 
     By odometers that are not `independent` a lag may widen what is assumed of a clock, and never narrow it.
     """
-    ranges_s = [range_s for of_one in lags if (range_s := of_one.range_s(declared, config)) is not None]
+    ranges_s = [range_s for of_one in lags if (range_s := of_one.range_s(config)) is not None]
     if not ranges_s:
         return RecorderClock(0.0, config.evidence_clock_s, assumed=True)
     low_s, high_s = min(low for low, _ in ranges_s), max(high for _, high in ranges_s)
@@ -84,11 +79,10 @@ def clock_of(lags: Sequence[Lags], independent: bool, declared: bool, config: Ha
 
 
 def clocks_of(
-    lags: tuple[Sequence[Lags], Sequence[Lags]], independent: bool, vehicle: Vehicle, config: HazardConfig
+    lags: tuple[Sequence[Lags], Sequence[Lags]], independent: bool, config: HazardConfig
 ) -> tuple[RecorderClock, RecorderClock]:
     """Those of reference and reads. One that cannot be measured may have the odometer's clock or that of the other."""
-    declared = vehicle.reference_latency_s is not None, vehicle.reads_latency_s is not None
-    first, second = (clock_of(*of_one, config) for of_one in zip(lags, [independent] * 2, declared, strict=True))
+    first, second = (clock_of(of_one, independent, config) for of_one in lags)
     return _beside(first, second, config), _beside(second, first, config)
 
 
@@ -147,5 +141,8 @@ def lags_of(
     variance_m2 = 2.0 * sigma_m**2 + np.nan_to_num(counter.between(begin_ns, end_ns).variance_m2)
     factor = config.hazards.evidence_factor
     scale_off = factor * (counter.odometer.scale_sigma or 0.0) if counter.by_file else config.lds.odometer_share
-    possible_s = possible_lags((begin_s, end_s, way_m), counter.rows, np.sqrt(variance_m2), scale_off, factor)
-    return Lags((found,), possible_s)
+    ways = (begin_s, end_s, way_m)
+    low_s, high_s = possible_lags(ways, counter.rows, np.sqrt(variance_m2), scale_off, _SHOWN_SIGMAS) or (0.0, 0.0)
+    if low_s <= 0.0 <= high_s:
+        return Lags((found,))
+    return Lags((found,), possible_lags(ways, counter.rows, np.sqrt(variance_m2), scale_off, factor))

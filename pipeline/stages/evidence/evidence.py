@@ -395,11 +395,10 @@ def evidence_of(
     searches = [GapSearch(counter, network, config, facing) for counter in counters]
     lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
-    declared = vehicle.reference_latency_s is not None
-    found = [anchors.Witness.of(*of_one, declared, config) for of_one in zip(counters, lags, strict=True)]
+    found = [anchors.Witness.of(*of_one, config) for of_one in zip(counters, lags, strict=True)]
     read = anchors.read_anchors(reads, balises, network.track, hazards)
     lags_of_reads = [_lags_of_reads(search.carried(_points(read)), config) for search in searches]
-    of_reference, of_reads = clocks_of((lags, lags_of_reads), bool(independent), vehicle, hazards)
+    of_reference, of_reads = clocks_of((lags, lags_of_reads), bool(independent), hazards)
     clocked = anchors.on_clock(read, of_reads, main)
     recorded, unclosed = _known_stretches(sides, of_reference, found, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())

@@ -12,9 +12,9 @@ from schemas.arrays import floats, times_ns
 from schemas.config import HazardConfig
 
 
-def on_time(stream: pl.DataFrame | None, latency_s: float | None) -> pl.DataFrame | None:
+def on_time(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | None:
     """The stream with its declared lag taken off (vehicle file, `reference_latency_s`, `reads_latency_s`)."""
-    if stream is None or not latency_s:
+    if stream is None or latency_s == 0.0:
         return stream
     return stream.with_columns(pl.col("t") - pl.duration(nanoseconds=round(latency_s * 1e9)))
 

@@ -35,7 +35,7 @@ def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch
 
 def against(*counters: Counter) -> tuple[Witness, ...]:
     """These odometers on the reference's clock, their scale within 5 %."""
-    return tuple(Witness.of(counter, Lags(), False, CONFIG) for counter in counters)
+    return tuple(Witness.of(counter, Lags(), CONFIG) for counter in counters)
 
 
 def counter(at_m: Floats, rate_hz: float) -> Counter:

@@ -72,9 +72,7 @@ BALISES = pl.DataFrame(
 def test_between_reads_both_tell_and_beside_them_five_metres_and_five_percent() -> None:
     """10 m each second: reads are true to 3 m at three sigmas and, by a clock of 0.1 s, to a metre more."""
     counted = counting(np.arange(0.0, 110.0, 10.0))
-    # Two reads cannot tell their clock: it is declared.
-    vehicle = Vehicle(reads_latency_s=0.0)
-    known = evidence_of(([], []), READS, BALISES, [counted], line("both"), vehicle, Configuration())
+    known = evidence_of(([], []), READS, BALISES, [counted], line("both"), Vehicle(), Configuration())
     found = known.at(seconds(0, 3, 8))
     assert found.kind.tolist() == [KINDS.index(Kind.BALISE)] * 3
     rows = {int(row): (low, high) for one in found.alternatives for row, low, high in zip(

@@ -110,8 +110,6 @@ def _vehicle(draw: Draw, turns: bool) -> tuple[Vehicle | None, float]:
         return None, 1.0 + (draw.between(-1e-4, 1e-4) if turns else draw.between(-0.02, 0.02))
     stated, sigma = 1.0 + draw.between(-0.01, 0.01), draw.one(0.0003, 0.0005, 0.001)
     vehicle = Vehicle(
-        reference_latency_s=0.0,
-        reads_latency_s=0.0,
         odometer_scale=stated,
         odometer_scale_sigma=sigma,
         gnss_latency_s=draw.one(0.0, 0.1, 0.25),

@@ -19,17 +19,8 @@ from tests.stages.judge.ride import Leg, Ride, make_ride
 from tests.stages.judge.sensors import Better, Counter, Receiver, gnss, odometer, reads, reference
 
 READ_SIGMA_M = 0.4
-# Nothing is known of the vehicle but that its recorders have one clock.
-ON_TIME = Vehicle(reference_latency_s=0.0, reads_latency_s=0.0)
 RECEIVER, COUNTER, REFERENCE = Receiver(), Counter(), Better()
-VEHICLE = Vehicle(
-    odometer_scale=1.0,
-    odometer_scale_sigma=0.001,
-    gnss_latency_s=0.0,
-    gnss_latency_sigma_s=0.01,
-    reference_latency_s=0.0,
-    reads_latency_s=0.0,
-)
+VEHICLE = Vehicle(odometer_scale=1.0, odometer_scale_sigma=0.001, gnss_latency_s=0.0, gnss_latency_sigma_s=0.01)
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,7 +116,7 @@ def make_journey(world: World, seed: int, name: str = "run") -> Journey:
     """The world as it writes itself down."""
     rng = np.random.default_rng(seed)
     ride = make_ride(list(world.legs), world.start_m)
-    route, vehicle = world.ground.route, world.vehicle or ON_TIME
+    route, vehicle = world.ground.route, world.vehicle or Vehicle()
     low, high = float(ride.track_m.min()), float(ride.track_m.max())
     if low < 100.0 or high > route.length_m - 100.0:
         raise ValueError(f"the ride from {low:.0f} to {high:.0f} m leaves the route of {route.length_m:.0f} m")
