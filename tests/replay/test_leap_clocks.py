@@ -55,34 +55,6 @@ def test_a_lag_that_no_leap_second_makes_stays_a_failure(lag_s: float) -> None:
     assert row["verdict"] == "unsafe"
 
 
-@pytest.mark.parametrize("late_s", [-1, 1])
-@pytest.mark.parametrize("kept", ["odometer and reference", "odometer and reads"])
-def test_one_second_that_motion_and_places_show_is_of_the_clock(kept: str, late_s: int) -> None:
-    run, site = journey()
-    (row,) = replay(_shifted(run, late_s).with_streams(**STREAMS[kept]), site, Vehicle(), WARN).runs.to_dicts()
-    assert row["verdict"] == "unproven"
-    assert "input_doubtful" in row["reasons"]
-    assert "leap second" in row["notes"]
-
-
-def test_an_odometer_of_unknown_origin_names_no_clock() -> None:
-    run, site = journey()
-    assert run.odometer is not None
-    undeclared = run.odometer.with_columns(origin=pl.lit("unknown").cast(run.odometer["origin"].dtype))
-    late = _shifted(run, 1).with_streams(odometer=undeclared, balise_reads=None)
-    (row,) = replay(late, site, Vehicle(), WARN).runs.to_dicts()
-    assert row["verdict"] == "unsafe"
-
-
-@pytest.mark.parametrize("size_m", [-30.0, 30.0])
-@pytest.mark.parametrize("kept", ["odometer and reference", "odometer and reads"])
-def test_thirty_metres_at_thirty_metres_a_second_are_no_clock(kept: str, size_m: float) -> None:
-    """As far as a train goes in a second: the places lag by one, the ways of the odometer do not."""
-    run, site = journey({"kind": "bias", "size_m": size_m, "start_s": 0.0, "duration_s": 400.0})
-    (row,) = replay(run.with_streams(**STREAMS[kept]), site, Vehicle(), WARN).runs.to_dicts()
-    assert row["verdict"] == "unsafe"
-
-
 def test_a_failure_by_either_clock_stays_one() -> None:
     """200 m ahead for a minute: two seconds at 30 m/s do not explain it."""
     run, site = journey({"kind": "step", "size_m": 200.0, "start_s": 140.0, "duration_s": 60.0})

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from pipeline.read.ingest.timescale import leap_seconds
-from pipeline.stages.odometry.origin import declared_origin
 from pipeline.studies.plausibility.causes import explain_lag
 from pipeline.studies.plausibility.check import (
     IN_VEHICLE_FILE,
@@ -29,9 +28,6 @@ _SAME_CLOCK_S = 1.5
 # A clock with an old count of leap seconds (16 or 17 in place of 18, or none of the last three) is off by these; lags
 # of reads and odometers are known to so much beside their noise [s].
 _LEAPS_S = (2, 3)
-# By one second positions are old as often: only an odometer that is free of the GNSS and a recorder of places together
-# show that the clock is off by it. A constant error along the track shows to the recorder of places alone.
-_ONE_S = 1
 _WHOLE_NEAR_S = 0.3
 _LEAP_NEAR_S = 0.12
 
@@ -109,8 +105,7 @@ def leap_of(lag: StreamLag, t_ns: int) -> int:
 def _leap_of_gnss(of: Recording, lags: list[StreamLag]) -> int | None:
     """The whole seconds by which two recorders and more say that the clock of the GNSS is off; none where they do not.
 
-    One second may be the age of positions: motion and places have to show it. A misfit, not an impossibility: a slow
-    fault of the GNSS can look like it.
+    One second may be the age of positions. A misfit, not an impossibility: a slow fault of the GNSS can look like it.
     """
     known = [lag for lag in lags if not lag.reason]
     sure = [lag for lag in known if lag.sure]
@@ -118,23 +113,10 @@ def _leap_of_gnss(of: Recording, lags: list[StreamLag]) -> int | None:
         return None
     whole = round(sure[0].lag_s)
     exact = abs(sure[0].lag_s - whole) <= _LEAP_NEAR_S
-    if not exact:
-        return None
-    if abs(whole) == _ONE_S:
-        return whole if _by_motion_and_places(of, known, whole) else None
-    alike = all(abs(lag.lag_s - whole) <= _WHOLE_NEAR_S + SIGNIFICANT_SIGMAS * min(lag.sigma_s, 0.1) for lag in known)
+    alike = exact and all(
+        abs(lag.lag_s - whole) <= _WHOLE_NEAR_S + SIGNIFICANT_SIGMAS * min(lag.sigma_s, 0.1) for lag in known
+    )
     return whole if alike and abs(whole) in _LEAPS_S else None
-
-
-def _by_motion_and_places(of: Recording, known: Sequence[StreamLag], whole_s: int) -> bool:
-    """Whether the ways of an odometer that is free of the GNSS, and all recorders of places, show this one lag."""
-    motion = [lag for lag in known if lag.stream == "odometer" and lag.sure and _is_independent(of)]
-    exact = all(abs(lag.lag_s - whole_s) <= _LEAP_NEAR_S for lag in motion)
-    return bool(motion) and exact and all(abs(lag.lag_s - whole_s) <= _WHOLE_NEAR_S for lag in known)
-
-
-def _is_independent(of: Recording) -> bool:
-    return of.run.odometer is not None and declared_origin(of.run.odometer, of.vehicle).independent
 
 
 def _of_leap(of: Recording, lag: StreamLag, leap_s: int) -> Check:
@@ -142,13 +124,7 @@ def _of_leap(of: Recording, lag: StreamLag, leap_s: int) -> Check:
     found = f"{lag.lag_s:+.2f} s, stamps of the {lag.name} are {later}"
     causes = (Cause(MisfitCause.LEAP_SECONDS, (f"{abs(leap_s)}",)), Cause(MisfitPlace.IN_STREAM, ("GNSS", lag.name)))
     what = f"clock of the {lag.name} against the GNSS"
-    if abs(leap_s) == _ONE_S:
-        # No lines: nobody should shift positions that are a second old to where the train is by now.
-        advice = "Find out whether the receiver's clock is wrong or its positions are this old. Only a wrong clock is"
-        advice += f' mended by [[ingest.correct]] stream = "gnss", shift_s = {float(leap_s)}.'
-        return Check(what, FitState.MISFIT, found, causes, advice=advice, leap_s=leap_s)
-    lines = _lines_of_gnss(of, float(leap_s))
-    return Check(what, FitState.MISFIT, found, causes, lines, leap_s=leap_s)
+    return Check(what, FitState.MISFIT, found, causes, _lines_of_gnss(of, float(leap_s)), leap_s=leap_s)
 
 
 def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
