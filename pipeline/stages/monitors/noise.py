@@ -209,15 +209,13 @@ class _Sampler:
         self._series = series
         self._config = config
         self._t_s = np.cumsum(series.dt_s) - series.dt_s[:1]
+        self.renewal: Ints = (self._t_s // config.noise_renewal_s).astype(np.int64)
         # Only of the time before the noise is first known: later rows must not change the lags (causal).
         steps_s = series.dt_s[1:]
         first_s = steps_s[: max(int(np.searchsorted(self._t_s[1:], config.noise_first_s, side="right")), 1)]
         self.period_s = round(float(np.median(first_s)), 6) if first_s.size else 0.0
         unknown = ~np.isfinite(series.rate_mps + series.sigma_m.sum(axis=1))
         self._countable = moving & ~unknown
-        # From the begin of the first step that counts, or a stand before it would cost up to a renewal more.
-        since_s = self._t_s - np.maximum(self._t_s - series.dt_s, 0.0)[self._countable][:1].sum()
-        self.renewal: Ints = np.floor(since_s / config.noise_renewal_s + 1e-6).astype(np.int64)
         self._piece = np.cumsum(series.fresh | unknown)  # the same number for rows joined by increments
         self._offset_m = np.cumsum(np.where(series.border | unknown, 0.0, series.rate_mps) * series.dt_s)
         self._white_m2 = np.cumsum(series.white_m2)

@@ -122,15 +122,6 @@ def test_unknown_for_thirty_seconds_and_said_so() -> None:
     assert reasons.to_list() == [NOISE_UNKNOWN] * 30 + [None] * 330
 
 
-@pytest.mark.parametrize("stood_s", [3, 7, 16])
-def test_known_thirty_seconds_after_the_departure_however_long_the_train_stood(stood_s: int) -> None:
-    """The first second differences reach back into the stand; renewals count from the departure."""
-    offset_m = np.random.default_rng(2).normal(0.0, 0.05, 200)
-    moving = np.arange(200) > stood_s
-    meter = NoiseMeter(series_of(offset_m), moving, None, CONFIG)
-    assert meter.known_from() == stood_s + 30
-
-
 def test_no_verdict_where_noise_hides_a_failure() -> None:
     bank = MonitorBank(epochs_of(Receiver(white_m=3.0), 0.1, np.random.default_rng(1)), {}, CONFIG)
     assert pl.DataFrame(bank.columns())["along_raw_reason"][40:].unique().to_list() == [NOISE_TOO_LARGE]
