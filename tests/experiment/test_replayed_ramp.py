@@ -45,5 +45,6 @@ def test_a_range_ramp_of_1_cm_per_second_is_found_before_the_failure(
     first = tables.epochs.filter(pl.col("pseudorange_state") == "fail")["t"][0]
     assert timedelta(0) < first - hazard["t_onset"] < timedelta(seconds=2_400)
     evaluated = tables.epochs.filter(pl.col("pseudorange_state") != "not_evaluated").height
-    # The ramp moves the position across too: where that refutes the track, the ranges are not tested on it.
-    assert 0.7 < evaluated * period_s / tables.epochs.height < 1.1
+    # The ramp moves the position across too: where that refutes the track, the ranges are not tested on it, until a
+    # movement has led back (40 % of the time, long after the failure was found).
+    assert 0.55 < evaluated * period_s / tables.epochs.height < 1.1
