@@ -226,6 +226,9 @@ class MatchingConfig(Settings):
     # is, and past an open end a path goes on for as much, and for this much more. So far before an element may begin.
     paths_along_sigmas: NonNegative = 3.0
     paths_end_m: NonNegative = 10.0
+    # Behind a switch that a path came over its branches are one track until they are so far apart: nearer than the
+    # gauge of 1.435 m they share rails.
+    paths_one_track_m: NonNegative = 1.5
     # Over a longer step the train may have taken any way of at most this share and margin more than the distance. Of
     # several the one is shown that agrees with it best; the margin is ten sigmas of that: 5 m and 2 % of an odometer.
     paths_gap_s: Positive = 3.5

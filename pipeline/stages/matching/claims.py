@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
+from pipeline.stages.matching.branches import OneTrack, branches_beyond_m
 from pipeline.stages.paths.path_set import PathSet, Span, unbranched_groups
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints, spans_of
@@ -106,7 +107,7 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
     carried_m = 1.2 * speed_mps[np.maximum(before, 0)] * since_s + config.paths_along_sigmas * np.nan_to_num(sigma_m)
     group = np.where(element >= 0, found.groups[np.maximum(element, 0)], -1)
     alone = _alone(found)
-    live = _left(found, found.living(config.paths_delay_s))
+    live = _left(found, found.living(config.paths_delay_s), OneTrack(found, config.paths_one_track_m))
     at = np.maximum(before, 0)
     gate = _confidence(live, at, group, carried_m, alone)
     gate[before < 0] = 0.0
@@ -184,8 +185,11 @@ def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:
     return Possible(epoch, np.searchsorted(step, np.arange(count + 1)), element, confidence)
 
 
-def _left(found: PathSet, spans: list[Span]) -> _Left:
-    """What the sets come to, the likeliest line first; of equal ones that found first."""
+def _left(found: PathSet, spans: list[Span], one_track: OneTrack | None = None) -> _Left:
+    """What the sets come to, the likeliest line first; of equal ones that found first.
+
+    `one_track`: a path is near the branch until the other branches of a switch that it came over are another track.
+    """
     count = len(found.steps)
     ends = {2 * node.element + side for node, *_ in spans for side in (0, 1)}
     beyond_m = branches_beyond_m(found.network, ends)
@@ -198,6 +202,8 @@ def _left(found: PathSet, spans: list[Span]) -> _Left:
         _put(line[begin:end], element[begin:end], p[begin:end], (own, node.element), value)
         beyond = np.array([beyond_m[2 * node.element + 1], beyond_m[2 * node.element]])
         ends_m = node.left_m[: end - begin] + beyond
+        if one_track is not None:
+            ends_m -= one_track.behind_m(node)
         part = slice(begin, begin + len(ends_m))
         branch_m[part] = np.minimum(branch_m[part], ends_m.min(axis=1))
     group = np.where(line[:, 1] < 0, line[:, 0], -2)
@@ -243,26 +249,3 @@ def _alone(found: PathSet) -> Floats:
     lines = found.groups[found.candidates.element]
     pairs = np.unique(np.column_stack([found.candidates.step, lines]), axis=0)
     return np.asarray(np.bincount(pairs[:, 0], minlength=len(found.steps)) == 1, dtype=np.float64)
-
-
-def branches_beyond_m(network: Network, wanted: set[int]) -> dict[int, float]:
-    """Per oriented element the way beyond its exit to the next branch of tracks [m], infinite to an open end."""
-    beyond: dict[int, float] = {}
-    for start in sorted(wanted):
-        chain: list[int] = []
-        on_chain: set[int] = set()
-        oriented = start
-        while oriented not in beyond and oriented not in on_chain:
-            onward = network.successors[oriented]
-            if len(onward) != 1 or len(network.successors[onward[0].to ^ 1]) != 1:
-                beyond[oriented] = 0.0 if onward else np.inf
-                break
-            chain.append(oriented)
-            on_chain.add(oriented)
-            oriented = onward[0].to
-        # A ring without a branch has none.
-        ahead_m = beyond.get(oriented, np.inf)
-        for at in reversed(chain):
-            ahead_m += network.length_m(network.successors[at][0].to)
-            beyond[at] = ahead_m
-    return beyond
