@@ -212,9 +212,10 @@ class MatchingConfig(Settings):
     paths_delay_s: NonNegative = 3.0
     # By so much the variance of a movement, measured along the track, may be too small: it is one of few windows.
     paths_measured_factor: Annotated[Number, Field(ge=1)] = 1.5
-    # An empty set begins anew within the first minute: the first positions of a receiver settle. As long it claims
-    # nothing then: what refuted every path may have errors larger than stated. As long before the end of a stretch that
-    # ends off the network, refuted paths are alike.
+    # An empty set begins anew within the first minute of a run: the first positions of a receiver settle. As long it
+    # claims nothing then: what refuted every path may have errors larger than stated. Not after every outage: of 60
+    # runs with a fault across the tracks from an outage on, 12 would claim another track, none does. As long before the
+    # end of a stretch that ends off the network, refuted paths are alike.
     paths_anew_s: NonNegative = 60.0
     # A mean over so long is an offset. Later a set begins anew where such a mean has moved back beside the same line
     # to where it was, within so many sigmas.

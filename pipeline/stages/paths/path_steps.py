@@ -27,7 +27,8 @@ class PathSteps:
     `t_ns`: mean time; `begin_s`, `end_s`: of its first and last position, since `start_ns`, the first of all;
     `sigma_m` of the position across; `way_m`: since the step before, the larger of odometer and positions; `counted`:
     it moved by a metre, and is no outlier; `along_m`: position along the track minus an independent odometer, NaN
-    without one; `pinned`: element of a balise read then, else -1.
+    without one; `with_odometer`: some odometer has told of the way by then; `pinned`: element of a balise read then,
+    else -1.
     """
 
     t_ns: Ints
@@ -39,6 +40,7 @@ class PathSteps:
     way_m: Floats
     counted: Bools
     along_m: Floats
+    with_odometer: Bools
     pinned: Ints
 
     def __len__(self) -> int:
@@ -47,11 +49,6 @@ class PathSteps:
     @property
     def begin_ns(self) -> Ints:
         return np.round(self.begin_s * NS_PER_S).astype(np.int64) + self.start_ns
-
-    @cached_property
-    def measured(self) -> Bools:
-        """Steps by which an independent odometer has told of the noise along the track."""
-        return np.asarray(np.logical_or.accumulate(np.isfinite(self.along_m)))
 
     @cached_property
     def period_s(self) -> Floats:
@@ -114,6 +111,7 @@ def path_steps(
         way_m=np.where(known, np.maximum(moved_m, chord_m), chord_m),
         counted=counted & ~outliers(means, mean_sigma_m),
         along_m=_along_m(means, counted_m) if independent else np.full(len(means), np.nan),
+        with_odometer=np.logical_or.accumulate(known),
         pinned=pins,
     )
 

@@ -187,7 +187,7 @@ class PathTests:
         long, short, shortest = (_greatest_shares(tau_s)[:, None] for tau_s in (50.0, 20.0, 10.0))
         measured_m2 = self.measured_m2[:, at]
         by_odometer_m2 = np.fmax(sigma_m2 * long, self.config.paths_measured_factor * measured_m2)
-        soon = np.where(steps.measured[at], short, shortest)
+        soon = np.where(steps.with_odometer[at], short, shortest)
         noise_m2 = np.where(np.isfinite(measured_m2), by_odometer_m2, sigma_m2 * soon)
         lasting = np.array(WINDOWS_S)[:, None] > _MEASURED_S
         return np.where(lasting, sigma_m2 * long * self.excess[at], noise_m2)

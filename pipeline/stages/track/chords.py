@@ -82,7 +82,7 @@ class Chords:
         begin_rad = heading_rad[row, against] + np.pi * against
         end_rad = heading_rad[row, 1 - against] + np.pi * against
         inner_rad = _wrapped(begin_rad[1:] - end_rad[:-1])
-        # A chain ends at a switch whose other branch is straighter: that turn is the switch's, not the track's.
+        # A chain ends at a switch whose other branch is straighter: the turn there is the switch's, not the track's.
         turn_rad = np.concatenate([[0.0], inner_rad, [0.0]])
         self._known_m[vertex] = _sigmas_m(np.append(0.0, np.cumsum(length_m)), turn_rad)
 
@@ -141,9 +141,12 @@ def _sigmas_m(way_m: Floats, turn_rad: Floats) -> Floats:
     """Of each segment between points of a chain the largest sigma of all chords that it may be a part of.
 
     A chord spans 1, 2, ... `points` segments. Its turn is the geometric mean of the turns at its ends (0 with a
-    straight at one of them) less the turn within it. At the end of the survey the turn is unknown and counts as 0.
+    straight at one of them) less the turn within it. Where the chain ends, with the survey or at a switch, its turn is
+    unknown: the points there are as far apart as beyond, and so it counts as that of the curve that begins there.
     """
     bend_rad = _turn_about(way_m, turn_rad)
+    ends_rad = _turn_at_begin(way_m, bend_rad), _turn_at_begin(way_m[-1] - way_m[::-1], bend_rad[::-1])
+    bend_rad[[0, -1]] = np.maximum(bend_rad[[0, -1]], ends_rad)
     inside_rad = np.cumsum(np.abs(turn_rad))
     last = len(way_m) - 1
     out = np.zeros(last)
@@ -172,6 +175,25 @@ def _turn_about(way_m: Floats, turn_rad: Floats) -> Floats:
     low = np.searchsorted(way_m, way_m - _ONE_POINT_M)
     high = np.searchsorted(way_m, way_m + _ONE_POINT_M, side="right")
     return np.asarray(np.abs(turned[high] - turned[low]))
+
+
+def _turn_at_begin(way_m: Floats, bend_rad: Floats) -> float:
+    """Turn [rad] at the first point of a chain, by those after it.
+
+    A point turns by half of the arc before it and half of that after it; the arc after it has the curvature of the next
+    point. What is left is of the chord before, twice over, and no more than the point's own: nothing where a straight
+    leads to a curve. A curve at a switch is no longer than a chord with points on it may be.
+    """
+    # Smaller turns are none: points on a chord.
+    turns = np.flatnonzero(bend_rad[1:-1] > 16.0 * _LEAST_M / _LONGEST_CUT_M)[:3] + 1
+    if not turns.size or way_m[turns[0]] > _LONGEST_CUT_M:
+        return 0.0
+    own_rad = float(bend_rad[turns[0]])
+    if turns.size < 2:
+        return own_rad
+    next_m, after_m = np.diff(way_m[[*turns, -1][:3]])
+    arc_rad = float(bend_rad[turns[1]] * next_m / (next_m + after_m))
+    return min(own_rad, max(2.0 * (own_rad - arc_rad), 0.0))
 
 
 def _wrapped(angle_rad: Floats) -> Floats:

@@ -32,16 +32,45 @@ def _sigmas_m(network: Network) -> Floats:
 
 @pytest.mark.parametrize(("step_rad", "expected_m"), [(0.2, 1.25), (0.1, 0.3125), (0.04, 0.05)])
 def test_a_chord_lies_aside_by_half_of_its_length_times_its_turn_over_eight(step_rad: float, expected_m: float) -> None:
-    """Points every 100, 50 and 20 m at a radius of 500 m; how the first and the last chord turn nobody knows."""
+    """Points every 100, 50 and 20 m at a radius of 500 m; the first and the last chord are of the same arc."""
     points = arc(np.arange(0.0, 1.01, step_rad))
-    assert sigmas_m(points) == pytest.approx([0.0, *[expected_m] * (len(points) - 3), 0.0], rel=0.01)
+    assert sigmas_m(points) == pytest.approx([expected_m] * (len(points) - 1), rel=0.01)
 
 
 def test_a_straight_before_a_curve_has_no_chord_error() -> None:
     """300 m of straight in three chords, then an arc; the first chord of the arc turns half as much at its start."""
     points = np.vstack([[[-300.0, 0.0], [-200.0, 0.0], [-100.0, 0.0]], arc([0.0, 0.2, 0.4, 0.6, 0.8])])
     root = float(np.sqrt(0.5))
-    assert sigmas_m(points) == pytest.approx([0.0, 0.0, 0.0, 1.25 * root, 1.25, 1.25, 0.0], abs=0.05)
+    assert sigmas_m(points) == pytest.approx([0.0, 0.0, 0.0, 1.25 * root, 1.25, 1.25, 1.25], abs=0.05)
+
+
+def test_a_short_straight_before_a_curve_has_none_either() -> None:
+    """The line begins 100 m before the arc: the turn where the arc begins is all of the arc."""
+    points = np.vstack([[[-100.0, 0.0]], arc([0.0, 0.2, 0.4, 0.6, 0.8])])
+    assert sigmas_m(points)[0] == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_first_chord_behind_a_switch_is_as_long_as_the_others(turned: bool) -> None:
+    """A straight line, and from its middle an arc of 500 m with points every 50 m: half of 0.1 rad * 50 m / 8 each."""
+    branch = arc([0.0, 0.1, 0.2, 0.3])
+    parts = {"s": line((-300.0, 0.0), (0.0, 0.0), 50.0), "m": line((0.0, 0.0), (300.0, 0.0), 50.0)}
+    links: list[Link] = [("s", 1, "m", 0, "both"), ("s", 1, "b", int(turned), "both")]
+    place = site(parts | {"b": branch[::-1] if turned else branch}, links, sigma_m=0.3)
+    found = _sigmas_m(site_network(place))[-3:]
+    assert found.tolist() == pytest.approx([0.3125] * 3, rel=0.01)
+
+
+def test_a_straight_behind_a_switch_has_no_chord_error() -> None:
+    """Of 40 m, in which the branch leads away, and then on without a turn; and of 400 m up to a turn."""
+    parts = {"s": line((-300.0, 0.0), (0.0, 0.0)), "m": line((0.0, 0.0), (900.0, 0.0))}
+    parts["b"] = np.array([[0.0, 0.0], [40.0, 4.0], [80.0, 8.0], [120.0, 12.0]])
+    parts["c"] = np.array([[0.0, 0.0], [400.0, -40.0], [500.0, -60.0], [600.0, -90.0]])
+    links: list[Link] = [("s", 1, name, 0, "both") for name in "mbc"]
+    network = site_network(site(parts, links, sigma_m=0.3))
+    found, first = _sigmas_m(network), network.track.first
+    assert found[first[2] : first[2] + 3].tolist() == pytest.approx([0.0] * 3, abs=0.01)
+    assert found[first[3]] == pytest.approx(0.0, abs=0.01)
 
 
 def test_points_on_a_chord_change_nothing() -> None:
