@@ -490,6 +490,9 @@ class HazardConfig(Settings):
     # Behind an open end a track may go on unsurveyed: sidings are as long as the longest trains (740 m on the TEN-T
     # network, Regulation (EU) 2024/1679) and their switches.
     open_end_m: NonNegative = 1000.0
+    # A reference on no track left its track over a switch that the survey lacks: within so much way the longest ones
+    # (1:18.5 and a curve of 1200 m) have led it 4 m aside.
+    reference_leaves_m: NonNegative = 120.0
     # If no way between two known places is within the odometer's confidence, ways that differ from its distance by no
     # more than this are taken: slip may be that large. A limit of the search: beyond it position and track are unknown.
     slip_m: NonNegative = 200.0

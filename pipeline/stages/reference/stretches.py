@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.stages.paths.path_set import path_set
 from pipeline.stages.paths.path_steps import path_steps
-from pipeline.stages.reference.open_ends import off_the_survey
+from pipeline.stages.reference.open_ends import leaving, off_the_survey
 from pipeline.stages.reference.samples import Samples, samples_of
 from pipeline.stages.reference.visits import ElementStay
 from pipeline.stages.reference.ways import ways_of
@@ -63,7 +63,8 @@ def reference_stretches(
     hazards = config.hazards
     samples = samples_of(reference, network, config)
     # A sample beyond k_T roots of every track is no sample of the track.
-    near = samples.placed(config.align.sure_sigmas) & ~off_the_survey(samples, network, hazards)
+    placed = samples.placed(config.align.sure_sigmas)
+    near = placed & ~leaving(samples, placed, config) & ~off_the_survey(samples, network, hazards)
     search = _Search(samples, network.unsearched(), numbers, config)
     stretches: list[ReferenceStretch] = []
     covered = np.zeros(samples.t_ns.size, dtype=np.bool_)

@@ -198,3 +198,35 @@ def test_a_reference_that_excludes_the_siding_knows_its_track_behind_the_open_en
     assert spans_and_tracks(x_m, np.zeros(x_m.size), 0.5) == [(20.0, 3000.0, {"m"})]
     # The end of the survey itself, with no other track near.
     assert spans_and_tracks(np.linspace(3000.0, 4004.0, 500), np.zeros(500), 2.0)[0][2] == {"m"}
+
+
+@pytest.mark.parametrize("outward", [True, False])
+@pytest.mark.parametrize(("aside_m", "left_m"), [(0.0, 3004.0), (0.45, 2890.0)])
+def test_where_it_left_over_a_switch_that_the_survey_lacks_it_is_unknown(
+    outward: bool, aside_m: float, left_m: float
+) -> None:
+    """The train leaves the main track at 3000 m by a siding at 1:12 that nobody surveyed; a root is 0.304 m.
+
+    It lies on no track beyond 5.33 roots, 1.62 m aside: 19.5 m behind the switch. Up to one root, 3.6 m behind it, the
+    two are one. Of a reference that lies 1.5 roots aside all the time, no sample is within one root: 120 m before it
+    lies on no track.
+    """
+    x_m = np.linspace(1500.0, 3400.0, 1500)
+    y_m = -aside_m - np.clip((x_m - 3000.0) / 12.0, 0.0, 5.0)
+    if not outward:
+        x_m, y_m = x_m[::-1], y_m[::-1]
+    (begin_m, end_m, names), *more = spans_and_tracks(x_m, y_m, 0.05)
+    assert names == {"m"}
+    assert not more
+    assert sorted((begin_m, end_m)) == pytest.approx([1500.0, left_m], abs=8.0)
+
+
+def test_a_pause_of_the_reference_is_no_leaving() -> None:
+    """A root and a half aside, and no sample for 4 s."""
+    x_m = np.linspace(1500.0, 3400.0, 1500)
+    frame = samples(x_m, np.full(x_m.size, -0.45))
+    late = pl.col("t") + pl.duration(seconds=4)
+    frame = frame.with_columns(t=pl.when(pl.int_range(pl.len()) < 700).then("t").otherwise(late))
+    network = site_network(SIDING)
+    found, _ = reference_stretches(frame, network_in_pieces(SIDING), network.track.index, Configuration())
+    assert [one.t_ns.size for one in found] == [700, 800]
