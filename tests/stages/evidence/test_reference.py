@@ -87,6 +87,32 @@ def test_beside_every_track_is_silence_and_nothing_is_known() -> None:
     assert len(found.silent) == 1
 
 
+APART = site({"a": line((0.0, 0.0), (3000.0, 0.0)), "b": line((0.0, 12.0), (3000.0, 12.0))}, sigma_m=1.0)
+
+
+def known_aside(*y_m: float) -> list[tuple[float, float, set[str]]]:
+    """Where a reference is known that lies so far aside of a up to 1400 m, to 2200 m, and behind that.
+
+    Surveyed to 1 m: an offset of 8 s is refuted at 4.8 m, a movement of as long at 6.8 m; samples lie beside a track up
+    to 5.3 m.
+    """
+    return spans_and_tracks(X_M, np.interp(X_M, [1400.0, 1420.0, 2200.0, 2220.0], np.repeat(y_m, 2)[1:-1]), 0.05, APART)
+
+
+def test_a_reference_is_known_again_once_a_movement_has_led_it_back() -> None:
+    """By 7.5 m there and back; nobody knows how long before it had been wrong."""
+    ((begin, end, names),) = known_aside(2.5, -5.0, 2.5)
+    # Back at 2220 m, and there for two means of 8 s at 20 m/s.
+    assert 2220.0 <= begin <= 2220.0 + 2 * 8 * 20.0
+    assert (end, names) == (X_M[-1], {"a"})
+
+
+@pytest.mark.parametrize("y_m", [(2.5, -5.0, -5.0), (2.5, -5.0, 1.0), (1.5, -5.0, 1.5), (2.5, -5.0, 4.5)])
+def test_a_reference_that_has_not_come_back_is_silent_to_its_end(y_m: tuple[float, ...]) -> None:
+    """It stays, comes elsewhere, or comes back by no more than the survey explains."""
+    assert known_aside(*y_m) == []
+
+
 def test_a_mean_is_not_a_sample() -> None:
     """A tenth of the samples 1.3 m beside the track."""
     aside = np.where(np.arange(X_M.size) % 10 == 0, 1.3, 0.0)
@@ -165,11 +191,13 @@ SIDING = site(
 )
 
 
-def spans_and_tracks(x_m: Floats, y_m: Floats, sigma_m: float) -> list[tuple[float, float, set[str]]]:
-    """From where to where each stretch of the reference goes on the siding's site, and the tracks of it."""
+def spans_and_tracks(
+    x_m: Floats, y_m: Floats, sigma_m: float, place: Site = SIDING
+) -> list[tuple[float, float, set[str]]]:
+    """From where to where each stretch of the reference goes, and the tracks of it."""
     frame = samples(x_m, y_m, sigma_m)
-    network = site_network(SIDING)
-    found, _ = reference_stretches(frame, network_in_pieces(SIDING), network.track.index, Configuration())
+    network = site_network(place)
+    found, _ = reference_stretches(frame, network_in_pieces(place), network.track.index, Configuration())
     t_ns = frame["t"].to_physical().to_numpy()
     return [
         (
