@@ -17,7 +17,16 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
 from pipeline.stages.paths.path_steps import PathSteps
-from pipeline.stages.paths.path_tests import LOOKED_S, NO_STEPS, WINDOWS_S, PathTests, Totals, Trail
+from pipeline.stages.paths.path_tests import (
+    LOOKED_S,
+    NO_STEPS,
+    NO_STRETCH,
+    WINDOWS_S,
+    PathTests,
+    Stretch,
+    Totals,
+    Trail,
+)
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
@@ -28,8 +37,8 @@ class Node:
     """One hypothesis while it is on one net element, oriented as its path began.
 
     Covers the steps from `begin` on, before `end`; `rejected`: the step at which its residuals refuted it, a large
-    number if none did; `residual_m`, `survey_m`, `heading_rad`, `left_m` (to both ends of the element): of its own
-    steps; `before`: what its whole path comes to before `begin`; `p`: least p-value of its tests so far.
+    number if none did; `along`, `left_m` (to both ends of the element): of its own steps; `before`: what its whole path
+    comes to before `begin`; `p`: least p-value of its tests so far.
     `also`: hypotheses that came to it later, and have been one with it since.
     """
 
@@ -42,9 +51,7 @@ class Node:
     end: int = 0
     rejected: int = 2**62
     barred: int = 2**62
-    residual_m: Floats = field(default_factory=lambda: np.zeros(0))
-    survey_m: Floats = field(default_factory=lambda: np.zeros(0))
-    heading_rad: Floats = field(default_factory=lambda: np.zeros(0))
+    along: Stretch = NO_STRETCH
     left_m: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     p_by_step: Floats = field(default_factory=lambda: np.ones(1))
     followed: bool = False
@@ -69,7 +76,7 @@ class Node:
     def residuals_m(self, first: int, last: int) -> Floats:
         """Of its path over the steps from `first` on, before `last`; NaN before its beginning."""
         chain = self.since(first)
-        known = np.concatenate([node.residual_m for node in chain])
+        known = np.concatenate([node.along.residual_m for node in chain])
         whole_m = np.full(last - first, np.nan)
         begin = max(chain[0].begin, first)
         if begin >= last:
@@ -291,7 +298,7 @@ class _Growth:
         windows_m = sliding_window_view(beside_m, window)
         means_m = windows_m.mean(axis=1) - float(np.mean(residual_m[before]))
         sigma_m = steps.sigma_m[died + window - 1 :]
-        survey_m = np.full(sigma_m.size, float(np.median(node.survey_m)))
+        survey_m = np.full(sigma_m.size, float(np.median(node.along.survey_m)))
         farthest_m = np.fmax(np.fmax.accumulate(means_m) - means_m, means_m - np.fmin.accumulate(means_m))
         # Out of reach for a whole window it was farther away than any measured offset.
         farthest_m[np.logical_or.accumulate(np.isnan(windows_m).all(axis=1))] = np.inf
@@ -335,11 +342,48 @@ class _Growth:
     def _near(self) -> Bools:
         """Candidates that a path may begin with: as near as the test of the offset allows."""
         candidates = self.candidates
-        limit_m = self.tests.offset_m(self.steps.sigma_m[candidates.step], self.survey_m)
+        limit_m = self.tests.offset_m(self.steps.sigma_m[candidates.step], self.survey_m, self._beside_m)
         near: Bools = (np.abs(candidates.offset_m) <= limit_m) & (
             self._inside(np.arange(len(candidates.step))) | (candidates.beyond_m <= self.config.paths_end_m)
         )
         return near
+
+    def _stretch(self, oriented: int, rows: Ints) -> Stretch:
+        """Of an oriented element at its candidates."""
+        candidates = self.candidates
+        turned = oriented % 2
+        return Stretch(
+            (1.0 - 2.0 * turned) * candidates.offset_m[rows],
+            self.survey_m[rows],
+            self._sides_m[turned][rows],
+            self._sides_m[1 - turned][rows],
+            candidates.heading_rad[rows] + np.pi * turned,
+        )
+
+    @cached_property
+    def _beside_m(self) -> Floats:
+        """Per candidate the distance to the nearest track on the side of the position [m], 0 without one."""
+        return np.where(self.candidates.offset_m > 0.0, *self._sides_m)
+
+    @cached_property
+    def _sides_m(self) -> tuple[Floats, Floats]:
+        """Per candidate how far left and right in its own sense the nearest other track lies [m], 0 without one.
+
+        The tracks of a step in the order in which they lie beside each other, but for those that end before it.
+        """
+        candidates = self.candidates
+        # Of tracks that run the other way the offset has the other sign.
+        first = candidates.first[:-1][candidates.step]
+        turned = np.cos(candidates.heading_rad - candidates.heading_rad[first]) < 0.0
+        aside_m = np.where(turned, -candidates.offset_m, candidates.offset_m)
+        rows = np.flatnonzero(candidates.past == 0)
+        rows = rows[np.lexsort((aside_m[rows], candidates.step[rows]))]
+        # Two that lie in one place are two all the same.
+        apart_m = np.maximum(np.diff(aside_m[rows]), 1e-3) * (np.diff(candidates.step[rows]) == 0)
+        sides_m = np.zeros((2, candidates.step.size))
+        # The farther left a track lies, the smaller is the position's offset left of it.
+        sides_m[0, rows[1:]], sides_m[1, rows[:-1]] = apart_m, apart_m
+        return np.where(turned, sides_m[1], sides_m[0]), np.where(turned, sides_m[0], sides_m[1])
 
     @cached_property
     def _first_steps(self) -> Ints:
@@ -381,9 +425,7 @@ class _Growth:
             apart_m = np.where(self.steps.counted[begin:last], np.nan_to_num(one_m - other_m), 0.0)
             if self.tests.farthest_m(self.steps, apart_m, last, window_s) > alike_m:
                 return False
-        own = self.tests.totals(
-            self.steps, one.begin, *(of[: last - one.begin] for of in (one.residual_m, one.survey_m))
-        )
+        own = self.tests.totals(self.steps, one.begin, one.along.upto(last - one.begin))
         sums = one.before.residual_m + own.residual_m, other.before.residual_m
         return abs(sums[0] - sums[1]) <= alike_m * max(one.before.number + own.number, 1.0)
 
@@ -406,10 +448,7 @@ class _Growth:
         node.followed = True
         node.end = node.begin + stays
         if stays:
-            sense = 1.0 - 2.0 * (node.oriented % 2)
-            node.residual_m = sense * candidates.offset_m[rows]
-            node.survey_m = self.survey_m[rows]
-            node.heading_rad = candidates.heading_rad[rows] + np.pi * (node.oriented % 2)
+            node.along = self._stretch(node.oriented, rows)
             node.left_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
             node.barred = min(node.barred, self._unread(node))
             node.rejected = min(node.rejected, node.barred)
@@ -430,10 +469,8 @@ class _Growth:
         """Its path as far back as any test looks."""
         end_s = self.steps.end_s
         chain = node.since(int(np.searchsorted(end_s, end_s[node.begin] - self.tests.longest_s)))
-        residual_m, survey_m, heading_rad = (
-            np.concatenate([getattr(one, name) for one in chain]) for name in ("residual_m", "survey_m", "heading_rad")
-        )
-        return Trail(node.stretch, chain[0].begin, node.begin, residual_m, survey_m, heading_rad, node.before)
+        along = Stretch.joined([one.along for one in chain])
+        return Trail(node.stretch, chain[0].begin, node.begin, along, node.before)
 
     def _unread(self, node: Node) -> int:
         """The first step of the node at which a balise was read on an element that the train cannot have come from."""
@@ -500,10 +537,12 @@ class _Growth:
                 return []
             child = children[0]
             if not self._inside(np.array([row]))[0]:
-                sense = 1.0 - 2.0 * (node.oriented % 2)
-                node.residual_m = np.append(node.residual_m, sense * candidates.offset_m[row])
-                node.survey_m = np.append(node.survey_m, self.survey_m[row])
-                node.heading_rad = np.append(node.heading_rad, node.heading_rad[-1:] if node.heading_rad.size else 0.0)
+                own = self._stretch(node.oriented, np.array([row]))
+                # It leaves the bias where it was.
+                own = own._replace(
+                    heading_rad=node.along.heading_rad[-1:] if node.along.heading_rad.size else np.zeros(1)
+                )
+                node.along = Stretch.joined([node.along, own])
                 node.p_by_step = np.append(node.p_by_step, node.p)
                 node.left_m = np.vstack([node.left_m, [candidates.along_m[row], candidates.left_m[row]]])
                 node.end = step + 1
@@ -512,7 +551,7 @@ class _Growth:
         return children
 
     def _child(self, node: Node, oriented: int, step: int) -> Node:
-        own = self.tests.totals(self.steps, node.begin, node.residual_m, node.survey_m)
+        own = self.tests.totals(self.steps, node.begin, node.along)
         before = Totals(*(one + other for one, other in zip(node.before, own, strict=True)))
         child = Node(oriented, step, node.stretch, node, before, node.p)
         child.rejected, child.barred = node.rejected, node.barred

@@ -6,6 +6,7 @@ receiver. Tested are movements over several windows, the offset, and the lasting
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
@@ -15,6 +16,7 @@ import numpy as np
 from pipeline.stages.paths.path_steps import PathSteps
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
+from schemas.stages import ONE_TRACK_LEFT
 
 # Windows of the movements [s].
 WINDOWS_S = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0)
@@ -39,16 +41,53 @@ class Verdict(NamedTuple):
     p: Floats
 
 
+class _Test(NamedTuple):
+    """Residuals in sigmas and their limits, shapes (windows, n); looks of each window."""
+
+    sigmas: Floats
+    limits: Floats
+    looks: Floats
+
+
 class Totals(NamedTuple):
-    """Over the steps of a path that count: how many, residuals [m], survey's sigmas [m], squares of sigmas [m2]."""
+    """Over the steps of a path that count: how many, residuals [m], survey's sigmas [m], squares of sigmas [m2].
+
+    `to_left_m`, `to_right_m`: how far away the nearest other track lies on that side [m].
+    """
 
     number: float
     residual_m: float
     survey_m: float
     sigma_m2: float
+    to_left_m: float
+    to_right_m: float
 
 
-NO_STEPS = Totals(0.0, 0.0, 0.0, 0.0)
+NO_STEPS = Totals(*(0.0 for _ in range(6)))
+
+
+class Stretch(NamedTuple):
+    """Of a path at successive steps: residuals, sigmas of the survey, ways to the nearest tracks left and right [m].
+
+    These are 0 where none is within reach; `heading_rad`: of the path, in whose sense residuals and sides are.
+    """
+
+    residual_m: Floats
+    survey_m: Floats
+    to_left_m: Floats
+    to_right_m: Floats
+    heading_rad: Floats
+
+    @classmethod
+    def joined(cls, parts: Sequence[Stretch]) -> Stretch:
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def upto(self, count: int) -> Stretch:
+        """Its first steps."""
+        return Stretch(*(column[:count] for column in self))
+
+
+NO_STRETCH = Stretch(*(np.zeros(0) for _ in range(5)))
 
 
 @dataclass(frozen=True)
@@ -61,9 +100,7 @@ class Trail:
     first: int
     start: int
     begin: int
-    residual_m: Floats
-    survey_m: Floats
-    heading_rad: Floats
+    along: Stretch
     before: Totals
 
 
@@ -95,10 +132,10 @@ class PathTests:
                 measured_m2[number] = _measured_m2(steps, window_s)
         return cls(alone, measured_m2, _excess(steps, measured_m2), late, early_end, early, config)
 
-    def offset_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
-        """How far beside its track a single step may lie [m]."""
-        limit = _size(self.config.paths_alpha, LOOKED_S / self.config.paths_level_s)
-        return np.asarray(limit * np.sqrt(self.config.cross_bias_sigma_m**2 + survey_m**2 + sigma_m**2))
+    def offset_m(self, sigma_m: Floats, survey_m: Floats, beside_m: Floats) -> Floats:
+        """How far beside its track a single step may lie, another one being so far away there, 0 for none [m]."""
+        root_m = np.sqrt(self.config.cross_bias_sigma_m**2 + survey_m**2 + sigma_m**2)
+        return np.asarray(root_m * self._limits_of_offsets(root_m, beside_m, LOOKED_S / self.config.paths_level_s))
 
     def moved_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
         """By more than so much two means of `paths_level_s`, a while apart, differ on no path [m]."""
@@ -110,9 +147,9 @@ class PathTests:
         """As far back as a movement looks."""
         return 3.0 * WINDOWS_S[-1]
 
-    def totals(self, steps: PathSteps, begin: int, residual_m: Floats, survey_m: Floats) -> Totals:
+    def totals(self, steps: PathSteps, begin: int, along: Stretch) -> Totals:
         """Over the steps from `begin` on."""
-        counted = self._counted(steps, begin, residual_m, survey_m, np.zeros(residual_m.size))
+        counted = self._counted(steps, begin, along)
         return Totals(*(float(value) for value in counted[: len(NO_STEPS)].sum(axis=1)))
 
     def farthest_m(self, steps: PathSteps, apart_m: Floats, last: int, window_s: float) -> float:
@@ -128,35 +165,36 @@ class PathTests:
 
     def of(self, steps: PathSteps, trail: Trail) -> Verdict:
         """Test the new steps of a path."""
-        values = self._counted(steps, trail.start, trail.residual_m, trail.survey_m, trail.heading_rad)
+        values = self._counted(steps, trail.start, trail.along)
         sums = np.zeros((values.shape[0], values.shape[1] + 1))
         np.cumsum(values, axis=1, out=sums[:, 1:])
         at = np.arange(trail.begin, trail.start + values.shape[1])
         refuted = np.zeros(at.size, dtype=np.bool_)
         p = np.ones(at.size)
-        offset_looks = LOOKED_S / self.config.paths_level_s
-        tests = [(self._offset(steps, sums, trail, at)[None], np.array([offset_looks]))]
+        tests = [self._offset(steps, sums, trail, at)]
         if (apart := at >= self.alone).any():
-            tests.append((self._movements(steps, sums, trail, at) * apart, LOOKED_S / np.array(WINDOWS_S)))
-            tests.append((self._lasting(steps, sums, trail, at)[None] * apart, np.array([_LASTING_LOOKS])))
-        for sigmas, looks in tests:
-            refuted |= (sigmas > _sizes(self.config.paths_alpha, looks)[:, None]).any(axis=0)
+            looks = LOOKED_S / np.array(WINDOWS_S)
+            limits = _sizes(self.config.paths_alpha, looks)[:, None]
+            tests.append(_Test(self._movements(steps, sums, trail, at) * apart, limits, looks))
+            lasting = self._lasting(steps, sums, trail, at)
+            tests.append(lasting._replace(sigmas=lasting.sigmas * apart))
+        for sigmas, limits, looks in tests:
+            refuted |= (sigmas > limits).any(axis=0)
             if (_TESTS * looks * 2.0 * _tails(sigmas.max(axis=1, initial=0.0))).min() < 1.0:
                 p = np.minimum(p, (_TESTS * looks[:, None] * 2.0 * _tails(sigmas)).min(axis=0))
         first = np.flatnonzero(refuted)
         return Verdict(int(at[first[0]]) if first.size else 2**62, np.minimum.accumulate(p))
 
-    def _counted(
-        self, steps: PathSteps, begin: int, residual_m: Floats, survey_m: Floats, heading_rad: Floats
-    ) -> Floats:
-        """Per step 1, residual, sigma of the survey, square of that of the position, and its normal (north, east).
+    def _counted(self, steps: PathSteps, begin: int, along: Stretch) -> Floats:
+        """Per step 1, residual, sigma of the survey, square of the position's, tracks beside, normal (north, east).
 
-        Zeros where it does not count; shape (6, n).
+        Zeros where it does not count; shape (8, n).
         """
-        part = slice(begin, begin + residual_m.size)
-        counted = steps.counted[part] & np.isfinite(residual_m)
-        normal = np.sin(heading_rad), -np.cos(heading_rad)
-        values = np.stack([np.ones(residual_m.size), residual_m, survey_m, steps.sigma_m[part] ** 2, *normal])
+        count = along.residual_m.size
+        part = slice(begin, begin + count)
+        counted = steps.counted[part] & np.isfinite(along.residual_m)
+        measured = along.residual_m, along.survey_m, steps.sigma_m[part] ** 2, along.to_left_m, along.to_right_m
+        values = np.stack([np.ones(count), *measured, np.sin(along.heading_rad), -np.cos(along.heading_rad)])
         return np.where(counted, values, 0.0)
 
     def _movements(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> Floats:
@@ -174,7 +212,7 @@ class PathTests:
         survey_m2 = now_mean[1] ** 2 + then_mean[1] ** 2
         sigma_m2 = 0.5 * (now_mean[2] + then_mean[2])
         # A bias of any direction moves the mean of a window by its part along the mean normal there.
-        swung_m2 = self.config.cross_bias_sigma_m**2 * ((now_mean[3:] - then_mean[3:]) ** 2).sum(axis=0)
+        swung_m2 = self.config.cross_bias_sigma_m**2 * ((now_mean[5:] - then_mean[5:]) ** 2).sum(axis=0)
         root_m = np.sqrt(np.maximum(survey_m2 + self._noise_m2(steps, sigma_m2, at) + swung_m2, 1e-12))
         spare_m = np.maximum(np.abs(now_mean[0] - then_mean[0]) - 2.0 * self.config.paths_alike_m, 0.0)
         return np.where(usable & np.isfinite(root_m), spare_m / root_m, 0.0)
@@ -192,27 +230,35 @@ class PathTests:
         lasting = np.array(WINDOWS_S)[:, None] > _MEASURED_S
         return np.where(lasting, sigma_m2 * long * self.excess[at], noise_m2)
 
-    def _offset(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> Floats:
-        """The mean of the last seconds, in sigmas."""
+    def _offset(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> _Test:
+        """The mean of the last seconds."""
         late = np.searchsorted(steps.end_s, steps.end_s[at] - self.config.paths_level_s, side="right")
         late = np.maximum(np.minimum(late, at) - trail.start, 0)
         part = sums[:, at + 1 - trail.start] - sums[:, late]
         least = _WHOLE * self.config.paths_level_s / steps.period_s[at]
-        return self._in_sigmas(part, part[0] >= least, self.excess[at])
+        return self._in_sigmas(part, part[0] >= least, self.excess[at], LOOKED_S / self.config.paths_level_s)
 
-    def _lasting(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> Floats:
-        """The mean of the whole way, in sigmas."""
+    def _lasting(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> _Test:
+        """The mean of the whole way."""
         own = sums[:, at + 1 - trail.start] - sums[:, [trail.begin - trail.start]]
         part = own[: len(NO_STEPS)] + np.array(trail.before)[:, None]
         lasted_s = np.maximum(steps.end_s[at] - steps.end_s[trail.first], 1e-9)
         share = _SLOW + (1.0 - _SLOW) * np.minimum(1.0, _AVERAGED_S / lasted_s)
-        return self._in_sigmas(part, part[0] >= _LASTING_STEPS, share * self.excess[at])
+        return self._in_sigmas(part, part[0] >= _LASTING_STEPS, share * self.excess[at], _LASTING_LOOKS)
 
-    def _in_sigmas(self, part: Floats, usable: Bools, share: Floats) -> Floats:
+    def _in_sigmas(self, part: Floats, usable: Bools, share: Floats, looks: float) -> _Test:
         """Mean residual over its sigma, 0 where steps are too few; `share`: of the position's variance."""
         mean = part[1:] / np.maximum(part[0], 1.0)
         root_m = np.sqrt(self.config.cross_bias_sigma_m**2 + mean[1] ** 2 + mean[2] * share)
-        return np.where(usable & (root_m > 0.0), np.abs(mean[0]) / np.maximum(root_m, 1e-9), 0.0)
+        sigmas = np.where(usable & (root_m > 0.0), np.abs(mean[0]) / np.maximum(root_m, 1e-9), 0.0)
+        # If the train is on it all the same, the track on the side of the positions is left instead.
+        beside_m = np.where(mean[0] > 0.0, mean[3], mean[4])
+        return _Test(sigmas[None], self._limits_of_offsets(root_m, beside_m, looks)[None], np.array([looks]))
+
+    def _limits_of_offsets(self, root_m: Floats, beside_m: Floats, looks: float) -> Floats:
+        """Limits in sigmas of an offset, another track being so far away, 0 for none."""
+        beside = np.where(beside_m > 0.0, beside_m / np.maximum(root_m, 1e-9), np.inf)
+        return _limits_beside(beside, self.config.paths_alpha, looks)
 
 
 def told_by_a_switch_m(survey_m: Floats, alpha: float, merged_m: float) -> Floats:
@@ -234,6 +280,25 @@ def _sizes(alpha: float, looks: Floats) -> Floats:
     from scipy.special import ndtri
 
     return np.asarray(-ndtri(alpha / (_TESTS * looks * 2.0)))
+
+
+def _limits_beside(beside: Floats, alpha: float, looks: float) -> Floats:
+    """Limits of an offset where another track lies so many of its sigmas beside the path, infinite: none [sigmas].
+
+    As seldom as its level says an offset refutes the true track and leaves the one beside it: a wrong claim. It makes a
+    right one as often as the other track is beyond the limit while the train is on this one. Where that is seldom too,
+    the limit grows until of both together no more are wrong than claims may be; at the most up to that of a level as
+    much smaller, for what is more seldom is claimed in no run.
+    """
+    from scipy.special import ndtri
+
+    share = 1.0 - ONE_TRACK_LEFT
+    limits = np.linspace(_size(alpha, looks), _size(alpha * share, looks), 100)
+    # So often the other track has to be beyond the limit, and so far away it is.
+    told = looks * _tails(limits) / share
+    limits, told = limits[told < 1.0], told[told < 1.0]
+    needed = limits + ndtri(told)
+    return np.interp(-beside, -needed, limits)
 
 
 def _tails(sigmas: Floats) -> Floats:

@@ -24,20 +24,20 @@ def test_double_track_is_named_once_with_its_extent_and_what_tells_it_apart() ->
     (text,) = found(4.0)
     assert text.startswith("element a: 0 to 2000 m: b lies 4.0 m beside it")
     assert "a switch taken tells them apart at a survey of 0.02 m" in text
-    # 4.19 · √2 · 1 m, and 0.2 m for paths that merge.
+    # 4.39 · √2 · 1 m, and 0.2 m for paths that merge.
     (text,) = found(4.0, sigma_m=1.0)
-    assert "nor does a switch taken at a survey of 1 m, which takes 6.1 m" in text
+    assert "nor does a switch taken at a survey of 1 m, which takes 6.4 m" in text
 
 
-@pytest.mark.parametrize(("spacing_m", "named"), [(3.4, True), (4.6, True), (4.75, False), (20.0, False)])
+@pytest.mark.parametrize(("spacing_m", "named"), [(3.4, True), (5.0, True), (5.15, False), (20.0, False)])
 def test_tracks_far_enough_apart_are_not(spacing_m: float, named: bool) -> None:
-    """3.11 · 1.5 m = 4.67 m."""
+    """3.37 · 1.5 m = 5.06 m."""
     assert bool(found(spacing_m)) == named
 
 
 def test_a_poor_survey_widens_it() -> None:
-    assert found(5.0, sigma_m=1.0)
-    assert not found(5.0, sigma_m=0.05)
+    assert found(5.2, sigma_m=1.0)
+    assert not found(5.2, sigma_m=0.05)
 
 
 def test_tracks_that_cross_or_part_are_none() -> None:
@@ -75,14 +75,14 @@ def test_a_run_right_on_its_track_claims_it_where_nothing_is_found(spacing_m: fl
 
 
 def test_neighbours_are_named_with_what_tells_them_apart_and_where() -> None:
-    """b lies 1.5, 4.4 and 6 m beside a, 1 km each: at 0.3 m a switch tells from 1.98 m on, offsets from 4.76 m."""
+    """b lies 1.5, 4.4 and 6 m beside a, 1 km each: at 0.3 m a switch tells from 2.06 m on, offsets from 5.16 m."""
     b = np.array([(0.0, 1.5), (1000.0, 1.5), (1040.0, 4.4), (2000.0, 4.4), (2040.0, 6.0), (3000.0, 6.0)])
     place = site({"a": line((0, 0), (3000, 0)), "b": b}, sigma_m=0.3)
     table = neighbours(place, Configuration())
     assert table["told_apart_by"].to_list() == ["nothing but a route or a read", "a switch taken", "the offset"]
     assert table["apart_m"].to_list() == pytest.approx([1.5, 4.4, 6.0], abs=0.03)
     assert table["from_m"].to_list() == pytest.approx([0.0, 1020.0, 2020.0], abs=30.0)
-    assert table["switch_tells_from_m"].to_list() == pytest.approx([1.98] * 3, abs=0.02)
-    assert table["offset_tells_from_m"].to_list() == pytest.approx([4.76] * 3, abs=0.02)
+    assert table["switch_tells_from_m"].to_list() == pytest.approx([2.06] * 3, abs=0.02)
+    assert table["offset_tells_from_m"].to_list() == pytest.approx([5.16] * 3, abs=0.02)
     route = pl.DataFrame({"netelement_id": ["a"], "direction": ["AB"]})
     assert neighbours(replace(place, route=route), Configuration()).is_empty()

@@ -63,8 +63,8 @@ def double(pieces: int, sigma_m: float | None, turnouts: bool = False, turned: b
 def test_a_reference_nearer_to_one_track_is_on_it_however_that_is_cut(
     sigma_m: float | None, pieces: int, turnouts: bool, turned: bool
 ) -> None:
-    """0.42 m from a, 3.58 m from b: out with a survey of 0.3 m, possible at 4.1 sigma with one of 1 m."""
-    ways = tracks(double(pieces, sigma_m, turnouts, turned), samples(X_M, np.full(X_M.size, 0.42)))
+    """0.6 m from a, 3.4 m from b: out with a survey of 0.3 m, possible at 3.56 sigma with one of 1 m."""
+    ways = tracks(double(pieces, sigma_m, turnouts, turned), samples(X_M, np.full(X_M.size, 0.6)))
     beside = set() if sigma_m == 0.3 else {("b",)}
     assert ways == [{tuple(f"a{n}" for n in range(pieces)), *beside}]
 
@@ -77,14 +77,40 @@ def test_where_the_survey_lets_both_be_both_are(pieces: int, turnouts: bool) -> 
 
 
 def test_beside_every_track_is_silence_and_nothing_is_known() -> None:
-    """The mean of the whole way is within 4.1 roots of 0.3 m on the track's own: 1.26 m."""
-    assert tracks(double(1, 0.3), samples(X_M, np.full(X_M.size, -1.2))) == [{("a0",)}]
+    """The mean of the whole way is within 3.56 roots of 0.3 m on the track's own: 1.08 m."""
+    assert tracks(double(1, 0.3), samples(X_M, np.full(X_M.size, -1.0))) == [{("a0",)}]
     place = double(1, 0.3)
     assert tracks(place, samples(X_M, np.full(X_M.size, -1.55))) == []
     found = known(place, of_reference=samples(X_M, np.full(X_M.size, -1.55)))
     assert set(found.at(found.reads_ns).kind.tolist()) == set()
     assert found.stretches == ()
     assert len(found.silent) == 1
+
+
+APART = site({"a": line((0.0, 0.0), (3000.0, 0.0)), "b": line((0.0, 12.0), (3000.0, 12.0))}, sigma_m=1.0)
+
+
+def known_aside(*y_m: float) -> list[tuple[float, float, set[str]]]:
+    """Where a reference is known that lies so far aside of a up to 1400 m, to 2200 m, and behind that.
+
+    Surveyed to 1 m: an offset of 8 s is refuted at 4.3 m, a movement of as long at 6.1 m; samples lie beside a track up
+    to 5.3 m.
+    """
+    return spans_and_tracks(X_M, np.interp(X_M, [1400.0, 1420.0, 2200.0, 2220.0], np.repeat(y_m, 2)[1:-1]), 0.05, APART)
+
+
+def test_a_reference_is_known_again_once_a_movement_has_led_it_back() -> None:
+    """By 7.5 m there and back; nobody knows how long before it had been wrong."""
+    ((begin, end, names),) = known_aside(2.5, -5.0, 2.5)
+    # Back at 2220 m, and there for two means of 8 s at 20 m/s.
+    assert 2220.0 <= begin <= 2220.0 + 2 * 8 * 20.0
+    assert (end, names) == (X_M[-1], {"a"})
+
+
+@pytest.mark.parametrize("y_m", [(2.5, -5.0, -5.0), (2.5, -5.0, 1.0), (0.9, -5.0, 0.9), (2.5, -5.0, 4.5)])
+def test_a_reference_that_has_not_come_back_is_silent_to_its_end(y_m: tuple[float, ...]) -> None:
+    """It stays, comes elsewhere, or comes back by no more than the survey explains."""
+    assert known_aside(*y_m) == []
 
 
 def test_a_mean_is_not_a_sample() -> None:
@@ -165,11 +191,13 @@ SIDING = site(
 )
 
 
-def spans_and_tracks(x_m: Floats, y_m: Floats, sigma_m: float) -> list[tuple[float, float, set[str]]]:
-    """From where to where each stretch of the reference goes on the siding's site, and the tracks of it."""
+def spans_and_tracks(
+    x_m: Floats, y_m: Floats, sigma_m: float, place: Site = SIDING
+) -> list[tuple[float, float, set[str]]]:
+    """From where to where each stretch of the reference goes, and the tracks of it."""
     frame = samples(x_m, y_m, sigma_m)
-    network = site_network(SIDING)
-    found, _ = reference_stretches(frame, network_in_pieces(SIDING), network.track.index, Configuration())
+    network = site_network(place)
+    found, _ = reference_stretches(frame, network_in_pieces(place), network.track.index, Configuration())
     t_ns = frame["t"].to_physical().to_numpy()
     return [
         (

@@ -286,7 +286,7 @@ def _decided(rung: Rung) -> list[str]:
     heard, at = seconds(reference["t"]), rung.journey.judged_at_s(kind.time_s)
     after = np.clip(np.searchsorted(heard, at), 1, len(heard) - 1)
     covered = (heard[after] - heard[after - 1] < 2.0) & (at >= heard[0]) & (at <= heard[-1]) & kind.sure & ~kind.beside
-    # A neighbour is out at 4.8 sigmas of reference and survey (`hazards.reference_alpha`), not at three.
+    # A neighbour is out at 4.3 sigmas of reference and survey (`hazards.reference_alpha`), not at three.
     alone = ~_at_switch(rung, kind) & (band < 1.3 * kind.apart_m)
     beyond = covered & (np.abs(kind.error_m) > LIMIT_M + band) & (kind.judgement != "wrong")
     within = covered & alone & (np.abs(kind.error_m) < LIMIT_M - band) & (kind.judgement != "right")

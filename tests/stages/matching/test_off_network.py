@@ -34,13 +34,13 @@ def test_a_siding_that_the_survey_lacks_is_named_with_place_and_offset(turned: b
     assert np.allclose(found.epochs["path_m"], x, atol=0.1)
 
 
-@pytest.mark.parametrize(("rate_mps", "moved_m"), [(0.5, -5.0), (0.05, -8.0), (1.0, 5.0)])
+@pytest.mark.parametrize(("rate_mps", "moved_m"), [(0.5, -5.2), (0.05, -8.0), (1.0, 5.2)])
 def test_a_movement_onto_another_track_is_no_way_back(rate_mps: float, moved_m: float) -> None:
-    """A fault across the track, two exact tracks 5 m apart: beside the other one positions lie as they did before."""
-    place = site({"a": line((0.0, 0.0), (6000.0, 0.0)), "b": line((0.0, 5.0), (6000.0, 5.0))})
+    """A fault across the track, two exact tracks 5.2 m apart: beside the other one positions lie as they did before."""
+    place = site({"a": line((0.0, 0.0), (6000.0, 0.0)), "b": line((0.0, 5.2), (6000.0, 5.2))})
     t_s = np.arange(400.0)
     x = 20.0 + 12.0 * t_s
-    y = 5.0 + np.sign(moved_m) * np.clip(rate_mps * (t_s - 100.0), 0.0, abs(moved_m))
+    y = 5.2 + np.sign(moved_m) * np.clip(rate_mps * (t_s - 100.0), 0.0, abs(moved_m))
     gate = matched(run(x, y, sigma_m=0.05), place, odometer(x)).epochs["gate_probability"]
     assert gate[60:100].min() >= 0.99
     off = int(gate.is_null().arg_max() or 0)
