@@ -435,7 +435,8 @@ def _drifts(
 ) -> list[ReferenceStep]:
     """Windows that an odometer contradicts beyond `explained_m` of steps.
 
-    `window`: length, first begin [s], and what an odometer may be off whatever it counted [m].
+    `window`: length, first begin [s], and what an odometer may be off whatever it counted [m]. Beside one that is
+    contradicted the reference may have drifted already, or still, where no odometer counted.
     """
     t_ns = stretch.t_ns
     window_s, late_s, fixed_m = window
@@ -448,15 +449,21 @@ def _drifts(
     explained_m = explained_m[end] - explained_m[begin]
     rest_m, allowed_m = _contradicted(known, stretch, witnesses, (begin, end), explained_m, config)
     allowed_m += fixed_m
-    return [
-        ReferenceStep(
-            sample=int(begin[row] + end[row]) // 2,
-            step_m=float(rest_m[row]),
-            noise_m=float(allowed_m[row]),
-            span=(int(begin[row]), int(end[row])),
+    counted = np.flatnonzero(np.isfinite(allowed_m))
+    steps: list[ReferenceStep] = []
+    for row in np.flatnonzero(np.abs(rest_m) > allowed_m).tolist():
+        at = int(np.searchsorted(counted, row))
+        first = int(counted[at - 1]) + 1 if at else 0
+        last = int(counted[at + 1]) - 1 if at + 1 < counted.size else begin.size - 1
+        steps.append(
+            ReferenceStep(
+                sample=int(begin[row] + end[row]) // 2,
+                step_m=float(rest_m[row]),
+                noise_m=float(allowed_m[row]),
+                span=(int(begin[first]), int(end[last])),
+            )
         )
-        for row in np.flatnonzero(np.abs(rest_m) > allowed_m).tolist()
-    ]
+    return steps
 
 
 @dataclass(frozen=True)

@@ -181,6 +181,26 @@ def test_a_reference_that_drifts_beside_an_odometer_says_nothing(rate_mps: float
     assert found.at(ns(np.arange(200.0, 390.0, 1.0))).kind.tolist() == [NOTHING] * 190
 
 
+def test_a_drift_may_have_begun_where_no_odometer_counted() -> None:
+    """The reference drifts off from 150 s on; the odometer's rows from 148 s to 176 s are lost.
+
+    A read at 100 s or so confirmed the reference: up to the drift, and not through the hole.
+    """
+    rng = np.random.default_rng(15)
+    ride = wavy(20.0)
+    counted = odometer(ride, rng).filter(~pl.col("t").is_between(*stamps(np.array([148.0, 176.0]))))
+    drift_m = np.clip(np.arange(4000) / 10.0 - 150.0, 0.0, 40.0)
+    truth = reads(ride, GROUND, rng).head(3)
+    found = known(GROUND, counted, of_reference=reference(ride, rng, ahead_m=drift_m), of_reads=truth)
+    assert found.doubted
+    at_s = np.arange(5.0, 390.0, 0.7)
+    evidence = found.at(ns(at_s))
+    _, _, holds = bounds(evidence, ride.at(at_s))
+    known_rows = evidence.kind != NOTHING
+    assert holds[known_rows].all()
+    assert known_rows[at_s < 120.0].all()
+
+
 def test_a_reference_that_stepped_in_a_gap_is_doubted_on_both_sides() -> None:
     """30 m ahead up to 195 s, nothing until 200 s, right from then on: what the gap hides is a step all the same."""
     rng = np.random.default_rng(8)
