@@ -156,6 +156,11 @@ class TrainEvidence:
         return any(clock.assumed for clock in self.clocks)
 
     @property
+    def clock_open_s(self) -> float:
+        """How far apart the instants are at which, by the clocks of all recorders, a place may have been passed."""
+        return float(np.ptp(self.true_clocks_s)) + 2.0 * max((clock.delta_s for clock in self.clocks), default=0.0)
+
+    @property
     def in_step(self) -> bool:
         """All its recorders have the clock of the odometer, as measured to half a second."""
         near = (not of.assumed and abs(of.shift_s) + of.delta_s < _IN_STEP_S for of in self.clocks)
