@@ -496,16 +496,14 @@ def _known_stretches(
     """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
     ahead_m = vehicle.gnss_antenna_ahead_m
     known = [anchors.known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
-    if not witnesses:
-        return known, 0
-    search = searches[0]
     order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
-    borders = [known[number].ends(search.counter) for number in order]
-    witness = witnesses[0]
-    steps_m = [
-        search.misclosure_m(before[1], after[0], witness.scale, witness.scale_sigma)
-        for before, after in pairwise(borders)
-    ]
+    steps_m = [0.0] * max(len(known) - 1, 0)
+    for search, witness in zip(searches[:1], witnesses[:1], strict=True):
+        borders = [known[number].ends(search.counter) for number in order]
+        steps_m = [
+            search.misclosure_m(before[1], after[0], witness.scale, witness.scale_sigma)
+            for before, after in pairwise(borders)
+        ]
     levels = [known[number].levels for number in order]
     if len(known) < 2 or not (any(steps_m) or any(of.doubts for of in levels)):
         return known, 0
