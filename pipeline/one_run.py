@@ -168,6 +168,7 @@ def _results(
         notes=[*fit.notes, *ride_notes(ride, evidence)],
         reasons=[reason for reason, applies in against.items() if applies],
         anchored_ns=evidence.anchored_ns,
+        clock_open_s=evidence.clock_open_s,
     )
 
 

@@ -447,6 +447,10 @@ FAMILIES: dict[str, Callable[[World], World]] = {
 }
 
 
+CLOCKS_DIFFER = frozenset({"lag_of_reference", "one_bus", "late_reads"})
+"""Families in which a recorder stamps late."""
+
+
 def world_of(family: str, seed: int) -> World:
     return FAMILIES[family](honest(seed))
 
@@ -466,6 +470,37 @@ def cut_out(world: World) -> World:
         inside = (world.reference.t_s > begin_s) & (world.reference.t_s < begin_s + lasts_s)
         world.reference = world.reference.where(~inside)
     return world
+
+
+def frozen_reference(world: World) -> World:
+    """It repeats one place, while the train goes on."""
+    begin_s, lasts_s = _part(world)
+    if world.reference is not None:
+        world.reference = _frozen(world.reference, begin_s, lasts_s)
+    return world
+
+
+def thinned_odometer(world: World) -> World:
+    every = int(world.dice.choice([2, 5, 10]))
+    world.odometer = world.odometer.where(np.arange(world.odometer.t_s.size) % every == 0)
+    return world
+
+
+def cut_odometer(world: World) -> World:
+    begin_s, lasts_s = _part(world)
+    t_s = world.odometer.t_s
+    world.odometer = world.odometer.where((t_s < begin_s) | (t_s > begin_s + lasts_s))
+    return world
+
+
+def frozen_odometer(world: World) -> World:
+    world.odometer = _frozen(world.odometer, *_part(world))
+    return world
+
+
+def _part(world: World) -> tuple[float, float]:
+    """Begin and length of a part of the journey [s]."""
+    return float(world.dice.uniform(20.0, 240.0)), float(world.dice.uniform(2.0, 40.0))
 
 
 def fewer_reads(world: World) -> World:
@@ -497,12 +532,17 @@ def open_survey(world: World) -> World:
 WEAKER: dict[str, Callable[[World], World]] = {
     "thinned": thinned,
     "cut_out": cut_out,
+    "frozen_reference": frozen_reference,
+    "thinned_odometer": thinned_odometer,
+    "cut_odometer": cut_odometer,
+    "frozen_odometer": frozen_odometer,
     "fewer_reads": fewer_reads,
     "no_reads": no_reads,
     "no_reference": no_reference,
     "undeclared": undeclared,
     "open_survey": open_survey,
 }
+OF_ODOMETER = ("thinned_odometer", "cut_odometer", "frozen_odometer")
 
 
 # ---- the oracle ----

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.one_run import replay
 from schemas.run import RunTables
-from tests.replay.crooked import FAMILIES, START_NS, WEAKER, World, danger_of, verdict_of, world_of
+from tests.replay.crooked import CLOCKS_DIFFER, FAMILIES, START_NS, WEAKER, World, danger_of, verdict_of, world_of
 from tests.replay.weaker import better_by_less
 
 # Each family loses another two of what it has.
@@ -31,7 +31,7 @@ def test_no_witness_makes_danger_health(family: str) -> None:
     for loss in LOSSES[family]:
         weaker = WEAKER[loss](world_of(family, 1))
         less = replayed(weaker)
-        assert better_by_less(tables, less, weaker.read_ns) == []
+        assert better_by_less(tables, less, loss, weaker.read_ns, family in CLOCKS_DIFFER) == []
         danger = danger_of(world, less)
         assert not danger.any, (loss, danger)
 
@@ -60,4 +60,4 @@ def test_danger_and_gain_are_seen_by_the_oracle() -> None:
     assert danger.right_epochs > 0
     assert danger.right_balises > 0
     assert danger.accepted_while_safe > 0
-    assert better_by_less(tables, praised, world.read_ns)
+    assert better_by_less(tables, praised, "thinned", world.read_ns)

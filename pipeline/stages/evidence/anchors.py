@@ -357,13 +357,15 @@ def _confirming_ns(
 class ReferenceStep:
     """From one sample to the next the reference moves by `step_m` more than every odometer; more than `noise_m`.
 
-    `span`: samples over which it drifted by so much, where it was no step.
+    `span`: samples over which it drifted by so much, where it was no step; `leap`: no odometer says so, but no train
+    can drive it.
     """
 
     sample: int
     step_m: float
     noise_m: float
     span: tuple[int, int] | None = None
+    leap: bool = False
 
 
 @dataclass(frozen=True)
@@ -398,20 +400,29 @@ class Witness:
 def contradictions(
     known: KnownPath, stretch: ReferenceStretch, witnesses: Sequence[Witness], config: Configuration
 ) -> list[ReferenceStep]:
-    """Steps that an odometer contradicts by more than k_T sigmas: between samples, over 10 s and over 100 s.
+    """Steps that no train can drive, or that an odometer contradicts by more than k_T sigmas, over 10 s and 100 s too.
 
-    A step between samples is one that the speed around it does not explain. Of a window the difference that no step in
-    it explains counts as one step in its middle: the reference drifted, or stood still (DOMAIN section 5.1). Over 100 s
+    A step between samples is one that the speed around it does not explain. Where no odometer says what it should be,
+    lost or hung with the reference in one logger, a leap shows it alone. Of a window the difference that no step in it
+    explains counts as one step in its middle: the reference drifted, or stood still (DOMAIN section 5.1). Over 100 s
     the fixed 5 m of an odometer, its slip, are allowed too: so drifts of 0.1 m/s show.
     """
     t_ns = stretch.t_ns
-    if t_ns.size < 2 or not witnesses:
+    if t_ns.size < 2:
         return []
     rows = np.arange(t_ns.size)
     nothing_m = np.zeros(t_ns.size - 1)
     step_m, limit_m = _contradicted(known, stretch, witnesses, (rows[:-1], rows[1:]), nothing_m, config)
-    stepped = np.flatnonzero((np.abs(step_m) > limit_m) & _uneven(known.at_m, t_ns, limit_m))
-    steps = [ReferenceStep(row, float(step_m[row]), float(limit_m[row])) for row in stepped.tolist()]
+    leap_m, leap_limit_m = _undrivable_m(known, stretch, config)
+    contradicted = np.abs(step_m) > limit_m
+    contradicted[contradicted] = (_unexplained_m(known.at_m, t_ns, limit_m) != 0.0)[contradicted]
+    step_m = np.where(contradicted, step_m, leap_m)
+    limit_m = np.where(contradicted, limit_m, leap_limit_m)
+    stepped = np.flatnonzero(step_m)
+    steps = [
+        ReferenceStep(row, float(step_m[row]), float(limit_m[row]), leap=not contradicted[row])
+        for row in stepped.tolist()
+    ]
     gathered_m = np.zeros(t_ns.size)
     gathered_m[1:][stepped] = step_m[stepped]
     for window in (
@@ -435,7 +446,8 @@ def _drifts(
 ) -> list[ReferenceStep]:
     """Windows that an odometer contradicts beyond `explained_m` of steps.
 
-    `window`: length, first begin [s], and what an odometer may be off whatever it counted [m].
+    `window`: length, first begin [s], and what an odometer may be off whatever it counted [m]. Beside one that is
+    contradicted the reference may have drifted already, or still, where no odometer counted.
     """
     t_ns = stretch.t_ns
     window_s, late_s, fixed_m = window
@@ -448,15 +460,21 @@ def _drifts(
     explained_m = explained_m[end] - explained_m[begin]
     rest_m, allowed_m = _contradicted(known, stretch, witnesses, (begin, end), explained_m, config)
     allowed_m += fixed_m
-    return [
-        ReferenceStep(
-            sample=int(begin[row] + end[row]) // 2,
-            step_m=float(rest_m[row]),
-            noise_m=float(allowed_m[row]),
-            span=(int(begin[row]), int(end[row])),
+    counted = np.flatnonzero(np.isfinite(allowed_m))
+    steps: list[ReferenceStep] = []
+    for row in np.flatnonzero(np.abs(rest_m) > allowed_m).tolist():
+        at = int(np.searchsorted(counted, row))
+        first = int(counted[at - 1]) + 1 if at else 0
+        last = int(counted[at + 1]) - 1 if at + 1 < counted.size else begin.size - 1
+        steps.append(
+            ReferenceStep(
+                sample=int(begin[row] + end[row]) // 2,
+                step_m=float(rest_m[row]),
+                noise_m=float(allowed_m[row]),
+                span=(int(begin[first]), int(end[last])),
+            )
         )
-        for row in np.flatnonzero(np.abs(rest_m) > allowed_m).tolist()
-    ]
+    return steps
 
 
 @dataclass(frozen=True)
@@ -475,12 +493,18 @@ class Levels:
     @classmethod
     def of(cls, steps: Sequence[ReferenceStep], t_ns: Ints, reads_ns: Sequence[int]) -> Levels:
         lasting, spikes = _without_spikes(steps, t_ns)
-        borders = [0, *(step.sample + 1 for step in lasting), t_ns.size]
-        rows = [slice(first, max(last, first)) for first, last in pairwise(borders)]
         heard = np.searchsorted(t_ns, np.array(reads_ns, dtype=np.int64))
+        begins = [(step.sample + 1, step.step_m, step.span is not None) for step in lasting]
+        for leap in (step for step in lasting if step.leap):
+            # Reads before and after say of an odometer that it failed; of a leap that the reference was off between.
+            before, after = heard[heard <= leap.sample], heard[heard > leap.sample]
+            begins += [(row, 0.0, False) for row in (*(before[-1:] + 1).tolist(), *after[:1].tolist())]
+        begins.sort(key=lambda begin: begin[0])
+        borders = [0, *(begin for begin, _, _ in begins), t_ns.size]
+        rows = [slice(first, max(last, first)) for first, last in pairwise(borders)]
         confirmed = np.array([bool(((heard >= part.start) & (heard < part.stop)).any()) for part in rows])
-        heights_m = np.concatenate([[0.0], np.cumsum([step.step_m for step in lasting])])
-        drifts = np.array([False, *(step.span is not None for step in lasting)])
+        heights_m = np.concatenate([[0.0], np.cumsum([step_m for _, step_m, _ in begins])])
+        drifts = np.array([False, *(drift for _, _, drift in begins)])
         return cls(tuple(rows), heights_m, confirmed, drifts, tuple(spikes))
 
     def seen(self, sense: int) -> Levels:
@@ -528,8 +552,13 @@ def left_open(
             open_step_m[step.sample] = max(open_step_m[step.sample], abs(step.step_m))
     for first, last in levels.spikes:
         part = slice(first.sample + 1, last.sample + 1)
-        low_m[part] = np.minimum(low_m[part], -first.step_m)
-        high_m[part] = np.maximum(high_m[part], -first.step_m)
+        behind_m = ahead_m = -first.step_m
+        for begin, end in (step.span for step in (first, last) if step.span is not None):
+            # It drifted before the step or after it: nobody knows when within its window.
+            part = slice(min(part.start, begin), max(part.stop, end))
+            behind_m, ahead_m = -abs(first.step_m), abs(first.step_m)
+        low_m[part] = np.minimum(low_m[part], behind_m)
+        high_m[part] = np.maximum(high_m[part], ahead_m)
     for number in np.flatnonzero(~levels.confirmed).tolist():
         behind_m = levels.heights_m[number] - _possible_m(levels, number, beyond)
         unknown = bool(np.isnan(behind_m).any())
@@ -601,6 +630,8 @@ def _without_spikes(
     for step in steps:
         before = lasting[-1] if lasting else None
         soon = before is not None and int(t_ns[step.sample] - t_ns[before.sample]) <= round(_WINDOW_S * NS_PER_S)
+        # A leap that ends a standstill is no way back from it.
+        soon = soon and before is not None and before.leap == step.leap
         if before is not None and soon and abs(before.step_m + step.step_m) <= np.hypot(before.noise_m, step.noise_m):
             spikes.append((before, step))
             lasting.pop()
@@ -609,13 +640,31 @@ def _without_spikes(
     return lasting, spikes
 
 
-def _uneven(at_m: Floats, t_ns: Ints, limit_m: Floats) -> Bools:
-    """Steps that the speed around them does not explain: these are of the reference, not of a failing odometer."""
+def _unexplained_m(at_m: Floats, t_ns: Ints, least_m: Floats) -> Floats:
+    """How far each step leads beyond the speed of the 2 s before and after it, as the median has it [m].
+
+    0 where that is `least_m` at most: such a step a train may drive, however its odometer fails.
+    """
     dt_s = np.diff(t_ns) / NS_PER_S
     speed_mps = np.diff(at_m) / dt_s
     beside = max(1, round(_EVEN_S / float(np.median(dt_s))))
     around = sliding_window_view(np.pad(speed_mps, beside, mode="edge"), 2 * beside + 1)
-    return np.greater(np.abs(speed_mps - np.median(around, axis=1)) * dt_s, limit_m)
+    # A median lies among its values: far from it lie few.
+    farthest_mps = np.maximum(around.max(axis=1) - speed_mps, speed_mps - around.min(axis=1))
+    rows = np.flatnonzero(farthest_mps * dt_s > least_m)
+    beyond_m = np.zeros(dt_s.size)
+    beyond_m[rows] = (speed_mps[rows] - np.median(around[rows], axis=1)) * dt_s[rows]
+    return np.where(np.abs(beyond_m) > least_m, beyond_m, 0.0)
+
+
+def _undrivable_m(known: KnownPath, stretch: ReferenceStretch, config: Configuration) -> tuple[Floats, Floats]:
+    """Per step of the reference how far it leads beyond what a train can drive, 0 where it may; and what is allowed."""
+    dt_s = np.diff(stretch.t_ns) / NS_PER_S
+    root_m = np.hypot(stretch.sigma_m[1:], stretch.sigma_m[:-1])
+    driven_m = config.align.braking_mps2 * np.maximum(dt_s, _EVEN_S) * dt_s
+    allowed_m = config.align.sure_sigmas * root_m + driven_m
+    same_leg = np.diff(known.path.leg) == 0
+    return np.where(same_leg, _unexplained_m(known.at_m, stretch.t_ns, allowed_m), 0.0), allowed_m
 
 
 def _contradicted(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -38,7 +39,7 @@ _AGREES = 1.0 - 1.0 / np.sqrt(2.0)
 
 @dataclass(frozen=True)
 class Alternative:
-    """One track that the train may have been on at some of the instants, and where on it [m]."""
+    """One track that the train may have been on at some of the instants, and where on it [m]; `rows` in order."""
 
     rows: Ints
     route: RoutePath
@@ -49,9 +50,13 @@ class Alternative:
     def middle_m(self) -> Floats:
         return 0.5 * (self.low_m + self.high_m)
 
-    def where(self, kept: Bools | Ints) -> Alternative:
+    def where(self, kept: Bools | Ints | slice) -> Alternative:
         """At some of its instants only."""
         return Alternative(self.rows[kept], self.route, self.low_m[kept], self.high_m[kept])
+
+    def over(self, first: int, last: int) -> Alternative:
+        """At its rows from one to another one, both included."""
+        return self.where(slice(*np.searchsorted(self.rows, [first, last + 1]).tolist()))
 
     def loosened(self, slack_m: Floats) -> Alternative:
         """By so much more at each instant, on both sides."""
@@ -135,19 +140,25 @@ class TrainEvidence:
     def disputed(self) -> int:
         """Reads that exclude the reference at k_T sigmas: at k = 3 noise alone would do so in a long run."""
         t_ns = self.reads_ns
+        instants = _Instants(t_ns)
         anywhere = np.ones(t_ns.size, dtype=np.bool_)
         factor = self.config.align.sure_sigmas / self.config.hazards.evidence_factor
         kind = np.full(t_ns.size, NOTHING)
         shown = _Shown(kind, *np.zeros((2, t_ns.size), dtype=np.bool_))
-        by_reference = [there.widened(factor) for there in self._covered(t_ns, anywhere, shown)]
+        by_reference = [there.widened(factor) for there in self._covered(instants, anywhere, shown)]
         # Outside the time of the reference there is nothing to exclude.
-        by_reads = [there.widened(factor) for there in self._carried(self.by_reads, t_ns, kind != NOTHING, shown)]
+        by_reads = [there.widened(factor) for there in self._carried(self.by_reads, instants, kind != NOTHING, shown)]
         return int(common(by_reference, by_reads, t_ns.size)[1].size)
 
     @property
     def clock_assumed(self) -> bool:
         """The clock of reference or reads against the odometer's could not be measured."""
         return any(clock.assumed for clock in self.clocks)
+
+    @property
+    def clock_open_s(self) -> float:
+        """How far apart the instants are at which, by the clocks of all recorders, a place may have been passed."""
+        return float(np.ptp(self.true_clocks_s)) + 2.0 * max((clock.delta_s for clock in self.clocks), default=0.0)
 
     @property
     def in_step(self) -> bool:
@@ -181,19 +192,20 @@ class TrainEvidence:
         return replace(found, alternatives=widened) if slack_m.any() else found
 
     def _at(self, t_ns: Ints) -> EvidenceSet:
+        instants = _Instants(t_ns)
         kind = np.full(t_ns.size, NOTHING)
         proves, on_survey = np.zeros((2, t_ns.size), dtype=np.bool_)
         shown = _Shown(kind, proves, on_survey)
         on_track = ~within_spans(t_ns, self.silent)
         heard = on_track & ~within_spans(t_ns, self.unsure)
-        alternatives = self._covered(t_ns, heard, shown)
-        alternatives += self._carried(self.carried, t_ns, heard & (kind == NOTHING), shown)
+        alternatives = self._covered(instants, heard, shown)
+        alternatives += self._carried(self.carried, instants, heard & (kind == NOTHING), shown)
         # Its clock puts the ends of a stretch anywhere within what is not known of it.
-        alternatives += self._covered(t_ns, heard & (kind == NOTHING), shown, beyond=True)
+        alternatives += self._covered(instants, heard & (kind == NOTHING), shown, beyond=True)
         if self.by_reads:
             of_reads = _Shown(np.full(t_ns.size, NOTHING), *np.zeros((2, t_ns.size), dtype=np.bool_))
             # A reference that drifted by nobody knows how much leaves the reads what they prove without it.
-            by_reads = self._carried(self.by_reads, t_ns, on_track, of_reads)
+            by_reads = self._carried(self.by_reads, instants, on_track, of_reads)
             disputed = within_spans(t_ns, self.disputes)
             both = (kind != NOTHING) & (of_reads.kind != NOTHING)
             narrows = self.by_reads[0].counter.odometer.independent
@@ -204,7 +216,7 @@ class TrainEvidence:
         complete = self.config.evidence.survey_complete
         return EvidenceSet(kind, tuple(alternatives), proves, on_survey | (complete & (kind != NOTHING)))
 
-    def _covered(self, t_ns: Ints, heard: Bools, shown: _Shown, beyond: bool = False) -> list[Alternative]:
+    def _covered(self, instants: _Instants, heard: Bools, shown: _Shown, beyond: bool = False) -> list[Alternative]:
         """By the reference; writes into `shown` where it speaks. `beyond`: past its ends as far as its clock may be."""
         alternatives: list[Alternative] = []
         for stretch in self.stretches:
@@ -212,10 +224,12 @@ class TrainEvidence:
             last_ns = stretch.t_ns[-1]
             # One sample shows no speed, and so not how far the train came meanwhile.
             margin_ns = stretch.clock_ns if beyond and stretch.t_ns.size > 1 else 0
-            reached = (t_ns >= first_ns - margin_ns) & (t_ns <= last_ns + margin_ns)
-            rows = np.flatnonzero(reached & heard & (shown.kind == NOTHING))
+            rows = instants.within(int(first_ns) - margin_ns, int(last_ns) + margin_ns)
+            rows = rows[heard[rows] & (shown.kind[rows] == NOTHING)]
+            if rows.size == 0:
+                continue
             shown.proves[rows] = True
-            at_ns = np.clip(t_ns[rows], first_ns, last_ns)
+            at_ns = np.clip(instants.t_ns[rows], first_ns, last_ns)
             shown.on_survey[rows] = stretch.proved_at(at_ns)
             for path in stretch.paths:
                 for there in _on_path(stretch, path, rows, at_ns, self.config.hazards.evidence_factor):
@@ -223,20 +237,23 @@ class TrainEvidence:
                     shown.kind[there.rows] = KINDS.index(Kind.REFERENCE)
         return alternatives
 
-    def _carried(self, sources: Sequence[Carried], t_ns: Ints, wanted: Bools, shown: _Shown) -> list[Alternative]:
+    def _carried(
+        self, sources: Sequence[Carried], instants: _Instants, wanted: Bools, shown: _Shown
+    ) -> list[Alternative]:
         """By each odometer, from the anchors of its gaps: the train was where one of them says.
 
         Writes into `shown`. Between two anchors of one surveyed way that the odometer closes the train was on that way;
         a read itself needs no odometer.
         """
+        t_ns = instants.t_ns
         alternatives: list[Alternative] = []
         for source in sources:
             open_rows = wanted.copy()
             for gap in source.gaps:
-                inside = (t_ns >= gap.begin_ns) & (t_ns <= gap.end_ns) & open_rows
+                rows = instants.within(gap.begin_ns, gap.end_ns)
+                rows = rows[open_rows[rows]]
                 if len(gap.anchors) == 1:
-                    inside &= ~_after_standing(t_ns, gap, self.stood)
-                rows = np.flatnonzero(inside)
+                    rows = rows[~_after_standing(instants.t_ns[rows], gap, self.stood)]
                 for way in gap.ways or [] if rows.size else []:
                     low_m, high_m = self._interval(source.counter, gap, way, t_ns[rows])
                     there = Alternative(rows, way.chain.route(self.network), low_m, high_m).where(np.isfinite(low_m))
@@ -284,7 +301,7 @@ def common(
     Where they agree: the net elements common to both, with the narrower interval; that of the first where the second
     may narrow nothing. Where only one speaks, or they exclude each other, every alternative of either stays possible.
     """
-    narrowed = [_narrowed(left, right) for left in first for right in second]
+    narrowed = [_narrowed(left, right) for left, right in _overlapping(first, second)]
     agreed = _spoken(narrowed, size)
     together = narrowed if narrows else [alternative.where(agreed[alternative.rows]) for alternative in first]
     alone = [alternative.where(~agreed[alternative.rows]) for alternative in (*first, *second)]
@@ -299,11 +316,29 @@ def _with_reads(
     Within a dispute either may be right, and one alone says nothing: it is as if the reference had stepped.
     """
     both, disputed = where
+    if not disputed.any():
+        return common(alternatives, by_reads, both.size, narrows)[0]
     left = [there.where(~disputed[there.rows]) for there in alternatives]
     right = [there.where(~disputed[there.rows]) for there in by_reads]
     together, _ = common(left, right, both.size, narrows)
     apart = both & disputed
     return together + [there.where(apart[there.rows]) for there in (*alternatives, *by_reads)]
+
+
+def _overlapping(
+    first: Sequence[Alternative], second: Sequence[Alternative]
+) -> Iterator[tuple[Alternative, Alternative]]:
+    """Pairs of either, over the rows from the first to the last that they may share."""
+    rights = [right for right in second if right.rows.size]
+    if not rights:
+        return
+    begins, ends = (np.array([right.rows[at] for right in rights]) for at in (0, -1))
+    for left in first:
+        if left.rows.size == 0:
+            continue
+        for number in np.flatnonzero((ends >= left.rows[0]) & (begins <= left.rows[-1])).tolist():
+            low, high = max(int(left.rows[0]), int(begins[number])), min(int(left.rows[-1]), int(ends[number]))
+            yield left.over(low, high), rights[number].over(low, high)
 
 
 def _spoken(alternatives: Sequence[Alternative], size: int) -> Bools:
@@ -337,23 +372,46 @@ def either(sets: Sequence[EvidenceSet]) -> EvidenceSet:
 
     Where one is silent, so are all: it could have said anything.
     """
-    first, *others = sets
-    for other in others:
-        spoken = (first.kind != NOTHING) & (other.kind != NOTHING)
-        first = EvidenceSet(
-            kind=np.where(spoken, np.maximum(first.kind, other.kind), NOTHING),
-            alternatives=tuple(there.where(spoken[there.rows]) for there in (*first.alternatives, *other.alternatives)),
-            proves=first.proves & other.proves,
-            on_survey=first.on_survey & other.on_survey,
-        )
-    return first
+    if len(sets) == 1:
+        return sets[0]
+    kinds = np.array([one.kind for one in sets])
+    spoken = (kinds != NOTHING).all(axis=0)
+    every = [there for one in sets for there in one.alternatives]
+    return EvidenceSet(
+        kind=np.where(spoken, kinds.max(axis=0), NOTHING),
+        alternatives=tuple(every if spoken.all() else [there.where(spoken[there.rows]) for there in every]),
+        proves=np.logical_and.reduce([one.proves for one in sets]),
+        on_survey=np.logical_and.reduce([one.on_survey for one in sets]),
+    )
+
+
+@dataclass(frozen=True)
+class _Instants:
+    """Instants in any order."""
+
+    t_ns: Ints
+
+    @cached_property
+    def _order(self) -> Ints:
+        return np.argsort(self.t_ns, kind="stable")
+
+    @cached_property
+    def _sorted_ns(self) -> Ints:
+        return self.t_ns[self._order]
+
+    def within(self, first_ns: int, last_ns: int) -> Ints:
+        """Rows of those from one instant to another one, both included, in order of rows."""
+        low = int(np.searchsorted(self._sorted_ns, first_ns, side="left"))
+        high = int(np.searchsorted(self._sorted_ns, last_ns, side="right"))
+        return np.sort(self._order[low:high])
 
 
 def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
     """Instants of the spans, their ends left out."""
-    inside = np.zeros(t_ns.size, dtype=np.bool_)
-    for begin_ns, end_ns in spans:
-        inside |= (t_ns >= begin_ns) & (t_ns < end_ns)
+    spans = [span for span in spans if span[0] < span[1]]
+    begins, ends = (np.sort(np.array([span[at] for span in spans], dtype=np.int64)) for at in (0, 1))
+    begun = np.searchsorted(begins, t_ns, side="right")
+    inside: Bools = begun > np.searchsorted(ends, t_ns, side="right")
     return inside
 
 
@@ -438,16 +496,14 @@ def _known_stretches(
     """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
     ahead_m = vehicle.gnss_antenna_ahead_m
     known = [anchors.known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
-    if not witnesses:
-        return known, 0
-    search = searches[0]
     order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
-    borders = [known[number].ends(search.counter) for number in order]
-    witness = witnesses[0]
-    steps_m = [
-        search.misclosure_m(before[1], after[0], witness.scale, witness.scale_sigma)
-        for before, after in pairwise(borders)
-    ]
+    steps_m = [0.0] * max(len(known) - 1, 0)
+    for search, witness in zip(searches[:1], witnesses[:1], strict=True):
+        borders = [known[number].ends(search.counter) for number in order]
+        steps_m = [
+            search.misclosure_m(before[1], after[0], witness.scale, witness.scale_sigma)
+            for before, after in pairwise(borders)
+        ]
     levels = [known[number].levels for number in order]
     if len(known) < 2 or not (any(steps_m) or any(of.doubts for of in levels)):
         return known, 0

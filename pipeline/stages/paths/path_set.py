@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about
+from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, search_about
 from pipeline.stages.paths.path_steps import PathSteps
 from pipeline.stages.paths.path_tests import (
     LOOKED_S,
@@ -165,16 +165,16 @@ class PathSet:
         return found
 
 
-def path_set(steps: PathSteps, network: Network, config: MatchingConfig) -> PathSet:
+def path_set(steps: PathSteps, network: Network, config: MatchingConfig, search: Search | None = None) -> PathSet:
     """Every path that begins near the first positions and goes on over navigable relations, until it is refuted.
 
     `steps`: of positions (`path_steps`), of a solution or of a reference, whose own bias and level `config` holds;
     `network`: with elements that turn round in pieces (`network_in_pieces`), as `Node.element` counts them. Of the
     result `living` gives the set of each step by what was known then, `to_the_end` in hindsight, both with the least
     p-value of each path, and `elements` the same by net element. Without a position near the network the set is empty:
-    off the survey.
+    off the survey. `search`: of all that may be within reach, where many stretches share it.
     """
-    search = search_about(steps.points.surface, network, config.reach_m)
+    search = search or search_about(steps.points.surface, network, config.reach_m)
     candidates = candidates_of(steps.points, network, search, config.reach_m)
     survey_m = network.survey_sigmas_m(config.survey_sigma_default_m, candidates.vertex)
     groups = unbranched_groups(network)

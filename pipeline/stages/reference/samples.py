@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.stages.paths.candidates import Candidates, candidates_of, search_about, segments_of
+from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, search_about, segments_of
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.segments import box_about
@@ -17,13 +17,17 @@ from schemas.config import Configuration
 
 @dataclass(frozen=True)
 class Samples:
-    """`sigma_m` of each; `near`: places by sample, `survey_m` the survey's sigma at each of these, `root_m` of both."""
+    """`sigma_m` of each; `near`: places by sample, `survey_m` the survey's sigma at each of these, `root_m` of both.
+
+    `search`: where all that may be near the run is looked for.
+    """
 
     t_ns: Ints
     points: Points
     sigma_m: Floats
     near: Candidates
     survey_m: Floats
+    search: Search
 
     @property
     def root_m(self) -> Floats:
@@ -49,6 +53,7 @@ def samples_of(reference: pl.DataFrame, network: Network, config: Configuration)
     vertex = segments.vertex[box.touched_by(segments.start, segments.end)]
     survey_m = network.survey_sigmas_m(hazards.survey_sigma_m, vertex).max(initial=hazards.survey_sigma_m)
     reach_m = factor * float(np.hypot(sigma_m, survey_m).max())
-    near = candidates_of(points, network, search_about(points.surface, network, reach_m), reach_m)
+    search = search_about(points.surface, network, max(reach_m, config.matching.reach_m))
+    near = candidates_of(points, network, search, reach_m)
     near_survey_m = network.survey_sigmas_m(hazards.survey_sigma_m, near.vertex)
-    return Samples(times_ns(reference), points, sigma_m, near, near_survey_m)
+    return Samples(times_ns(reference), points, sigma_m, near, near_survey_m, search)

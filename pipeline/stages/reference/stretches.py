@@ -126,7 +126,7 @@ class _Search:
         )
         samples = self.samples
         steps = path_steps(samples.t_ns[rows], samples.points.take(rows), samples.sigma_m[rows])
-        found = path_set(steps, self.network, law)
+        found = path_set(steps, self.network, law, samples.search)
         begins = rows[0] + np.searchsorted(samples.t_ns[rows], steps.begin_ns)
         ends = np.append(begins[1:], rows[-1] + 1)
         first, ways = ways_of(found, law, hazards.routes_limit)

@@ -45,11 +45,17 @@ def unknown_parts(epochs: pl.DataFrame, config: Configuration) -> Unknown:
 
 
 def remedies(
-    run: Mapping[str, Any], lost: LostTime, unknown: Unknown, survey_stated: bool, config: Configuration
+    run: Mapping[str, Any],
+    lost: LostTime,
+    unknown: Unknown,
+    survey_stated: bool,
+    config: Configuration,
+    clock_open_m: float = 0.0,
 ) -> list[Remedy]:
     """What would mend this run, in the order of the enum, a missing declaration first.
 
-    `survey_stated`: the survey states its sigma.
+    `survey_stated`: the survey states its sigma; `clock_open_m`: how wide the clocks of the recorders alone make the
+    evidence at the highest speed.
     """
     unproven = run["verdict"] == RunVerdict.UNPROVEN
     reasons = frozenset(run.get("reasons") or ())
@@ -80,6 +86,8 @@ def remedies(
         Remedy.READS_CLOSER: missing and truth and unknown.between,
         Remedy.ROUTE: costs(LostTo.TRACK_AMBIGUOUS),
         Remedy.CLOCK: bool(reasons & {Reason.CLOCK_ASSUMED, Reason.EVIDENCE_DISPUTED}),
+        # Of the room for an error, the limit to both sides, the clocks alone take half.
+        Remedy.RECORDER_LATENCY: missing and truth and clock_open_m > config.hazards.failure_limit_m,
         Remedy.ODOMETER: run["vehicle"] == VehicleFigures.NONE or of_gnss or costs(LostTo.NO_ODOMETER),
         Remedy.ODOMETER_ORIGIN: Reason.ODOMETER_ORIGIN_UNKNOWN in reasons and not of_gnss,
         Remedy.FASTER_LOG: _too_slow(run, config),

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, may_move
@@ -18,7 +19,7 @@ from pipeline.stages.run_row import run_figures as figures
 from pipeline.stages.run_row.lost_time import lost_time
 from pipeline.stages.run_row.remedies import remedies, unknown_parts
 from pipeline.stages.run_row.verdict import reasons_of, verdict_of
-from schemas.arrays import NS_PER_S
+from schemas.arrays import NS_PER_S, floats
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
 from schemas.enums import Note, Reason, RunStatus
@@ -34,7 +35,7 @@ class SolutionResults:
     """What the stages say of one solution; `epochs` as in `schemas.tables`, `columns` of `runs` as they stand there.
 
     `reasons`: those that no figure holds; `anchored_ns`: first and last instant at which a read or the reference says
-    where the train was.
+    where the train was; `clock_open_s`: over how long the clocks of the recorders leave the instant open.
     """
 
     solution: str
@@ -45,6 +46,7 @@ class SolutionResults:
     notes: Sequence[Remark] = ()
     reasons: Sequence[Reason] = ()
     anchored_ns: tuple[int, int] | None = None
+    clock_open_s: float = 0.0
 
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
@@ -71,7 +73,8 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     )
     row |= _part(results, row, config) | figures.service_levels(row, config) | _verdict(row, config)
     stated = epochs["survey_sigma_m"].is_not_null().any()
-    cures = remedies(row, lost, unknown_parts(epochs, config), stated, config)
+    clock_open_m = results.clock_open_s * float(np.abs(np.nan_to_num(floats(epochs, "speed_mps"))).max(initial=0.0))
+    cures = remedies(row, lost, unknown_parts(epochs, config), stated, config, clock_open_m)
     noted = (
         *notes.ingest_notes(results.ingest),
         *results.notes,

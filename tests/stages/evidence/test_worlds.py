@@ -181,6 +181,63 @@ def test_a_reference_that_drifts_beside_an_odometer_says_nothing(rate_mps: float
     assert found.at(ns(np.arange(200.0, 390.0, 1.0))).kind.tolist() == [NOTHING] * 190
 
 
+def test_a_drift_may_have_begun_where_no_odometer_counted() -> None:
+    """The reference drifts off from 150 s on; the odometer's rows from 148 s to 176 s are lost.
+
+    A read at 100 s or so confirmed the reference: up to the drift, and not through the hole.
+    """
+    rng = np.random.default_rng(15)
+    ride = wavy(20.0)
+    counted = odometer(ride, rng).filter(~pl.col("t").is_between(*stamps(np.array([148.0, 176.0]))))
+    drift_m = np.clip(np.arange(4000) / 10.0 - 150.0, 0.0, 40.0)
+    truth = reads(ride, GROUND, rng).head(3)
+    found = known(GROUND, counted, of_reference=reference(ride, rng, ahead_m=drift_m), of_reads=truth)
+    assert found.doubted
+    at_s = np.arange(5.0, 390.0, 0.7)
+    evidence = found.at(ns(at_s))
+    _, _, holds = bounds(evidence, ride.at(at_s))
+    known_rows = evidence.kind != NOTHING
+    assert holds[known_rows].all()
+    assert known_rows[at_s < 120.0].all()
+
+
+def _hung(frame: pl.DataFrame, begin_s: float, end_s: float) -> pl.DataFrame:
+    """A logger that repeats the values of one instant for a while, with stamps that go on."""
+    hangs = pl.col("t").is_between(*stamps(np.array([begin_s, end_s])), closed="right")
+    values = [name for name in frame.columns if name != "t"]
+    return frame.with_columns(pl.when(~hangs).then(name).forward_fill().alias(name) for name in values)
+
+
+@pytest.mark.parametrize("lasts_s", [3.4, 8.0])
+@pytest.mark.parametrize("counted", ["hangs too", "hangs for longer", "is not there"])
+def test_a_leap_that_no_train_can_drive_doubts_the_reference(lasts_s: float, counted: str) -> None:
+    """Reference and odometer stand in one logger that hangs at 20 m/s, and reads confirm both before and after.
+
+    What the odometer lost there it cannot contradict: the leap of the reference, 68 m or more in 0.1 s, says it alone.
+    """
+    rng = np.random.default_rng(16)
+    ride = wavy(30.0)
+    hung = _hung(reference(ride, rng), 150.0, 150.0 + lasts_s)
+    ends_s = 150.0 + lasts_s + (9.0 if counted == "hangs for longer" else 0.0)
+    odometers = [] if counted == "is not there" else [_hung(odometer(ride, rng), 150.0, ends_s)]
+    found = known(GROUND, *odometers, of_reference=hung, of_reads=reads(ride, GROUND, rng), vehicle=Vehicle())
+    # An odometer that bridges the hang has it end where it began, as a spike, which is open while it lasts.
+    assert found.doubted or counted == "hangs too"
+    at_s = np.arange(5.0, 390.0, 0.3)
+    evidence = found.at(ns(at_s))
+    _, _, holds = bounds(evidence, ride.at(at_s))
+    assert holds[evidence.kind != NOTHING].all()
+    assert (evidence.kind[at_s < 100.0] != NOTHING).all()
+
+
+def test_a_train_that_brakes_hard_leaps_nowhere() -> None:
+    """1.6 m/s2 from 50 m/s to a stand and back, at 1 and 10 Hz, without an odometer: nothing is doubted."""
+    rng = np.random.default_rng(17)
+    ride = Ride((0.0, 30.0, 60.0, 91.0, 101.0, 132.0, 160.0), (0.0, 48.0, 50.0, 0.0, 0.0, 50.0, 50.0))
+    for rate_hz in (1.0, 10.0):
+        assert known(GROUND, of_reference=reference(ride, rng, rate_hz=rate_hz)).doubted == 0
+
+
 def test_a_reference_that_stepped_in_a_gap_is_doubted_on_both_sides() -> None:
     """30 m ahead up to 195 s, nothing until 200 s, right from then on: what the gap hides is a step all the same."""
     rng = np.random.default_rng(8)

@@ -167,6 +167,17 @@ def test_a_verdict_names_its_cure(run: dict[str, Any], unknown: Unknown, cure: l
     assert cures(run, unknown=unknown) == cure
 
 
+def test_clocks_that_leave_too_much_open_are_to_be_declared() -> None:
+    """Of the 40 m that an error may span the clocks alone take 21 m: 0.7 s at 30 m/s."""
+    lacking = RUN | {"evidence": "balise", "reasons": ["unknown_in_use"]}
+    wide, narrow = (remedies(lacking, LostTime(), NOTHING, True, CONFIG, open_m) for open_m in (21.0, 19.0))
+    assert (wide, narrow) == ([Remedy.RECORDER_LATENCY], [])
+    proved = RUN | {"evidence": "balise", "reasons": ["not_diagnosed"]}
+    assert remedies(proved, LostTime(), NOTHING, True, CONFIG, 21.0) == [], "nothing is unknown"
+    alone = RUN | {"evidence": "odometer", "reasons": ["unknown_in_use"]}
+    assert remedies(alone, LostTime(), NOTHING, True, CONFIG, 21.0) == [Remedy.REFERENCE]
+
+
 def test_an_ambiguous_track_needs_a_route_and_a_survey_that_states_its_accuracy() -> None:
     twin = {LostTo.TRACK_AMBIGUOUS: 0.4}
     assert cures({}, twin) == [Remedy.ROUTE]
