@@ -124,13 +124,18 @@ def pytest_collection_finish() -> None:
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Campaigns and pages are made here: for tests that are not about workers, which take seconds to start."""
+    work_here(monkeypatch)
+
+
+def work_here(patch: pytest.MonkeyPatch) -> None:
+    """As `in_process`, for a fixture of a module."""
     from pipeline.campaign import run
     from pipeline.campaign.engines import SerialEngine
     from pipeline.results import workers
 
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    monkeypatch.setattr(run, "_engine_for", lambda jobs, runs, scheduler, limit_s: SerialEngine(limit_s))
-    monkeypatch.setattr(workers, "ProcessPoolExecutor", lambda count, mp_context: contextlib.nullcontext(_Here()))
+    patch.setattr(os, "cpu_count", lambda: 1)
+    patch.setattr(run, "_engine_for", lambda jobs, runs, scheduler, limit_s: SerialEngine(limit_s))
+    patch.setattr(workers, "ProcessPoolExecutor", lambda count, mp_context: contextlib.nullcontext(_Here()))
 
 
 class _Here:
