@@ -40,6 +40,8 @@ def conform(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
 
 def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
     """The contract's columns and dtypes, in its order; the values are taken as they are."""
+    if (frame.columns, frame.dtypes) == _names_and_dtypes(schema):
+        return frame
     return pl.DataFrame([_cast(frame[rule.name], rule.dtype) for rule in _rules(schema)])
 
 
@@ -59,6 +61,11 @@ def meanings(schema: type[dy.Schema]) -> dict[str, dict[str, str]]:
 
 def _cast(series: pl.Series, dtype: pl.DataType) -> pl.Series:
     return series if series.dtype == dtype else series.cast(dtype)
+
+
+@lru_cache(maxsize=64)
+def _names_and_dtypes(schema: type[dy.Schema]) -> tuple[list[str], list[pl.DataType]]:
+    return [rule.name for rule in _rules(schema)], [rule.dtype for rule in _rules(schema)]
 
 
 @lru_cache(maxsize=64)

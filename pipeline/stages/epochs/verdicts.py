@@ -22,6 +22,9 @@ STATES = [state.value for state in MonitorState]
 PASS, FAIL, NOT_EVALUATED = (
     STATES.index(state) for state in (MonitorState.PASS, MonitorState.FAIL, MonitorState.NOT_EVALUATED)
 )
+# Made once: a replay asks for them at every monitor, and an enumeration takes longer to make than to index.
+_STATE_WORDS = pl.Series(STATES, dtype=pl.Enum(STATES))
+_NO_REASON = pl.Series([None], dtype=pl.String)
 
 
 def states_of(value: Floats, threshold: Floats, evaluated: Bools) -> States:
@@ -36,17 +39,20 @@ def verdicts(value: Floats, threshold: Floats, reasons: pl.Series, state: States
     `state` where the monitor gives it already. Else what has no reason and yet no value or threshold is not
     evaluated either: absence is never health.
     """
+    unexplained = reasons.is_null().to_numpy()
     if state is None:
         known = np.isfinite(value) & np.isfinite(threshold)
-        state = states_of(value, threshold, known & reasons.is_null().to_numpy())
+        state = states_of(value, threshold, known & unexplained)
     unknown = state == NOT_EVALUATED
-    nothing = pl.Series([None], dtype=pl.String)
+    words = reasons.cast(pl.String)
+    if (unknown & unexplained).any():
+        words = words.fill_null(NO_VALUE)
     return pl.DataFrame(
         {
             "value": pl.Series(np.where(unknown, np.nan, value), nan_to_null=True),
             "threshold": pl.Series(np.where(unknown, np.nan, threshold), nan_to_null=True),
-            "state": pl.Series(STATES, dtype=pl.Enum(STATES)).gather(state.astype(np.uint32)),
-            "reason": reasons.cast(pl.String).fill_null(NO_VALUE).zip_with(pl.Series(unknown), nothing),
+            "state": _STATE_WORDS[state.astype(np.uint32)],
+            "reason": words.zip_with(pl.Series(unknown), _NO_REASON),
         }
     )
 
