@@ -18,12 +18,15 @@ from pipeline.campaign.verify import recompute, verify
 from pipeline.show.terminal import table_lines, to_json
 from schemas.config import Vehicle, load_settings
 from schemas.run import RunTables
+from tests.conftest import work_here
 from tests.docs.json_page import fields, places
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
-    return demo(tmp_path_factory.mktemp("demo"))
+    with pytest.MonkeyPatch.context() as patch:
+        work_here(patch)
+        return demo(tmp_path_factory.mktemp("demo"))
 
 
 def test_the_demo_verifies(result: DemoResult) -> None:

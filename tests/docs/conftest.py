@@ -23,27 +23,26 @@ from tests.docs.blocks import ROOT
 
 BLIND = ("windows_only_early", "windows_only_late")
 LINK_MONITORS = ("link_order", "link_distance", "along_doppler")
-FEW = ("drift_early", "jump_two")
-RUNS = (*FEW, "outage_and_slip")
+FAULTY = "jump_two"
+RUNS = ("drift_early", FAULTY, "outage_and_slip")
 
 
 @pytest.fixture(scope="session")
 def workspace(shared: Shared) -> Path:
-    """A small site, some runs on it, their result, a receiver log. Not to be changed: see `workplace`."""
+    """A small site, a run with faults and one without, their result, a receiver log. Not to be changed: `workplace`."""
     return shared("docs", _fill_workspace)
 
 
 def _fill_workspace(folder: Path) -> None:
     scenario = _with_a_clean_run(load_scenario(ROOT / "tests/golden/golden.toml"))
     write_site(build_site(scenario), folder / "SITE")
-    for name in FEW:
-        run = build_run(scenario, _spec(scenario, name))
-        write_run_log(run.with_streams(faults=None), folder / "runs")
-    shutil.copytree(folder / "runs" / "jump_two", folder / "RUN")
+    faulty = build_run(scenario, _spec(scenario, FAULTY))
+    write_run_log(faulty.with_streams(faults=None), folder / "runs")
+    shutil.copytree(folder / "runs" / FAULTY, folder / "RUN")
     write_run_log(build_run(scenario, _spec(scenario, "evening")), folder / "runs")
     assert scenario.vehicle is not None
     (folder / "vehicle.toml").write_text(to_toml(scenario.vehicle))
-    _replay(folder, (*FEW, "evening"), Configuration())
+    _replay(folder, (FAULTY, "evening"), Configuration())
     shutil.copytree(folder / "OUT", folder / "OUT_A")
     shutil.copytree(folder / "OUT", folder / "OUT_B")
     _receiver_log(folder / "runs" / "evening", folder)
@@ -88,7 +87,7 @@ def _replay(folder: Path, names: Sequence[str], config: Configuration) -> None:
 
 
 def _with_a_clean_run(scenario: Scenario) -> Scenario:
-    clean = _spec(scenario, "jump_two").model_copy(update={"id": "evening", "faults": ()})
+    clean = _spec(scenario, FAULTY).model_copy(update={"id": "evening", "faults": ()})
     return scenario.model_copy(update={"runs": (*scenario.runs, clean)})
 
 

@@ -75,7 +75,7 @@ def _prepare(folder: Path) -> None:
         write_files_of(page, folder)
     shutil.copytree(folder / "OUT_A", folder / "OUT_C")
     for table in TABLES:
-        one, other = (folder / "OUT_C" / table / f"run_id={name}" for name in ("drift_early", "jump_two"))
+        one, other = (folder / "OUT_C" / table / f"run_id={name}" for name in ("evening", "jump_two"))
         shutil.rmtree(other)
         shutil.copytree(one, other)
     write_run_as(read_run(folder / "RUN", IngestConfig()), folder / "monday.mcap")
