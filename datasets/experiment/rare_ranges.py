@@ -14,7 +14,6 @@ from typing import ClassVar
 
 import numpy as np
 from scipy.special import chdtr, chdtri
-from scipy.stats import ncx2
 
 from datasets.experiment.geometry import TAUS_S
 from datasets.experiment.ranges import RangePlan, held_rows, statistic
@@ -124,5 +123,7 @@ def range_system(plan: RangePlan, heading_deg: float) -> RangeSystem:
 
 def miss_at_one_epoch(system: RangeSystem, range_error_m: float) -> float:
     """Probability that one epoch with this range error passes: exact, and above that of all epochs before it."""
+    from scipy.stats import ncx2  # takes half a second to load
+
     strength = range_error_m**2 * float(system.metre @ system.metre)
     return float(ncx2.cdf(system.threshold, system.size, strength))

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 from polars import selectors as cs
-from scipy.stats import binom
 
 from pipeline import storage
 from pipeline.stages.run_row.bounds import CONFIDENCE, clopper_pearson
@@ -47,6 +46,8 @@ def expected(values: Floats, least: float, greatest: float, confidence: float = 
     Mean: empirical Bernstein bound, two-sided (Maurer and Pontil 2009, theorem 4), finite-sample.
     Median: order statistics with binomial coverage.
     """
+    from scipy.stats import binom  # takes half a second to load
+
     n = values.size
     if n < 2:
         return None

@@ -50,11 +50,18 @@ def with_alarms(run_id: str, count: int, availability: float = 0.5) -> RunTables
 RUNS = {"a b": 2, "c/d": 0, "e": 3, "f": 1}
 
 
-@pytest.fixture
-def out(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`RUNS` as they are written; not to be changed."""
+    folder = tmp_path_factory.mktemp("written") / "out"
     for run_id, count in RUNS.items():
-        store.write_run(with_alarms(run_id, count), tmp_path / "out", METADATA)
-    return tmp_path / "out"
+        store.write_run(with_alarms(run_id, count), folder, METADATA)
+    return folder
+
+
+@pytest.fixture
+def out(written: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(written, tmp_path / "out"))
 
 
 def content(out: Path) -> dict[str, list[tuple[object, ...]]]:

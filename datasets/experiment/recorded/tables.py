@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 from scipy.special import betaincinv
-from scipy.stats import binom
 
 from datasets.experiment.recorded.plan import Cell, RecordedPlan
 from datasets.experiment.tables import Row
@@ -154,6 +153,8 @@ def _time_to_detect(frame: pl.DataFrame, independent: int) -> Row:
 
 def _median_bounds(times_s: Floats, independent: int) -> tuple[float | None, float | None]:
     """None of fewer than six passes: the least and the largest of five enclose the median with 93.75 % only."""
+    from scipy.stats import binom  # takes half a second to load
+
     tail = (1.0 - CONFIDENCE) / 2.0
     order = int(binom.ppf(tail, independent, 0.5)) if independent else 0
     if order < 1:

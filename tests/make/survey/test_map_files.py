@@ -10,7 +10,6 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-import pyogrio.raw
 import pyproj
 import pytest
 
@@ -31,6 +30,8 @@ def write(path: Path, shapes: list[bytes], **options: str) -> Path:
     names = np.array([f"way{number}" for number in range(len(shapes))], dtype=object)
     kinds = np.array(["rail", "abandoned", "rail"][: len(shapes)], dtype=object)
     fields = {"field_data": [names, kinds], "fields": ["name", "railway"], **options}
+    import pyogrio.raw  # with pandas: takes long to load, in each of the test processes
+
     pyogrio.raw.write(path, np.array(shapes, dtype=object), **fields, geometry_type="LineString", crs="EPSG:31370")
     return path
 
