@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, search_about
 from pipeline.stages.paths.path_steps import PathSteps
@@ -27,6 +26,7 @@ from pipeline.stages.paths.path_tests import (
     Totals,
     Trail,
 )
+from pipeline.stages.paths.way_back import Left, WayBack
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
@@ -280,58 +280,16 @@ class _Growth:
         return self._returned[-1]
 
     def _came_back(self, node: Node, died: int) -> int:
-        """The first step after a rejection at which a movement of equal size has led back to the path refuted last.
-
-        The nearest track would not do: a fault across the tracks, or a siding that the survey lacks, leads beside
-        another one. So the path is carried on as far as no switch leaves a choice, and the positions have to have moved
-        back to where they lay beside it, by more than noise and survey explain.
-        """
+        """The first step after a rejection by which a movement has led back to the path refuted last (`way_back`)."""
         steps = self.steps
-        level_s = self.config.paths_level_s
-        first, last = np.searchsorted(steps.end_s, steps.end_s[died] - level_s * np.array([3.0, 1.0]), side="right")
+        ends_s = steps.end_s[died] - self.config.paths_level_s * np.array([3.0, 1.0])
+        first, last = np.searchsorted(steps.end_s, ends_s, side="right")
         residual_m = node.residuals_m(int(first), int(last))
         before = np.isfinite(residual_m) & steps.counted[first:last]
-        beside_m = self._beside_line_m(node.oriented, died)
-        window = max(1, round(level_s / float(steps.period_s[died])))
-        if not before.any() or beside_m.size < window:
+        if not before.any():
             return len(steps)
-        windows_m = sliding_window_view(beside_m, window)
-        means_m = windows_m.mean(axis=1) - float(np.mean(residual_m[before]))
-        sigma_m = steps.sigma_m[died + window - 1 :]
-        survey_m = np.full(sigma_m.size, float(np.median(node.along.survey_m)))
-        farthest_m = np.fmax(np.fmax.accumulate(means_m) - means_m, means_m - np.fmin.accumulate(means_m))
-        # Out of reach for a whole window it was farther away than any measured offset.
-        farthest_m[np.logical_or.accumulate(np.isnan(windows_m).all(axis=1))] = np.inf
-        near = np.abs(means_m) <= self.config.paths_back_sigmas * np.hypot(sigma_m, survey_m)
-        # It stays there as long again: what only passes on its way to somewhere else does not.
-        stays = np.convolve(near, np.ones(window + 1))[: near.size] > window
-        back = np.flatnonzero(stays & (farthest_m > self.tests.moved_m(sigma_m, survey_m)))
-        return int(died + back[0] + window) if back.size else len(steps)
-
-    def _beside_line_m(self, oriented: int, begin: int) -> Floats:
-        """Per step from one on the offset from a line without a choice, in its sense; NaN where it is not within reach.
-
-        The line goes on from an element, ahead and behind, as long as one way alone leads on.
-        """
-        ahead, behind = (self._without_choice(side) for side in (oriented, oriented ^ 1))
-        count = len(self.steps)
-        nearest_m = np.full(count, np.inf)
-        beside_m = np.full(count, np.nan)
-        for one in {*ahead, *(other ^ 1 for other in behind)}:
-            rows = self.candidates.of(one // 2, begin, count)
-            rows = rows[self.candidates.beyond_m[rows] <= self.config.paths_end_m]
-            rows = rows[self.candidates.distance_m[rows] < nearest_m[self.candidates.step[rows]]]
-            step = self.candidates.step[rows]
-            nearest_m[step] = self.candidates.distance_m[rows]
-            beside_m[step] = self.candidates.offset_m[rows] * (1.0 - 2.0 * (one % 2))
-        return beside_m[begin:]
-
-    def _without_choice(self, oriented: int) -> list[int]:
-        """An oriented element and those after it, up to the first switch that leaves a choice, or an open end."""
-        line = [oriented]
-        while len(onward := self.network.successors[line[-1]]) == 1 and onward[0].to not in line:
-            line.append(onward[0].to)
-        return line
+        left = Left(node.oriented, died, float(np.mean(residual_m[before])), float(np.median(node.along.survey_m)))
+        return WayBack(steps, self.network, self.candidates, self.tests, self.config).after(left)
 
     def _begin(self, step: int) -> int:
         """The first step from this one on with an element that its offset does not refute, else the number of steps."""
