@@ -46,17 +46,23 @@ from schemas.run import Site
 SURE = 0.99
 # Of claims so long at most one in a hundred may be wrong [s]; tracks nearer than this are one [m].
 CLAIM_S, ONE_TRACK_M = 5.0, 1.5
+# Of runs with a balise of another track accepted at most one in a thousand; one balise on so much of a track [m].
+BALISES_M = 200.0
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one run: seconds claimed and claimed wrongly, live and in hindsight; share of seconds claimed; seconds."""
+    """Of one run: seconds claimed and claimed wrongly, live and in hindsight; all seconds; balises of another track.
+
+    Those passed while that track was claimed live: one every `BALISES_M` of each element, the first after half of that.
+    """
 
     live_s: float
     live_wrong_s: float
     later_s: float
     later_wrong_s: float
     total_s: float
+    other_balises: int
 
 
 def ladder_yard(rng: np.random.Generator) -> World:
@@ -203,7 +209,15 @@ def outcome(family: str, seed: int) -> Outcome:
     for row in np.flatnonzero(wrong & (live | later)).tolist():
         wrong[row] = apart_m(world, names[row], truth.place[row]) > ONE_TRACK_M
     seconds = [float(np.count_nonzero(one)) / rate_hz for one in (live, live & wrong, later, later & wrong)]
-    return Outcome(seconds[0], seconds[1], seconds[2], seconds[3], count / rate_hz)
+    passed = passed_balises(names, floats(epochs, "measure_m"), live & wrong)
+    return Outcome(seconds[0], seconds[1], seconds[2], seconds[3], count / rate_hz, passed)
+
+
+def passed_balises(names: np.ndarray, measure_m: np.ndarray, chosen: np.ndarray) -> int:
+    """Balises between neighbouring epochs, both chosen and on one element."""
+    together = chosen[1:] & chosen[:-1] & (names[1:] == names[:-1])
+    number = np.floor(measure_m / BALISES_M + 0.5)
+    return int(np.abs(np.diff(number))[together].sum())
 
 
 @dataclass(frozen=True)
@@ -282,6 +296,8 @@ def figures(runs: int, seed: int, families: list[str]) -> list[Figure]:
                 Figure(f"{name}, {title}: wrong for less than 5 s", float(short), ""),
                 Figure(f"{name}, {title}: share of time claimed", share, ""),
             ]
+        others = float(sum(one.other_balises > 0 for one in found))
+        out.append(Figure(f"{name}: runs of {runs} that accept a balise of another track", others, "", 0.001 * runs))
     return out
 
 
