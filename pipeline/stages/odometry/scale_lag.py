@@ -53,6 +53,8 @@ _APART_S = 0.25
 _USUAL = 4.5
 # 1.4826 MAD is the sigma of normal residuals, whatever less than half of them do.
 _MAD = 1.4826
+# A change of speed, as a share of the usual one.
+_CHANGES = 0.5
 # So many lengths of a way are left out to see how much depends on them.
 _LEFT_OUT = 6
 # Numerics: with less independent information about scale and lag, as a share of the whole, they are not told apart.
@@ -355,7 +357,7 @@ class _Ways:
         change_mps = np.where(np.abs(change_mps) <= self.counter.least_change_mps, 0.0, change_mps)
         beside = np.column_stack(slopes(counted, change_mps))
         known = np.asarray(np.isfinite(np.column_stack([design, beside])).all(axis=1))
-        # Where both stand there is nothing to learn, nor of the noise.
+        # Where the counter stands there is nothing to learn but of the noise.
         moving: Bools = known & (np.abs(counted) > 0.0)
         if moving.sum() < FEWEST:
             return None
@@ -374,20 +376,25 @@ class _Ways:
             theta, used = solved, kept
             if same:
                 break
-        return _Regression(design, beside, self.way_m, used, theta, self.overlap, abs(scale) * self.counter.noise_m)
+        used = used & ~_near(moving & ~used, self.overlap // 2)
+        if used.sum() < FEWEST:
+            return None
+        return _Regression(design, beside, self.way_m, used, self.overlap, known & ~moving)
 
 
 @dataclass(frozen=True)
 class _Regression:
-    """way = design @ (scale, scale * rest of the lag), by the moments of `beside`, over the `used` ways."""
+    """way = design @ (scale, scale * rest of the lag), by the moments of `beside`, over the `used` ways.
+
+    `standing`: ways of which the counter says that the train stood.
+    """
 
     design: Floats
     beside: Floats
     way_m: Floats
     used: Bools
-    theta: Floats
     overlap: int
-    noise_m: float
+    standing: Bools
 
     def solved(self, assumed_s: float) -> ScaleLag:
         """Scale and lag."""
@@ -399,7 +406,7 @@ class _Regression:
             scale=scale,
             scale_sigma=max(sigma, _apart(halves)),
             lag_s=assumed_s + rest_s / scale,
-            lag_sigma_s=max(sigma_s / abs(scale), self._lags_apart(halves)),
+            lag_sigma_s=sigma_s / abs(scale),
             state=LagState.MEASURED,
             halves=halves,
         )
@@ -409,30 +416,51 @@ class _Regression:
         design, beside = (values[:, parts] * self.used[:, None] for values in (self.design, self.beside))
         inverse = np.linalg.inv(beside.T @ design)
         theta = inverse @ (beside.T @ self.way_m)
-        left = np.where(self.used, self.way_m - design @ theta, 0.0)
-        spreads = [_spread(beside, left, self.used, reach) for reach in (self.overlap, _MEMORY * self.overlap)]
-        spreads.append(_sandwich(beside, left, self.overlap))
-        # Counts of a counter do not show at one speed, and are there where it changes.
-        unseen_m2 = max(self.noise_m**2 - float(left @ left) / self.used.sum(), 0.0)
-        spreads.append(_alike(beside, unseen_m2 * (1.0 - np.arange(self.overlap) / self.overlap)))
+        left = self.way_m - self.design[:, parts] @ theta
+        # A recorder may be quiet where the counter stands, or drift there, and then elsewhere too.
+        spreads = [
+            _spread(beside, np.where(rows, left, 0.0), rows, reach)
+            for rows in (self.used, self.used | self.standing)
+            for reach in (self.overlap, _MEMORY * self.overlap)
+        ]
         variances = np.max([np.diag(inverse @ one @ inverse.T) for one in spreads], axis=0)
         sigmas = _student(self.used.sum() / self.overlap - 2.0) * np.sqrt(np.maximum(variances, 0.0))
         sigmas = np.maximum(sigmas, self._without_one(design, beside, theta))
         return [float(value) for pair in zip(theta, sigmas, strict=True) for value in pair]
 
     def _without_one(self, design: Floats, beside: Floats, theta: Floats) -> Floats:
-        """By how much each part of the estimate changes at most without the ways of a minute, or a quarter of all.
+        """By how much each part of the estimate changes at most without a change of speed, a minute, a quarter.
 
-        One change of speed alone looks like a step or drift of the other recorder, or a slip, that came with it.
+        One change of speed alone looks like a step or drift of the other recorder, or a slip, that came with it and
+        may last as long.
         """
         moments = beside[:, :, None] * np.concatenate([design, self.way_m[:, None]], axis=1)[:, None, :]
         sums = np.cumsum(np.concatenate([np.zeros((1, *moments.shape[1:])), moments]), axis=0)
         reach = max(self.overlap + 1, min(_LEFT_OUT * self.overlap, len(design) // 4))
-        left = sums[-1] - (sums[reach:] - sums[:-reach])
+        begin = np.arange(len(design) - reach + 1)
+        end = begin + reach
+        if theta.size > 1:
+            changes = self._changes()
+            begin, end = np.append(begin, changes[0]), np.append(end, changes[1])
+        left = sums[-1] - (sums[end] - sums[begin])
         normal, right = left[:, :, :-1], left[:, :, -1:]
         if not np.all(np.linalg.det(normal)):
             return np.full(theta.size, np.inf)
         return np.asarray(np.abs(np.linalg.solve(normal, right)[:, :, 0] - theta).max(axis=0))
+
+    def _changes(self) -> tuple[Ints, Ints]:
+        """First row of each change of speed, and the one after its last: one sense, whatever outliers are in it, and
+        all ways that hold a part of it.
+
+        Where the speed changes by less than half as much as it does usually it does not change.
+        """
+        used = np.flatnonzero(self.used)
+        change = self.beside[used, 1]
+        usual = float(np.sqrt(np.mean(change[change != 0.0] ** 2)))
+        rows = np.flatnonzero(np.abs(change) > _CHANGES * usual)
+        other = (np.diff(rows) > self.overlap) | (np.diff(np.sign(change[rows])) != 0.0)
+        begin, end = used[rows[np.append(True, other)]], used[rows[np.append(other, True)]] + 1
+        return np.maximum(begin - self.overlap, 0), np.minimum(end + self.overlap, self.used.size)
 
     def _changes_show(self) -> bool:
         """Two figures of each change of speed, by other rows, have in common more than their noise would by chance."""
@@ -441,12 +469,6 @@ class _Regression:
         near, beside = self.design[self.used, 1], self.beside[self.used, 1]
         noise = 0.5 * float(((near - beside) ** 2).sum()) / np.sqrt(near.size / self.overlap)
         return bool(near @ beside > _SHOWN * noise)
-
-    def _lags_apart(self, halves: Sequence[tuple[float, float]]) -> float:
-        """Half of what the lags of both halves differ by, where neither tells much less than the other."""
-        told = np.cumsum(np.where(self.used, self.beside[:, 1] * self.design[:, 1], 0.0))
-        share = float(told[np.flatnonzero(self.used)[: int(self.used.sum()) // 2][-1]] / told[-1])
-        return 0.5 * abs(halves[0][1] - halves[1][1]) if len(halves) == 2 and 0.2 <= share <= 0.8 else 0.0
 
     def halves(self, assumed_s: float, parts: slice = slice(None)) -> tuple[tuple[float, float], ...]:
         """Scale and lag by the first and by the second half of the ways."""
@@ -485,6 +507,11 @@ def _alike_columns(normal: Floats) -> bool:
     return bool(abs(np.linalg.det(normal)) <= _LEAST_INDEPENDENT * abs(float(np.prod(np.diag(normal)))))
 
 
+def _near(rows: Bools, reach: int) -> Bools:
+    """These rows, and so many on both sides: an outlier's neighbour begins or ends in the same slip or step."""
+    return np.asarray(np.convolve(rows, np.ones(2 * reach + 1), "same")[: rows.size] > 0.5)
+
+
 def _robust(size: Floats) -> float:
     """Sigma of normal values of this size, whatever a part of them does."""
     return _MAD * float(np.median(size)) if size.size else 0.0
@@ -513,25 +540,11 @@ def _spread(beside: Floats, left: Floats, used: Bools, reach: int) -> Floats:
     pairs = np.array([counts[apart:] @ counts[: left.size - apart] for apart in range(count)])
     sums = np.array([left[apart:] @ left[: left.size - apart] for apart in range(count)])
     share = 1.0 - np.arange(count) / (reach + 1.0)
-    return _alike(beside, share * sums / np.maximum(pairs, 1.0))
-
-
-def _alike(beside: Floats, covariance: Floats) -> Floats:
-    """Variance of the moments by the covariance of the noise of ways so many rows apart."""
+    covariance = share * sums / np.maximum(pairs, 1.0)
     total: Floats = covariance[0] * beside.T @ beside
-    for apart in range(1, min(covariance.size, len(beside))):
+    for apart in range(1, count):
         product = covariance[apart] * beside[apart:].T @ beside[:-apart]
         total += product + product.T
-    return total
-
-
-def _sandwich(beside: Floats, left: Floats, reach: int) -> Floats:
-    """The same where the noise is not alike: by the moments themselves (Newey and West 1987)."""
-    moments = beside * left[:, None]
-    total = moments.T @ moments
-    for apart in range(1, min(reach + 1, left.size)):
-        product = moments[apart:].T @ moments[:-apart]
-        total += (1.0 - apart / (reach + 1.0)) * (product + product.T)
     return total
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.clock import draw, estimate
-from pipeline.stages.odometry.scale_lag import CountedRows, LagState, possible_lags, scale_and_lag
+from pipeline.stages.odometry.scale_lag import CountedRows, LagState, ScaleLag, possible_lags, scale_and_lag
 from schemas.arrays import Floats
 
 
@@ -89,6 +89,30 @@ def test_one_change_of_speed_that_comes_with_a_step_is_no_lag() -> None:
     ways_m = np.interp(begin_s + 10.0, t_s, place_m) - np.interp(begin_s, t_s, place_m)
     found = scale_and_lag(begin_s, begin_s + 10.0, ways_m, CountedRows(t_s, way_m, np.zeros(t_s.size)))
     assert not found.measured or abs(found.lag_s) < 4.0 * found.lag_sigma_s
+
+
+def drifting(begin_s: float, end_s: float, rate_mps: float, speeds: tuple[list[float], list[float]]) -> ScaleLag:
+    """The other recorder, exact to 0.1 m and in time, walks away at this rate between these instants."""
+    t_s = np.arange(0.0, speeds[0][-1], 0.05)
+    way_m = np.cumsum(np.interp(t_s, *speeds)) * 0.05
+    place_m = way_m + rate_mps * np.clip(t_s - begin_s, 0.0, end_s - begin_s)
+    at_s = np.arange(2.0, t_s[-1] - 2.0, 2.0)
+    seen_m = np.interp(at_s, t_s, place_m) + np.random.default_rng(4).normal(0.0, 0.1, at_s.size)
+    return scale_and_lag(at_s[:-5], at_s[5:], seen_m[5:] - seen_m[:-5], CountedRows(t_s, way_m, np.zeros(t_s.size)))
+
+
+@pytest.mark.parametrize("drift", [(115.0, 215.0), (140.0, 240.0)])
+def test_a_drift_as_long_as_the_only_change_of_speed_is_no_lag(drift: tuple[float, float]) -> None:
+    """0.5 m/s beside a start at 0.2 m/s2 looks like a lag of -2.5 s, to the last minute of it."""
+    found = drifting(*drift, 0.5, ([0.0, 140.0, 240.0, 320.0], [0.0, 0.0, 20.0, 20.0]))
+    assert not found.measured or abs(found.lag_s) < 4.0 * found.lag_sigma_s
+
+
+def test_a_drift_that_a_stand_shows_makes_the_scale_less_sure() -> None:
+    """0.2 m/s from the stand on to the braking: 1 % of 20 m/s, as if the counter counted short."""
+    speeds = ([0.0, 170.0, 230.0, 310.0, 370.0, 400.0], [0.0, 0.0, 20.0, 20.0, 0.0, 0.0])
+    found = drifting(50.0, 310.0, 0.2, speeds)
+    assert abs(found.scale - 1.0) < 4.0 * found.scale_sigma
 
 
 def test_a_step_in_doubt_is_not_compared() -> None:
