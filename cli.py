@@ -618,6 +618,9 @@ def make_a_site(
     id_field: Annotated[
         str | None, Option("--id", help="Attribute of GeoPackage, Shapefile or GeoJSON that names the lines.")
     ] = None,
+    sigma: Annotated[
+        float | None, Option(help="Standard deviation of the survey across the track in metres, where it states none.")
+    ] = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     force: Force = False,
@@ -630,7 +633,7 @@ def make_a_site(
     from pipeline.show.report.site_page import site_page
     from schemas.enums import TravelAlong
 
-    wish = wish_of(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field)
+    wish = wish_of(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field, sigma)
     site = make_site(wish, _vehicle(vehicle), _configuration(config))
     write_made(site, site_page(out.resolve().name, site), out, force)
     elements, findings = elements_table(site), findings_table(site.findings)

@@ -235,6 +235,11 @@ class _EpochsAfterMonitors(dy.Schema):
     satellites = dy.Int64(nullable=True, min=0, description="satellites used, as recorded", metadata={"unit": "1"})
     suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
     moving = flag("the train moves from here to the next epoch; null where not known", nullable=True)
+    moving_s = real("s", "time to the next epoch in which the train moves or may move, gaps included", min=0)
+    lost_s = real("s", "of this without a valid TVB; 1 - sum(lost_s) / sum(moving_s) is the availability", min=0)
+    lost_to = one_of(
+        LostTo, "what `lost_s` was lost to; null where nothing was, or none of these explains it", nullable=True
+    )
     in_use = flag("fix valid, unambiguous, confident, not negated, not withheld (DOMAIN section 5.2)")
     undetected_ahead_m = real(
         "m", "largest fault ahead of the train that no monitor would have noticed; not proved on curves", min=0
@@ -296,6 +301,7 @@ class Runs(dy.Schema):
     distance_m = real("m", "distance travelled", min=0)
     epochs = count("GNSS epochs")
     gnss_rate_hz = real("Hz", "nominal rate of the positions; null for fewer than two", min=0)
+    moving_s = real("s", "time in which the train moved or may have moved, gaps included", min=0)
     availability = real("1", "share of moving time with a valid TVB", min=0, max=1)
     outages = count("stretches without a usable position")
     longest_outage_s = real("s", "longest of them", min=0)
@@ -378,7 +384,10 @@ class Runs(dy.Schema):
     stanford_hpl_hazardous = count("as stanford_hazardous, with the receiver's HPL", nullable=True)
     stanford_hpl_unavailable = count("as stanford_unavailable, with the receiver's HPL", nullable=True)
     ambiguous_stretches = count("stretches where a parallel path is as likely")
-    remedies = ones_of(Remedy, "what would mend verdict or availability, see DOMAIN section 5.4", nullable=True)
+    remedies = ones_of(Remedy, "what would mend verdict or availability, the largest gain first", nullable=True)
+    remedies_gain = reals(
+        "1", "share of the moving time that each of these would win back or prove, at most", nullable=True
+    )
     misfits = ones_of(MisfitCause, "why streams of the run do not fit each other, the impossible first", nullable=True)
     faults_injected = flag("the log says that faults were injected: rates are those of a trial", nullable=True)
     lost_to = ones_of(

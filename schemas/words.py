@@ -163,13 +163,16 @@ def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) 
     )
 
 
-def remedy_words(remedy: Remedy | str, **places: str) -> str:
-    """What would mend it, and how; `places`: paths known where it is shown, with `project` the keys of that file in
-    place of a command. Without any, in words for readers inside and outside a project.
+def remedy_words(remedy: Remedy | str, gain: float = 0.0, **places: str) -> str:
+    """What would mend it, how, and which share of the moving time that would win back or prove at most.
+
+    `places`: paths known where it is shown, with `project` the keys of that file in place of a command. Without any, in
+    words for readers inside and outside a project.
     """
     section = "remedies_of_project" if "project" in places else "remedies_by_command" if places else "remedies_anywhere"
     how = WORDS[section].get(Remedy(remedy).value, "")
-    plain = ("options", "of_project", "again")
+    plain = ("options", "of_project", "again", "how_sigma", "how_complete")
     named = {"run": "RUN", "site": "the site", "out": "OUT", "options": ""}
     named |= {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
-    return REMEDIES[Remedy(remedy)].format(how=how.format(**named), **named)
+    won = say("remedies", "gain", gain) if gain >= _LEAST_SHARE else ""
+    return REMEDIES[Remedy(remedy)].format(how=how.format(**named), **named) + won

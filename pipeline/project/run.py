@@ -230,7 +230,9 @@ def wish_for(opened: Opened, entry: TrackEntry) -> Wish:
     if balises is not None and not balises.startswith("every"):
         balises = opened.place(balises)
     surveys = [Path(opened.place(named)) for named in entry.survey]
-    return wish_of(surveys, balises, entry.epsg, entry.join_m, entry.flat, entry.direction, entry.id_field)
+    return wish_of(
+        surveys, balises, entry.epsg, entry.join_m, entry.flat, entry.direction, entry.id_field, entry.sigma_m
+    )
 
 
 def _calibrate(steps: _Steps) -> None:

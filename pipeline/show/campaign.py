@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Sequence
 
 import polars as pl
@@ -63,18 +65,22 @@ def _beside(outcome: RunOutcome) -> tuple[str, str, str]:
 
 
 def remedy_lines(summary: CampaignSummary, **places: str) -> list[str]:
-    """Per remedy how many runs it would mend, and the command for the worst of them; the most frequent first.
+    """Per remedy how many runs it would mend, and the command for the worst of them; what gains most time first.
 
     `places`: paths as the user named them.
     """
     ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
     mended: dict[str, list[RunOutcome]] = {}
+    won_s: dict[str, float] = defaultdict(float)
     for outcome in ranked:
-        for remedy in outcome.remedies:
+        for remedy, gain in zip(outcome.remedies, outcome.remedies_gain, strict=True):
             mended.setdefault(remedy, []).append(outcome)
-    order = sorted(mended, key=lambda remedy: -len(mended[remedy]))
+            won_s[remedy] += gain * (outcome.moving_s or 0.0)
+    whole_s = sum(outcome.moving_s or 0.0 for outcome in ranked) or math.inf
+    order = sorted(mended, key=lambda remedy: (-won_s[remedy], -len(mended[remedy])))
     return [
-        f"{len(runs)} of {len(ranked)} runs: {remedy_words(remedy, **places | {'run': runs[0].log})}"
+        f"{len(runs)} of {len(ranked)} runs: "
+        + remedy_words(remedy, won_s[remedy] / whole_s, **places | {"run": runs[0].log})
         for remedy, runs in ((remedy, mended[remedy]) for remedy in order)
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -33,7 +34,7 @@ class Wish:
     """What a site is made of: balises every so many metres or of a list; ends this near [m] meet.
 
     `travel`: for which direction of travel those every so many metres are valid. `id_field`: attribute of maps that
-    names the lines.
+    names the lines. `sigma_m`: standard deviation across the track of points that state none.
     """
 
     surveys: list[Path]
@@ -44,6 +45,7 @@ class Wish:
     join_m: float | None = None
     flat: bool = False
     id_field: str | None = None
+    sigma_m: float | None = None
 
 
 def wish_of(
@@ -54,6 +56,7 @@ def wish_of(
     flat: bool,
     travel: TravelAlong = TravelAlong.BOTH,
     id_field: str | None = None,
+    sigma_m: float | None = None,
 ) -> Wish:
     """The words of the command; `--balises every 1000` leaves its number among the surveys. Raises `UsageError`."""
     words = [str(path) for path in surveys]
@@ -71,8 +74,10 @@ def wish_of(
     if spacing is None and travel is not TravelAlong.BOTH:
         remedy = "In a list of balises the column `direction` says it, one by one."
         raise UsageError("needs --balises every N", place=f"--direction {travel.value}", remedy=remedy)
+    if sigma_m is not None and not 0.0 < sigma_m < math.inf:
+        raise UsageError("is no standard deviation", place=f"--sigma {sigma_m:g}", expected="metres, more than 0")
     balise_list = None if spacing or balises is None else Path(balises)
-    return Wish(surveys, spacing, travel, balise_list, epsg, join_m, flat, id_field)
+    return Wish(surveys, spacing, travel, balise_list, epsg, join_m, flat, id_field, sigma_m)
 
 
 def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
@@ -86,6 +91,8 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config, wish.id_field), config.survey)
     if wish.flat:
         survey.pieces = [replace(piece, height_m=np.full(len(piece), np.nan)) for piece in survey.pieces]
+    if wish.sigma_m is not None:
+        survey.pieces = [piece.with_sigma(wish.sigma_m) for piece in survey.pieces]
     network = make_network(survey, wish.join_m, config.survey)
     if not network.elements:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))

@@ -33,6 +33,7 @@ UNSAFE = {
     "balises_on_path": 3,
     "availability": 0.25,
     "held_s": 60.0,
+    "moving_s": 60.0,
     "unsafe_accepted": 1,
     "accepted_judged": 1,
     "unproven_accepted": 1,
