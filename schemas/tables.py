@@ -235,7 +235,9 @@ class _EpochsAfterMonitors(dy.Schema):
     satellites = dy.Int64(nullable=True, min=0, description="satellites used, as recorded", metadata={"unit": "1"})
     suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
     moving = flag("the train moves from here to the next epoch; null where not known", nullable=True)
-    moving_s = real("s", "time to the next epoch in which the train moves or may move, gaps included", min=0)
+    step_s = real("s", "time to the next epoch, 0 at the last", min=0)
+    gap = flag("an epoch is missing before the next one: nothing is known to hold until then")
+    moving_s = real("s", "`step_s` where the train moves or may move, gaps included; else 0", min=0)
     lost_s = real("s", "of this without a valid TVB; 1 - sum(lost_s) / sum(moving_s) is the availability", min=0)
     lost_to = one_of(
         LostTo, "what `lost_s` was lost to; null where nothing was, or none of these explains it", nullable=True

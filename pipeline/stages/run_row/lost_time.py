@@ -42,9 +42,9 @@ class LostTime:
 
 
 def lost_columns(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
-    """`moving_s`, `lost_s` and `lost_to` of `epochs`: from each to the next, the first cause that applies.
+    """`step_s`, `gap`, `moving_s`, `lost_s` and `lost_to` of `epochs`: from each to the next.
 
-    A gap is time without a position, as for `availability`.
+    Lost to the first cause that applies. A gap is time without a position, as for `availability`.
     """
     clock = Clock.of(epochs, config)
     steps_s = np.diff(clock.t_ns, append=clock.t_ns[-1:]) / NS_PER_S
@@ -54,7 +54,8 @@ def lost_columns(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     causes = _causes(epochs, gap, clock.t_ns, config)
     first = np.select([lost & applies for applies in causes.values()], list(range(len(causes))), default=len(causes))
     words = pl.Series([*(cause.value for cause in causes), None], dtype=_LOST_TO)
-    return pl.DataFrame({"moving_s": steps_s * moving, "lost_s": steps_s * lost, "lost_to": words.gather(first)})
+    time_s = {"moving_s": steps_s * moving, "lost_s": steps_s * lost}
+    return pl.DataFrame({"step_s": steps_s, "gap": gap, **time_s, "lost_to": words.gather(first)})
 
 
 def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, config: Configuration) -> LostTime:

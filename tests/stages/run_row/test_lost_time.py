@@ -211,6 +211,8 @@ def test_the_epochs_say_what_each_was_lost_to() -> None:
     moving = [True, False, True, True, True, True, None, True]
     frame = epochs(t_s, moving=moving, tvb=[k != 3 for k in range(8)], confidence_m=[5.0, 5.0, 5.0, 50.0, *[5.0] * 4])
     found = lost_columns(frame, CONFIG)
+    assert found["step_s"].to_list() == [1.0, 1.0, 1.0, 1.0, 20.0, 1.0, 1.0, 0.0]
+    assert found["gap"].to_list() == [False, False, False, False, True, False, False, False]
     assert found["moving_s"].to_list() == [1.0, 0.0, 1.0, 1.0, 20.0, 1.0, 1.0, 0.0]
     assert found["lost_s"].to_list() == [0.0, 0.0, 0.0, 1.0, 20.0, 0.0, 1.0, 0.0]
     assert found["lost_to"].to_list() == [None, None, None, "confidence", "no_position", None, None, None]
