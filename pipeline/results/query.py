@@ -103,6 +103,15 @@ def _unanswered(message: str, tables: Mapping[str, pl.LazyFrame], others: Iterab
     return UsageError(text, place="SQL", expected=_EXPECTED, remedy=_REMEDY)
 
 
+def named_results(given: Iterable[str]) -> dict[str, str]:
+    """`NAME=OUT` by name, for `others`. Raises `UsageError`."""
+    named = list(given)
+    for text in named:
+        if not _NAMED.fullmatch(text):
+            raise UsageError("names no result", place=f"--with {text}", expected="NAME=OUT, for example old=OUT_OLD")
+    return dict(text.split("=", 1) for text in named)
+
+
 def _check_query(sql: str, allow_files: bool) -> None:
     begin = 0
     while before := _BEFORE.match(sql, begin):
