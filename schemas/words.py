@@ -138,10 +138,18 @@ def beside_words(run: Mapping[str, Any]) -> str:
     `run`: a `runs` row, or figures of several runs with `odometer_origins`, those of the safe ones.
     """
     share, margin_m = run["availability"], run["proof_margin_m"]
-    accepted = say("verdicts", "accepted", run["balises_accepted"], run["balises_on_path"])
+    once, times = accepted_words(run)
+    accepted = say("verdicts", "accepted", once) + times
     available = say("verdicts", "no_motion") if share is None else say("verdicts", "available", share)
     margin = [] if margin_m is None else [say("verdicts", "margin", margin_m)]
     return ", ".join([accepted, available, *margin, *_provided(run)])
+
+
+def accepted_words(run: Mapping[str, Any]) -> tuple[str, str]:
+    """`7 of 9`: balises accepted of those passed, each once; and how often, where that is not the same."""
+    once = run["balises_found"], run["balises_passed"]
+    times = run["balises_accepted"], run["balises_on_path"]
+    return say("verdicts", "of", *once), say("verdicts", "times", *times) if times != once else ""
 
 
 def _provided(run: Mapping[str, Any]) -> list[str]:

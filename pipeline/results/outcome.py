@@ -12,6 +12,8 @@ from pipeline.results.figures.head import CampaignHead, figures_beside, head_of
 from schemas.enums import RunStatus, RunVerdict
 
 BESIDE = {
+    "balises_found": pl.Int64,
+    "balises_passed": pl.Int64,
     "balises_accepted": pl.Int64,
     "balises_on_path": pl.Int64,
     "availability": pl.Float64,
@@ -49,6 +51,8 @@ class RunOutcome:
     faults: tuple[str, ...] = ()
     proof: str = ""
     log: str = ""
+    balises_found: int | None = None
+    balises_passed: int | None = None
     balises_accepted: int | None = None
     balises_on_path: int | None = None
     availability: float | None = None

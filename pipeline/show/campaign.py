@@ -13,7 +13,7 @@ from pipeline.results.outcome import CampaignSummary, RunOutcome
 from pipeline.show.terminal import duration_text
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
-from schemas.words import beside_words, remedy_words
+from schemas.words import accepted_words, beside_words, remedy_words, say
 
 _WORST_FIRST = {"unsafe": 0, "failed": 1, "unproven": 2, "safe": 3}
 
@@ -59,8 +59,8 @@ def _beside(outcome: RunOutcome) -> tuple[str, str, str]:
     """Balises accepted of those on the path, availability, proof margin."""
     if outcome.verdict is None:
         return "-", "-", "-"
-    accepted = f"{outcome.balises_accepted} of {outcome.balises_on_path}"
-    available = "-" if outcome.availability is None else f"{outcome.availability:.0%}"
+    accepted = "".join(accepted_words(vars(outcome)))
+    available = say("verdicts", "not_known") if outcome.availability is None else f"{outcome.availability:.0%}"
     return accepted, available, "-" if outcome.proof_margin_m is None else f"{outcome.proof_margin_m:.1f} m"
 
 
@@ -111,6 +111,8 @@ def outcome_rows(summary: CampaignSummary) -> pl.DataFrame:
         "skipped": pl.Boolean,
         "attempts": pl.Int64,
         "error": pl.String,
+        "balises_found": pl.Int64,
+        "balises_passed": pl.Int64,
         "balises_accepted": pl.Int64,
         "balises_on_path": pl.Int64,
         "availability": pl.Float64,

@@ -33,7 +33,7 @@ STARTING_CONFIG = "Configuration to begin with"
 _RUN_COLUMNS = (
     *("verdict", "run_id", "solution", "reasons", "part_verdict", "proof_margin_m", "remedies", "status"),
     *("duration_s", "distance_m", "gnss_rate_hz", "availability", "lost_to", "lost_to_share", "lost_to_monitor"),
-    *("evidence", "vehicle", "share_unknown", "balises_on_path", "balises_accepted", "unsafe_accepted"),
+    *("evidence", "vehicle", "share_unknown", "balises_passed", "balises_found", "unsafe_accepted"),
     *("unproven_accepted", "failures", "failures_within_budget", *HAZARD_COUNTS, "missed_detections"),
     *("alarms", "false_alarms", "error"),
 )

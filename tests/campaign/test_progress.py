@@ -199,16 +199,25 @@ def test_each_remedy_stands_once_with_its_command_and_the_worst_run() -> None:
 
 
 def test_what_stands_beside_a_verdict_in_the_ending() -> None:
-    figures = {"balises_accepted": 28, "balises_on_path": 31, "availability": 0.964, "proof_margin_m": 11.26}
+    once = {"balises_found": 28, "balises_passed": 31}
+    figures = {**once, "balises_accepted": 28, "balises_on_path": 31, "availability": 0.964, "proof_margin_m": 11.26}
     safe = replace(OK, **figures, moving_s=900.0)
-    poor = replace(OLD, balises_accepted=2, balises_on_path=9, availability=0.0, moving_s=100.0, lost="100% alarms")
+    twice = {"balises_found": 2, "balises_passed": 9, "balises_accepted": 4, "balises_on_path": 18}
+    poor = replace(OLD, **twice, availability=0.0, moving_s=100.0, lost="100% alarms")
     rows = campaign.ending_rows(CampaignSummary(2, (safe, BAD), 1.0))
     columns = ("verdict", "accepted", "available", "margin")
     assert rows.select(columns).rows() == [("failed", "-", "-", "-"), ("safe", "28 of 31", "96%", "11.3 m")]
     poor_row = campaign.ending_rows(CampaignSummary(1, (poor,), 1.0)).row(0, named=True)
-    assert (poor_row["accepted"], poor_row["margin"], poor_row["why"]) == ("2 of 9", "-", "lost to 100% alarms")
+    assert (poor_row["accepted"], poor_row["margin"], poor_row["why"]) == (
+        "2 of 9 (4 times in 18 passages)",
+        "-",
+        "lost to 100% alarms",
+    )
     line = campaign.summary_line(CampaignSummary(3, (safe, poor, BAD), 1.0))
-    assert "; 30 of 40 balises accepted, available for 87% of the moving time, proof margin 11.3 m; 3 of 3 runs" in line
+    assert (
+        "; 30 of 40 balises accepted (32 times in 49 passages), available for 87% of the moving time, proof margin 11.3 m; 3 of 3 runs"
+        in line
+    )
     # What a safe verdict rests on by declaration alone stands beside it; other verdicts need no such words.
     declared = [replace(one, odometer_origin="wheel") for one in (safe, poor)]
     lines = [campaign.summary_line(CampaignSummary(1, (one,), 1.0)) for one in declared]

@@ -27,7 +27,9 @@ _KEYS: dict[str, tuple[str, ...]] = {
 # How a result was made is shown, but is no change of the result.
 _PROVENANCE = ("config_digest", "input_digest", "software", "contract")
 BALISE_COUNTS = {
-    "balises_on_path": "on the path",
+    "balises_passed": "passed",
+    "balises_found": "found",
+    "balises_on_path": "passages",
     "balises_accepted": "accepted",
     "balises_rejected": "rejected",
     "balises_missed": "not found",

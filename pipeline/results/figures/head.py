@@ -68,7 +68,7 @@ def figures_beside(runs: pl.DataFrame) -> Mapping[str, Any]:
     weight_s = pl.col("moving_s").filter(pl.col("availability").is_not_null()).sum()
     available = (pl.col("availability") * pl.col("moving_s")).sum() / weight_s
     figures = runs.select(
-        pl.col("balises_accepted", "balises_on_path").sum(),
+        pl.col("balises_found", "balises_passed", "balises_accepted", "balises_on_path").sum(),
         pl.col("proof_margin_m").min(),
         availability=pl.when(weight_s > 0.0).then(available),
     )
