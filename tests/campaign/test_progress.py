@@ -214,10 +214,8 @@ def test_what_stands_beside_a_verdict_in_the_ending() -> None:
         "lost to 100% alarms",
     )
     line = campaign.summary_line(CampaignSummary(3, (safe, poor, BAD), 1.0))
-    assert (
-        "; 30 of 40 balises accepted (32 times in 49 passages), available for 87% of the moving time, proof margin 11.3 m; 3 of 3 runs"
-        in line
-    )
+    accepted = "; 30 of 40 balises accepted (32 times in 49 passages), "
+    assert f"{accepted}available for 87% of the moving time, proof margin 11.3 m; 3 of 3 runs" in line
     # What a safe verdict rests on by declaration alone stands beside it; other verdicts need no such words.
     declared = [replace(one, odometer_origin="wheel") for one in (safe, poor)]
     lines = [campaign.summary_line(CampaignSummary(1, (one,), 1.0)) for one in declared]
