@@ -942,19 +942,34 @@ def compact(
     raise Exit(RUNS_NOT_OK if left_out else OK)
 
 
-@_command("balise diff week11 week12", "balise diff week11 week12 --detail")
+@_command(
+    "balise diff week11 week12",
+    "balise diff week11 week12 --detail",
+    "balise diff golden result --tolerance availability=0.001 --ignore runs.notes",
+    "balise diff golden result --rules diff.toml",
+)
 def diff(
     out_a: Result,
     out_b: Annotated[str, Argument(help="The result to compare it with.")],
     detail: Annotated[bool, Option("--detail", help="Also list every changed value.")] = False,
+    tolerance: Annotated[
+        list[str] | None,
+        Option(help="COLUMN=VALUE: a column (`availability`, `runs.availability`) may differ by so much, in its unit."),
+    ] = None,
+    ignore: Annotated[list[str] | None, Option(help="A column that is not compared.")] = None,
+    rules: Annotated[
+        Path | None, _file("--rules", help="TOML: `ignore = [...]`, `[tolerance]`.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Compare two results; exit status 1 if they differ."""
     from pipeline.results.diff.results import diff_results
+    from pipeline.results.diff.rules import rules_of
     from schemas.errors import visible
 
+    allowed = rules_of(tolerance or [], ignore or [], rules)
     with _telling("runs"):
-        found = diff_results(out_a, out_b)
+        found = diff_results(out_a, out_b, allowed)
     if as_json:
         _print_json(found.as_dict())
     else:
