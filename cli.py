@@ -720,7 +720,7 @@ def experiment(
 
             settings = _configuration(config)
             made = recorded_experiment(
-                runs or [], site, out, plan, vehicle, settings, seed, repetitions, solution, jobs
+                runs or [], site, out, plan, vehicle, settings, seed, repetitions, solution, jobs, _say
             )
         else:
             wanted = experiment_of(name, on_recordings=bool(runs or site or vehicle or plan))
@@ -774,7 +774,12 @@ def sql(
         _tell(as_json, answer, {"": answer})
 
 
-@_command("balise report week12 --site line9", "balise report week12 --run monday", of_project=True)
+@_command(
+    "balise report week12 --site line9",
+    "balise report week12 --run monday",
+    "balise report week12 --against week11",
+    of_project=True,
+)
 def report(
     out: ResultFolder,
     site: Annotated[str | None, Option(help="Site, for plans of the track.")] = None,
@@ -783,6 +788,9 @@ def report(
     most: Annotated[
         int, Option("--pages", min=0, help="Above so many runs, write pages of runs only with --run.")
     ] = 1000,
+    against: Annotated[
+        str | None, Option(help="Another result of the same runs: write the page of both side by side.")
+    ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
     project: OfProject = None,
@@ -792,13 +800,17 @@ def report(
     Pages of runs that have not changed since the last report are left as they are.
     """
     from pipeline.results.packs import steady
-    from pipeline.show.report import write_page, write_report
+    from pipeline.show.report import write_against, write_page, write_report
 
     ground = _ground(site, _used(out)) if site else None
+
+    def written() -> list[Path]:
+        if against is not None:
+            return [write_against(out, against)]
+        return write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
+
     with _telling("pages", quiet):
-        pages = steady(
-            lambda: write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
-        )
+        pages = steady(written)
     if as_json or not quiet:
         _tell(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
 
@@ -957,9 +969,7 @@ def diff(
         Option(help="COLUMN=VALUE: a column (`availability`, `runs.availability`) may differ by so much, in its unit."),
     ] = None,
     ignore: Annotated[list[str] | None, Option(help="A column that is not compared.")] = None,
-    rules: Annotated[
-        Path | None, _file("--rules", help="TOML: `ignore = [...]`, `[tolerance]`.")
-    ] = None,
+    rules: Annotated[Path | None, _file("--rules", help="TOML: `ignore = [...]`, `[tolerance]`.")] = None,
     as_json: Json = False,
 ) -> None:
     """Compare two results; exit status 1 if they differ."""

@@ -15,6 +15,7 @@ from pipeline.make.survey.network import SurveyNetwork, make_network
 from pipeline.make.survey.pieces import Survey
 from pipeline.make.survey.sources import read_surveys
 from pipeline.make.survey.trace import clean_traces
+from pipeline.read.site.alike import ambiguities
 from pipeline.read.site.checks import remarks
 from pipeline.read.site.describe import without_balises
 from pipeline.stages.track.survey import track_of
@@ -101,14 +102,16 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     remarked = remarks(track_of(track), network.links, balises, None, survey.declared_m, config.site)
     if remarked.breaches:
         raise SiteError(remarked.breaches[0], place=", ".join(map(str, wish.surveys)))
+    # Relations as given: what no train can run over is said, and left out, each time that the site is read.
+    site = Site(track, network.links, balises, None)
     findings = (
+        *ambiguities(site, config),
         *survey.findings,
         *doubts(network, config.survey, config.site),
         *remarked.findings,
         *without_balises(balises),
     )
-    # Relations as given: what no train can run over is said, and left out, each time that the site is read.
-    return Site(track, network.links, balises, None, findings)
+    return replace(site, findings=findings)
 
 
 def _balises(wish: Wish, network: SurveyNetwork, survey: Survey, config: Configuration) -> pl.DataFrame | None:
