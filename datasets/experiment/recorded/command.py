@@ -54,12 +54,11 @@ _SHOWN_OF_BANKS = (
 )
 _LOST_KEY = "balise.lost"
 
+_LOST = {"bank": pl.String, "cell": pl.String, "reason": pl.String}
+
 
 def _silent(text: str) -> None:
     """Nobody listens."""
-
-
-_LOST = {"bank": pl.String, "cell": pl.String, "reason": pl.String}
 
 
 @dataclass(frozen=True)
