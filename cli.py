@@ -618,6 +618,9 @@ def make_a_site(
     id_field: Annotated[
         str | None, Option("--id", help="Attribute of GeoPackage, Shapefile or GeoJSON that names the lines.")
     ] = None,
+    sigma: Annotated[
+        float | None, Option(help="Standard deviation of the survey across the track in metres, where it states none.")
+    ] = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     force: Force = False,
@@ -630,7 +633,7 @@ def make_a_site(
     from pipeline.show.report.site_page import site_page
     from schemas.enums import TravelAlong
 
-    wish = wish_of(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field)
+    wish = wish_of(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field, sigma)
     site = make_site(wish, _vehicle(vehicle), _configuration(config))
     write_made(site, site_page(out.resolve().name, site), out, force)
     elements, findings = elements_table(site), findings_table(site.findings)
@@ -717,7 +720,7 @@ def experiment(
 
             settings = _configuration(config)
             made = recorded_experiment(
-                runs or [], site, out, plan, vehicle, settings, seed, repetitions, solution, jobs
+                runs or [], site, out, plan, vehicle, settings, seed, repetitions, solution, jobs, _say
             )
         else:
             wanted = experiment_of(name, on_recordings=bool(runs or site or vehicle or plan))
@@ -771,7 +774,12 @@ def sql(
         _tell(as_json, answer, {"": answer})
 
 
-@_command("balise report week12 --site line9", "balise report week12 --run monday", of_project=True)
+@_command(
+    "balise report week12 --site line9",
+    "balise report week12 --run monday",
+    "balise report week12 --against week11",
+    of_project=True,
+)
 def report(
     out: ResultFolder,
     site: Annotated[str | None, Option(help="Site, for plans of the track.")] = None,
@@ -780,6 +788,9 @@ def report(
     most: Annotated[
         int, Option("--pages", min=0, help="Above so many runs, write pages of runs only with --run.")
     ] = 1000,
+    against: Annotated[
+        str | None, Option(help="Another result of the same runs: write the page of both side by side.")
+    ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
     project: OfProject = None,
@@ -789,13 +800,17 @@ def report(
     Pages of runs that have not changed since the last report are left as they are.
     """
     from pipeline.results.packs import steady
-    from pipeline.show.report import write_page, write_report
+    from pipeline.show.report import write_against, write_page, write_report
 
     ground = _ground(site, _used(out)) if site else None
+
+    def written() -> list[Path]:
+        if against is not None:
+            return [write_against(out, against)]
+        return write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
+
     with _telling("pages", quiet):
-        pages = steady(
-            lambda: write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
-        )
+        pages = steady(written)
     if as_json or not quiet:
         _tell(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
 
@@ -939,19 +954,32 @@ def compact(
     raise Exit(RUNS_NOT_OK if left_out else OK)
 
 
-@_command("balise diff week11 week12", "balise diff week11 week12 --detail")
+@_command(
+    "balise diff week11 week12",
+    "balise diff week11 week12 --detail",
+    "balise diff golden result --tolerance availability=0.001 --ignore runs.notes",
+    "balise diff golden result --rules diff.toml",
+)
 def diff(
     out_a: Result,
     out_b: Annotated[str, Argument(help="The result to compare it with.")],
     detail: Annotated[bool, Option("--detail", help="Also list every changed value.")] = False,
+    tolerance: Annotated[
+        list[str] | None,
+        Option(help="COLUMN=VALUE: a column (`availability`, `runs.availability`) may differ by so much, in its unit."),
+    ] = None,
+    ignore: Annotated[list[str] | None, Option(help="A column that is not compared.")] = None,
+    rules: Annotated[Path | None, _file("--rules", help="TOML: `ignore = [...]`, `[tolerance]`.")] = None,
     as_json: Json = False,
 ) -> None:
     """Compare two results; exit status 1 if they differ."""
     from pipeline.results.diff.results import diff_results
+    from pipeline.results.diff.rules import rules_of
     from schemas.errors import visible
 
+    allowed = rules_of(tolerance or [], ignore or [], rules)
     with _telling("runs"):
-        found = diff_results(out_a, out_b)
+        found = diff_results(out_a, out_b, allowed)
     if as_json:
         _print_json(found.as_dict())
     else:

@@ -13,6 +13,7 @@ from pipeline.stages.judge.judge import Judged, judge
 from pipeline.stages.matching import Match
 from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.stages.ride import Ride, ride_of
+from pipeline.stages.run_row.lost_time import lost_columns
 from pipeline.stages.run_row.notes import ride_notes
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
 from pipeline.studies.plausibility.accuracy import accuracy_checks, refuted
@@ -94,7 +95,8 @@ def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence
     ride = ride_of(prepared, solution, _with_match(beside, prepared, solution), evidence)
     unnoticed = unnoticed_of(ride)
     judged = judge(_case(ride, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
-    epochs = pl.concat([judged.epochs, ride.solution.fixes.select("satellites")], how="horizontal")
+    lost = lost_columns(judged.epochs, prepared.config)
+    epochs = pl.concat([judged.epochs, lost, ride.solution.fixes.select("satellites")], how="horizontal")
     results = _results(ride, judged, epochs, unnoticed, fit, evidence)
     tables = {
         "hazards": judged.hazards,

@@ -48,7 +48,6 @@ def campaign_runs_schema(levels: Iterable[str]) -> type[dy.Schema]:
 @lru_cache(maxsize=8)
 def _campaign_runs_schema(levels: tuple[str, ...]) -> type[dy.Schema]:
     columns: dict[str, dy.Column] = {"run_id": text("run"), **Runs.columns()}
-    columns["faults"] = count("faults in the hazard table; the rows that belong to one fault count once")
     columns |= _estimate("hazard_rate", "faults per hour in use judged by a reference or balise reads", "1/h", "_per_h")
     columns["missed"] = count("faults with a failure that no monitor found by t_failure + budget")
     columns |= _estimate("missed_share", "share of missed ones, of the faults with a failure that a truth judged")

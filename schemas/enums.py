@@ -151,7 +151,6 @@ class Remedy(StrEnum):
     READS_CLOSER = "reads_closer"
     ROUTE = "route"
     CLOCK = "clock"
-    RECORDER_LATENCY = "recorder_latency"
     ODOMETER = "odometer"
     ODOMETER_ORIGIN = "odometer_origin"
     FASTER_LOG = "faster_log"

@@ -9,6 +9,17 @@ _ALIKE = 0.6
 _SHOWN = 3
 
 
+def nearest(name: str, known: Iterable[str]) -> list[str]:
+    """The three that are most like a name, by its words and by its letters, however unlike they are."""
+
+    def unlike(item: str) -> tuple[float, str]:
+        words, others = (set(text.lower().split("_")) for text in (name, item))
+        letters = difflib.SequenceMatcher(None, name.lower(), item.lower()).ratio()
+        return -letters - len(words & others) / len(words | others), item
+
+    return sorted(known, key=unlike)[:_SHOWN]
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """` (did you mean `antenna_height_m`?)` to put behind a message; empty where nothing is alike."""
     by_lower = {item.lower(): item for item in known}

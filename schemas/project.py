@@ -16,6 +16,7 @@ from pydantic import AfterValidator, Field, model_validator
 from schemas.config import (
     Configuration,
     NonNegative,
+    Positive,
     Settings,
     StreamCorrection,
     StreamMapping,
@@ -101,7 +102,11 @@ class ConvertEntry(Settings):
 
 
 class TrackEntry(Settings):
-    """A site made of surveys (`balise site`)."""
+    """A site made of surveys (`balise site`).
+
+    `sigma_m`: standard deviation of its points across the track where they state none. `survey_complete`: it holds
+    every track that the trains may have used, as under `[evidence]` of the configuration.
+    """
 
     survey: Annotated[tuple[PathText, ...], Field(min_length=1)]
     balises: PathText | None = None
@@ -110,6 +115,8 @@ class TrackEntry(Settings):
     join_m: NonNegative | None = None
     flat: bool = False
     id_field: str | None = None
+    sigma_m: Positive | None = None
+    survey_complete: bool = False
 
 
 class CalibrateEntry(Settings):
@@ -205,6 +212,9 @@ def configuration_of(project: Project, file: Path) -> Configuration:
     # By name: the project's folder may not exist yet.
     named = None if project.config is None else Path(os.path.normpath(file.parent / project.config))
     config = load_settings(named, Configuration)
+    if project.track is not None and project.track.survey_complete:
+        complete = config.evidence.model_copy(update={"survey_complete": True})
+        config = config.model_copy(update={"evidence": complete})
     return _at_level(config, project.service_level, file)
 
 

@@ -138,10 +138,18 @@ def beside_words(run: Mapping[str, Any]) -> str:
     `run`: a `runs` row, or figures of several runs with `odometer_origins`, those of the safe ones.
     """
     share, margin_m = run["availability"], run["proof_margin_m"]
-    accepted = say("verdicts", "accepted", run["balises_accepted"], run["balises_on_path"])
+    once, times = accepted_words(run)
+    accepted = say("verdicts", "accepted", once) + times
     available = say("verdicts", "no_motion") if share is None else say("verdicts", "available", share)
     margin = [] if margin_m is None else [say("verdicts", "margin", margin_m)]
     return ", ".join([accepted, available, *margin, *_provided(run)])
+
+
+def accepted_words(run: Mapping[str, Any]) -> tuple[str, str]:
+    """`7 of 9`: balises accepted of those passed, each once; and how often, where that is not the same."""
+    once = run["balises_found"], run["balises_passed"]
+    times = run["balises_accepted"], run["balises_on_path"]
+    return say("verdicts", "of", *once), say("verdicts", "times", *times) if times != once else ""
 
 
 def _provided(run: Mapping[str, Any]) -> list[str]:
@@ -163,13 +171,16 @@ def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) 
     )
 
 
-def remedy_words(remedy: Remedy | str, **places: str) -> str:
-    """What would mend it, and how; `places`: paths known where it is shown, with `project` the keys of that file in
-    place of a command. Without any, in words for readers inside and outside a project.
+def remedy_words(remedy: Remedy | str, gain: float = 0.0, **places: str) -> str:
+    """What would mend it, how, and which share of the moving time that would win back or prove at most.
+
+    `places`: paths known where it is shown, with `project` the keys of that file in place of a command. Without any, in
+    words for readers inside and outside a project.
     """
     section = "remedies_of_project" if "project" in places else "remedies_by_command" if places else "remedies_anywhere"
     how = WORDS[section].get(Remedy(remedy).value, "")
-    plain = ("options", "of_project", "again")
+    plain = ("options", "of_project", "again", "how_sigma", "how_complete")
     named = {"run": "RUN", "site": "the site", "out": "OUT", "options": ""}
     named |= {name: text if name in plain else shlex.quote(text) for name, text in places.items()}
-    return REMEDIES[Remedy(remedy)].format(how=how.format(**named), **named)
+    won = say("remedies", "gain", gain) if gain >= _LEAST_SHARE else ""
+    return REMEDIES[Remedy(remedy)].format(how=how.format(**named), **named) + won

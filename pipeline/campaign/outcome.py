@@ -126,7 +126,8 @@ def _beside(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[
     if verdict is None:
         return {}
     row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
-    figures = {name: row[name] for name in BESIDE} | {"remedies": tuple(row["remedies"] or ())}
+    figures = {name: row[name] for name in BESIDE}
+    figures |= {name: tuple(row[name] or ()) for name in ("remedies", "remedies_gain")}
     available = row["availability"]
     if available is None or available >= low:
         return figures

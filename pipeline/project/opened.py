@@ -13,6 +13,7 @@ from pipeline.storage.address import is_url
 from schemas.config import Configuration, Settings, Vehicle, load_settings, read_toml
 from schemas.errors import UsageError
 from schemas.project import FILE_NAME, NO_VEHICLE, Project, configuration_of, is_project, load_project
+from schemas.words import say
 
 MEASURED_VEHICLE = "vehicle_measured.toml"
 MEASURED_CONFIG = "config_measured.toml"
@@ -47,14 +48,23 @@ class Opened:
     def words(self) -> dict[str, str]:
         """What sentences on a project name: its file, the option where it is not that of the working directory."""
         option = "" if self.file == Path(FILE_NAME) else f" --project {self.folder}"
-        return {"project": str(self.file), "of_project": option, "again": f"balise run{option}"}
+        made = "made" if self.project.track is not None else "given"
+        places = {"project": self.file, "site": self.project.site}
+        return {
+            "project": str(self.file),
+            "of_project": option,
+            "again": f"balise run{option}",
+            "how_sigma": say("survey_of_project", f"sigma_of_{made}", **places),
+            "how_complete": say("survey_of_project", f"complete_of_{made}", **places),
+        }
 
     @property
     def config_file(self) -> Path | None:
         """What stands for `--config`: the project itself where it changes the configuration."""
         if self.project.calibrate is not None and self.project.calibrate.monitors:
             return self.folder / RECORD / MEASURED_CONFIG
-        return self.file if self.project.service_level else self.path(self.project.config)
+        changed = self.project.service_level or (self.project.track and self.project.track.survey_complete)
+        return self.file if changed else self.path(self.project.config)
 
     @property
     def vehicle_file(self) -> Path | None:

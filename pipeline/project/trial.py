@@ -23,6 +23,7 @@ from pipeline.project.run import wish_for
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected_further
 from pipeline.read.ingest.parts import LogPart, lines_of_parts
+from pipeline.read.site.alike import ambiguities, told_in_short
 from pipeline.read.site.read import read_site
 from pipeline.storage.files import require_regular
 from pipeline.studies.plausibility.check import CONFIGURATION, FitState
@@ -104,6 +105,9 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     drafted.remarks += _without_odometer(rides)
     drafted.remarks += [note for ride in rides for note in _notes_of(ride)]
     site = _site(base)
+    if site is not None:
+        listed = "`balise inspect` of the site lists them"
+        drafted.remarks += told_in_short(ambiguities(site, base.given_config()), listed)
     entries = []
     ready = []
     of_odometers: dict[str, Sequence[str]] = {}

@@ -12,11 +12,13 @@ from pipeline.results.figures.head import CampaignHead, figures_beside, head_of
 from schemas.enums import RunStatus, RunVerdict
 
 BESIDE = {
+    "balises_found": pl.Int64,
+    "balises_passed": pl.Int64,
     "balises_accepted": pl.Int64,
     "balises_on_path": pl.Int64,
     "availability": pl.Float64,
     "proof_margin_m": pl.Float64,
-    "held_s": pl.Float64,
+    "moving_s": pl.Float64,
     "odometer_origin": pl.String,
 }
 """Figures of a run that stand beside its verdict."""
@@ -31,7 +33,7 @@ class RunOutcome:
     `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
     over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
     `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved. `log`: what was
-    replayed. The figures beside the verdict, `remedies` and `lost` are of the solution that heads the run;
+    replayed. The figures beside the verdict, `remedies`, their gains and `lost` are of the solution that heads the run;
     `lost`: what the moving time of a run of low availability was lost to.
     """
 
@@ -49,13 +51,16 @@ class RunOutcome:
     faults: tuple[str, ...] = ()
     proof: str = ""
     log: str = ""
+    balises_found: int | None = None
+    balises_passed: int | None = None
     balises_accepted: int | None = None
     balises_on_path: int | None = None
     availability: float | None = None
     proof_margin_m: float | None = None
-    held_s: float | None = None
+    moving_s: float | None = None
     odometer_origin: str | None = None
     remedies: tuple[str, ...] = ()
+    remedies_gain: tuple[float, ...] = ()
     lost: str = ""
 
     @property
@@ -77,7 +82,11 @@ class CampaignSummary:
     def beside(self) -> dict[str, Any]:
         """The figures beside the verdict over all runs that have one; nothing where none has."""
         names = {**BESIDE, "verdict": pl.String}
-        rows = [{name: getattr(outcome, name) for name in names} for outcome in self.outcomes if outcome.held_s]
+        rows = [
+            {name: getattr(outcome, name) for name in names}
+            for outcome in self.outcomes
+            if outcome.moving_s is not None
+        ]
         return dict(figures_beside(pl.DataFrame(rows, schema=names))) if rows else {}
 
     def count(self, status: RunStatus) -> int:

@@ -15,14 +15,14 @@ import dataframely as dy
 import polars as pl
 
 from pipeline import storage
-from pipeline.results import packs, store
+from pipeline.results import packs, store, views
 from pipeline.results.source import source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, join
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.dictionary import dictionary_frame
 from schemas.errors import UsageError
-from schemas.near import did_you_mean
+from schemas.near import nearest
 from schemas.tables import TABLES
 
 # What may stand before the words that a query begins with, one piece at a time: in one expression it takes for ever.
@@ -35,7 +35,11 @@ _SHOW = re.compile(r"\s*show\s+tables\s*;?\s*", re.IGNORECASE)
 _DESCRIBE = re.compile(r"\s*(?:describe|desc)\s+(?:table\s+)?[\"`]?(\w+)[\"`]?\s*;?\s*", re.IGNORECASE)
 _NAMED = re.compile(r"[A-Za-z]\w*=.+")
 
-_EXPECTED = "a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES])
+_NO_COLUMN = re.compile(r"(?:unable to find column|no column named) [\"'](\w+)[\"']")
+_NO_TABLE = re.compile(r"relation '(\w+)' was not found")
+
+_KNOWN = (*TABLES, *CAMPAIGN_TABLES)
+_EXPECTED = "a SELECT over " + ", ".join(_KNOWN)
 _REMEDY = "SHOW TABLES and DESCRIBE table list what there is."
 
 
@@ -44,8 +48,8 @@ def run_sql(
 ) -> pl.DataFrame:
     """The answer to one SELECT, SHOW TABLES or DESCRIBE over the complete runs of a result.
 
-    Tables: `hazards`, `passages`, `alarms`, `epochs`, `runs`, each with `run_id`, and those of the
-    campaign where they are written. A condition on `run_id` reads the files of these runs only.
+    Tables: `hazards`, `passages`, `alarms`, `epochs`, `runs`, each with `run_id`, those of the campaign where they are
+    written, and the views of `views.toml`. A condition on `run_id` reads the files of these runs only.
     `others`: more results by name; `{"old": OUT}` adds the tables `old_runs`, `old_hazards` and so on.
     `allow_files`: the query may also read other files of this machine (`read_csv` and its like).
     """
@@ -58,19 +62,45 @@ def _answered(out: Address, sql: str, allow_files: bool, others: Mapping[str, Ad
     if described := _DESCRIBE.fullmatch(sql):
         return _columns_of(described[1], others)
     _check_query(sql, allow_files)
-    tables = _tables(out, sql)
-    for name, address in others.items():
-        tables |= _tables(address, sql, f"{name}_")
+    asked = [view for view in views.asked(sql) if not view.needs or view.needs in others]
+    # What a view asks is asked too.
+    whole = "\n".join([sql, *(view.sql for view in asked)])
+    tables = _tables(out, whole)
     try:
-        return pl.SQLContext(tables).execute(sql).collect()
+        for name, address in others.items():
+            tables |= _tables_of_other(address, whole, f"{name}_")
+        frames = tables | views.answered(asked, tables)
+        return pl.SQLContext(frames).execute(sql).collect()
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, RecursionError) as error:
         message = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise UsageError(
-            f"cannot be answered: {message}",
-            place="SQL",
-            expected=_EXPECTED,
-            remedy=_REMEDY,
-        ) from None
+        raise _unanswered(message, tables, others) from None
+
+
+def _tables_of_other(out: Address, sql: str, prefix: str) -> dict[str, pl.LazyFrame]:
+    """The tables and views of a second result that a query names, under its name."""
+    asked = views.asked(sql, prefix)
+    own = "\n".join([*(name for name in _KNOWN if views.names(sql, f"{prefix}{name}")), *(view.sql for view in asked)])
+    tables = _tables(out, own)
+    return {f"{prefix}{name}": frame for name, frame in (tables | views.answered(asked, tables)).items()}
+
+
+def _unanswered(message: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> UsageError:
+    """Why a query has no answer; of a name that does not exist the three nearest."""
+    if unknown := _NO_COLUMN.search(message):
+        known = {name for frame in tables.values() for name in frame.collect_schema().names()}
+        kind = "column"
+    elif unknown := _NO_TABLE.search(message):
+        view = views.views().get(unknown[1].lower())
+        if view is not None and view.needs:
+            remedy = f"`--with {view.needs}=OUT_OLD` names the other one."
+            return UsageError("compares two results", place=f"view `{view.name}`", remedy=remedy)
+        known = {*_contracts(others), *views.views()}
+        kind = "table"
+    else:
+        return UsageError(f"cannot be answered: {message}", place="SQL", expected=_EXPECTED, remedy=_REMEDY)
+    near = " or ".join(f"`{name}`" for name in nearest(unknown[1], known))
+    text = f"there is no {kind} {unknown[1]} (did you mean {near}?)"
+    return UsageError(text, place="SQL", expected=_EXPECTED, remedy=_REMEDY)
 
 
 def named_results(given: Iterable[str]) -> dict[str, str]:
@@ -104,17 +134,15 @@ def _check_query(sql: str, allow_files: bool) -> None:
         )
 
 
-def _tables(out: Address, sql: str, prefix: str = "") -> dict[str, pl.LazyFrame]:
+def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
     """What the query may name: ten thousand addresses take their time, remote tables their transfer."""
     store.complete_runs(out)
 
-    def named(names: Iterable[str]) -> list[str]:
-        return [name for name in names if re.search(rf"\b{prefix}{name}\b", sql, re.IGNORECASE)]
+    def named(known: Iterable[str]) -> list[str]:
+        return [name for name in known if views.names(sql, name)]
 
-    tables = {name: store.read_table(out, name) for name in named(TABLES)} | _campaign_tables(
-        out, named(CAMPAIGN_TABLES)
-    )
-    return {f"{prefix}{name}": frame for name, frame in tables.items()}
+    own = {name: store.read_table(out, name) for name in named(TABLES)}
+    return own | _campaign_tables(out, named(CAMPAIGN_TABLES))
 
 
 def _contracts(others: Iterable[str]) -> dict[str, tuple[str, type[dy.Schema]]]:
@@ -130,16 +158,18 @@ def _tables_there_are(others: Iterable[str]) -> pl.DataFrame:
         (name, len(kind.columns()), " ".join((kind.__doc__ or "").split()))
         for name, (_, kind) in _contracts(others).items()
     ]
+    rows += [(view.name, len(view.columns), view.meaning) for view in views.views().values()]
     return pl.DataFrame(rows, schema={"table": pl.String, "columns": pl.Int64, "meaning": pl.String}, orient="row")
 
 
 def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
+    if (view := views.views().get(table.lower())) is not None:
+        return pl.DataFrame(view.columns, schema=["column", "unit", "meaning"], orient="row")
     known = _contracts(others)
     contract = known.get(table.lower())
     if contract is None:
-        raise UsageError(
-            f"is not a table{did_you_mean(table, known)}", place=table, expected=", ".join(known), remedy=_REMEDY
-        )
+        near = " or ".join(f"`{name}`" for name in nearest(table, [*known, *views.views()]))
+        raise UsageError(f"is not a table (did you mean {near}?)", place=table, expected=_EXPECTED, remedy=_REMEDY)
     columns = dictionary_frame(contract[0]).drop("group", "table")
     if contract[0] not in TABLES:
         return columns

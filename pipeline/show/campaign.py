@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Sequence
 
 import polars as pl
@@ -11,7 +13,7 @@ from pipeline.results.outcome import CampaignSummary, RunOutcome
 from pipeline.show.terminal import duration_text
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
-from schemas.words import beside_words, remedy_words
+from schemas.words import accepted_words, beside_words, remedy_words, say
 
 _WORST_FIRST = {"unsafe": 0, "failed": 1, "unproven": 2, "safe": 3}
 
@@ -57,24 +59,28 @@ def _beside(outcome: RunOutcome) -> tuple[str, str, str]:
     """Balises accepted of those on the path, availability, proof margin."""
     if outcome.verdict is None:
         return "-", "-", "-"
-    accepted = f"{outcome.balises_accepted} of {outcome.balises_on_path}"
-    available = "-" if outcome.availability is None else f"{outcome.availability:.0%}"
+    accepted = "".join(accepted_words(vars(outcome)))
+    available = say("verdicts", "not_known") if outcome.availability is None else f"{outcome.availability:.0%}"
     return accepted, available, "-" if outcome.proof_margin_m is None else f"{outcome.proof_margin_m:.1f} m"
 
 
 def remedy_lines(summary: CampaignSummary, **places: str) -> list[str]:
-    """Per remedy how many runs it would mend, and the command for the worst of them; the most frequent first.
+    """Per remedy how many runs it would mend, and the command for the worst of them; what gains most time first.
 
     `places`: paths as the user named them.
     """
     ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
     mended: dict[str, list[RunOutcome]] = {}
+    won_s: dict[str, float] = defaultdict(float)
     for outcome in ranked:
-        for remedy in outcome.remedies:
+        for remedy, gain in zip(outcome.remedies, outcome.remedies_gain, strict=True):
             mended.setdefault(remedy, []).append(outcome)
-    order = sorted(mended, key=lambda remedy: -len(mended[remedy]))
+            won_s[remedy] += gain * (outcome.moving_s or 0.0)
+    whole_s = sum(outcome.moving_s or 0.0 for outcome in ranked) or math.inf
+    order = sorted(mended, key=lambda remedy: (-won_s[remedy], -len(mended[remedy])))
     return [
-        f"{len(runs)} of {len(ranked)} runs: {remedy_words(remedy, **places | {'run': runs[0].log})}"
+        f"{len(runs)} of {len(ranked)} runs: "
+        + remedy_words(remedy, won_s[remedy] / whole_s, **places | {"run": runs[0].log})
         for remedy, runs in ((remedy, mended[remedy]) for remedy in order)
     ]
 
@@ -105,6 +111,8 @@ def outcome_rows(summary: CampaignSummary) -> pl.DataFrame:
         "skipped": pl.Boolean,
         "attempts": pl.Int64,
         "error": pl.String,
+        "balises_found": pl.Int64,
+        "balises_passed": pl.Int64,
         "balises_accepted": pl.Int64,
         "balises_on_path": pl.Int64,
         "availability": pl.Float64,

@@ -33,7 +33,7 @@ STARTING_CONFIG = "Configuration to begin with"
 _RUN_COLUMNS = (
     *("verdict", "run_id", "solution", "reasons", "part_verdict", "proof_margin_m", "remedies", "status"),
     *("duration_s", "distance_m", "gnss_rate_hz", "availability", "lost_to", "lost_to_share", "lost_to_monitor"),
-    *("evidence", "vehicle", "share_unknown", "balises_on_path", "balises_accepted", "unsafe_accepted"),
+    *("evidence", "vehicle", "share_unknown", "balises_passed", "balises_found", "unsafe_accepted"),
     *("unproven_accepted", "failures", "failures_within_budget", *HAZARD_COUNTS, "missed_detections"),
     *("alarms", "false_alarms", "error"),
 )
@@ -155,15 +155,14 @@ def inspect_site(
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
     # What they need takes long to load, and a log needs none of it.
-    from pipeline.read.site.alike import parallel_findings, window_findings
+    from pipeline.read.site.alike import ambiguities
     from pipeline.read.site.describe import describe_site, elements_table, without_balises
     from pipeline.read.site.neighbours import neighbours
     from pipeline.read.site.survey_findings import survey_findings
 
     config = config or Configuration()
     site = read_site(path, config.site)
-    alike = (*window_findings(site, config.lds, config.site), *parallel_findings(site, config))
-    findings = (*site.findings, *without_balises(site.balises), *alike)
+    findings = (*ambiguities(site, config), *site.findings, *without_balises(site.balises))
     tables = {
         "Site": _figures(describe_site(site)),
         "Elements": elements_table(site),

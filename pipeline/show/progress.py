@@ -152,7 +152,15 @@ class JsonWatch(LineWatch):
     def counted(self, outcome: RunOutcome) -> None:
         names = (
             *("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections"),
-            *("balises_accepted", "balises_on_path", "availability", "proof_margin_m", "remedies"),
+            *(
+                "balises_found",
+                "balises_passed",
+                "balises_accepted",
+                "balises_on_path",
+                "availability",
+                "proof_margin_m",
+                "remedies",
+            ),
         )
         fields = {"verdict": word_of(outcome.verdict), **{name: getattr(outcome, name) for name in names}}
         self._say("run", **fields | {"seconds": round(outcome.seconds, 3)} | self.figures())

@@ -181,32 +181,41 @@ def test_json_on_both_streams(
 
 def test_each_remedy_stands_once_with_its_command_and_the_worst_run() -> None:
     runs = [
-        replace(OK, run_id="b", log="logs/b.mcap", remedies=("route",)),
-        replace(OLD, run_id="a", log="logs/a.mcap", remedies=("vehicle_file", "route")),
+        replace(OK, run_id="b", log="logs/b.mcap", remedies=("route",), remedies_gain=(0.1,), moving_s=100.0),
+        replace(OLD, run_id="a", log="logs/a.mcap", remedies=("vehicle_file", "route"), remedies_gain=(0.2, 0.15)),
     ]
+    runs[1] = replace(runs[1], moving_s=300.0)
     lines = campaign.remedy_lines(
         CampaignSummary(2, tuple(runs), 1.0), site="line9", out="week", options=" --config c.toml"
     )
     assert lines == [
+        "1 of 2 runs: calibrate the odometer on two or more other fault-free runs of this vehicle: "
+        "`balise replay logs/a.mcap --site line9 --out week --config c.toml --calibrate 'OTHER_RUNS/*'`"
+        "; would win back or prove up to 15% of the moving time",
         "2 of 2 runs: give the route that the train took: "
         "`balise replay logs/a.mcap --site line9 --out week --config c.toml --route ROUTES` "
-        "(--write-route ROUTES writes what was found)",
-        "1 of 2 runs: calibrate the odometer on two or more other fault-free runs of this vehicle: "
-        "`balise replay logs/a.mcap --site line9 --out week --config c.toml --calibrate 'OTHER_RUNS/*'`",
+        "(--write-route ROUTES writes what was found); would win back or prove up to 14% of the moving time",
     ]
 
 
 def test_what_stands_beside_a_verdict_in_the_ending() -> None:
-    figures = {"balises_accepted": 28, "balises_on_path": 31, "availability": 0.964, "proof_margin_m": 11.26}
-    safe = replace(OK, **figures, held_s=900.0)
-    poor = replace(OLD, balises_accepted=2, balises_on_path=9, availability=0.0, held_s=100.0, lost="100% alarms")
+    once = {"balises_found": 28, "balises_passed": 31}
+    figures = {**once, "balises_accepted": 28, "balises_on_path": 31, "availability": 0.964, "proof_margin_m": 11.26}
+    safe = replace(OK, **figures, moving_s=900.0)
+    twice = {"balises_found": 2, "balises_passed": 9, "balises_accepted": 4, "balises_on_path": 18}
+    poor = replace(OLD, **twice, availability=0.0, moving_s=100.0, lost="100% alarms")
     rows = campaign.ending_rows(CampaignSummary(2, (safe, BAD), 1.0))
     columns = ("verdict", "accepted", "available", "margin")
     assert rows.select(columns).rows() == [("failed", "-", "-", "-"), ("safe", "28 of 31", "96%", "11.3 m")]
     poor_row = campaign.ending_rows(CampaignSummary(1, (poor,), 1.0)).row(0, named=True)
-    assert (poor_row["accepted"], poor_row["margin"], poor_row["why"]) == ("2 of 9", "-", "lost to 100% alarms")
+    assert (poor_row["accepted"], poor_row["margin"], poor_row["why"]) == (
+        "2 of 9 (4 times in 18 passages)",
+        "-",
+        "lost to 100% alarms",
+    )
     line = campaign.summary_line(CampaignSummary(3, (safe, poor, BAD), 1.0))
-    assert "; 30 of 40 balises accepted, available for 87% of the moving time, proof margin 11.3 m; 3 of 3 runs" in line
+    accepted = "; 30 of 40 balises accepted (32 times in 49 passages), "
+    assert f"{accepted}available for 87% of the moving time, proof margin 11.3 m; 3 of 3 runs" in line
     # What a safe verdict rests on by declaration alone stands beside it; other verdicts need no such words.
     declared = [replace(one, odometer_origin="wheel") for one in (safe, poor)]
     lines = [campaign.summary_line(CampaignSummary(1, (one,), 1.0)) for one in declared]

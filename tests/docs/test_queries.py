@@ -10,11 +10,13 @@ from typing import Any
 import polars as pl
 import pytest
 
+from pipeline.results import views
 from pipeline.results.query import run_sql
 from tests.docs.blocks import ROOT, Block, blocks
 
 PAGE = blocks(ROOT / "docs" / "analyst.md")
 PREAMBLE = next(block.text for block in PAGE if block.language == "python")
+VIEW_OF_FILES = next(block.text for block in PAGE if block.text.startswith("CREATE VIEW"))
 PAIRS = [
     (sql, python) for sql, python in itertools.pairwise(PAGE) if (sql.language, python.language) == ("sql", "python")
 ]
@@ -40,15 +42,55 @@ def test_sql_and_polars_agree(sql: Block, python: Block, asked: Path, monkeypatc
 def test_duckdb_gives_the_same(sql: Block, asked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     duckdb = pytest.importorskip("duckdb", reason="DuckDB is not installed")
     monkeypatch.chdir(asked)
-    view = next(block.text for block in PAGE if block.text.startswith("CREATE VIEW"))
     with duckdb.connect() as connection:
         for name in ("hazards", "passages", "alarms", "epochs", "runs"):
-            connection.execute(view.replace("hazards", name))
+            connection.execute(VIEW_OF_FILES.replace("hazards", name))
         connection.execute("CREATE VIEW campaign_runs AS SELECT * FROM 'OUT/campaign/runs.parquet'")
         found = pl.from_arrow(connection.sql(sql.text).to_arrow_table())
     told = run_sql("OUT", sql.text)
     assert told.columns == found.columns
     assert_same_rows(found, told)
+
+
+VIEWS = [view for view in views.views().values() if not view.needs]
+
+
+def test_duckdb_answers_the_views_alike(asked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    duckdb = pytest.importorskip("duckdb", reason="DuckDB is not installed")
+    monkeypatch.chdir(asked)
+    with duckdb.connect() as connection:
+        for name in ("hazards", "passages", "alarms", "epochs", "runs"):
+            connection.execute(VIEW_OF_FILES.replace("hazards", name))
+        for view in VIEWS:
+            connection.execute(f"CREATE VIEW {view.name} AS {view.sql}")
+            found = pl.from_arrow(connection.sql(f"SELECT * FROM {view.name}").to_arrow_table())
+            told = run_sql("OUT", f"SELECT * FROM {view.name}")
+            assert told.height > 0, view.name
+            assert told.columns == found.columns
+            of_runs = [name for name in told.columns if name == "run_ids"]
+            assert_same_rows(*(frame.with_columns(pl.col(of_runs).list.sort()) for frame in (found, told)))
+
+
+def test_by_epochs_and_by_runs_availability_is_the_same(asked: Path) -> None:
+    by_epochs = (
+        "SELECT run_id, solution, 1 - SUM(lost_s) / SUM(moving_s) AS share FROM stretches GROUP BY run_id, solution"
+    )
+    of_runs = "SELECT run_id, solution, availability FROM runs WHERE availability IS NOT NULL"
+    shares, told = (
+        {(run, solution): share for run, solution, share in run_sql(asked / "OUT", sql).rows()}
+        for sql in (by_epochs, of_runs)
+    )
+    assert len(told) > 5
+    assert {run: shares[run] for run in told} == pytest.approx(told)
+
+
+def test_there_are_ten_questions_on_views() -> None:
+    asked_of_views = [
+        block.text for block in PAGE if block.heading.startswith("Ten questions") and "balise sql" in block.text
+    ]
+    lines = [line for text in asked_of_views for line in text.splitlines() if "balise sql" in line]
+    assert len(lines) == 10
+    assert all(any(views.names(line, name) for name in views.views()) for line in lines)
 
 
 def test_hardly_a_query_is_empty(asked: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import timedelta
+from html.parser import HTMLParser
 from pathlib import Path
 
 import polars as pl
@@ -21,6 +22,8 @@ from pipeline import replay
 from pipeline.read.ingest import read_run
 from pipeline.read.site.read import read_site
 from pipeline.results.diff import compare_tables
+from pipeline.results.store import write_run
+from pipeline.show.report import write_report
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, Hazard, NotEvaluated, PassageStatus
 from schemas.inputs import BaliseReads
@@ -209,3 +212,93 @@ def test_each_column_is_filled_and_varies_somewhere(replayed: dict[str, RunTable
         alone = {column.name for column in whole if len({str(value) for value in column.drop_nulls()}) < 2}
         assert alone <= set(ALONE[name]), f"{name}: {sorted(alone - set(ALONE[name]))} hold one value, or none"
         assert set(ALONE[name]) <= set(whole.columns)
+
+
+class Page(HTMLParser):
+    """Tiles and pairs by name, and rows of the tables by id."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.values: dict[str, list[str]] = {}
+        self.tables: dict[str, list[list[str]]] = {}
+        self.text = ""
+        self._table = ""
+        self._name = ""
+        self._tag = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "table":
+            self._table = dict(attrs).get("id") or ""
+        if tag == "tr":
+            self.tables.setdefault(self._table, []).append([])
+        if tag in ("td", "th"):
+            self.tables[self._table][-1].append("")
+        if tag == "dt":
+            self._name = ""
+        if tag == "dd":
+            self.values.setdefault(self._name, []).append("")
+        if tag in ("td", "th", "dt", "dd", "script", "style"):
+            self._tag = tag
+
+    def handle_endtag(self, tag: str) -> None:
+        self._tag = "" if tag == self._tag else self._tag
+
+    def handle_data(self, data: str) -> None:
+        if self._tag in ("td", "th"):
+            self.tables[self._table][-1][-1] += data
+        elif self._tag == "dt":
+            self._name += data
+        elif self._tag == "dd":
+            self.values[self._name][-1] += data
+        elif not self._tag:
+            self.text += data
+
+
+def recounted(tables: RunTables) -> dict[str, str]:
+    """The figures of a page of one solution, row by row from its tables."""
+    met = [row for row in tables.passages.iter_rows(named=True) if row["kind"] == "virtual"]
+    beyond = [row for row in met if row["t_true"] is None and row["judgement"] == "wrong"]
+    passed = [row for row in met if row not in beyond]
+    accepted = [row for row in met if row["status"] == "accepted"]
+    found = {row["balise_id"] for row in passed if row["status"] == "accepted"}
+    begins = {
+        row["t_onset"] or row["t_hazard"] for row in tables.hazards.iter_rows(named=True) if row["caused_by"] is None
+    }
+    moving_s, lost_s = (sum(tables.epochs[name].to_list()) for name in ("moving_s", "lost_s"))
+    times = f" ({len(accepted)} times in {len(passed)} passages)"
+    once = (len(found), len({row["balise_id"] for row in passed}))
+    judged = tables.runs["evidence"][0] is not None
+    return {
+        "accepted at a wrong place": "–" if not judged else str(sum(row["judgement"] == "wrong" for row in accepted)),
+        "accepted, could not be checked": str(sum(row["judgement"] not in ("right", "wrong") for row in accepted)),
+        "of moving time with a valid TVB": f"{1.0 - lost_s / moving_s:.1%}",
+        "balises": f"{once[0]} of {once[1]} balises accepted" + (times if once != (len(accepted), len(passed)) else ""),
+        "faults": str(len(begins)),
+    }
+
+
+def test_every_figure_of_ten_pages_is_that_of_the_tables(replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    one_solution = {run: tables for run, tables in replayed.items() if tables.runs.height == 1}
+    ten = dict(list(one_solution.items())[:10])
+    assert len(ten) == 10
+    for tables in ten.values():
+        write_run(tables, tmp_path, {"software": "test"})
+    write_report(tmp_path)
+    listed = Page((tmp_path / "report" / "index.html").read_text(encoding="utf-8")).tables["table-runs"]
+    heads, rows = listed[0], {row[1]: row for row in listed[1:]}
+    for run, tables in ten.items():
+        page = Page((tmp_path / "report" / "runs" / f"{run}.html").read_text(encoding="utf-8"))
+        counted = recounted(tables)
+        told = {name: page.values[name][0] for name in counted if name in page.values}
+        assert told == {name: value for name, value in counted.items() if name in page.values}
+        assert set(counted) - set(told) == {"balises", "faults"}
+        assert counted["balises"] in page.text
+        figures = {row[0]: row[1] for row in page.tables["table-all-s0"]}
+        assert figures["faults"] == counted["faults"] or tables.runs["evidence"][0] is None
+        for name, frame in (("hazards", tables.hazards), ("alarms", tables.alarms), ("passages", tables.passages)):
+            shown = page.tables.get(f"table-{name}-s0", [[]])
+            assert len(shown) - 1 == frame.height, f"{run}: {name}"
+        of_campaign = dict(zip(heads, rows[run], strict=True))
+        assert f"{of_campaign['balises accepted']}".split(" (")[0] + " balises" in counted["balises"]
+        assert of_campaign["verdict"] == tables.runs["verdict"][0]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -28,6 +29,7 @@ from pipeline.read.ingest import read_run
 from pipeline.read.site.read import read_site
 from pipeline.results.software import software_digest
 from pipeline.results.workers import mapped
+from pipeline.show.terminal import duration_text
 from pipeline.storage.parquet import parquet_bytes
 from schemas.arrays import flags
 from schemas.config import Configuration, Vehicle, digest_of, load_settings, to_toml
@@ -51,7 +53,12 @@ _SHOWN_OF_BANKS = (
     *("failures", "missed_at_failure", "pmd_at_failure", "pmd_at_failure_high", "in_use_max_m"),
 )
 _LOST_KEY = "balise.lost"
+
 _LOST = {"bank": pl.String, "cell": pl.String, "reason": pl.String}
+
+
+def _silent(text: str) -> None:
+    """Nobody listens."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +91,11 @@ class Made:
 
 @dataclass(frozen=True)
 class _Surveyed:
-    """A run without a fault, by all banks; `error` where it cannot be used."""
+    """A run without a fault, by all banks, which took `replays_s`; `error` where it cannot be used."""
 
     run_id: str
     row: Row
+    replays_s: float = 0.0
     room: Room | None = None
     quiet: tuple[Quiet, ...] = ()
     run_digest: str = ""
@@ -124,8 +132,12 @@ def recorded_experiment(
     per_cell: int | None,
     solution: str,
     jobs: int,
+    say: Callable[[str], None] = _silent,
 ) -> Made:
-    """Run the experiment; what is in `out` of the same inputs is not made again. Writes tables, pictures and a page."""
+    """Run the experiment; what is in `out` of the same inputs is not made again. Writes tables, pictures and a page.
+
+    `say` is told how many injections there are, and how long they will take, before the first of them.
+    """
     if not runs or site is None:
         raise UsageError("needs recorded runs and --site", place="experiment recorded")
     plan = load_plan(plan_file)
@@ -142,7 +154,9 @@ def recorded_experiment(
     drawn = onsets_of(rooms, cells, plan)
     _refuse_lack_of_room(cells, drawn, rooms, plan_file)
     digests = {one.run_id: one.run_digest for one in surveyed}
-    pieces = _pieces(inputs, numbered(cells, drawn), digests, out)
+    onsets = numbered(cells, drawn)
+    pieces = _pieces(inputs, onsets, digests, out)
+    say(_ahead(onsets, pieces, surveyed, len(inputs.banks), jobs))
     tables = _tables(mapped(_made_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
     files = _write(out, tables, plan)
     _forget_others(pieces, out)
@@ -168,6 +182,7 @@ def _inputs(
 
 def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
     inputs, (run_id, address) = task
+    begin_s = time.perf_counter()
     try:
         baselines = [_baseline(inputs, address, bank) for bank in inputs.banks]
     except InputError as error:
@@ -185,7 +200,20 @@ def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
         "has_odometer": True,
         "has_ranges": room.has_ranges,
     }
-    return _Surveyed(run_id, row, room, tuple(map(_quiet, baselines)), first.run.input_digest)
+    replays_s = time.perf_counter() - begin_s
+    return _Surveyed(run_id, row, replays_s, room, tuple(map(_quiet, baselines)), first.run.input_digest)
+
+
+def _ahead(
+    onsets: Sequence[Onset], pieces: Sequence[_Piece], surveyed: Sequence[_Surveyed], banks: int, jobs: int
+) -> str:
+    """How much there is to do: each injection takes as long as its run did without a fault."""
+    one_s = {one.run_id: one.replays_s / banks for one in surveyed}
+    left = [piece for piece in pieces if not piece.file.exists()]
+    count = sum(len(piece.onsets) for piece in left)
+    takes_s = sum(one_s[onset.run_id] for piece in left for onset in piece.onsets) / max(1, jobs)
+    done = len(onsets) * banks - count
+    return f"{count} injections, about {duration_text(takes_s)}" + (f"; {done} are done already" if done else "")
 
 
 def _unusable(run_id: str, error: InputError) -> _Surveyed:

@@ -109,7 +109,7 @@ class RecordedPlan(Settings):
     """The whole plan; docs/experiments.md says why each default is what it is."""
 
     seed: Annotated[int, Field(ge=0)] = 1
-    per_cell: Annotated[int, Field(strict=True, ge=1)] = 40
+    per_cell: Annotated[int, Field(strict=True, ge=1)] = 10
     # How long a fault is watched beyond the failure that it leads to.
     after_s: Positive = 120.0
     # The recorded position's own error may delay the failure by what the fault needs for so much more.

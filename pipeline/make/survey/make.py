@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pipeline.make.survey.network import SurveyNetwork, make_network
 from pipeline.make.survey.pieces import Survey
 from pipeline.make.survey.sources import read_surveys
 from pipeline.make.survey.trace import clean_traces
+from pipeline.read.site.alike import ambiguities
 from pipeline.read.site.checks import remarks
 from pipeline.read.site.describe import without_balises
 from pipeline.stages.track.survey import track_of
@@ -33,7 +35,7 @@ class Wish:
     """What a site is made of: balises every so many metres or of a list; ends this near [m] meet.
 
     `travel`: for which direction of travel those every so many metres are valid. `id_field`: attribute of maps that
-    names the lines.
+    names the lines. `sigma_m`: standard deviation across the track of points that state none.
     """
 
     surveys: list[Path]
@@ -44,6 +46,7 @@ class Wish:
     join_m: float | None = None
     flat: bool = False
     id_field: str | None = None
+    sigma_m: float | None = None
 
 
 def wish_of(
@@ -54,6 +57,7 @@ def wish_of(
     flat: bool,
     travel: TravelAlong = TravelAlong.BOTH,
     id_field: str | None = None,
+    sigma_m: float | None = None,
 ) -> Wish:
     """The words of the command; `--balises every 1000` leaves its number among the surveys. Raises `UsageError`."""
     words = [str(path) for path in surveys]
@@ -71,8 +75,10 @@ def wish_of(
     if spacing is None and travel is not TravelAlong.BOTH:
         remedy = "In a list of balises the column `direction` says it, one by one."
         raise UsageError("needs --balises every N", place=f"--direction {travel.value}", remedy=remedy)
+    if sigma_m is not None and not 0.0 < sigma_m < math.inf:
+        raise UsageError("is no standard deviation", place=f"--sigma {sigma_m:g}", expected="metres, more than 0")
     balise_list = None if spacing or balises is None else Path(balises)
-    return Wish(surveys, spacing, travel, balise_list, epsg, join_m, flat, id_field)
+    return Wish(surveys, spacing, travel, balise_list, epsg, join_m, flat, id_field, sigma_m)
 
 
 def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
@@ -86,6 +92,8 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config, wish.id_field), config.survey)
     if wish.flat:
         survey.pieces = [replace(piece, height_m=np.full(len(piece), np.nan)) for piece in survey.pieces]
+    if wish.sigma_m is not None:
+        survey.pieces = [piece.with_sigma(wish.sigma_m) for piece in survey.pieces]
     network = make_network(survey, wish.join_m, config.survey)
     if not network.elements:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
@@ -94,14 +102,16 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     remarked = remarks(track_of(track), network.links, balises, None, survey.declared_m, config.site)
     if remarked.breaches:
         raise SiteError(remarked.breaches[0], place=", ".join(map(str, wish.surveys)))
+    # Relations as given: what no train can run over is said, and left out, each time that the site is read.
+    site = Site(track, network.links, balises, None)
     findings = (
+        *ambiguities(site, config),
         *survey.findings,
         *doubts(network, config.survey, config.site),
         *remarked.findings,
         *without_balises(balises),
     )
-    # Relations as given: what no train can run over is said, and left out, each time that the site is read.
-    return Site(track, network.links, balises, None, findings)
+    return replace(site, findings=findings)
 
 
 def _balises(wish: Wish, network: SurveyNetwork, survey: Survey, config: Configuration) -> pl.DataFrame | None:

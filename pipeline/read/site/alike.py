@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from typing import NamedTuple
@@ -36,6 +36,23 @@ class _Point:
     element: int
     accuracy_m: float
     at_m: float
+
+
+_TOLD = 3
+"""So many warnings stand in a few lines."""
+
+
+def ambiguities(site: Site, config: Configuration = _WHOLE) -> tuple[Finding, ...]:
+    """What costs availability wherever trains run on this site: tracks, then balises, that cannot be told apart."""
+    return (*parallel_findings(site, config), *window_findings(site, config.lds, config.site))
+
+
+def told_in_short(findings: Iterable[Finding], where: str) -> list[str]:
+    """The first warnings, each a line; `where`: what lists them all."""
+    warnings = [finding for finding in findings if finding.severity == "warning"]
+    lines = [f"{one.place}: {one.message}. {one.remedy}".rstrip() for one in warnings[:_TOLD]]
+    more = len(warnings) - _TOLD
+    return lines + ([f"and {more} more warnings: {where}"] if more > 0 else [])
 
 
 def window_findings(site: Site, config: LdsConfig = DEFAULTS, limits: SiteConfig = _DEFAULTS) -> list[Finding]:

@@ -7,7 +7,8 @@ from typing import Literal
 
 import polars as pl
 
-from pipeline.results.diff.tables import Difference, compare_tables
+from pipeline.results.diff.rules import Rules
+from pipeline.results.diff.tables import NO_RULES, Difference, compare_tables
 from schemas.tables import Hazards
 
 # Of the comparison of two results, which have a configuration each: an onset moves by an epoch at 1 Hz either way.
@@ -53,12 +54,14 @@ class HazardChange:
         return self._head + "".join(f"\n    {item.column}: {item.message}" for item in self.differences)
 
 
-def compare_hazards(a: pl.DataFrame, b: pl.DataFrame) -> tuple[list[Difference], list[HazardChange]]:
+def compare_hazards(
+    a: pl.DataFrame, b: pl.DataFrame, rules: Rules = NO_RULES
+) -> tuple[list[Difference], list[HazardChange]]:
     """Differences of the tables' schemas, and the hazards that appeared, vanished or changed, in time order.
 
     The numbers of hazards (`hazard_id`, `caused_by`) count as changed only where none came or went.
     """
-    schema = [item for item in compare_tables(a.clear(), b.clear(), Hazards) if item.kind == "schema"]
+    schema = [item for item in compare_tables(a.clear(), b.clear(), Hazards, rules=rules) if item.kind == "schema"]
     if any(item.column in {"solution", "hazard", "t_hazard"} for item in schema):
         return schema, []
     pairs = _matched(a, b)
@@ -67,7 +70,7 @@ def compare_hazards(a: pl.DataFrame, b: pl.DataFrame) -> tuple[list[Difference],
     ids = ["hazard_id", "caused_by"] if changes else []
     for row_a, row_b in pairs.items():
         rows = (a.drop(ids, strict=False)[row_a : row_a + 1], b.drop(ids, strict=False)[row_b : row_b + 1])
-        differing = tuple(item for item in compare_tables(*rows, Hazards) if item.kind == "values")
+        differing = tuple(item for item in compare_tables(*rows, Hazards, rules=rules) if item.kind == "values")
         if differing:
             changes.append(_change("changed", a, row_a, differing))
     return schema, [change for _, change in sorted(changes, key=lambda item: item[0])]

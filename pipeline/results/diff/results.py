@@ -11,7 +11,8 @@ import polars as pl
 from pipeline import storage
 from pipeline.results import store
 from pipeline.results.diff.hazards import HazardChange, compare_hazards
-from pipeline.results.diff.tables import Difference, compare_tables
+from pipeline.results.diff.rules import Rules
+from pipeline.results.diff.tables import NO_RULES, Difference, compare_tables
 from pipeline.results.workers import told
 from pipeline.storage.address import Address, redacted
 from pipeline.storage.parquet import ParquetError, read_parquet
@@ -27,7 +28,9 @@ _KEYS: dict[str, tuple[str, ...]] = {
 # How a result was made is shown, but is no change of the result.
 _PROVENANCE = ("config_digest", "input_digest", "software", "contract")
 BALISE_COUNTS = {
-    "balises_on_path": "on the path",
+    "balises_passed": "passed",
+    "balises_found": "found",
+    "balises_on_path": "passages",
     "balises_accepted": "accepted",
     "balises_rejected": "rejected",
     "balises_missed": "not found",
@@ -122,14 +125,14 @@ class ResultDiff:
         return {"same": self.same, **asdict(self)}
 
 
-def diff_results(out_a: Address, out_b: Address) -> ResultDiff:
-    """Compare two results run by run; files of the same bytes are not opened.
+def diff_results(out_a: Address, out_b: Address, rules: Rules = NO_RULES) -> ResultDiff:
+    """Compare two results run by run; files of the same bytes are not opened. `rules`: what may differ.
 
     Hazards of the same solution and class at most `HAZARD_WINDOW_S` apart are the same hazard.
     """
     runs_a, runs_b = (store.complete_runs(out) for out in (out_a, out_b))
     common = [run for run in runs_a if run in set(runs_b)]
-    diffs = [_diff_run(out_a, out_b, run) for run in told(common)]
+    diffs = [_diff_run(out_a, out_b, run, rules) for run in told(common)]
     others = Counter(column for run in diffs for column in run.made_otherwise)
     return ResultDiff(
         compared=len(common),
@@ -150,7 +153,7 @@ def _section(title: str, rows: list[tuple[str, str]], detail: bool) -> list[str]
     return ["", title, *(f"  {run_id:<{width}}  {text}" for run_id, text in shown), *more]
 
 
-def _diff_run(out_a: Address, out_b: Address, run_id: str) -> RunDiff:
+def _diff_run(out_a: Address, out_b: Address, run_id: str, rules: Rules) -> RunDiff:
     hazards: list[HazardChange] = []
     differences: list[Difference] = []
     verdicts: tuple[str, ...] = ()
@@ -159,13 +162,15 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str) -> RunDiff:
         if (pair := _unlike(out_a, out_b, table, run_id)) is None:
             continue
         if table == "hazards":
-            differing, hazards = compare_hazards(*pair)
+            differing, hazards = compare_hazards(*pair, rules)
         else:
-            differing = compare_tables(*pair, contract, _KEYS[table])
+            differing = compare_tables(*pair, contract, _KEYS[table], rules)
+        changed_columns = {item.column for item in differing}
         if table == "runs":
-            verdicts = _changed_words(*pair, {"verdict": ""}, unknown="failed")
-            balises = _changed_words(*pair, BALISE_COUNTS, unknown="unknown") + balises
-        elif table == "passages":
+            verdicts = _changed_words(*pair, {"verdict": ""}, unknown="failed") if "verdict" in changed_columns else ()
+            counts = {name: words for name, words in BALISE_COUNTS.items() if name in changed_columns}
+            balises = _changed_words(*pair, counts, unknown="unknown") + balises
+        elif table == "passages" and {"status", ""} & changed_columns:
             balises = _passage_changes(*pair)
         differences += differing
     made = [item for item in differences if item.kind == "values" and item.column in _PROVENANCE]

@@ -13,6 +13,10 @@ from typing import Literal
 import dataframely as dy
 import polars as pl
 
+from pipeline.results.diff.rules import Rules
+
+NO_RULES = Rules()
+
 
 @dataclass(frozen=True)
 class Difference:
@@ -33,15 +37,16 @@ class Difference:
 
 
 def compare_tables(
-    a: pl.DataFrame, b: pl.DataFrame, contract: type[dy.Schema], keys: tuple[str, ...] = ()
+    a: pl.DataFrame, b: pl.DataFrame, contract: type[dy.Schema], keys: tuple[str, ...] = (), rules: Rules = NO_RULES
 ) -> list[Difference]:
     """The differences of `b` against `a`; none means the same.
 
     Rows are compared as they stand, or by `keys` where given, so that one row more is one
-    difference. A column without a tolerance in the contract is compared exactly. NaN, which no
+    difference. A column without a tolerance in rules or contract is compared exactly. NaN, which no
     table may hold, is always a difference.
     """
     name = contract.__name__.lower()
+    a, b = (rules.left(name, frame) for frame in (a, b))
     differences = [Difference(name, "schema", *what) for what in _schema_differences(a, b)]
     common = [column for column in a.columns if b.schema.get(column) == a.schema[column]]
     if not set(keys) <= set(common):
@@ -54,14 +59,10 @@ def compare_tables(
         return [*differences, Difference(name, "rows", "", f"{a.height} rows became {b.height}", rows)]
     columns = contract.columns()
     for column in common:
-        if (differing := _values_differ(a[column], b[column], tolerance_of(columns.get(column)))) is not None:
+        tolerance = rules.tolerance(name, column, columns.get(column))
+        if (differing := _values_differ(a[column], b[column], tolerance)) is not None:
             differences.append(Difference(name, "values", column, *differing))
     return differences
-
-
-def tolerance_of(column: dy.Column | None) -> float:
-    """Absolute tolerance of a column [its unit]; zero where the contract names none."""
-    return float((column.metadata or {}).get("tolerance", 0.0)) if column is not None else 0.0
 
 
 def _schema_differences(a: pl.DataFrame, b: pl.DataFrame) -> Iterator[tuple[str, str]]:
@@ -99,6 +100,8 @@ def _joined(a: pl.DataFrame, b: pl.DataFrame, by: list[str], how: Literal["anti"
 def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, int] | None:
     """What differs, and in how many rows."""
     differs = a.ne_missing(b)
+    if a.dtype.is_integer() and tolerance > 0.0:
+        differs &= ~((a.cast(pl.Float64) - b.cast(pl.Float64)).abs() <= tolerance).fill_null(value=False)
     if a.dtype.is_float():
         near = ((a - b).abs() <= tolerance).fill_null(value=False)
         differs = (differs & ~near) | a.is_nan().fill_null(value=False) | b.is_nan().fill_null(value=False)

@@ -35,7 +35,7 @@ RATES: tuple[Estimator, ...] = (
 
 
 def counted_runs(runs: pl.DataFrame, hazards: pl.DataFrame) -> pl.DataFrame:
-    """`runs` rows with `faults`, `missed`, `hours` and, as `truth_*`, what a reference or balise reads tell of them.
+    """`runs` rows with `missed`, `hours` and, as `truth_*`, what a reference or balise reads tell of them.
 
     The odometer alone can show that a position was wrong, never that it was right.
     """
@@ -91,7 +91,6 @@ def _faults_per_run(hazards: pl.DataFrame) -> pl.DataFrame:
     missed = pl.col("missed")
     truth = pl.col("with_truth")
     counts = {
-        "faults": pl.len(),
         "missed": missed.sum(),
         "truth_faults": truth.sum(),
         "truth_failed": (missed.is_not_null() & truth).sum(),

@@ -62,13 +62,13 @@ def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
 
 
 def figures_beside(runs: pl.DataFrame) -> Mapping[str, Any]:
-    """The figures beside a campaign's verdict: sums, availability by time, the least margin, and where the odometers
-    of its safe runs come from by their declarations.
+    """The figures beside a campaign's verdict: sums, availability by moving time, the least margin, and where the
+    odometers of its safe runs come from by their declarations.
     """
-    weight_s = pl.col("held_s").filter(pl.col("availability").is_not_null()).sum()
-    available = (pl.col("availability") * pl.col("held_s")).sum() / weight_s
+    weight_s = pl.col("moving_s").filter(pl.col("availability").is_not_null()).sum()
+    available = (pl.col("availability") * pl.col("moving_s")).sum() / weight_s
     figures = runs.select(
-        pl.col("balises_accepted", "balises_on_path").sum(),
+        pl.col("balises_found", "balises_passed", "balises_accepted", "balises_on_path").sum(),
         pl.col("proof_margin_m").min(),
         availability=pl.when(weight_s > 0.0).then(available),
     )

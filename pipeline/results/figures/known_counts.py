@@ -11,7 +11,7 @@ HAZARD_COUNTS = tuple(kind.counted_as for kind in Hazard)
 """Rows of the hazard table by class."""
 
 JUDGED_COUNTS = (
-    *("unsafe_accepted", *HAZARD_COUNTS, "hazards_detected", "hazards_within_budget", "missed_detections"),
+    *("unsafe_accepted", *HAZARD_COUNTS, "hazards_detected", "hazards_within_budget", "faults", "missed_detections"),
     *("failures", "failures_within_budget", "failures_beyond_budget"),
     *(f"stanford_{kind}" for kind in STANFORD),
 )

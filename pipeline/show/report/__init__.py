@@ -8,6 +8,6 @@ tiles: `headline`. Tables: `columns`, `balises`, `route_found`. Drawings: `serie
 both are thinned by `decimate`. HTML: `markup`; words: `words`.
 """
 
-from pipeline.show.report.write import MOST_PAGES, page_name, write_page, write_report
+from pipeline.show.report.write import MOST_PAGES, page_name, write_against, write_page, write_report
 
-__all__ = ["MOST_PAGES", "page_name", "write_page", "write_report"]
+__all__ = ["MOST_PAGES", "page_name", "write_against", "write_page", "write_report"]

@@ -72,7 +72,8 @@
       rules: [-limit, limit].filter((x) => Math.abs(x) < reach).map((x) => ({ x })) });
   }
 
-  const CLASSES = [[0.999, "all epochs", "m1"], [0.95, "95 % and more", "m2"], [0.5, "50 % and more", "m3"], [0, "less than half", "m4"]];
+  const CLASSES = [[0.999, "all epochs", "m1"], [0.95, "95 % and more", "m2"], [0.5, "50 % and more", "m3"], [0, "less than half", "m4"],
+    [null, "not known", "m0"]];
 
   function mapLayers(map) {
     const lines = map.track.map((one, index) => ({ type: "line", look: "track", name: index ? "" : "track", x: one.x, y: one.y }));
@@ -80,7 +81,7 @@
       const most = index ? CLASSES[index - 1][0] : Infinity;
       const layer = { type: "line", name, look, x: [], y: [] };
       for (const piece of map.pieces) {
-        if (piece.share < least || piece.share >= most) continue;
+        if (least === null ? piece.share !== null : piece.share === null || piece.share < least || piece.share >= most) continue;
         layer.x.push(...piece.x, null);
         layer.y.push(...piece.y, null);
       }
@@ -89,7 +90,7 @@
     const places = map.pieces.filter((piece) => piece.x.length);
     const middles = { type: "marks", tone: "none", shape: ["circle", 0], x: places.map((piece) => piece.x[piece.x.length >> 1]),
       y: places.map((piece) => piece.y[piece.y.length >> 1]),
-      tell: (i) => `${places[i].name}, ${places[i].from_m} to ${places[i].to_m} m: ${(100 * places[i].share).toFixed(1)} % of ${places[i].epochs} epochs` };
+      tell: (i) => `${places[i].name}, ${places[i].from_m} to ${places[i].to_m} m: ${places[i].share === null ? "not known" : `${(100 * places[i].share).toFixed(1)} % of ${places[i].epochs} epochs`}` };
     const hazards = { type: "marks", tone: "hazard", name: "hazard", x: map.hazards.map((one) => one[0]),
       y: map.hazards.map((one) => one[1]), tell: (i) => map.hazards[i][2] };
     return [...lines, ...groups, middles, ...(map.hazards.length ? [hazards] : [])];

@@ -38,7 +38,7 @@ from pipeline.studies.safety.sentences import level_statements, plain_statements
 from schemas.campaign import CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
 from schemas.enums import TRUTH, Hazard, RunVerdict
 from schemas.tables import Hazards
-from schemas.words import notes_apart
+from schemas.words import accepted_words, notes_apart
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Campaign:
 # The first ten are shown, the others behind a switch.
 RUN_COLUMNS = (
     *("verdict", "run_id", "why", "unsafe_accepted", "failures_beyond_budget", "missed_detections"),
-    *("balises_accepted", "availability", "proof_margin_m", "remedies"),
+    *("balises_found", "availability", "proof_margin_m", "remedies"),
     *("balises_on_path", "unproven_accepted", "share_unknown", "part_verdict", "part_share"),
     *("location_error_max_m", "hazards", "hazardous_max_s", "time_to_detect_max_s", "alarms", "false_alarms"),
     *("lost_to", "lost_to_share", "lost_to_monitor", "outages", "evidence", "solution"),
@@ -158,7 +158,7 @@ def _runs_table(campaign: Campaign) -> str:
         "run_id": lambda row: Cell(
             row["run_id"], row["run_id"], link(campaign.hrefs.get(row["run_id"], ""), row["run_id"], data_run="")
         ),
-        "balises_accepted": _accepted,
+        "balises_found": _accepted,
         "notes": _notes,
         "why": lambda row: Cell(text := why[row["run_id"], row["solution"]], text),
         "status": lambda row: Cell(row["status"], row["status"], badge(f"reading {row['status']}", row["status"])),
@@ -170,8 +170,8 @@ def _runs_table(campaign: Campaign) -> str:
 
 def _accepted(row: Row) -> Cell:
     """Of the balises on the path."""
-    accepted = row["balises_accepted"]
-    return Cell(UNKNOWN) if accepted is None else Cell(f"{accepted} of {row['balises_on_path']}", float(accepted))
+    found = row["balises_found"]
+    return Cell(UNKNOWN) if found is None else Cell("".join(accepted_words(row)), float(found))
 
 
 def _notes(row: Row) -> Cell:

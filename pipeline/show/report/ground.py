@@ -151,7 +151,7 @@ PIECE_COLUMNS = ("solution", "netelement_id", "measure_m", "moving", "tvb", "ala
 def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
     """Per solution, net element and piece of it: epochs while moving, those with a valid TVB, alarms.
 
-    Where nobody knows whether the train moved, the epoch counts, and its TVB does not.
+    Where nobody knows whether the train moved, the epoch counts, and its TVB does not; `known` counts the others.
 
     Pieces have one length, `step_m`, chosen so that there are some hundred of them.
     """
@@ -165,6 +165,7 @@ def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
     valid = pl.col("tvb") & pl.col("moving").fill_null(value=False)
     counted = moving.group_by(_PLACE[:2], from_m=_piece_m(pl.col("measure_m"), step_m)).agg(
         epochs=pl.len().cast(pl.Int64),
+        known=pl.col("moving").count().cast(pl.Int64),
         tvb=valid.sum().cast(pl.Int64),
         alarms=pl.col("alarm").sum().cast(pl.Int64),
         low_m=pl.col("measure_m").min(),
@@ -176,7 +177,7 @@ def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
 def together(pieces: pl.DataFrame) -> pl.DataFrame:
     """The pieces of several runs as pieces of one length, none shorter than those of any run."""
     step_m = _step_m(pieces)
-    sums = (pl.col(name).sum() for name in ("epochs", "tvb", "alarms"))
+    sums = (pl.col(name).sum() for name in ("epochs", "known", "tvb", "alarms"))
     merged = pieces.with_columns(from_m=_piece_m(pl.col("from_m"), step_m)).group_by(_PLACE)
     return _of_length(merged.agg(*sums, pl.col("low_m").min(), pl.col("high_m").max()), step_m)
 
@@ -251,7 +252,8 @@ def _pieces(pieces: pl.DataFrame, elements: list[str], site: Site | None) -> lis
             "from_m": row["from_m"],
             "to_m": row["to_m"],
             "epochs": row["epochs"],
-            "share": round(row["tvb"] / row["epochs"], 4),
+            # As `runs.availability`: not known where nothing shows the train moving.
+            "share": round(row["tvb"] / row["epochs"], 4) if row["known"] else None,
             "x": line[0],
             "y": line[1],
         }

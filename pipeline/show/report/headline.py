@@ -107,7 +107,7 @@ def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.Da
 
 _TRAINS = {
     "file": "odometer and antenna as in the vehicle file",
-    "learned": "no vehicle file: odometer scale and GNSS latency learned in the run",
+    "learned": "odometer scale and GNSS latency learned in the run: no vehicle file states them",
     "none": "no odometer: no monitor along the track can work",
 }
 FILES = "_files"
@@ -162,7 +162,7 @@ def _line(row: Row, epochs: pl.DataFrame) -> str:
     if not names:
         return "not known"
     driven = f", {row['distance_m'] / 1000.0:.1f} km driven" if row["distance_m"] is not None else ""
-    return f"{some_of(names, 6)}{driven}, {row['balises_on_path']} balises passed"
+    return f"{some_of(names, 6)}{driven}, {row['balises_passed']} balises passed"
 
 
 def _reading(row: Row) -> str:
@@ -178,7 +178,7 @@ def tile_figures(run: Row, balises: pl.DataFrame) -> list[tuple[str, str, str]]:
     return [
         *((words, number(run[name]), _tone(run[name], tone)) for words, name, tone in _COUNTED),
         ("of the time in use not checked", _percent(share), "good" if checked else "doubt"),
-        ("balises lost, of those passed", f"{lost} of {passed}", _tone(lost, "lost")),
+        ("passages without the balise, of all", f"{lost} of {passed}", _tone(lost, "lost")),
         ("false alarms", number(run["false_alarms"]), _tone(run["false_alarms"], "lost")),
         ("of moving time with a valid TVB", _percent(run["availability"]), "" if run["availability"] else "lost"),
     ]

@@ -6,6 +6,7 @@ const Plots = (() => {
   const EDGE = { left: 78, time: 128, names: 128, right: 14, top: 10, bottom: 40 };
   const NEAR_PX = 12;
   const LETTERS_PX = 13;
+  const [LETTER_PX, NAME_ROW_PX] = [7.4, 14];
   const SHAPES = {
     right: ["circle", 5], read: ["square", 4.5], lost: ["diamond", 6.5], unknown: ["ring", 5], wrong: ["cross", 6.5],
     hazard: ["cross", 6],
@@ -113,13 +114,20 @@ const Plots = (() => {
     write(svg, (left + right) / 2, frame.y1 - 16, text, { "text-anchor": "middle", class: "name" });
   }
 
+  // Names side by side have no room in one row.
+  function crowded(axis, frame) {
+    if (axis.kind !== "names") return false;
+    return (frame.x1 - frame.x0) / axis.names.length < LETTER_PX * Math.max(...axis.names.map((name) => name.length));
+  }
+
   function axes(svg, spec, sx, sy, frame) {
     if (spec.compass !== undefined) { compass(svg, spec, sx, frame); return; }
-    for (const [value, text] of Scales.ticks(spec.x, frame.x1 - frame.x0)) {
+    const rows = crowded(spec.x, frame) ? 2 : 1;
+    Scales.ticks(spec.x, frame.x1 - frame.x0).forEach(([value, text], index) => {
       const x = sx.at(value);
       if (spec.x.kind !== "names") make("path", { d: `M${x.toFixed(1)} ${frame.y0}V${frame.y1}`, class: "grid" }, svg);
-      write(svg, x, frame.y1 + 15, text, { "text-anchor": "middle" });
-    }
+      write(svg, x, frame.y1 + 15 + NAME_ROW_PX * (index % rows), text, { "text-anchor": "middle" });
+    });
     let last = Infinity;
     for (const [value, text] of Scales.ticks({ ...spec.y, upright: true }, frame.y1 - frame.y0)) {
       const y = sy.at(value);
@@ -190,6 +198,7 @@ const Plots = (() => {
     if (!width) return;
     const left = spec.compass !== undefined ? EDGE.right : spec.x.kind === "time" ? EDGE.time : spec.y.kind === "names" ? EDGE.names : EDGE.left;
     const frame = { x0: left, x1: width - EDGE.right, y0: EDGE.top, y1: spec.height - (spec.x.title ? EDGE.bottom : spec.compass !== undefined ? EDGE.right : 24) };
+    if (crowded(spec.x, frame)) frame.y1 -= NAME_ROW_PX;
     let { x, y } = spec;
     if (spec.equal) [x, y] = Scales.equal(x, y, frame.x1 - frame.x0, frame.y1 - frame.y0);
     const shown = { ...spec, x, y };

@@ -34,7 +34,12 @@
       button.type = "button";
       button.textContent = head.textContent;
       button.addEventListener("click", () => sort(table, column, head.getAttribute("aria-sort") === "ascending"));
-      head.replaceChildren(button);
+      // Browsers do not repeat buttons at the top of each sheet of paper; text they do.
+      const printed = document.createElement("span");
+      printed.textContent = head.textContent;
+      printed.className = "printed";
+      printed.ariaHidden = "true";
+      head.replaceChildren(button, printed);
     });
   }
 

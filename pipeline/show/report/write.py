@@ -27,10 +27,12 @@ from pipeline.results.store import (
     tables_of,
 )
 from pipeline.results.workers import mapped, told
+from pipeline.show.report.against_page import against_page
 from pipeline.show.report.campaign_page import Campaign, campaign_page
 from pipeline.show.report.ground import PIECE_COLUMNS, availability_pieces, together
 from pipeline.show.report.run_page import Made, Neighbours, run_page
 from pipeline.storage import files
+from pipeline.storage.address import Address
 from pipeline.storage.parquet import parquet_bytes, read_parquet
 from pipeline.studies.safety.assessment import compare_architectures
 from pipeline.studies.safety.side_by_side import side_by_side
@@ -42,6 +44,7 @@ from schemas.run import Site
 # Kept of each run until it changes: what its page was made from, the digest of the page, and what the run adds to the
 # page of the campaign, rows of `availability_pieces` and `side_by_side`.
 _KEPT = "pages"
+AGAINST = "against.html"
 MOST_PAGES = 1000
 """Runs of a campaign of which each gets a page unasked."""
 _RUNS_AT_ONCE = 256
@@ -80,6 +83,8 @@ def write_report(out: Path, site: Site | None = None, jobs: int = 0, most_pages:
     for name in set(files.list_dir(folder) if folder.exists() else []) - {page.path.name for page in there}:
         if name.endswith(".html"):
             storage.remove(folder / name)
+    if (folder.parent / AGAINST).exists():
+        storage.remove(folder.parent / AGAINST)
     hrefs = {page.run: f"runs/{quote(page.path.name)}" for page in there}
     index = out / "report" / "index.html"
     made = pages[0].made
@@ -99,6 +104,14 @@ def write_page(out: Path, run_id: str, site: Site | None = None, most_pages: int
     _keep(out, markers, [known[run] for run in pages if run in known])
     _noted(out, [out / "report" / name for name in storage.files_below(out / "report")])
     return pages[run_id].path
+
+
+def write_against(out: Path, other: Address) -> Path:
+    """Write `OUT/report/against.html`: this result beside another; the next report of the result removes it."""
+    place = out / "report" / AGAINST
+    storage.write_bytes(place, against_page(out, other).encode())
+    _noted(out, [out / "report" / name for name in storage.files_below(out / "report")])
+    return place
 
 
 def _pages(out: Path, site: Site | None, markers: Mapping[str, str], most_pages: int) -> list[_Page]:

@@ -109,7 +109,7 @@ def t_hazard_ns(row: HazardRow, course: Course) -> int:
 
 
 def size_m(row: HazardRow, course: Course) -> float | None:
-    """The largest |e| of the episode with its sign, by the interval's centre; of a jump back its step.
+    """The largest |e| of the episode with its sign, by the interval's centre; of a jump back the error that it ended.
 
     The step of a jump serves where no place along the track can be compared with the evidence.
     """
@@ -118,7 +118,9 @@ def size_m(row: HazardRow, course: Course) -> float | None:
     of_positions = course.judged.middle_m[episode.onset : episode.end]
     error_m = np.concatenate([of_positions, course.offers.judged.middle_m[row.hits]])
     error_m = error_m[np.isfinite(error_m)]
-    if jump is not None and (jump is episode.jump_back or error_m.size == 0):
+    if jump is not None and jump is episode.jump_back:
+        return -jump.step_m
+    if jump is not None and error_m.size == 0:
         return jump.step_m
     return float(error_m[np.argmax(np.abs(error_m))]) if error_m.size else None
 

@@ -9,11 +9,13 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, confident, may_move, met, unambiguous, usable
-from schemas.arrays import NS_PER_S, Bools, Ints, times_ns
+from schemas.arrays import NS_PER_S, Bools, Ints, floats, times_ns
 from schemas.config import Configuration
 from schemas.enums import LdsMode, LostTo, MonitorState, Verdict
-from schemas.tables import MONITORS
+from schemas.tables import MONITORS, Epochs
 from schemas.words import lost_words
+
+_LOST_TO = Epochs.columns()["lost_to"].dtype
 
 
 @dataclass(frozen=True)
@@ -39,33 +41,39 @@ class LostTime:
         return {**causes, "lost_to_monitor": self.monitor}
 
 
-def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, clock: Clock, config: Configuration) -> LostTime:
-    """Shares of the moving time; each judged epoch counts for the first cause that applies.
+def lost_columns(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+    """`step_s`, `gap`, `moving_s`, `lost_s` and `lost_to` of `epochs`: from each to the next.
 
-    A gap is time without a position, as for `availability`.
+    Lost to the first cause that applies. A gap is time without a position, as for `availability`.
     """
-    moving = met(epochs, may_move())
+    clock = Clock.of(epochs, config)
     steps_s = np.diff(clock.t_ns, append=clock.t_ns[-1:]) / NS_PER_S
-    whole_s = float(steps_s[moving].sum())
-    if whole_s <= 0.0 or not met(epochs, pl.col("moving"))[:-1].any():
-        return LostTime()
+    moving = met(epochs, may_move())
     gap = clock.held_s < steps_s
     lost = moving & (gap | ~met(epochs, pl.col("tvb") & pl.col("moving").is_not_null()))
-    left = lost
-    parts: dict[LostTo, float] = {}
-    alarmed = lost
-    for cause, applies in _causes(epochs, gap, clock.t_ns, config).items():
-        parts[cause] = float(steps_s[left & applies].sum()) / whole_s
-        if cause is LostTo.ALARM:
-            alarmed = left & applies
-        left = left & ~applies
+    causes = _causes(epochs, gap, clock.t_ns, config)
+    first = np.select([lost & applies for applies in causes.values()], list(range(len(causes))), default=len(causes))
+    words = pl.Series([*(cause.value for cause in causes), None], dtype=_LOST_TO)
+    time_s = {"moving_s": steps_s * moving, "lost_s": steps_s * lost}
+    return pl.DataFrame({"step_s": steps_s, "gap": gap, **time_s, "lost_to": words.gather(first)})
+
+
+def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, config: Configuration) -> LostTime:
+    """Shares of the moving time, from `epochs` with their `lost_columns`."""
+    lost_s = floats(epochs, "lost_s")
+    whole_s = float(floats(epochs, "moving_s").sum())
+    if whole_s <= 0.0 or not met(epochs, pl.col("moving"))[:-1].any():
+        return LostTime()
+    to = epochs["lost_to"].cast(pl.String).to_numpy()
+    parts = {cause: float(lost_s[to == cause.value].sum()) / whole_s for cause in LostTo}
     ranked = sorted((cause for cause, part in parts.items() if part > 0.0), key=lambda cause: -parts[cause])
-    unexplained = alarmed & ~_explained(alarms, clock.t_ns, config.lds.recovery_s)
+    alarmed = to == LostTo.ALARM.value
+    unexplained = alarmed & ~_explained(alarms, times_ns(epochs), config.lds.recovery_s)
     return LostTime(
-        share=float(steps_s[lost].sum()) / whole_s,
+        share=float(lost_s.sum()) / whole_s,
         causes={cause: parts[cause] for cause in ranked},
         monitor=_loudest(epochs.filter(alarmed)),
-        unfounded=bool(2.0 * steps_s[unexplained].sum() > steps_s[alarmed].sum()),
+        unfounded=bool(2.0 * lost_s[unexplained].sum() > lost_s[alarmed].sum()),
     )
 
 

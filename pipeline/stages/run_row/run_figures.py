@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.stages.epochs import clock as along_time
 from pipeline.stages.epochs.clock import Clock, may_move, met, share_of_time
 from pipeline.stages.run_row.bounds import CONTINUITY_S, UNKNOWN, columns_of, continuity, poisson_rate
-from pipeline.stages.run_row.independent import missed_detection
+from pipeline.stages.run_row.independent import independent_episodes
 from pipeline.stages.run_row.verdict import LEVEL_LISTS, level_rows
 from schemas import enums
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
@@ -139,7 +139,9 @@ def balise_counts(passages: pl.DataFrame) -> Row:
     virtual = passages.filter(pl.col("kind") == enums.BaliseKind.VIRTUAL)
     counts = {"balises_on_path": is_passage(), **{f"balises_{name}": met for name, met in outcomes().items()}}
     errors = spread(pl.col("location_error_m").filter(accepted()), "location_error", "count")
-    return _counted(virtual, counts | acceptances()) | virtual.select(**errors).row(0, named=True)
+    each_once = {"balises_passed": is_passage(), "balises_found": is_passage() & accepted()}
+    once = {name: virtual.filter(condition)["balise_id"].n_unique() for name, condition in each_once.items()}
+    return _counted(virtual, counts | acceptances()) | virtual.select(**errors).row(0, named=True) | once
 
 
 def _counted(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
@@ -159,10 +161,12 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
     counts = {kind.counted_as: pl.col("hazard") == kind for kind in enums.Hazard} | {
         "hazards_detected": pl.col("detected"),
         "hazards_within_budget": pl.col("within_budget"),
-        "missed_detections": missed_detection(),
     }
     times = ("time_to_detect", "time_since_failure", "time_since_failure_may")
-    return _counted(hazards, counts) | {f"{name}_max_s": hazards[f"{name}_s"].max() for name in times}
+    # A fault counts once, whatever its rows.
+    faults = independent_episodes(hazards)
+    of_faults = {"faults": faults.height, "missed_detections": faults["missed"].sum()}
+    return _counted(hazards, counts) | of_faults | {f"{name}_max_s": hazards[f"{name}_s"].max() for name in times}
 
 
 def failure_counts(failures: pl.DataFrame) -> Row:

@@ -17,7 +17,7 @@ from pipeline.stages.provenance import Provenance
 from pipeline.stages.run_row import notes
 from pipeline.stages.run_row import run_figures as figures
 from pipeline.stages.run_row.lost_time import lost_time
-from pipeline.stages.run_row.remedies import remedies, unknown_parts
+from pipeline.stages.run_row.remedies import remedies, time_in_use
 from pipeline.stages.run_row.verdict import reasons_of, verdict_of
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import Configuration
@@ -54,7 +54,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     epochs = results.epochs
     clock = Clock.of(epochs, config)
     judged = results.judged
-    lost = lost_time(epochs, judged.alarms, clock, config)
+    lost = lost_time(epochs, judged.alarms, config)
     row = (
         _identity(results)
         | _decisive(epochs, judged.passages, judged.failures, config)
@@ -74,7 +74,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     row |= _part(results, row, config) | figures.service_levels(row, config) | _verdict(row, config)
     stated = epochs["survey_sigma_m"].is_not_null().any()
     clock_open_m = results.clock_open_s * float(np.abs(np.nan_to_num(floats(epochs, "speed_mps"))).max(initial=0.0))
-    cures = remedies(row, lost, unknown_parts(epochs, config), stated, config, clock_open_m)
+    cures = remedies(row, lost, time_in_use(epochs), stated, config, clock_open_m)
     noted = (
         *notes.ingest_notes(results.ingest),
         *results.notes,
@@ -82,9 +82,10 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         *notes.undiagnosed_notes(epochs, judged.passages),
         *notes.in_use_notes(epochs),
         *notes.time_notes(epochs, clock, lost, config),
-        *(Remark(Note.REMEDY, (remedy_words(cure),)) for cure in cures),
+        *(Remark(Note.REMEDY, (remedy_words(cure, gain),)) for cure, gain in cures.items()),
     )
-    return _frame(row | {"remedies": cures, "notes": notes_text(noted)})
+    advice = {"remedies": list(cures), "remedies_gain": list(cures.values())}
+    return _frame(row | advice | {"notes": notes_text(noted)})
 
 
 def _identity(results: SolutionResults) -> Row:
@@ -155,6 +156,7 @@ def _extent(epochs: pl.DataFrame, clock: Clock) -> Row:
         "t_start": epochs["t"].dt.timestamp("ns").first(),
         "t_end": epochs["t"].dt.timestamp("ns").last(),
         "duration_s": clock.duration_s,
+        "moving_s": float(epochs["moving_s"].sum()) if epochs.height else None,
         "epochs": epochs.height,
         "gnss_rate_hz": 1.0 / clock.period_s if clock.period_s else None,
     }

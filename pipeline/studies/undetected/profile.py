@@ -77,8 +77,14 @@ def epoch_of(ride: Ride, balise: str | None, at_s: float | None) -> int:
         row = int(np.searchsorted(stamps, latest, side="right")) - 1
         return int(rows.epoch[row]) if row >= 0 else 0
     at = rows_of_passages(ride, rows)
-    of_balise = (passages["balise_id"] == balise).to_numpy() & (at >= 0)
-    if not of_balise.any():
-        known = ", ".join(passages["balise_id"].unique(maintain_order=True).to_list())
-        raise UsageError("is no balise that a watched position passed", place=balise, expected=known)
-    return int(rows.epoch[at[of_balise][0]])
+    watched = at >= 0
+    of_balise = (passages["balise_id"] == balise).to_numpy()
+    if not (of_balise & watched).any():
+        known = passages.filter(watched)["balise_id"].unique(maintain_order=True).to_list()
+        why = "was passed, but not with a position in use after the last independent fix" if of_balise.any() else None
+        raise UsageError(
+            why or "was not passed in this run",
+            place=f"--balise {balise}",
+            expected=", ".join(known) or "none of this run: leave --balise out",
+        )
+    return int(rows.epoch[at[of_balise & watched][0]])

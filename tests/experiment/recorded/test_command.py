@@ -32,13 +32,16 @@ class Bench:
         (folder / "a.toml").write_text("")
         (folder / "b.toml").write_text('[monitors]\ndisabled = ["along_ewma_0p1"]\n')
 
+    said: list[str]
+
     def run(self, plan: str, out: str = "out", run: RunLog | None = None) -> Made:
+        self.said = []
         write_run_log(run or self._run, self.folder / "runs")
         (self.folder / "plan.toml").write_text(plan)
         runs = [str(self.folder / "runs")]
         vehicle = self.folder / "vehicle.toml"
         places = (str(self.folder / "site"), self.folder / out, self.folder / "plan.toml", vehicle)
-        return recorded_experiment(runs, *places, Configuration(), None, None, "primary", 1)
+        return recorded_experiment(runs, *places, Configuration(), None, None, "primary", 1, self.said.append)
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +58,8 @@ def test_two_banks_on_the_same_faults(bench: Bench, monkeypatch: pytest.MonkeyPa
     made = bench.run(plan)
     injections = made.tables["injections"]
     assert made.failed == {}
+    (estimate,) = bench.said
+    assert estimate.startswith("8 injections, about ")
     assert injections.group_by("bank").len().sort("bank")["len"].to_list() == [4, 4]
     fast, deaf = (injections.filter(bank=bank).sort("injection_id") for bank in ("default", "deaf"))
     assert fast["t_onset"].equals(deaf["t_onset"])

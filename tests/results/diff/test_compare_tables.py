@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.results.diff import compare_tables
-from pipeline.results.diff.tables import tolerance_of
+from pipeline.results.diff.rules import Rules
 from schemas.columns import count, flag, instant, one_of, real, text, texts
 from schemas.enums import Hazard
 from schemas.tables import TABLES, Epochs
@@ -190,8 +190,8 @@ def test_columns_left_out_on_both_sides_are_no_difference() -> None:
 @pytest.mark.parametrize("table", sorted(TABLES))
 def test_every_float_of_the_contract_has_a_tolerance(table: str) -> None:
     floats = [name for name, column in TABLES[table].columns().items() if isinstance(column, dy.Float64)]
-    assert all(tolerance_of(TABLES[table].columns()[name]) > 0 for name in floats)
-    assert all(tolerance_of(TABLES[table].columns()[name]) <= 1e-6 for name in floats)
+    assert all(Rules().tolerance(table, name, TABLES[table].columns()[name]) > 0 for name in floats)
+    assert all(Rules().tolerance(table, name, TABLES[table].columns()[name]) <= 1e-6 for name in floats)
 
 
 @lru_cache(maxsize=1)

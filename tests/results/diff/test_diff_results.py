@@ -8,6 +8,7 @@ import polars as pl
 import pytest
 
 from pipeline.results.diff import compare_hazards, diff_results
+from pipeline.results.diff.rules import rules_of
 from pipeline.results.store import table_address, write_run
 from schemas.errors import UsageError
 from schemas.run import RunTables
@@ -207,3 +208,58 @@ def test_all_columns_of_a_hazard_can_change() -> None:
         value = pl.Series(column, other if isinstance(other, list) else [1 if other is None else other], dtype=dtype)
         _, changes = compare_hazards(frame, frame.with_columns(value))
         assert [item.column for change in changes for item in change.differences] == [column]
+
+
+class TestRules:
+    """What may differ, and what is left out."""
+
+    @pytest.fixture
+    def b(self, tmp_path: Path) -> Path:
+        changed = table(Runs, 1, solution="primary", status="ok", availability=0.9004, epochs=3)
+        return result(tmp_path / "b", tables(runs=changed, epochs=epochs([0, 1, 2, 3], solution="primary", hpl_m=9.0)))
+
+    @pytest.mark.parametrize(
+        ("tolerances", "ignored", "left"),
+        [
+            ([], [], {"runs.availability", "runs.epochs", "epochs.hpl_m"}),
+            (["availability=0.001"], ["hpl_m"], {"runs.epochs"}),
+            (["runs.availability=0.001", "epochs=3"], ["epochs.hpl_m"], set()),
+            (["availability=0.0003"], ["epochs.hpl_m", "runs.epochs"], {"runs.availability"}),
+        ],
+    )
+    def test_columns_are_compared_as_told(
+        self, a: Path, b: Path, tolerances: list[str], ignored: list[str], left: set[str]
+    ) -> None:
+        compared = diff_results(a, b, rules_of(tolerances, ignored, None))
+        assert {item.place for run in compared.runs for item in run.differences} == left
+        assert compared.same == (not left)
+
+    def test_a_file_holds_the_same_and_the_command_adds_to_it(self, a: Path, b: Path, tmp_path: Path) -> None:
+        file = tmp_path / "diff.toml"
+        file.write_text('ignore = ["epochs.hpl_m"]\n[tolerance]\navailability = 1e-9\n"runs.epochs" = 3\n')
+        assert {item.place for run in diff_results(a, b, rules_of([], [], file)).runs for item in run.differences} == {
+            "runs.availability"
+        }
+        assert diff_results(a, b, rules_of(["availability=0.01"], [], file)).same
+
+    def test_a_verdict_that_is_not_compared_is_not_told(self, a: Path, tmp_path: Path) -> None:
+        unsafe = table(Runs, 1, solution="primary", status="ok", availability=0.9, verdict="unsafe")
+        b = result(tmp_path / "b", tables(runs=unsafe))
+        assert diff_results(a, b).runs[0].verdicts
+        assert diff_results(a, b, rules_of([], ["verdict"], None)).same
+
+    @pytest.mark.parametrize(
+        ("tolerances", "ignored", "said"),
+        [
+            (["availability"], [], "is no tolerance"),
+            (["availability=-1"], [], "is no tolerance"),
+            (["availability=nan"], [], "is no tolerance"),
+            (["verdict=1"], [], "is no number"),
+            ([], ["availabilty"], "did you mean `availability`"),
+            ([], ["run.availability"], "did you mean `runs.availability`"),
+            ([], ["epochs.t"], "tells the rows apart"),
+        ],
+    )
+    def test_a_rule_that_is_none_is_refused(self, tolerances: list[str], ignored: list[str], said: str) -> None:
+        with pytest.raises(UsageError, match=said):
+            rules_of(tolerances, ignored, None)

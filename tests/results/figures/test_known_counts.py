@@ -18,6 +18,7 @@ ROWS = table(
     status=["ok", "ok", "failed"],
     evidence=["odometer", None, None],
     balises_accepted=[8, 7, 0],
+    balises_found=[8, 7, 0],
     hazards_1b=[1, 0, 0],
     lost_to=[None, ["no_position", "no_odometer"], None],
     lost_to_share=[None, [0.6, 0.4], None],
@@ -53,5 +54,5 @@ def test_inspected_result(tmp_path: Path) -> None:
     assert inspected["Verdict"].rows() == [
         ("verdict", "failed"), ("unsafe", "0"), ("unproven", "0"), ("safe", "0"), ("failed", "2")
     ]  # fmt: skip
-    runs = inspected["Runs"].select("run_id", "unsafe_accepted", "hazards_1b", "balises_accepted", "lost_to_share")
+    runs = inspected["Runs"].select("run_id", "unsafe_accepted", "hazards_1b", "balises_found", "lost_to_share")
     assert runs.rows() == [("blind", None, None, 7, [0.6, 0.4]), ("seen", 0, 1, 8, None)]

@@ -240,3 +240,54 @@ def test_readable_in_both_schemes(browser: Chrome, out: Path, scheme: str) -> No
             assert contrast(browser, selector) >= 4.5, selector
     finally:
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+OVERLAPPING = """
+    const bad = [];
+    for (const svg of document.querySelectorAll('svg[data-drawn]')) {
+        const written = [...svg.querySelectorAll('text')].filter((one) => one.textContent.trim());
+        const texts = written.filter((one) => one.getClientRects().length);
+        const boxes = texts.map((one) => one.getBoundingClientRect());
+        for (let i = 0; i < boxes.length; i += 1) for (let j = 0; j < i; j += 1) {
+            const [a, b] = [boxes[i], boxes[j]];
+            const wide = Math.min(a.right, b.right) - Math.max(a.left, b.left);
+            const high = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
+            const named = [svg.parentElement.id, texts[i].textContent, texts[j].textContent];
+            if (wide > 2 && high > 4) bad.push(named.join(' | '));
+        }
+    }
+    return bad"""
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (820, "light"), (1300, "dark")])
+@pytest.mark.parametrize("page", PAGES)
+def test_nothing_overlaps_or_runs_over_at_any_width(
+    browser: Chrome, out: Path, tmp_path: Path, page: str, width: int, scheme: str
+) -> None:
+    screen = {"width": width, "height": 1200, "deviceScaleFactor": 1, "mobile": width < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    try:
+        visit(browser, out, page)
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        assert browser.execute_script(OVERLAPPING) == []
+        shot = tmp_path / f"{width}-{scheme}.png"
+        assert browser.save_screenshot(str(shot))
+        assert len(set(shot.read_bytes())) > 100, "an empty picture"
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+def test_on_paper_the_heads_of_tables_are_text(browser: Chrome, out: Path) -> None:
+    """Buttons would not be repeated on the next sheet."""
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    try:
+        visit(browser, out, "index.html")
+        heads = browser.find_elements("css selector", "table.data th:not(.more)")
+        assert heads
+        assert not any(head.find_element("tag name", "button").is_displayed() for head in heads)
+        assert all(head.find_element("class name", "printed").is_displayed() for head in heads)
+    finally:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})

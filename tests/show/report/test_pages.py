@@ -271,7 +271,7 @@ def test_without_truth_no_health_is_claimed(replayed: dict[str, RunTables], tmp_
     (row,) = rows_of_table(index, "table-runs")
     told = dict(zip(RUN_COLUMNS, row, strict=True))
     assert {told[name] for name in ("hazards", "missed_detections", "unsafe_accepted")} == {"–"}
-    assert told["balises_accepted"] != "–"
+    assert told["balises_found"] != "–"
     assert dict(row[:2] for row in rows_of_table(index, "table-figures-s0"))["false_alarm_rate_per_h"] == "not known"
 
 

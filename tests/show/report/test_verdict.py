@@ -21,6 +21,8 @@ from tests.tables import NS, alarms, epochs, hazards, passages, table
 SAFE = {
     "verdict": "safe",
     "reasons": [[]],
+    "balises_found": 1,
+    "balises_passed": 1,
     "balises_accepted": 1,
     "balises_on_path": 1,
     "accepted_judged": 1,
@@ -29,10 +31,13 @@ SAFE = {
 UNSAFE = {
     "verdict": "unsafe",
     "reasons": [["accepted_wrong", "failure_beyond_budget", "budget_unknown", "unknown_in_use"]],
+    "balises_found": 2,
+    "balises_passed": 3,
     "balises_accepted": 2,
     "balises_on_path": 3,
     "availability": 0.25,
     "held_s": 60.0,
+    "moving_s": 60.0,
     "unsafe_accepted": 1,
     "accepted_judged": 1,
     "unproven_accepted": 1,

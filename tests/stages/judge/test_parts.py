@@ -645,7 +645,7 @@ def test_evidence_is_looked_at_between_positions_that_are_far_apart() -> None:
         (6.0, None, False, -25.0, -2.5),  # by the interval's centre at any width
         (np.nan, Jump(3, 3, 30.0), False, 30.0, None),  # no place along the track: the step
         (1.0, Jump(3, 3, 30.0), False, -25.0, None),
-        (1.0, Jump(3, 3, 30.0), True, 30.0, None),  # of a jump back its step
+        (1.0, Jump(3, 3, 30.0), True, -30.0, None),  # of a jump back ahead by 30 m the error behind that it ended
     ],
 )
 def test_the_size_and_slope_of_a_hazard(

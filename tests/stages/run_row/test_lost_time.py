@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from pipeline.stages.epochs.clock import Clock
-from pipeline.stages.run_row.lost_time import LostTime, lost_time
-from pipeline.stages.run_row.remedies import Unknown, remedies, unknown_parts
+from pipeline.stages.run_row.lost_time import LostTime, lost_columns, lost_time
+from pipeline.stages.run_row.remedies import InUse, remedies, time_in_use
 from schemas.config import Configuration
 from schemas.enums import LostTo, Remedy
+from schemas.words import remedy_words
 from tests.tables import NS, alarms, epochs
 
 CONFIG = Configuration()
@@ -20,7 +20,7 @@ NO_ALARMS = alarms()
 
 def lost(t_s: list[float] = TEN_S, found: Any = NO_ALARMS, **columns: Any) -> LostTime:
     frame = epochs(t_s, **columns)
-    return lost_time(frame, found, Clock.of(frame, CONFIG), CONFIG)
+    return lost_time(frame.with_columns(lost_columns(frame, CONFIG)), found, CONFIG)
 
 
 def test_each_epoch_counts_for_the_first_cause_that_applies() -> None:
@@ -102,19 +102,21 @@ ONE_LATE = {
     "failure_accepted": ["right"],
 }
 CHECKED_LITTLE = {"evidence": "balise", "reasons": ["unknown_in_use"]}
-NOTHING = Unknown(at_ends=False, between=False)
+ALL_KNOWN = InUse(moving_s=100.0, in_use_s=50.0)
+AT_ENDS = InUse(100.0, 50.0, unknown_at_ends_s=20.0)
+BETWEEN = InUse(100.0, 50.0, unknown_between_s=30.0)
 
 
 def cures(
     run: dict[str, Any] | None = None,
     causes: dict[LostTo, float] | None = None,
-    unknown: Unknown = NOTHING,
+    used: InUse = ALL_KNOWN,
     monitor: str = "along_raw",
     unfounded: bool = True,
     stated: bool = True,
 ) -> list[Remedy]:
     lost = LostTime(0.5, causes or {}, monitor, unfounded)
-    return remedies(RUN | (run or {}), lost, unknown, stated, CONFIG)
+    return list(remedies(RUN | (run or {}), lost, used, stated, CONFIG))
 
 
 def test_an_odometer_that_may_be_of_the_gnss_is_mended_first_and_calibrates_nothing() -> None:
@@ -138,7 +140,7 @@ def test_alarms_that_nothing_explains_are_mended_by_calibration_and_not_by_more_
     assert cures({}, {LostTo.NOISE: 0.5}) == [Remedy.CALIBRATE]
     assert cures({}, {LostTo.NOISE: 0.08, LostTo.CONFIDENCE: 0.42}) == [], "the begin of a short run"
     done = Configuration.model_validate({"calibration": {"runs": ["b", "c"]}})
-    assert Remedy.CALIBRATE not in remedies(RUN, LostTime(0.5, noisy, "along_raw", True), NOTHING, True, done)
+    assert Remedy.CALIBRATE not in remedies(RUN, LostTime(0.5, noisy, "along_raw", True), ALL_KNOWN, True, done)
     assert cures({}, noisy, unfounded=False) == []
     assert cures({"faults_injected": True}, noisy) == []
     assert cures({}, noisy, monitor="along_ewma_0p001") == []
@@ -147,35 +149,36 @@ def test_alarms_that_nothing_explains_are_mended_by_calibration_and_not_by_more_
 
 
 @pytest.mark.parametrize(
-    ("run", "unknown", "cure"),
+    ("run", "used", "cure"),
     [
-        ({"evidence": "odometer", "reasons": ["unknown_in_use"]}, NOTHING, [Remedy.REFERENCE]),
-        ({"evidence": None, "reasons": ["accepted_unknown"]}, NOTHING, [Remedy.REFERENCE]),
-        (CHECKED_LITTLE, Unknown(at_ends=True, between=False), [Remedy.READS_AT_ENDS]),
-        (CHECKED_LITTLE, Unknown(at_ends=False, between=True), [Remedy.READS_CLOSER]),
-        ({"evidence": "balise", "reasons": []}, Unknown(at_ends=True, between=True), []),
-        ({"vehicle": "learned"}, NOTHING, [Remedy.VEHICLE_FILE]),
-        ({"vehicle": "none"}, NOTHING, [Remedy.ODOMETER]),
-        ({"reasons": ["clock_assumed"]}, NOTHING, [Remedy.CLOCK]),
-        (ONE_LATE | {"gnss_rate_hz": 1.0}, NOTHING, [Remedy.FASTER_LOG]),
-        (ONE_LATE, NOTHING, []),
-        (ONE_LATE | {"gnss_rate_hz": 1.0, "failure_hazardous_may_s": [2.1]}, NOTHING, []),
-        (ONE_LATE | {"gnss_rate_hz": 1.0, "failure_accepted": ["wrong"]}, NOTHING, []),
+        ({"evidence": "odometer", "reasons": ["unknown_in_use"]}, ALL_KNOWN, [Remedy.REFERENCE]),
+        ({"evidence": None, "reasons": ["accepted_unknown"]}, ALL_KNOWN, [Remedy.REFERENCE]),
+        (CHECKED_LITTLE, AT_ENDS, [Remedy.READS_AT_ENDS]),
+        (CHECKED_LITTLE, BETWEEN, [Remedy.READS_CLOSER]),
+        ({"evidence": "balise", "reasons": []}, AT_ENDS, []),
+        ({"vehicle": "learned"}, ALL_KNOWN, [Remedy.VEHICLE_FILE]),
+        ({"vehicle": "none"}, ALL_KNOWN, [Remedy.ODOMETER]),
+        ({"reasons": ["clock_assumed"]}, ALL_KNOWN, [Remedy.CLOCK]),
+        (ONE_LATE | {"gnss_rate_hz": 1.0}, ALL_KNOWN, [Remedy.FASTER_LOG]),
+        (ONE_LATE, ALL_KNOWN, []),
+        (ONE_LATE | {"gnss_rate_hz": 1.0, "failure_hazardous_may_s": [2.1]}, ALL_KNOWN, []),
+        (ONE_LATE | {"gnss_rate_hz": 1.0, "failure_accepted": ["wrong"]}, ALL_KNOWN, []),
     ],
 )
-def test_a_verdict_names_its_cure(run: dict[str, Any], unknown: Unknown, cure: list[Remedy]) -> None:
-    assert cures(run, unknown=unknown) == cure
+def test_a_verdict_names_its_cure(run: dict[str, Any], used: InUse, cure: list[Remedy]) -> None:
+    assert cures(run, used=used) == cure
 
 
 def test_clocks_that_leave_too_much_open_are_to_be_declared() -> None:
     """Of the 40 m that an error may span the clocks alone take 21 m: 0.7 s at 30 m/s."""
-    lacking = RUN | {"evidence": "balise", "reasons": ["unknown_in_use"]}
-    wide, narrow = (remedies(lacking, LostTime(), NOTHING, True, CONFIG, open_m) for open_m in (21.0, 19.0))
-    assert (wide, narrow) == ([Remedy.RECORDER_LATENCY], [])
-    proved = RUN | {"evidence": "balise", "reasons": ["not_diagnosed"]}
-    assert remedies(proved, LostTime(), NOTHING, True, CONFIG, 21.0) == [], "nothing is unknown"
-    alone = RUN | {"evidence": "odometer", "reasons": ["unknown_in_use"]}
-    assert remedies(alone, LostTime(), NOTHING, True, CONFIG, 21.0) == [Remedy.REFERENCE]
+
+    def told(run: dict[str, Any], open_m: float) -> list[Remedy]:
+        return list(remedies(RUN | run, LostTime(), ALL_KNOWN, True, CONFIG, open_m))
+
+    lacking = {"evidence": "balise", "reasons": ["unknown_in_use"]}
+    assert (told(lacking, 21.0), told(lacking, 19.0)) == ([Remedy.CLOCK], [])
+    assert told({"evidence": "balise", "reasons": ["not_diagnosed"]}, 21.0) == [], "nothing is unknown"
+    assert told({"evidence": "odometer", "reasons": ["unknown_in_use"]}, 21.0) == [Remedy.REFERENCE]
 
 
 def test_an_ambiguous_track_needs_a_route_and_a_survey_that_states_its_accuracy() -> None:
@@ -184,15 +187,44 @@ def test_an_ambiguous_track_needs_a_route_and_a_survey_that_states_its_accuracy(
     assert cures({}, twin, stated=False) == [Remedy.ROUTE, Remedy.SURVEY_SIGMA]
 
 
+def test_what_wins_back_most_time_comes_first() -> None:
+    """Of 100 s of motion 60 s are lost to the track, 10 s to re-links, and of 30 s in use 20 s are unknown."""
+    run = {"vehicle": "learned", "evidence": None, "reasons": ["unknown_in_use"]}
+    lost = LostTime(0.7, {LostTo.TRACK_AMBIGUOUS: 0.6, LostTo.RELINK: 0.1}, "along_raw")
+    found = remedies(RUN | run, lost, InUse(100.0, 30.0, 5.0, 15.0), False, CONFIG)
+    gains = {Remedy.ROUTE: 0.6, Remedy.SURVEY_SIGMA: 0.6, Remedy.VEHICLE_FILE: 0.3, Remedy.REFERENCE: 0.2}
+    assert found == pytest.approx(gains)
+    assert list(found) == list(gains)
+
+
+def test_a_remedy_says_what_it_would_win_back() -> None:
+    assert "up to 62% of the moving time" in remedy_words(Remedy.ROUTE, 0.62)
+    assert "moving time" not in remedy_words(Remedy.ROUTE, 0.001)
+
+
 def test_where_the_unknown_lies() -> None:
-    """Of ten epochs the first two and the last are unknown, then one in the middle."""
+    """Of nine seconds the first two are unknown (the last epoch holds for none), then one in the middle."""
     word = {True: "right", False: "unknown"}
 
-    def parts(known: list[bool], **columns: Any) -> Unknown:
-        return unknown_parts(epochs(TEN_S, judgement=[word[k] for k in known], **columns), CONFIG)
+    def parts(known: list[bool], **columns: Any) -> InUse:
+        frame = epochs(TEN_S, judgement=[word[k] for k in known], **columns)
+        return time_in_use(frame.with_columns(lost_columns(frame, CONFIG)))
 
     ends = [False, False, True, True, True, True, True, True, True, False]
-    assert parts(ends) == Unknown(at_ends=True, between=False)
-    assert parts([True, True, True, False, True, True, True, True, True, True]) == Unknown(at_ends=False, between=True)
-    assert parts([False] * 10) == Unknown(at_ends=True, between=False)
-    assert parts(ends, in_use=False) == NOTHING
+    middle = [True, True, True, False, True, True, True, True, True, True]
+    assert parts(ends) == InUse(9.0, 9.0, 2.0, 0.0)
+    assert parts(middle) == InUse(9.0, 9.0, 0.0, 1.0)
+    assert parts(ends, in_use=False) == InUse(moving_s=9.0)
+
+
+def test_the_epochs_say_what_each_was_lost_to() -> None:
+    """Ten epochs a second apart but for 20 s after the fifth; the train stands at the second, the third is no TVB."""
+    t_s = [0.0, 1.0, 2.0, 3.0, 4.0, 24.0, 25.0, 26.0]
+    moving = [True, False, True, True, True, True, None, True]
+    frame = epochs(t_s, moving=moving, tvb=[k != 3 for k in range(8)], confidence_m=[5.0, 5.0, 5.0, 50.0, *[5.0] * 4])
+    found = lost_columns(frame, CONFIG)
+    assert found["step_s"].to_list() == [1.0, 1.0, 1.0, 1.0, 20.0, 1.0, 1.0, 0.0]
+    assert found["gap"].to_list() == [False, False, False, False, True, False, False, False]
+    assert found["moving_s"].to_list() == [1.0, 0.0, 1.0, 1.0, 20.0, 1.0, 1.0, 0.0]
+    assert found["lost_s"].to_list() == [0.0, 0.0, 0.0, 1.0, 20.0, 0.0, 1.0, 0.0]
+    assert found["lost_to"].to_list() == [None, None, None, "confidence", "no_position", None, None, None]

@@ -296,12 +296,21 @@ class TestHazards:
         detected = [9.0, 10.0, 11.675, 11.676, 60.0, None]
         frame = hazards(
             7,
+            t_onset=[k * NS for k in range(7)],
             t_failure=[10 * NS] * 6 + [None],
             t_detected=[None if t is None else round(t * NS) for t in detected] + [None],
             time_since_failure_s=[None if t is None else t - 10.0 for t in detected] + [None],
             budget_s=1.675,
         )
-        assert row(epochs(seconds(3)), hazards=frame)["missed_detections"] == 3
+        found = row(epochs(seconds(3)), hazards=frame)
+        assert (found["faults"], found["missed_detections"]) == (7, 3)
+
+    def test_a_jump_back_is_no_second_fault(self) -> None:
+        """One fault that nothing saw hits two classes, and its jump back a balise."""
+        late = {"t_onset": [0, 0, 60 * NS], "t_failure": [NS, NS, 60 * NS], "caused_by": [None, None, 0]}
+        frame = hazards(3, hazard=["VB_JUMP_1B", "VB_SHIFT", "VB_JUMP_1B"], hazard_id=[0, 1, 2], budget_s=1.0, **late)
+        found = row(epochs(seconds(3)), hazards=frame)
+        assert (found["faults"], found["missed_detections"], found["hazards_1b"]) == (1, 1, 2)
 
 
 class TestFailures:
