@@ -449,8 +449,7 @@ class _Regression:
         return np.asarray(np.abs(np.linalg.solve(normal, right)[:, :, 0] - theta).max(axis=0))
 
     def _changes(self) -> tuple[Ints, Ints]:
-        """First row of each change of speed, and the one after its last: one sense, whatever outliers are in it, and
-        all ways that hold a part of it.
+        """First row of each change of speed, and the one after its last: one sense, whatever outliers are in it.
 
         Where the speed changes by less than half as much as it does usually it does not change.
         """
@@ -460,7 +459,7 @@ class _Regression:
         rows = np.flatnonzero(np.abs(change) > _CHANGES * usual)
         other = (np.diff(rows) > self.overlap) | (np.diff(np.sign(change[rows])) != 0.0)
         begin, end = used[rows[np.append(True, other)]], used[rows[np.append(other, True)]] + 1
-        return np.maximum(begin - self.overlap, 0), np.minimum(end + self.overlap, self.used.size)
+        return begin, end
 
     def _changes_show(self) -> bool:
         """Two figures of each change of speed, by other rows, have in common more than their noise would by chance."""

@@ -101,10 +101,9 @@ def drifting(begin_s: float, end_s: float, rate_mps: float, speeds: tuple[list[f
     return scale_and_lag(at_s[:-5], at_s[5:], seen_m[5:] - seen_m[:-5], CountedRows(t_s, way_m, np.zeros(t_s.size)))
 
 
-@pytest.mark.parametrize("drift", [(115.0, 215.0), (140.0, 240.0)])
-def test_a_drift_as_long_as_the_only_change_of_speed_is_no_lag(drift: tuple[float, float]) -> None:
+def test_a_drift_as_long_as_the_only_change_of_speed_is_no_lag() -> None:
     """0.5 m/s beside a start at 0.2 m/s2 looks like a lag of -2.5 s, to the last minute of it."""
-    found = drifting(*drift, 0.5, ([0.0, 140.0, 240.0, 320.0], [0.0, 0.0, 20.0, 20.0]))
+    found = drifting(115.0, 215.0, 0.5, ([0.0, 140.0, 240.0, 320.0], [0.0, 0.0, 20.0, 20.0]))
     assert not found.measured or abs(found.lag_s) < 4.0 * found.lag_sigma_s
 
 
