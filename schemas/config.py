@@ -186,6 +186,8 @@ class FixSigma(Settings):
     estimated_m: Positive = 5.0
     # Satellites are above the horizon only.
     vertical_factor: Positive = 1.5
+    # Coordinates written down in finer steps add nothing: those drown in the noise of any receiver.
+    digits_least_m: NonNegative = 0.02
 
     def horizontal_m(self, fix: Fix) -> float | None:
         """Sigma per horizontal axis [m], none for an epoch without fix."""
@@ -250,8 +252,6 @@ class MatchingConfig(Settings):
     # DOMAIN section 2: the noise of a standing train is no turn; the first 20 m of net movement orient the path.
     deadband_mps: Positive = 0.3
     orientation_distance_m: Positive = 20.0
-    # Coordinates written down in finer steps add nothing: those drown in the noise of any receiver.
-    digits_least_m: NonNegative = 0.02
 
 
 class AlignConfig(Settings):

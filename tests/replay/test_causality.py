@@ -150,6 +150,7 @@ OF_THE_JUDGE = {
     *("error_along_m", "error_low_m", "error_high_m", "error_cross_m", "error_up_m", "judgement", "evidence"),
     *("true_netelement_ids", "true_measure_low_m", "true_measure_high_m", "lds_state", "suspect_after_the_fact"),
     *("moving", "in_use", "verdict", "suspect", "hazard_id", "t_true", "location_error_m", "proof_margin_m"),
+    *("step_s", "gap", "moving_s", "lost_s", "lost_to"),
     *("failure_mode", "cause", "crossing_id"),
 }
 

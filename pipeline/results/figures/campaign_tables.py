@@ -50,7 +50,8 @@ def counted_runs(runs: pl.DataFrame, hazards: pl.DataFrame) -> pl.DataFrame:
         "truth_held_s": pl.col("held_s").fill_null(0.0),
     }
     return (
-        runs.join(faults, on=RUN, how="left", maintain_order="left")
+        runs.drop("faults")
+        .join(faults, on=RUN, how="left", maintain_order="left")
         .with_columns(pl.col(faults.drop(RUN).columns).fill_null(0), hours=pl.col("duration_s").fill_null(0.0) / 3600.0)
         .with_columns(pl.when(by_truth).then(value).otherwise(0).alias(name) for name, value in counts.items())
         .with_columns(truth_budget=pl.col("truth_within") + pl.col("truth_beyond"))
@@ -91,6 +92,7 @@ def _faults_per_run(hazards: pl.DataFrame) -> pl.DataFrame:
     missed = pl.col("missed")
     truth = pl.col("with_truth")
     counts = {
+        "faults": pl.len(),
         "missed": missed.sum(),
         "truth_faults": truth.sum(),
         "truth_failed": (missed.is_not_null() & truth).sum(),

@@ -85,7 +85,7 @@ def match(
         # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, assignment, placed, vehicle, config)
-    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg"), config.digits_least_m))
+    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg"), fix_sigma.digits_least_m))
     off = off_stretches(claimed, epochs, config.paths_level_s)
     return Match(epochs, path, ambiguous, off, claimed.possible, sign)
 

@@ -111,7 +111,7 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _TrackFrame:
     level = np.cos(rise)
     zero = np.zeros_like(angle)
     survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
-    survey_m = np.hypot(np.maximum(survey_m, config.matching.digits_least_m), np.nan_to_num(chord_m))
+    survey_m = np.hypot(np.maximum(survey_m, config.fix_sigma.digits_least_m), np.nan_to_num(chord_m))
     matched = flags(epochs, "on_track") & np.isfinite(cross_m) & np.isfinite(heading)
     sure = met(epochs, unambiguous())
     known = np.isfinite(vertical_m)

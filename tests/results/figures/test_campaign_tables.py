@@ -63,7 +63,6 @@ class TestRuns:
             evidence=["reference", "reference", None, None],
             status=["ok", "ok", "ok", "failed"],
             balises_accepted=[10, 10, 0, 0],
-            faults=[2, 0, 0, 0],
             accepted_judged=[8, 10, 0, 0],
             unsafe_accepted=[1, 0, 0, 0],
             outages=[3, 0, 0, 0],

@@ -53,7 +53,7 @@ def test_the_finest_step_that_counts_is_a_setting():
     x_m = np.cumsum(2.0 + np.sin(np.arange(400) / 9.0))
     fixes = run(x_m, np.zeros(400)).with_columns(pl.col("longitude_deg").round(7))
     sigmas_m = [
-        match(fixes, None, STRAIGHT, Vehicle(), MatchingConfig(digits_least_m=least_m), FixSigma()).epochs[
+        match(fixes, None, STRAIGHT, Vehicle(), MatchingConfig(), FixSigma(digits_least_m=least_m)).epochs[
             "digits_along_m"
         ][-1]
         for least_m in (0.02, 0.001)

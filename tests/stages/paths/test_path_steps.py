@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.stages.paths.path_steps import PathSteps, path_steps
-from pipeline.stages.paths.path_tests import NO_STEPS, PathTests, Trail
+from pipeline.stages.paths.path_tests import NO_STEPS, PathTests, Stretch, Trail
 from pipeline.stages.track.geodesy import points_of
 from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig
@@ -77,5 +77,5 @@ def _refuted(steps: PathSteps, jump_m: float) -> bool:
     zeros = np.zeros(count)
     config = MatchingConfig(cross_bias_sigma_m=1e-6)
     tests = PathTests.of_run(steps, 0, config)
-    verdict = tests.of(steps, Trail(0, 0, 0, aside_m, zeros, zeros, NO_STEPS))
+    verdict = tests.of(steps, Trail(0, 0, 0, Stretch(aside_m, *[zeros] * 4), NO_STEPS))
     return verdict.rejected < count

@@ -58,4 +58,5 @@ def test_a_step_exceeds_mapo_once_and_a_clean_run_never(tmp_path: Path) -> None:
         ("safe_front_end", "mainline", "not met", 1),
         ("safe_front_end", "all", "not met", 1),
     ]
-    assert all(42.0 < size_m < 48.0 for size_m in worst_m)
+    # 45 m less what the reference's clock leaves open: a journey this short measures no lag.
+    assert all(40.0 < size_m < 48.0 for size_m in worst_m)
