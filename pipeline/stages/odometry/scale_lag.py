@@ -357,7 +357,7 @@ class _Ways:
         change_mps = np.where(np.abs(change_mps) <= self.counter.least_change_mps, 0.0, change_mps)
         beside = np.column_stack(slopes(counted, change_mps))
         known = np.asarray(np.isfinite(np.column_stack([design, beside])).all(axis=1))
-        # Where the counter stands there is nothing to learn but of the noise.
+        # Where both stand there is nothing to learn, nor of the noise.
         moving: Bools = known & (np.abs(counted) > 0.0)
         if moving.sum() < FEWEST:
             return None
@@ -379,22 +379,18 @@ class _Ways:
         used = used & ~_near(moving & ~used, self.overlap // 2)
         if used.sum() < FEWEST:
             return None
-        return _Regression(design, beside, self.way_m, used, self.overlap, known & ~moving)
+        return _Regression(design, beside, self.way_m, used, self.overlap)
 
 
 @dataclass(frozen=True)
 class _Regression:
-    """way = design @ (scale, scale * rest of the lag), by the moments of `beside`, over the `used` ways.
-
-    `standing`: ways of which the counter says that the train stood.
-    """
+    """way = design @ (scale, scale * rest of the lag), by the moments of `beside`, over the `used` ways."""
 
     design: Floats
     beside: Floats
     way_m: Floats
     used: Bools
     overlap: int
-    standing: Bools
 
     def solved(self, assumed_s: float) -> ScaleLag:
         """Scale and lag."""
@@ -416,13 +412,8 @@ class _Regression:
         design, beside = (values[:, parts] * self.used[:, None] for values in (self.design, self.beside))
         inverse = np.linalg.inv(beside.T @ design)
         theta = inverse @ (beside.T @ self.way_m)
-        left = self.way_m - self.design[:, parts] @ theta
-        # A recorder may be quiet where the counter stands, or drift there, and then elsewhere too.
-        spreads = [
-            _spread(beside, np.where(rows, left, 0.0), rows, reach)
-            for rows in (self.used, self.used | self.standing)
-            for reach in (self.overlap, _MEMORY * self.overlap)
-        ]
+        left = np.where(self.used, self.way_m - design @ theta, 0.0)
+        spreads = [_spread(beside, left, self.used, reach) for reach in (self.overlap, _MEMORY * self.overlap)]
         variances = np.max([np.diag(inverse @ one @ inverse.T) for one in spreads], axis=0)
         sigmas = _student(self.used.sum() / self.overlap - 2.0) * np.sqrt(np.maximum(variances, 0.0))
         sigmas = np.maximum(sigmas, self._without_one(design, beside, theta))

@@ -107,13 +107,6 @@ def test_a_drift_as_long_as_the_only_change_of_speed_is_no_lag() -> None:
     assert not found.measured or abs(found.lag_s) < 4.0 * found.lag_sigma_s
 
 
-def test_a_drift_that_a_stand_shows_makes_the_scale_less_sure() -> None:
-    """0.2 m/s from the stand on to the braking: 1 % of 20 m/s, as if the counter counted short."""
-    speeds = ([0.0, 170.0, 230.0, 310.0, 370.0, 400.0], [0.0, 0.0, 20.0, 20.0, 0.0, 0.0])
-    found = drifting(50.0, 310.0, 0.2, speeds)
-    assert abs(found.scale - 1.0) < 4.0 * found.scale_sigma
-
-
 def test_a_step_in_doubt_is_not_compared() -> None:
     """The counter begins anew at zero; without the doubt that is a way of 9 km."""
     whole = counter()
