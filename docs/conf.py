@@ -6,7 +6,7 @@ from sphinx.application import Sphinx
 
 from schemas.version import VERSION
 
-FIRST = ("project", "field-engineer", "analyst", "assessor", "domain")
+FIRST = ("project", "field-engineer", "analyst", "assessor", "measurements", "domain")
 """Pages with which the menu begins; the others follow in the order of their names."""
 
 project = "balise"

@@ -131,7 +131,8 @@ class AlignConfig(Settings):
     """Prior probability that a position is offset after a long gap.
 
     A wrong scale with a small sigma is worse than slow learning; with the same probability for single missing epochs
-    the filter would learn almost nothing from noisy positions. Chosen on the assessor's table of tunnels. Ours.
+    the filter would learn almost nothing from noisy positions. Chosen by the table of tunnels (docs/measurements.md).
+    Ours.
     """
     break_moving_s: Positive = 30.0
     """In gaps much shorter than this a position is expected not to move [s].
