@@ -16,6 +16,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationErro
 from schemas.breaches import told
 from schemas.enums import Fix, Origin
 from schemas.errors import BaliseError, ConfigError, listed
+from schemas.limits import Limits, limits_of, noise_limit_m, scatter_limit_m
 from schemas.tables import MONITORS
 
 # Strict: neither text nor true or false is a number.
@@ -516,6 +517,11 @@ class HazardConfig(Settings):
     # LPV-200 is the guaranteed service (LOC uses no other).
     service_level: str = "lpv200"
 
+    @property
+    def limits(self) -> Limits:
+        """What is compared with these limits, by the name of the question."""
+        return limits_of(self)
+
 
 class EvidenceConfig(Settings):
     """What the evidence may take for granted (DOMAIN section 5.0)."""
@@ -726,8 +732,13 @@ class Configuration(Settings):
     @property
     def noise_limit_m(self) -> float:
         """The largest fast noise with which a position failure still shows (DOMAIN section 3) [m]."""
-        least = self.hazards.failure_limit_m / (2.0 * self.monitors.threshold_factor)
+        least = noise_limit_m(self.hazards.limits.failure_m, self.monitors.threshold_factor)
         return self.monitors.noise_limit_m or least
+
+    @property
+    def scatter_limit_m(self) -> float:
+        """The largest deviation of an odometer's row, or of digits, that the thresholds allow for [m]."""
+        return scatter_limit_m(self.hazards.limits.failure_m, self.monitors.threshold_factor)
 
     @property
     def budget_s(self) -> float:
