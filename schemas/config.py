@@ -34,6 +34,7 @@ from schemas.config_safety import AdviceConfig, CalibrationConfig, SafetyConfig,
 from schemas.config_track import MatchingConfig, SiteConfig, SurveyConfig
 from schemas.enums import Origin
 from schemas.errors import BaliseError, ConfigError, listed
+from schemas.limits import noise_limit_m, scatter_limit_m
 
 __all__ = [
     "AdviceConfig",
@@ -101,8 +102,13 @@ class Configuration(Settings):
     @property
     def noise_limit_m(self) -> float:
         """The largest fast noise with which a position failure still shows (DOMAIN section 3) [m]."""
-        least = self.hazards.failure_limit_m / (2.0 * self.monitors.threshold_factor)
+        least = noise_limit_m(self.hazards.limits.failure_m, self.monitors.threshold_factor)
         return self.monitors.noise_limit_m or least
+
+    @property
+    def scatter_limit_m(self) -> float:
+        """The largest deviation of an odometer's row, or of digits, that the thresholds allow for [m]."""
+        return scatter_limit_m(self.hazards.limits.failure_m, self.monitors.threshold_factor)
 
     @property
     def budget_s(self) -> float:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, Field
 
 from schemas.config_base import NonNegative, Number, Positive, Probability, Settings
+from schemas.limits import Limits, limits_of
 
 
 class LdsConfig(Settings):
@@ -244,6 +245,11 @@ class HazardConfig(Settings):
 
     LPV-200 is the guaranteed service (LOC uses no other).
     """
+
+    @property
+    def limits(self) -> Limits:
+        """What is compared with these limits, by the name of the question."""
+        return limits_of(self)
 
 
 class EvidenceConfig(Settings):

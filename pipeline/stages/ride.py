@@ -22,9 +22,9 @@ from pipeline.stages.monitors.single import NO_OTHER_SOLUTION, WITHOUT_MEMORY, S
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun
 from schemas.enums import NotEvaluated
+from schemas.tables import ALL_MONITORS
 
-_AGAINST_ODOMETER = ("along_doppler", "link_distance")
-"""Monitors beside the bank that hold the GNSS against the odometer."""
+_AGAINST_ODOMETER = tuple(monitor.name for monitor in ALL_MONITORS if monitor.against_odometer)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ MONITOR = [
         "    return verdicts(size, factor * sigma, first_reason((unknown, NO_POSITION)))\n\n\n",
     ),
     (SINGLE, '    "channel": lambda', '    "offside": lambda seen: offside_monitor(seen.epochs, 5.3),\n'),
-    (TABLES, '    Monitor("channel"', '    Monitor("offside", "m", "other", "off side"),\n'),
+    (TABLES, '    Monitor("channel"', '    Monitor("offside", "m", "other", "off side", axis="cross"),\n'),
 ]
 COLUMN = [
     (TABLES, "    part_verdict = one_of(", '    epochs_on_track = count("epochs on the track")\n'),
@@ -57,6 +57,7 @@ import json, sys
 from pathlib import Path
 import polars as pl
 from datasets.scenario import Scenario
+from datasets.motion import build_motion
 from datasets.trial import build_run, build_site
 from pipeline import read_run, replay
 from pipeline.show.report.series import monitor_lines, time_data
@@ -64,12 +65,22 @@ from pipeline.results.store import write_run
 from schemas.config import Configuration, settings_from
 from schemas.dictionary import dictionary_markdown
 from schemas.settings_page import settings_markdown
+from schemas.tables import MONITORS
 import numpy as np
 
 scenario = settings_from(json.loads(sys.argv[1]), Scenario, "test")
 run = build_run(scenario, scenario.runs[0])
 tables = replay(run, build_site(scenario))
 states = tables.epochs["offside_state"].value_counts()
+aside = build_run(scenario, scenario.runs[1])
+motion, start = build_motion(scenario.runs[1].motion), aside.gnss["t"].dt.timestamp("ns")[0]
+passed = [start + round(motion.time_at(at_m) * 1e9) for at_m in range(200, 2000, 100)]
+passed = pl.Series("t", passed, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+reads = pl.DataFrame([passed, pl.Series("balise_id", [f"BG{at_m}" for at_m in range(200, 2000, 100)])])
+alone = {"monitors": {"disabled": [name for name in MONITORS if name != "offside"]}}
+alone |= {"hazards": {"false_alarm_lookback_s": 5.0, "false_alarm_margin_m": 20.0}}
+aside = aside.with_streams(reference=None, balise_reads=reads)
+alarms = replay(aside, build_site(scenario), None, Configuration.model_validate(alone)).alarms
 page = time_data(tables.epochs, np.array([], dtype=np.int64), 1.0)
 folder = Path(sys.argv[2]); folder.mkdir()
 run.gnss.write_parquet(folder / "gnss.parquet")
@@ -78,6 +89,7 @@ text = dictionary_markdown()
 print(json.dumps({
     "key": "| `ingest.doors` | none |  | Topics that hold door states. |" in settings_markdown(),
     "states": states["offside_state"].cast(pl.String).to_list(),
+    "alarms": alarms.select("monitors", pl.col("verdict").cast(pl.String)).rows(),
     "drawn": monitor_lines()["other"],
     "series": sorted(name for name in page["series"] if "offside" in name),
     "column": tables.runs["epochs_on_track"].to_list(),
@@ -87,8 +99,15 @@ print(json.dumps({
 }))
 """
 TRIAL = """{"name": "recipe", "seed": 7, "gnss": {"rate_hz": 1.0}, "odometer": {"rate_hz": 5.0},
-"line": {"sections": [{"length_m": 3000.0}], "elements": [{"id": "A", "length_m": 3000.0}], "balises": []},
-"runs": [{"id": "run", "motion": {"start_m": 100.0, "phases": [{"speed_mps": 30.0}, {"stop_at_m": 2000.0}]}}]}"""
+"line": {"sections": [{"length_m": 3000.0}], "elements": [{"id": "A", "length_m": 3000.0}], "balises": BALISES},
+"runs": [{"id": "run", "motion": MOTION}, {"id": "aside", "motion": MOTION, "faults": [ASIDE]}]}"""
+TRIAL = (
+    TRIAL.replace(
+        "BALISES", json.dumps([{"id": f"BG{m}", "at_m": m, "kind": "physical"} for m in range(200, 2000, 100)])
+    )
+    .replace("MOTION", '{"start_m": 100.0, "phases": [{"speed_mps": 30.0}, {"stop_at_m": 2000.0}]}')
+    .replace("ASIDE", '{"kind": "step", "target": "cross", "size_m": 12.0, "start_s": 40.0, "duration_s": 10.0}')
+)
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +134,8 @@ def test_a_monitor_takes_two_files(followed: dict[str, object]) -> None:
     assert followed["series"] == ["ratio_offside"]
     assert followed["disabled"] == ["offside"]
     assert len({file for file, _, _ in MONITOR}) == 2
+    # Reads say nothing of the place across the track: no alarm of a monitor that sees this axis is a false one.
+    assert followed["alarms"] == [[["offside"], "unknown"]]
 
 
 def test_a_column_takes_two_files(followed: dict[str, object]) -> None:

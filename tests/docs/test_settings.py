@@ -202,7 +202,8 @@ def test_a_key_that_is_described_is_read(key: str, sources: str) -> None:
 @pytest.fixture(scope="module")
 def sources() -> str:
     """The program without the texts under keys, which name other keys."""
-    settings = [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "schemas").glob("config*.py")]
+    files = [*(ROOT / "schemas").glob("config*.py"), ROOT / "schemas" / "limits.py"]
+    settings = [ast.parse(path.read_text(encoding="utf-8")) for path in sorted(files)]
     for tree in settings:
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):

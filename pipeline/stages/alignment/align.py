@@ -11,7 +11,6 @@ from pipeline.stages.alignment.learning import Hold, learn
 from pipeline.stages.alignment.odometer_filter import Estimates, stamp_jitter_s
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER, first_reason
-from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.monitors.series import along_axis
 from pipeline.stages.odometry.driven import with_hysteresis
@@ -29,7 +28,7 @@ _OF_ODOMETER = (
 
 def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
     """Positions of one solution with the odometer beside them: `schemas.stages.Aligned`."""
-    positions = positions.with_columns(pl.col(r"^digits_(along|cross|up)_m$").clip(upper_bound=most_scatter_m(config)))
+    positions = positions.with_columns(pl.col(r"^digits_(along|cross|up)_m$").clip(upper_bound=config.scatter_limit_m))
     positions = positions.with_columns(*_sigmas(config.monitors), _confidence(config.lds))
     if odometry is None:
         return _without_odometer(positions, vehicle, config)
@@ -124,7 +123,7 @@ def _columns(
     total, travelled = (np.where(known, np.cumsum(steps), np.nan) for steps in (step, driven))
     speed = np.where(known, in_use.scale * odometry.speed_at_s(at), np.nan)
     noise = odometry.noise_at_s(at)
-    rows_m = np.minimum(odometry.known_row_sigma_m(at), most_scatter_m(config))
+    rows_m = np.minimum(odometry.known_row_sigma_m(at), config.scatter_limit_m)
     width_m = odometry.hysteresis_m(at)
     held = with_hysteresis(total, width_m)
     turning = np.where(width_m > 0.0, speed_of_positions(at, held, config.align.speed_window_s), speed)

@@ -14,7 +14,6 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
-from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.monitors.pseudorange import pseudorange_monitor
 from pipeline.stages.monitors.series import FIRST_EPOCH
 from schemas.arrays import Floats, floats, times_ns
@@ -35,7 +34,7 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame
     velocity_mps = floats(epochs, "velocity_along_mps")
     no_odometer = epochs["odometer_reason"]
     # The sigma of rows is cut off there: with coarser ones a threshold would not hold.
-    coarse = floats(epochs, "odometer_rows_m") >= most_scatter_m(config)
+    coarse = floats(epochs, "odometer_rows_m") >= config.scatter_limit_m
     usable = np.isfinite(velocity_mps) & no_odometer.is_null().to_numpy() & epochs["fix_valid"].to_numpy() & ~coarse
     first, span_s = _window(t_s, usable, floats(epochs, "odometer_doubt_m"), config)
     doppler_m = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity_mps, np.nan)))])[:-1]
