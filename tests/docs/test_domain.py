@@ -8,7 +8,25 @@ from pathlib import Path
 
 import pytest
 
-from schemas.enums import Evidence, Fix, Hazard, Judgement, LdsState, MonitorState, Navigability, Origin, RunVerdict
+from schemas.enums import (
+    Evidence,
+    FailureMode,
+    Fix,
+    Hazard,
+    Judgement,
+    LdsMode,
+    LdsState,
+    LinkingError,
+    MonitorState,
+    Navigability,
+    Origin,
+    PassageStatus,
+    Reaction,
+    RunStatus,
+    RunVerdict,
+    Suspect,
+    Timing,
+)
 from tests.docs.blocks import ROOT
 
 DOMAIN = (ROOT / "docs" / "domain.md").read_text(encoding="utf-8")
@@ -23,7 +41,10 @@ SOURCES = sorted(
 )
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 # Enumerations whose values a reader of tables meets, and that the page defines.
-DEFINED = (Hazard, Judgement, RunVerdict, LdsState, MonitorState, Evidence, Fix, Origin, Navigability)
+DEFINED = (
+    *(Hazard, Judgement, RunVerdict, RunStatus, LdsMode, LdsState, MonitorState, FailureMode, Timing, LinkingError),
+    *(Evidence, Fix, Origin, Navigability, Reaction, PassageStatus, Suspect),
+)
 CITED = re.compile(r"DOMAIN(?: sections?)? (\d(?:\.\d)?)((?:,? (?:and|to) \d(?:\.\d)?)*)")
 
 
@@ -74,4 +95,5 @@ def test_terms_are_numbered_once_each_with_its_source() -> None:
 @pytest.mark.parametrize("values", DEFINED, ids=lambda enum: enum.__name__)
 def test_values_of_tables_are_explained(values: type[StrEnum]) -> None:
     text = DOMAIN.lower().replace("_", " ")
-    assert [value for value in values if not re.search(rf"\b{value.lower().replace('_', ' ')}\b", text)] == []
+    names = {value: value.lower().replace("_", " ").removeprefix("rejected ") for value in values}
+    assert [value for value, name in names.items() if not re.search(rf"\b{name}\b", text)] == []
