@@ -10,7 +10,7 @@ TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 POLAR
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 STAMP := $(VENV)/.balise-installed
 
-.PHONY: install demo test quick stress check lint types bench docs mutations dictionary configuration lock clean
+.PHONY: install demo test quick stress check lint types bench docs dictionary configuration lock clean
 
 install: $(STAMP)
 
@@ -50,9 +50,6 @@ bench: install
 docs: install
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c docs . build/docs
 	@echo "build/docs/index.html"
-
-mutations: install
-	$(BIN)/python -m benchmarks.mutations
 
 dictionary: install
 	$(BIN)/python -m schemas.dictionary > docs/dictionary.md

@@ -12,39 +12,27 @@ import polars as pl
 from benchmarks.results import Figure
 from pipeline.show.terminal import show_table, to_json
 
-MODULES = (
-    "start",
-    "sites",
-    "end_to_end",
-    "ingest",
-    "matching",
-    "calibration",
-    "topologies",
-    "tracks",
-    "campaign",
-    "compact",
-    "interruptions",
-    "experiment",
-    "relink",
-    "growth",
-    "plausibility",
-    "line",
-    "undetected",
-    "recorded",
-    "follows",
-    "witnesses",
-)
+MODULES = {
+    "speed": ("short", "start", "sites", "end_to_end", "ingest", "matching"),
+    "growth": ("rows", "campaign", "compact", "interruptions"),
+    "truth": (
+        *("tracks", "topologies", "calibration", "odometer", "follows", "witnesses", "relink", "plausibility", "line"),
+        *("undetected", "recorded", "experiment"),
+    ),
+}
+"""By folder; others there are run for themselves (`python -m benchmarks.truth.clock`)."""
+NAMES = tuple(f"{folder}.{name}" for folder, names in MODULES.items() for name in names)
 
 
 def main() -> int:
     """Command line: names of benchmarks, all by default."""
     parser = argparse.ArgumentParser(prog="benchmarks", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(MODULES))
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join([*MODULES, *NAMES]))
     parser.add_argument("--out", type=Path, default=Path("bench-out"), help="where trials and figures go")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     held: list[tuple[str, Figure]] = []
-    for name in given.names or MODULES:
+    for name in _asked(given.names):
         figures: list[Figure] = importlib.import_module(f"benchmarks.{name}").measure(given.out / name)
         table = _table(figures)
         show_table(table, name)
@@ -54,6 +42,11 @@ def main() -> int:
     missed = sum(figure.met is False for _, figure in held)
     print(f"{missed} of {len(held)} targets missed")
     return 1 if missed else 0
+
+
+def _asked(names: list[str]) -> list[str]:
+    """Those of a folder, single ones, or all."""
+    return [name for name in NAMES if not names or name in names or name.split(".")[0] in names]
 
 
 def _summary(held: list[tuple[str, Figure]]) -> list[str]:

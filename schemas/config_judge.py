@@ -270,7 +270,7 @@ class EvidenceConfig(Settings):
     alone (V).
 
     Independent odometers stay above it (above 0.58 but for RTK), copies at SBAS noise are near 0.05:
-    `benchmarks/follows.py`. DOMAIN section 5.0.
+    `benchmarks/truth/follows.py`. DOMAIN section 5.0.
     """
     sigma_refuted_share: Probability = 0.01
     """A stated sigma (or HPL) is refuted by errors beyond `lds.ci_factor` sigmas at more than this part of the epochs.

@@ -188,7 +188,8 @@ class MonitorConfig(Settings):
     noise_doubt: NonNegative = 1.0
     """This many standard errors of the measured variance are added to it.
 
-    Without it 113, with it 116 of 120 random receivers stayed without an alarm for 4 h (`benchmarks.noise`). Ours.
+    Without it 113, with it 116 of 120 random receivers stayed without an alarm for 4 h
+    (`benchmarks.truth.noise`). Ours.
     """
     noise_quantiles: tuple[Probability, ...] = (0.5, 0.95, 0.99)
     """Of second differences, each over its Gaussian value: the largest counts; the last not at the longest lag.

@@ -11,7 +11,6 @@ from typing import Never
 
 import pytest
 
-from benchmarks.cluster import Cluster
 from pipeline.campaign import RunOutcome, run_campaign
 from pipeline.campaign.cluster import lost_scheduler, replay_there
 from pipeline.campaign.outcome import lost, overdue
@@ -20,6 +19,7 @@ from pipeline.campaign.waits import WAITS
 from pipeline.results import store
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
+from tests.campaign.cluster import Cluster
 from tests.campaign.compare import ROOT, Hurried, by_run, endless, plan_of, result_bytes, wait_for
 from tests.campaign.compare import command as replay_command
 from tests.campaign.test_local import Spy

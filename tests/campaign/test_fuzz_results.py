@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import fuzz_archives, fuzz_results
-from benchmarks.fuzz_files import fuzz
+from tests.fuzz import archives as fuzz_archives
+from tests.fuzz import results as fuzz_results
+from tests.fuzz.files import fuzz
 
 
 def test_random_damage_to_archives_and_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 import cli
-from benchmarks import interruptions
-from benchmarks.interruptions import Job, Victim, disturb
+from benchmarks.growth import interruptions
+from benchmarks.growth.interruptions import Job, Victim, disturb
 from pipeline import storage
 from pipeline.campaign import Interrupted, make_plan, run_campaign
 from pipeline.campaign.lock import locked

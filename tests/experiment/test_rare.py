@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from benchmarks.counting import agree, counted_alarms, counted_misses
 from datasets.experiment.geometry import TAUS_S, Constellation, default_geometry
 from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
 from datasets.experiment.plan import BANKS
@@ -19,6 +18,7 @@ from datasets.experiment.rare import (
 from datasets.experiment.sigmas import bank_sigmas, limit_sigmas
 from datasets.experiment.splitting import most_probable_miss
 from datasets.experiment.workers import generator, in_blocks
+from tests.experiment.counting import agree, counted_alarms, counted_misses
 
 GPS = default_geometry("gps")
 

@@ -6,7 +6,6 @@ import numpy as np
 import polars as pl
 import pytest
 
-from benchmarks.counting import counted_alarms, counted_misses
 from datasets.experiment import EXPERIMENTS, rare_tables
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
 from datasets.experiment.ranges import RangePlan
@@ -17,6 +16,7 @@ from datasets.experiment.rare_ranges import (
 )
 from datasets.experiment.workers import generator
 from schemas.config import Configuration, MonitorConfig
+from tests.experiment.counting import counted_alarms, counted_misses
 
 
 def plan(constellation: Constellation = "gps", probability: float = 1e-7, period_s: float = 10.0) -> RangePlan:

@@ -1,4 +1,4 @@
-"""Random faults through the whole replay; the same trials as `python -m benchmarks.random_trials`, fewer of them."""
+"""Random faults through the whole replay; the same trials as `python -m tests.replay.random_trials`, fewer of them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from functools import lru_cache
 import polars as pl
 import pytest
 
-from benchmarks.random_deviations import deviations
 from datasets.random_trials import KINDS
 from datasets.random_trials import random_trial as draw_trial
 from pipeline.one_run import replay
+from tests.replay.random_trials import deviations
 
 # Seeds that failed once stay. 620, 771: faults of the odometer while the position wanders by 3.2 and 3.4 sigma;
 # 1192: a monitor of height fails by chance before a slow ramp.

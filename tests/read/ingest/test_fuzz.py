@@ -8,8 +8,8 @@ import sys
 
 import numpy as np
 
-from benchmarks import fuzz_files
-from benchmarks.fuzz_ingest import MUTATIONS, fuzz
+from tests.fuzz import files as fuzz_files
+from tests.fuzz.ingest import MUTATIONS, fuzz
 from tests.read.ingest import samples
 
 
@@ -23,7 +23,7 @@ def test_random_damage_never_gives_wrong_data():
 
 def test_judge_sees_wrong_data(tmp_path, monkeypatch):
     """The fuzz run can fail: a reader that swaps two rows is caught."""
-    import benchmarks.fuzz_ingest as bench
+    import tests.fuzz.ingest as bench
 
     path = samples.save(tmp_path, samples.log_bytes())
     expected = bench.read_run(path, bench.IngestConfig())

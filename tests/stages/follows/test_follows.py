@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from benchmarks.follows import COPIES, INDEPENDENT, RECEIVERS, odometer_frame, stamps, tried
+from benchmarks.truth.follows import COPIES, INDEPENDENT, RECEIVERS, odometer_frame, stamps, tried
 from pipeline.stages.follows import NOT_TESTED, Follows, follows_positions
 from schemas.config import Configuration, EvidenceConfig
 

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from benchmarks.relink import Journey, Outcome, journey, lds_of, outcome, ramp
+from benchmarks.truth.relink import Journey, Outcome, journey, lds_of, outcome, ramp
 from pipeline.stages.lds import LdsResult
 from schemas.config import Configuration, LdsConfig, Vehicle
 

@@ -1,13 +1,13 @@
-"""Are claims right in any network? A short form of `python -m benchmarks.tracks`, whose seeds are others."""
+"""Are claims right in any network? A short form of `python -m benchmarks.truth.tracks`, whose seeds are others."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from benchmarks import topologies
-from benchmarks.calibration import stated
-from benchmarks.tracks import CLAIM_S, FAMILIES, outcome
+from benchmarks.truth import topologies
+from benchmarks.truth.calibration import stated
+from benchmarks.truth.tracks import CLAIM_S, FAMILIES, outcome
 
 
 @pytest.mark.parametrize("family", FAMILIES)

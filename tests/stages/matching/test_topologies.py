@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from benchmarks.topologies import WORLDS, judge
+from benchmarks.truth.topologies import WORLDS, judge
 from schemas.arrays import Floats
 from schemas.run import Site
 from tests.stages.matching.builders import Link, line, matched, odometer, run, site, times
@@ -136,7 +136,7 @@ def test_a_balloon_loop_brings_the_train_back_turned_round(seed: int) -> None:
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_worlds_by_chance(name: str) -> None:
-    """Short form of `python -m benchmarks.topologies`, whose seeds are others."""
+    """Short form of `python -m benchmarks.truth.topologies`, whose seeds are others."""
     found = [judge(name, seed) for seed in (71, 72)]
     assert max(one.sure_and_wrong for one in found) == 0.0
     assert max(one.path_off_m for one in found) < 25.0

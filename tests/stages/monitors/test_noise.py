@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from benchmarks.noise import Receiver, epochs_of, first_alarm
+from benchmarks.truth.noise import Receiver, epochs_of, first_alarm
 from pipeline.stages.monitors.axis import AxisSeries, Source, errors_of
 from pipeline.stages.monitors.bank import NOISE_TOO_LARGE, NOISE_UNKNOWN, MonitorBank
 from pipeline.stages.monitors.noise import NoiseMeter

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.clock import draw, estimate
+from benchmarks.truth.clock import draw, estimate
 from pipeline.stages.odometry.scale_lag import CountedRows, LagState, ScaleLag, possible_lags, scale_and_lag
 from schemas.arrays import Floats
 
@@ -120,7 +120,7 @@ def test_a_step_in_doubt_is_not_compared() -> None:
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10**6))
 def test_no_figure_is_wrong_by_more_than_four_of_its_sigmas(seed: int) -> None:
-    """Constant speed, shuttles, freight, trams; `benchmarks.clock` draws ten thousand."""
+    """Constant speed, shuttles, freight, trams; `benchmarks.truth.clock` draws ten thousand."""
     drawn = draw(seed)
     found = estimate(drawn)
     assert abs(found.scale - drawn.scale) <= 4.0 * found.scale_sigma

@@ -9,9 +9,7 @@ from dataclasses import replace
 import polars as pl
 import pytest
 
-from benchmarks.plausibility import applies, fit_of, told
-from benchmarks.plausibility_trips import Trip, trip
-from benchmarks.plausibility_wrongs import WRONGS, Wrong, moved_site, scaled, shifted
+from benchmarks.truth.plausibility import applies, fit_of, told
 from datasets.random_trials import random_trial
 from pipeline.one_run import replay as replayed
 from pipeline.read.ingest.correct import corrected
@@ -25,6 +23,8 @@ from schemas.config import Configuration, IngestConfig, PlausibilityConfig, Vehi
 from schemas.enums import MisfitCause
 from schemas.errors import ConfigError, InputError
 from schemas.run import RunLog, Site
+from tests.studies.plausibility.trips import Trip, trip
+from tests.studies.plausibility.wrongs import WRONGS, Wrong, moved_site, scaled, shifted
 
 # Short; one with a stop and all streams, one with a reversal, one without a stop.
 SEEDS = (27, 26, 29, 7)

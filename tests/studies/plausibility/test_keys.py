@@ -7,9 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.plausibility import applies
-from benchmarks.plausibility_trips import trip
-from benchmarks.plausibility_wrongs import WRONGS
+from benchmarks.truth.plausibility import applies
 from pipeline.stages.clean.clean import clean
 from pipeline.stages.track.geodesy import points_of
 from pipeline.studies.plausibility.check import Check
@@ -18,6 +16,8 @@ from pipeline.studies.plausibility.pairs import clock_lag
 from pipeline.studies.plausibility.records import Places, Record
 from schemas.config import Configuration, PlausibilityConfig, Vehicle
 from schemas.run import RunLog, Site
+from tests.studies.plausibility.trips import trip
+from tests.studies.plausibility.wrongs import WRONGS
 
 Case = tuple[RunLog, Site, Vehicle]
 _WRONGS = {wrong.name: wrong for wrong in WRONGS}

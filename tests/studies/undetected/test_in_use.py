@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from benchmarks.relink import journey
+from benchmarks.truth.relink import journey
 from pipeline.one_run import replay
 from pipeline.studies.undetected.in_use import Returns, in_use_errors
 from pipeline.studies.undetected.watched import NO_ROW, FaultWindow, Watched

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from benchmarks.undetected import proof
+from benchmarks.truth.undetected import proof
 from datasets.faults import FaultSpec
 from datasets.inject import inject
 from datasets.scenario import Scenario

@@ -1,6 +1,6 @@
 """Leaps of a counter: none found on healthy ones, and none that its bound does not cover; random drives with truth.
 
-`python -m benchmarks.odometer [DRIVES]`
+`python -m benchmarks.truth.odometer [DRIVES]`
 """
 
 from __future__ import annotations

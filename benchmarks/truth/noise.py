@@ -1,7 +1,7 @@
 """Does the bank live with the noise of real receivers, and what does measuring it cost in detection.
 
-    python -m benchmarks.noise quiet [--runs N] [--hours H] [--seed S]
-    python -m benchmarks.noise ramps [--runs N] [--seed S]
+    python -m benchmarks.truth.noise quiet [--runs N] [--hours H] [--seed S]
+    python -m benchmarks.truth.noise ramps [--runs N] [--seed S]
 
 Own simulation on a straight track with known scale and latency, which shares nothing with the program's generator:
 Gauss-Markov errors of any correlation time, white noise, heavy tails, bursts, digits, an odometer that walks at random;

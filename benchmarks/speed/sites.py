@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from benchmarks.results import Figure
-from benchmarks.start import Cost, cost_of
+from benchmarks.speed.start import Cost, cost_of
 from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
 from schemas.enums import Navigability

@@ -1,6 +1,6 @@
 """Damage archives of logs and files of maps: one error or a reading, in 2 s, and nothing left behind.
 
-    python -m benchmarks.fuzz_archives --count 2000
+    python -m tests.fuzz.archives --count 2000
 
 What an archive still unpacks to must be positions that were packed into it: `gz`, `bz2`, `xz`, `zst` and `zip` have
 checksums. `tar` has none over contents, so that its logs are held to their own. `--first N --count 1 --seed S` repeats.
@@ -22,11 +22,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from benchmarks.fuzz_files import Case, main, mutated
-from benchmarks.fuzz_ingest import Random
 from pipeline.make.receivers import gather
 from pipeline.make.survey.sources import read_surveys
 from schemas.config import Configuration, Vehicle
+from tests.fuzz.files import Case, main, mutated
+from tests.fuzz.ingest import Random
 
 _PLACES = ((60.0 * 50 + number) / 60 for number in range(9))
 

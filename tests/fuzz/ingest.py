@@ -1,6 +1,6 @@
 """Damage well-formed logs at random and read them: an error or correct data, never anything else.
 
-    python -m benchmarks.fuzz_ingest --count 10000 --seed 1
+    python -m tests.fuzz.ingest --count 10000 --seed 1
 
 Each case is one mutation of one log, both drawn from a generator seeded by (seed, number of the case),
 so that `--first N --count 1` repeats case N alone.
@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from benchmarks.ingest_logs import run_of
+from benchmarks.speed.ingest import run_of
 from datasets.mcap_log import Encoding, write_mcap
 from pipeline.read.ingest import read_run
 from pipeline.show.export.mcap_file import Compression

@@ -1,9 +1,11 @@
-"""Is the track right where lines branch, cross and come back? `python -m benchmarks.topologies [--runs N] [--seed S]`.
+"""Is the track right where lines branch, cross and come back?
+
+`python -m benchmarks.truth.topologies [--runs N] [--seed S]`.
 
 Worlds by chance: rings, balloon loops, shuttles, yards, crossings at grade and above, stations, passing loops,
 turnouts and ladders on one of two tracks.
 Tracks are drawn from curves of a radius, trains drive them from element to element, and both the track and the place of
-every epoch are known. Errors are those of `benchmarks.calibration`; nothing here uses the program's geometry.
+every epoch are known. Errors are those of `benchmarks.truth.calibration`; nothing here uses the program's geometry.
 """
 
 from __future__ import annotations
@@ -16,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from benchmarks.calibration import degrees, fixes_at, noise, odometer_at, stated
 from benchmarks.results import Figure
+from benchmarks.truth.calibration import degrees, fixes_at, noise, odometer_at, stated
 from pipeline.stages.matching import match
 from pipeline.stages.odometry import odometry_of
 from schemas.arrays import floats

@@ -1,6 +1,6 @@
 """Does the statistic V of an odometer accuse no independent one, and find those that are made of the positions.
 
-    python -m benchmarks.follows [--runs N] [--seed S]
+    python -m benchmarks.truth.follows [--runs N] [--seed S]
 
 Own simulation, which shares nothing with the program's generator: journeys with stops over curves and grades; receivers
 with RTK, SBAS, canyon and heavy-tailed errors, digits and gaps; independent odometers (tacho pulses of 0.02 to 1 m,

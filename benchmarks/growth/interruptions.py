@@ -20,10 +20,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from benchmarks.cluster import ROOT, Cluster, kill_one, wait_for, workers_of
 from benchmarks.results import Figure, stopwatch
 from benchmarks.trials import write_campaign
 from pipeline.results import store
+from tests.campaign.cluster import ROOT, Cluster, kill_one, wait_for, workers_of
 
 TRIALS = 50
 STOP_S = 2.0

@@ -1,4 +1,6 @@
-"""Are claims of a track as right as they say? `python -m benchmarks.calibration [--claims N] [--seed S] [--family F]`.
+"""Are claims of a track as right as they say?
+
+`python -m benchmarks.truth.calibration [--claims N] [--seed S] [--family F]`.
 
 Runs on tracks beside each other whose own track is known. The generator knows nothing of the matcher's model: lines
 cut alike or on one track only, turnouts and yards on one side, survey errors per track, per element or by distance, a

@@ -1,4 +1,6 @@
-"""Are claims of a track right, whatever the network? `python -m benchmarks.tracks [--runs N] [--seed S] [--family F]`.
+"""Are claims of a track right, whatever the network?
+
+`python -m benchmarks.truth.tracks [--runs N] [--seed S] [--family F]`.
 
 Families of TRACKS: ladder yards, crossovers, one-sided turnouts, loops, throats, flyovers, junctions; surveys of 0.3 to
 2 m, exact, aside per track or per element; receivers of four Gauss-Markov processes (DIAG Table 1). The truth is known;
@@ -16,9 +18,9 @@ import numpy as np
 import polars as pl
 from scipy.signal import lfilter
 
-from benchmarks.calibration import degrees, fixes_at, noise, odometer_at
 from benchmarks.results import Figure
-from benchmarks.topologies import (
+from benchmarks.truth.calibration import degrees, fixes_at, noise, odometer_at
+from benchmarks.truth.topologies import (
     World,
     apart_m,
     bridge,

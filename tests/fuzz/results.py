@@ -1,6 +1,6 @@
 """Damage a result's caches and its manifest: the same answers, or one error; `balise verify` sees a changed manifest.
 
-    python -m benchmarks.fuzz_results --count 300
+    python -m tests.fuzz.results --count 300
 
 Bytes of `.catalogue` or of `manifest.json` of a small result are changed. Queries must answer as before, whatever the
 caches hold; of a changed manifest `verify` says so, or fails with one error, but for what SECURITY.md names
@@ -15,13 +15,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.fuzz_files import Case, main, mutated
-from benchmarks.fuzz_ingest import Random
 from datasets.scenario import Scenario
 from datasets.trial import write_trial
 from pipeline.campaign import make_plan, resume, run_campaign
 from pipeline.campaign.verify import verify
 from pipeline.results.query import run_sql
+from tests.fuzz.files import Case, main, mutated
+from tests.fuzz.ingest import Random
 
 _QUERY = "SELECT * FROM runs ORDER BY run_id, solution"
 _SCENARIO = {

@@ -1,4 +1,4 @@
-"""Speed and calibration of map matching: `python -m benchmarks.matching [--seeds N] [--no-shapely]`.
+"""Speed and calibration of map matching: `python -m benchmarks.speed.matching [--seeds N]`.
 
 Speeds are given as multiples of what scipy's KD-tree takes to find the nearest vertex of the same points, so
 that they mean the same on every machine.
@@ -137,17 +137,7 @@ def kd_tree_s(site: Site, fixes: pl.DataFrame) -> float:
     return best_of(5, lambda: tree.query(points))
 
 
-def shapely_s(site: Site, fixes: pl.DataFrame, count: int = 500) -> float | None:
-    """`line_locate_point` on the single line, from a part of the epochs; none without shapely."""
-    try:
-        import shapely
-    except ImportError:
-        return None
-    line, points = shapely.LineString(planar(site.track)), shapely.points(planar(fixes[:: EPOCHS // count]))
-    return best_of(1, lambda: shapely.line_locate_point(line, points)) * EPOCHS / len(points)
-
-
-def speeds(with_shapely: bool) -> list[Figure]:
+def speeds() -> list[Figure]:
     """Projection, the whole stage on a line, and on a network, as multiples of the KD-tree's time."""
     site = single_line()
     fixes, odometer = journey(site)
@@ -164,9 +154,6 @@ def speeds(with_shapely: bool) -> list[Figure]:
         Figure("projection on the line", projected / yardstick, "x KD-tree", 4.0),
         Figure("whole stage on the line", whole_s(site, fixes, odometer) / yardstick, "x KD-tree", 12.0),
     ]
-    if with_shapely and (by_shapely := shapely_s(site, fixes)) is not None:
-        name = "shapely line_locate_point over projection"
-        figures.append(Figure(name, by_shapely / projected, "times", 100.0, "above"))
     big = network()
     fixes, odometer = journey(big)
     yardstick, taken = kd_tree_s(big, fixes), whole_s(big, fixes, odometer)
@@ -220,15 +207,14 @@ def calibration(seeds: int) -> list[Figure]:
 
 def measure(out: Path) -> list[Figure]:
     """All figures; nothing is written."""
-    return [*speeds(with_shapely=True), *calibration(200)]
+    return [*speeds(), *calibration(200)]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=200)
-    parser.add_argument("--no-shapely", action="store_true")
     options = parser.parse_args()
-    for figure in [*speeds(not options.no_shapely), *calibration(options.seeds)]:
+    for figure in [*speeds(), *calibration(options.seeds)]:
         limit = f" (target {figure.better} {figure.target:g})" if figure.target is not None else ""
         verdict = {True: " met", False: " MISSED", None: ""}[figure.met]
         print(f"{figure.name:<58} {figure.value:9.3f} {figure.unit}{limit}{verdict}")

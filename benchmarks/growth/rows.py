@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from benchmarks.end_to_end import command_peak_mb
-from benchmarks.relink import SCALE_SIGMA, SPEED_MPS, journey
 from benchmarks.results import Figure
+from benchmarks.speed.end_to_end import command_peak_mb
 from benchmarks.trials import line_scenario
+from benchmarks.truth.relink import SCALE_SIGMA, SPEED_MPS, journey
 from datasets.trial import build_run, build_site, write_run_log, write_site
 from pipeline.stages.alignment.align import align, odometer_at
 from pipeline.stages.lds import run_lds

@@ -1,6 +1,6 @@
 """Damage what no checksum of the container covers: messages and schemas of logs, tables, networks and settings.
 
-    python -m benchmarks.fuzz_files --count 5000
+    python -m tests.fuzz.files --count 5000
 
 Messages and schemas are changed inside a log that is written anew, so that its checksums are right, and what is read
 is held against the stock decoders. Of Parquet, what is read must be what was written. CSV, GeoJSON and TOML may say
@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from benchmarks.fuzz_ingest import MUTATIONS, FuzzReport, Random
-from benchmarks.ingest_logs import run_of
+from benchmarks.speed.ingest import run_of
 from datasets.mcap_log import Encoding, write_mcap
 from pipeline.read.ingest import read_run
 from pipeline.read.site.read import read_site
@@ -33,6 +32,7 @@ from pipeline.storage.parquet import parquet_bytes
 from schemas.config import Configuration, IngestConfig, load_settings, to_toml
 from schemas.errors import BaliseError
 from schemas.run import RunLog
+from tests.fuzz.ingest import MUTATIONS, FuzzReport, Random
 
 _SLOWEST_S = 2.0
 # Names and statistics in the footer of Parquet have no checksum: damage there may pass.

@@ -1,6 +1,6 @@
 """The fit of a run: wrong units, clocks, axes and shifts that must be told, and faulty runs that must not fail.
 
-python -m benchmarks.plausibility --trips 12 --runs 1000
+python -m benchmarks.truth.plausibility --trips 12 --runs 1000
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.plausibility_trips import Trip, trip
-from benchmarks.plausibility_wrongs import WRONGS, Wrong
 from benchmarks.results import Figure
 from pipeline.stages.clean.clean import clean
 from pipeline.studies.plausibility.check import Check, FitState
@@ -23,6 +21,8 @@ from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
+from tests.studies.plausibility.trips import Trip, trip
+from tests.studies.plausibility.wrongs import WRONGS, Wrong
 
 _CONFIG = Configuration()
 
@@ -90,7 +90,7 @@ def measure(_: Path) -> list[Figure]:
 
 def main() -> int:
     """Print what was not told, and each plausible run that fails; exit status 1 if there is one."""
-    parser = argparse.ArgumentParser(prog="benchmarks.plausibility", description=__doc__)
+    parser = argparse.ArgumentParser(prog="benchmarks.truth.plausibility", description=__doc__)
     parser.add_argument("--trips", type=int, default=12, help="of each wrong")
     parser.add_argument("--runs", type=int, default=1000, help="faulty but plausible ones")
     parser.add_argument("--verbose", action="store_true")

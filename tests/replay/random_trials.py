@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
+import sys
 from typing import Any
 
 import polars as pl
 
 from datasets.expected_hazards import ExpectedRow
-from datasets.random_trials import ON_ODOMETER, RandomTrial
+from datasets.random_trials import ON_ODOMETER, RandomTrial, random_trial
+from pipeline.one_run import replay
 from pipeline.stages.epochs.clock import nominal_period_s
 from schemas.enums import Verdict
 from schemas.run import RunTables
@@ -68,3 +71,24 @@ def _wrong_alarms(trial: RandomTrial, tables: RunTables) -> list[str]:
     if trial.kind in ("step", "offset", "ramp", "slow ramp") and not suspects <= {"gnss", "unknown"}:
         wrong.append(f"suspects {sorted(suspects)} of a fault of the position")
     return wrong
+
+
+def main() -> int:
+    """Print each trial that is not as expected; exit status 1 if there is one."""
+    parser = argparse.ArgumentParser(prog="tests.replay.random_trials", description=__doc__)
+    parser.add_argument("--trials", type=int, default=500)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    given = parser.parse_args()
+    failures = 0
+    for seed in range(given.first, given.first + given.trials):
+        trial = random_trial(seed)
+        wrong = deviations(trial, replay(trial.run, trial.site, trial.vehicle))
+        if wrong:
+            failures += 1
+            print(f"seed {seed} ({trial.kind}): {'; '.join(wrong)}", flush=True)
+    print(f"{given.trials} trials, {failures} not as expected")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

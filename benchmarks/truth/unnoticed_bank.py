@@ -4,7 +4,7 @@ The skies are those of the published experiment (`datasets.experiment`), the noi
 track and an odometer of 0.05 m over one second; the bank has run for 2,000 s when the fix comes. Figures are medians
 over noise and headings, of the larger direction; `docs/undetected.md` has them.
 
-python -m benchmarks.unnoticed_bank
+python -m benchmarks.truth.unnoticed_bank
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ def range_figure(constellation: Constellation, heading_deg: float) -> float:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(prog="benchmarks.unnoticed_bank", description=__doc__)
+    parser = argparse.ArgumentParser(prog="benchmarks.truth.unnoticed_bank", description=__doc__)
     parser.add_argument("--repetitions", type=int, default=4)
     given = parser.parse_args()
     skies: tuple[Constellation, ...] = ("gps", "gps_galileo")

@@ -1,4 +1,4 @@
-"""Is the lag between two recorders as sure as it says? `python -m benchmarks.clock [--draws N] [--seed S]`.
+"""Is the lag between two recorders as sure as it says? `python -m benchmarks.truth.clock [--draws N] [--seed S]`.
 
 Journeys of constant speed, shuttles, freight and trams, a counter and another recorder of them that is 0.02 to 20 s
 early or late. The drawing knows nothing of the estimator: noise of the other recorder is white and correlated over 20

@@ -1,0 +1,1 @@
+"""How campaigns and logs grow, and what interruptions leave of them."""

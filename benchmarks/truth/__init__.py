@@ -1,0 +1,1 @@
+"""Campaigns against truths that what is judged cannot know."""
