@@ -1,7 +1,8 @@
 """Worlds whose witnesses are crooked, against their truth: danger called health, and what healthy worlds are called.
 
 `python -m benchmarks.truth.witnesses [SEEDS] [FAMILY...]` prints per family: replays with danger
-(those in which a clock was assumed, and said to be, apart), verdicts, and worlds in which less evidence made something `right` or `safe`.
+(those in which a clock was assumed, and said to be, apart), verdicts, and worlds in which less evidence made something
+`right` or `safe`.
 """
 
 from __future__ import annotations
