@@ -10,7 +10,7 @@ TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 POLAR
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 STAMP := $(VENV)/.balise-installed
 
-.PHONY: install demo test quick stress check lint types bench docs dictionary configuration lock clean
+.PHONY: install demo test quick stress check lint types bench docs dist dictionary configuration lock clean
 
 install: $(STAMP)
 
@@ -42,6 +42,10 @@ types: install
 	$(BIN)/mypy
 
 check: lint types test
+
+# sdist and wheel, and the demonstration by the wheel in fresh environments. Needs the package registry.
+dist: install
+	bash .ci/wheel
 
 bench: install
 	$(BIN)/python -m benchmarks
