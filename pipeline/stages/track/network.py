@@ -128,7 +128,12 @@ class Network:
         return len(self.track.ids)
 
     def length_m(self, oriented: int) -> float:
-        return float(self.track.length_m[oriented // 2])
+        return self._lengths_m[oriented // 2]
+
+    @cached_property
+    def _lengths_m(self) -> list[float]:
+        lengths_m: list[float] = self.track.length_m.tolist()  # searches ask for one at a time
+        return lengths_m
 
     def reach(self, oriented: int, limit_m: float) -> dict[int, Reach]:
         """Everything whose entry lies within `limit_m` beyond the exit of an oriented element, each by its nearest way.
