@@ -21,7 +21,7 @@ from pipeline.results import store
 from schemas.config import Configuration
 from schemas.enums import RunStatus
 
-TIMES_READING_AND_WRITING = 2.5
+TIMES_READING_AND_WRITING = 2.7
 TIMES_NOTEBOOK = 30.0
 MEMORY_ONE_HOUR_MB, MEMORY_TEN_HOURS_MB = 600.0, 2500.0
 

@@ -198,27 +198,13 @@ def path_set(steps: PathSteps, network: Network, config: MatchingConfig, search:
     search = search or search_about(steps.points.surface, network, config.reach_m)
     candidates = candidates_of(steps.points, network, search, config.reach_m)
     survey_m = network.survey_sigmas_m(config.survey_sigma_default_m, candidates.vertex)
-    groups = unbranched_groups(network)
+    groups = network.unbranched
     # Until another track has come near there is nothing to tell apart.
     lines = groups[candidates.element]
     others = candidates.step[lines != lines[:1]]
     alone = int(others[0]) if others.size else len(steps)
     tests = PathTests.of_run(steps, alone, config)
     return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
-
-
-def unbranched_groups(network: Network) -> Ints:
-    """Per net element the number of the line without a branch that it belongs to, however it is cut."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    ways = network.successors
-    alone = np.diff(ways.first) == 1
-    joined = alone[ways.here] & alone[ways.to ^ 1]
-    pairs = (ways.here[joined] // 2, ways.to[joined] // 2)
-    size = (network.count, network.count)
-    _, group = connected_components(coo_array((np.ones(len(pairs[0])), pairs), shape=size), directed=False)
-    return np.asarray(group, dtype=np.int64)
 
 
 @dataclass

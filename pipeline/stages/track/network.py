@@ -122,6 +122,20 @@ class Network:
         """Per net element the number of the part that it is connected with, whichever way trains would run."""
         return np.asarray(self.parts.reshape(-1, 2).min(axis=1))
 
+    @cached_property
+    def unbranched(self) -> Ints:
+        """Per net element the number of the line without a branch that it belongs to, however it is cut."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        ways = self.successors
+        alone = np.diff(ways.first) == 1
+        joined = alone[ways.here] & alone[ways.to ^ 1]
+        pairs = (ways.here[joined] // 2, ways.to[joined] // 2)
+        size = (self.count, self.count)
+        _, group = connected_components(coo_array((np.ones(len(pairs[0])), pairs), shape=size), directed=False)
+        return np.asarray(group, dtype=np.int64)
+
     @property
     def count(self) -> int:
         """Number of net elements."""
