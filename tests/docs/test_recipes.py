@@ -13,8 +13,7 @@ from tests.docs.blocks import ROOT
 
 SINGLE, TABLES = "pipeline/stages/monitors/single.py", "schemas/tables.py"
 FIGURES = "pipeline/stages/run_row/run_figures.py"
-INPUTS, RUN, CONFIG = "schemas/inputs.py", "schemas/run.py", "schemas/config.py"
-KEYS = "docs/configuration.md"
+INPUTS, RUN, CONFIG = "schemas/inputs.py", "schemas/run.py", "schemas/config_ingest.py"
 
 MONITOR = [
     (
@@ -46,11 +45,11 @@ STREAM = [
     (RUN, '"faults"]', '"doors", '),
     (RUN, '    "faults",\n', '    "doors",\n'),
     (RUN, "    faults: pl.DataFrame", "    doors: pl.DataFrame | None = None\n"),
-    (CONFIG, "    balise_reads: tuple[StreamMapping", "    doors: tuple[StreamMapping, ...] = ()\n"),
     (
-        KEYS,
-        "| `ingest.balise_reads` |",
-        "| `ingest.doors` | none | mappings of topics that hold door states | as above |\n",
+        CONFIG,
+        "    balise_reads: tuple[StreamMapping",
+        "    doors: tuple[StreamMapping, ...] = ()\n"
+        '    """Topics that hold door states.\n\n    As for `ingest.gnss`.\n    """\n',
     ),
 ]
 CHECK = """
@@ -65,6 +64,7 @@ from pipeline.show.report.series import monitor_lines, time_data
 from pipeline.results.store import write_run
 from schemas.config import Configuration, settings_from
 from schemas.dictionary import dictionary_markdown
+from schemas.settings_page import settings_markdown
 from schemas.tables import MONITORS
 import numpy as np
 
@@ -86,9 +86,8 @@ folder = Path(sys.argv[2]); folder.mkdir()
 run.gnss.write_parquet(folder / "gnss.parquet")
 pl.DataFrame({"t": run.gnss["t"][:2], "open": [False, True]}).write_parquet(folder / "doors.parquet")
 text = dictionary_markdown()
-keys = Path("docs/configuration.md").read_text(encoding="utf-8")
 print(json.dumps({
-    "undocumented": [name for name in Configuration().ingest.model_dump() if f"`ingest.{name}`" not in keys],
+    "key": "| `ingest.doors` | none |  | Topics that hold door states. |" in settings_markdown(),
     "states": states["offside_state"].cast(pl.String).to_list(),
     "alarms": alarms.select("monitors", pl.col("verdict").cast(pl.String)).rows(),
     "drawn": monitor_lines()["other"],
@@ -115,7 +114,7 @@ TRIAL = (
 def followed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     """What a copy of the project answers once all three recipes are followed in it."""
     copy = tmp_path_factory.mktemp("copy")
-    for folder in ("schemas", "pipeline", "datasets", "docs"):
+    for folder in ("schemas", "pipeline", "datasets"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for file, before, text in (*MONITOR, *COLUMN, *STREAM):
         source = (copy / file).read_text(encoding="utf-8")
@@ -144,10 +143,10 @@ def test_a_column_takes_two_files(followed: dict[str, object]) -> None:
     assert len({file for file, _, _ in COLUMN}) == 2
 
 
-def test_a_stream_takes_four_files(followed: dict[str, object]) -> None:
+def test_a_stream_takes_three_files(followed: dict[str, object]) -> None:
     assert followed["doors"] == [False, True]
-    assert followed["undocumented"] == []
-    assert len({file for file, _, _ in STREAM}) == 4
+    assert followed["key"] is True
+    assert len({file for file, _, _ in STREAM}) == 3
 
 
 def test_the_dictionary_follows(followed: dict[str, object]) -> None:
@@ -159,5 +158,5 @@ def test_the_page_names_the_files(title: str, edits: list[tuple[str, str, str]])
     page = (ROOT / "docs" / "developer.md").read_text(encoding="utf-8")
     recipe = page.split(f"## How to add a{'n' if title == 'input stream' else ''} {title}\n")[1].split("\n## ")[0]
     assert {file for file, _, _ in edits} <= {
-        file for file in (SINGLE, TABLES, FIGURES, INPUTS, RUN, CONFIG, KEYS) if file in recipe
+        file for file in (SINGLE, TABLES, FIGURES, INPUTS, RUN, CONFIG) if file in recipe
     }
