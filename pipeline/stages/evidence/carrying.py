@@ -246,17 +246,22 @@ def carried_forward(
 
 def _consistent(accepted_ns: Ints, path_m: Floats, counter: Counter, config: Configuration) -> Ints:
     """Accepted balises that agree, within the failure limit, with the odometer since the last one that did."""
-    used: list[int] = []
     limit_m = config.hazards.limits.agreement_m
-    for number, at_m in enumerate(path_m.tolist()):
-        here_ns = accepted_ns[number : number + 1]
-        if used:
-            before = used[-1]
-            since_ns = accepted_ns[before : before + 1]
-            fixed_m = config.lds.odometer_fixed_m
-            low, high = _carried_from(counter, since_ns, float(path_m[before]), here_ns, fixed_m, config)
-            if at_m < low[0] - limit_m or at_m > high[0] + limit_m:
-                continue
-        if counter.odometer.known_at(here_ns)[0]:
-            used.append(number)
+
+    def agree(before: Ints, here: Ints) -> Bools:
+        fixed_m = config.lds.odometer_fixed_m
+        low, high = _carried_from(counter, accepted_ns[before], path_m[before], accepted_ns[here], fixed_m, config)
+        at_m = path_m[here]
+        # Where the odometer tells nothing it contradicts nothing.
+        return np.asarray(~((at_m < low - limit_m) | (at_m > high + limit_m)))
+
+    known = np.flatnonzero(counter.odometer.known_at(accepted_ns))
+    # One call for all pairs of neighbours; only after one that disagrees is another pair asked for.
+    with_neighbour = agree(known[:-1], known[1:]).tolist()
+    used: list[int] = known[:1].tolist()
+    for place in range(1, known.size):
+        here = known[place : place + 1]
+        next_to = used[-1] == known[place - 1]
+        if with_neighbour[place - 1] if next_to else agree(np.array(used[-1:]), here)[0]:
+            used.append(int(here[0]))
     return np.array(used, dtype=np.int64)

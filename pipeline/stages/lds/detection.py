@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import isnan
 
+import numpy as np
+
 from pipeline.stages.lds.crossings import Balise, Crossing
 from pipeline.stages.lds.journey import Journey, turning_epochs
 from pipeline.stages.lds.link_monitors import LinkOrder, disorder
 from pipeline.stages.lds.linking import LinkingChain
+from schemas.arrays import Floats
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import BaliseKind, PassageStatus
 
@@ -42,11 +45,6 @@ class BaliseDetection:
         """Odometer reading, times direction of travel, at which the next window closes."""
         return min(self.virtual.closing_m, self.physical.closing_m)
 
-    @property
-    def disarmed(self) -> bool:
-        """Noise could detect a balise again."""
-        return bool(self._disarmed)
-
     def turn(self, epoch: int) -> None:
         for chain in (self.virtual, self.physical) if epoch in self._turns else ():
             chain.turn(self._journey, epoch)
@@ -77,9 +75,10 @@ class BaliseDetection:
         accepted = [crossing for crossing, refusal in refusals if self._offer(crossing, refusal)]
         return accepted, self._order_fails(epoch, offered, overdue)
 
-    def rearm(self, epoch: int) -> None:
+    def rearm(self, begin: int, end: int) -> None:
+        """By these epochs, at none of which a balise is crossed after the first."""
         if self._disarmed:
-            self._disarmed.rearm(epoch)
+            self._disarmed.rearm(begin, end)
 
     def close_windows(self, epoch: int, t_ns: int) -> None:
         along_m = self._along_m[epoch]
@@ -146,16 +145,20 @@ class Disarmed:
         odometer_m = float("nan") if crossing.odometer_m is None else crossing.odometer_m
         self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
 
-    def rearm(self, epoch: int) -> None:
-        away_m = max(self._config.rearm_m, self._config.rearm_sigmas * float(self._journey.sigma_m[epoch]))
+    def rearm(self, begin: int, end: int) -> None:
+        """Those that are far enough away at one of the epochs from `begin` on, before `end`."""
+        part = slice(begin, end)
+        away_m = np.fmax(self._config.rearm_m, self._config.rearm_sigmas * self._journey.sigma_m[part])
         for name, (balise, at_m) in list(self._at.items()):
-            if abs(self._moved_m(epoch, balise, at_m)) >= away_m:
+            if (np.abs(self._moved_m(part, balise, at_m)) >= away_m).any():
                 del self._at[name]
 
-    def _moved_m(self, epoch: int, balise: Balise, at_m: float) -> float:
+    def _moved_m(self, part: slice, balise: Balise, at_m: float) -> Floats:
         if not self._journey.has_odometer:
-            return float(self._journey.path_m[epoch]) - balise.path_m
-        odometer_m = float(self._journey.odometer_m[epoch])
+            return self._journey.path_m[part] - balise.path_m
+        odometer_m = self._journey.odometer_m[part]
         if isnan(at_m):
-            self._at[balise.balise_id] = (balise, odometer_m)
+            known = odometer_m[np.isfinite(odometer_m)]
+            at_m = float(known[0]) if known.size else at_m
+            self._at[balise.balise_id] = (balise, at_m)
         return odometer_m - at_m

@@ -25,7 +25,8 @@ from schemas.enums import NotEvaluated
 
 # Identities are counted: half a balise lies between none and one.
 ORDER_THRESHOLD = 0.5
-_BLOCK = 4096  # epochs evaluated at once
+# Numerics: epochs evaluated at once, at first and at the most; between balises near each other few are needed.
+_FIRST_BLOCK, _BLOCK = 64, 4096
 
 
 def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:
@@ -84,17 +85,19 @@ class LinkDistance:
         self._fails = np.zeros(journey.t_ns.size, dtype=bool)
         self._anchor: Anchor | None = None
         self._done = 0
+        self._begun = False  # evaluated at all since what it is measured from changed
+        self._block = _FIRST_BLOCK
         self._since_return = np.full((2, journey.t_ns.size), np.nan)  # moved since the re-link anchor, its bound
 
     def measure_from(self, anchor: Anchor | None, epoch: int) -> None:
+        self._end_at(epoch)
         self._anchor = anchor
-        self._done = epoch
 
     def hold_to(self, epoch: int, moved_m: Floats, bound_m: Floats) -> None:
         """From `epoch` on the distance since the re-link anchor counts, for as long as it is given."""
+        self._end_at(epoch)
         self._since_return[:, epoch:] = np.nan
         self._since_return[:, epoch : epoch + moved_m.size] = moved_m, bound_m
-        self._done = epoch
 
     def can_measure(self, epoch: int) -> bool:
         """Nothing of the odometer's distance since the anchor is in doubt."""
@@ -104,24 +107,37 @@ class LinkDistance:
     def fails(self, epoch: int) -> bool:
         if self._anchor is None:
             return False
-        if epoch >= self._done:
-            self._evaluate(self._anchor, epoch)
+        self._look(self._anchor, epoch)
         return bool(self._fails[epoch])
 
     def quiet_until(self, epoch: int, end: int) -> int:
         """The first epoch from `epoch` on that fails or is not evaluated yet; at most `end`."""
         if self._anchor is None:
             return end
-        if epoch >= self._done:
-            self._evaluate(self._anchor, epoch)
+        self._look(self._anchor, epoch)
         ahead = self._fails[epoch : min(self._done, end)]
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
-    def _evaluate(self, anchor: Anchor, epoch: int) -> None:
-        """A block ahead at once: elementwise, so every epoch still knows only its own past."""
-        self._done = min(epoch + _BLOCK, self._fails.size)
-        ahead = slice(epoch, self._done)
+    def _look(self, anchor: Anchor, epoch: int) -> None:
+        """A block ahead at once, and whatever nobody asked for before it: a failing bank is alarm enough."""
+        if epoch >= self._done:
+            begin = self._done if self._begun else epoch
+            self._done = min(epoch + self._block, self._fails.size)
+            self._block = min(2 * self._block, _BLOCK)
+            self._begun = True
+            self._evaluate(anchor, slice(begin, self._done))
+
+    def _end_at(self, epoch: int) -> None:
+        """What it is measured from changes: epochs up to this one are evaluated, those after it anew."""
+        if self._anchor is not None and self._begun and epoch >= self._done:
+            self._evaluate(self._anchor, slice(self._done, epoch + 1))
+        self._done = epoch
+        self._begun = False
+        self._block = _FIRST_BLOCK
+
+    def _evaluate(self, anchor: Anchor, ahead: slice) -> None:
+        """Elementwise, so every epoch still knows only its own past."""
         way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
         rows_m2 = self._journey.rows_m[ahead] ** 2 + self._journey.rows_m[anchor.epoch] ** 2
         noise_m = self._factor * np.sqrt(self._journey.sigma_m[ahead] ** 2 + anchor.sigma_m**2 + rows_m2)
@@ -153,6 +169,7 @@ class LinkDistance:
         self._reason[epoch:][self._possible[epoch:]] = None
 
     def columns(self) -> list[pl.Series]:
+        self._end_at(self._fails.size - 1)
         reasons = pl.Series(self._reason.tolist(), dtype=pl.String)
         unknown = reasons.is_null() & pl.Series(np.isnan(self._value))
         reasons = first_reason((reasons.is_not_null(), reasons), (unknown, NotEvaluated.NEVER_VALIDATED))

@@ -102,7 +102,7 @@ class LocationSystem:
         """
         if self._use is not Use.IN_USE or self._withheld_for(epoch) is not None or self._hidden_ns is not None:
             return epoch
-        if self.balises.disarmed or self._chain_from is None or epoch <= self._chain_from:
+        if self._chain_from is None or epoch <= self._chain_from:
             return epoch
         if self._journey.has_odometer and not self.distance.can_measure(epoch):
             return epoch
@@ -118,6 +118,7 @@ class LocationSystem:
         self.evaluated[epoch:end] = evaluated.tolist()
         self.tvb[epoch:end] = (evaluated & self._journey.usable[epoch:end]).tolist()
         self._validated = True
+        self.balises.rearm(epoch, end)
 
     def _step(self, epoch: int) -> None:
         if epoch in self._missions:
@@ -138,7 +139,7 @@ class LocationSystem:
         accepted, disordered = self.balises.pass_virtual(epoch, distrusted, self._chain_from is None)
         for crossing in accepted:
             self._accept(crossing, epoch)
-        self.balises.rearm(epoch)
+        self.balises.rearm(epoch, epoch + 1)
         self.balises.close_windows(epoch, self._t_ns[epoch])
         self.evaluated[epoch] = self._bank.along_evaluated(epoch)
         self.alarm[epoch] = bank_failed or disordered or self.distance.fails(epoch)

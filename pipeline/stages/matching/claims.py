@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.matching.branches import OneTrack, branches_beyond_m
-from pipeline.stages.paths.path_set import PathSet, Span, unbranched_groups
+from pipeline.stages.paths.path_set import PathSet, Span
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import MatchingConfig
@@ -127,7 +127,7 @@ def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, 
     """Stretches where the path is doubtful at the time, or in hindsight; `read`: epochs at which a balise was read."""
     least = np.fmin(np.nan_to_num(claimed.live), np.nan_to_num(claimed.hindsight))
     ids = network.track.ids
-    groups = unbranched_groups(network)
+    groups = network.unbranched
     rows = []
     for begin, last in spans_of((least < ONE_TRACK_LEFT) & (element >= 0)):
         part = slice(begin, last + 1)

@@ -8,6 +8,9 @@ import polars as pl
 from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig
 
+# Numerics: rows that are looked at together, and fewer than which are not worth it.
+_BLOCK, _FEW = 4096, 64
+
 
 def hysteresis_m(sigma_m: Floats, config: AlignConfig) -> Floats:
     """How far the distance may leave the held distance before that follows [m]."""
@@ -24,14 +27,40 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
     if rows.size == 0:
         return held_m
     at_m = float(distance_m[rows[0]])
-    least_m = (distance_m - width_m)[rows].tolist()
-    most_m = (distance_m + width_m)[rows].tolist()
-    values = []
-    for low_m, high_m in zip(least_m, most_m, strict=True):
-        at_m = min(max(at_m, low_m), high_m)
-        values.append(at_m)
+    least_m, most_m = (distance_m - width_m)[rows], (distance_m + width_m)[rows]
+    values = np.empty(rows.size)
+    begin, ahead, few = 0, True, _FEW
+    while begin < rows.size:
+        # Ahead it follows the lower edge, back the upper one, up to the row at which the other edge takes it along.
+        block = slice(begin, begin + _BLOCK)
+        low_m, high_m = least_m[block], most_m[block]
+        edge_m, other_m = (low_m, high_m) if ahead else (high_m, low_m)
+        follow, beyond = (np.fmax, np.greater) if ahead else (np.fmin, np.less)
+        part_m = follow(follow.accumulate(edge_m), at_m)
+        taken = beyond(part_m, other_m)
+        count = int(np.argmax(taken)) if taken.any() else taken.size
+        values[begin : begin + count] = part_m[:count]
+        at_m = float(part_m[count - 1]) if count else at_m
+        begin += count
+        ahead ^= count < taken.size
+        # The more often movements are short, the longer no block is tried.
+        few = _FEW if count >= _FEW else min(2 * few, _BLOCK)
+        if count < _FEW:
+            end = min(begin + few, rows.size)
+            values[begin:end] = _row_by_row(at_m, least_m[begin:end], most_m[begin:end])
+            at_m = float(values[end - 1])
+            begin = end
     held_m[rows] = values
     return held_m
+
+
+def _row_by_row(at_m: float, least_m: Floats, most_m: Floats) -> list[float]:
+    """Where movements to and fro are shorter than a block is worth."""
+    values = []
+    for low_m, high_m in zip(least_m.tolist(), most_m.tolist(), strict=True):
+        at_m = min(max(at_m, low_m), high_m)
+        values.append(at_m)
+    return values
 
 
 def turns_of(distance_m: Floats, back_m: float) -> list[tuple[int, int, int]]:

@@ -31,6 +31,9 @@ from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
+# Numerics: means that are rounded stay below a limit where their terms do by so much.
+_SURELY_ALIKE = 1.0 - 1e-9
+
 
 @dataclass
 class Node:
@@ -84,6 +87,24 @@ class Node:
         part = known[begin - chain[0].begin : last - chain[0].begin]
         whole_m[begin - first : begin - first + part.size] = part
         return whole_m
+
+
+class _Way:
+    """Of a new hypothesis what it is compared by: its residuals before it, where each window of a test may begin."""
+
+    def __init__(self, node: Node, steps: PathSteps) -> None:
+        self.node = node
+        self._steps = steps
+
+    @cached_property
+    def begins(self) -> Ints:
+        end_s = self._steps.end_s
+        return np.asarray(np.searchsorted(end_s, end_s[self.node.begin] - 3.0 * np.array(WINDOWS_S)))
+
+    @cached_property
+    def residual_m(self) -> Floats:
+        """Over the longest window [m]."""
+        return self.node.residuals_m(int(self.begins[-1]), self.node.begin)
 
 
 class Span(NamedTuple):
@@ -177,27 +198,13 @@ def path_set(steps: PathSteps, network: Network, config: MatchingConfig, search:
     search = search or search_about(steps.points.surface, network, config.reach_m)
     candidates = candidates_of(steps.points, network, search, config.reach_m)
     survey_m = network.survey_sigmas_m(config.survey_sigma_default_m, candidates.vertex)
-    groups = unbranched_groups(network)
+    groups = network.unbranched
     # Until another track has come near there is nothing to tell apart.
     lines = groups[candidates.element]
     others = candidates.step[lines != lines[:1]]
     alone = int(others[0]) if others.size else len(steps)
     tests = PathTests.of_run(steps, alone, config)
     return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
-
-
-def unbranched_groups(network: Network) -> Ints:
-    """Per net element the number of the line without a branch that it belongs to, however it is cut."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    ways = network.successors
-    alone = np.diff(ways.first) == 1
-    joined = alone[ways.here] & alone[ways.to ^ 1]
-    pairs = (ways.here[joined] // 2, ways.to[joined] // 2)
-    size = (network.count, network.count)
-    _, group = connected_components(coo_array((np.ones(len(pairs[0])), pairs), shape=size), directed=False)
-    return np.asarray(group, dtype=np.int64)
 
 
 @dataclass
@@ -355,9 +362,10 @@ class _Growth:
 
     def _push(self, node: Node) -> None:
         same = self._by_element.setdefault(node.oriented, [])
+        way = _Way(node, self.steps)
         for other in same:
             covers = other.begin <= node.begin and (not other.followed or other.end > node.begin)
-            if covers and other.rejected >= node.rejected and self._alike(other, node):
+            if covers and other.rejected >= node.rejected and self._alike(other, way):
                 # Their tests cannot differ by more than the bounds allow for (rule 8).
                 other.p = max(other.p, node.p)
                 later = other.p_by_step[1 + node.begin - other.begin :]
@@ -369,19 +377,23 @@ class _Growth:
         self._made.append(node)
         heapq.heappush(self._queue, (node.begin, len(self._made), node))
 
-    def _alike(self, one: Node, other: Node) -> bool:
+    def _alike(self, one: Node, new: _Way) -> bool:
         """Two paths to one element that no test can tell apart by more than it allows for, whatever comes (rule 8).
 
         Their means agree over every window that a later test may still look at, and over the whole way.
         """
+        other = new.node
         last, alike_m = other.begin, self.config.paths_alike_m
-        begins = np.searchsorted(self.steps.end_s, self.steps.end_s[last] - 3.0 * np.array(WINDOWS_S))
-        for window_s, begin in zip(WINDOWS_S, begins.tolist(), strict=True):
-            one_m, other_m = (node.residuals_m(begin, last) for node in (one, other))
-            if (np.isfinite(one_m) != np.isfinite(other_m)).any():
-                return False
-            apart_m = np.where(self.steps.counted[begin:last], np.nan_to_num(one_m - other_m), 0.0)
-            if self.tests.farthest_m(self.steps, apart_m, last, window_s) > alike_m:
+        first = int(new.begins[-1])
+        one_m, other_m = one.residuals_m(first, last), new.residual_m
+        if (np.isfinite(one_m) != np.isfinite(other_m)).any():
+            return False
+        apart_m = np.where(self.steps.counted[first:last], np.nan_to_num(one_m - other_m), 0.0)
+        for window_s, begin in zip(WINDOWS_S, new.begins.tolist(), strict=True):
+            part_m = apart_m[begin - first :]
+            # No mean is larger than the largest difference: most pairs need none.
+            doubtful = np.abs(part_m).max(initial=0.0) > _SURELY_ALIKE * alike_m
+            if doubtful and self.tests.farthest_m(self.steps, part_m, last, window_s) > alike_m:
                 return False
         own = self.tests.totals(self.steps, one.begin, one.along.upto(last - one.begin))
         sums = one.before.residual_m + own.residual_m, other.before.residual_m

@@ -158,8 +158,16 @@ class PathTests:
         Windows may end later, where nothing differs; none counts with fewer than `_WHOLE` of its steps.
         """
         size = max(round(window_s / float(steps.period_s[last])), 1)
-        sums = np.cumsum(np.concatenate([np.zeros(1), apart_m, np.zeros(size)]))
-        counts = np.cumsum(np.concatenate([np.zeros(1), steps.counted[last - apart_m.size : last], np.ones(size)]))
+        # A window without a difference has the mean 0.
+        begin = max(int(np.argmax(apart_m != 0.0)) - size, 0)
+        apart_m = apart_m[begin:]
+        sums = np.zeros(apart_m.size + size + 1)
+        np.cumsum(apart_m, out=sums[1 : apart_m.size + 1])
+        sums[apart_m.size + 1 :] = sums[apart_m.size]
+        counts = np.ones(sums.size)
+        counts[0] = 0.0
+        counts[1 : apart_m.size + 1] = steps.counted[last - apart_m.size : last]
+        counts = np.cumsum(counts)
         number = np.maximum(counts[size:] - counts[:-size], _WHOLE * size)
         return float((np.abs(sums[size:] - sums[:-size]) / number).max(initial=0.0))
 
@@ -290,6 +298,13 @@ def _limits_beside(beside: Floats, alpha: float, looks: float) -> Floats:
     the limit grows until of both together no more are wrong than claims may be; at the most up to that of a level as
     much smaller, for what is more seldom is claimed in no run.
     """
+    limits, needed = _limits_and_needed(alpha, looks)
+    return np.interp(-beside, -needed, limits)
+
+
+@cache
+def _limits_and_needed(alpha: float, looks: float) -> tuple[Floats, Floats]:
+    """Limits of an offset, and how far away another track needs to be for each [sigmas]."""
     from scipy.special import ndtri
 
     share = 1.0 - ONE_TRACK_LEFT
@@ -297,8 +312,7 @@ def _limits_beside(beside: Floats, alpha: float, looks: float) -> Floats:
     # So often the other track has to be beyond the limit, and so far away it is.
     told = looks * _tails(limits) / share
     limits, told = limits[told < 1.0], told[told < 1.0]
-    needed = limits + ndtri(told)
-    return np.interp(-beside, -needed, limits)
+    return limits, limits + ndtri(told)
 
 
 def _tails(sigmas: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -52,7 +52,7 @@ class Chain:
     def after(self, network: Network, edge: Edge) -> Chain:
         """The chain carried on over a way from its last element."""
         entry_m = self.exit_m(network) + edge.gap_m
-        return replace(self, oriented=(*self.oriented, edge.to), entry_m=(*self.entry_m, entry_m))
+        return Chain((*self.oriented, edge.to), (*self.entry_m, entry_m), self.low, self.shared)
 
     def before(self, network: Network, oriented: int) -> Chain:
         """The chain with an element before its first, that leads to it."""

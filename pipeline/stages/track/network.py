@@ -122,13 +122,32 @@ class Network:
         """Per net element the number of the part that it is connected with, whichever way trains would run."""
         return np.asarray(self.parts.reshape(-1, 2).min(axis=1))
 
+    @cached_property
+    def unbranched(self) -> Ints:
+        """Per net element the number of the line without a branch that it belongs to, however it is cut."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        ways = self.successors
+        alone = np.diff(ways.first) == 1
+        joined = alone[ways.here] & alone[ways.to ^ 1]
+        pairs = (ways.here[joined] // 2, ways.to[joined] // 2)
+        size = (self.count, self.count)
+        _, group = connected_components(coo_array((np.ones(len(pairs[0])), pairs), shape=size), directed=False)
+        return np.asarray(group, dtype=np.int64)
+
     @property
     def count(self) -> int:
         """Number of net elements."""
         return len(self.track.ids)
 
     def length_m(self, oriented: int) -> float:
-        return float(self.track.length_m[oriented // 2])
+        return self._lengths_m[oriented // 2]
+
+    @cached_property
+    def _lengths_m(self) -> list[float]:
+        lengths_m: list[float] = self.track.length_m.tolist()  # searches ask for one at a time
+        return lengths_m
 
     def reach(self, oriented: int, limit_m: float) -> dict[int, Reach]:
         """Everything whose entry lies within `limit_m` beyond the exit of an oriented element, each by its nearest way.

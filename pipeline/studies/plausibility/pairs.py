@@ -21,6 +21,8 @@ _WINDOW_M = 150.0
 _WINDOW_LEAST_S = 8.0
 _WINDOW_MOST_S = 60.0
 _WINDOWS_OVERLAP = 4.0
+# Numerics: no more windows are looked at, evenly; longer runs tell no more of a unit or a clock.
+_WINDOWS_MOST = 1_000
 # A window agrees on a factor within so much: positions, curves and slip together.
 _WINDOW_AGREES = 0.12
 # Below this share of the usual speed a record tells more of noise than of the scale.
@@ -153,7 +155,8 @@ def _windows(gnss: Places, begin_s: float, end_s: float) -> tuple[Floats, Floats
     if not fast.size:
         return np.zeros(0), np.zeros(0)
     length_s = float(np.clip(_WINDOW_M / np.median(fast), _WINDOW_LEAST_S, _WINDOW_MOST_S))
-    starts = gnss.instants(length_s / _WINDOWS_OVERLAP, begin_s, end_s - length_s)
+    step_s = max(length_s / _WINDOWS_OVERLAP, (end_s - begin_s) / _WINDOWS_MOST)
+    starts = gnss.instants(step_s, begin_s, end_s - length_s)
     way = gnss.way(starts, starts + length_s)
     starts = starts[np.nan_to_num(way) > max(_SLOW_SHARE * usual(way, 0.9), MOVING_MPS * length_s)]
     return starts, starts + length_s
@@ -215,14 +218,19 @@ def _possible_lags(gnss: Places, other: Record) -> tuple[list[float], str]:
 
 def _correlations(first: Floats, second: Floats) -> Floats:
     """Correlation at every shift over what both know; 0 where that is too little (Padfield 2012, masked FFT)."""
-    from scipy.signal import correlate  # takes long to load, and hardly any run needs it
-
+    size = first.size + second.size - 1
     known = [np.isfinite(values).astype(np.float64) for values in (first, second)]
     apart = [np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0) for values in (first, second)]
-    spread = correlate(apart[0] ** 2, known[1], method="fft") * correlate(known[0], apart[1] ** 2, method="fft")
+
+    def at_every_shift(one: Floats, other: Floats) -> Floats:
+        # A power of two is a fast length; the other one turned round makes a correlation of a convolution.
+        fast = 1 << (size - 1).bit_length()
+        return np.fft.irfft(np.fft.rfft(one, fast) * np.fft.rfft(other[::-1], fast), fast)[:size]
+
+    spread = at_every_shift(apart[0] ** 2, known[1]) * at_every_shift(known[0], apart[1] ** 2)
     least = max(_COMMON_S, _COMMON_SHARE * min(known[0].sum(), known[1].sum()))
-    enough = (np.round(correlate(*known, method="fft")) >= least) & (spread > _SPEED_CHANGE**4)
-    return np.where(enough, correlate(*apart, method="fft") / np.sqrt(np.where(enough, spread, 1.0)), 0.0)
+    enough = (np.round(at_every_shift(*known)) >= least) & (spread > _SPEED_CHANGE**4)
+    return np.where(enough, at_every_shift(*apart) / np.sqrt(np.where(enough, spread, 1.0)), 0.0)
 
 
 def _common(gnss: Places, other: Record, lag_s: float) -> tuple[float, float]:

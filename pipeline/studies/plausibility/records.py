@@ -107,10 +107,11 @@ def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
 def counters_of(odometer: pl.DataFrame, epoch_ns: int) -> dict[str, Record]:
     """`distance`, and `speed` summed up, of an odometer, each where enough rows have it."""
     counters: dict[str, Record] = {}
+    rows_s = seconds_since(epoch_ns, odometer)
     for name, column in ("distance", "distance_m"), ("speed", "speed_mps"):
-        known = odometer.filter(pl.col(column).is_finite())
-        t_s = seconds_since(epoch_ns, known)
-        way = floats(known, column)
+        way = floats(odometer, column)
+        known = np.isfinite(way)
+        t_s, way = rows_s[known], way[known]
         if name == "speed" and way.size:
             way = np.concatenate([[0.0], np.cumsum(0.5 * (way[1:] + way[:-1]) * np.diff(t_s))])
         kept = _thinned(t_s)

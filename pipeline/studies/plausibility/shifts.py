@@ -13,7 +13,7 @@ from pipeline.stages.track.segments import Polyline, on_segments
 from pipeline.studies.plausibility.pairs import clock_lag
 from pipeline.studies.plausibility.records import MOVING_MPS, Places
 from pipeline.studies.plausibility.robust import LEAST, explains, halves_of, regressed, sampled, steady
-from schemas.arrays import Floats
+from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
 from schemas.run import Site
 
@@ -28,6 +28,8 @@ _ONE_HEADING = 0.04
 # Each round finds the nearest segments of the track anew, or looks along another part of the journey.
 _ROUNDS = 8
 _LAG_ROUNDS = 4
+# Numerics: a lag that moves by no more shows the same part again.
+_STAYS_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,10 @@ def fit_places(gnss: Places, record: Places, config: PlausibilityConfig) -> Plac
         shifted = _refined(gnss, record, lag_s, config)
         if not shifted.reason and explains(shifted.agreeing, as_recorded.agreeing):
             best = shifted
+        moved_s = abs(shifted.lag_s - lag_s)
         lag_s = shifted.lag_s
+        if moved_s <= _STAYS_S:
+            break
     return replace(best, as_recorded=as_recorded.as_recorded)
 
 
@@ -174,9 +179,12 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float) -> SurveyFit:
     points = gnss.points.take(rows)
     axes = np.stack([points.east, points.north], axis=1)
 
-    def beside(shift_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Direction across the track at the nearest segment of each moved position, how far it is, and its height."""
-        _, nearest = line.nearest_sample(points.surface + np.einsum("ijk,j->ik", axes, shift_m))
+    def nearest_to(shift_m: Floats) -> Ints:
+        """The nearest segment of each moved position."""
+        return line.nearest_sample(points.surface + np.einsum("ijk,j->ik", axes, shift_m))[1]
+
+    def beside(nearest: Ints) -> tuple[Floats, Floats, Floats]:
+        """Direction across the track at these segments, how far it is from each position, and its height."""
         along = np.einsum("ijk,ik->ij", axes, line.end[nearest] - line.start[nearest])
         across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
         feet = on_segments(points, line, nearest)
@@ -184,11 +192,15 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float) -> SurveyFit:
         low_m = line.height_start_m[nearest]
         return across, -feet.offset_m, low_m + part * (line.height_end_m[nearest] - low_m)
 
-    aside_m = float(np.median(np.abs(beside(np.zeros(2))[1])))
-    shift = np.zeros(2)
+    nearest = nearest_to(np.zeros(2))
+    across, apart, height_m = beside(nearest)
+    aside_m = float(np.median(np.abs(apart)))
     for _ in range(_ROUNDS):
-        across, apart, height_m = beside(shift)
         shift = regressed(across[:, None, :], apart[:, None], floor=1.0, least_known=_ONE_HEADING).estimate
+        before, nearest = nearest, nearest_to(shift)
+        if np.array_equal(nearest, before):
+            break
+        across, apart, height_m = beside(nearest)
     explained = across @ shift
     left = np.abs(apart - explained)
     is_steady = all(explained[half] @ apart[half] > 0.5 * (explained[half] ** 2).sum() for half in halves_of(len(left)))

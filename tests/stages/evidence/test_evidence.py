@@ -112,3 +112,20 @@ def test_since_an_accepted_balise_nothing_is_carried_over_a_stand() -> None:
     low_m, high_m = carried_forward(accepted_ns, path_m, at_ns, counted, stood, Configuration())
     assert low_m == pytest.approx([np.nan, 14.5, np.nan, np.nan, 74.0], nan_ok=True)
     assert high_m == pytest.approx([np.nan, 25.5, np.nan, np.nan, 86.0], nan_ok=True)
+
+
+def test_an_accepted_balise_that_the_odometer_contradicts_carries_nothing() -> None:
+    """10 m/s; those of 3 s and 4 s lie 40 m ahead, that of 5 s where it should; 5 m and 5 % of the way."""
+    accepted_ns, path_m = seconds(1, 2, 3, 4, 5, 20), np.array([10.0, 20.0, 70.0, 80.0, 50.0, 200.0])
+    counted = counting(np.arange(0.0, 110.0, 10.0))
+    low_m, high_m = carried_forward(accepted_ns, path_m, seconds(2, 4, 5, 7), counted, [], Configuration())
+    assert low_m == pytest.approx([15.0, 34.0, 45.0, 64.0])
+    assert high_m == pytest.approx([25.0, 46.0, 55.0, 76.0])
+
+
+def test_without_an_accepted_balise_nothing_is_carried() -> None:
+    counted = counting(np.arange(0.0, 110.0, 10.0))
+    nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
+    low_m, high_m = carried_forward(*nothing, seconds(2, 4), counted, [], Configuration())
+    assert np.isnan(low_m).all()
+    assert np.isnan(high_m).all()

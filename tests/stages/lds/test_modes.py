@@ -272,3 +272,18 @@ def test_no_balises_and_no_positions_are_no_error() -> None:
     lost = run(epochs_of([None] * 5, [None] * 5), balises_at(V1), ScriptedBank(blind=range(5)))
     assert set(lost.epochs["lds_mode"]) == {"initialising"}
     assert lost.passages.is_empty()
+
+
+@pytest.mark.parametrize("fails", [range(50, 120), range(70, 75), range(100, 400)])
+def test_link_distance_has_a_verdict_through_a_failure_of_the_bank(fails: range) -> None:
+    """From the accepted balise on, however many epochs are looked at together."""
+    result = run(epochs_of(steps(0.0, 20.0, 400)), balises_at(V1), ScriptedBank(fails=fails))
+    assert result.epochs["link_distance_state"].to_list()[6:] == ["pass"] * 394
+
+
+@pytest.mark.parametrize("step_m", [1.0, 4.0])
+def test_a_balise_is_detected_again_on_the_way_back_only_beyond_its_distance(step_m: float) -> None:
+    """50 m past it and back; an uneventful way counts as every epoch of it does."""
+    there = steps(0.0, step_m, round(160.0 / step_m) + 1)
+    result = run(epochs_of([*there, *there[-2::-1]]), balises_at(V1))
+    assert [row[:2] for row in passage_rows(result, "balise_id", "status")] == [("V1", "accepted")] * 2

@@ -68,6 +68,27 @@ def test_without_hysteresis_the_distance_is_as_it_is():
     assert driven[-1] == pytest.approx(np.abs(np.diff(rows)).sum())
 
 
+@pytest.mark.parametrize("turns", [0, 3, 400])
+@pytest.mark.parametrize("width_m", [0.0, 0.3, 5.0])
+def test_long_drives_are_held_as_each_row_alone_would_be(turns, width_m):
+    """By the definition, row by row: the edge that reaches it takes it along. Some rows and widths are unknown."""
+    rng = np.random.default_rng(turns)
+    sense = np.cos(np.pi * (turns + 0.5) * np.linspace(0.0, 1.0, 20_000))
+    distance_m = np.cumsum(0.4 * sense) + 0.1 * rng.normal(size=sense.size)
+    distance_m[rng.integers(0, sense.size, 50)] = np.nan
+    width = np.full(sense.size, width_m)
+    width[:100] = np.inf
+    held = with_hysteresis(distance_m, width)
+    at_m = distance_m[0]
+    for row in np.flatnonzero(np.isfinite(distance_m)).tolist():
+        if distance_m[row] - width[row] > at_m:
+            at_m = distance_m[row] - width[row]
+        elif distance_m[row] + width[row] < at_m:
+            at_m = distance_m[row] + width[row]
+        assert held[row] == at_m
+    assert np.isnan(held[~np.isfinite(distance_m)]).all()
+
+
 def test_way_to_and_fro_by_hand():
     """100 m there and 40 m back; what scatters within the hysteresis adds nothing."""
     there, back = np.linspace(0.0, 100.0, 201), np.linspace(99.5, 60.0, 80)
