@@ -20,7 +20,7 @@ from pipeline.studies.plausibility.accuracy import accuracy_checks, refuted
 from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, with_checks
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
-from schemas.conform import conform, shaped
+from schemas.conform import conform
 from schemas.enums import Reason
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
@@ -53,7 +53,8 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
             parts.append(_failed(prepared, solution, error))
     if len(errors) == len(parts):
         raise errors[0]
-    whole = {name: conform(pl.concat([part[name] for part in parts]), table) for name, table in TABLES.items()}
+    # Each part was brought to the contract when it was made.
+    whole = {name: pl.concat([part[name] for part in parts]) for name in TABLES}
     return RunTables(run_id=run.run_id, **whole)
 
 
@@ -106,7 +107,7 @@ def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence
         "runs": summarise(results, prepared.config, prepared.provenance),
     }
     # Judged epochs have more columns than the contract: those end here.
-    return {name: shaped(table, TABLES[name]) for name, table in tables.items()}
+    return {name: conform(table, TABLES[name]) for name, table in tables.items()}
 
 
 def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence, leaps_s: Sequence[int]) -> Case:
@@ -183,4 +184,4 @@ def _track_assumed(judged: Judged) -> bool:
 def _failed(prepared: PreparedRun, solution: str, error: InputError) -> Tables:
     """A solution without content but for the row that says why."""
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
-    return nothing | {"runs": failed_row(str(error), prepared.provenance, solution)}
+    return nothing | {"runs": conform(failed_row(str(error), prepared.provenance, solution), TABLES["runs"])}

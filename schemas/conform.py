@@ -40,9 +40,10 @@ def conform(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
 
 def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
     """The contract's columns and dtypes, in its order; the values are taken as they are."""
-    if (frame.columns, frame.dtypes) == _names_and_dtypes(schema):
+    series = {column.name: column for column in frame.get_columns()}
+    if (list(series), [column.dtype for column in series.values()]) == _names_and_dtypes(schema):
         return frame
-    return pl.DataFrame([_cast(frame[rule.name], rule.dtype) for rule in _rules(schema)])
+    return pl.DataFrame([_cast(series[rule.name], rule.dtype) for rule in _rules(schema)])
 
 
 def dtypes(schema: type[dy.Schema]) -> dict[str, pl.DataType]:

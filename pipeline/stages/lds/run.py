@@ -83,7 +83,7 @@ def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config
     starts = np.array([change.epoch for change in system.lrvb_changes])
     index = np.searchsorted(starts, np.arange(journey.t_ns.size), side="right") - 1
     distance_m, doubt_m = _reported_m(system.lrvb_changes, index, journey, config)
-    withheld_for = pl.Series("withheld_for", system.withheld_for, dtype=Epochs.columns()["withheld_for"].dtype)
+    withheld_for = pl.Series("withheld_for", system.withheld_for, dtype=dtypes(Epochs)["withheld_for"])
     withheld = withheld_for.is_not_null().alias("withheld")
     columns = [
         t,
@@ -123,7 +123,7 @@ def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld
     in_use = np.where(journey.usable & ~withheld, modes.index(LdsMode.LINKED), modes.index(LdsMode.ODOMETRY))
     mode = np.where(linked, in_use, modes.index(LdsMode.INITIALISING))
     mode = np.where(system.negated, modes.index(LdsMode.FAIL_SAFE), mode)
-    return pl.Series("lds_mode", modes, dtype=Epochs.columns()["lds_mode"].dtype).gather(mode)
+    return pl.Series("lds_mode", modes, dtype=dtypes(Epochs)["lds_mode"]).gather(mode)
 
 
 def _reported_m(

@@ -11,11 +11,12 @@ import polars as pl
 from pipeline.stages.epochs.clock import Clock, confident, may_move, met, unambiguous, usable
 from schemas.arrays import NS_PER_S, Bools, Ints, floats, times_ns
 from schemas.config import Configuration
+from schemas.conform import dtypes
 from schemas.enums import LdsMode, LostTo, MonitorState, Verdict
 from schemas.tables import MONITORS, Epochs
 from schemas.words import lost_words
 
-_LOST_TO = Epochs.columns()["lost_to"].dtype
+_LOST_TO = dtypes(Epochs)["lost_to"]
 
 
 @dataclass(frozen=True)
