@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.passing import passings
+from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.lds.crossings import (
     PLACE,
     Crossing,
@@ -28,6 +29,7 @@ from schemas.arrays import Bools, Floats
 from schemas.config import Configuration, LdsConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode
+from schemas.stages import AlignedEpochs
 from schemas.tables import Epochs, Passages
 
 
@@ -35,12 +37,13 @@ from schemas.tables import Epochs, Passages
 class LdsResult:
     """What the LDS made of one solution.
 
-    `epochs`: `t` and the LDS columns. `passages`: as in the contract, what needs a truth null or `none`, and
-    `t_reckoned`: when LRVB and odometer say that the train passes a balise that was not offered. `unknown_reads`: of
-    balises not on the path. `held`: re-links that held.
+    `epochs`: `t` and the LDS columns. `linking`: verdicts of the linking monitors by name. `passages`: as in the
+    contract, what needs a truth null or `none`, and `t_reckoned`: when LRVB and odometer say that the train passes a
+    balise that was not offered. `unknown_reads`: of balises not on the path. `held`: re-links that held.
     """
 
     epochs: pl.DataFrame
+    linking: Mapping[str, Verdicts]
     crossings: pl.DataFrame
     passages: pl.DataFrame
     unknown_reads: pl.DataFrame
@@ -48,7 +51,7 @@ class LdsResult:
 
 
 def run_lds(
-    epochs: pl.DataFrame,
+    epochs: AlignedEpochs,
     bank: MonitorBank,
     balises: pl.DataFrame,
     balise_reads: pl.DataFrame | None,
@@ -58,7 +61,7 @@ def run_lds(
 ) -> LdsResult:
     """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
 
-    `epochs`: `schemas.stages.Aligned`. `balises`: of the travelled path. `balise_reads`: `t, balise_id`, and
+    `balises`: of the travelled path. `balise_reads`: `t, balise_id`, and
     `odometer_m`; without that stream physical balises have no passages. `scale_sigma`: of the odometer by a vehicle
     file, else None.
     """
@@ -70,7 +73,8 @@ def run_lds(
     system.run()
     passages = system.balises.virtual.passages + system.balises.physical.passages
     return LdsResult(
-        epochs=epoch_columns(epochs["t"], system, journey, config.lds),
+        epochs=epoch_columns(epochs.table["t"], system, journey, config.lds),
+        linking={"link_order": system.balises.order.verdicts(), "link_distance": system.distance.verdicts()},
         crossings=crossing_rows(crossings),
         passages=passage_rows(passages, crossings, journey, solution),
         unknown_reads=unknown,
@@ -100,7 +104,7 @@ def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config
         pl.Series("diagnosis_faulty", _diagnosis_faulty(system, journey, withheld.to_numpy())),
         pl.Series("alarm", system.alarm, dtype=pl.Boolean),
     ]
-    return pl.DataFrame(columns).with_columns(*system.balises.order.columns(), *system.distance.columns())
+    return pl.DataFrame(columns)
 
 
 def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools) -> Bools:

@@ -9,6 +9,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, met
+from pipeline.stages.epochs.verdicts import NUMBER, Verdicts
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.matching.fixes import contradictory_covariances
 from pipeline.stages.odometry import Odometry
@@ -57,7 +58,7 @@ def ride_notes(ride: Ride, evidence: TrainEvidence) -> list[Remark]:
             Note.COVARIANCE: contradictory_covariances(ride.solution.fixes),
             Note.AMBIGUOUS: ", ".join(say("ambiguity", "stretch", **row) for row in doubtful),
             Note.OFF_NETWORK: _few([_off(row) for row in ride.match.off.iter_rows(named=True)]),
-            Note.UNLINKED: _unlinked(ride.lds.epochs["link_distance_reason"]),
+            Note.UNLINKED: _unlinked(ride.lds.linking["link_distance"]),
             Note.UNKNOWN_TELEGRAMS: ", ".join(sorted(set(ride.lds.unknown_reads["balise_id"]))),
             Note.READS_DISPUTED: evidence.disputed,
             Note.READS_UNREACHABLE: evidence.unreachable,
@@ -96,10 +97,11 @@ def _of_odometer(odometry: Odometry | None, straight_s: float) -> dict[Note, obj
     }
 
 
-def _unlinked(reasons: pl.Series) -> tuple[int, str] | None:
+def _unlinked(distance: Verdicts) -> tuple[int, str] | None:
     """How many positions after outages could not be re-linked, and why not."""
-    unlinked = reasons.filter(reasons.is_in([reason.value for reason in NO_RELINK]))
-    return (unlinked.len(), ", ".join(sorted(set(unlinked)))) if unlinked.len() else None
+    counts = {reason.value: int((distance.reason == NUMBER[reason]).sum()) for reason in NO_RELINK}
+    why = sorted(reason for reason, count in counts.items() if count)
+    return (sum(counts.values()), ", ".join(why)) if why else None
 
 
 def judged_notes(run: Mapping[str, Any]) -> list[Remark]:

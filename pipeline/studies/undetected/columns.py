@@ -150,7 +150,7 @@ def _range_m(ride: Ride, rows: Watched, parts: list[FaultWindow]) -> Floats:
     satellites = ride.prepared.ranges(ride.solution.name)
     if satellites is None:
         return np.full((2, rows.rows), np.nan)
-    low_m, high_m = range_bounds(ride.solution.epochs, satellites, ride.prepared.config)
+    low_m, high_m = range_bounds(ride.aligned, satellites, ride.prepared.config)
     return _both(bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts, ride.prepared.config.undetected).error_m
 
 
