@@ -24,6 +24,7 @@ from schemas.conform import conform
 from schemas.enums import Reason
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
+from schemas.stages import EpochFigures
 from schemas.tables import TABLES
 
 Tables = dict[str, pl.DataFrame]
@@ -96,9 +97,8 @@ def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence
     ride = ride_of(prepared, solution, _with_match(beside, prepared, solution), evidence)
     unnoticed = unnoticed_of(ride)
     judged = judge(_case(ride, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
-    lost = lost_columns(judged.epochs, prepared.config)
-    epochs = pl.concat([judged.epochs, lost, ride.solution.fixes.select("satellites")], how="horizontal")
-    results = _results(ride, judged, epochs, unnoticed, fit, evidence)
+    results = _results(ride, judged, unnoticed, fit, evidence)
+    epochs = judged.epochs.with_columns(*results.lost.columns(), ride.solution.fixes["satellites"])
     tables = {
         "hazards": judged.hazards,
         "passages": judged.passages,
@@ -127,16 +127,15 @@ def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence, leaps_s: S
     )
 
 
-def _results(
-    ride: Ride, judged: Judged, epochs: pl.DataFrame, unnoticed: Undetected, fit: Fit, evidence: TrainEvidence
-) -> SolutionResults:
+def _results(ride: Ride, judged: Judged, unnoticed: Undetected, fit: Fit, evidence: TrainEvidence) -> SolutionResults:
     """All that the `runs` row is made of."""
     prepared = ride.prepared
     run = prepared.run
-    accuracy = accuracy_checks(epochs, run.faults, prepared.config)
+    accuracy = accuracy_checks(judged.epochs, run.faults, prepared.config)
     fit = with_checks(fit, accuracy)
     counts = prepared.counts.solutions[ride.solution.name]
     odometry = prepared.odometry
+    epochs = EpochFigures.of_table(judged.epochs)
     columns = {
         "vehicle": prepared.figures_from,
         "faults_injected": run.faults is not None and run.faults.height > 0,
@@ -149,7 +148,7 @@ def _results(
         "ambiguous_stretches": ride.match.ambiguous.height,
         **ride.at_the_end(),
         **ride.bank.white_noise(),
-        **unnoticed.figures(epochs, prepared.config),
+        **unnoticed.figures(judged.epochs, prepared.config),
     }
     # What stands against a verdict whatever was judged (DOMAIN section 5.4).
     against = {
@@ -165,6 +164,7 @@ def _results(
     return SolutionResults(
         solution=ride.solution.name,
         epochs=epochs,
+        lost=lost_columns(epochs, prepared.config),
         judged=judged,
         columns=columns,
         ingest=run.notes,

@@ -16,9 +16,9 @@ import dataframely as dy
 import numpy as np
 import polars as pl
 
-from schemas.arrays import Bools, Floats, Ints, floats, ints, times_ns, truths
+from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns, truths
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import BaliseKind, Evidence, Judgement, LdsState, NotEvaluated, PassageStatus, SigmaSource
+from schemas.enums import BaliseKind, Evidence, Judgement, LdsMode, LdsState, NotEvaluated, PassageStatus, SigmaSource
 
 # Confidence where one track is left of the set of those that the positions do not reject (DOMAIN section 2).
 ONE_TRACK_LEFT = 0.99
@@ -246,6 +246,140 @@ def _array(name: str, kind: str, table: pl.DataFrame, elements: Sequence[str]) -
         numbers = {word: number for number, word in enumerate(words[name])}
         return ints(table[column].cast(pl.String).replace_strict(numbers, default=None, return_dtype=pl.Int64))
     return ints(table[column])
+
+
+@dataclass(frozen=True)
+class EpochFigures:
+    """The judged epochs of a solution, as far as the figures of a run are made of them; arrays of shape (epochs,)."""
+
+    t_ns: Ints
+    """Stamp of the epoch [ns since 1970, UTC]."""
+    at_ns: Ints
+    """The instant at which the position is judged [ns]: its stamp less the latency of the vehicle file."""
+    path_m: Floats
+    """Path position [m]."""
+    on_track: Bools
+    """As in `MatchedEpochs`."""
+    path_probability: Floats
+    """Confidence in the track in hindsight [1]."""
+    gate_probability: Floats
+    """The same by what was known then [1]."""
+    confidence_m: Floats
+    """Half-width of the confidence interval along the track [m]."""
+    hpl_m: Floats
+    """Horizontal protection level of the receiver [m]."""
+    speed_mps: Floats
+    """Speed along growing path [m/s]."""
+    without_odometer: Bools
+    """There is no odometer here."""
+    tvb: Bools
+    """The position is a train-borne virtual balise (TVB)."""
+    negated: Bools
+    """The LDS negated the position."""
+    alarm: Bools
+    """A monitor fails."""
+    fail_safe: Bools
+    """Mode of the LDS."""
+    withheld_for: Ints
+    """What the position is withheld for, by number in `LostTo`; -1 where it is not."""
+    exposure_s: Floats
+    """Time since the last validated position before this one [s]."""
+    judgement: Ints
+    """What the evidence says of the position, by number in `Judgement`."""
+    error_low_m: Floats
+    """Least error in the direction of travel that the evidence leaves [m]."""
+    error_high_m: Floats
+    """Largest error in the direction of travel that the evidence leaves [m]."""
+    error_along_m: Floats
+    """Error where reference or reads give it to `known_error_m` [m]."""
+    moves: Bools
+    """The train moves from here to the next epoch, as is known."""
+    may_move: Bools
+    """It does, or nobody knows (DOMAIN section 5.5)."""
+    undiagnosed: Bools
+    """State P3: no verdict of `along_raw`, by the LDS, or the odometer is wrong."""
+    in_use: Bools
+    """Fix valid, unambiguous, confident, not negated, not withheld."""
+    used_s: Floats
+    """Time in use that the epoch stands for [s]."""
+    counted_s: Floats
+    """Time that the epoch stands for in shares of time [s]."""
+    lds_state: Ints
+    """State of the reactive LDS by number in `LdsState`; -1 where it needs a truth that is missing."""
+    table: pl.DataFrame
+    """All columns of the epochs, for what reads few of them, or names them."""
+
+    @classmethod
+    def of_table(cls, table: pl.DataFrame) -> EpochFigures:
+        """The arrays of judged epochs."""
+        moving = table["moving"]
+        moves = truths(moving)
+        return cls(
+            t_ns=times_ns(table),
+            at_ns=times_ns(table, "at") if "at" in table.columns else times_ns(table),
+            on_track=flags(table, "on_track"),
+            without_odometer=table["odometer_reason"].is_not_null().to_numpy(),
+            tvb=flags(table, "tvb"),
+            negated=flags(table, "negated"),
+            alarm=flags(table, "alarm"),
+            fail_safe=_numbers(table["lds_mode"]) == tuple(LdsMode).index(LdsMode.FAIL_SAFE),
+            withheld_for=_numbers(table["withheld_for"]),
+            judgement=_numbers(table["judgement"]),
+            moves=moves,
+            may_move=moves | moving.is_null().to_numpy(),
+            undiagnosed=flags(table, "undiagnosed"),
+            in_use=flags(table, "in_use"),
+            lds_state=_numbers(table["lds_state"]),
+            table=table,
+            **{name: floats(table, name) for name in _FIGURES},
+        )
+
+    def where(self, chosen: Bools) -> EpochFigures:
+        """Some of the epochs."""
+        return EpochFigures.of_table(self.table.filter(pl.Series(chosen)))
+
+    @property
+    def height(self) -> int:
+        """Number of epochs."""
+        return self.t_ns.size
+
+    @property
+    def usable(self) -> Bools:
+        """Epochs with a position on the track."""
+        return np.isfinite(self.path_m) & self.on_track
+
+    @property
+    def unambiguous(self) -> Bools:
+        """One track is left for the position by what the train knew then."""
+        return np.asarray(self.gate_probability >= ONE_TRACK_LEFT)
+
+    @property
+    def valid(self) -> Bools:
+        """TVBs while it is known whether the train moves: a TVB where nobody knows counts for no availability."""
+        return self.tvb & (self.moves | ~self.may_move)
+
+    @property
+    def judged(self) -> Bools:
+        """The evidence calls the position right or wrong (DOMAIN section 5.2)."""
+        return self.is_judged(Judgement.RIGHT) | self.is_judged(Judgement.WRONG)
+
+    def is_judged(self, judgement: Judgement) -> Bools:
+        return np.asarray(self.judgement == tuple(Judgement).index(judgement))
+
+    def confident(self, limit_m: float) -> Bools:
+        """The confidence interval along the track is within its limit."""
+        return np.asarray(self.confidence_m <= limit_m)
+
+
+_FIGURES = (
+    *("path_m", "path_probability", "gate_probability", "confidence_m", "hpl_m", "speed_mps", "exposure_s"),
+    *("error_low_m", "error_high_m", "error_along_m", "used_s", "counted_s"),
+)
+
+
+def _numbers(words: pl.Series) -> Ints:
+    """Words of an enumeration by their number in it, -1 for null."""
+    return ints(words.to_physical())
 
 
 class Crossings(dy.Schema):

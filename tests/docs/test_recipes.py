@@ -33,7 +33,7 @@ COLUMN = [
     (
         FIGURES,
         '        "outages": lost_s.size,',
-        '        "epochs_on_track": int(epochs["on_track"].sum()),\n',
+        '        "epochs_on_track": int(epochs.on_track.sum()),\n',
     ),
 ]
 STREAM = [

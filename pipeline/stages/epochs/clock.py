@@ -35,8 +35,12 @@ class Clock:
 
     @classmethod
     def of(cls, epochs: pl.DataFrame, config: Configuration) -> Clock:
-        t_ns = times_ns(epochs)
-        period_s = nominal_period_s(position_ns(epochs))
+        return cls.at(times_ns(epochs), position_ns(epochs), config)
+
+    @classmethod
+    def at(cls, t_ns: Ints, position_ns: Ints, config: Configuration) -> Clock:
+        """`t_ns`: all epochs; `position_ns`: those with a position."""
+        period_s = nominal_period_s(position_ns)
         limit_s = gap_limit_s(period_s, config.align.gap_reset_s)
         return cls(t_ns, period_s, limit_s, held_s(t_ns, limit_s))
 
