@@ -166,8 +166,8 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
     }
     times = ("time_to_detect", "time_since_failure", "time_since_failure_may")
     # A fault counts once, whatever its rows.
-    faults = independent_episodes(hazards)
-    of_faults = {"faults": faults.height, "missed_detections": faults["missed"].sum()}
+    faults = independent_episodes(hazards)["missed"] if hazards.height else pl.Series(dtype=pl.Boolean)
+    of_faults = {"faults": faults.len(), "missed_detections": faults.sum()}
     return _counted(hazards, counts) | of_faults | {f"{name}_max_s": hazards[f"{name}_s"].max() for name in times}
 
 

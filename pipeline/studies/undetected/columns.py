@@ -75,7 +75,7 @@ def unnoticed_of(ride: Ride) -> Undetected:
 
 def _nothing(table: type[dy.Schema], rows: int) -> pl.DataFrame:
     kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith(("undetected_", "physical_"))}
-    return pl.DataFrame({name: [None] * rows for name in kinds}, schema=kinds)
+    return pl.DataFrame([pl.Series(name, [None], dtype=kind).new_from_index(0, rows) for name, kind in kinds.items()])
 
 
 def _gathered(at_rows: pl.DataFrame, at: Ints) -> pl.DataFrame:
