@@ -203,7 +203,7 @@ class AlignedEpochs(MatchedEpochs):
 
 def _gathered(words: pl.Series, number: Ints) -> pl.Series:
     """Words by their number, the last of them for -1."""
-    return words[np.where(number < 0, len(words) - 1, number).astype(np.uint32)]
+    return words[pl.Series(np.where(number < 0, len(words) - 1, number).astype(np.uint32))]
 
 
 def _series(epochs: MatchedEpochs, name: str) -> pl.Series:

@@ -63,7 +63,7 @@ class Verdicts:
         return [
             pl.Series(f"{name}_value", self.value, nan_to_null=True),
             pl.Series(f"{name}_threshold", self.threshold, nan_to_null=True),
-            _STATE_WORDS[self.state.astype(np.uint32)].alias(f"{name}_state"),
+            _STATE_WORDS[pl.Series(self.state.astype(np.uint32))].alias(f"{name}_state"),
             reason_words(self.reason).alias(f"{name}_reason"),
         ]
 
