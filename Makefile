@@ -10,7 +10,7 @@ TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 POLAR
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 STAMP := $(VENV)/.balise-installed
 
-.PHONY: install demo test quick stress check lint types bench docs mutations dictionary lock clean
+.PHONY: install demo test quick stress check lint types bench docs mutations dictionary configuration lock clean
 
 install: $(STAMP)
 
@@ -56,6 +56,9 @@ mutations: install
 
 dictionary: install
 	$(BIN)/python -m schemas.dictionary > docs/dictionary.md
+
+configuration: install
+	$(BIN)/python -m schemas.settings_page > docs/configuration.md
 
 # Pins every dependency with its hashes, for every extra, Python version and system; names no index.
 lock:

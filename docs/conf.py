@@ -6,8 +6,10 @@ from sphinx.application import Sphinx
 
 from schemas.version import VERSION
 
-FIRST = ("project", "field-engineer", "analyst", "assessor", "domain")
+FIRST = ("project", "field-engineer", "analyst", "assessor", "measurements", "domain")
 """Pages with which the menu begins; the others follow in the order of their names."""
+LAST = ("CONTRIBUTING", "SECURITY", "CHANGELOG")
+"""Pages of the repository with which it ends."""
 
 project = "balise"
 version = release = VERSION
@@ -15,7 +17,7 @@ extensions = ["myst_parser"]
 myst_heading_anchors = 4
 # The sources are those that one reads in the repository, README.md first; links between them lead to the same places.
 root_doc = "README"
-include_patterns = ["README.md", "SECURITY.md", "CHANGELOG.md", "docs/*.md"]
+include_patterns = ["README.md", "SECURITY.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md", "docs/*.md"]
 exclude_patterns = [".*", "build", "benchmarks", "datasets", "pipeline", "schemas", "tests", "*-out"]
 html_theme = "furo"
 html_title = f"balise {VERSION}"
@@ -35,5 +37,7 @@ def setup(app: Sphinx) -> None:
 def _add_menu(app: Sphinx, page: str, source: list[str]) -> None:
     """README.md holds no menu: those who read it as a file have the folder."""
     if page == root_doc:
-        entries = "\n".join([*(f"docs/{name}" for name in FIRST), "docs/*", "SECURITY", "CHANGELOG"])
+        entries = "\n".join(
+            [*(f"docs/{name}" for name in FIRST), "docs/*", "examples/README", "CONTRIBUTING", "SECURITY", "CHANGELOG"]
+        )
         source[0] += f"\n```{{toctree}}\n:hidden:\n:glob:\n\n{entries}\n```\n"

@@ -93,7 +93,7 @@ def judged(ready: Stage, tables: RunTables, healthy: RunTables | None, config: C
     beside = healthy.epochs if healthy is not None else tables.epochs.clear()
     seen = _first_fails(epochs, _from_onset(beside, ready))
     detected_s = min(seen.values(), default=None)
-    beyond = epochs.filter(pl.col("error_along_m").abs() > config.hazards.failure_limit_m)
+    beyond = epochs.filter(pl.col("error_along_m").abs() > config.hazards.limits.failure_m)
     return {
         "detected_s": detected_s,
         "way_m": None if detected_s is None else _way_m(ready, detected_s),
@@ -146,7 +146,7 @@ def _way_m(ready: Stage, since_s: float) -> float:
 
 def _unsafe(tables: RunTables, ready: Stage, config: Configuration) -> int:
     """Virtual balises accepted from the onset on with an error beyond the limit."""
-    wrong = (pl.col("status") == "accepted") & (pl.col("location_error_m").abs() > config.hazards.failure_limit_m)
+    wrong = (pl.col("status") == "accepted") & (pl.col("location_error_m").abs() > config.hazards.limits.failure_m)
     return tables.passages.filter(
         (pl.col("solution") == _SOLUTION)
         & wrong

@@ -128,7 +128,7 @@ def _missed(noise: RecordedNoise, config: Configuration, runs: int, seed: int, j
     for rate_mps in RATES_MPS:
         rate_hz = noise.rate_hz if rate_mps >= _SLOWEST_AT_RECORDED_RATE_MPS else min(1.0, noise.rate_hz)
         bank = noise.bank(config, rate_hz)
-        failure_s = config.hazards.failure_limit_m / rate_mps
+        failure_s = config.hazards.limits.failure_m / rate_mps
         asked = [("failure", int(min(failure_s, _LONGEST_S) * rate_hz))]
         found = epochs_until(bank, rate_mps, TARGETS, seed, jobs, 1.0 / rate_hz)
         asked += [(f"{target:g}", epochs) for target, epochs in zip(TARGETS, found, strict=True) if epochs is not None]

@@ -25,9 +25,9 @@ from pipeline.stages.prepare import PreparedRun
 from schemas.arrays import Ints, times_ns
 from schemas.enums import NotEvaluated
 from schemas.stages import AlignedEpochs
+from schemas.tables import ALL_MONITORS
 
-_AGAINST_ODOMETER = ("along_doppler", "link_distance")
-"""Monitors beside the bank that hold the GNSS against the odometer."""
+_AGAINST_ODOMETER = tuple(monitor.name for monitor in ALL_MONITORS if monitor.against_odometer)
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import runpy
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -75,19 +73,6 @@ def run_ids(table: pl.LazyFrame | pa.Table) -> set[Any]:
     if isinstance(table, pa.Table):
         return set(table["run_id"].to_pylist())
     return set(table.select("run_id").collect()["run_id"]) if "run_id" in table.collect_schema() else set()
-
-
-def test_the_example_draws_its_picture(
-    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
-    picture = tmp_path / "error.png"
-    monkeypatch.setattr(sys, "argv", ["example.py", str(workspace / "RUN"), str(workspace / "SITE"), str(picture)])
-    names = runpy.run_path(str(ROOT / "docs" / "example.py"))
-    assert names["passages"]["len"].sum() == names["tables"].passages.height > 0
-    assert 0 < names["epochs"].height <= names["tables"].epochs.height
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert "balises_accepted" in capsys.readouterr().out
 
 
 def test_there_are_such_blocks() -> None:

@@ -13,8 +13,7 @@ from tests.docs.blocks import ROOT
 
 SINGLE, TABLES = "pipeline/stages/monitors/single.py", "schemas/tables.py"
 FIGURES = "pipeline/stages/run_row/run_figures.py"
-INPUTS, RUN, CONFIG = "schemas/inputs.py", "schemas/run.py", "schemas/config.py"
-KEYS = "docs/configuration.md"
+INPUTS, RUN, CONFIG = "schemas/inputs.py", "schemas/run.py", "schemas/config_ingest.py"
 
 MONITOR = [
     (
@@ -26,7 +25,7 @@ MONITOR = [
         "    return verdicts(epochs.cross_track_m, factor * epochs.sigma_cross_m, reasons)\n\n\n",
     ),
     (SINGLE, '    "channel": lambda', '    "offside": lambda seen: offside_monitor(seen.epochs, 5.3),\n'),
-    (TABLES, '    Monitor("channel"', '    Monitor("offside", "m", "other", "off side"),\n'),
+    (TABLES, '    Monitor("channel"', '    Monitor("offside", "m", "other", "off side", axis="cross"),\n'),
 ]
 COLUMN = [
     (TABLES, "    part_verdict = one_of(", '    epochs_on_track = count("epochs on the track")\n'),
@@ -46,11 +45,11 @@ STREAM = [
     (RUN, '"faults"]', '"doors", '),
     (RUN, '    "faults",\n', '    "doors",\n'),
     (RUN, "    faults: pl.DataFrame", "    doors: pl.DataFrame | None = None\n"),
-    (CONFIG, "    balise_reads: tuple[StreamMapping", "    doors: tuple[StreamMapping, ...] = ()\n"),
     (
-        KEYS,
-        "| `ingest.balise_reads` |",
-        "| `ingest.doors` | none | mappings of topics that hold door states | as above |\n",
+        CONFIG,
+        "    balise_reads: tuple[StreamMapping",
+        "    doors: tuple[StreamMapping, ...] = ()\n"
+        '    """Topics that hold door states.\n\n    As for `ingest.gnss`.\n    """\n',
     ),
 ]
 CHECK = """
@@ -58,27 +57,39 @@ import json, sys
 from pathlib import Path
 import polars as pl
 from datasets.scenario import Scenario
+from datasets.motion import build_motion
 from datasets.trial import build_run, build_site
 from pipeline import read_run, replay
 from pipeline.show.report.series import monitor_lines, time_data
 from pipeline.results.store import write_run
 from schemas.config import Configuration, settings_from
 from schemas.dictionary import dictionary_markdown
+from schemas.settings_page import settings_markdown
+from schemas.tables import MONITORS
 import numpy as np
 
 scenario = settings_from(json.loads(sys.argv[1]), Scenario, "test")
 run = build_run(scenario, scenario.runs[0])
 tables = replay(run, build_site(scenario))
 states = tables.epochs["offside_state"].value_counts()
+aside = build_run(scenario, scenario.runs[1])
+motion, start = build_motion(scenario.runs[1].motion), aside.gnss["t"].dt.timestamp("ns")[0]
+passed = [start + round(motion.time_at(at_m) * 1e9) for at_m in range(200, 2000, 100)]
+passed = pl.Series("t", passed, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+reads = pl.DataFrame([passed, pl.Series("balise_id", [f"BG{at_m}" for at_m in range(200, 2000, 100)])])
+alone = {"monitors": {"disabled": [name for name in MONITORS if name != "offside"]}}
+alone |= {"hazards": {"false_alarm_lookback_s": 5.0, "false_alarm_margin_m": 20.0}}
+aside = aside.with_streams(reference=None, balise_reads=reads)
+alarms = replay(aside, build_site(scenario), None, Configuration.model_validate(alone)).alarms
 page = time_data(tables.epochs, np.array([], dtype=np.int64), 1.0)
 folder = Path(sys.argv[2]); folder.mkdir()
 run.gnss.write_parquet(folder / "gnss.parquet")
 pl.DataFrame({"t": run.gnss["t"][:2], "open": [False, True]}).write_parquet(folder / "doors.parquet")
 text = dictionary_markdown()
-keys = Path("docs/configuration.md").read_text(encoding="utf-8")
 print(json.dumps({
-    "undocumented": [name for name in Configuration().ingest.model_dump() if f"`ingest.{name}`" not in keys],
+    "key": "| `ingest.doors` | none |  | Topics that hold door states. |" in settings_markdown(),
     "states": states["offside_state"].cast(pl.String).to_list(),
+    "alarms": alarms.select("monitors", pl.col("verdict").cast(pl.String)).rows(),
     "drawn": monitor_lines()["other"],
     "series": sorted(name for name in page["series"] if "offside" in name),
     "column": tables.runs["epochs_on_track"].to_list(),
@@ -88,15 +99,22 @@ print(json.dumps({
 }))
 """
 TRIAL = """{"name": "recipe", "seed": 7, "gnss": {"rate_hz": 1.0}, "odometer": {"rate_hz": 5.0},
-"line": {"sections": [{"length_m": 3000.0}], "elements": [{"id": "A", "length_m": 3000.0}], "balises": []},
-"runs": [{"id": "run", "motion": {"start_m": 100.0, "phases": [{"speed_mps": 30.0}, {"stop_at_m": 2000.0}]}}]}"""
+"line": {"sections": [{"length_m": 3000.0}], "elements": [{"id": "A", "length_m": 3000.0}], "balises": BALISES},
+"runs": [{"id": "run", "motion": MOTION}, {"id": "aside", "motion": MOTION, "faults": [ASIDE]}]}"""
+TRIAL = (
+    TRIAL.replace(
+        "BALISES", json.dumps([{"id": f"BG{m}", "at_m": m, "kind": "physical"} for m in range(200, 2000, 100)])
+    )
+    .replace("MOTION", '{"start_m": 100.0, "phases": [{"speed_mps": 30.0}, {"stop_at_m": 2000.0}]}')
+    .replace("ASIDE", '{"kind": "step", "target": "cross", "size_m": 12.0, "start_s": 40.0, "duration_s": 10.0}')
+)
 
 
 @pytest.fixture(scope="module")
 def followed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     """What a copy of the project answers once all three recipes are followed in it."""
     copy = tmp_path_factory.mktemp("copy")
-    for folder in ("schemas", "pipeline", "datasets", "docs"):
+    for folder in ("schemas", "pipeline", "datasets"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for file, before, text in (*MONITOR, *COLUMN, *STREAM):
         source = (copy / file).read_text(encoding="utf-8")
@@ -116,6 +134,8 @@ def test_a_monitor_takes_two_files(followed: dict[str, object]) -> None:
     assert followed["series"] == ["ratio_offside"]
     assert followed["disabled"] == ["offside"]
     assert len({file for file, _, _ in MONITOR}) == 2
+    # Reads say nothing of the place across the track: no alarm of a monitor that sees this axis is a false one.
+    assert followed["alarms"] == [[["offside"], "unknown"]]
 
 
 def test_a_column_takes_two_files(followed: dict[str, object]) -> None:
@@ -123,10 +143,10 @@ def test_a_column_takes_two_files(followed: dict[str, object]) -> None:
     assert len({file for file, _, _ in COLUMN}) == 2
 
 
-def test_a_stream_takes_four_files(followed: dict[str, object]) -> None:
+def test_a_stream_takes_three_files(followed: dict[str, object]) -> None:
     assert followed["doors"] == [False, True]
-    assert followed["undocumented"] == []
-    assert len({file for file, _, _ in STREAM}) == 4
+    assert followed["key"] is True
+    assert len({file for file, _, _ in STREAM}) == 3
 
 
 def test_the_dictionary_follows(followed: dict[str, object]) -> None:
@@ -138,5 +158,5 @@ def test_the_page_names_the_files(title: str, edits: list[tuple[str, str, str]])
     page = (ROOT / "docs" / "developer.md").read_text(encoding="utf-8")
     recipe = page.split(f"## How to add a{'n' if title == 'input stream' else ''} {title}\n")[1].split("\n## ")[0]
     assert {file for file, _, _ in edits} <= {
-        file for file in (SINGLE, TABLES, FIGURES, INPUTS, RUN, CONFIG, KEYS) if file in recipe
+        file for file in (SINGLE, TABLES, FIGURES, INPUTS, RUN, CONFIG) if file in recipe
     }

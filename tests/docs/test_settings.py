@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,8 @@ from datasets.scenario import (
     SkySpec,
     SurveySpec,
 )
-from schemas.config import StreamCorrection, StreamMapping
+from schemas.config import Configuration, StreamCorrection, StreamMapping, Vehicle
+from schemas.config_base import Settings
 from schemas.dictionary import settings_frame
 from schemas.project import (
     CalibrateEntry,
@@ -41,6 +43,7 @@ from schemas.project import (
     TrackEntry,
     load_project,
 )
+from schemas.settings_page import Key, field_texts, keys, settings_markdown
 from tests.docs.blocks import ROOT, blocks
 
 Rows = dict[str, str]
@@ -117,22 +120,61 @@ def test_fault_kinds() -> None:
     assert {kind: (needs, target) for kind, needs, target in rows} == kinds
 
 
-def test_configuration_keys_and_defaults() -> None:
-    rows = {(file, key): default for file, key, default in settings_frame().iter_rows()}
-    *sections, mapping, correction, vehicle = tables(CONFIGURATION)
-    written = {("configuration", key): default for section in sections for key, default in section.items()}
-    written |= {("vehicle", key): default for key, default in vehicle.items()}
-    assert written == {key: "none" if value == "()" else value for key, value in rows.items()}
-    assert mapping == {**defaults(StreamMapping), "time": "auto"}
-    assert correction == defaults(StreamCorrection)
+def documented() -> list[Key]:
+    """Every key of the configuration as the page shows it."""
+    return [key for name, section in Configuration() for key in keys(type(section), f"{name}.")]
 
 
-def test_configuration_tells_reason_or_source() -> None:
-    """Every key of the configuration has a cell that says why it has this value."""
-    lines = CONFIGURATION.read_text(encoding="utf-8").splitlines()
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if re.match(r"\| `\w+\.", line)]
-    assert len(rows) == sum(file == "configuration" for file in settings_frame()["file"])
-    assert [row[0] for row in rows if len(row) != 4 or not row[3]] == []
+def test_page_of_the_configuration_is_up_to_date() -> None:
+    """Else: `make configuration`."""
+    assert CONFIGURATION.read_text(encoding="utf-8") == settings_markdown()
+
+
+def test_page_has_every_key_and_default() -> None:
+    shown = {key.name: key.default for key in documented()}
+    values = {name: default for file, name, default in settings_frame().iter_rows() if file == "configuration"}
+    assert list(shown) == list(values)
+    assert {name for name in values if shown[name] in ("none", "not set")} == {
+        name for name, default in values.items() if default in ("()", "not set")
+    }
+    numbers = {name: float(default) for name, default in values.items() if re.fullmatch(r"[\d.e+-]+", default)}
+    assert len(numbers) > 200
+    assert {name: float(shown[name]) for name in numbers} == numbers
+
+
+def test_every_key_has_its_meaning_and_its_reason_or_source() -> None:
+    assert [key.name for key in documented() if not (key.meaning and key.reason)] == []
+    others = [
+        key.name for model in (StreamMapping, StreamCorrection, Vehicle) for key in keys(model) if not key.meaning
+    ]
+    assert others == []
+
+
+def test_a_unit_that_is_stated_is_that_of_the_name() -> None:
+    """Keys whose text states a unit have it in their name, and no other one."""
+    stated = {key.name: re.search(r" \[(m/s2|m/s|m|s|h|deg|1/h|MiB|MB)\]", key.meaning) for key in documented()}
+    units = {key.name: key.unit.replace("²", "2").replace("°", "deg") for key in documented()}
+    assert {name: found[1] for name, found in stated.items() if found and found[1] != units[name]} == {}
+
+
+class Brakes(Settings):
+    """Not of this project: made by hand for the test."""
+
+    lag_s: float = 0.5
+    """Time until the brakes grip [s], however
+    hard.
+
+    A guess | ours.
+    """
+    silent: bool = False
+    # No text.
+
+
+def test_texts_are_those_under_the_keys() -> None:
+    assert field_texts(Brakes) == {"lag_s": ("Time until the brakes grip [s], however hard.", "A guess | ours.")}
+    lag, silent = keys(Brakes, "brakes.")
+    assert (lag.name, lag.default, lag.unit) == ("brakes.lag_s", "0.5", "s")
+    assert (silent.default, silent.unit, silent.meaning, silent.reason) == ("false", "", "", "")
 
 
 # Read by the name of the stream, of the fix, of the service level and of the axis.
@@ -159,8 +201,15 @@ def test_a_key_that_is_described_is_read(key: str, sources: str) -> None:
 
 @pytest.fixture(scope="module")
 def sources() -> str:
-    files = [*(ROOT / "pipeline").rglob("*.py"), ROOT / "schemas" / "config.py"]
-    return "\n".join(path.read_text(encoding="utf-8") for path in sorted(files))
+    """The program without the texts under keys, which name other keys."""
+    files = [*(ROOT / "schemas").glob("config*.py"), ROOT / "schemas" / "limits.py"]
+    settings = [ast.parse(path.read_text(encoding="utf-8")) for path in sorted(files)]
+    for tree in settings:
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                node.body = [item for item in node.body if not isinstance(item, ast.Expr)] or [ast.Pass()]
+    texts = [path.read_text(encoding="utf-8") for path in sorted((ROOT / "pipeline").rglob("*.py"))]
+    return "\n".join([*texts, *(ast.unparse(tree) for tree in settings)])
 
 
 def test_project_keys_and_defaults() -> None:

@@ -150,7 +150,7 @@ def recorded_experiment(
     rooms = [one.room for one in surveyed if one.room is not None]
     if not rooms:
         raise next(one.error for one in surveyed if one.error is not None)
-    cells = plan.cells(inputs.banks[0].config.hazards.failure_limit_m)
+    cells = plan.cells(inputs.banks[0].config.hazards.limits.failure_m)
     drawn = onsets_of(rooms, cells, plan)
     _refuse_lack_of_room(cells, drawn, rooms, plan_file)
     digests = {one.run_id: one.run_digest for one in surveyed}

@@ -90,7 +90,7 @@ def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
     own_low_m, own_high_m = (values[row] for values in base.own_m)
     low_m = own_low_m + moved_m
     high_m = own_high_m + moved_m
-    limit_m = base.config.hazards.failure_limit_m
+    limit_m = base.config.hazards.limits.failure_m
     code = np.full(t_ns.size, UNKNOWN)
     with np.errstate(invalid="ignore"):
         code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
@@ -169,7 +169,7 @@ def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
     at_m = at_m * sense + floats(base.epochs, "path_m")[row]
     own_low_m, own_high_m = (values[row] for values in base.own_m)
     moved_m = (at_m - train_m) * sense
-    limit_m = base.config.hazards.failure_limit_m
+    limit_m = base.config.hazards.limits.failure_m
     low_m = own_low_m + moved_m
     high_m = own_high_m + moved_m
     wrong = (low_m > limit_m) | (high_m < -limit_m) | astray

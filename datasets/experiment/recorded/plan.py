@@ -262,7 +262,7 @@ def banks_of(plan: RecordedPlan, path: Path | None, config: Configuration) -> tu
         )
         for bank in plan.banks
     )
-    limits = {bank.config.hazards.failure_limit_m for bank in banks}
+    limits = {bank.config.hazards.limits.failure_m for bank in banks}
     if len(limits) > 1:
         found = ", ".join(f"{limit:g}" for limit in sorted(limits))
         raise ConfigError("banks have different failure limits", place=str(path), found=found, expected="one for all")

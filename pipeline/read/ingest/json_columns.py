@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.json
 
 from pipeline.read.ingest.layout import Columns, Decoded, UndecodableError, Values, parse_path, undecodable
-from pipeline.read.ingest.mcap_block import Messages
+from pipeline.read.ingest.mcap_block import Messages, Stretches
 from pipeline.read.ingest.mcap_records import Channel
 
 _ARROW = {pl.Float64: pa.float64(), pl.Int64: pa.int64(), pl.Boolean: pa.bool_(), pl.String: pa.string()}
@@ -46,6 +46,11 @@ class JsonDecoder:
         self._schema = pa.schema(list(_struct(tree)))
         self._met: pa.Schema | None = None  # what of it the first messages held, while no other has held more
         self._narrow = True
+
+    @property
+    def wanted(self) -> Stretches:
+        """The parser takes whole messages."""
+        return {}
 
     def decode(self, messages: Messages) -> Iterator[Decoded]:
         """The fields of all messages."""

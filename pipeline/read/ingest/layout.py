@@ -18,7 +18,7 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from pipeline.read.ingest.mcap_block import Bytes, Messages
+from pipeline.read.ingest.mcap_block import Bytes, Messages, Stretches
 from pipeline.read.ingest.mcap_records import Channel
 from schemas.arrays import Bools, Ints
 from schemas.errors import InputError
@@ -123,6 +123,8 @@ def text(offset: int, length: int) -> Field:
 def constant(value: float | str | bool | None, dtype: pl.DataType) -> Field:
     """A field that messages of this layout leave out: its default, or null."""
     values = pl.Series([value], dtype=dtype, strict=False)
+    if dtype.is_numeric() and value is not None:
+        return Field(type(dtype), 0, 0, lambda rows: np.full(len(rows), values[0], dtype=values.to_numpy().dtype))
     return Field(type(dtype), 0, 0, lambda rows: values.new_from_index(0, len(rows)))
 
 
@@ -204,14 +206,15 @@ def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Sequence[F
 def _by_length(messages: Messages) -> Iterator[tuple[int, Messages]]:
     """The messages of each length, in order of the file."""
     longest = int(messages.length.max())
+    if longest == messages.length.min():
+        yield longest, messages.of_length(longest)
+        return
     # As narrow numbers: numpy sorts those of 16 bits in one pass.
     order = np.argsort(messages.length.astype(np.min_scalar_type(longest)), kind="stable")
     lengths = messages.length[order]
-    if lengths[0] == longest:
-        yield longest, messages
-        return
     for rows in np.split(order, np.flatnonzero(np.diff(lengths)) + 1):
-        yield int(messages.length[rows[0]]), messages.chosen(rows)
+        length = int(messages.length[rows[0]])
+        yield length, messages.chosen(rows).of_length(length)
 
 
 class LayoutDecoder:
@@ -226,6 +229,15 @@ class LayoutDecoder:
         self._walk = walk
         self._layouts: dict[int, list[Layout]] = {}
         self._kept = 0
+
+    @property
+    def wanted(self) -> Stretches:
+        """The stretches of each length of which one layout has been met."""
+        return {
+            length: [(stretch.start, stretch.end) for stretch in layouts[0].stretches]
+            for length, layouts in self._layouts.items()
+            if len(layouts) == 1
+        }
 
     def decode(self, messages: Messages) -> Iterator[Decoded]:
         """The fields of all messages, of those of one layout together."""

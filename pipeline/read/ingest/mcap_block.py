@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,52 @@ MESSAGE_HEAD = np.dtype(
     }
 )
 _FIXED_FIELDS = MESSAGE_HEAD.itemsize - HEAD_SIZE
+_MOST_LENGTHS = 8  # of the messages of a channel, that are read ahead
+
+Stretch = tuple[int, int]
+"""From one byte of a payload to another."""
+Stretches = Mapping[int, Sequence[Stretch]]
+"""Of messages by their length."""
+Wanted = Callable[[int], Stretches | None]
+"""Of a channel: what will be read of its messages, none of a length that is not named; None where nobody reads them."""
+
+
+@dataclass(frozen=True)
+class Records:
+    """Records of neighbouring chunks; side by side only where somebody asks for more than was read ahead.
+
+    Of a chunk that was read ahead its records are not kept, but unpacked once more.
+    """
+
+    parts: Sequence[Bytes | Callable[[], Bytes]]
+
+    @cached_property
+    def whole(self) -> Bytes:
+        parts = [part() if callable(part) else part for part in self.parts]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+OfLengths = Mapping[int, Mapping[Stretch, Bytes]]
+"""By length of the messages: stretches of their payloads, a row per message of the channel, also of other lengths."""
+
+
+@dataclass(frozen=True)
+class ReadAhead:
+    """Stretches of payloads that were read while their chunk was in the cache.
+
+    `rows`: of the messages that ask, None for all; `length`: of each of them, None where it is not known to be one.
+    """
+
+    of: OfLengths = field(default_factory=dict)
+    rows: Ints | None = None
+    length: int | None = None
+
+    def get(self, stretch: Stretch) -> Bytes | None:
+        found = None if self.length is None else self.of.get(self.length, {}).get(stretch)
+        return found if found is None or self.rows is None else found[self.rows]
+
+    def chosen(self, rows: Ints) -> ReadAhead:
+        return replace(self, rows=rows if self.rows is None else self.rows[rows])
 
 
 @dataclass(frozen=True)
@@ -36,14 +84,19 @@ class Messages:
     Times are in nanoseconds; `before` is the size of all blocks before this one.
     """
 
-    data: Bytes
+    records: Records
     start: Ints
     length: Ints
     log_time: Ints
     before: int = 0
+    ahead: ReadAhead = ReadAhead()
 
     def __len__(self) -> int:
         return len(self.start)
+
+    @property
+    def data(self) -> Bytes:
+        return self.records.whole
 
     @property
     def ordinal(self) -> Ints:
@@ -57,16 +110,21 @@ class Messages:
 
     def stretches(self, start: int, end: int) -> Bytes:
         """From one byte to another of each payload, one row each; the payloads must be that long."""
-        return stretches_of(self.data, self.start + start, end - start)
+        ahead = self.ahead.get((start, end))
+        return stretches_of(self.data, self.start + start, end - start) if ahead is None else ahead
 
     def payload(self, row: int) -> bytes:
         return self.data[self.start[row] :][: self.length[row]].tobytes()
 
+    def of_length(self, length: int) -> Messages:
+        """The same, all of which have this length."""
+        return replace(self, ahead=replace(self.ahead, length=length))
+
     def chosen(self, rows: Ints | Bools | slice) -> Messages:
         """Some of them."""
-        if isinstance(rows, np.ndarray) and rows.dtype == np.bool_:
-            rows = np.flatnonzero(rows)
-        return replace(self, start=self.start[rows], length=self.length[rows], log_time=self.log_time[rows])
+        these = np.arange(len(self))[rows]
+        start, length, log_time = self.start[these], self.length[these], self.log_time[these]
+        return Messages(self.records, start, length, log_time, self.before, self.ahead.chosen(these))
 
 
 Block = dict[int, Messages]  # by channel
@@ -82,21 +140,70 @@ def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
 
 
 @dataclass(frozen=True)
-class Piece:
-    """Records side by side, as of one chunk, and where messages begin among them, with the heads of these.
+class Part:
+    """Messages of one channel among records side by side, in order: where they begin, and how long payloads are."""
 
-    `offset`: its place in the file.
+    starts: Ints
+    lengths: Ints
+    log_times: Ints
+    ahead: OfLengths = field(default_factory=dict)
+
+    def reading_ahead(self, data: Bytes, wanted: Stretches) -> Part:
+        if not wanted or len(wanted) > _MOST_LENGTHS:
+            return self
+        starts = self.starts + MESSAGE_HEAD.itemsize
+        read: dict[int, dict[Stretch, Bytes]] = {}
+        for length, stretches in wanted.items():
+            here = self.lengths == length
+            some = slice(None) if here.all() else here
+            read[length] = {}
+            for begin, end in stretches:
+                taken = stretches_of(data, starts[some] + begin, end - begin)
+                if some is here:
+                    rows = np.zeros((len(starts), end - begin), dtype=np.uint8)
+                    rows[here] = taken
+                    taken = rows
+                read[length][begin, end] = taken
+        return replace(self, ahead=read)
+
+    def is_read(self) -> bool:
+        """Every message has a length that was wanted."""
+        if len(self.ahead) == 1:
+            return bool((self.lengths == next(iter(self.ahead))).all())
+        return bool(np.isin(self.lengths, list(self.ahead)).all())
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Records side by side, as of one chunk, and the messages among them, by channel.
+
+    `offset`: its place in the file; `size`: of the records [bytes].
     """
 
-    data: Bytes
-    starts: Ints
-    heads: npt.NDArray[np.void]
+    data: Bytes | Callable[[], Bytes]
+    parts: Mapping[int, Part]
     offset: int
+    size: int
 
+    def reading_ahead(self, wanted: Wanted, again: Callable[[], Bytes]) -> Piece:
+        """With what is wanted of its messages, and without its records where that is all: `again` unpacks them."""
+        assert not callable(self.data)
+        parts = dict(self.parts)
+        is_all = True
+        for channel, part in self.parts.items():
+            stretches = wanted(channel)
+            if stretches is not None:
+                parts[channel] = part.reading_ahead(self.data, stretches)
+                is_all &= parts[channel].is_read()
+        return Piece(again if is_all else self.data, parts, self.offset, self.size)
 
-def _piece(data: Bytes, starts: Ints, offset: int) -> Piece:
-    heads = stretches_of(data, starts, MESSAGE_HEAD.itemsize).reshape(-1) if len(starts) else data[:0]
-    return Piece(data, starts, heads.view(MESSAGE_HEAD), offset)
+    @property
+    def held(self) -> int:
+        """Bytes that it takes."""
+        if not callable(self.data):
+            return self.size
+        ahead = (rows for part in self.parts.values() for of in part.ahead.values() for rows in of.values())
+        return sum(rows.nbytes for rows in ahead) + sum(24 * len(part.starts) for part in self.parts.values())
 
 
 @dataclass
@@ -130,8 +237,7 @@ def piece_of_chunk(
     view = memoryview(content)
     starts = array("q")
     indexes = [(channel, entries) for channel, entries in indexes if entries]  # recovered logs have empty ones
-    listed = _listed(np.frombuffer(content, dtype=np.uint8), offset, indexes)
-    end = int(listed.starts[0]) if listed else len(view)
+    end, listed = _listed(np.frombuffer(content, dtype=np.uint8), offset, indexes) or (len(view), None)
     at = _walk(view, 0, end, starts, offset, on_record, allowance)
     if listed and at == end and not starts:
         return listed
@@ -147,35 +253,60 @@ def piece_of_chunk(
 
 def _agree(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> bool:
     """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
-    order = np.argsort(piece.heads["channel"], kind="stable")
-    channels = piece.heads["channel"][order]
-    messages = np.column_stack([piece.heads["log_time"], piece.starts])[order]
     for channel, entries in indexes:
-        first, end = np.searchsorted(channels, np.array([channel, channel + 1]))
+        part = piece.parts.get(channel)
         listed = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
-        if not np.array_equal(listed[np.argsort(listed[:, 1], kind="stable")], messages[first:end]):
+        messages = np.empty((0, 2)) if part is None else np.column_stack([part.log_times, part.starts])
+        if not np.array_equal(listed[np.argsort(listed[:, 1], kind="stable")], messages):
             return False
     return True
 
 
-def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> Piece | None:
-    """The messages by their indexes; none unless they follow each other to the end and are as the indexes list them."""
-    log_times, starts = np.frombuffer(b"".join(entries for _, entries in indexes), dtype="<i8").reshape(-1, 2).T
-    channels = np.repeat([channel for channel, _ in indexes], [len(entries) // 16 for _, entries in indexes])
-    order = np.argsort(starts, kind="stable")
-    starts = starts[order]
-    if not len(starts) or starts[0] < 0 or starts[-1] > len(data) - MESSAGE_HEAD.itemsize:
+def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> tuple[int, Piece] | None:
+    """Where the first message begins, and all by their indexes; none unless they follow each other from there to the
+    end and are as the indexes list them.
+    """
+    tables = _by_channel(indexes)
+    if not tables:
         return None
-    piece = _piece(data, starts, offset)
-    lengths = np.ascontiguousarray(piece.heads["length"])
-    ends = starts + HEAD_SIZE + lengths
-    tiled = ends[-1] == len(data) and (ends[:-1] == starts[1:]).all() and lengths.min() >= _FIXED_FIELDS
-    as_listed = (
-        (piece.heads["opcode"] == int(Opcode.MESSAGE)).all()
-        and (piece.heads["channel"] == channels[order]).all()
-        and (piece.heads["log_time"] == log_times[order]).all()
-    )
-    return piece if as_listed and tiled else None
+    log_times, starts = np.concatenate(list(tables.values())).T
+    order = np.argsort(starts, kind="stable")
+    first, last = int(starts[order[0]]), int(starts[order[-1]])
+    if first < 0 or last > len(data) - MESSAGE_HEAD.itemsize:
+        return None
+    heads = stretches_of(data, starts, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
+    lengths = heads["length"].astype(np.int64)
+    ends = (starts + lengths)[order] + HEAD_SIZE
+    counts = [len(table) for table in tables.values()]
+    if (
+        ends[-1] != len(data)
+        or (ends[:-1] != starts[order][1:]).any()
+        or lengths.min() < _FIXED_FIELDS
+        or (heads["opcode"] != int(Opcode.MESSAGE)).any()
+        or (heads["log_time"] != log_times).any()
+        or (heads["channel"] != np.repeat(list(tables), counts)).any()
+    ):
+        return None
+    lengths -= _FIXED_FIELDS
+    parts: dict[int, Part] = {}
+    at = 0
+    for channel, count in zip(tables, counts, strict=True):
+        rows = slice(at, at + count)
+        parts[channel] = Part(starts[rows], lengths[rows], log_times[rows])
+        at += count
+    return first, Piece(data, parts, offset, len(data))
+
+
+def _by_channel(indexes: Sequence[tuple[int, bytes]]) -> dict[int, Ints]:
+    """Log time and start of the messages of each channel, in the order of their starts."""
+    entries: dict[int, bytes] = {}
+    for channel, more in indexes:
+        entries[channel] = entries.get(channel, b"") + more
+    tables = {channel: np.frombuffer(of_channel, dtype="<i8").reshape(-1, 2) for channel, of_channel in entries.items()}
+    for channel, table in tables.items():
+        if (table[1:, 1] < table[:-1, 1]).any():
+            tables[channel] = table[np.argsort(table[:, 1], kind="stable")]
+    return tables
 
 
 def _walk(
@@ -218,26 +349,40 @@ def _walked(content: Any, starts: array[int], offset: int) -> Piece:
     at = np.array(starts, dtype=np.int64)
     if len(at) and (stretches_of(data, at + 1, 8).view("<i8") < _FIXED_FIELDS).any():
         raise DamageError(offset, "a message is shorter than its header")
-    return _piece(data, at, offset)
+    if not len(at):
+        return Piece(data, {}, offset, len(data))
+    heads = stretches_of(data, at, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
+    order = np.argsort(heads["channel"], kind="stable")
+    channels = heads["channel"][order]
+    lengths, log_times = heads["length"] - _FIXED_FIELDS, heads["log_time"].astype(np.int64)
+    parts = {
+        int(heads["channel"][rows[0]]): Part(at[rows], lengths[rows], log_times[rows])
+        for rows in np.split(order, np.flatnonzero(channels[1:] != channels[:-1]) + 1)
+    }
+    return Piece(data, parts, offset, len(data))
 
 
 def block_of(pieces: list[Piece], before: int) -> Block:
     """The messages of neighbouring pieces, by channel; `before` is the size of the pieces before these."""
-    whole = pieces[0] if len(pieces) == 1 else _together(pieces)
-    order = np.argsort(whole.heads["channel"], kind="stable")
-    channels = whole.heads["channel"][order]
-    starts = whole.starts + MESSAGE_HEAD.itemsize
-    lengths = whole.heads["length"] - _FIXED_FIELDS
-    log_times = whole.heads["log_time"]
-    return {
-        int(whole.heads["channel"][rows[0]]): Messages(whole.data, starts[rows], lengths[rows], log_times[rows], before)
-        for rows in np.split(order, np.flatnonzero(channels[1:] != channels[:-1]) + 1)
-        if len(rows)
+    records = Records([piece.data for piece in pieces])
+    parts: dict[int, list[tuple[int, Part]]] = defaultdict(list)
+    base = MESSAGE_HEAD.itemsize
+    for piece in pieces:
+        for channel, part in piece.parts.items():
+            parts[channel].append((base, part))
+        base += piece.size
+    return {channel: _messages(parts[channel], records, before) for channel in sorted(parts)}
+
+
+def _messages(parts: Sequence[tuple[int, Part]], records: Records, before: int) -> Messages:
+    """`parts`: where payloads behind their heads lie in the records, beside their place in the piece."""
+    starts = np.concatenate([part.starts + base for base, part in parts])
+    lengths = np.concatenate([part.lengths for _, part in parts])
+    log_times = np.concatenate([part.log_times for _, part in parts])
+    read = [part.ahead for _, part in parts]
+    # A length that was not wanted in all of these pieces is read when it is asked for.
+    ahead = {
+        length: {stretch: np.concatenate([of_part[length][stretch] for of_part in read]) for stretch in read[0][length]}
+        for length in set(read[0]).intersection(*read[1:])
     }
-
-
-def _together(pieces: list[Piece]) -> Piece:
-    bases = np.cumsum([0, *(len(piece.data) for piece in pieces[:-1])])
-    data = np.concatenate([piece.data for piece in pieces])
-    starts = np.concatenate([piece.starts + base for piece, base in zip(pieces, bases, strict=True)])
-    return Piece(data, starts, np.concatenate([piece.heads for piece in pieces]), pieces[0].offset)
+    return Messages(records, starts, lengths, log_times, before, ReadAhead(ahead))

@@ -16,7 +16,7 @@ from pipeline.read.ingest.assemble import DecodedRows, stream_frames
 from pipeline.read.ingest.conform import refuse
 from pipeline.read.ingest.correct import read_corrections, read_damage, read_raw_logs
 from pipeline.read.ingest.fields import fields_of
-from pipeline.read.ingest.mcap_block import Block, Messages
+from pipeline.read.ingest.mcap_block import Block, Messages, Stretches
 from pipeline.read.ingest.mcap_records import Channel, DamageError
 from pipeline.read.ingest.mcap_walk import McapWalk
 from pipeline.read.ingest.plan import Sample, Source, is_candidate, settle, solution_of, sources_of
@@ -53,6 +53,13 @@ class McapStreams:
             for reader in readers:
                 for part in _pieces(messages):
                     reader.add(part)
+
+    def wanted(self, channel_id: int) -> Stretches | None:
+        """None for a channel that feeds no stream; several readers of one read for themselves."""
+        readers = self.readers.get(channel_id)
+        if readers is None or len(readers) > 1:
+            return {}
+        return readers[0].wanted if readers else None
 
     def _readers(self, messages: Messages, channel: Channel) -> list[SourceReader]:
         if not is_candidate(channel, self._config):
@@ -169,7 +176,11 @@ def _partial_until_ns(logs: Sequence[_WalkedLog], gnss: pl.DataFrame) -> int | N
 
 
 class BlockSink(Protocol):
+    """Looks at the messages of a log; what it wants of each in the blocks to come is only a hint."""
+
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None: ...
+
+    def wanted(self, channel_id: int) -> Stretches | None: ...
 
 
 class _Sinks:
@@ -181,6 +192,9 @@ class _Sinks:
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
         for sink in self._sinks:
             sink.add(block, channels)
+
+    def wanted(self, channel_id: int) -> Stretches | None:
+        return self._sinks[0].wanted(channel_id) if len(self._sinks) == 1 else {}
 
 
 def walk_log(
@@ -194,7 +208,8 @@ def walk_log(
         with files.open_binary(path) as raw, io.BufferedReader(raw, _MIB) as stream:  # type: ignore[type-var]
             size = stream.seek(0, io.SEEK_END)
             chunk_limit = int(config.chunk_limit_mib * _MIB)
-            walk = McapWalk(stream, size, str(path), chunk_limit, most_unpacked(size, config), first_ordinal)
+            unpacked = most_unpacked(size, config)
+            walk = McapWalk(stream, size, str(path), chunk_limit, unpacked, first_ordinal, streams.wanted)
             for block in walk.blocks():
                 streams.add(block, walk.channels)
             stream.seek(0)

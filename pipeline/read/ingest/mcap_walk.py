@@ -10,13 +10,24 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from typing import IO
 
+import numpy as np
 from isal.isal_zlib import crc32
 from mcap import records
 from mcap.opcode import Opcode
 
-from pipeline.read.ingest.mcap_block import Allowance, Block, Piece, block_of, piece_of_chunk, piece_of_messages
+from pipeline.read.ingest.mcap_block import (
+    Allowance,
+    Block,
+    Bytes,
+    Piece,
+    Wanted,
+    block_of,
+    piece_of_chunk,
+    piece_of_messages,
+)
 from pipeline.read.ingest.mcap_records import (
     HEAD,
     HEAD_SIZE,
@@ -48,7 +59,14 @@ class McapWalk:
     """Walks a log once; `blocks` yields its messages, the attributes hold what was met so far."""
 
     def __init__(
-        self, stream: IO[bytes], size: int, file: str, chunk_limit: int, most_unpacked: int, first_ordinal: int = 0
+        self,
+        stream: IO[bytes],
+        size: int,
+        file: str,
+        chunk_limit: int,
+        most_unpacked: int,
+        first_ordinal: int = 0,
+        wanted: Wanted = lambda _: {},
     ) -> None:
         self.channels: dict[int, Channel] = {}
         self.met = WalkCounts()
@@ -56,6 +74,7 @@ class McapWalk:
         self.without_crc = 0  # blocks of messages whose content no checksum covers
         self._bare_chunks = array("q")  # contents of chunks without checksum, from and to
         self._stream = stream
+        self._wanted = wanted
         self._size = size
         self._file = file
         self._limit = chunk_limit
@@ -234,8 +253,13 @@ class McapWalk:
         content = unpacked(chunk, position)
         indexes, end = self._indexes(end, position, size)
         self.met.chunks.add(chunk, position, record, record)
-        self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes, self.met.add_orphan))
+        piece = piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes, self.met.add_orphan)
+        self._keep(piece.reading_ahead(self._wanted, partial(self._unpacked_again, position, len(body))))
         return end
+
+    def _unpacked_again(self, position: int, length: int) -> Bytes:
+        chunk = parse(records.Chunk, self._read(position + HEAD_SIZE, length), position)
+        return np.frombuffer(unpacked(chunk, position), dtype=np.uint8)
 
     def _indexes(self, position: int, chunk: int, room: int) -> tuple[list[tuple[int, bytes]], int]:
         """Channel and entries of the message indexes of a chunk, and the position behind them or a cut in them."""
@@ -264,13 +288,13 @@ class McapWalk:
         several = min(_LOOSE, self._size - position)
         piece = piece_of_messages(self._read(position, max(HEAD_SIZE + length, several)), position)
         self.without_crc += position != self._loose_until  # one for all that follow each other
-        self._loose_until = position + len(piece.data)
+        self._loose_until = position + piece.size
         self._keep(piece)
         return self._loose_until
 
     def _keep(self, piece: Piece) -> None:
         self._pieces.append(piece)
-        self._waiting += max(len(piece.data), _LEAST_PIECE)
+        self._waiting += max(piece.held, _LEAST_PIECE)
 
     def _block(self) -> Block:
         """The messages that wait."""
@@ -285,7 +309,7 @@ class McapWalk:
             if messages.log_time.min() < 0:
                 raise DamageError(pieces[0].offset, "a log time behind it is beyond the year 2262")
             self.met.add_times(int(messages.log_time.min()), int(messages.log_time.max()))
-        self._ordinal += sum(len(piece.data) for piece in pieces)
+        self._ordinal += sum(piece.size for piece in pieces)
         return block
 
     def _define_lost(self, channel_id: int, offset: int) -> None:

@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.read.ingest.fields import definition_of
 from pipeline.read.ingest.json_columns import JsonDecoder
 from pipeline.read.ingest.layout import LayoutDecoder, Values
-from pipeline.read.ingest.mcap_block import Messages
+from pipeline.read.ingest.mcap_block import Messages, Stretches
 from pipeline.read.ingest.plan import Source
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import layout_of_cdr
@@ -44,6 +44,11 @@ class SourceReader:
     @property
     def slow_messages(self) -> int:
         return self._decoder.slow_messages
+
+    @property
+    def wanted(self) -> Stretches:
+        """What is read of each message, by its length, as far as it is known by now."""
+        return self._decoder.wanted
 
     def add(self, messages: Messages) -> None:
         """Decode these messages."""

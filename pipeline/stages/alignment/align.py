@@ -11,7 +11,6 @@ from pipeline.stages.alignment.learning import Hold, ToLearn, learn
 from pipeline.stages.alignment.odometer_filter import Estimates, stamp_jitter_s
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER, NUMBER, first_reason
-from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.monitors.series import along_axis
 from pipeline.stages.odometry.driven import with_hysteresis
@@ -28,7 +27,7 @@ def align(
     positions: MatchedEpochs, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
 ) -> AlignedEpochs:
     """Positions of one solution with the odometer beside them; `odometry` grows with the path of the positions."""
-    most_m = most_scatter_m(config)
+    most_m = config.scatter_limit_m
     positions = replace(
         positions,
         digits_along_m=np.minimum(positions.digits_along_m, most_m),
@@ -172,7 +171,7 @@ def _with_odometer(
         odometer_slips=odometry.slips_at_s(at) & inside,
         odometer_doubt_m=odometry.doubt_at_s(at),
         odometer_white_m2_per_s=odometry.white_m2_per_s_at(at),
-        odometer_rows_m=np.minimum(odometry.known_row_sigma_m(at), most_scatter_m(config)),
+        odometer_rows_m=np.minimum(odometry.known_row_sigma_m(at), config.scatter_limit_m),
         odometer_period_s=noise.period_s,
         stamp_jitter_s=jitter_s,
         speed_mps=speed,

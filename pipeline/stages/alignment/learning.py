@@ -17,7 +17,6 @@ from pipeline.stages.monitors.axis import (
     AxisSeries,
     along_series,
     error_model,
-    most_scatter_m,
     run_axis,
 )
 from pipeline.stages.monitors.noise import NoiseMeter
@@ -94,7 +93,7 @@ class _Learner:
         self._alphas = np.array(config.monitors.ewma_alphas)
         self._factor = config.monitors.threshold_factor
         self.holds: list[Hold] = []
-        self._limit_m = config.hazards.failure_limit_m
+        self._moved_m = config.hazards.limits.moved_m
         self._rule = RecoveryRule(config)
         # The filter reads the odometer up to a latency of five sigmas earlier.
         margin_ns = round(5e9 * config.align.latency_prior_sigma_s)
@@ -204,9 +203,9 @@ class _Learner:
         """Where the odometer lost its distance the offset begins anew: nothing shows whether the position moved."""
         if self._doubt_m[before] == self._doubt_m[row]:
             observed = *self._observation(row), float(self._sigma_m[row]), float(self._jitter_s[row])
-            return self._filter.resume(state, *observed, self._limit_m)
+            return self._filter.resume(state, *observed, self._moved_m)
         away = self._outages[before] != self._outages[row]
-        return self._filter.restart(state, *self._observation(row), self._limit_m**2 if away else 0.0)
+        return self._filter.restart(state, *self._observation(row), self._moved_m**2 if away else 0.0)
 
     def _due(self, last_s: float, begin: int, end: int) -> Ints:
         """Rows of the updates: a filter period apart."""
@@ -242,7 +241,7 @@ class _Learner:
             scale_sigma=in_use.scale_sigma,
             latency_sigma_s=in_use.latency_sigma_s,
             white_m2_per_s=self._odometry.white_m2_per_s_at(at_s),
-            rows_m=np.minimum(self._odometry.known_row_sigma_m(at_s), most_scatter_m(self._config)),
+            rows_m=np.minimum(self._odometry.known_row_sigma_m(at_s), self._config.scatter_limit_m),
             period_s=self._odometry.noise_at_s(at_s).period_s,
         )
         odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s)

@@ -261,7 +261,7 @@ def known_stretch(
         known = KnownPath(path, side.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
         clock_m = path_mps * clock.delta_s
         # A clock that leaves more than half the failure limit open lets a read confirm nothing.
-        most_m = 0.5 * config.hazards.failure_limit_m
+        most_m = config.hazards.limits.confirming_m
         reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor, most_m)
         steps = contradictions(known, side.stretch, witnesses, config)
         of_path = Levels.of(steps, t_ns, reads_ns)

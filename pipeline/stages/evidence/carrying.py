@@ -227,7 +227,7 @@ def carried_forward(
     NaN before the first balise, over a break and over a stand in `stood`. `accepted_ns` in order, at `path_m` of the
     solution's own path, with which the odometer grows.
     """
-    counter = Counter(odometer, config.hazards.failure_limit_m)
+    counter = Counter(odometer, config.hazards.limits.doubt_m)
     used = _consistent(accepted_ns, path_m, counter, config)
     low, high = np.full((2, t_ns.size), np.nan)
     if used.size:
@@ -247,7 +247,7 @@ def carried_forward(
 def _consistent(accepted_ns: Ints, path_m: Floats, counter: Counter, config: Configuration) -> Ints:
     """Accepted balises that agree, within the failure limit, with the odometer since the last one that did."""
     used: list[int] = []
-    limit_m = config.hazards.failure_limit_m
+    limit_m = config.hazards.limits.agreement_m
     for number, at_m in enumerate(path_m.tolist()):
         here_ns = accepted_ns[number : number + 1]
         if used:

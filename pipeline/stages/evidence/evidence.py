@@ -442,7 +442,7 @@ def evidence_of(
     """
     hazards = config.hazards
     independent = [odometer for odometer in odometers if odometer.independent]
-    counters = [Counter(odometer, config.hazards.failure_limit_m) for odometer in independent or odometers]
+    counters = [Counter(odometer, config.hazards.limits.doubt_m) for odometer in independent or odometers]
     main = counters[0] if counters else None
     least_m = config.matching.orientation_distance_m
     stretches, silent = reference

@@ -14,7 +14,10 @@ from schemas.arrays import NS_PER_S, Bools, Floats, floats, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.conform import dtypes, table_of_rows
 from schemas.enums import Suspect, Verdict
-from schemas.tables import Alarms
+from schemas.tables import ALL_MONITORS, Alarms
+
+Healthy = dict[str | None, Bools]
+"""Epochs whose error is within the noise, by axis of the monitors."""
 
 
 def alarms_table(
@@ -41,17 +44,17 @@ def alarms_table(
     return table_of_rows(rows, dtypes(Alarms))
 
 
-def healthy_across(epochs: pl.DataFrame, config: HazardConfig) -> dict[str, Bools]:
-    """Per axis of the monitors, epochs whose error by the reference is within the noise of both."""
+def healthy_across(epochs: pl.DataFrame, config: HazardConfig) -> Healthy:
+    """Per axis across the track, epochs whose error by the reference is within the noise of both."""
     reference_m = np.nan_to_num(Judgements.of(epochs).half_m / config.evidence_factor)
     noise_m = {
         axis: config.evidence_factor * np.hypot(np.nan_to_num(floats(epochs, f"sigma_{axis}_m")), reference_m)
         for axis in ("cross", "up")
     }
-    return {f"{axis}_": np.abs(floats(epochs, f"error_{axis}_m")) <= limit_m for axis, limit_m in noise_m.items()}
+    return {axis: np.abs(floats(epochs, f"error_{axis}_m")) <= limit_m for axis, limit_m in noise_m.items()}
 
 
-def verdict_of(alarm: AlarmEpisode, epochs: pl.DataFrame, healthy: dict[str, Bools], config: HazardConfig) -> Verdict:
+def verdict_of(alarm: AlarmEpisode, epochs: pl.DataFrame, healthy: Healthy, config: HazardConfig) -> Verdict:
     """True where the whole interval was beyond the margin at some epoch, false where all of it stayed within.
 
     Only reference or balise reads can say false, and only of every position from 300 s before the alarm to its end; of
@@ -61,9 +64,8 @@ def verdict_of(alarm: AlarmEpisode, epochs: pl.DataFrame, healthy: dict[str, Boo
     first = int(np.searchsorted(times_ns(epochs), since_ns))
     part = epochs[first : alarm.last + 1]
     can_say_false = Judgements.of(part).by_truth
-    for axis, within in healthy.items():
-        if any(monitor.startswith(axis) for monitor in alarm.monitors):
-            can_say_false = can_say_false & within[first : alarm.last + 1]
+    for axis in {monitor.axis for monitor in ALL_MONITORS if monitor.name in alarm.monitors} & healthy.keys():
+        can_say_false = can_say_false & healthy[axis][first : alarm.last + 1]
     positioned = part["path_m"].is_not_null().to_numpy()
     judged = Judgements.of(part.filter(positioned))
     if judged.wrong_track.any():

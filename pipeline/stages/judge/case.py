@@ -82,5 +82,5 @@ class Case:
         # A train is on a net element for many epochs: each name is looked up once for all of them.
         visit = names.rle_id().to_numpy()
         first = names[np.flatnonzero(np.diff(visit, prepend=-1))]
-        numbers: Ints = np.array([-1 if name is None else index.get(name, -1) for name in first], dtype=np.int64)
-        return numbers[visit]
+        numbers = np.array([-1 if name is None else index.get(name, -1) for name in first], dtype=np.int64)
+        return np.asarray(numbers[visit])

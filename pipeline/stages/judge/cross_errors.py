@@ -38,7 +38,7 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
         # The vector from reference to position, turned from east and north to along and left of the heading.
         along_m = east * np.sin(heading) + north * np.cos(heading)
         left_m = north * np.sin(heading) - east * np.cos(heading)
-        near = np.abs(along_m) <= case.config.hazards.failure_limit_m
+        near = np.abs(along_m) <= case.config.hazards.limits.abreast_m
         errors_m[:, rows] = np.where(near, [left_m, height_m[rows] - there[2]], np.nan)
     names = ("error_cross_m", "error_up_m")
     return [pl.Series(name, error_m, nan_to_null=True) for name, error_m in zip(names, errors_m, strict=True)]

@@ -106,7 +106,7 @@ def _is_back(course: Course, jump: Jump) -> bool:
     """The jump goes against the error before it, and the error after it is within the limit."""
     judged = course.judged
     back = float(judged.middle_m[jump.first - 1]) * jump.step_m < 0.0
-    within = float(judged.least_m[jump.last]) <= course.config.hazards.failure_limit_m
+    within = float(judged.least_m[jump.last]) <= course.config.hazards.limits.failure_m
     return back and within and judged.code[jump.last] != WRONG
 
 
@@ -189,5 +189,5 @@ def _failed_may_ns(course: Course, failed: int) -> int | None:
     if (judged.kind[since] == NOTHING).any():
         return None
     # Where no place along the track can be compared (NaN), any error may be.
-    may = ~(judged.largest_m <= course.config.hazards.failure_limit_m) | judged.is_wrong
+    may = ~(judged.largest_m <= course.config.hazards.limits.failure_m) | judged.is_wrong
     return int(course.t_ns[since][may[since]][0])

@@ -77,7 +77,7 @@ def judged_offers(case: Case, epochs: pl.DataFrame) -> pl.DataFrame:
     Judged is the place of the balise: at the time of the telegram, or of the crossing less the GNSS latency.
     """
     offers = case.solution.offers
-    limits = case.config.hazards
+    hazards = case.config.hazards
     t_ns = times_ns(offers)
     before = ints(offers["before"])
     sure = flags(epochs, "unambiguous")
@@ -85,7 +85,7 @@ def judged_offers(case: Case, epochs: pl.DataFrame) -> pl.DataFrame:
     at_ns = np.where(flags(offers, "virtual"), case.instants(t_ns), t_ns)
     along = judgements_of(case, positions, at_ns, case.evidence_at(at_ns))
     judged = along.turned(ints(epochs["direction"])[before])
-    margin_m = np.where(judged.is_right, limits.failure_limit_m - judged.largest_m, np.nan)
+    margin_m = np.where(judged.is_right, hazards.limits.failure_m - judged.largest_m, np.nan)
     late = case.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
     return offers.select(
         *("crossing_id", "balise_id", "t", "epoch", "path_m", "virtual", "accepted"),
@@ -93,6 +93,6 @@ def judged_offers(case: Case, epochs: pl.DataFrame) -> pl.DataFrame:
         beyond_window=pl.col("crossing_id").is_in(late.drop_nulls().implode()),
     ).with_columns(
         *judged.columns(),
-        pl.Series("location_error_m", judged.known_m(limits.known_error_m), nan_to_null=True),
+        pl.Series("location_error_m", judged.known_m(hazards.known_error_m), nan_to_null=True),
         pl.Series("proof_margin_m", margin_m, nan_to_null=True),
     )

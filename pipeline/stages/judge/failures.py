@@ -115,7 +115,7 @@ def course_of(positions: pl.DataFrame, offers: pl.DataFrame, jumps: Sequence[Jum
 
 def _calm_from(t_ns: Ints, judged: Judgements, config: HazardConfig) -> Ints:
     """`Course.calm_from`: from each position on, the first that begins `episode_end_s` within half the limit."""
-    calm = (judged.largest_m <= 0.5 * config.failure_limit_m) & ~judged.is_wrong
+    calm = (judged.largest_m <= config.limits.settled_m) & ~judged.is_wrong
     hold_ns = round(config.episode_end_s * NS_PER_S)
     begins = np.full(t_ns.size, t_ns.size)
     for first, last in spans_of(calm):
@@ -129,7 +129,7 @@ def _quiet(judged: Judgements, sigma_m: Floats, config: HazardConfig) -> Bools:
     """|e| at most min(3 sqrt(sigma_x^2 + sigma_ref^2), half the limit)."""
     sigma_ref_m = np.nan_to_num(judged.half_m) / config.evidence_factor
     noise_m = config.evidence_factor * np.hypot(np.nan_to_num(sigma_m), sigma_ref_m)
-    within = np.less_equal(np.abs(judged.middle_m), np.minimum(noise_m, 0.5 * config.failure_limit_m))
+    within = np.less_equal(np.abs(judged.middle_m), np.minimum(noise_m, config.limits.settled_m))
     return np.logical_and(within, ~judged.is_wrong)
 
 

@@ -76,7 +76,7 @@ def _jumps(episode: Episode, course: Course) -> dict[Hazard, HazardRow]:
 def _hits(episode: Episode, course: Course) -> list[int]:
     """Offers judged wrong during the episode, beyond the shift limit or on another track."""
     offers = course.offers
-    beyond = (offers.judged.least_m > course.config.hazards.shift_limit_m) | offers.judged.wrong_track
+    beyond = (offers.judged.least_m > course.config.hazards.limits.shift_m) | offers.judged.wrong_track
     wrong = offers.offered & offers.judged.is_wrong & offers.between(episode.onset, episode.end)
     return np.flatnonzero(beyond & wrong).tolist()
 

@@ -129,7 +129,7 @@ class Judgements:
 
 def margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
     """Errors of a healthy position: max(5 m, min(3 sigma, failure limit))."""
-    noise = np.minimum(config.evidence_factor * np.nan_to_num(sigma_m, nan=np.inf), config.failure_limit_m)
+    noise = np.minimum(config.evidence_factor * np.nan_to_num(sigma_m, nan=np.inf), config.limits.healthy_m)
     return np.maximum(config.false_alarm_margin_m, noise)
 
 
@@ -163,7 +163,7 @@ def judge_positions(
     position's, as only there a distance along the track exists.
     """
     size = positions.element.size
-    limit_m = config.failure_limit_m
+    limit_m = config.limits.failure_m
     low_m = np.full(size, np.inf)
     high_m = np.full(size, -np.inf)
     # True as long as it holds for every alternative seen so far.
@@ -264,7 +264,8 @@ def with_own_anchors(
     rows = (judged.kind == NOTHING) & positions.known & np.isfinite(train_m[0])
     low_m = positions.path_m - train_m[1]
     high_m = positions.path_m - train_m[0]
-    beyond = rows & ((low_m > config.failure_limit_m) | (high_m < -config.failure_limit_m))
+    limit_m = config.limits.failure_m
+    beyond = rows & ((low_m > limit_m) | (high_m < -limit_m))
     return Judgements(
         code=np.where(beyond, WRONG, judged.code),
         low_m=np.where(rows, low_m, judged.low_m),

@@ -56,7 +56,7 @@ def find_jumps(steps: PositionChanges, direction: Ints, config: HazardConfig) ->
     largest_m = _largest_step(steps, config)
     jumps: list[Jump] = []
     for sign in (1.0, -1.0):
-        for begin, end in spans_of(largest_m * sign > config.jump_limit_m):
+        for begin, end in spans_of(largest_m * sign > config.limits.jump_m):
             first, last = _extent(steps, begin, end, sign, config)
             step_m = float(steps.excess_m[last] - steps.excess_m[first - 1]) * float(direction[last])
             jumps.append(Jump(first, last, step_m))
@@ -70,7 +70,7 @@ def _largest_step(steps: PositionChanges, config: HazardConfig) -> Floats:
     """
     excess_m = steps.excess_m
     largest_m = np.zeros(excess_m.size)
-    if excess_m.size < 2 or np.ptp(excess_m) <= config.jump_limit_m:
+    if excess_m.size < 2 or np.ptp(excess_m) <= config.limits.jump_m:
         return largest_m
     window_ns = round(config.jump_window_s * NS_PER_S)
     chain = np.cumsum(~steps.linked)

@@ -44,7 +44,7 @@ def odometer_steps(case: Case) -> OdometerSteps:
     for first, last in spans_of(counts & ~moves):
         rows = slice(first, min(last + 2, at_ns.size))
         places_m = path_m[rows][np.isfinite(path_m[rows])]
-        if np.abs(places_m - places_m[:1]).max(initial=0.0) > case.config.hazards.failure_limit_m:
+        if np.abs(places_m - places_m[:1]).max(initial=0.0) > case.config.hazards.limits.stand_m:
             stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
     return OdometerSteps(moves, counts, tuple(stood))
 

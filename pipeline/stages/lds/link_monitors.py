@@ -20,7 +20,6 @@ from pipeline.stages.epochs.verdicts import (
 from pipeline.stages.lds.crossings import Crossing
 from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.relink import Anchor, Comparison
-from pipeline.stages.monitors.axis import most_scatter_m
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
@@ -190,5 +189,5 @@ def _distance_reasons(journey: Journey, disabled: bool, config: Configuration) -
 
 def _is_coarse(journey: Journey, config: Configuration) -> Bools:
     """Rows of the odometer scatter by as much as thresholds allow for, or more: no threshold would hold."""
-    coarse: Bools = journey.rows_m >= most_scatter_m(config)
+    coarse: Bools = journey.rows_m >= config.scatter_limit_m
     return coarse

@@ -186,12 +186,3 @@ def _rows_decorrelation(dt_s: Floats, period_s: Floats | float, config: MonitorC
     lasts_s = 0.5 / config.ewma_alphas[0]
     lost: Floats = np.maximum(changed, np.minimum(dt_s / lasts_s, 1.0))
     return lost
-
-
-def most_scatter_m(config: Configuration) -> float:
-    """The largest deviation of an odometer's row, or of digits, that the thresholds allow for [m].
-
-    With more, k_T sqrt(2) sigma of two rows would exceed the failure limit: false alarms rather than a failure hidden.
-    """
-    factor = config.monitors.threshold_factor
-    return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))

@@ -14,7 +14,6 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.epochs.verdicts import NO_POSITION, Verdicts, first_reason, no_verdicts, verdicts
-from pipeline.stages.monitors.axis import most_scatter_m
 from pipeline.stages.monitors.pseudorange import pseudorange_monitor
 from pipeline.stages.monitors.series import FIRST_EPOCH
 from schemas.arrays import Floats, floats, times_ns, truths
@@ -35,7 +34,7 @@ def doppler_monitor(epochs: AlignedEpochs, config: Configuration) -> Verdicts:
     velocity_mps = epochs.velocity_along_mps
     without = epochs.odometer_reason
     # The sigma of rows is cut off there: with coarser ones a threshold would not hold.
-    coarse = epochs.odometer_rows_m >= most_scatter_m(config)
+    coarse = epochs.odometer_rows_m >= config.scatter_limit_m
     usable = np.isfinite(velocity_mps) & (without == NO_REASON) & epochs.fix_valid & ~coarse
     first, span_s = _window(t_s, usable, epochs.odometer_doubt_m, config)
     doppler_m = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity_mps, np.nan)))])[:-1]

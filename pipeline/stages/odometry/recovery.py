@@ -22,7 +22,7 @@ class RecoveryRule:
     @property
     def most_m(self) -> float:
         """Half of the failure limit [m]: no bound is wider, and no more may be in doubt."""
-        return 0.5 * self.config.hazards.failure_limit_m
+        return self.config.hazards.limits.relink_m
 
     def is_quiet(self, quiet_s: float | Floats) -> Bools:
         return np.asarray(quiet_s) >= self.config.lds.recovery_s

@@ -13,9 +13,9 @@ from pipeline.stages.run_row.lost_time import LostTime
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, LostTo, Origin, Reason, Remedy, RunVerdict, VehicleFigures
 from schemas.stages import EpochFigures
-from schemas.tables import BANK_MONITORS
+from schemas.tables import ALL_MONITORS
 
-FAST = tuple(name for name in BANK_MONITORS if name.endswith(("_raw", "_ewma_0p1")))
+FAST_OF_BANK = tuple(monitor.name for monitor in ALL_MONITORS if monitor.scale is not None and monitor.is_fast)
 """Monitors that the receiver's fast noise fails where the model states it too small."""
 
 _LACKING = {Reason.ACCEPTED_UNKNOWN, Reason.BUDGET_UNKNOWN, Reason.UNKNOWN_IN_USE}
@@ -78,7 +78,7 @@ def remedies(
         return scarce and lost_to(*causes) >= config.advice.lost_share
 
     healthy = lost.unfounded and not run["faults_injected"]
-    noisy = healthy and lost.monitor in FAST and costs(LostTo.ALARM, LostTo.RELINK)
+    noisy = healthy and lost.monitor in FAST_OF_BANK and costs(LostTo.ALARM, LostTo.RELINK)
     # Some time passes in every run until the noise is known; alone it has to make availability low.
     loud = lost_to(LostTo.NOISE) > 1.0 - config.advice.low_availability
     calibrate = (noisy or loud) and not config.calibration.runs
@@ -114,7 +114,7 @@ def remedies(
         Remedy.CLOCK: (
             # Of the room for an error, the limit to both sides, the clocks alone take half.
             bool(reasons & {Reason.CLOCK_ASSUMED, Reason.EVIDENCE_DISPUTED})
-            or (missing and truth and clock_open_m > config.hazards.failure_limit_m),
+            or (missing and truth and clock_open_m > config.hazards.limits.clock_open_m),
             unknown,
         ),
         Remedy.ODOMETER: (

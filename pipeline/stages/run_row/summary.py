@@ -111,7 +111,7 @@ def _decisive(epochs: EpochFigures, passages: pl.DataFrame, failures: pl.DataFra
         **figures.time_in_use(epochs, config.lds.recovery_s),
         **figures.balise_counts(passages),
         **figures.failure_counts(failures),
-        "proof_margin_m": figures.proof_margin_m(epochs, passages, config.hazards.failure_limit_m),
+        "proof_margin_m": figures.proof_margin_m(epochs, passages, config.hazards.limits.failure_m),
     }
 
 

@@ -16,17 +16,18 @@ from scipy.optimize import nnls
 from schemas.arrays import Floats
 from schemas.config import CalibrationConfig, Configuration
 from schemas.enums import MonitorState
-from schemas.tables import AXES, BANK_MONITORS, SCALES
+from schemas.tables import ALL_MONITORS, AXES, SCALES
 
 # Numerics of the regression: bins of the same number of epochs. Half or twice as many change a simulated fit by less
 # than a fifth of its standard error.
 _BINS = 12
 _LINKING = ("link_order", "link_distance")
+_AXIS_OF_BANK = {monitor.name: str(monitor.axis) for monitor in ALL_MONITORS if monitor.scale is not None}
 
 _READ = ("state", "value", "threshold")
 COMPARED = (
     *(f"sigma_{axis}_m" for axis in AXES),
-    *(f"{monitor}_{part}" for monitor in BANK_MONITORS for part in _READ),
+    *(f"{monitor}_{part}" for monitor in _AXIS_OF_BANK for part in _READ),
     *("along_doppler_value", "along_doppler_threshold"),
 )
 """Columns of epochs that sigmas are regressed on."""
@@ -53,8 +54,7 @@ def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float, config: Calibrat
     """
     fits = []
     least = -(-config.left_out_pieces // max(len(runs), 1))
-    for monitor in BANK_MONITORS:
-        axis = next(name for name in AXES if monitor.removeprefix(name + "_") in SCALES)
+    for monitor, axis in _AXIS_OF_BANK.items():
         pieces = [piece for run in runs for piece in _pieces(run, monitor, axis, factor, least)]
         samples = np.concatenate(pieces) if pieces else np.zeros((0, 2))
         if len(samples) >= config.least_epochs:

@@ -95,7 +95,7 @@ def front_of(
     shift = np.where(gnss, 0.0, direction * (estimate - path))
     low = floats(epochs, "error_low_m") + shift
     high = floats(epochs, "error_high_m") + shift
-    right, wrong, elsewhere = _judged(epochs, config.hazards.failure_limit_m)
+    right, wrong, elsewhere = _judged(epochs, config.hazards.limits.failure_m)
     train_m = np.stack(train_path_m(epochs, stretches_of(epochs)))
     # Without a position nothing was judged: the report is compared with the place of the train itself.
     silent = np.isnan(path) & np.isfinite(train_m).all(axis=0)

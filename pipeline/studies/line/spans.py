@@ -91,7 +91,7 @@ def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Con
     ends = np.unique(np.concatenate([here[apart], there[apart]]))
     ends = ends[states[ends] >= SpanState.WRONG]
     here, there, state = (np.concatenate(pair) for pair in ((here, ends), (there, ends), (state, states[ends])))
-    wide = np.maximum((high - low)[here], (high - low)[there]) > 2.0 * config.hazards.failure_limit_m
+    wide = np.maximum((high - low)[here], (high - low)[there]) > config.hazards.limits.span_m
     state = np.where(wide & (state < SpanState.WRONG), int(SpanState.UNKNOWN), state)
     middle = 0.5 * (low + high)
     return pl.DataFrame(

@@ -22,14 +22,16 @@ from pipeline.studies.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
 from schemas.arrays import NS_PER_S, Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
-from schemas.tables import MONITORS, SCALES
+from schemas.tables import ALL_MONITORS
 
 Row = dict[str, object]
 
 COMPARISON = "channel"
-_DIAGNOSIS = tuple(name for name in MONITORS if name != COMPARISON)
+"""The monitor of two solutions that composite fail-safety consists of."""
+_DIAGNOSIS = tuple(monitor.name for monitor in ALL_MONITORS if monitor.solutions == 1)
+"""The monitors that one solution is diagnosed by."""
 _STATES = pl.col("trusted", "known", "wrong")
-_ALONG = tuple(f"along_{scale}" for scale in SCALES)
+_ALONG = tuple(monitor.name for monitor in ALL_MONITORS if monitor.axis == "along" and monitor.scale is not None)
 EPOCH_COLUMNS = (
     *("t", "solution", "netelement_id", "measure_m", "path_m", "on_track", "gate_probability", "confidence_m"),
     *("sigma_along_m", "error_low_m", "error_high_m", "judgement", "moving"),

@@ -37,7 +37,7 @@ class Undetected:
 
     def figures(self, epochs: pl.DataFrame, config: Configuration) -> dict[str, object]:
         """Columns of the `runs` row, over judged epochs; none where nothing was computed."""
-        return undetected_figures(epochs, self.spacing, config.hazards.failure_limit_m)
+        return undetected_figures(epochs, self.spacing, config.hazards.limits.failure_m)
 
 
 def unnoticed_of(ride: Ride) -> Undetected:

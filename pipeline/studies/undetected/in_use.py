@@ -149,7 +149,7 @@ class _Window:
         way_m = returns.travelled_m - returns.travelled_m[0]
         bound_m = rule.bound_m(rule.variance_m2(sigma_m2, waited_s, way_m, returns.scale_sigma))
         doubt_m = np.maximum(returns.doubt_m - returns.doubt_m[0], 0.0)
-        widest_m: Floats = np.minimum(0.5 * self.config.hazards.failure_limit_m, bound_m + doubt_m)
+        widest_m: Floats = np.minimum(self.config.hazards.limits.relink_m, bound_m + doubt_m)
         return widest_m
 
     def _after_m(self, ended_m: Floats) -> Floats:

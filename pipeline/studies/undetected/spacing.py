@@ -31,7 +31,7 @@ def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tupl
     both = (rows, rows.mirrored())
     grow = partial(growth_with, splits=splits_anywhere(rows))
     errors = partial(largest_errors, config=config.undetected, grow=grow, after=splits_after(rows, config.undetected))
-    search = partial(_first_beyond, both, errors=errors, limit_m=config.hazards.failure_limit_m, ahead_s=step_s)
+    search = partial(_first_beyond, both, errors=errors, limit_m=config.hazards.limits.failure_m, ahead_s=step_s)
     starts = np.unique(np.searchsorted(rows.t_s, np.arange(rows.t_s[0], rows.t_s[-1], step_s))).tolist()
     first_beyond = _first_rows_beyond([start for start in starts if start + 1 < rows.rows], rows.rows, search)
     shortest = partial(_shortest, first_beyond, rows.t_s, config=config.undetected, search=search)

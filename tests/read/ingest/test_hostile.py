@@ -122,7 +122,8 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
 def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
     spent = mcap_block.Allowance(3)
     records = definitions() + some_messages(1)
-    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent).starts.tolist() == [len(definitions())]
+    (part,) = mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent).parts.values()
+    assert part.starts.tolist() == [len(definitions())]
     assert spent.left == 0
     with pytest.raises(mcap_block.DamageError, match="more records"):
         mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent)
@@ -160,14 +161,14 @@ def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
     def piece(entries: bytes) -> mcap_block.Piece:
         return mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance, [(1, entries)])
 
-    walked = mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance)
-    right = np.column_stack([walked.heads["log_time"], walked.starts]).tobytes()
+    walked = mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance).parts[1]
+    right = np.column_stack([walked.log_times, walked.starts]).tobytes()
     pairs = np.frombuffer(right, dtype="<i8").reshape(-1, 2)
     shifted, beyond, late = (pairs + np.array(change) for change in ([0, 1], [0, 1 << 40], [1, 0]))
     for entries in (right, b"", pairs[::-1].tobytes()):
-        found = piece(entries)
-        assert found.starts.tolist() == walked.starts.tolist()
-        assert found.heads.tolist() == walked.heads.tolist()
+        found = piece(entries).parts[1]
+        for name in ("starts", "lengths", "log_times"):
+            assert getattr(found, name).tolist() == getattr(walked, name).tolist()
     for entries in (right[16:], right[:-16], right + right[:16], *(a.tobytes() for a in (shifted, beyond, late))):
         with pytest.raises(mcap_block.DamageError, match="disagrees"):
             piece(entries)
@@ -176,12 +177,13 @@ def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
 def test_a_message_without_bytes_at_the_end_of_a_block_is_decoded() -> None:
     """A protobuf message is empty where all its fields have their defaults."""
     start, length, log_time = (np.array([number]) for number in (3, 0, 0))
-    message = mcap_block.Messages(np.frombuffer(b"abc", dtype=np.uint8), start, length, log_time)
+    records = mcap_block.Records([np.frombuffer(b"abc", dtype=np.uint8)])
+    message = mcap_block.Messages(records, start, length, log_time)
     fields = {"x": [constant(0.0, pl.Float64())]}
     channel = Channel(1, "/x", "protobuf", None, "x.mcap")
     decoder = LayoutDecoder(channel, lambda payload: layout_of(payload, bytearray(payload), fields))
     ((_, columns),) = decoder.decode(message)
-    assert columns["x"].to_list() == [0.0]
+    assert list(columns["x"]) == [0.0]
 
 
 def test_pieces_of_a_block_are_one_after_the_other() -> None:

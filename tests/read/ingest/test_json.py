@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.read.ingest.json_columns import JsonDecoder, one_by_one, parse_json
 from pipeline.read.ingest.layout import Columns, UndecodableError
-from pipeline.read.ingest.mcap_block import Messages
+from pipeline.read.ingest.mcap_block import Messages, Records
 from pipeline.read.ingest.mcap_records import Channel
 from schemas.errors import InputError
 
@@ -50,7 +50,7 @@ def messages_of(contents: list[bytes]) -> Messages:
     lengths = np.array([len(content) for content in contents], dtype=np.int64)
     starts = np.cumsum(lengths + 1) - lengths
     data = np.frombuffer(b"".join(b"#" + content for content in contents) + b" ", dtype=np.uint8)
-    return Messages(data, starts, lengths, starts)
+    return Messages(Records([data]), starts, lengths, starts)
 
 
 def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:

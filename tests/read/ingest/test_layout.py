@@ -13,7 +13,7 @@ from mcap_ros2._dynamic import serialize_dynamic
 
 from pipeline.read.ingest import layout
 from pipeline.read.ingest.layout import Layout, LayoutDecoder
-from pipeline.read.ingest.mcap_block import Messages
+from pipeline.read.ingest.mcap_block import Messages, Records
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import layout_of_cdr, parse_definitions
@@ -26,7 +26,8 @@ def rows_of(contents: list[bytes], walk: Callable[[bytes], Layout]) -> tuple[lis
     """The rows in order of their messages, each behind the number of its message; messages without a kept layout."""
     lengths = np.array([len(content) for content in contents])
     starts = np.cumsum(lengths) - lengths
-    messages = Messages(np.frombuffer(b"".join(contents), dtype=np.uint8), starts, lengths, np.arange(len(contents)))
+    records = Records([np.frombuffer(b"".join(contents), dtype=np.uint8)])
+    messages = Messages(records, starts, lengths, np.arange(len(contents)))
     decoder = LayoutDecoder(CHANNEL, walk)
     parts = [
         pl.DataFrame({"message": group.log_time, **{path: pl.Series(columns[path]) for path in sorted(columns)}})

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.monitors.axis import AlongEpochs, along_series, most_scatter_m, run_axis
+from pipeline.stages.monitors.axis import AlongEpochs, along_series, run_axis
 from pipeline.stages.odometry.counts import count_step
 from pipeline.stages.odometry.odometry import Increments
 from pipeline.stages.odometry.quantisation import QuantisationNoise
@@ -215,7 +215,7 @@ def test_by_a_counter_too_coarse_for_the_failure_limit_no_drift_is_hidden():
 
 def test_no_more_noise_enters_than_leaves_the_failure_limit_seen():
     config = Configuration()
-    most_m = most_scatter_m(config)
+    most_m = config.scatter_limit_m
     assert threshold_factor(1e-7) * np.sqrt(2.0) * most_m == pytest.approx(config.hazards.failure_limit_m)
     t = np.arange(0.0, 500.0, 0.1)
     for step_m, expected_m in ((5.0, 5.0 / np.sqrt(12.0)), (20.0, most_m)):
