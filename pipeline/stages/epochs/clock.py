@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import polars as pl
 
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median, times_ns
 from schemas.config import Configuration, LdsConfig
 from schemas.stages import ONE_TRACK_LEFT
 
@@ -89,7 +89,7 @@ def trusted(config: Configuration) -> pl.Expr:
 
 def nominal_period_s(t_ns: Ints) -> float | None:
     """Median distance of consecutive epochs [s]; None for fewer than two."""
-    return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else None
+    return median(np.diff(t_ns)) / NS_PER_S if len(t_ns) > 1 else None
 
 
 def position_ns(epochs: pl.DataFrame) -> Ints:

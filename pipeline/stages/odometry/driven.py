@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, median
 from schemas.config import AlignConfig
 
 
@@ -132,7 +132,7 @@ def evenly_driven(
 
 def _departure(t_s: Floats, distance_m: Floats, sigma_m: Floats) -> tuple[float, float]:
     """The last time of a stand near its place, and the place."""
-    place_m = float(np.median(distance_m))
+    place_m = median(distance_m)
     # A uniform error of sigma s has its edges at sqrt(3) s.
     near = np.flatnonzero(np.abs(distance_m - place_m) <= np.sqrt(3.0) * sigma_m)
     return float(t_s[near[-1] if near.size else 0]), place_m
