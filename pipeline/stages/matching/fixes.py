@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.stages.odometry.written_steps import step_of
 from pipeline.stages.track.geodesy import MEAN_RADIUS_M, Points, points_of
-from schemas.arrays import Bools, Floats, Ints, floats
+from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import FixSigma
 from schemas.enums import Fix
 
@@ -70,7 +70,7 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
     latitude = np.where(valid, column["latitude_deg"], np.nan)
     longitude = np.where(valid, column["longitude_deg"], np.nan)
     return Fixes(
-        t_ns=frame["t"].to_physical().to_numpy(),
+        t_ns=times_ns(frame),
         valid=valid,
         points=points_of(latitude, longitude),
         latitude_deg=latitude,
