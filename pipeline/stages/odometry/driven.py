@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from schemas.arrays import Bools, Floats, median
+from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig
 
 
@@ -28,11 +28,7 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
     most_m = (distance_m + width_m)[rows].tolist()
     values = []
     for low_m, high_m in zip(least_m, most_m, strict=True):
-        # Comparisons instead of `min` and `max`: a log has tens of rows a second, and calls take most of the time.
-        if at_m < low_m:
-            at_m = low_m
-        elif at_m > high_m:
-            at_m = high_m
+        at_m = min(max(at_m, low_m), high_m)
         values.append(at_m)
     held_m[rows] = values
     return held_m
@@ -132,7 +128,7 @@ def evenly_driven(
 
 def _departure(t_s: Floats, distance_m: Floats, sigma_m: Floats) -> tuple[float, float]:
     """The last time of a stand near its place, and the place."""
-    place_m = median(distance_m)
+    place_m = float(np.median(distance_m))
     # A uniform error of sigma s has its edges at sqrt(3) s.
     near = np.flatnonzero(np.abs(distance_m - place_m) <= np.sqrt(3.0) * sigma_m)
     return float(t_s[near[-1] if near.size else 0]), place_m
