@@ -97,7 +97,7 @@ def _site_way(run: RunLog, solution: str, site: Site) -> DrivenWay:
     prepared = prepare(run, site, Vehicle(), Configuration())
     fixes = prepared.fixes(solution)
     found = prepared.match(solution)
-    epochs = found.epochs.filter(pl.col("path_m").is_not_null())
+    epochs = found.epochs.table.filter(pl.col("path_m").is_not_null())
     if epochs["leg"].n_unique() != 1:
         raise InputError("the path changes direction at a switch", place=run.run_id, remedy="Inject without --site.")
     s_m = epochs["path_m"].to_numpy()

@@ -20,10 +20,11 @@ from pipeline.studies.plausibility.accuracy import accuracy_checks, refuted
 from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, with_checks
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
-from schemas.conform import conform, shaped
+from schemas.conform import conform
 from schemas.enums import Reason
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
+from schemas.stages import EpochFigures
 from schemas.tables import TABLES
 
 Tables = dict[str, pl.DataFrame]
@@ -53,7 +54,8 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
             parts.append(_failed(prepared, solution, error))
     if len(errors) == len(parts):
         raise errors[0]
-    whole = {name: conform(pl.concat([part[name] for part in parts]), table) for name, table in TABLES.items()}
+    # Each part was brought to the contract when it was made.
+    whole = {name: pl.concat([part[name] for part in parts]) for name in TABLES}
     return RunTables(run_id=run.run_id, **whole)
 
 
@@ -95,9 +97,8 @@ def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence
     ride = ride_of(prepared, solution, _with_match(beside, prepared, solution), evidence)
     unnoticed = unnoticed_of(ride)
     judged = judge(_case(ride, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
-    lost = lost_columns(judged.epochs, prepared.config)
-    epochs = pl.concat([judged.epochs, lost, ride.solution.fixes.select("satellites")], how="horizontal")
-    results = _results(ride, judged, epochs, unnoticed, fit, evidence)
+    results = _results(ride, judged, unnoticed, fit, evidence)
+    epochs = judged.epochs.with_columns(*results.lost.columns(), ride.solution.fixes["satellites"])
     tables = {
         "hazards": judged.hazards,
         "passages": judged.passages,
@@ -106,7 +107,7 @@ def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence
         "runs": summarise(results, prepared.config, prepared.provenance),
     }
     # Judged epochs have more columns than the contract: those end here.
-    return {name: shaped(table, TABLES[name]) for name, table in tables.items()}
+    return {name: conform(table, TABLES[name]) for name, table in tables.items()}
 
 
 def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence, leaps_s: Sequence[int]) -> Case:
@@ -126,16 +127,15 @@ def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence, leaps_s: S
     )
 
 
-def _results(
-    ride: Ride, judged: Judged, epochs: pl.DataFrame, unnoticed: Undetected, fit: Fit, evidence: TrainEvidence
-) -> SolutionResults:
+def _results(ride: Ride, judged: Judged, unnoticed: Undetected, fit: Fit, evidence: TrainEvidence) -> SolutionResults:
     """All that the `runs` row is made of."""
     prepared = ride.prepared
     run = prepared.run
-    accuracy = accuracy_checks(epochs, run.faults, prepared.config)
+    accuracy = accuracy_checks(judged.epochs, run.faults, prepared.config)
     fit = with_checks(fit, accuracy)
     counts = prepared.counts.solutions[ride.solution.name]
     odometry = prepared.odometry
+    epochs = EpochFigures.of_table(judged.epochs)
     columns = {
         "vehicle": prepared.figures_from,
         "faults_injected": run.faults is not None and run.faults.height > 0,
@@ -148,7 +148,7 @@ def _results(
         "ambiguous_stretches": ride.match.ambiguous.height,
         **ride.at_the_end(),
         **ride.bank.white_noise(),
-        **unnoticed.figures(epochs, prepared.config),
+        **unnoticed.figures(judged.epochs, prepared.config),
     }
     # What stands against a verdict whatever was judged (DOMAIN section 5.4).
     against = {
@@ -164,6 +164,7 @@ def _results(
     return SolutionResults(
         solution=ride.solution.name,
         epochs=epochs,
+        lost=lost_columns(epochs, prepared.config),
         judged=judged,
         columns=columns,
         ingest=run.notes,
@@ -183,4 +184,4 @@ def _track_assumed(judged: Judged) -> bool:
 def _failed(prepared: PreparedRun, solution: str, error: InputError) -> Tables:
     """A solution without content but for the row that says why."""
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
-    return nothing | {"runs": failed_row(str(error), prepared.provenance, solution)}
+    return nothing | {"runs": conform(failed_row(str(error), prepared.provenance, solution), TABLES["runs"])}

@@ -38,6 +38,23 @@ def truths(series: pl.Series) -> Bools:
     return (series.fill_null(False) if series.null_count() else series).to_numpy().astype(np.bool_, copy=False)
 
 
+def median(values: Floats | Ints) -> float:
+    """The median of numbers of any shape, NaN where one of them is or where there is none.
+
+    What `numpy.median` gives to the last bit; for the few hundred values that most are asked of, its handling of axes
+    takes four times as long as the median.
+    """
+    flat = np.ravel(values).astype(np.float64, copy=False)
+    half = flat.size // 2
+    if flat.size < 2:
+        return float(flat[0]) if flat.size else float("nan")
+    # NaN is sorted to the end.
+    ordered = np.partition(flat, (half - 1, half, flat.size - 1))
+    if np.isnan(ordered[-1]):
+        return float("nan")
+    return float(ordered[half] if flat.size % 2 else 0.5 * (ordered[half - 1] + ordered[half]))
+
+
 def runs_of(mask: Bools) -> tuple[Ints, Ints]:
     """First and last index of every run of true values."""
     edges = np.diff(np.concatenate(([False], mask, [False])).astype(np.int8))

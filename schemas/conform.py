@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -40,9 +40,17 @@ def conform(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
 
 def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
     """The contract's columns and dtypes, in its order; the values are taken as they are."""
-    if (frame.columns, frame.dtypes) == _names_and_dtypes(schema):
+    series = {column.name: column for column in frame.get_columns()}
+    if (list(series), [column.dtype for column in series.values()]) == _names_and_dtypes(schema):
         return frame
-    return pl.DataFrame([_cast(frame[rule.name], rule.dtype) for rule in _rules(schema)])
+    return pl.DataFrame([_cast(series[rule.name], rule.dtype) for rule in _rules(schema)])
+
+
+def table_of_rows(rows: Sequence[Mapping[str, object]], dtypes: Mapping[str, pl.DataType]) -> pl.DataFrame:
+    """Rows by the names of these columns as a table; most runs have no hazard and no alarm, and columns are many."""
+    if not rows:
+        return pl.DataFrame([pl.Series(name, dtype=dtype) for name, dtype in dtypes.items()])
+    return pl.DataFrame(rows, schema=dtypes)
 
 
 def dtypes(schema: type[dy.Schema]) -> dict[str, pl.DataType]:

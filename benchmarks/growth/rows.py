@@ -24,6 +24,7 @@ from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.odometry import Odometry, odometry_of
 from schemas.config import Configuration
 from schemas.enums import BaliseKind
+from schemas.stages import AlignedEpochs
 
 DURATION_S = 3_600.0
 FEW, TIMES = 2_500, 4
@@ -70,7 +71,7 @@ def _peak_mb(folder: Path, hours: float) -> float:
     return command_peak_mb(folder / "runs", folder / "site", folder / "out")
 
 
-def _aligned(config: Configuration) -> tuple[pl.DataFrame, Odometry]:
+def _aligned(config: Configuration) -> tuple[AlignedEpochs, Odometry]:
     """Aligned epochs of a steady journey, and its odometer."""
     t_s = np.arange(DURATION_S)
     made = journey(np.random.default_rng(1), t_s, np.zeros(t_s.size), 0.5)
@@ -81,7 +82,7 @@ def _aligned(config: Configuration) -> tuple[pl.DataFrame, Odometry]:
     return align(matched.epochs, odometry, made.vehicle, config), odometry
 
 
-def _seconds(aligned: pl.DataFrame, odometry: Odometry, count: int, kind: BaliseKind, config: Configuration) -> float:
+def _seconds(aligned: AlignedEpochs, odometry: Odometry, count: int, kind: BaliseKind, config: Configuration) -> float:
     """Processor time of the LDS over a line with so many balises; the shorter of two goes."""
     places_m = np.linspace(500.0, SPEED_MPS * DURATION_S - 500.0, count)
     names = [f"B{number:05}" for number in range(count)]
@@ -97,9 +98,9 @@ def _seconds(aligned: pl.DataFrame, odometry: Odometry, count: int, kind: Balise
     reads = None
     if kind is BaliseKind.PHYSICAL:
         since_s = (places_m - places_m[0]) / SPEED_MPS
-        t_ns = aligned["t"].dt.epoch("ns")[20] + np.round(since_s * 1e9).astype(np.int64)
+        t_ns = aligned.t_ns[20] + np.round(since_s * 1e9).astype(np.int64)
         t = pl.Series("t", t_ns).cast(pl.Datetime("ns", "UTC"))
-        reads = pl.DataFrame({"t": t, "balise_id": names, "odometer_m": odometer_at(t, aligned, odometry)})
+        reads = pl.DataFrame({"t": t, "balise_id": names, "odometer_m": odometer_at(t_ns, aligned, odometry)})
     seconds = []
     for _ in range(2):
         bank = MonitorBank(aligned, {}, config)

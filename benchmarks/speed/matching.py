@@ -187,7 +187,7 @@ def calibration(seeds: int) -> list[Figure]:
                 Vehicle(),
                 MatchingConfig(),
                 FixSigma(),
-            ).epochs
+            ).epochs.table
             rights.append(np.abs(matched_lateral_m(epochs) - trip.lateral_m) < 1.0)
             claims.append(epochs["path_probability"].to_numpy())
             wrong += bool(((claims[-1] > 0.99) & ~rights[-1]).mean() > 0.01)

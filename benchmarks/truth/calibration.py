@@ -229,7 +229,7 @@ def stamps(t_s: np.ndarray) -> pl.Series:
 
 def claim(one: Trial) -> Claim:
     odometry = odometry_of(one.odometer, Vehicle(), Configuration())
-    found = match(one.fixes, odometry, one.site, Vehicle(), MatchingConfig(), FixSigma()).epochs
+    found = match(one.fixes, odometry, one.site, Vehicle(), MatchingConfig(), FixSigma()).epochs.table
     right = (found["netelement_id"].str.head(1) == one.track).fill_null(False).to_numpy()
     known = found["netelement_id"].is_not_null().to_numpy()
     gate, gate_right = largest(floats(found, "gate_probability"), right, known & ~right)

@@ -29,6 +29,7 @@ from schemas.config import Configuration, LdsConfig, Vehicle
 from schemas.conform import shaped
 from schemas.inputs import Balises, Gnss, Links, Odometer, Track
 from schemas.run import RunLog, Site
+from schemas.stages import AlignedEpochs
 
 CASES = 50
 # Sound journeys with one jump of 3 s, and with one outage of 90 s, in the middle of 2,400 s.
@@ -108,7 +109,7 @@ def journey(dice: np.random.Generator, t_s: Floats, fault_m: Floats, sigma_m: fl
     return Journey(run, _site(float(true_m[-1]) + 2_000.0), vehicle, true_m[~lost])
 
 
-def lds_of(made: Journey, config: Configuration, vehicle: Vehicle | None = None) -> tuple[pl.DataFrame, LdsResult]:
+def lds_of(made: Journey, config: Configuration, vehicle: Vehicle | None = None) -> tuple[AlignedEpochs, LdsResult]:
     """Aligned epochs and what the LDS makes of them; `vehicle` stands in for that of the journey."""
     vehicle = vehicle or made.vehicle
     run, site = made.run, made.site
@@ -124,11 +125,11 @@ def lds_of(made: Journey, config: Configuration, vehicle: Vehicle | None = None)
 def outcome(made: Journey, config: Configuration) -> Outcome:
     """Replay the positions and hold those in use against the train's own path positions."""
     aligned, lds = lds_of(made, config)
-    path_m = aligned["path_m"].cast(pl.Float64).to_numpy()
+    path_m = aligned.path_m
     error_m = np.abs(path_m - made.true_m - np.median(path_m[:300] - made.true_m[:300]))
     negated = lds.epochs["negated"].to_numpy()
     withheld = lds.epochs["withheld"].to_numpy()
-    in_use = ~negated & ~withheld & (aligned["confidence_m"].to_numpy() <= config.lds.ci_limit_m)
+    in_use = ~negated & ~withheld & (aligned.confidence_m <= config.lds.ci_limit_m)
     returns = np.flatnonzero(negated[:-1] & ~negated[1:]) + 1
     after = np.arange(path_m.size) >= (returns[0] if returns.size else path_m.size)
     beyond_s = float((in_use & after & (error_m > LIMIT_M)).sum())
@@ -138,7 +139,7 @@ def outcome(made: Journey, config: Configuration) -> Outcome:
 def unused_s(made: Journey, config: Configuration) -> float:
     """For how long the position of a sound journey is out of use from 1,000 s on, when its event is over [s]."""
     aligned, lds = lds_of(made, config)
-    t_s = (aligned["t"] - aligned["t"][0]).dt.total_seconds().to_numpy()
+    t_s = (aligned.t_ns - aligned.t_ns[0]) // NS_PER_S
     unused = lds.epochs["negated"].to_numpy() | lds.epochs["withheld"].to_numpy()
     return float((unused & (t_s >= 1_000.0)).sum())
 

@@ -358,7 +358,7 @@ def judge(name: str, seed: int) -> Verdict:
     way = odometer_at(truth.t_s, truth.way_m * (1.0 + 0.003 * rng.normal())) if rng.random() < 0.7 else None
     odometry = odometry_of(way, Vehicle(), Configuration())
     found = match(fixes, odometry, site, Vehicle(), MatchingConfig(), FixSigma())
-    return verdict(world, truth, found.epochs, np.hypot(error[:, 0], error[:, 1]))
+    return verdict(world, truth, found.epochs.table, np.hypot(error[:, 0], error[:, 1]))
 
 
 def verdict(world: World, truth: Drive, epochs: pl.DataFrame, error_m: np.ndarray) -> Verdict:

@@ -203,7 +203,8 @@ def outcome(family: str, seed: int) -> Outcome:
     vehicle = Vehicle.model_validate({"odometer_origin": str(rng.choice(["wheel", "unknown"]))})
     way = odometer_at(truth.t_s, truth.way_m * (1.0 + 0.003 * rng.normal()))
     odometry = odometry_of(way, vehicle, Configuration())
-    epochs = match(fixes, odometry, site_of(world, survey_m, law, rng), vehicle, MatchingConfig(), FixSigma()).epochs
+    found = match(fixes, odometry, site_of(world, survey_m, law, rng), vehicle, MatchingConfig(), FixSigma())
+    epochs = found.epochs.table
     names = epochs["netelement_id"].fill_null("").to_numpy()
     wrong = (names != truth.element) & (names != "")
     live = np.nan_to_num(floats(epochs, "gate_probability")) >= SURE

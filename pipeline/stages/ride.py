@@ -6,12 +6,13 @@ Nothing here knows of the truth, but for one case: without an odometer the direc
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import polars as pl
 
 from pipeline.stages.alignment.align import align, odometer_at
-from pipeline.stages.epochs.verdicts import without_passes
+from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.case import Case, Solution
 from pipeline.stages.judge.epochs import direction_by_evidence
@@ -21,7 +22,9 @@ from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.monitors.single import NO_OTHER_SOLUTION, WITHOUT_MEMORY, Seen, on_path_of
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun
+from schemas.arrays import Ints, times_ns
 from schemas.enums import NotEvaluated
+from schemas.stages import AlignedEpochs
 from schemas.tables import ALL_MONITORS
 
 _AGAINST_ODOMETER = tuple(monitor.name for monitor in ALL_MONITORS if monitor.against_odometer)
@@ -37,17 +40,22 @@ class Ride:
     prepared: PreparedRun
     solution: Solution
     match: Match
-    aligned: pl.DataFrame
+    aligned: AlignedEpochs
     odometry: Odometry | None
     other: pl.DataFrame | None
-    singles: Mapping[str, pl.DataFrame]
+    singles: Mapping[str, Verdicts]
     bank: MonitorBank
     lds: LdsResult
 
     def at_the_end(self) -> dict[str, float | None]:
         """Latency and odometer scale at the last epoch, as columns of `runs`."""
-        columns = ("latency_s", "latency_sigma_s", "odometer_scale")
-        return self.aligned.select(*columns, odometer_scale_sigma="scale_sigma").row(-1, named=True)
+        last = {
+            "latency_s": self.aligned.latency_s[-1],
+            "latency_sigma_s": self.aligned.latency_sigma_s[-1],
+            "odometer_scale": self.aligned.odometer_scale[-1],
+            "odometer_scale_sigma": self.aligned.scale_sigma[-1],
+        }
+        return {name: None if np.isnan(value) else float(value) for name, value in last.items()}
 
 
 def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: TrainEvidence) -> Ride:
@@ -58,7 +66,7 @@ def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], 
     aligned = align(matched.epochs, odometry, prepared.vehicle, config)
     if odometry is None:
         # A balise valid in one direction means that of the train, not of one step of the positions (DOMAIN section 4).
-        aligned = aligned.with_columns(_direction(prepared, solution, aligned, matched, evidence))
+        aligned = replace(aligned, direction=_direction(prepared, solution, aligned, matched, evidence))
     channel = _other_solution(prepared, solution, aligned, matches)
     # What is made of the positions cannot say that they are right (DOMAIN section 5.0).
     blind_along = NotEvaluated.ODOMETER_OF_GNSS if odometry is not None and odometry.of_gnss else None
@@ -68,36 +76,37 @@ def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], 
     reads = _reads_on_odometer(prepared.run.balise_reads, aligned, odometry)
     scale_sigma = None if odometry is None else odometry.scale_sigma
     lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)
-    monitored = pl.concat([aligned, lds.epochs.drop("t"), pl.DataFrame(bank.columns())], how="horizontal")
+    found = {**lds.linking, **bank.verdicts()}
     if blind_along is not None:
-        for name in _AGAINST_ODOMETER:
-            monitored = monitored.with_columns(without_passes(name, monitored, blind_along))
+        found |= {name: found[name].without_passes(blind_along) for name in _AGAINST_ODOMETER}
+    verdicts = pl.DataFrame([column for name, one in found.items() for column in one.columns(name)])
+    monitored = pl.concat([aligned.table, lds.epochs.drop("t"), verdicts], how="horizontal")
     fixes = prepared.fixes(solution)
     replayed = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, matched.path)
     return Ride(prepared, replayed, matched, aligned, odometry, channel, singles, bank, lds)
 
 
 def _direction(
-    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matched: Match, evidence: TrainEvidence
-) -> pl.Series:
+    prepared: PreparedRun, solution: str, aligned: AlignedEpochs, matched: Match, evidence: TrainEvidence
+) -> Ints:
     nothing = pl.DataFrame()
-    unjudged = Solution(solution, prepared.fixes(solution), aligned, nothing, nothing, nothing, matched.path)
+    unjudged = Solution(solution, prepared.fixes(solution), aligned.table, nothing, nothing, nothing, matched.path)
     return direction_by_evidence(Case(unjudged, evidence, None, prepared.vehicle, prepared.config))
 
 
 def _other_solution(
-    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, matches: Mapping[str, Match]
+    prepared: PreparedRun, solution: str, aligned: AlignedEpochs, matches: Mapping[str, Match]
 ) -> pl.DataFrame | None:
     """None if not named or not recorded."""
     channel = prepared.config.monitors.channel_reference
     if channel is None or channel == solution or channel not in matches:
         return None
-    return on_path_of(aligned, matches[channel].epochs, prepared.config.lds)
+    return on_path_of(aligned.table, matches[channel].epochs.table, prepared.config.lds)
 
 
 def _without_memory(
-    prepared: PreparedRun, solution: str, aligned: pl.DataFrame, channel: pl.DataFrame | None
-) -> dict[str, pl.DataFrame]:
+    prepared: PreparedRun, solution: str, aligned: AlignedEpochs, channel: pl.DataFrame | None
+) -> dict[str, Verdicts]:
     named = prepared.config.monitors.channel_reference
     absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
     seen = Seen(aligned, prepared.ranges(solution), channel, absent, prepared.config)
@@ -105,9 +114,10 @@ def _without_memory(
 
 
 def _reads_on_odometer(
-    reads: pl.DataFrame | None, aligned: pl.DataFrame, odometry: Odometry | None
+    reads: pl.DataFrame | None, aligned: AlignedEpochs, odometry: Odometry | None
 ) -> pl.DataFrame | None:
     """Telegrams with the odometer at each, on the scale of `aligned`."""
     if reads is None or odometry is None:
         return reads
-    return reads.with_columns(odometer_at(reads["t"], aligned, odometry))
+    odometer_m = odometer_at(times_ns(reads), aligned, odometry)
+    return reads.with_columns(pl.Series("odometer_m", odometer_m, nan_to_null=True))

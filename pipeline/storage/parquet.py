@@ -40,13 +40,18 @@ def parquet_bytes(
     `columns`: what stands in the fields beside what polars notes of its own types (enums).
     """
     notes = columns or {}
-    plain = frame.clear().to_arrow().schema
-    fields = [field.with_metadata({**(field.metadata or {}), **notes.get(field.name, {})}) for field in plain]
+    group = _row_group(frame, 0)
+    fields = [field.with_metadata({**(field.metadata or {}), **notes.get(field.name, {})}) for field in group.schema]
     writer = GroupedWriter(pa.schema(fields, metadata=dict(sorted((metadata or {}).items())) or None), _ROWS_PER_GROUP)
+    writer.add(pa.Table.from_arrays(group.columns, schema=writer.schema))
     # A row group at a time: the table is never there twice.
-    for first in range(0, max(frame.height, 1), _ROWS_PER_GROUP):
-        writer.add(frame.slice(first, _ROWS_PER_GROUP).rechunk().to_arrow().cast(writer.schema))
+    for first in range(_ROWS_PER_GROUP, frame.height, _ROWS_PER_GROUP):
+        writer.add(pa.Table.from_arrays(_row_group(frame, first).columns, schema=writer.schema))
     return writer.content()
+
+
+def _row_group(frame: pl.DataFrame, first: int) -> pa.Table:
+    return frame.slice(first, _ROWS_PER_GROUP).rechunk().to_arrow()
 
 
 def encoded(table: pa.Table) -> bytes:

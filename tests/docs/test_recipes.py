@@ -19,10 +19,10 @@ MONITOR = [
     (
         SINGLE,
         "def _window(",
-        "def offside_monitor(epochs: pl.DataFrame, factor: float) -> pl.DataFrame:\n"
-        '    unknown = epochs["cross_track_m"].is_null() | epochs["sigma_cross_m"].is_null()\n'
-        '    size, sigma = floats(epochs, "cross_track_m"), floats(epochs, "sigma_cross_m")\n'
-        "    return verdicts(size, factor * sigma, first_reason((unknown, NO_POSITION)))\n\n\n",
+        "def offside_monitor(epochs: AlignedEpochs, factor: float) -> Verdicts:\n"
+        "    unknown = np.isnan(epochs.cross_track_m) | np.isnan(epochs.sigma_cross_m)\n"
+        "    reasons = first_reason((unknown, NO_POSITION))\n"
+        "    return verdicts(epochs.cross_track_m, factor * epochs.sigma_cross_m, reasons)\n\n\n",
     ),
     (SINGLE, '    "channel": lambda', '    "offside": lambda seen: offside_monitor(seen.epochs, 5.3),\n'),
     (TABLES, '    Monitor("channel"', '    Monitor("offside", "m", "other", "off side", axis="cross"),\n'),
@@ -32,7 +32,7 @@ COLUMN = [
     (
         FIGURES,
         '        "outages": lost_s.size,',
-        '        "epochs_on_track": int(epochs["on_track"].sum()),\n',
+        '        "epochs_on_track": int(epochs.on_track.sum()),\n',
     ),
 ]
 STREAM = [

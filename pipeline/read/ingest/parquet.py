@@ -14,6 +14,7 @@ from pipeline.storage.address import Address, join, stem_of
 from pipeline.storage.described import notes_of
 from pipeline.storage.parquet import ColumnTypes, ParquetError, read_parquet, rows_of, without_checksums
 from schemas.config import IngestConfig, StreamCorrection
+from schemas.conform import dtypes
 from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -111,4 +112,4 @@ def _read(
 
 def _is_known(column: str, stream: Stream) -> bool:
     """Of other columns than the contract's only the names are kept."""
-    return column in STREAM_SCHEMAS[stream].columns()
+    return column in dtypes(STREAM_SCHEMAS[stream])

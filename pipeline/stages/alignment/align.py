@@ -3,50 +3,55 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-import polars as pl
 
-from pipeline.stages.alignment.learning import Hold, learn
+from pipeline.stages.alignment.learning import Hold, ToLearn, learn
 from pipeline.stages.alignment.odometer_filter import Estimates, stamp_jitter_s
 from pipeline.stages.epochs.clock import periods_before_s
-from pipeline.stages.epochs.verdicts import NO_ODOMETER, first_reason
+from pipeline.stages.epochs.verdicts import NO_ODOMETER, NUMBER, first_reason
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.monitors.series import along_axis
 from pipeline.stages.odometry.driven import with_hysteresis
 from pipeline.stages.odometry.odometry import Odometry
-from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
-from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
+from schemas.arrays import Floats, Ints
+from schemas.config import Configuration, Vehicle
 from schemas.enums import NotEvaluated
+from schemas.stages import AlignedEpochs, MatchedEpochs
 
 BEYOND_SPAN = NotEvaluated.BEYOND_SPAN
-_OF_ODOMETER = (
-    *("along_m", "odometer_m", "travelled_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m"),
-    *("odometer_period_s", "odometer_scale", "scale_sigma"),
-)
 
 
-def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
-    """Positions of one solution with the odometer beside them: `schemas.stages.Aligned`."""
-    positions = positions.with_columns(pl.col(r"^digits_(along|cross|up)_m$").clip(upper_bound=config.scatter_limit_m))
-    positions = positions.with_columns(*_sigmas(config.monitors), _confidence(config.lds))
+def align(
+    positions: MatchedEpochs, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
+) -> AlignedEpochs:
+    """Positions of one solution with the odometer beside them; `odometry` grows with the path of the positions."""
+    most_m = config.scatter_limit_m
+    positions = replace(
+        positions,
+        digits_along_m=np.minimum(positions.digits_along_m, most_m),
+        digits_cross_m=np.minimum(positions.digits_cross_m, most_m),
+        digits_up_m=np.minimum(positions.digits_up_m, most_m),
+    )
+    allowed = _allowed(positions, config)
     if odometry is None:
-        return _without_odometer(positions, vehicle, config)
+        return _without_odometer(positions, allowed, vehicle, config)
     # A position that has jumped aside is still compared: that is how the monitors see the jump.
-    along_m = unrolled(positions, flags(positions, "near_track"))
-    positions = positions.with_columns(pl.Series("along_m", along_m, nan_to_null=True))
-    t_ns = times_ns(positions)
-    jitter_s = stamp_jitter_s(odometry.seconds(t_ns), periods_before_s(t_ns), config.align.clock_periods)
-    in_use, holds = learn(positions, flags(positions, "on_track"), jitter_s, odometry, vehicle, config)
-    aligned = positions.with_columns(_columns(t_ns, jitter_s, odometry, in_use, config))
+    along_m = unrolled(positions)
+    jitter_s = stamp_jitter_s(
+        odometry.seconds(positions.t_ns), periods_before_s(positions.t_ns), config.align.clock_periods
+    )
+    to_learn = ToLearn(positions.t_ns, positions.on_track, along_m, allowed.along_m, positions.digits_along_m, jitter_s)
+    in_use, holds = learn(to_learn, odometry, vehicle, config)
+    aligned = _with_odometer(positions, allowed, along_m, jitter_s, odometry, in_use, config)
     if not odometry.independent or config.lds.ci_source != "sigma":
         return aligned
-    excess_m2 = stated_excess_m2(aligned, holds, config)
-    widened = (pl.col("sigma_along_m") ** 2 + pl.Series(excess_m2)).sqrt()
-    return aligned.with_columns(confidence_m=config.lds.ci_factor * widened)
+    widened_m = np.sqrt(aligned.sigma_along_m**2 + stated_excess_m2(aligned, holds, config))
+    return replace(aligned, confidence_m=config.lds.ci_factor * widened_m)
 
 
-def stated_excess_m2(aligned: pl.DataFrame, holds: Sequence[Hold], config: Configuration) -> Floats:
+def stated_excess_m2(aligned: AlignedEpochs, holds: Sequence[Hold], config: Configuration) -> Floats:
     """By how much the variance along the track is larger than stated, as epochs before each show it (DOMAIN section 3).
 
     Measured in every run, whatever noise is given for the thresholds; nothing of a hold enters.
@@ -63,57 +68,78 @@ def stated_excess_m2(aligned: pl.DataFrame, holds: Sequence[Hold], config: Confi
     return np.asarray(np.where(known < 0, 0.0, meter.stated_excess_m2()[known]))
 
 
-def _sigmas(config: MonitorConfig) -> list[pl.Expr]:
-    """Sigmas that every test counts with: a + b sigma as `calibrate` fitted it, and the digits."""
-    calibrated = {
-        f"calibrated_{axis}_m": config.sigma_intercept_m + config.sigma_slope * pl.col(f"sigma_{axis}_m")
-        for axis in ("along", "cross", "up")
-    }
-    with_digits = (calibrated["calibrated_along_m"] ** 2 + pl.col("digits_along_m") ** 2).sqrt()
-    return [with_digits.alias("position_sigma_m"), *(value.alias(name) for name, value in calibrated.items())]
+@dataclass(frozen=True)
+class _Allowed:
+    """What every test allows for the position at each epoch [m]; shape (epochs,).
+
+    `along_m`, `cross_m`, `up_m`: a + b sigma as `calibrate` fitted it; `position_m`: along the track, with the digits;
+    `confidence_m`: half-width of the confidence interval.
+    """
+
+    along_m: Floats
+    cross_m: Floats
+    up_m: Floats
+    position_m: Floats
+    confidence_m: Floats
 
 
-def _confidence(lds: LdsConfig) -> pl.Expr:
-    """K sigma along the track, as stated, or the receiver's HPL (DOMAIN section 4)."""
-    half_width = lds.ci_factor * pl.col("sigma_along_m") if lds.ci_source == "sigma" else pl.col("hpl_m")
-    return half_width.alias("confidence_m")
+def _allowed(positions: MatchedEpochs, config: Configuration) -> _Allowed:
+    """The confidence interval is K sigma along the track, as stated, or the receiver's HPL (DOMAIN section 4)."""
+    along_m, cross_m, up_m = (
+        config.monitors.sigma_intercept_m + config.monitors.sigma_slope * sigma_m
+        for sigma_m in (positions.sigma_along_m, positions.sigma_cross_m, positions.sigma_up_m)
+    )
+    by_sigma = config.lds.ci_source == "sigma"
+    return _Allowed(
+        along_m,
+        cross_m,
+        up_m,
+        position_m=np.sqrt(along_m**2 + positions.digits_along_m**2),
+        confidence_m=config.lds.ci_factor * positions.sigma_along_m if by_sigma else positions.hpl_m,
+    )
 
 
-def unrolled(epochs: pl.DataFrame, near: Bools) -> Floats:
+def unrolled(epochs: MatchedEpochs) -> Floats:
     """Path position less what a curve adds to the way of a position beside the track [m]; NaN off the track.
 
     A point y to the left of a track with left curvature k moves dx / (1 - k y) along it while the train moves dx.
     """
-    along = np.full(near.size, np.nan)
-    rows = np.flatnonzero(near)
-    path_m = floats(epochs, "path_m")[rows]
-    beside = np.nan_to_num(floats(epochs, "curvature_per_m")[rows] * floats(epochs, "cross_track_m")[rows])
+    along = np.full(epochs.height, np.nan)
+    rows = np.flatnonzero(epochs.near_track)
+    path_m = epochs.path_m[rows]
+    beside = np.nan_to_num(epochs.curvature_per_m[rows] * epochs.cross_track_m[rows])
     along[rows] = path_m - np.cumsum(beside * np.diff(path_m, prepend=path_m[:1]))
     return along
 
 
-def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometry: Odometry) -> pl.Series:
-    """Odometer distance at any times [m], on the scale of `aligned`'s `odometer_m`; null beyond what is known.
+def odometer_at(at_ns: Ints, aligned: AlignedEpochs, odometry: Odometry) -> Floats:
+    """Odometer distance at any times [m], on the scale of `aligned`'s `odometer_m`; NaN beyond what is known.
 
     Carried on from the nearest epoch before (or the first one) with the scale in use there.
     """
-    anchors = aligned.drop_nulls("odometer_m")
-    if anchors.is_empty():
-        return pl.Series("odometer_m", [None] * times.len(), dtype=pl.Float64)
-    anchor_s = odometry.seconds(times_ns(anchors)) - floats(anchors, "latency_s")
-    at_s = odometry.seconds(times.dt.timestamp("ns").to_numpy())
+    anchors = np.flatnonzero(np.isfinite(aligned.odometer_m))
+    if anchors.size == 0:
+        return np.full(at_ns.size, np.nan)
+    anchor_s = odometry.seconds(aligned.t_ns[anchors]) - aligned.latency_s[anchors]
+    at_s = odometry.seconds(at_ns)
     near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
     way = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
     whole = odometry.doubt_at_s(at_s) == odometry.doubt_at_s(anchor_s[near])
-    distance = floats(anchors, "odometer_m")[near] + floats(anchors, "odometer_scale")[near] * way
-    known = np.where(odometry.known_at_s(at_s) & whole, distance, np.nan)
-    return pl.Series("odometer_m", known, nan_to_null=True)
+    distance = aligned.odometer_m[anchors[near]] + aligned.odometer_scale[anchors[near]] * way
+    return np.where(odometry.known_at_s(at_s) & whole, distance, np.nan)
 
 
-def _columns(
-    t_ns: Ints, jitter_s: Floats, odometry: Odometry, in_use: Estimates, config: Configuration
-) -> list[pl.Series]:
-    """Each read at the epoch less the latency in use there."""
+def _with_odometer(
+    positions: MatchedEpochs,
+    allowed: _Allowed,
+    along_m: Floats,
+    jitter_s: Floats,
+    odometry: Odometry,
+    in_use: Estimates,
+    config: Configuration,
+) -> AlignedEpochs:
+    """Each column read at the epoch less the latency in use there."""
+    t_ns = positions.t_ns
     at = odometry.seconds(t_ns) - in_use.latency_s
     known = odometry.known_at_s(at)
     rows = np.flatnonzero(known)
@@ -123,7 +149,6 @@ def _columns(
     total, travelled = (np.where(known, np.cumsum(steps), np.nan) for steps in (step, driven))
     speed = np.where(known, in_use.scale * odometry.speed_at_s(at), np.nan)
     noise = odometry.noise_at_s(at)
-    rows_m = np.minimum(odometry.known_row_sigma_m(at), config.scatter_limit_m)
     width_m = odometry.hysteresis_m(at)
     held = with_hysteresis(total, width_m)
     turning = np.where(width_m > 0.0, speed_of_positions(at, held, config.align.speed_window_s), speed)
@@ -132,50 +157,75 @@ def _columns(
     reason = first_reason(
         (~known & inside, NotEvaluated.INTERRUPTED), (~known, BEYOND_SPAN), (~noise.shown, NotEvaluated.NOISE_UNKNOWN)
     )
-    return [
-        pl.Series("odometer_m", total, nan_to_null=True),
-        pl.Series("travelled_m", travelled, nan_to_null=True),
-        reason.alias("odometer_reason"),
-        pl.Series("odometer_doubt_m", odometry.doubt_at_s(at)),
-        pl.Series("odometer_slips", odometry.slips_at_s(at) & inside),
-        pl.Series("stamp_jitter_s", jitter_s),
-        pl.Series("odometer_white_m2_per_s", odometry.white_m2_per_s_at(at)),
-        pl.Series("odometer_rows_m", rows_m),
-        pl.Series("odometer_period_s", noise.period_s),
-        pl.Series("speed_mps", speed, nan_to_null=True),
-        pl.Series("direction", _direction(turning, config.matching.deadband_mps)),
-        pl.Series("odometer_scale", in_use.scale),
-        pl.Series("scale_sigma", in_use.scale_sigma),
-        pl.Series("latency_s", in_use.latency_s),
-        pl.Series("latency_sigma_s", in_use.latency_sigma_s),
-    ]
+    return AlignedEpochs(
+        **positions.columns(),
+        position_sigma_m=allowed.position_m,
+        calibrated_along_m=allowed.along_m,
+        calibrated_cross_m=allowed.cross_m,
+        calibrated_up_m=allowed.up_m,
+        confidence_m=allowed.confidence_m,
+        along_m=along_m,
+        odometer_m=total,
+        travelled_m=travelled,
+        odometer_reason=reason,
+        odometer_slips=odometry.slips_at_s(at) & inside,
+        odometer_doubt_m=odometry.doubt_at_s(at),
+        odometer_white_m2_per_s=odometry.white_m2_per_s_at(at),
+        odometer_rows_m=np.minimum(odometry.known_row_sigma_m(at), config.scatter_limit_m),
+        odometer_period_s=noise.period_s,
+        stamp_jitter_s=jitter_s,
+        speed_mps=speed,
+        direction=_direction(turning, config.matching.deadband_mps),
+        odometer_scale=in_use.scale,
+        scale_sigma=in_use.scale_sigma,
+        latency_s=in_use.latency_s,
+        latency_sigma_s=in_use.latency_sigma_s,
+    )
 
 
-def _direction(speed_mps: Floats, deadband_mps: float) -> pl.Series:
+def _direction(speed_mps: Floats, deadband_mps: float) -> Ints:
     """+1 or -1 along growing path, held inside the dead band; the path grows the way that the run begins."""
-    moving = np.where(np.abs(np.nan_to_num(speed_mps)) > deadband_mps, np.sign(np.nan_to_num(speed_mps)), 0.0)
-    signs = pl.Series(moving).replace(0.0, None).forward_fill().fill_null(1.0)
-    return signs.cast(pl.Int8)
+    known_mps = np.nan_to_num(speed_mps)
+    moving = np.abs(known_mps) > deadband_mps
+    last = np.maximum.accumulate(np.where(moving, np.arange(moving.size), -1))
+    return np.where(last >= 0, np.where(known_mps[last] > 0.0, 1, -1), 1)
 
 
-def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
+def _without_odometer(
+    positions: MatchedEpochs, allowed: _Allowed, vehicle: Vehicle, config: Configuration
+) -> AlignedEpochs:
     """Speed and direction from GNSS: velocity, else positions."""
-    nothing = pl.lit(None, pl.Float64)
-    t_s = times_ns(positions) * 1e-9
-    path_m = np.where(flags(positions, "on_track"), floats(positions, "path_m"), np.nan)
+    unknown = np.full(positions.height, np.nan)
+    t_s = positions.t_ns * 1e-9
+    path_m = np.where(positions.on_track, positions.path_m, np.nan)
     by_position = speed_of_positions(t_s - t_s[0], path_m, config.align.speed_window_s)
-    by_doppler = floats(positions, "velocity_along_mps")
+    by_doppler = positions.velocity_along_mps
     speed = np.where(np.isfinite(by_doppler), by_doppler, by_position)
     latency = vehicle.gnss_latency_s
-    return positions.with_columns(
-        **dict.fromkeys(_OF_ODOMETER, nothing),
-        odometer_reason=pl.lit(NO_ODOMETER),
-        odometer_doubt_m=pl.lit(0.0),
-        odometer_slips=pl.lit(value=False),
-        speed_mps=pl.Series(speed, nan_to_null=True),
+    latency_sigma = np.nan if latency is None else vehicle.gnss_latency_sigma_s or 0.0
+    return AlignedEpochs(
+        **positions.columns(),
+        position_sigma_m=allowed.position_m,
+        calibrated_along_m=allowed.along_m,
+        calibrated_cross_m=allowed.cross_m,
+        calibrated_up_m=allowed.up_m,
+        confidence_m=allowed.confidence_m,
+        along_m=unknown,
+        odometer_m=unknown,
+        travelled_m=unknown,
+        odometer_reason=np.full(positions.height, NUMBER[NO_ODOMETER]),
+        odometer_slips=np.zeros(positions.height, dtype=np.bool_),
+        odometer_doubt_m=np.zeros(positions.height),
+        odometer_white_m2_per_s=unknown,
+        odometer_rows_m=unknown,
+        odometer_period_s=unknown,
+        stamp_jitter_s=unknown,
+        speed_mps=speed,
         direction=_direction(speed, config.matching.deadband_mps),
-        latency_s=pl.lit(latency, pl.Float64),
-        latency_sigma_s=pl.lit(None if latency is None else vehicle.gnss_latency_sigma_s or 0.0, pl.Float64),
+        odometer_scale=unknown,
+        scale_sigma=unknown,
+        latency_s=np.full(positions.height, np.nan if latency is None else latency),
+        latency_sigma_s=np.full(positions.height, latency_sigma),
     )
 
 

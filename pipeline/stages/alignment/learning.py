@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import polars as pl
 
 from pipeline.stages.alignment.odometer_filter import Estimates, FilterState, ScaleLatencyFilter, estimates_of, prior_of
 from pipeline.stages.epochs.clock import gap_limits_s, periods_before_s
@@ -24,7 +24,7 @@ from pipeline.stages.monitors.recursion import AxisState
 from pipeline.stages.odometry.driven import under_way
 from pipeline.stages.odometry.odometry import Odometry
 from pipeline.stages.odometry.recovery import RecoveryRule
-from schemas.arrays import Bools, Floats, Ints, floats, times_ns
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, Vehicle
 
 Hold = tuple[int, int]
@@ -33,21 +33,34 @@ learned.
 """
 
 
+@dataclass(frozen=True)
+class ToLearn:
+    """What is learned from, of each epoch of a solution; arrays of shape (epochs,)."""
+
+    t_ns: Ints
+    """Stamp of the epoch [ns]."""
+    usable: Bools
+    """There is a position on the track."""
+    along_m: Floats
+    """Position along the track, for increments (`AlignedEpochs.along_m`) [m]."""
+    calibrated_m: Floats
+    """Deviation of its errors with memory [m]."""
+    digits_m: Floats
+    """Deviation by the digits that it is written with [m]."""
+    jitter_s: Floats
+    """Deviation of the stamp about the receiver's clock [s]."""
+
+
 def learn(
-    positions: pl.DataFrame,
-    usable: Bools,
-    jitter_s: Floats,
+    positions: ToLearn,
     odometry: Odometry,
     vehicle: Vehicle,
     config: Configuration,
 ) -> tuple[Estimates, list[Hold]]:
-    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only; and the holds.
-
-    `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `jitter_s`: of their stamps.
-    """
+    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only; and the holds."""
     prior = prior_of(vehicle, config.align)
-    learned = prior.over(positions.height)
-    learner = _Learner(positions, usable, jitter_s, odometry, vehicle, config, learned)
+    learned = prior.over(positions.t_ns.size)
+    learner = _Learner(positions, odometry, vehicle, config, learned)
     learner.run(prior)
     if vehicle.odometer_scale is not None:
         learned.scale_sigma[:] = prior.scale_sigma
@@ -66,9 +79,7 @@ class _Learner:
 
     def __init__(
         self,
-        positions: pl.DataFrame,
-        usable: Bools,
-        jitter_s: Floats,
+        positions: ToLearn,
         odometry: Odometry,
         vehicle: Vehicle,
         config: Configuration,
@@ -86,12 +97,13 @@ class _Learner:
         self._rule = RecoveryRule(config)
         # The filter reads the odometer up to a latency of five sigmas earlier.
         margin_ns = round(5e9 * config.align.latency_prior_sigma_s)
-        t_ns = times_ns(positions)
+        t_ns = positions.t_ns
+        usable = positions.usable
         known = odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns)
         self._rows = np.flatnonzero(usable & known & odometry.noise_at_s(odometry.seconds(t_ns)).shown)
-        self._path_m, self._calibrated_m, self._digits_m = (
-            floats(positions, name)[self._rows] for name in ("along_m", "calibrated_along_m", "digits_along_m")
-        )
+        self._path_m = positions.along_m[self._rows]
+        self._calibrated_m = positions.calibrated_m[self._rows]
+        self._digits_m = positions.digits_m[self._rows]
         self._sigma_m = np.hypot(self._calibrated_m, self._digits_m)
         t_s = odometry.seconds(t_ns)
         self._t_ns = t_ns[self._rows]
@@ -99,8 +111,8 @@ class _Learner:
         self._doubt_m = odometry.doubt_at_s(self._t_s)
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
-        self._jitter_s = jitter_s[self._rows]
-        scattered_s = config.align.scattered_gap_sigmas * jitter_s
+        self._jitter_s = positions.jitter_s[self._rows]
+        scattered_s = config.align.scattered_gap_sigmas * positions.jitter_s
         gap_s = gap_limits_s(periods_before_s(t_ns), config.align.gap_reset_s) + scattered_s
         self._breaks = _gaps_before(self._t_s, self._t_s, gap_s[self._rows])
         self._outages = _gaps_before(self._t_s, t_s[usable], gap_s[usable])

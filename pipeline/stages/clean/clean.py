@@ -13,7 +13,7 @@ import polars as pl
 from pipeline.stages.clean.held import copies
 from pipeline.stages.clean.journey import DAY_NS, require_spans, require_two_times
 from pipeline.stages.clean.placeholders import without_placeholders
-from schemas.arrays import Bools
+from schemas.arrays import Bools, times_ns
 from schemas.config import Configuration
 from schemas.errors import InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -183,7 +183,7 @@ def _without_copies(gnss: pl.DataFrame) -> tuple[pl.DataFrame, dict[str, int]]:
     left_out = np.zeros(gnss.height, dtype=np.bool_)
     narrow = gnss.select("solution", "t", *_PLACE).with_row_index("_row")
     for part in narrow.partition_by("solution", maintain_order=True):
-        t_ns = part["t"].to_physical().to_numpy()
+        t_ns = times_ns(part)
         places = (part[name].cast(pl.Float64).fill_null(float("nan")).to_numpy() for name in _PLACE)
         held = copies((t_ns - t_ns[:1]) / 1e9, *places)
         left_out[part["_row"].to_numpy()] = held
@@ -203,7 +203,7 @@ def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNote
 
 def _strays(frame: pl.DataFrame, few: float) -> Bools:
     """Rows before 1970, and rows more than a day away from most of their solution, if at most the share `few`."""
-    t_ns = frame["t"].cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy()
+    t_ns = times_ns(frame)
     stray: Bools = t_ns < 0
     if not t_ns.size or int(t_ns.max()) - int(t_ns.min()) <= DAY_NS:
         return stray
@@ -226,7 +226,7 @@ def _far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
 
 def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
     """Times more than a day from every position, in 64 bits without overflow."""
-    t_ns, known = (series.cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy() for series in (t, positions))
+    t_ns, known = (series.cast(pl.Datetime("ns")).cast(pl.Int64).to_numpy() for series in (t, positions))
     if not known.size:
         return np.zeros(t.len(), dtype=np.bool_)
     known = np.sort(known)
@@ -253,7 +253,7 @@ def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
 def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
     """In order of time, the first of each `keys`; how many were duplicates, how many recorded too late."""
     frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
-    if (np.diff(frame["t"].to_physical().to_numpy()) > 0).all():
+    if (np.diff(times_ns(frame)) > 0).all():
         return frame, StreamCounts()
     latest = pl.col("t").cum_max()  # of the rows recorded so far
     keys = [key for key in keys if key in frame.columns]
@@ -272,8 +272,8 @@ def _require_common_time(run: RunLog, clock_advice: ClockAdvice) -> None:
     odometer = run.odometer
     if gnss.is_empty() or odometer is None:
         return
-    begin, end = gnss["t"].to_physical()[[0, -1]]
-    odometer_begin, odometer_end = odometer["t"].to_physical()[[0, -1]]
+    begin, end = times_ns(gnss)[[0, -1]]
+    odometer_begin, odometer_end = times_ns(odometer)[[0, -1]]
     if odometer_begin > end or odometer_end < begin:
         remedy = "Check date and time scale (UTC or GPS) of both recorders, or leave the odometer out."
         advice = clock_advice(run) if {"fix", *_PLACE} <= set(gnss.columns) else ""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, median
 
 # Numerics of the reading: with fewer updates no period is known; a regular one is met, to a logged step, by so many of
 # the updates. Digits that repeat at low speed are not: their time changes with the speed.
@@ -26,9 +26,9 @@ def copies(t_s: Floats, latitude_deg: Floats, longitude_deg: Floats) -> Bools:
     updates = t_s[~same & np.isfinite(latitude_deg)]
     if not same.any() or updates.size < _FEWEST:
         return none
-    step_s = float(np.median(np.diff(t_s)))
+    step_s = median(np.diff(t_s))
     apart_s = np.diff(updates)
-    period_s = float(np.median(apart_s))
+    period_s = median(apart_s)
     regular = np.mean(np.abs(apart_s - period_s) <= _STEP_NOISE * step_s)
     if period_s < _LEAST_RATIO * step_s or regular < _REGULAR_SHARE:
         return none

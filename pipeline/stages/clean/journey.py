@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from schemas.arrays import NS_PER_S
+from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.run import RunLog
@@ -30,7 +30,7 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
 
 def require_one_journey(fixes: pl.DataFrame, place: str, config: IngestConfig) -> None:
     """Refuse a solution with a gap of more than a day, or one that lasts too long."""
-    gaps = np.diff(fixes["t"].to_physical().to_numpy()) > DAY_NS
+    gaps = np.diff(times_ns(fixes)) > DAY_NS
     if gaps.any():
         row = int(gaps.argmax())
         raise InputError(
@@ -54,7 +54,8 @@ def require_spans(run: RunLog, config: IngestConfig) -> None:
 
 
 def require_span(t: pl.Series, place: str, config: IngestConfig) -> None:
-    if t.len() and int(t.to_physical()[-1]) - int(t.to_physical()[0]) > config.longest_journey_h * _NS_PER_H:
+    t_ns = t.cast(pl.Int64)
+    if t.len() and int(t_ns[-1]) - int(t_ns[0]) > config.longest_journey_h * _NS_PER_H:
         raise InputError(
             "lasts longer than a journey",
             place=f"{place}, column t",

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import polars as pl
 
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median, times_ns
 from schemas.config import Configuration, LdsConfig
 from schemas.stages import ONE_TRACK_LEFT
 
@@ -35,8 +35,12 @@ class Clock:
 
     @classmethod
     def of(cls, epochs: pl.DataFrame, config: Configuration) -> Clock:
-        t_ns = times_ns(epochs)
-        period_s = nominal_period_s(position_ns(epochs))
+        return cls.at(times_ns(epochs), position_ns(epochs), config)
+
+    @classmethod
+    def at(cls, t_ns: Ints, position_ns: Ints, config: Configuration) -> Clock:
+        """`t_ns`: all epochs; `position_ns`: those with a position."""
+        period_s = nominal_period_s(position_ns)
         limit_s = gap_limit_s(period_s, config.align.gap_reset_s)
         return cls(t_ns, period_s, limit_s, held_s(t_ns, limit_s))
 
@@ -85,7 +89,7 @@ def trusted(config: Configuration) -> pl.Expr:
 
 def nominal_period_s(t_ns: Ints) -> float | None:
     """Median distance of consecutive epochs [s]; None for fewer than two."""
-    return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else None
+    return median(np.diff(t_ns)) / NS_PER_S if len(t_ns) > 1 else None
 
 
 def position_ns(epochs: pl.DataFrame) -> Ints:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.stages.follows.steps import Steps, around_sum
-from schemas.arrays import Bools, Floats, spans_of
+from schemas.arrays import Bools, Floats, median, spans_of
 from schemas.config import EvidenceConfig
 
 # Steps of this length are compared; what lies so near to a movement is no stand [s].
@@ -62,7 +62,7 @@ def _tells(odometer_m: Floats, other_m: Floats, time_s: float, config: EvidenceC
 
 def _usual(steps_m: Floats) -> Floats:
     """About their mean, and none beyond four deviations (by the median); none at all where most are alike."""
-    apart_m = steps_m - np.median(steps_m)
-    sigma_m = float(np.median(np.abs(apart_m))) / 0.674490
+    apart_m = steps_m - median(steps_m)
+    sigma_m = median(np.abs(apart_m)) / 0.674490
     clipped = np.clip(apart_m, -4.0 * sigma_m, 4.0 * sigma_m)
     return np.asarray(clipped - clipped.mean())

@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import curvature_radii_m
-from schemas.arrays import Bools, Floats, floats, times_ns
+from schemas.arrays import Bools, Floats, floats, median, times_ns
 from schemas.config import Configuration
 from schemas.enums import Fix
 
@@ -56,7 +56,7 @@ def common_steps(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Configurat
         return None
     counter_s, counter_m = counted
     places_s, places_m = placed
-    periods_s = float(np.median(np.diff(counter_s))), float(np.median(np.diff(places_s)))
+    periods_s = median(np.diff(counter_s)), median(np.diff(places_s))
     slower_s = counter_s if periods_s[0] > 1.2 * periods_s[1] else places_s
     t_s = slower_s[(slower_s >= max(counter_s[0], places_s[0])) & (slower_s <= min(counter_s[-1], places_s[-1]))]
     if t_s.size < _FEWEST:

@@ -12,7 +12,7 @@ from pipeline.stages.judge.episodes import Episode
 from pipeline.stages.judge.judgement import ODOMETER, Judgements, margins_m
 from schemas.arrays import NS_PER_S, Bools, Floats, floats, times_ns
 from schemas.config import Configuration, HazardConfig
-from schemas.conform import dtypes
+from schemas.conform import dtypes, table_of_rows
 from schemas.enums import Suspect, Verdict
 from schemas.tables import ALL_MONITORS, Alarms
 
@@ -41,7 +41,7 @@ def alarms_table(
         }
         for number, alarm in enumerate(log.alarms)
     ]
-    return pl.DataFrame(rows, schema=dtypes(Alarms))
+    return table_of_rows(rows, dtypes(Alarms))
 
 
 def healthy_across(epochs: pl.DataFrame, config: HazardConfig) -> Healthy:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import polars as pl
 
 from pipeline.stages.evidence import EvidenceSet, TrainEvidence, either
@@ -78,4 +79,8 @@ class Case:
     def element_numbers(self, names: pl.Series) -> Ints:
         """Net elements by their numbers in the survey, -1 for none."""
         index = self.evidence.network.track.index
-        return names.replace_strict(index, default=-1, return_dtype=pl.Int64).fill_null(-1).to_numpy()
+        # A train is on a net element for many epochs: each name is looked up once for all of them.
+        visit = names.rle_id().to_numpy()
+        first = names[np.flatnonzero(np.diff(visit, prepend=-1))]
+        numbers = np.array([-1 if name is None else index.get(name, -1) for name in first], dtype=np.int64)
+        return np.asarray(numbers[visit])

@@ -26,7 +26,7 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
     evidence = case.evidence_at(at_ns)
     along = judgements_of(case, positions, at_ns, evidence)
     direction = _direction(case, positions, at_ns, along)
-    judged = along.turned(direction.to_numpy())
+    judged = along.turned(direction)
     train_m = positions.path_m - along.known_m(config.hazards.known_error_m)
     reference_m = np.where(along.kind == REFERENCE, train_m, np.nan)
     stood = within_spans(at_ns, case.evidence.stood)
@@ -39,7 +39,7 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
     return epochs.drop("direction").with_columns(
         pl.Series("epoch", np.arange(epochs.height)),
         pl.Series("at", at_ns).cast(pl.Datetime("ns", "UTC")),
-        direction,
+        pl.Series("direction", direction, dtype=pl.Int8),
         *judged.columns(),
         *true_places(evidence, case.evidence.network.track),
         pl.Series("error_along_m", judged.known_m(config.hazards.known_error_m), nan_to_null=True),
@@ -57,14 +57,13 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
     )
 
 
-def _direction(case: Case, positions: MatchedPositions, at_ns: Ints, along: Judgements) -> pl.Series:
+def _direction(case: Case, positions: MatchedPositions, at_ns: Ints, along: Judgements) -> Ints:
     as_driven = ints(case.solution.epochs["direction"], 1)
     hazards = case.config.hazards
-    direction = travel_direction(as_driven, along, at_ns, positions.path_m, case.odometry is not None, hazards)
-    return pl.Series("direction", direction, dtype=pl.Int8)
+    return travel_direction(as_driven, along, at_ns, positions.path_m, case.odometry is not None, hazards)
 
 
-def direction_by_evidence(case: Case) -> pl.Series:
+def direction_by_evidence(case: Case) -> Ints:
     """Direction of travel of a run without an odometer, before anything is judged: `epochs` as they are aligned."""
     at_ns = case.instants_of_epochs()
     positions = MatchedPositions.of(case, case.solution.epochs, met(case.solution.epochs, unambiguous()))

@@ -18,7 +18,7 @@ from pipeline.stages.judge.failures import Course, Offers
 from pipeline.stages.judge.jumps import Jump
 from pipeline.stages.judge.travel import speed_at
 from schemas.arrays import NS_PER_S
-from schemas.conform import dtypes
+from schemas.conform import dtypes, table_of_rows
 from schemas.enums import Evidence, FailureMode, Hazard, Timing
 from schemas.tables import Hazards
 
@@ -162,7 +162,7 @@ def hazards_table(rows: Sequence[HazardRow], case: Case, epochs: pl.DataFrame, c
         }
         for number, row in enumerate(rows)
     ]
-    return pl.DataFrame(values, schema=dtypes(Hazards))
+    return table_of_rows(values, dtypes(Hazards))
 
 
 def _kind(row: HazardRow, offers: Offers) -> Row:

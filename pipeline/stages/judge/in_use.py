@@ -16,7 +16,7 @@ from pipeline.stages.epochs.clock import (
     trusted,
 )
 from pipeline.stages.judge.judgement import RIGHT, WRONG
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, runs_of, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, runs_of, times_ns
 from schemas.config import Configuration
 from schemas.enums import LdsState
 
@@ -31,11 +31,11 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
     of it where the position was wrong. `counted_s`: for shares of time, `wrong_s` where there is any. An epoch without
     a position accounts for time only in a gap.
     """
-    known = met(epochs, pl.col("path_m").is_not_null())
+    known = np.isfinite(floats(epochs, "path_m"))
     steps = _StepTimes.of(epochs, known, config)
-    usable = met(epochs.filter(known), trusted(config) & ~pl.col("withheld"))
+    usable = met(epochs, trusted(config) & ~pl.col("withheld"))
     in_use = np.zeros(known.size, dtype=np.bool_)
-    in_use[known] = usable & (steps.left_s(steps.alone_s) > _LEAST_S)
+    in_use[known] = usable[known] & (steps.left_s(steps.alone_s) > _LEAST_S)
     used_s = np.zeros(known.size)
     used_s[known] = np.where(in_use[known], steps.left_s(steps.near_s), 0.0)
     wrong_s = np.where(code == WRONG, used_s, 0.0)
@@ -116,5 +116,6 @@ def lds_states(epochs: pl.DataFrame, code: Ints, in_use: Bools, undiagnosed: Boo
         LdsState.P3: undiagnosed,
         LdsState.P0: code == RIGHT,
     }
-    states = [pl.when(pl.Series(held)).then(pl.lit(state.value)) for state, held in applies.items()]
-    return pl.select(lds_state=pl.coalesce(states).cast(pl.Enum(LdsState))).to_series()
+    words = pl.Series("lds_state", [*(state.value for state in applies), None], dtype=pl.Enum(LdsState))
+    first = np.select(list(applies.values()), list(range(len(applies))), default=len(applies))
+    return words[first.astype(np.uint32)]

@@ -18,6 +18,8 @@ from schemas.config import HazardConfig
 from schemas.enums import Evidence, Judgement
 
 JUDGEMENTS = tuple(Judgement)
+_JUDGEMENT_WORDS = pl.Series("judgement", [word.value for word in Judgement], dtype=pl.Enum(Judgement))
+_EVIDENCE_WORDS = pl.Series("evidence", [*(kind.value for kind in KINDS), None], dtype=pl.Enum(Evidence))
 RIGHT, WRONG, UNKNOWN = (JUDGEMENTS.index(word) for word in (Judgement.RIGHT, Judgement.WRONG, Judgement.UNKNOWN))
 REFERENCE, BALISE, ODOMETER = (KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER))
 
@@ -74,13 +76,11 @@ class Judgements:
         )
 
     def columns(self) -> list[pl.Series]:
-        words = [word.value for word in JUDGEMENTS]
-        kinds = pl.Series("evidence", [*(kind.value for kind in KINDS), None], dtype=pl.Enum(Evidence))
         return [
-            pl.Series("judgement", words, dtype=pl.Enum(words)).gather(self.code),
+            _JUDGEMENT_WORDS[self.code.astype(np.uint32)],
             pl.Series("error_low_m", self.low_m, nan_to_null=True),
             pl.Series("error_high_m", self.high_m, nan_to_null=True),
-            kinds.gather(np.where(self.kind == NOTHING, len(KINDS), self.kind)),
+            _EVIDENCE_WORDS[np.where(self.kind == NOTHING, len(KINDS), self.kind).astype(np.uint32)],
             pl.Series("wrong_track", self.wrong_track),
             pl.Series("track_assumed", self.track_assumed),
         ]

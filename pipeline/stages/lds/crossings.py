@@ -13,7 +13,7 @@ from pipeline.stages.epochs.passing import Passing, passings
 from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.windows import Window
 from schemas.arrays import spans_of
-from schemas.conform import dtypes
+from schemas.conform import dtypes, table_of_rows
 from schemas.enums import BaliseKind, LinkingError, PassageStatus, Reaction
 from schemas.stages import Crossings
 
@@ -150,7 +150,7 @@ def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
 
 def crossing_rows(crossings: Sequence[Crossing]) -> pl.DataFrame:
     rows = [_row(number, crossing) for number, crossing in enumerate(crossings)]
-    return pl.DataFrame(rows, schema=dtypes(Crossings))
+    return table_of_rows(rows, dtypes(Crossings))
 
 
 def _row(number: int, crossing: Crossing) -> dict[str, object]:

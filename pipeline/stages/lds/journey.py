@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
-import polars as pl
 
-from pipeline.stages.epochs.clock import confident, crossing_gaps_ns, met, unambiguous
+from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.odometry.bound import is_lost
 from pipeline.stages.odometry.driven import turns_of
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import PassageStatus
+from schemas.stages import AlignedEpochs
+
+AnyArray = TypeVar("AnyArray", Floats, Ints)
 
 
 class Journey:
-    """Epochs in order of time; NaN is not known. Names are those of `schemas.stages.Aligned`, but:
+    """Epochs in order of time; NaN is not known. Names are those of `schemas.stages.AlignedEpochs`, but:
 
     `refusal`: why a detection here would not count, None where it would. `direction` of travel (+1/-1 along growing
     path) as known at that epoch. `doubt_m`: in the odometer's distance, a sum; the epochs between which it stays the
@@ -24,23 +27,23 @@ class Journey:
     over; `blind`: no position for longer.
     """
 
-    def __init__(self, epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> None:
+    def __init__(self, epochs: AlignedEpochs, scale_sigma: float | None, config: Configuration) -> None:
         """The only place where the LDS reads columns of aligned epochs."""
-        self.t_ns = times_ns(epochs)
-        self.leg: Ints = epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64)
-        self.path_m = floats(epochs, "path_m")
-        self.positioned: Bools = np.isfinite(self.path_m)
-        self.placed_nowhere: Bools = flags(epochs, "fix_valid") & ~self.positioned
-        self.refusal = _refusals(epochs, self.positioned, config)
-        self.sigma_m = floats(epochs.select(pl.col("position_sigma_m").forward_fill()), "position_sigma_m")
-        self.confidence_m = floats(epochs, "confidence_m")
-        self.odometer_m = floats(epochs, "odometer_m")
-        self.doubt_m = floats(epochs, "odometer_doubt_m")
-        self.slips = flags(epochs, "odometer_slips")
-        self.rows_m = np.nan_to_num(floats(epochs, "odometer_rows_m"))
+        self.t_ns = epochs.t_ns
+        self.leg: Ints = _held(epochs.leg, epochs.leg >= 0, 0)
+        self.path_m = epochs.path_m
+        self.positioned: Bools = epochs.positioned
+        self.placed_nowhere: Bools = epochs.fix_valid & ~self.positioned
+        self.refusal = _refusals(epochs, config)
+        self.sigma_m: Floats = _held(epochs.position_sigma_m, np.isfinite(epochs.position_sigma_m), np.nan)
+        self.confidence_m = epochs.confidence_m
+        self.odometer_m = epochs.odometer_m
+        self.doubt_m = epochs.odometer_doubt_m
+        self.slips = epochs.odometer_slips
+        self.rows_m = np.nan_to_num(epochs.odometer_rows_m)
         self.scale_sigma = scale_sigma
-        self.direction = _direction(self.odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
-        self.travelled_m = floats(epochs, "travelled_m")
+        self.direction = _direction(self.odometer_m, epochs.direction, config.lds.odometer_fixed_m)
+        self.travelled_m = epochs.travelled_m
         self.gap_ns = crossing_gaps_ns(self.t_ns, config.lds)
         self.blind = _blind(self.t_ns, self.positioned, self.gap_ns)
 
@@ -81,23 +84,28 @@ def _blind(t_ns: Ints, positioned: Bools, gap_ns: Ints) -> Bools:
     return blind
 
 
-def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) -> list[PassageStatus | None]:
-    """Ambiguity before confidence; null is never taken as good."""
-    refusals = np.full(positioned.size, None)
-    refusals[~met(epochs, confident(config))] = PassageStatus.REJECTED_CONFIDENCE
-    refusals[~met(epochs, unambiguous())] = PassageStatus.REJECTED_AMBIGUOUS
-    refusals[~positioned] = PassageStatus.NOT_AVAILABLE
+def _held(values: AnyArray, known: Bools, first: float) -> AnyArray:
+    """Each value that is not known as the last one that is; before any of them `first`."""
+    last = np.maximum.accumulate(np.where(known, np.arange(values.size), -1))
+    return np.where(last >= 0, values[last], first).astype(values.dtype)
+
+
+def _refusals(epochs: AlignedEpochs, config: Configuration) -> list[PassageStatus | None]:
+    """Ambiguity before confidence; what is not known is never taken as good."""
+    refusals = np.full(epochs.height, None)
+    refusals[~(epochs.confidence_m <= config.lds.ci_limit_m)] = PassageStatus.REJECTED_CONFIDENCE
+    refusals[~epochs.unambiguous] = PassageStatus.REJECTED_AMBIGUOUS
+    refusals[~epochs.positioned] = PassageStatus.NOT_AVAILABLE
     return list(refusals)
 
 
-def _direction(odometer_m: Floats, matched: pl.Series, turn_m: float) -> Ints:
+def _direction(odometer_m: Floats, matched: Ints, turn_m: float) -> Ints:
     """Direction of travel along growing path, as known at each epoch.
 
     With an odometer the train has turned once it came back by `turn_m`: a wheel's jitter at a stand is no turn.
     """
     if not np.isfinite(odometer_m).any():
-        held = matched.replace(0, None).fill_null(strategy="forward").fill_null(1)
-        return held.to_numpy().astype(np.int64)
+        return _held(matched, matched != 0, 1)
     known = np.flatnonzero(np.isfinite(odometer_m))
     direction = np.ones(odometer_m.size, dtype=np.int64)
     for _, seen_at, sense in turns_of(odometer_m[known], turn_m):

@@ -5,23 +5,25 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-import polars as pl
 
 from pipeline.stages.epochs.verdicts import (
     DISABLED,
     NO_ODOMETER,
     NO_POSITION,
     NO_SIGMA,
+    NUMBER,
+    Verdicts,
     first_reason,
-    of_monitor,
+    otherwise,
     verdicts,
 )
 from pipeline.stages.lds.crossings import Crossing
 from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.relink import Anchor, Comparison
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
+from schemas.stages import NO_REASON
 
 # Identities are counted: half a balise lies between none and one.
 ORDER_THRESHOLD = 0.5
@@ -51,7 +53,7 @@ class LinkOrder:
 
     def __init__(self, journey: Journey, config: Configuration) -> None:
         self._reason = _order_reasons(journey, "link_order" in config.monitors.disabled, config)
-        self._evaluated: Bools = self._reason.is_null().to_numpy()
+        self._evaluated: Bools = self._reason == NO_REASON
         self._value = np.zeros(journey.t_ns.size)
 
     def is_evaluated(self, epoch: int) -> bool:
@@ -60,9 +62,8 @@ class LinkOrder:
     def note(self, epoch: int, out_of_order: int) -> None:
         self._value[epoch] = out_of_order
 
-    def columns(self) -> list[pl.Series]:
-        threshold = np.full(self._value.size, ORDER_THRESHOLD)
-        return of_monitor("link_order", verdicts(self._value, threshold, self._reason))
+    def verdicts(self) -> Verdicts:
+        return verdicts(self._value, np.full(self._value.size, ORDER_THRESHOLD), self._reason)
 
 
 class LinkDistance:
@@ -76,9 +77,8 @@ class LinkDistance:
         self._journey = journey
         self._config = config.lds
         self._factor = config.monitors.threshold_factor
-        reasons = _distance_reasons(journey, "link_distance" in config.monitors.disabled, config)
-        self._possible: Bools = reasons.is_null().to_numpy()
-        self._reason = reasons.to_numpy().astype(np.object_)  # None where it is evaluated
+        self._reason = _distance_reasons(journey, "link_distance" in config.monitors.disabled, config)
+        self._possible: Bools = self._reason == NO_REASON
         self._offset_m = journey.path_m - journey.odometer_m
         self._value = np.full(journey.t_ns.size, np.nan)
         self._threshold = np.full(journey.t_ns.size, np.nan)
@@ -146,8 +146,8 @@ class LinkDistance:
         known = self._possible[ahead] & ~lost
         moved_m, bound_m = self._since_return[:, ahead]
         held = known & np.isfinite(moved_m)
-        self._reason[ahead][self._possible[ahead]] = None
-        self._reason[ahead][lost] = NotEvaluated.DISTANCE_LOST
+        self._reason[ahead][self._possible[ahead]] = NO_REASON
+        self._reason[ahead][lost] = NUMBER[NotEvaluated.DISTANCE_LOST]
         since_m = np.where(held, moved_m, self._offset_m[ahead] - anchor.offset_m)
         self._value[ahead] = np.where(known, since_m, np.nan)
         self._threshold[ahead] = np.where(known, np.where(held, bound_m, threshold_m), np.nan)
@@ -160,23 +160,21 @@ class LinkDistance:
         self._value[epoch] = comparison.moved_m
         self._threshold[epoch] = comparison.bound_m
         self._fails[epoch] = comparison.reason is None and not comparison.holds
-        self._reason[epoch] = comparison.reason
+        self._reason[epoch] = NO_REASON if comparison.reason is None else NUMBER[comparison.reason]
 
     def forget(self, epoch: int) -> None:
         self.measure_from(None, epoch)
         self._since_return[:, epoch:] = np.nan
         self._value[epoch:] = self._threshold[epoch:] = np.nan
-        self._reason[epoch:][self._possible[epoch:]] = None
+        self._reason[epoch:][self._possible[epoch:]] = NO_REASON
 
-    def columns(self) -> list[pl.Series]:
+    def verdicts(self) -> Verdicts:
         self._end_at(self._fails.size - 1)
-        reasons = pl.Series(self._reason.tolist(), dtype=pl.String)
-        unknown = reasons.is_null() & pl.Series(np.isnan(self._value))
-        reasons = first_reason((reasons.is_not_null(), reasons), (unknown, NotEvaluated.NEVER_VALIDATED))
-        return of_monitor("link_distance", verdicts(self._value, self._threshold, reasons))
+        never = first_reason((np.isnan(self._value), NotEvaluated.NEVER_VALIDATED))
+        return verdicts(self._value, self._threshold, otherwise(self._reason, never))
 
 
-def _order_reasons(journey: Journey, disabled: bool, config: Configuration) -> pl.Series:
+def _order_reasons(journey: Journey, disabled: bool, config: Configuration) -> Ints:
     """Per step: both its ends must be good for it."""
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
@@ -195,7 +193,7 @@ def _order_reasons(journey: Journey, disabled: bool, config: Configuration) -> p
     )
 
 
-def _distance_reasons(journey: Journey, disabled: bool, config: Configuration) -> pl.Series:
+def _distance_reasons(journey: Journey, disabled: bool, config: Configuration) -> Ints:
     return first_reason(
         (np.full(journey.t_ns.size, disabled), DISABLED),
         (~np.isfinite(journey.odometer_m), NO_ODOMETER),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.passing import passings
+from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.lds.crossings import (
     PLACE,
     Crossing,
@@ -28,6 +29,7 @@ from schemas.arrays import Bools, Floats
 from schemas.config import Configuration, LdsConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode
+from schemas.stages import AlignedEpochs
 from schemas.tables import Epochs, Passages
 
 
@@ -35,12 +37,13 @@ from schemas.tables import Epochs, Passages
 class LdsResult:
     """What the LDS made of one solution.
 
-    `epochs`: `t` and the LDS columns. `passages`: as in the contract, what needs a truth null or `none`, and
-    `t_reckoned`: when LRVB and odometer say that the train passes a balise that was not offered. `unknown_reads`: of
-    balises not on the path. `held`: re-links that held.
+    `epochs`: `t` and the LDS columns. `linking`: verdicts of the linking monitors by name. `passages`: as in the
+    contract, what needs a truth null or `none`, and `t_reckoned`: when LRVB and odometer say that the train passes a
+    balise that was not offered. `unknown_reads`: of balises not on the path. `held`: re-links that held.
     """
 
     epochs: pl.DataFrame
+    linking: Mapping[str, Verdicts]
     crossings: pl.DataFrame
     passages: pl.DataFrame
     unknown_reads: pl.DataFrame
@@ -48,7 +51,7 @@ class LdsResult:
 
 
 def run_lds(
-    epochs: pl.DataFrame,
+    epochs: AlignedEpochs,
     bank: MonitorBank,
     balises: pl.DataFrame,
     balise_reads: pl.DataFrame | None,
@@ -58,7 +61,7 @@ def run_lds(
 ) -> LdsResult:
     """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
 
-    `epochs`: `schemas.stages.Aligned`. `balises`: of the travelled path. `balise_reads`: `t, balise_id`, and
+    `balises`: of the travelled path. `balise_reads`: `t, balise_id`, and
     `odometer_m`; without that stream physical balises have no passages. `scale_sigma`: of the odometer by a vehicle
     file, else None.
     """
@@ -70,7 +73,8 @@ def run_lds(
     system.run()
     passages = system.balises.virtual.passages + system.balises.physical.passages
     return LdsResult(
-        epochs=epoch_columns(epochs["t"], system, journey, config.lds),
+        epochs=epoch_columns(epochs.table["t"], system, journey, config.lds),
+        linking={"link_order": system.balises.order.verdicts(), "link_distance": system.distance.verdicts()},
         crossings=crossing_rows(crossings),
         passages=passage_rows(passages, crossings, journey, solution),
         unknown_reads=unknown,
@@ -83,24 +87,24 @@ def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config
     starts = np.array([change.epoch for change in system.lrvb_changes])
     index = np.searchsorted(starts, np.arange(journey.t_ns.size), side="right") - 1
     distance_m, doubt_m = _reported_m(system.lrvb_changes, index, journey, config)
-    withheld_for = pl.Series("withheld_for", system.withheld_for, dtype=Epochs.columns()["withheld_for"].dtype)
+    withheld_for = pl.Series("withheld_for", system.withheld_for, dtype=dtypes(Epochs)["withheld_for"])
     withheld = withheld_for.is_not_null().alias("withheld")
     columns = [
         t,
         _modes(system, index, journey, withheld.to_numpy()),
         pl.Series("tvb", system.tvb, dtype=pl.Boolean),
         pl.Series("lrvb_id", names, dtype=pl.String).gather(index),
-        pl.Series("distance_from_lrvb_m", distance_m).fill_nan(None),
-        pl.Series("doubt_over_m", doubt_m).fill_nan(None),
-        pl.Series("doubt_under_m", doubt_m).fill_nan(None),
-        pl.Series("exposure_s", _exposure_s(system, journey)).fill_nan(None),
+        pl.Series("distance_from_lrvb_m", distance_m, nan_to_null=True),
+        pl.Series("doubt_over_m", doubt_m, nan_to_null=True),
+        pl.Series("doubt_under_m", doubt_m, nan_to_null=True),
+        pl.Series("exposure_s", _exposure_s(system, journey), nan_to_null=True),
         pl.Series("negated", system.negated, dtype=pl.Boolean),
         withheld,
         withheld_for,
         pl.Series("diagnosis_faulty", _diagnosis_faulty(system, journey, withheld.to_numpy())),
         pl.Series("alarm", system.alarm, dtype=pl.Boolean),
     ]
-    return pl.DataFrame(columns).with_columns(*system.balises.order.columns(), *system.distance.columns())
+    return pl.DataFrame(columns)
 
 
 def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools) -> Bools:
@@ -123,7 +127,7 @@ def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld
     in_use = np.where(journey.usable & ~withheld, modes.index(LdsMode.LINKED), modes.index(LdsMode.ODOMETRY))
     mode = np.where(linked, in_use, modes.index(LdsMode.INITIALISING))
     mode = np.where(system.negated, modes.index(LdsMode.FAIL_SAFE), mode)
-    return pl.Series("lds_mode", modes, dtype=Epochs.columns()["lds_mode"].dtype).gather(mode)
+    return pl.Series("lds_mode", modes, dtype=dtypes(Epochs)["lds_mode"]).gather(mode)
 
 
 def _reported_m(

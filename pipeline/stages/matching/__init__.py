@@ -1,6 +1,6 @@
 """Map matching: which way the train went over the network, and where each epoch is on that path.
 
-In: fixes of one solution (or the reference), odometer, site. Out: `Match`: `schemas.stages.Positions` and the path.
+In: fixes of one solution (or the reference), odometer, site. Out: `Match`: `schemas.stages.MatchedEpochs` and the path.
 Touches no file. The path may use the whole run; `gate_probability`, which feeds detection, only what came before.
 
 Which tracks are possible is the set of `paths`; what it lets a train claim: `claims`. `match` places the epochs on the

@@ -13,9 +13,9 @@ import polars as pl
 from pipeline.stages.matching.branches import OneTrack, branches_beyond_m
 from pipeline.stages.paths.path_set import PathSet, Span
 from pipeline.stages.track.network import Network
-from schemas.arrays import Bools, Floats, Ints, spans_of
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 from schemas.config import MatchingConfig
-from schemas.stages import ONE_TRACK_LEFT
+from schemas.stages import ONE_TRACK_LEFT, MatchedEpochs
 
 # No other track within reach; more than one left of the set.
 ALONE, MOST_IN_DOUBT = 1.0, 0.95
@@ -146,17 +146,17 @@ def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, 
     return pl.DataFrame(rows, schema=AMBIGUOUS_COLUMNS, orient="row")
 
 
-def off_stretches(claimed: Claims, epochs: pl.DataFrame, least_s: float) -> pl.DataFrame:
+def off_stretches(claimed: Claims, epochs: MatchedEpochs, least_s: float) -> pl.DataFrame:
     """Where the positions were on no path of the network, by what was known then; shorter ones are jumps.
 
     Named by the element beside which most of them lay; `offset_m` left of its own sense.
     """
-    off = np.isnan(claimed.live) & epochs["near_track"].to_numpy() & epochs["netelement_id"].is_not_null().to_numpy()
+    off = np.isnan(claimed.live) & epochs.near_track & (epochs.element >= 0)
     parts = []
     for begin, last in spans_of(off):
-        part = epochs[begin : last + 1]
-        if (part["t"][-1] - part["t"][0]).total_seconds() < least_s:
+        if (epochs.t_ns[last] - epochs.t_ns[begin]) / NS_PER_S < least_s:
             continue
+        part = epochs.table[begin : last + 1]
         name = part["netelement_id"].mode().sort()[0]
         beside = part.filter(pl.col("netelement_id") == name)
         turned = pl.cov("measure_m", "path_m").sign().fill_nan(1.0).fill_null(1.0)

@@ -1,15 +1,11 @@
-"""Every epoch on the travelled path: the `epochs` frame of a match."""
+"""Every epoch on the travelled path: the epochs of a match."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-import polars as pl
 
 from pipeline.stages.matching.fixes import Fixes
 from pipeline.stages.track.leg import segments_at
@@ -18,6 +14,9 @@ from pipeline.stages.track.segments import Feet
 from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig, Vehicle
 from schemas.enums import SigmaSource
+from schemas.stages import SIGMA_SOURCES, MatchedEpochs
+
+_RECEIVER, _TABLE = (SIGMA_SOURCES.index(source) for source in (SigmaSource.RECEIVER, SigmaSource.TABLE))
 
 
 @dataclass(frozen=True)
@@ -61,15 +60,32 @@ class Shape:
         return np.sin(heading), np.cos(heading)
 
 
-def epoch_frame(
+@dataclass(frozen=True)
+class Written:
+    """How a solution is written down: its name, and the deviation by its coordinates' steps [m] (`digit_steps`)."""
+
+    solution: str
+    north_m: float
+    east_m: float
+    up_m: float
+
+    def turned_m(self, shape: Shape) -> tuple[Floats, Floats, Floats]:
+        """The same along and across the track, and of the height [m]; shape (epochs,)."""
+        turned = np.radians(np.nan_to_num(shape.heading_deg))
+        along = np.hypot(self.north_m * np.cos(turned), self.east_m * np.sin(turned))
+        cross = np.hypot(self.north_m * np.sin(turned), self.east_m * np.cos(turned))
+        return along, cross, np.full(turned.size, self.up_m)
+
+
+def matched_epochs(
     fixes: Fixes,
-    solution: pl.Series,
+    written: Written,
     path: TravelledPath,
     assignment: Assignment,
     placed: Placed,
     vehicle: Vehicle,
     config: MatchingConfig,
-) -> pl.DataFrame:
+) -> MatchedEpochs:
     """The epochs on the path, positions referred to the balise antenna.
 
     `path_m` is the raw position projected, never smoothed: a jump of the GNSS stays a jump. It is given off
@@ -85,32 +101,38 @@ def epoch_frame(
     allowed_m = on_track_limit_m(sigma_cross_m, shape.survey_sigma_m, config)
     distance_m = np.nan_to_num(feet.distance_m, nan=np.inf)
     on_track = fixes.valid & (distance_m <= np.nan_to_num(allowed_m))
-    source = np.where(fixes.valid, np.where(fixes.from_receiver, 0, 1), -1)
-    columns: dict[str, npt.NDArray[Any] | pl.Series] = {
-        "leg": pl.Series(assignment.leg, dtype=pl.Int32),
-        "netelement_id": _words(path.track.ids, element, pl.String()),
-        "measure_m": measure_m,
-        "path_m": path_m,
-        "cross_track_m": feet.offset_m,
-        "vertical_m": placed.vertical_m,
-        "on_track": on_track,
-        "near_track": fixes.valid & (distance_m <= config.reach_m),
-        "path_probability": np.where(on_track, assignment.path_probability, np.nan),
-        "gate_probability": np.where(on_track, assignment.gate_probability, np.nan),
-        "heading_deg": shape.heading_deg,
-        "slope": shape.slope,
-        "curvature_per_m": shape.curvature_per_m,
-        "interpolation_error_m": shape.interpolation_error_m,
-        "survey_sigma_m": shape.survey_sigma_m,
-        "sigma_along_m": sigma_along_m,
-        "sigma_cross_m": sigma_cross_m,
-        "sigma_up_m": np.sqrt(fixes.cov_uu_m2),
-        "sigma_source": _words(_SOURCES, source, pl.Enum(SigmaSource)),
-        "fix_valid": fixes.valid,
-        "velocity_along_mps": velocity_along_mps(fixes, shape),
-        "hpl_m": fixes.hpl_m,
-    }
-    return _frame(fixes, solution, columns)
+    source = np.where(fixes.from_receiver, _RECEIVER, _TABLE)
+    digits_along_m, digits_cross_m, digits_up_m = written.turned_m(shape)
+    return MatchedEpochs(
+        t_ns=fixes.t_ns,
+        solution=written.solution,
+        leg=np.where(fixes.valid, assignment.leg, -1),
+        element=element,
+        elements=path.track.ids,
+        measure_m=measure_m,
+        path_m=path_m,
+        cross_track_m=feet.offset_m,
+        vertical_m=placed.vertical_m,
+        on_track=on_track,
+        near_track=fixes.valid & (distance_m <= config.reach_m),
+        path_probability=np.where(on_track, assignment.path_probability, np.nan),
+        gate_probability=np.where(on_track, assignment.gate_probability, np.nan),
+        heading_deg=shape.heading_deg,
+        slope=shape.slope,
+        curvature_per_m=shape.curvature_per_m,
+        interpolation_error_m=shape.interpolation_error_m,
+        survey_sigma_m=shape.survey_sigma_m,
+        sigma_along_m=sigma_along_m,
+        sigma_cross_m=sigma_cross_m,
+        sigma_up_m=np.sqrt(fixes.cov_uu_m2),
+        sigma_source=np.where(fixes.valid, source, -1),
+        fix_valid=fixes.valid,
+        velocity_along_mps=velocity_along_mps(fixes, shape),
+        hpl_m=fixes.hpl_m,
+        digits_along_m=digits_along_m,
+        digits_cross_m=digits_cross_m,
+        digits_up_m=digits_up_m,
+    )
 
 
 def shape_at(path: TravelledPath, leg: Ints, path_m: Floats) -> Shape:
@@ -164,19 +186,3 @@ def _slope(rise_m: Floats, length_m: Floats) -> Floats:
     """Rise over run, from rise and 3-D length; NaN without heights."""
     run = np.sqrt(np.maximum(length_m * length_m - rise_m * rise_m, 1e-12))
     return np.asarray(rise_m / run)
-
-
-_SOURCES = (SigmaSource.RECEIVER.value, SigmaSource.TABLE.value)
-
-
-def _words(words: Sequence[str], number: Ints, kind: pl.DataType) -> pl.Series:
-    """Words by their number, null for -1."""
-    rows = np.where(number < 0, len(words), number)
-    return pl.Series([*words, None], dtype=kind).gather(pl.Series(rows))
-
-
-def _frame(fixes: Fixes, solution: pl.Series, columns: dict[str, npt.NDArray[Any] | pl.Series]) -> pl.DataFrame:
-    """Arrays as a frame: NaN becomes null, and an epoch without a position has no leg."""
-    time = pl.Series("t", fixes.t_ns, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
-    frame = pl.DataFrame([time, solution.alias("solution"), *(pl.Series(k, v) for k, v in columns.items())])
-    return frame.with_columns(pl.col(pl.Float64).fill_nan(None), leg=pl.when(pl.col("fix_valid")).then(pl.col("leg")))

@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.stages.odometry.written_steps import step_of
 from pipeline.stages.track.geodesy import MEAN_RADIUS_M, Points, points_of
-from schemas.arrays import Bools, Floats, Ints, floats
+from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import FixSigma
 from schemas.enums import Fix
 
@@ -70,7 +70,7 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
     latitude = np.where(valid, column["latitude_deg"], np.nan)
     longitude = np.where(valid, column["longitude_deg"], np.nan)
     return Fixes(
-        t_ns=frame["t"].to_physical().to_numpy(),
+        t_ns=times_ns(frame),
         valid=valid,
         points=points_of(latitude, longitude),
         latitude_deg=latitude,
@@ -117,15 +117,14 @@ def _kinds(fix: pl.Series) -> Ints:
 _ROUNDED_M = 1e-4
 
 
-def digit_noise(fixes: pl.DataFrame, heading_deg: Floats, least_m: float) -> list[pl.Series]:
-    """Columns `digits_along_m`, `digits_cross_m`, `digits_up_m`: deviation by the steps of the recorded coordinates.
+def digit_steps(fixes: pl.DataFrame, least_m: float) -> tuple[float, float, float]:
+    """Deviation to the north, to the east and of the height by the steps of the recorded coordinates [m].
 
     Five decimals of a degree, NMEA of four decimals of a minute, or single precision move each position by up to half a
     step, the next one by something else: at 10 Hz metres per second. Only the digits are looked at, so no fault of the
     position can pass for it.
 
-    `fixes`: those of one solution, row for row with `heading_deg`, the direction of growing path. `least_m`: finer
-    steps count for nothing.
+    `fixes`: those of one solution. `least_m`: finer steps count for nothing.
     """
     latitude = floats(fixes, "latitude_deg")
     known = latitude[np.isfinite(latitude)]
@@ -139,14 +138,7 @@ def digit_noise(fixes: pl.DataFrame, heading_deg: Floats, least_m: float) -> lis
             (floats(fixes, "height_m"), 1.0),
         )
     )
-    turned = np.radians(np.nan_to_num(heading_deg))
-    along = np.hypot(north * np.cos(turned), east * np.sin(turned))
-    cross = np.hypot(north * np.sin(turned), east * np.cos(turned))
-    return [
-        pl.Series("digits_along_m", along),
-        pl.Series("digits_cross_m", cross),
-        pl.Series("digits_up_m", np.full(turned.size, up)),
-    ]
+    return north, east, up
 
 
 def step_m(values: Floats, metres: float, least_m: float) -> float:

@@ -8,8 +8,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches, off_stretches
-from pipeline.stages.matching.epochs import Assignment, Placed, epoch_frame
-from pipeline.stages.matching.fixes import Fixes, digit_noise, fixes_of
+from pipeline.stages.matching.epochs import Assignment, Placed, Written, matched_epochs
+from pipeline.stages.matching.fixes import Fixes, digit_steps, fixes_of
 from pipeline.stages.matching.path_search import find_path
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import polarity
@@ -18,10 +18,11 @@ from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.track.network import network_in_pieces
 from pipeline.stages.track.path import TravelledPath
 from pipeline.stages.track.survey import SurveyedTrack
-from schemas.arrays import NS_PER_S, Ints, floats, ints, times_ns
+from schemas.arrays import NS_PER_S, Ints, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import Site
+from schemas.stages import MatchedEpochs
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Match:
     against growing path, set here and nowhere else.
     """
 
-    epochs: pl.DataFrame
+    epochs: MatchedEpochs
     path: TravelledPath
     ambiguous: pl.DataFrame
     off: pl.DataFrame
@@ -78,14 +79,14 @@ def match(
     claimed = claims(found, since_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
     assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
     ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, pinned >= 0, network)
-    epochs = epoch_frame(arrays, fixes["solution"], path, assignment, placed, vehicle, config)
+    written = Written(str(fixes["solution"][0]), *digit_steps(fixes, fix_sigma.digits_least_m))
+    epochs = matched_epochs(arrays, written, path, assignment, placed, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
     if sign < 0 and vehicle.gnss_antenna_ahead_m:
         # The odometer falls when reversing (CONTRACT section 1): the leading end faces against growing path, and the
         # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
-        epochs = epoch_frame(arrays, fixes["solution"], path, assignment, placed, vehicle, config)
-    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg"), fix_sigma.digits_least_m))
+        epochs = matched_epochs(arrays, written, path, assignment, placed, vehicle, config)
     off = off_stretches(claimed, epochs, config.paths_level_s)
     return Match(epochs, path, ambiguous, off, claimed.possible, sign)
 
@@ -104,13 +105,12 @@ def _pins_of_positions(pinned: Ints, rows: Ints) -> Ints:
     return pins
 
 
-def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: MatchingConfig) -> int:
+def _odometer_sign(odometry: Odometry | None, epochs: MatchedEpochs, config: MatchingConfig) -> int:
     """+1 or -1: the odometer's sign against growing path (DOMAIN section 2); +1 without one."""
     if odometry is None:
         return 1
-    matched = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
-    path_m = np.where(matched, floats(epochs, "path_m"), np.nan)
-    return polarity(odometry, times_ns(epochs), path_m, config.orientation_distance_m)
+    path_m = np.where(epochs.fix_valid & epochs.on_track, epochs.path_m, np.nan)
+    return polarity(odometry, epochs.t_ns, path_m, config.orientation_distance_m)
 
 
 def pins_of(fixes: Fixes, site: Site, track: SurveyedTrack, balise_reads: pl.DataFrame | None) -> Ints:

@@ -10,7 +10,7 @@ from pipeline.stages.matching.claims import Possible
 from pipeline.stages.matching.match import Match
 from pipeline.stages.track.leg import Leg, segments_at
 from pipeline.stages.track.survey import SurveyedTrack
-from schemas.arrays import Bools, Ints, floats
+from schemas.arrays import Bools, Ints
 from schemas.stages import ONE_TRACK_LEFT
 
 ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
@@ -35,7 +35,7 @@ def travelled_route(match: Match) -> pl.DataFrame:
     meanwhile, the most probable first, each with its highest probability, in words. `cross_bias_m`: by how much the
     positions lie left of growing path there (median), which survey and antenna do and no GNSS fault.
     """
-    leg = match.epochs["leg"].fill_null(-1).to_numpy()
+    leg = match.epochs.leg
     rows = [
         _row(match, number, one, visits, leg == number)
         for number, one in enumerate(match.path.legs)
@@ -60,14 +60,14 @@ def _passages(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
 
 
 def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools) -> tuple[object, ...]:
-    path_m = floats(match.epochs, "path_m")
+    path_m = match.epochs.path_m
     segment, _ = segments_at(leg, np.nan_to_num(path_m))
-    known = match.epochs["path_probability"].is_not_null().to_numpy()
+    known = np.isfinite(match.epochs.path_probability)
     inside = np.flatnonzero(on_leg & np.isin(leg.visit[segment], visits) & known)
-    epochs = match.epochs[inside]
+    epochs = match.epochs.table[inside]
     least = epochs.select(least_belief().min()).item()
     first_visit = leg.visits[visits[0]]
-    times = match.epochs["t"]
+    times = match.epochs.table["t"]
     return (
         match.path.track.ids[first_visit.element],
         "AB" if first_visit.forward else "BA",
@@ -76,7 +76,7 @@ def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools) 
         epochs["gate_probability"].min(),
         epochs["path_probability"].min(),
         _rivals(match, inside, 1.0 - ONE_TRACK_LEFT),
-        float(np.median(floats(match.epochs, "cross_track_m")[inside])) if len(inside) else None,
+        float(np.median(match.epochs.cross_track_m[inside])) if len(inside) else None,
         times[int(inside[0])] if len(inside) else None,
         times[int(inside[-1])] if len(inside) else None,
     )

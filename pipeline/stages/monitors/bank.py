@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,10 +12,12 @@ from pipeline.stages.epochs.verdicts import (
     DISABLED,
     FAIL,
     NOT_EVALUATED,
+    NUMBER,
     PASS,
+    Verdicts,
     first_reason,
     no_verdicts,
-    of_monitor,
+    otherwise,
     states_of,
     verdicts,
 )
@@ -24,11 +27,12 @@ from pipeline.stages.monitors.recursion import AxisState
 from pipeline.stages.monitors.series import FIRST_EPOCH, Axis, axes_of
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
-from schemas.enums import MonitorState, NotEvaluated
+from schemas.enums import NotEvaluated
+from schemas.stages import AlignedEpochs
 from schemas.tables import SCALES
 
-NOISE_UNKNOWN = "noise not yet known"
-NOISE_TOO_LARGE = "noise too large"
+NOISE_UNKNOWN = NotEvaluated.NOISE_UNKNOWN
+NOISE_TOO_LARGE = NotEvaluated.NOISE_TOO_LARGE
 WHITE_PART = float(np.sqrt(OF_WALK / OF_WHITE_NOISE))
 """White noise over what is measured, which is taken for a random walk."""
 
@@ -56,7 +60,7 @@ class AxisBank:
         self.state = np.full(shape, NOT_EVALUATED, dtype=np.int8, order="F")
         self.begins = np.zeros(epochs, dtype=np.bool_)
         # Rows of the odometer scatter by nobody knows how much yet.
-        self.noise_known: Bools = axis.reasons.ne_missing(NOISE_UNKNOWN).to_numpy()
+        self.noise_known: Bools = axis.reasons != NUMBER[NOISE_UNKNOWN]
         given_m: tuple[float, ...] | None = getattr(config.monitors, f"noise_{axis.name}_m")
         self._meter = NoiseMeter(axis.series, axis.moving, given_m, config)
         self._begin_at(0, None, BLOCK)
@@ -125,21 +129,26 @@ class AxisBank:
         known = self.noise_m[np.isfinite(self.noise_m).all(axis=1)]
         return tuple(np.median(known, axis=0).tolist()) if known.size else ()
 
-    def columns(self) -> list[pl.Series]:
+    def verdicts(self) -> dict[str, Verdicts]:
+        """Of the monitors of this axis by name, as far as they are evaluated."""
         unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
         unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
         too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
         of_noise = first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
-        reasons = self.axis.reasons.fill_null(of_noise)
+        reasons = otherwise(self.axis.reasons, of_noise)
         if self._blind is not None:
-            reasons = reasons.fill_null(first_reason((np.isfinite(self.value).any(axis=1), self._blind)))
-        reasons = reasons.fill_null(FIRST_EPOCH)
-        columns: list[pl.Series] = []
-        for index, scale in enumerate(SCALES):
-            why = reasons if self.enabled[index] else self.axis.reasons.fill_null(DISABLED)
-            frame = verdicts(self.value[:, index], self.threshold[:, index], why, self.state[:, index])
-            columns += of_monitor(f"{self.axis.name}_{scale}", frame)
-        return columns
+            reasons = otherwise(reasons, first_reason((np.isfinite(self.value).any(axis=1), self._blind)))
+        reasons = otherwise(reasons, FIRST_EPOCH)
+        disabled = otherwise(self.axis.reasons, DISABLED)
+        return {
+            f"{self.axis.name}_{scale}": verdicts(
+                self.value[:, index],
+                self.threshold[:, index],
+                reasons if self.enabled[index] else disabled,
+                self.state[:, index],
+            )
+            for index, scale in enumerate(SCALES)
+        }
 
 
 class MonitorBank:
@@ -153,8 +162,8 @@ class MonitorBank:
 
     def __init__(
         self,
-        epochs: pl.DataFrame,
-        single: dict[str, pl.DataFrame],
+        epochs: AlignedEpochs,
+        single: Mapping[str, Verdicts],
         config: Configuration,
         blind_along: NotEvaluated | None = None,
     ):
@@ -170,9 +179,9 @@ class MonitorBank:
         self._noise_known = along.noise_known
         self.watched: Ints = along.series.epoch
         self._single = {
-            name: no_verdicts(self._count, DISABLED) if name in disabled else frame for name, frame in single.items()
+            name: no_verdicts(self._count, DISABLED) if name in disabled else found for name, found in single.items()
         }
-        fails = [(frame["state"] == MonitorState.FAIL.value).to_numpy() for frame in self._single.values()]
+        fails = [found.fails for found in self._single.values()]
         self._single_fails = np.logical_or.reduce([np.zeros(self._count, dtype=np.bool_), *fails])
         self._any, self._stops, self._fast, self._along = (np.zeros(self._count, dtype=np.bool_) for _ in range(4))
         self._known_to = -1
@@ -257,7 +266,11 @@ class MonitorBank:
         shown = {f"noise_{axis.axis.name}_m": axis.median_noise_m() for axis in self._axes}
         return {name: noise_m for name, noise_m in shown.items() if noise_m}
 
-    def columns(self) -> list[pl.Series]:
+    def verdicts(self) -> dict[str, Verdicts]:
+        """Of each monitor of the bank by name, in the order of the columns of `epochs`."""
         self._look_to_the_end()
-        columns = [column for axis in self._axes for column in axis.columns()]
-        return columns + [column for name, frame in self._single.items() for column in of_monitor(name, frame)]
+        return {name: found for axis in self._axes for name, found in axis.verdicts().items()} | self._single
+
+    def columns(self) -> list[pl.Series]:
+        """The same as columns of `epochs`."""
+        return [column for name, found in self.verdicts().items() for column in found.columns(name)]

@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import ndtri
 
 from pipeline.stages.monitors.axis import AxisSeries, error_model
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, median
 from schemas.config import Configuration, MonitorConfig
 
 # M = (second difference)^2 / 4 is exact for a random walk; for white noise, whose second differences have six times its
@@ -213,7 +213,7 @@ class _Sampler:
         # Only of the time before the noise is first known: later rows must not change the lags (causal).
         steps_s = series.dt_s[1:]
         first_s = steps_s[: max(int(np.searchsorted(self._t_s[1:], config.noise_first_s, side="right")), 1)]
-        self.period_s = round(float(np.median(first_s)), 6) if first_s.size else 0.0
+        self.period_s = round(median(first_s), 6) if first_s.size else 0.0
         unknown = ~np.isfinite(series.rate_mps + series.sigma_m.sum(axis=1))
         self._countable = moving & ~unknown
         self._piece = np.cumsum(series.fresh | unknown)  # the same number for rows joined by increments

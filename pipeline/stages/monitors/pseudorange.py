@@ -15,13 +15,13 @@ import numpy as np
 import polars as pl
 from scipy.special import chdtri
 
-from pipeline.stages.epochs.clock import met, unambiguous
-from pipeline.stages.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
+from pipeline.stages.epochs.verdicts import NO_POSITION, Verdicts, first_reason, no_verdicts, verdicts
 from pipeline.stages.monitors.axis import BLOCK
 from pipeline.stages.monitors.sight import line_of_sight_rows, range_variances_m2
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
+from schemas.stages import MatchedEpochs
 
 NO_RANGES = NotEvaluated.NO_RANGES
 NO_RANGES_AT_EPOCH = NotEvaluated.NO_RANGES_AT_EPOCH
@@ -30,8 +30,8 @@ AMBIGUOUS = NotEvaluated.AMBIGUOUS
 _RIDGE = 1e-13
 
 
-def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, config: Configuration) -> pl.DataFrame:
-    """`value, threshold, state, reason`, row for row with the matched epochs of one solution.
+def pseudorange_monitor(epochs: MatchedEpochs, satellites: pl.DataFrame | None, config: Configuration) -> Verdicts:
+    """Verdicts, row for row with the matched epochs of one solution.
 
     Value: weighted sum of squares [1]; threshold: its chi-square quantile for the epoch's degrees of freedom.
     """
@@ -82,8 +82,8 @@ class _TrackFrame:
     matched: Bools
 
 
-def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame, apart_s: float) -> _Ranges:
-    at = epochs.select(t_ns=pl.col("t").to_physical()).with_row_index("epoch")
+def _ranges_by_epoch(epochs: MatchedEpochs, satellites: pl.DataFrame, apart_s: float) -> _Ranges:
+    at = pl.DataFrame({"t_ns": epochs.t_ns}).with_row_index("epoch")
     kept = (
         satellites.filter(pl.col("residual_m").is_not_null() & pl.col("used").fill_null(True))
         .unique(["t", "sv"], keep="first", maintain_order=True)
@@ -103,17 +103,17 @@ def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame, apart_s: fl
     )
 
 
-def _track_of(epochs: pl.DataFrame, config: Configuration) -> _TrackFrame:
-    names = ("heading_deg", "slope", "cross_track_m", "vertical_m", "survey_sigma_m", "interpolation_error_m")
-    heading, slope, cross_m, vertical_m, survey_m, chord_m = (floats(epochs, name) for name in names)
-    angle = np.radians(heading)
-    rise = np.arctan(np.nan_to_num(slope))
+def _track_of(epochs: MatchedEpochs, config: Configuration) -> _TrackFrame:
+    cross_m, vertical_m, survey_m = epochs.cross_track_m, epochs.vertical_m, epochs.survey_sigma_m
+    angle = np.radians(epochs.heading_deg)
+    rise = np.arctan(np.nan_to_num(epochs.slope))
     level = np.cos(rise)
     zero = np.zeros_like(angle)
     survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
-    survey_m = np.hypot(np.maximum(survey_m, config.fix_sigma.digits_least_m), np.nan_to_num(chord_m))
-    matched = flags(epochs, "on_track") & np.isfinite(cross_m) & np.isfinite(heading)
-    sure = met(epochs, unambiguous())
+    survey_m = np.hypot(
+        np.maximum(survey_m, config.fix_sigma.digits_least_m), np.nan_to_num(epochs.interpolation_error_m)
+    )
+    matched = epochs.on_track & np.isfinite(cross_m) & np.isfinite(epochs.heading_deg)
     known = np.isfinite(vertical_m)
     left = np.stack([-np.cos(angle), np.sin(angle), zero], axis=-1)
     offset = cross_m[:, None] * left + np.where(known, vertical_m, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
@@ -123,7 +123,7 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _TrackFrame:
         offset_m=offset,
         sigma_m=survey_m,
         height_known=known,
-        usable=matched & sure,
+        usable=matched & epochs.unambiguous,
         matched=matched,
     )
 
@@ -148,7 +148,7 @@ class Equations:
     along: Floats
 
 
-def equations_of(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configuration) -> Iterator[Equations]:
+def equations_of(epochs: MatchedEpochs, satellites: pl.DataFrame, config: Configuration) -> Iterator[Equations]:
     """Some thousand epochs at once."""
     ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
     return _chunks(ranges, _track_of(epochs, config))

@@ -1,6 +1,6 @@
 """Monitors that look at one epoch, or the second before it, without memory: Doppler, ranges, channel comparison.
 
-Each yields `value, threshold, state, reason`, row for row with the epochs.
+Each yields `Verdicts`, row for row with the epochs.
 """
 
 from __future__ import annotations
@@ -13,66 +13,67 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
-from pipeline.stages.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
+from pipeline.stages.epochs.verdicts import NO_POSITION, Verdicts, first_reason, no_verdicts, verdicts
 from pipeline.stages.monitors.pseudorange import pseudorange_monitor
 from pipeline.stages.monitors.series import FIRST_EPOCH
-from schemas.arrays import Floats, floats, times_ns
+from schemas.arrays import Floats, floats, times_ns, truths
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import NotEvaluated
+from schemas.stages import NO_REASON, AlignedEpochs
 
 NO_VELOCITY = NotEvaluated.NO_VELOCITY
 NO_OTHER_SOLUTION = NotEvaluated.NO_OTHER_SOLUTION
 
 
-def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def doppler_monitor(epochs: AlignedEpochs, config: Configuration) -> Verdicts:
     """GNSS velocity along track against odometer speed, both over the second before [m/s].
 
     Separates an odometer fault (slip, slide, radar on wet ground) from one of GNSS positions.
     """
-    t_ns = times_ns(epochs)
-    t_s = (t_ns - t_ns[0]) * 1e-9
-    velocity_mps = floats(epochs, "velocity_along_mps")
-    no_odometer = epochs["odometer_reason"]
+    t_s = (epochs.t_ns - epochs.t_ns[0]) * 1e-9
+    velocity_mps = epochs.velocity_along_mps
+    without = epochs.odometer_reason
     # The sigma of rows is cut off there: with coarser ones a threshold would not hold.
-    coarse = floats(epochs, "odometer_rows_m") >= config.scatter_limit_m
-    usable = np.isfinite(velocity_mps) & no_odometer.is_null().to_numpy() & epochs["fix_valid"].to_numpy() & ~coarse
-    first, span_s = _window(t_s, usable, floats(epochs, "odometer_doubt_m"), config)
+    coarse = epochs.odometer_rows_m >= config.scatter_limit_m
+    usable = np.isfinite(velocity_mps) & (without == NO_REASON) & epochs.fix_valid & ~coarse
+    first, span_s = _window(t_s, usable, epochs.odometer_doubt_m, config)
     doppler_m = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity_mps, np.nan)))])[:-1]
-    odometer_m = floats(epochs, "odometer_m")
+    odometer_m = epochs.odometer_m
     value_mps = (doppler_m - doppler_m[first]) / span_s - (odometer_m - odometer_m[first]) / span_s
     sigma_mps = _doppler_sigma(epochs, span_s, velocity_mps - velocity_mps[first], config)
     reasons = first_reason(
         (~np.isfinite(velocity_mps), NO_VELOCITY),
-        (no_odometer.is_not_null(), no_odometer),
-        (~epochs["fix_valid"], NO_POSITION),
+        (without != NO_REASON, without),
+        (~epochs.fix_valid, NO_POSITION),
         (coarse, NotEvaluated.NOISE_TOO_LARGE),
         (~np.isfinite(span_s), FIRST_EPOCH),
     )
     return verdicts(value_mps, config.monitors.threshold_factor * sigma_mps, reasons)
 
 
-def _doppler_sigma(epochs: pl.DataFrame, span_s: Floats, change_mps: Floats, config: Configuration) -> Floats:
+def _doppler_sigma(epochs: AlignedEpochs, span_s: Floats, change_mps: Floats, config: Configuration) -> Floats:
     """Sigma of Doppler minus odometer speed over `span_s`, in which the velocity changed by `change_mps` [m/s]."""
-    speed_mps = np.abs(floats(epochs, "speed_mps"))
+    speed_mps = np.abs(epochs.speed_mps)
     # At a change of speed dv a late stamp of T compares other moments: dv T / span.
-    late_s = floats(epochs, "latency_sigma_s") + np.abs(floats(epochs, "latency_s"))
+    late_s = epochs.latency_sigma_s + np.abs(epochs.latency_s)
     variance = (
         config.monitors.doppler_sigma_mps**2
-        + floats(epochs, "odometer_white_m2_per_s") / span_s
-        + 2.0 * (floats(epochs, "odometer_rows_m") / span_s) ** 2  # one row at each end
-        + (floats(epochs, "scale_sigma") * speed_mps) ** 2
+        + epochs.odometer_white_m2_per_s / span_s
+        + 2.0 * (epochs.odometer_rows_m / span_s) ** 2  # one row at each end
+        + (epochs.scale_sigma * speed_mps) ** 2
         + (late_s * np.abs(change_mps) / span_s) ** 2
     )
     return np.sqrt(variance)
 
 
 def channel_monitor(
-    epochs: pl.DataFrame, channel: pl.DataFrame | None, config: Configuration, absent: str = NO_OTHER_SOLUTION
-) -> pl.DataFrame:
+    epochs: pl.DataFrame, channel: pl.DataFrame | None, config: Configuration, absent: NotEvaluated = NO_OTHER_SOLUTION
+) -> Verdicts:
     """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
 
-    `channel`: the other solution, on the same path; its last position since the epoch before counts (`paired`). Errors
-    common to both make the threshold larger than needed. `absent`: the reason where there is no other.
+    `epochs`: `t, path_m, sigma_along_m, fix_valid, on_track`; `channel`: the same of the other solution, on the same
+    path; its last position since the epoch before counts (`paired`). Errors common to both make the
+    threshold larger than needed. `absent`: the reason where there is no other.
     """
     if channel is None:
         return no_verdicts(epochs.height, absent)
@@ -82,10 +83,9 @@ def channel_monitor(
     met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
     value = floats(pairs, "path_m") - floats(met, "path_m")
     both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
-    placed = epochs["fix_valid"] & epochs["on_track"] & epochs["sigma_along_m"].is_not_null()
-    reasons = first_reason(
-        (~placed, NO_POSITION), (met["path_m"].is_null() | met["sigma_along_m"].is_null(), NotEvaluated.NO_OTHER_EPOCH)
-    )
+    placed = truths(epochs["fix_valid"] & epochs["on_track"] & epochs["sigma_along_m"].is_not_null())
+    unknown = truths(met["path_m"].is_null() | met["sigma_along_m"].is_null())
+    reasons = first_reason((~placed, NO_POSITION), (unknown, NotEvaluated.NO_OTHER_EPOCH))
     return verdicts(value, config.monitors.threshold_factor * both_m, reasons)
 
 
@@ -177,16 +177,16 @@ def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
 class Seen:
     """What monitors without memory may look at; `other` on this solution's path, `absent`: why there is none."""
 
-    epochs: pl.DataFrame
+    epochs: AlignedEpochs
     satellites: pl.DataFrame | None
     other: pl.DataFrame | None
     absent: NotEvaluated
     config: Configuration
 
 
-WITHOUT_MEMORY: Mapping[str, Callable[[Seen], pl.DataFrame]] = {
+WITHOUT_MEMORY: Mapping[str, Callable[[Seen], Verdicts]] = {
     "along_doppler": lambda seen: doppler_monitor(seen.epochs, seen.config),
-    "channel": lambda seen: channel_monitor(seen.epochs, seen.other, seen.config, seen.absent),
+    "channel": lambda seen: channel_monitor(seen.epochs.table, seen.other, seen.config, seen.absent),
     "pseudorange": lambda seen: pseudorange_monitor(seen.epochs, seen.satellites, seen.config),
 }
 """Monitors by the name that `schemas.tables.ALL_MONITORS` gives them."""

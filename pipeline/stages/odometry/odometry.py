@@ -25,7 +25,7 @@ from pipeline.stages.odometry.quantisation import (
     scatter_pieces,
 )
 from pipeline.stages.odometry.rows import Ways, filled_in, ways_between
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, median, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
 
@@ -385,7 +385,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         noise=noise,
         known_noise=known_noise,
         deadband_mps=config.matching.deadband_mps,
-        period_s=float(np.median(dt_s)),
+        period_s=median(dt_s),
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
         leaps_ns=tuple(t_ns[list(ways.resets)].tolist()),
@@ -452,7 +452,7 @@ def _noise(
     white_m2_per_s = np.maximum(least_m2_per_s, np.nan_to_num(declared_mps) ** 2 * period_s)
     pieces = scatter_pieces(t_s, distance_m, whole, period_s, white_m2_per_s, config.matching.deadband_mps, align)
     noise = Noise(
-        white_m2_per_s=float(np.median(white_m2_per_s)),
+        white_m2_per_s=median(white_m2_per_s),
         quantisation=of_the_run(pieces, align).of_counter(float(counts.step_m[-1])),
     )
     # Rows far apart, or of speeds alone, have no such noise.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, median
 from schemas.config import AlignConfig
 
 # Numerics of the fit: so many rows of a piece, and the degree of its curve.
@@ -118,7 +118,7 @@ def known_at_rows(
         if number >= _FEWEST_PIECES and t_s[end] - renewed_s >= renewal_s:
             last = pieces.take(slice(max(number - _PIECES, 0), number))
             found = _fit(last, config)
-            known.seen_mps[end:] = np.inf if _speeds(last, config).differ else float(np.median(last.speed_mps))
+            known.seen_mps[end:] = np.inf if _speeds(last, config).differ else median(last.speed_mps)
             known.still_m2[end:] = found.still_m2
             known.moving_s2[end:] = found.moving_s2
             known.shown[end:] = True
@@ -175,8 +175,8 @@ class _Speeds(NamedTuple):
 
 
 def _speeds(pieces: ScatterPieces, config: AlignConfig) -> _Speeds:
-    fast: Bools = pieces.speed_mps > np.median(pieces.speed_mps)
-    low_mps, high_mps = (float(np.median(pieces.speed_mps[part])) if part.any() else 0.0 for part in (~fast, fast))
+    fast: Bools = pieces.speed_mps > median(pieces.speed_mps)
+    low_mps, high_mps = (median(pieces.speed_mps[part]) if part.any() else 0.0 for part in (~fast, fast))
     differ = bool(fast.sum() >= _FEWEST_PIECES) and high_mps**2 >= config.quantisation_factor * low_mps**2
     return _Speeds(fast, low_mps, high_mps, differ)
 
@@ -234,6 +234,6 @@ def _scatter(since_s: Floats, way_m: Floats) -> tuple[Floats, Floats]:
 
 def _beyond(scatter_m2: Floats, explained_m2: Floats, config: AlignConfig) -> float:
     """The median scatter less what explains it [m^2]; none where that is most of it."""
-    scatter = float(np.median(scatter_m2))
-    explained = float(np.median(explained_m2))
+    scatter = median(scatter_m2)
+    explained = median(explained_m2)
     return scatter - explained if scatter > config.quantisation_factor * explained else 0.0

@@ -22,7 +22,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, median
 
 # Numerics: a lag shows where the speed changes, so ways over this time are compared, one every so often [s]; no longer
 # ones where a recorder pauses.
@@ -119,7 +119,7 @@ class CountedRows:
 
     @cached_property
     def _half_s(self) -> float:
-        return max(_SPEED_S, float(np.median(np.diff(self.t_s))))
+        return max(_SPEED_S, median(np.diff(self.t_s)))
 
     def speeds(self, t_s: Floats) -> tuple[Floats, Floats]:
         """Speed about each instant, and by rows beside these."""
@@ -135,7 +135,7 @@ class CountedRows:
         A straight line over a second is off by 15 cm at 1.2 m/s2: ahead of a train that starts, behind one that brakes.
         """
         step_s = np.diff(self.t_s)
-        parts = int(np.ceil(float(np.median(step_s)) / _APART_S - 1e-6))
+        parts = int(np.ceil(median(step_s) / _APART_S - 1e-6))
         if parts <= 1 or self.t_s.size < 3:
             return self
         speed = np.gradient(self.distance_m, self.t_s)
@@ -267,7 +267,7 @@ class _Ways:
     def overlap(self) -> int:
         """A way overlaps so many, itself and those after it."""
         after = np.searchsorted(self.begin_s, self.end_s - 1e-6)
-        return max(1, round(float(np.median(after - np.arange(after.size)))))
+        return max(1, round(median(after - np.arange(after.size))))
 
     @property
     def step(self) -> int:
@@ -504,7 +504,7 @@ def _near(rows: Bools, reach: int) -> Bools:
 
 def _robust(size: Floats) -> float:
     """Sigma of normal values of this size, whatever a part of them does."""
-    return _MAD * float(np.median(size)) if size.size else 0.0
+    return _MAD * median(size) if size.size else 0.0
 
 
 def _huber(size: Floats, limit: float) -> Floats:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.track.geodesy import Points
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median
 
 # Steps on each side with which one is compared before it counts.
 _NEIGHBOURS = 3
@@ -59,7 +59,7 @@ class PathSteps:
         since_s = np.diff(self.end_s)
         period_s = np.ones(len(self.end_s))
         for step in range(1, min(_PERIOD_STEPS, len(period_s))):
-            period_s[step] = np.median(since_s[:step])
+            period_s[step] = median(since_s[:step])
         if since_s.size >= _PERIOD_STEPS:
             period_s[_PERIOD_STEPS:] = np.median(sliding_window_view(since_s, _PERIOD_STEPS), axis=1)
         return np.maximum(period_s, 1.0)

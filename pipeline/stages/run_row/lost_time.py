@@ -8,14 +8,17 @@ from dataclasses import dataclass, field
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import Clock, confident, may_move, met, unambiguous, usable
-from schemas.arrays import NS_PER_S, Bools, Ints, floats, times_ns
+from pipeline.stages.epochs.clock import Clock
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns, truths
 from schemas.config import Configuration
-from schemas.enums import LdsMode, LostTo, MonitorState, Verdict
+from schemas.conform import dtypes
+from schemas.enums import LostTo, MonitorState, Verdict
+from schemas.stages import EpochFigures
 from schemas.tables import MONITORS, Epochs
 from schemas.words import lost_words
 
-_LOST_TO = Epochs.columns()["lost_to"].dtype
+_LOST_TO = dtypes(Epochs)["lost_to"]
+_NUMBER = {cause: number for number, cause in enumerate(LostTo)}
 
 
 @dataclass(frozen=True)
@@ -41,61 +44,80 @@ class LostTime:
         return {**causes, "lost_to_monitor": self.monitor}
 
 
-def lost_columns(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
-    """`step_s`, `gap`, `moving_s`, `lost_s` and `lost_to` of `epochs`: from each to the next.
+@dataclass(frozen=True)
+class LostColumns:
+    """What each epoch's time was lost to, from it to the next; arrays of shape (epochs,)."""
 
-    Lost to the first cause that applies. A gap is time without a position, as for `availability`.
-    """
-    clock = Clock.of(epochs, config)
+    step_s: Floats
+    """Time to the next epoch [s]."""
+    gap: Bools
+    """A gap in the positions follows."""
+    moving_s: Floats
+    """Of the step, time that the train moves or may move [s]."""
+    lost_s: Floats
+    """Of this, time without a valid TVB [s]."""
+    lost_to: Ints
+    """The first cause that applies, by number in `LostTo`; -1 for none."""
+
+    def columns(self) -> list[pl.Series]:
+        """As they stand in `epochs`."""
+        words = pl.Series("lost_to", [*(cause.value for cause in LostTo), None], dtype=_LOST_TO)
+        return [
+            pl.Series("step_s", self.step_s),
+            pl.Series("gap", self.gap),
+            pl.Series("moving_s", self.moving_s),
+            pl.Series("lost_s", self.lost_s),
+            words[np.where(self.lost_to < 0, len(LostTo), self.lost_to).astype(np.uint32)],
+        ]
+
+
+def lost_columns(epochs: EpochFigures, config: Configuration) -> LostColumns:
+    """Lost to the first cause that applies. A gap is time without a position, as for `availability`."""
+    clock = Clock.at(epochs.t_ns, epochs.t_ns[np.isfinite(epochs.path_m)], config)
     steps_s = np.diff(clock.t_ns, append=clock.t_ns[-1:]) / NS_PER_S
-    moving = met(epochs, may_move())
     gap = clock.held_s < steps_s
-    lost = moving & (gap | ~met(epochs, pl.col("tvb") & pl.col("moving").is_not_null()))
-    causes = _causes(epochs, gap, clock.t_ns, config)
-    first = np.select([lost & applies for applies in causes.values()], list(range(len(causes))), default=len(causes))
-    words = pl.Series([*(cause.value for cause in causes), None], dtype=_LOST_TO)
-    time_s = {"moving_s": steps_s * moving, "lost_s": steps_s * lost}
-    return pl.DataFrame({"step_s": steps_s, "gap": gap, **time_s, "lost_to": words.gather(first)})
+    lost = epochs.may_move & (gap | ~epochs.valid)
+    causes = _causes(epochs, gap, config)
+    numbers = [_NUMBER[cause] for cause in causes]
+    first = np.select([lost & applies for applies in causes.values()], numbers, default=-1)
+    return LostColumns(steps_s, gap, steps_s * epochs.may_move, steps_s * lost, first)
 
 
-def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, config: Configuration) -> LostTime:
-    """Shares of the moving time, from `epochs` with their `lost_columns`."""
-    lost_s = floats(epochs, "lost_s")
-    whole_s = float(floats(epochs, "moving_s").sum())
-    if whole_s <= 0.0 or not met(epochs, pl.col("moving"))[:-1].any():
+def lost_time(epochs: EpochFigures, lost: LostColumns, alarms: pl.DataFrame, config: Configuration) -> LostTime:
+    """Shares of the moving time."""
+    whole_s = float(lost.moving_s.sum())
+    if whole_s <= 0.0 or not epochs.moves[:-1].any():
         return LostTime()
-    to = epochs["lost_to"].cast(pl.String).to_numpy()
-    parts = {cause: float(lost_s[to == cause.value].sum()) / whole_s for cause in LostTo}
+    parts = {cause: float(lost.lost_s[lost.lost_to == _NUMBER[cause]].sum()) / whole_s for cause in LostTo}
     ranked = sorted((cause for cause, part in parts.items() if part > 0.0), key=lambda cause: -parts[cause])
-    alarmed = to == LostTo.ALARM.value
-    unexplained = alarmed & ~_explained(alarms, times_ns(epochs), config.lds.recovery_s)
+    alarmed = lost.lost_to == _NUMBER[LostTo.ALARM]
+    unexplained = alarmed & ~_explained(alarms, epochs.t_ns, config.lds.recovery_s)
     return LostTime(
-        share=float(lost_s.sum()) / whole_s,
+        share=float(lost.lost_s.sum()) / whole_s,
         causes={cause: parts[cause] for cause in ranked},
-        monitor=_loudest(epochs.filter(alarmed)),
-        unfounded=bool(2.0 * lost_s[unexplained].sum() > lost_s[alarmed].sum()),
+        monitor=_loudest(epochs.table, alarmed),
+        unfounded=bool(2.0 * lost.lost_s[unexplained].sum() > lost.lost_s[alarmed].sum()),
     )
 
 
-def _causes(epochs: pl.DataFrame, gap: Bools, t_ns: Ints, config: Configuration) -> dict[LostTo, Bools]:
+def _causes(epochs: EpochFigures, gap: Bools, config: Configuration) -> dict[LostTo, Bools]:
     """Conditions in the order in which they apply."""
-    negated = met(epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.FAIL_SAFE.value)
-    alarm_ns = np.where(met(epochs, pl.col("alarm")), t_ns, np.iinfo(np.int64).min)
+    negated = epochs.fail_safe
+    alarm_ns = np.where(epochs.alarm, epochs.t_ns, np.iinfo(np.int64).min)
     # A monitor fails, or has failed less than `recovery_s` ago (DOMAIN section 4).
-    alarmed = np.maximum.accumulate(alarm_ns) >= t_ns - round(config.lds.recovery_s * NS_PER_S)
+    alarmed = np.maximum.accumulate(alarm_ns) >= epochs.t_ns - round(config.lds.recovery_s * NS_PER_S)
     noise, slip, relink = (
-        met(epochs, pl.col("withheld_for").cast(pl.String) == cause.value)
-        for cause in (LostTo.NOISE, LostTo.SLIP, LostTo.RELINK)
+        epochs.withheld_for == _NUMBER[cause] for cause in (LostTo.NOISE, LostTo.SLIP, LostTo.RELINK)
     )
     return {
-        LostTo.NO_POSITION: gap | ~met(epochs, usable()),
-        LostTo.CONFIDENCE: ~met(epochs, confident(config)),
-        LostTo.TRACK_AMBIGUOUS: ~met(epochs, unambiguous()),
+        LostTo.NO_POSITION: gap | ~epochs.usable,
+        LostTo.CONFIDENCE: ~epochs.confident(config.lds.ci_limit_m),
+        LostTo.TRACK_AMBIGUOUS: ~epochs.unambiguous,
         LostTo.NOISE: noise,
         LostTo.SLIP: slip,
         LostTo.RELINK: relink | (negated & ~alarmed),
         LostTo.ALARM: negated,
-        LostTo.NO_ODOMETER: met(epochs, pl.col("odometer_reason").is_not_null()),
+        LostTo.NO_ODOMETER: epochs.without_odometer,
     }
 
 
@@ -109,9 +131,12 @@ def _explained(alarms: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
     return inside
 
 
-def _loudest(epochs: pl.DataFrame) -> str | None:
+def _loudest(epochs: pl.DataFrame, alarmed: Bools) -> str | None:
     """The monitor that failed in most of these epochs."""
-    failing = {name: pl.col(f"{name}_state").cast(pl.String) == MonitorState.FAIL.value for name in MONITORS}
-    counts = epochs.select(**{name: condition.sum() for name, condition in failing.items()}).row(0, named=True)
-    loudest = max(counts, key=lambda name: int(counts[name]))
+    if not alarmed.any():
+        return None
+    counts = {
+        name: int((truths(epochs[f"{name}_state"] == MonitorState.FAIL.value) & alarmed).sum()) for name in MONITORS
+    }
+    loudest = max(counts, key=lambda name: counts[name])
     return loudest if counts[loudest] else None

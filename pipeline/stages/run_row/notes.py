@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
+import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import Clock, met
+from pipeline.stages.epochs.clock import Clock
+from pipeline.stages.epochs.verdicts import NUMBER, Verdicts
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.matching.fixes import contradictory_covariances
 from pipeline.stages.odometry import Odometry
@@ -18,6 +20,7 @@ from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import Configuration
 from schemas.enums import NO_RELINK, BaliseKind, Evidence, Note, NotEvaluated, PassageStatus, Reason, VehicleFigures
 from schemas.run import IngestNotes, RunLog
+from schemas.stages import EpochFigures
 from schemas.words import Remark, remarks, say
 
 # So many names stand in one note.
@@ -57,7 +60,7 @@ def ride_notes(ride: Ride, evidence: TrainEvidence) -> list[Remark]:
             Note.COVARIANCE: contradictory_covariances(ride.solution.fixes),
             Note.AMBIGUOUS: ", ".join(say("ambiguity", "stretch", **row) for row in doubtful),
             Note.OFF_NETWORK: _few([_off(row) for row in ride.match.off.iter_rows(named=True)]),
-            Note.UNLINKED: _unlinked(ride.lds.epochs["link_distance_reason"]),
+            Note.UNLINKED: _unlinked(ride.lds.linking["link_distance"]),
             Note.UNKNOWN_TELEGRAMS: ", ".join(sorted(set(ride.lds.unknown_reads["balise_id"]))),
             Note.READS_DISPUTED: evidence.disputed,
             Note.READS_UNREACHABLE: evidence.unreachable,
@@ -96,10 +99,11 @@ def _of_odometer(odometry: Odometry | None, straight_s: float) -> dict[Note, obj
     }
 
 
-def _unlinked(reasons: pl.Series) -> tuple[int, str] | None:
+def _unlinked(distance: Verdicts) -> tuple[int, str] | None:
     """How many positions after outages could not be re-linked, and why not."""
-    unlinked = reasons.filter(reasons.is_in([reason.value for reason in NO_RELINK]))
-    return (unlinked.len(), ", ".join(sorted(set(unlinked)))) if unlinked.len() else None
+    counts = {reason.value: int((distance.reason == NUMBER[reason]).sum()) for reason in NO_RELINK}
+    why = sorted(reason for reason, count in counts.items() if count)
+    return (sum(counts.values()), ", ".join(why)) if why else None
 
 
 def judged_notes(run: Mapping[str, Any]) -> list[Remark]:
@@ -117,25 +121,27 @@ def judged_notes(run: Mapping[str, Any]) -> list[Remark]:
     )
 
 
-def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> list[Remark]:
+def undiagnosed_notes(epochs: EpochFigures, passages: pl.DataFrame) -> list[Remark]:
     """Virtual balises that were accepted while no odometer could contradict the position."""
     accepted = (pl.col("kind") == BaliseKind.VIRTUAL.value) & (pl.col("status") == PassageStatus.ACCEPTED.value)
-    offers = passages.filter(accepted).select(t=pl.col("t_offered").drop_nulls().sort())
-    reasons = offers.join_asof(epochs.select("t", "along_raw_reason"), on="t", strategy="forward")["along_raw_reason"]
+    offers = passages.filter(accepted).drop_nulls("t_offered")
+    # The first epoch at or after each offer.
+    epoch = np.searchsorted(epochs.t_ns, times_ns(offers, "t_offered"))
+    reasons = epochs.table["along_raw_reason"].gather(epoch[epoch < epochs.height])
     counts = {reason: (reasons == reason.value).sum() for reason in _WITHOUT_ODOMETER}
     return [Remark(Note.UNDIAGNOSED, (count, reason.value)) for reason, count in counts.items() if count]
 
 
-def in_use_notes(epochs: pl.DataFrame) -> list[Remark]:
+def in_use_notes(epochs: EpochFigures) -> list[Remark]:
     """Epochs in use at which no figure bounds a fault still in use; nothing where none was computed."""
-    used = epochs.filter(pl.col("in_use") & pl.col("undetected_ahead_m").is_not_null())
-    unbounded = used["undetected_ahead_in_use_m"].null_count()
-    return remarks({Note.IN_USE_UNBOUNDED: (unbounded, used.height) if unbounded else None})
+    used = epochs.in_use & epochs.table["undetected_ahead_m"].is_not_null().to_numpy()
+    unbounded = int((used & epochs.table["undetected_ahead_in_use_m"].is_null().to_numpy()).sum())
+    return remarks({Note.IN_USE_UNBOUNDED: (unbounded, int(used.sum())) if unbounded else None})
 
 
-def time_notes(epochs: pl.DataFrame, clock: Clock, lost: LostTime, config: Configuration) -> list[Remark]:
+def time_notes(epochs: EpochFigures, clock: Clock, lost: LostTime, config: Configuration) -> list[Remark]:
     """For how long nobody knows whether the train moved, and what the moving time without a valid TVB was lost to."""
-    unknown_s = float(clock.held_s[met(epochs, pl.col("moving").is_null())].sum())
+    unknown_s = float(clock.held_s[epochs.may_move & ~epochs.moves].sum())
     low = lost.share is not None and 1.0 - lost.share < config.advice.low_availability
     return remarks(
         {

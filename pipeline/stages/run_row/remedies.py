@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import polars as pl
 
-from pipeline.stages.epochs.clock import may_move, met, reaction_of
+from pipeline.stages.epochs.clock import reaction_of
 from pipeline.stages.run_row.lost_time import LostTime
-from schemas.arrays import floats
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, LostTo, Origin, Reason, Remedy, RunVerdict, VehicleFigures
+from schemas.stages import EpochFigures
 from schemas.tables import ALL_MONITORS
 
 FAST_OF_BANK = tuple(monitor.name for monitor in ALL_MONITORS if monitor.scale is not None and monitor.is_fast)
@@ -42,13 +41,13 @@ class InUse:
         return min(1.0, part_s / self.moving_s) if self.moving_s else 0.0
 
 
-def time_in_use(epochs: pl.DataFrame) -> InUse:
-    """From judged epochs with their `lost_columns`."""
-    known = met(epochs, pl.col("judgement") != Judgement.UNKNOWN.value)
+def time_in_use(epochs: EpochFigures, moving_s: float) -> InUse:
+    """Of the judged epochs; `moving_s`: moving time."""
+    known = (epochs.judgement >= 0) & ~epochs.is_judged(Judgement.UNKNOWN)
     inside = np.logical_or.accumulate(known) & np.logical_or.accumulate(known[::-1])[::-1]
-    used_s = floats(epochs, "used_s") * met(epochs, pl.col("in_use") & may_move())
+    used_s = epochs.used_s * (epochs.in_use & epochs.may_move)
     parts = (np.ones_like(known), ~known & ~inside, ~known & inside)
-    return InUse(float(floats(epochs, "moving_s").sum()), *(float(used_s[part].sum()) for part in parts))
+    return InUse(moving_s, *(float(used_s[part].sum()) for part in parts))
 
 
 def remedies(

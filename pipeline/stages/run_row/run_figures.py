@@ -9,34 +9,35 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs import clock as along_time
-from pipeline.stages.epochs.clock import Clock, may_move, met, share_of_time
+from pipeline.stages.epochs.clock import Clock, share_of_time
 from pipeline.stages.run_row.bounds import CONTINUITY_S, UNKNOWN, columns_of, continuity, poisson_rate
 from pipeline.stages.run_row.independent import independent_episodes
 from pipeline.stages.run_row.verdict import LEVEL_LISTS, level_rows
 from schemas import enums
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, truths
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, PassageStatus
+from schemas.stages import EpochFigures
 from schemas.tables import SCALES
 
 Row = dict[str, Any]
 
 
-def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
+def positions(epochs: EpochFigures, clock: Clock, config: Configuration) -> Row:
     """Availability, outages and continuity (CONTRACT section 3; LOC eq. 8).
 
     Time of which nobody knows whether the train moved counts as moving, and a TVB in it does not (DOMAIN section 5.5).
     """
-    lost_s = along_time.outages_s(clock.t_ns, met(epochs, along_time.usable()), clock.limit_s)
-    valid = met(epochs, pl.col("tvb") & pl.col("moving").is_not_null())
-    share = along_time.availability(clock.t_ns, valid, met(epochs, may_move()), clock.limit_s)
-    trust = along_time.uptime(clock.t_ns, met(epochs, along_time.trusted(config)), clock.limit_s)
+    lost_s = along_time.outages_s(clock.t_ns, epochs.usable, clock.limit_s)
+    share = along_time.availability(clock.t_ns, epochs.valid, epochs.may_move, clock.limit_s)
+    trusted = epochs.usable & epochs.confident(config.lds.ci_limit_m) & epochs.unambiguous
+    trust = along_time.uptime(clock.t_ns, trusted, clock.limit_s)
     mtbf_h = trust.up_s / trust.losses / 3600.0 if trust.losses and trust.up_s > 0 else None
     return {
-        "availability": share if met(epochs, pl.col("moving"))[:-1].any() else None,
+        "availability": share if epochs.moves[:-1].any() else None,
         "outages": lost_s.size,
         "longest_outage_s": float(lost_s.max(initial=0.0)) if epochs.height else None,
-        "cross_bias_m": epochs["cross_track_m"].filter(epochs["on_track"]).median(),
+        "cross_bias_m": epochs.table["cross_track_m"].filter(epochs.table["on_track"]).median(),
         "mtbf_h": mtbf_h,
         "continuity_15s": continuity(CONTINUITY_S, mtbf_h) if mtbf_h else None,
         "trusted_s": trust.up_s if epochs.height else None,
@@ -49,22 +50,22 @@ def judged() -> pl.Expr:
     return pl.col("judgement").is_in([Judgement.RIGHT, Judgement.WRONG])
 
 
-def time_in_use(epochs: pl.DataFrame, recovery_s: float) -> Row:
+def time_in_use(epochs: EpochFigures, recovery_s: float) -> Row:
     """Time in use, and what of it nobody can judge or nothing diagnoses (DOMAIN section 5.4); all null without epochs.
 
     Shares are of the moving time in use, null without any.
     """
-    used_s = floats(epochs, "used_s")
-    moves = met(epochs, may_move())
-    seen = met(epochs, judged())
-    negated_s = floats(epochs, "counted_s")[met(epochs, pl.col("negated"))]
+    used_s = epochs.used_s
+    moves = epochs.may_move
+    seen = epochs.judged
+    negated_s = epochs.counted_s[epochs.negated]
     figures = {
         "in_use_s": float(used_s.sum()),
         "in_use_judged_s": float(used_s[seen].sum()),
         "negated_s": float(negated_s.sum()),
         "share_unknown": share_of_time(used_s[moves], ~seen[moves]),
-        "share_undiagnosed": share_of_time(used_s[moves], met(epochs, pl.col("undiagnosed"))[moves]),
-        "unknown_in_use_s": _longest_s(times_ns(epochs), used_s, ~seen & moves & (used_s > 0.0), recovery_s),
+        "share_undiagnosed": share_of_time(used_s[moves], epochs.undiagnosed[moves]),
+        "unknown_in_use_s": _longest_s(epochs.t_ns, used_s, ~seen & moves & (used_s > 0.0), recovery_s),
     }
     return figures if epochs.height else dict.fromkeys(figures)
 
@@ -76,13 +77,14 @@ def _longest_s(t_ns: Ints, used_s: Floats, where: Bools, apart_s: float) -> floa
     return max(float(used_s[part].sum()) for part in np.split(rows, breaks))
 
 
-def proof_margin_m(epochs: pl.DataFrame, passages: pl.DataFrame, limit_m: float) -> float | None:
+def proof_margin_m(epochs: EpochFigures, passages: pl.DataFrame, limit_m: float) -> float | None:
     """Least proof margin of the epochs in use and the acceptances that are right [m] (DOMAIN section 5.2)."""
-    right = (pl.col("judgement") == Judgement.RIGHT) & pl.col("in_use")
-    largest_m = pl.max_horizontal(-pl.col("error_low_m"), pl.col("error_high_m"))
-    of_epochs = epochs.select((limit_m - largest_m.filter(right)).min()).item()
+    right = epochs.is_judged(Judgement.RIGHT) & epochs.in_use
+    margins_m = limit_m - np.fmax(-epochs.error_low_m[right], epochs.error_high_m[right])
+    of_epochs = margins_m[np.isfinite(margins_m)].min(initial=np.inf)
     of_passages = passages.filter(accepted())["proof_margin_m"].min()
-    margins = [margin for margin in (of_epochs, of_passages) if isinstance(margin, float)]
+    margins = [float(of_epochs)] if np.isfinite(of_epochs) else []
+    margins += [of_passages] if isinstance(of_passages, float) else []
     return min(margins, default=None)
 
 
@@ -97,11 +99,11 @@ def spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:
     }
 
 
-def accuracy(epochs: pl.DataFrame) -> Row:
+def accuracy(epochs: EpochFigures) -> Row:
     errors: dict[str, pl.Expr] = {}
     for axis in ("along", "cross", "up"):
         errors |= spread(pl.col(f"error_{axis}_m"), f"{axis}_error", "epochs")
-    return epochs.select(**errors).row(0, named=True)
+    return epochs.table.select(**errors).row(0, named=True)
 
 
 def accepted() -> pl.Expr:
@@ -164,8 +166,8 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
     }
     times = ("time_to_detect", "time_since_failure", "time_since_failure_may")
     # A fault counts once, whatever its rows.
-    faults = independent_episodes(hazards)
-    of_faults = {"faults": faults.height, "missed_detections": faults["missed"].sum()}
+    faults = independent_episodes(hazards)["missed"] if hazards.height else pl.Series(dtype=pl.Boolean)
+    of_faults = {"faults": faults.len(), "missed_detections": faults.sum()}
     return _counted(hazards, counts) | of_faults | {f"{name}_max_s": hazards[f"{name}_s"].max() for name in times}
 
 
@@ -188,17 +190,18 @@ def service_levels(row: Row, config: Configuration) -> Row:
     return {name: [level[part] for level in rows] for part, name in LEVEL_LISTS.items()}
 
 
-def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: enums.Evidence | None) -> Row:
+def alarm_counts(alarms: pl.DataFrame, epochs: EpochFigures, evidence: enums.Evidence | None) -> Row:
     """Alarms and the rate of false ones, which needs a reference or balise reads and a verdict on every alarm.
 
     The rate counts the time in use in which the along-track bank judged and the position was judged (DOMAIN 6).
     """
     false = alarms.filter(pl.col("verdict") == enums.Verdict.FALSE).height
-    evaluated = (pl.col(f"along_{scale}_state") != enums.MonitorState.NOT_EVALUATED for scale in SCALES)
-    monitored = met(epochs, pl.any_horizontal(evaluated))
-    seen = met(epochs, judged())
-    counted_s = floats(epochs, "counted_s")
-    judged_s = counted_s[monitored & seen & met(epochs, pl.col("in_use"))]
+    states = [epochs.table[f"along_{scale}_state"] for scale in SCALES]
+    evaluated = [truths(state != enums.MonitorState.NOT_EVALUATED.value) for state in states]
+    monitored: Bools = np.logical_or.reduce(evaluated)
+    seen = epochs.judged
+    counted_s = epochs.counted_s
+    judged_s = counted_s[monitored & seen & epochs.in_use]
     times = {
         "held_s": counted_s,
         "monitored_s": counted_s[monitored],
@@ -216,46 +219,46 @@ def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: enums.Evi
     }
 
 
-def exposure(epochs: pl.DataFrame) -> Row:
-    exposure_s = epochs["exposure_s"]
+def exposure(epochs: EpochFigures) -> Row:
+    exposure_s = epochs.table["exposure_s"]
     return {
         "exposure_max_s": exposure_s.max(),
         "exposure_p99_s": exposure_s.quantile(0.99, interpolation="linear"),
     }
 
 
-def state_shares(epochs: pl.DataFrame) -> Row:
+def state_shares(epochs: EpochFigures) -> Row:
     """Share of the time, without gaps, in which each state of the LDS is known to hold (TVB section 4).
 
     The time in P1 is the hazardous time of all failures. While the state is unknown no share grows, so the four may add
     up to less than one. If some state is unknown and no epoch is known to be P0, the share of P0 is null, not 0; so is
     that of P1 unless some epoch is in it.
     """
-    counted_s = floats(epochs, "counted_s")
-    inside = {state: met(epochs, pl.col("lds_state") == state) for state in enums.LdsState}
-    row: Row = {f"share_{state.value.lower()}": share_of_time(counted_s, held) for state, held in inside.items()}
-    if epochs["lds_state"].null_count() and not inside[enums.LdsState.P0].any():
+    inside = {state: epochs.lds_state == number for number, state in enumerate(enums.LdsState)}
+    row: Row = {f"share_{state.value.lower()}": share_of_time(epochs.counted_s, held) for state, held in inside.items()}
+    if (epochs.lds_state < 0).any() and not inside[enums.LdsState.P0].any():
         row["share_p0"] = None
         if not inside[enums.LdsState.P1].any():
             row["share_p1"] = None
     return row
 
 
-def stanford_counts(epochs: pl.DataFrame, limit_m: float, bound: str = "confidence_m") -> Row:
+def stanford_counts(epochs: EpochFigures, bound_m: Floats, limit_m: float) -> Row:
     """Epochs whose error is known to 5 m, by error and bound along the track (CONTRACT section 3, `stanford_*`)."""
-    error_m = pl.col("error_along_m").abs()
-    offered = pl.col(bound) <= limit_m
+    known = np.isfinite(epochs.error_along_m) & np.isfinite(bound_m)
+    error_m = np.abs(epochs.error_along_m[known])
+    bound_m = bound_m[known]
+    offered = bound_m <= limit_m
     counts = {
-        "nominal": offered & (error_m <= pl.col(bound)),
-        "misleading": offered & (error_m > pl.col(bound)) & (error_m <= limit_m),
+        "nominal": offered & (error_m <= bound_m),
+        "misleading": offered & (error_m > bound_m) & (error_m <= limit_m),
         "hazardous": offered & (error_m > limit_m),
         "unavailable": ~offered,
     }
-    known = epochs.drop_nulls(["error_along_m", bound])
-    return _counted(known, {f"stanford_{name}": condition for name, condition in counts.items()})
+    return {f"stanford_{name}": int(condition.sum()) for name, condition in counts.items()}
 
 
-def stanford_of_receiver(epochs: pl.DataFrame, limit_m: float) -> Row:
+def stanford_of_receiver(epochs: EpochFigures, limit_m: float) -> Row:
     """The same counts with the receiver's protection level as bound; not known where it gives none."""
-    counts = stanford_counts(epochs, limit_m, "hpl_m") if epochs["hpl_m"].count() else {}
+    counts = stanford_counts(epochs, epochs.hpl_m, limit_m) if np.isfinite(epochs.hpl_m).any() else {}
     return {f"stanford_hpl_{name.removeprefix('stanford_')}": value for name, value in counts.items()}

@@ -28,7 +28,6 @@ from pipeline.studies.calibration.sigmas import (
 )
 from pipeline.studies.calibration.vehicle import RunEstimate, estimate_run, pooled
 from pipeline.studies.plausibility.fit import clock_advice, required_fit
-from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
@@ -107,8 +106,8 @@ def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, so
 
 
 def _estimate(match: Match, odometry: Odometry) -> RunEstimate | None:
-    epochs = match.epochs.filter("fix_valid", "on_track")
-    return estimate_run(odometry.seconds(times_ns(epochs)), floats(epochs, "path_m"), odometry)
+    rows = match.epochs.fix_valid & match.epochs.on_track
+    return estimate_run(odometry.seconds(match.epochs.t_ns[rows]), match.epochs.path_m[rows], odometry)
 
 
 def _monitored(
@@ -121,7 +120,7 @@ def _monitored(
     noise_m = MonitorBank(aligned, {}, stated).median_noise_m()
     as_stated = _with_monitors(stated, noise_m)
     bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, as_stated)}, as_stated)
-    return noise_m, pl.concat([aligned, pl.DataFrame(bank.columns())], how="horizontal").select(COMPARED)
+    return noise_m, pl.concat([aligned.table, pl.DataFrame(bank.columns())], how="horizontal").select(COMPARED)
 
 
 def _alarms(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> tuple[str, ...]:

@@ -116,9 +116,7 @@ def _composite(first: SolutionTables, second: SolutionTables, config: Configurat
     slower, faster = (first, second) if _period_s(first) >= _period_s(second) else (second, first)
     placed = on_path_of(slower.epochs, faster.epochs, config.lds).with_columns(fix_valid=pl.col("path_m").is_not_null())
     positioned = slower.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
-    compared = channel_monitor(positioned, placed, config).select(
-        pl.col("value", "threshold", "state").name.prefix(f"{COMPARISON}_")
-    )
+    compared = pl.DataFrame(channel_monitor(positioned, placed, config).columns(COMPARISON))
     row_other = paired(slower.epochs, faster.epochs, config.lds)["row_other"]
     theirs = _states(faster, trusted(config)).select(_STATES.gather(row_other).fill_null(value=False))
     ours = _states(slower, trusted(config))

@@ -75,7 +75,7 @@ def unnoticed_of(ride: Ride) -> Undetected:
 
 def _nothing(table: type[dy.Schema], rows: int) -> pl.DataFrame:
     kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith(("undetected_", "physical_"))}
-    return pl.DataFrame({name: [None] * rows for name in kinds}, schema=kinds)
+    return pl.DataFrame([pl.Series(name, [None], dtype=kind).new_from_index(0, rows) for name, kind in kinds.items()])
 
 
 def _gathered(at_rows: pl.DataFrame, at: Ints) -> pl.DataFrame:
@@ -150,7 +150,7 @@ def _range_m(ride: Ride, rows: Watched, parts: list[FaultWindow]) -> Floats:
     satellites = ride.prepared.ranges(ride.solution.name)
     if satellites is None:
         return np.full((2, rows.rows), np.nan)
-    low_m, high_m = range_bounds(ride.solution.epochs, satellites, ride.prepared.config)
+    low_m, high_m = range_bounds(ride.aligned, satellites, ride.prepared.config)
     return _both(bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts, ride.prepared.config.undetected).error_m
 
 

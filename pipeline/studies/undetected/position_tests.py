@@ -13,27 +13,29 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
+from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.monitors.pseudorange import Equations, equations_of, normal_of
 from pipeline.stages.monitors.single import paired
 from pipeline.studies.undetected.watched import Watched
 from schemas.arrays import Floats, floats
 from schemas.config import Configuration, LdsConfig
+from schemas.stages import MatchedEpochs
 
 # A range that the monitor does not see at all may be wrong by any amount.
 _UNSEEN = 1e-12
 
 
 def with_channel(
-    rows: Watched, epochs: pl.DataFrame, channel: pl.DataFrame, second: pl.DataFrame | None, lds: LdsConfig
+    rows: Watched, epochs: pl.DataFrame, channel: Verdicts, second: pl.DataFrame | None, lds: LdsConfig
 ) -> Watched:
     """The rows with the bounds of the channel monitor, of a fault that the other solution has not.
 
-    `channel`: `value, threshold` per epoch; `other`: as the channel monitor took it. Where the other solution has its
+    `channel`: of the channel monitor; `second`: the other solution as that took it. Where the other solution has its
     epochs between two of this one, the comparison is with the position in between.
     """
     if second is None:
         return rows
-    value, threshold = (floats(channel, name)[rows.epoch] for name in ("value", "threshold"))
+    value, threshold = channel.value[rows.epoch], channel.threshold[rows.epoch]
     before = _share_before(epochs, second, lds)[rows.epoch]
     moving = before * rows.way_s
     ahead_m = moving * np.maximum(rows.most_mps - rows.rate_mps, 0.0)
@@ -63,7 +65,7 @@ def _share_before(epochs: pl.DataFrame, second: pl.DataFrame, lds: LdsConfig) ->
     return share
 
 
-def range_bounds(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configuration) -> tuple[Floats, Floats]:
+def range_bounds(epochs: MatchedEpochs, satellites: pl.DataFrame, config: Configuration) -> tuple[Floats, Floats]:
     """The fault along growing path [m] that the worst range may cause at each epoch: most behind, most ahead.
 
     Infinite where the monitor is not evaluated. The worst satellite of each epoch: no satellite may do more.

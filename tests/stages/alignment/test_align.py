@@ -13,10 +13,12 @@ from pipeline.stages.alignment.align import BEYOND_SPAN, align, odometer_at, spe
 from pipeline.stages.alignment.odometer_filter import stamp_jitter_s
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER
-from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.odometry.odometry import Noise
 from pipeline.stages.odometry.quantisation import QuantisationNoise
+from schemas.arrays import NS_PER_S
 from schemas.config import Configuration, Vehicle, threshold_factor
+from schemas.stages import AlignedEpochs, MatchedEpochs
+from tests.frames import bank_over
 from tests.stages.alignment.straight import (
     NO_NOISE,
     Straight,
@@ -34,7 +36,7 @@ REAL = Straight(scale=1.004, latency_s=0.08)
 
 
 def alarms(aligned):
-    bank = MonitorBank(aligned, {}, CONFIG)
+    bank = bank_over(aligned, {}, CONFIG)
     return [k for k in range(aligned.height) if bank.failed(k)]
 
 
@@ -174,11 +176,12 @@ def test_the_odometer_is_known_at_times_between_epochs_and_inside_gaps():
     vehicle = Vehicle(odometer_scale=1.004, gnss_latency_s=0.0)
     gap = epochs.filter((pl.col("t").dt.timestamp("ns") < 100 * 10**9) | (pl.col("t").dt.timestamp("ns") > 120 * 10**9))
     aligned = align_run(gap, odometer, vehicle, CONFIG)
-    at = times(np.array([0.5, 90.05, 110.0, 150.0, 300.0]))
+    at_ns = np.round(np.array([0.5, 90.05, 110.0, 150.0, 300.0]) * 1e9).astype(np.int64)
     start = distance(np.array([1.0, 200.0]))[0]
     expected = distance(np.array([0.5, 90.05, 110.0, 150.0, 200.0]))[:4] - start
-    found = odometer_at(at, aligned, odometry_from(odometer, vehicle, CONFIG).oriented(-1)).to_list()
-    assert found[4] is None
+    odometry = odometry_from(odometer, vehicle, CONFIG).oriented(-1)
+    found = odometer_at(at_ns, AlignedEpochs.of_table(aligned), odometry)
+    assert np.isnan(found[4])
     np.testing.assert_allclose(found[:4], expected, atol=2.5)
 
 
@@ -212,7 +215,8 @@ def test_a_long_stand_where_rows_scatter_with_the_speed_alone():
     noise = Noise(odometry.noise.white_m2_per_s, QuantisationNoise(0.0, 1e-3))
     known = replace(odometry.known_noise, moving_s2=np.full(t_s.size, 1e-3))
     scattered = replace(odometry, noise=noise, known_noise=known)
-    aligned = align(epochs_of(t_s[20:-20], way_m[20:-20]), scattered, Vehicle(), CONFIG)
+    epochs = MatchedEpochs.of_table(epochs_of(t_s[20:-20], way_m[20:-20]))
+    aligned = align(epochs, scattered, Vehicle(), CONFIG).table
     # 0.03 s at 20 m/s, 0.6 m, counts under way alone; GNSS and odometer agree, so the scale stays 1.
     rows_m = aligned["odometer_rows_m"]
     assert rows_m[500] == pytest.approx(20.0 * 1e-3**0.5, rel=1e-3)
@@ -233,8 +237,9 @@ def test_the_odometer_at_any_time_goes_on_from_the_epoch_before_at_its_time_of_v
     aligned = pl.DataFrame(
         {"t": times(np.array([10.0])), "odometer_m": [190.0], "odometer_scale": [1.0], "latency_s": [0.5]}
     )
-    found = odometer_at(times(np.array([9.0, 10.0, 12.0, 30.0])), aligned, odometry)
-    assert found.to_list() == pytest.approx([180.0, 200.0, 240.0, None])
+    at_ns = np.array([9, 10, 12, 30]) * NS_PER_S
+    found = odometer_at(at_ns, AlignedEpochs.of_table(aligned), odometry)
+    assert found == pytest.approx([180.0, 200.0, 240.0, np.nan], nan_ok=True)
 
 
 def test_nothing_is_learned_from_positions_off_the_track():

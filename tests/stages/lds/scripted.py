@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import polars as pl
 
 from pipeline.stages.lds import LdsResult, run_lds
 from schemas.config import Configuration, LdsConfig, MonitorConfig
+from schemas.stages import AlignedEpochs
 
 SCALE_SIGMA = 1e-4
 K_T = 5.3267238
@@ -152,7 +154,10 @@ def run(
 ) -> LdsResult:
     on_odometer = None if reads is None else with_odometer(reads, epochs)
     bank = (bank or ScriptedBank()).watch(epochs)
-    return run_lds(epochs, bank, balises, on_odometer, scale_sigma, settings(disabled, **lds))
+    config = settings(disabled, **lds)
+    result = run_lds(AlignedEpochs.of_table(epochs), bank, balises, on_odometer, scale_sigma, config)
+    columns = [column for name, verdicts in result.linking.items() for column in verdicts.columns(name)]
+    return replace(result, epochs=result.epochs.with_columns(columns))
 
 
 def settings(disabled: Sequence[str] = (), **lds: Any) -> Configuration:

@@ -74,6 +74,6 @@ def test_a_drift_found_in_time_does_not_come_back(rate_mps: float) -> None:
     drift_m = np.clip(rate_mps * np.maximum(np.arange(1_800.0) - 700.0, 0.0), -40.0, 40.0)
     made = journey(np.random.default_rng(5), np.arange(1_800.0), drift_m, 1.0)
     aligned, lds = lds_of(made, CONFIG)
-    error_m = np.abs(aligned["path_m"].to_numpy() - made.true_m)
+    error_m = np.abs(aligned.path_m - made.true_m)
     assert lds.epochs["negated"].any()
     assert error_m[~lds.epochs["negated"].to_numpy()].max() < 20.0

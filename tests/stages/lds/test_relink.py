@@ -14,6 +14,7 @@ from pipeline.stages.lds.journey import Journey
 from pipeline.stages.lds.relink import Relink
 from pipeline.stages.odometry.odd_steps import LOST_M
 from schemas.enums import BaliseKind, NotEvaluated
+from schemas.stages import AlignedEpochs
 from tests.stages.lds.scripted import (
     K_T,
     SCALE_SIGMA,
@@ -37,7 +38,7 @@ def relink_of(offsets_m: list[float], tvb: list[int], **columns: Any) -> tuple[R
     """Ten epochs whose position is `offsets_m` ahead of the odometer; `tvb`: epochs that are TVBs."""
     odometer_m = steps(0.0, 20.0, 10)
     path_m = [x + offset_m for x, offset_m in zip(odometer_m, offsets_m, strict=True)]
-    journey = Journey(epochs_of(path_m, odometer_m, **columns), SCALE_SIGMA, settings())
+    journey = Journey(AlignedEpochs.of_table(epochs_of(path_m, odometer_m, **columns)), SCALE_SIGMA, settings())
     return Relink(journey, [k in tvb for k in range(10)], settings()), journey
 
 

@@ -40,7 +40,7 @@ def double_track(
 
 def ride(place: Site, y_m: Floats | float = 0.0, stated_m: float = 1.0) -> pl.DataFrame:
     x = 50.0 + 20.0 * np.arange(280.0)
-    return matched(run(x, np.zeros(280) + y_m, sigma_m=stated_m), place, odometer(x)).epochs
+    return matched(run(x, np.zeros(280) + y_m, sigma_m=stated_m), place, odometer(x)).epochs.table
 
 
 def on_a(epochs: pl.DataFrame, name: str) -> Floats:
@@ -91,8 +91,8 @@ def test_turnouts_that_join_a_track_do_not_move_it(
     x = start_m - 20.0 * np.arange(float(steps))
     y = 2.5 + np.random.default_rng(seed).normal(0.0, 0.1, steps)
     fixes = run(x, y)
-    joined = on_a(matched(fixes, double_track(7, True, sigma_m), odometer(x)).epochs, "gate")
-    alone = on_a(matched(fixes, double_track(7, False, sigma_m), odometer(x)).epochs, "gate")
+    joined = on_a(matched(fixes, double_track(7, True, sigma_m), odometer(x)).epochs.table, "gate")
+    alone = on_a(matched(fixes, double_track(7, False, sigma_m), odometer(x)).epochs.table, "gate")
     # A branch is a way to have come on A, so A may be likelier by it; it says nothing of B.
     assert (joined - alone).max() < 0.15
     assert (joined - alone).min() > -0.02
@@ -193,11 +193,11 @@ def test_cutting_reversing_renaming_and_shuffling_change_nothing(seed: int) -> N
         matched(fixes, site(one.elements, one.links, sigma_m=0.3), distance) for one in (drawing, changed(drawing, rng))
     ]
     for name in ("path", "gate"):
-        claims = [floats(one.epochs, f"{name}_probability") for one in found]
+        claims = [floats(one.epochs.table, f"{name}_probability") for one in found]
         np.testing.assert_array_equal(claims[0] >= 0.99, claims[1] >= 0.99)
-    moved = [np.diff(floats(one.epochs, "path_m")) for one in found]
+    moved = [np.diff(floats(one.epochs.table, "path_m")) for one in found]
     np.testing.assert_allclose(moved[0], moved[1], atol=1e-3)
-    crosses = [floats(one.epochs, "cross_track_m") for one in found]
+    crosses = [floats(one.epochs.table, "cross_track_m") for one in found]
     np.testing.assert_allclose(crosses[0], crosses[1], atol=1e-3)
 
 
@@ -234,5 +234,5 @@ def test_standing_on_a_switch_does_not_make_its_track_likelier(seed: int) -> Non
     places = site(two, joint, sigma_m=0.3), site(two | {"T": away}, [*joint, ("A0", 1, "T", 0, "both")], sigma_m=0.3)
     for y_m in (0.0, 4.0):
         fixes = run(x + error[0], y_m + error[1], sigma_m=1.0)
-        without, beside = (on_a(matched(fixes, place, odometer(x)).epochs, "gate")[-2] for place in places)
+        without, beside = (on_a(matched(fixes, place, odometer(x)).epochs.table, "gate")[-2] for place in places)
         assert beside == pytest.approx(without, abs=0.02)

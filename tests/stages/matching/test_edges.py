@@ -19,14 +19,14 @@ PLACES = {"chain": site({"e": line((0, 0), (1000, 0))}), "network": site(SWITCH,
 @pytest.mark.parametrize("kind", PLACES)
 def test_one_epoch_only(kind: str) -> None:
     found = matched(run(np.array([100.0]), np.array([1.0])), PLACES[kind])
-    assert found.epochs["path_m"].to_list() == pytest.approx([100.0], abs=1e-3)
-    assert found.epochs["on_track"].to_list() == [True]
+    assert found.epochs.table["path_m"].to_list() == pytest.approx([100.0], abs=1e-3)
+    assert found.epochs.table["on_track"].to_list() == [True]
 
 
 @pytest.mark.parametrize("kind", PLACES)
 def test_one_place_only(kind: str) -> None:
     found = matched(run(np.full(50, 100.0), np.zeros(50)), PLACES[kind], odometer(np.zeros(50)))
-    assert np.allclose(found.epochs["path_m"], 100.0, atol=1e-3)
+    assert np.allclose(found.epochs.table["path_m"], 100.0, atol=1e-3)
 
 
 def test_elements_without_any_relation() -> None:
@@ -46,12 +46,12 @@ def test_an_odometer_of_speeds_and_one_that_ends_early() -> None:
     for distance in (speeds, short, whole[:1]):
         found = matched(fixes, PLACES["network"], distance)
         assert found.path.elements() == ["s", "m"]
-        assert np.allclose(found.epochs["path_m"], x, atol=1e-2)
+        assert np.allclose(found.epochs.table["path_m"], x, atol=1e-2)
 
 
 def test_columns_that_a_log_does_not_hold() -> None:
     fixes = run(np.arange(100.0, 200.0, 10.0), np.zeros(10)).drop("cov_ee_m2", "cov_en_m2", "cov_nn_m2")
-    assert matched(fixes, PLACES["chain"]).epochs["sigma_source"].cast(str).unique().to_list() == ["table"]
+    assert matched(fixes, PLACES["chain"]).epochs.table["sigma_source"].cast(str).unique().to_list() == ["table"]
 
 
 def test_the_antimeridian_is_no_edge() -> None:
@@ -62,7 +62,7 @@ def test_the_antimeridian_is_no_edge() -> None:
         turned = pl.col("longitude_deg") - 14.0 + 179.995
         return frame.with_columns(longitude_deg=(turned + 180.0) % 360.0 - 180.0)
 
-    found = matched(moved(fixes), Site(moved(place.track), place.links)).epochs
+    found = matched(moved(fixes), Site(moved(place.track), place.links)).epochs.table
     assert np.allclose(found["path_m"], np.arange(100.0, 900.0, 50.0), atol=2e-2)
     assert np.allclose(found["cross_track_m"], 2.0, atol=1e-3)
 
@@ -116,8 +116,8 @@ def test_exact_positions_give_the_exact_way(seed: int, backwards: bool, with_odo
     fixes = run(x, y, sigma_m=0.3)
     found = matched(fixes, site(elements, links), odometer(0.995 * distance) if with_odometer else None)
     assert found.path.elements() == way
-    assert np.allclose(np.diff(found.epochs["path_m"]), 4.0, atol=0.02)
-    assert np.abs(found.epochs["cross_track_m"]).max() < 0.01
+    assert np.allclose(np.diff(found.epochs.table["path_m"]), 4.0, atol=0.02)
+    assert np.abs(found.epochs.table["cross_track_m"]).max() < 0.01
 
 
 @settings(max_examples=15, deadline=None)
@@ -131,13 +131,13 @@ def test_any_positions_give_probabilities_and_the_same_ones_again(seed: int) -> 
     fixes = run(x, y, fix=rng.choice(["sbas", "none"], size=120, p=[0.9, 0.1]))
     distance = odometer(np.cumsum(rng.normal(8.0, 8.0, size=120)))
     first, again = (matched(fixes, ladder(), distance) for _ in range(2))
-    assert first.epochs.equals(again.epochs)
+    assert first.epochs.table.equals(again.epochs.table)
     for name in ("path_probability", "gate_probability"):
-        values = first.epochs[name].drop_nulls()
+        values = first.epochs.table[name].drop_nulls()
         assert values.is_between(0.0, 1.0).all()
         # Off the network there is none on the track either.
-        assert first.epochs.filter(~pl.col("on_track"))[name].is_null().all()
-    floats = first.epochs.select(pl.col(pl.Float64))
+        assert first.epochs.table.filter(~pl.col("on_track"))[name].is_null().all()
+    floats = first.epochs.table.select(pl.col(pl.Float64))
     assert not any(column.is_nan().any() or column.is_infinite().any() for column in floats)
-    known = first.epochs.filter(pl.col("fix_valid"))
+    known = first.epochs.table.filter(pl.col("fix_valid"))
     assert known.select("leg", "path_m", "measure_m", "netelement_id", "cross_track_m").null_count().row(0) == (0,) * 5

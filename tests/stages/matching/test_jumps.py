@@ -32,7 +32,7 @@ def test_a_jump_past_the_end_of_a_track_does_not_decide() -> None:
     y[-1] = 10.0
     found = matched(run(x, y, sigma_m=0.1), place)
     assert found.path.elements()[0] == "a"
-    assert found.epochs["path_probability"][50] >= 0.99
+    assert found.epochs.table["path_probability"][50] >= 0.99
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 2.5, 10.0])
@@ -44,7 +44,7 @@ def test_a_standing_train_does_not_jump_to_another_track(rate_hz: float) -> None
     found = matched(run(np.full(count, 500.0), y, rate_hz, sigma_m=0.1), TRACKS)
     assert found.path.elements() == ["a"]
     away = y > 0
-    gate = found.epochs["gate_probability"].fill_null(0.0).to_numpy()
+    gate = found.epochs.table["gate_probability"].fill_null(0.0).to_numpy()
     assert (gate[away & np.roll(away, round(rate_hz))] < 0.99).all()
     # It begins anew after the delay of the tests; what refuted all tracks in the first minute may do so again.
     t_s = np.arange(count) / rate_hz
@@ -60,8 +60,8 @@ def test_a_jump_along_the_track_puts_the_track_in_no_doubt(place: Site, measured
     jumped = x.copy()
     jumped[50:52] += 150.0
     found = matched(run(jumped, np.zeros(100), 2.5, sigma_m=0.1), place, odometer(x, 2.5) if measured else None)
-    assert found.epochs["gate_probability"][20:].min() >= 0.99
-    assert found.epochs["path_m"][50] - found.epochs["path_m"][49] == pytest.approx(156.0, abs=0.01)
+    assert found.epochs.table["gate_probability"][20:].min() >= 0.99
+    assert found.epochs.table["path_m"][50] - found.epochs.table["path_m"][49] == pytest.approx(156.0, abs=0.01)
 
 
 def test_a_train_that_speeds_up_or_lost_its_position_is_believed() -> None:
@@ -71,7 +71,7 @@ def test_a_train_that_speeds_up_or_lost_its_position_is_believed() -> None:
     fixes = run(x, np.zeros(len(x)), sigma_m=0.1)
     fixes = fixes.with_columns(t=pl.Series(np.round(t * 1e9).astype(np.int64)).cast(fixes["t"].dtype))
     # The first second ends with the third position.
-    assert matched(fixes, CHAIN).epochs["gate_probability"][3:].min() == 1.0
+    assert matched(fixes, CHAIN).epochs.table["gate_probability"][3:].min() == 1.0
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -86,7 +86,7 @@ def test_noise_of_a_receiver_without_accuracy_does_not_change_the_track(seed: in
         [("s", 1, "m", 0, "both"), ("s", 1, "b", 0, "both")],
     )
     found = matched(run(x + noise[0], y + noise[1], 2.5, sigma_m=None, fix=["rtk_fixed"] * len(x)), place)
-    wrong = (found.epochs["netelement_id"] == "m") & (found.epochs["path_probability"] >= 0.99)
+    wrong = (found.epochs.table["netelement_id"] == "m") & (found.epochs.table["path_probability"] >= 0.99)
     assert wrong.sum() <= 0.01 * len(wrong)
 
 
@@ -99,8 +99,8 @@ def test_a_stretch_of_positions_on_another_track_does_not_move_the_run(track_y: 
     found = matched(run(x, y, 2.5, sigma_m=0.1), TRACKS)
     assert found.path.elements() == (["a", "b"] if track_y == 0.0 else ["c", "d"])
     before_and_after = np.r_[20:140, 360:400]
-    assert found.epochs["gate_probability"].fill_null(0.0).to_numpy()[before_and_after].min() >= 0.99
-    assert not found.epochs["on_track"][150:250].any()
+    assert found.epochs.table["gate_probability"].fill_null(0.0).to_numpy()[before_and_after].min() >= 0.99
+    assert not found.epochs.table["on_track"][150:250].any()
 
 
 def test_a_track_far_beside_is_paid_for_by_the_time_on_it() -> None:
@@ -109,7 +109,7 @@ def test_a_track_far_beside_is_paid_for_by_the_time_on_it() -> None:
     y = np.where(np.arange(len(x)) < 25, 20.0, 0.0)
     found = matched(run(x, y, 2.5, sigma_m=0.1), TRACKS)
     assert found.path.elements() == ["a", "b"]
-    assert found.epochs["path_probability"][200] >= 0.99
+    assert found.epochs.table["path_probability"][200] >= 0.99
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -127,7 +127,7 @@ def test_how_a_lost_position_moves_does_not_choose_between_parallel_tracks(seed:
     y[150:300] += 100.0 + bend(x[150:300])
     found = matched(run(x, y, 2.5, sigma_m=None, fix=["rtk_fixed"] * len(x)), place)
     assert found.path.elements() == ["a"]
-    assert found.epochs["gate_probability"].to_numpy()[-8:].min() > 0.5
+    assert found.epochs.table["gate_probability"].to_numpy()[-8:].min() > 0.5
 
 
 def test_a_train_that_turns_back_in_a_pause_of_the_odometer_keeps_its_sense() -> None:
@@ -135,7 +135,7 @@ def test_a_train_that_turns_back_in_a_pause_of_the_odometer_keeps_its_sense() ->
     t = np.arange(0.0, 200.0)
     x = 1000.0 - 10.0 * np.minimum(t, 20.0) + 10.0 * np.clip(t - 40.0, 0.0, None)
     stream = odometer(x).with_columns(slip=pl.Series((t < 2.0) | ((t > 8.0) & (t < 15.0))))
-    epochs = matched(run(x, 0.0 * x, sigma_m=0.1), site({"a": line((0, 0), (6000, 0))}), stream).epochs
+    epochs = matched(run(x, 0.0 * x, sigma_m=0.1), site({"a": line((0, 0), (6000, 0))}), stream).epochs.table
     assert epochs["path_m"][19] > epochs["path_m"][2]
     assert epochs["gate_probability"].min() == 1.0
 
@@ -144,8 +144,8 @@ def test_epochs_before_the_first_position_put_no_claim_forward() -> None:
     """For 40 s the receiver has no fix; at the switch it knows no sooner which way it went than one that had."""
     distance = np.arange(500.0, 1500.0, 5.0)
     x, y = along(branch("d"), distance)
-    late = matched(run(x, y, fix=np.where(distance < 700.0, "none", "sbas")), site(SWITCH, SWITCH_LINKS)).epochs
-    whole = matched(run(x, y)[40:], site(SWITCH, SWITCH_LINKS)).epochs
+    late = matched(run(x, y, fix=np.where(distance < 700.0, "none", "sbas")), site(SWITCH, SWITCH_LINKS)).epochs.table
+    whole = matched(run(x, y)[40:], site(SWITCH, SWITCH_LINKS)).epochs.table
     assert late["gate_probability"][:40].fill_null(0.0).max() == 0.0
     assert late["gate_probability"][40:].to_list() == whole["gate_probability"].to_list()
     assert (whole["gate_probability"] < 0.99).any()

@@ -25,8 +25,8 @@ def test_over_an_outage_the_odometer_tells_which_way_was_taken(name: str) -> Non
     fixes = run(x, y, fix=np.where(seen, "sbas", "none"))
     found = matched(fixes, site(WAYS, LINKS), odometer(at))
     assert found.path.elements() == ["in", name, "out"]
-    known = found.epochs["path_m"].is_not_null().to_numpy()
-    assert np.allclose(found.epochs["path_m"].to_numpy()[known], at[known], atol=2.0)
+    known = found.epochs.table["path_m"].is_not_null().to_numpy()
+    assert np.allclose(found.epochs.table["path_m"].to_numpy()[known], at[known], atol=2.0)
 
 
 @pytest.mark.parametrize(("y_m", "name"), [(1.9, "a"), (2.1, "b")])
@@ -36,7 +36,7 @@ def test_of_two_tracks_that_no_position_tells_apart_the_nearer_is_shown_and_not_
     x = np.arange(20.0, 1980.0, 10.0)
     found = matched(run(x, np.full(len(x), y_m)), place, odometer(x))
     assert found.path.elements() == [name]
-    assert found.epochs["path_probability"].max() < 0.99
+    assert found.epochs.table["path_probability"].max() < 0.99
 
 
 def test_a_coarse_survey_does_not_win_by_being_coarse() -> None:
@@ -60,7 +60,7 @@ def test_what_the_whole_run_refutes_is_not_shown_however_near_it_is() -> None:
     y = np.where((at > 1130.0) & (at < 1250.0), 1.3, 0.6)
     found = matched(run(at, y, sigma_m=1.0), place, odometer(at))
     assert found.path.elements() == ["s", "a"]
-    assert not (found.epochs["netelement_id"] == "b").any()
+    assert not (found.epochs.table["netelement_id"] == "b").any()
 
 
 @pytest.mark.parametrize(("away_s", "names"), [(20, ["a"]), (45, ["a", "c"])])
@@ -81,5 +81,5 @@ def test_off_every_track_the_path_goes_on_over_the_elements_between() -> None:
     y = np.where((x > 700.0) & (x < 1500.0), 30.0, 0.0)
     found = matched(run(x, y, sigma_m=0.5), place, odometer(x))
     assert found.path.elements() == list("abcdef")
-    assert np.allclose(found.epochs["path_m"], x, atol=0.1)
-    assert np.allclose(found.epochs["cross_track_m"], y, atol=0.1)
+    assert np.allclose(found.epochs.table["path_m"], x, atol=0.1)
+    assert np.allclose(found.epochs.table["cross_track_m"], y, atol=0.1)

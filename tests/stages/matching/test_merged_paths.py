@@ -24,7 +24,9 @@ def test_a_track_that_nothing_told_apart_is_not_claimed_in_hindsight_after_ten_m
     for x in (at[at < 9000.0], at):
         fixes = run(x, np.where((x > 1090.0) & (x < 1600.0), 2.0, 0.0))
         found = matched(fixes, site(LINE, LINKS, sigma_m=2.0), odometer(x))
-        beside = found.epochs.filter((found.epochs["path_m"] > 1100.0) & (found.epochs["path_m"] < 1590.0))
+        beside = found.epochs.table.filter(
+            (found.epochs.table["path_m"] > 1100.0) & (found.epochs.table["path_m"] < 1590.0)
+        )
         assert beside.height > 20
         assert beside["path_probability"].max() < 0.99
         assert {"m", "l"} <= {found.path.track.ids[element] for element in found.possible.element.tolist()}

@@ -39,9 +39,9 @@ def test_either_way_over_a_switch(name: str, with_odometer: bool) -> None:
         run(x, y + bias), site(SWITCH, SWITCH_LINKS), odometer(-1.005 * distance) if with_odometer else None
     )
     assert found.path.elements() == ["s", name]
-    assert found.epochs["netelement_id"][-1] == name
-    assert np.allclose(found.epochs["path_m"], distance, atol=1.5)
-    assert (found.epochs["path_probability"] >= 0.99).all()
+    assert found.epochs.table["netelement_id"][-1] == name
+    assert np.allclose(found.epochs.table["path_m"], distance, atol=1.5)
+    assert (found.epochs.table["path_probability"] >= 0.99).all()
 
 
 def test_the_gate_doubts_the_branch_until_the_tracks_part() -> None:
@@ -49,16 +49,16 @@ def test_the_gate_doubts_the_branch_until_the_tracks_part() -> None:
     distance = np.arange(800.0, 1500.0, 5.0)
     x, y = along(branch("d"), distance)
     found = matched(run(x, y), site(SWITCH, SWITCH_LINKS), odometer(distance))
-    gate = found.epochs["gate_probability"].to_numpy()
+    gate = found.epochs.table["gate_probability"].to_numpy()
     assert gate[distance < 980].min() >= 0.99
     assert gate[(distance > 1015) & (distance < 1030)].max() < 0.99
     assert gate[distance > 1150].min() >= 0.99
-    assert found.epochs["path_probability"].min() >= 0.99
+    assert found.epochs.table["path_probability"].min() >= 0.99
     row = found.ambiguous.row(0, named=True)
     assert row["netelement_id"] == "d"
     assert row["gate_probability"] == pytest.approx(gate.min())
     assert row["path_probability"] >= 0.99
-    doubted = found.epochs.filter(pl.col("gate_probability") < 0.99)["t"]
+    doubted = found.epochs.table.filter(pl.col("gate_probability") < 0.99)["t"]
     assert row["t_start"] == doubted.min()
     assert row["t_end"] == doubted.max()
 
@@ -67,9 +67,9 @@ def test_the_gate_uses_nothing_that_comes_later() -> None:
     distance = np.arange(500.0, 1500.0, 5.0)
     x, y = along(branch("d"), distance)
     place, fixes = site(SWITCH, SWITCH_LINKS), run(x + NORMAL(size=len(x)), y + NORMAL(size=len(x)))
-    whole = matched(fixes, place, odometer(distance)).epochs["gate_probability"]
+    whole = matched(fixes, place, odometer(distance)).epochs.table["gate_probability"]
     for count in (120, 150):
-        cut = matched(fixes[:count], place, odometer(distance)).epochs["gate_probability"]
+        cut = matched(fixes[:count], place, odometer(distance)).epochs.table["gate_probability"]
         # The last epoch of a run is a step of its own, and the way on that was not taken yet counts for no path.
         assert np.allclose(cut[:100], whole[:100], atol=1e-9)
 
@@ -82,8 +82,8 @@ def test_trailing_through_a_switch_and_back() -> None:
     found = matched(run(x, y), site(SWITCH, SWITCH_LINKS), odometer(travelled))
     assert found.path.elements() == ["d", "s"]
     assert len(found.path.legs) == 1
-    assert found.epochs["path_m"][70] - found.epochs["path_m"][0] == pytest.approx(700.0, abs=1.0)
-    assert found.epochs["path_m"][-1] == pytest.approx(found.epochs["path_m"][1], abs=1.0)
+    assert found.epochs.table["path_m"][70] - found.epochs.table["path_m"][0] == pytest.approx(700.0, abs=1.0)
+    assert found.epochs.table["path_m"][-1] == pytest.approx(found.epochs.table["path_m"][1], abs=1.0)
 
 
 def test_a_zig_zag_over_the_switch_is_a_new_leg_with_the_same_position() -> None:
@@ -98,11 +98,11 @@ def test_a_zig_zag_over_the_switch_is_a_new_leg_with_the_same_position() -> None
         ["d", "s"],
         ["m", "s"],
     ]
-    moved = found.epochs["path_m"] - found.epochs["path_m"][0]
+    moved = found.epochs.table["path_m"] - found.epochs.table["path_m"][0]
     assert np.allclose(moved, -(distance - distance[0]), atol=1.0)
-    assert found.epochs["leg"][0] == 0
-    assert found.epochs["leg"][-1] == 1
-    assert (found.epochs["path_probability"] >= 0.99).all()
+    assert found.epochs.table["leg"][0] == 0
+    assert found.epochs.table["leg"][-1] == 1
+    assert (found.epochs.table["path_probability"] >= 0.99).all()
     on_s = [leg.entry_m([found.path.track.ids[v.element] for v in leg.visits].index("s")) for leg in found.path.legs]
     assert on_s[0] == pytest.approx(on_s[1], abs=1e-9)
 
@@ -118,7 +118,7 @@ def test_a_tunnel_is_bridged_and_elements_without_fixes_are_there() -> None:
     for distance in (odometer(x), None):
         found = matched(fixes, site(elements, links), distance)
         assert found.path.elements() == list("abcde")
-        assert found.epochs["path_m"].drop_nulls()[-1] == pytest.approx(x[-1], abs=0.1)
+        assert found.epochs.table["path_m"].drop_nulls()[-1] == pytest.approx(x[-1], abs=0.1)
 
 
 @pytest.mark.parametrize("jump_m", [250.0, -250.0])
@@ -135,9 +135,11 @@ def test_a_jump_along_the_track_makes_no_detour(jump_m: float, seed: int) -> Non
     found = matched(run(raw, y, rate_hz=2.0), ladder(), odometer(x, rate_hz=2.0))
     assert found.path.elements() == ["A1", "A2"]
     assert len(found.path.legs) == 1
-    assert np.allclose(found.epochs["path_m"], raw, atol=0.01)
+    assert np.allclose(found.epochs.table["path_m"], raw, atol=0.01)
     # Half a metre aside on tracks 4 m apart never proves more; the jump takes nothing off.
-    assert found.epochs["path_probability"].min() == pytest.approx(found.epochs["path_probability"].max(), abs=0.02)
+    assert found.epochs.table["path_probability"].min() == pytest.approx(
+        found.epochs.table["path_probability"].max(), abs=0.02
+    )
 
 
 def test_a_jump_onto_the_other_track_for_a_while_is_not_followed() -> None:
@@ -145,7 +147,7 @@ def test_a_jump_onto_the_other_track_for_a_while_is_not_followed() -> None:
     y = np.where((x > 1500) & (x < 1800), 4.0, 0.0)
     found = matched(run(x, y, rate_hz=2.0), ladder(), odometer(x, rate_hz=2.0))
     assert found.path.elements() == ["A1", "A2"]
-    assert np.allclose(found.epochs["cross_track_m"], y, atol=0.01)
+    assert np.allclose(found.epochs.table["cross_track_m"], y, atol=0.01)
 
 
 def test_relations_that_are_not_navigable_lead_nowhere() -> None:
@@ -172,8 +174,8 @@ def test_a_given_route_overrides_the_positions() -> None:
     )
     found = matched(trip.fixes, given, trip.odometer)
     assert found.path.elements() == ["B1", "B2"]
-    assert found.epochs["cross_track_m"].median() == pytest.approx(-4.0, abs=3.0)
-    assert (found.epochs["path_probability"] == 1.0).all()
+    assert found.epochs.table["cross_track_m"].median() == pytest.approx(-4.0, abs=3.0)
+    assert (found.epochs.table["path_probability"] == 1.0).all()
 
 
 def test_a_route_against_the_run_is_turned() -> None:
@@ -182,7 +184,7 @@ def test_a_route_against_the_run_is_turned() -> None:
     x, y = along(branch("d"), distance)
     found = matched(run(x, y), place, odometer(distance))
     assert found.path.elements() == ["s", "d"]
-    assert np.allclose(found.epochs["path_m"], distance, atol=0.1)
+    assert np.allclose(found.epochs.table["path_m"], distance, atol=0.1)
 
 
 def test_balise_reads_pin_the_track() -> None:
@@ -199,10 +201,10 @@ def test_balise_reads_pin_the_track() -> None:
     reads = pl.DataFrame({"t": times(200, 2.0)[45:46], "balise_id": names})
     free = matched(run(x, np.full(200, 2.0), rate_hz=2.0), place, odometer(x, rate_hz=2.0))
     pinned = matched(run(x, np.full(200, 2.0), rate_hz=2.0), place, odometer(x, rate_hz=2.0), reads=reads)
-    assert free.epochs["gate_probability"][60] < 0.9
+    assert free.epochs.table["gate_probability"][60] < 0.9
     assert pinned.path.elements() == ["B1", "B2"]
-    assert pinned.epochs["gate_probability"][44] < 0.9
-    assert pinned.epochs["gate_probability"][47:90].min() >= 0.99
+    assert pinned.epochs.table["gate_probability"][44] < 0.9
+    assert pinned.epochs.table["gate_probability"][47:90].min() >= 0.99
 
 
 def circle(radius: float, start: float, end: float) -> np.ndarray:
@@ -221,7 +223,7 @@ def test_laps_of_a_ring_add_up(pieces: int) -> None:
     distance = np.arange(100.0, 5.0 * np.pi * radius, 10.0)
     x, y = radius * np.sin(distance / radius), radius - radius * np.cos(distance / radius)
     found = matched(run(x, y), site(elements, links), odometer(distance))
-    moved = found.epochs["path_m"] - found.epochs["path_m"][0]
+    moved = found.epochs.table["path_m"] - found.epochs.table["path_m"][0]
     assert np.allclose(moved, distance - distance[0], atol=0.5)
     assert len(found.path.legs) == 1
     assert travelled_route(found).height == 2.5 * pieces + (0.5 if pieces == 1 else 0)
@@ -237,7 +239,7 @@ def test_a_given_route_may_pass_an_element_twice() -> None:
     found = matched(run(x, y), place, odometer(distance))
     assert found.path.elements() == ["in", "r", "out"]
     assert found.path.legs[0].end_m == pytest.approx(float(np.hypot(*np.diff(around, axis=0).T).sum()), abs=0.1)
-    assert np.allclose(found.epochs["path_m"], distance, atol=1.0)
+    assert np.allclose(found.epochs.table["path_m"], distance, atol=1.0)
 
 
 def test_a_network_in_pieces_is_crossed_with_a_break() -> None:
@@ -248,8 +250,8 @@ def test_a_network_in_pieces_is_crossed_with_a_break() -> None:
     seen = (whole < 500.0) | (whole >= 700.0)
     found = matched(run(whole, np.zeros(len(whole))).filter(pl.Series(seen)), place, odometer(whole))
     assert [leg.visits[0].forward for leg in found.path.legs] == [True, False]
-    assert np.allclose(found.epochs["path_m"], whole[seen], atol=15.0)
-    assert found.epochs["netelement_id"].unique().sort().to_list() == ["e", "w"]
+    assert np.allclose(found.epochs.table["path_m"], whole[seen], atol=15.0)
+    assert found.epochs.table["netelement_id"].unique().sort().to_list() == ["e", "w"]
 
 
 def test_gaps_between_linked_ends_count_as_track() -> None:
@@ -258,7 +260,7 @@ def test_gaps_between_linked_ends_count_as_track() -> None:
     x = np.arange(100.0, 900.0, 10.0)
     found = matched(run(x, np.zeros(len(x))), place, odometer(x))
     assert found.path.elements() == ["a", "b"]
-    assert np.allclose(found.epochs["path_m"], x, atol=0.1)
+    assert np.allclose(found.epochs.table["path_m"], x, atol=0.1)
 
 
 def test_a_survey_that_goes_on_beside_where_it_ended_has_no_way_in_between() -> None:
@@ -267,7 +269,7 @@ def test_a_survey_that_goes_on_beside_where_it_ended_has_no_way_in_between() -> 
     x = np.arange(100.0, 900.0, 10.0)
     found = matched(run(x, np.where(x < 500.0, 0.0, 1.5)), place, odometer(x))
     assert found.path.elements() == ["a", "b"]
-    assert np.allclose(found.epochs["path_m"], x, atol=0.1)
+    assert np.allclose(found.epochs.table["path_m"], x, atol=0.1)
 
 
 def test_standstill_beside_a_switch_adds_nothing() -> None:
@@ -278,7 +280,7 @@ def test_standstill_beside_a_switch_adds_nothing() -> None:
     found = matched(run(x + noise[:, 0], noise[:, 1]), site(SWITCH, SWITCH_LINKS), odometer(x))
     assert found.path.elements() == ["s", "m"]
     assert len(found.path.legs) == 1
-    assert np.allclose(found.epochs["path_m"], x, atol=3.0)
+    assert np.allclose(found.epochs.table["path_m"], x, atol=3.0)
 
 
 def test_off_the_network_for_a_while() -> None:
@@ -286,8 +288,8 @@ def test_off_the_network_for_a_while() -> None:
     y = np.where((x > 600) & (x < 900), 400.0, 0.0)
     found = matched(run(x, y), site(SWITCH, SWITCH_LINKS), odometer(x))
     away = (x > 600) & (x < 900)
-    assert found.epochs["on_track"].to_list() == (~away).tolist()
-    assert found.epochs["gate_probability"].is_null().to_list() == away.tolist()
+    assert found.epochs.table["on_track"].to_list() == (~away).tolist()
+    assert found.epochs.table["gate_probability"].is_null().to_list() == away.tolist()
     assert found.path.elements() == ["s", "m"]
     with pytest.raises(InputError, match="off the track"):
         matched(run(x, np.full(len(x), 400.0)), site(SWITCH, SWITCH_LINKS))
@@ -297,7 +299,7 @@ def test_an_unknown_track_error_is_no_certainty() -> None:
     """The same run over the same tracks: where the survey's sigma is not known, claims are weaker."""
     trip = journey(1)
     known, unknown = (matched(trip.fixes, ladder(sigma), trip.odometer) for sigma in (0.02, None))
-    assert unknown.epochs["gate_probability"].mean() < known.epochs["gate_probability"].mean()
+    assert unknown.epochs.table["gate_probability"].mean() < known.epochs.table["gate_probability"].mean()
 
 
 def test_reversed_runs_take_the_same_elements() -> None:
@@ -309,8 +311,10 @@ def test_reversed_runs_take_the_same_elements() -> None:
         back = matched(back_fixes, ladder(), distance)
         assert back.path.elements() == there.path.elements()[::-1]
         length = there.path.legs[-1].end_m
-        assert np.allclose(back.epochs["path_m"].reverse(), length - there.epochs["path_m"], atol=1e-6)
-        assert np.allclose(back.epochs["cross_track_m"].reverse(), -there.epochs["cross_track_m"], atol=1e-6)
+        assert np.allclose(back.epochs.table["path_m"].reverse(), length - there.epochs.table["path_m"], atol=1e-6)
+        assert np.allclose(
+            back.epochs.table["cross_track_m"].reverse(), -there.epochs.table["cross_track_m"], atol=1e-6
+        )
 
 
 def test_the_crossover_s_own_shape() -> None:

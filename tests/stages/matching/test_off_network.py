@@ -30,8 +30,8 @@ def test_a_siding_that_the_survey_lacks_is_named_with_place_and_offset(turned: b
     assert 1780.0 < end < 2050.0
     # Nothing is claimed meanwhile, and positions stay projected.
     away = (x > 1000.0) & (x < 1780.0)
-    assert found.epochs["gate_probability"].is_null().to_numpy()[away].all()
-    assert np.allclose(found.epochs["path_m"], x, atol=0.1)
+    assert found.epochs.table["gate_probability"].is_null().to_numpy()[away].all()
+    assert np.allclose(found.epochs.table["path_m"], x, atol=0.1)
 
 
 @pytest.mark.parametrize(("rate_mps", "moved_m"), [(0.5, -5.2), (0.05, -8.0), (1.0, 5.2)])
@@ -41,7 +41,7 @@ def test_a_movement_onto_another_track_is_no_way_back(rate_mps: float, moved_m: 
     t_s = np.arange(400.0)
     x = 20.0 + 12.0 * t_s
     y = 5.2 + np.sign(moved_m) * np.clip(rate_mps * (t_s - 100.0), 0.0, abs(moved_m))
-    gate = matched(run(x, y, sigma_m=0.05), place, odometer(x)).epochs["gate_probability"]
+    gate = matched(run(x, y, sigma_m=0.05), place, odometer(x)).epochs.table["gate_probability"]
     assert gate[60:100].min() >= 0.99
     off = int(gate.is_null().arg_max() or 0)
     assert 100 < off < 150
@@ -54,7 +54,7 @@ def test_a_movement_back_of_equal_size_is_one_with_a_bias_too() -> None:
     t_s = np.arange(400.0)
     x = 20.0 + 12.0 * t_s
     fault_m = np.interp(t_s, [150.0, 155.0, 215.0, 220.0], [0.0, -5.0, -5.0, 0.0])
-    gate = matched(run(x, 2.0 + fault_m, sigma_m=0.1), place, odometer(x)).epochs["gate_probability"]
+    gate = matched(run(x, 2.0 + fault_m, sigma_m=0.1), place, odometer(x)).epochs.table["gate_probability"]
     assert gate[165:218].null_count() == 53
     assert gate[260:].min() >= 0.99
 
@@ -73,7 +73,7 @@ def test_a_bias_that_turns_with_the_heading_in_a_curve_refutes_no_path(
     place = site({"a": points[::5], "b": (points + 5.0 * normal)[::5]}, sigma_m=0.05)
     way = np.arange(20.0, 1480.0, 10.0)
     x, y = (np.interp(way, np.arange(1501), points[:, axis]) + bias_m[axis] for axis in (0, 1))
-    gate = matched(run(x, y, sigma_m=0.05), place, odometer(way)).epochs["gate_probability"]
+    gate = matched(run(x, y, sigma_m=0.05), place, odometer(way)).epochs.table["gate_probability"]
     assert gate.null_count() == 0
 
 
@@ -83,7 +83,7 @@ def test_what_refutes_all_tracks_in_the_first_minute_claims_none_for_a_minute() 
     t_s = np.arange(300.0)
     x = 20.0 + 12.0 * t_s
     y = np.where(t_s < 20.0, 0.0, np.minimum(3.0 * (t_s - 20.0), 9.0))
-    gate = matched(run(x, y, sigma_m=1.0), place, odometer(x)).epochs["gate_probability"].to_numpy()
+    gate = matched(run(x, y, sigma_m=1.0), place, odometer(x)).epochs.table["gate_probability"].to_numpy()
     assert np.isnan(gate[:60]).any()
     assert (np.nan_to_num(gate[28:80]) < 0.99).all()
 

@@ -28,7 +28,7 @@ TWO_LINKS = [("a", 1, "b", 1, "both")]
 def test_hand_worked_places_on_a_line_to_the_east() -> None:
     x = np.array([100.0, 110.0, 120.0, 130.0])
     y = np.array([0.0, 2.0, -3.0, 60.0])
-    epochs = matched(run(x, y), site(EAST)).epochs
+    epochs = matched(run(x, y), site(EAST)).epochs.table
     assert np.allclose(epochs["path_m"], x, atol=2e-3)
     assert np.allclose(epochs["cross_track_m"], y, atol=2e-3)
     assert epochs["on_track"].to_list() == [True, True, True, False]
@@ -43,17 +43,17 @@ def test_a_run_to_the_west_grows_to_the_west_and_left_is_south() -> None:
     x = np.array([900.0, 850.0, 800.0])
     found = matched(run(x, np.array([1.0, 1.0, 1.0])), site(TWO, TWO_LINKS))
     assert found.path.elements() == ["b"]
-    assert np.allclose(found.epochs["path_m"], [100.0, 150.0, 200.0], atol=2e-3)
-    assert np.allclose(found.epochs["measure_m"], [100.0, 150.0, 200.0], atol=2e-3)
-    assert np.allclose(found.epochs["cross_track_m"], -1.0, atol=1e-4)
-    assert np.allclose(found.epochs["heading_deg"], 270.0, atol=0.02)
+    assert np.allclose(found.epochs.table["path_m"], [100.0, 150.0, 200.0], atol=2e-3)
+    assert np.allclose(found.epochs.table["measure_m"], [100.0, 150.0, 200.0], atol=2e-3)
+    assert np.allclose(found.epochs.table["cross_track_m"], -1.0, atol=1e-4)
+    assert np.allclose(found.epochs.table["heading_deg"], 270.0, atol=0.02)
 
 
 def test_measures_fall_on_an_element_that_points_the_other_way() -> None:
     found = matched(run(np.arange(400.0, 700.0, 50.0), np.zeros(6)), site(TWO, TWO_LINKS))
     assert found.path.elements() == ["a", "b"]
-    assert np.allclose(found.epochs["path_m"], np.arange(400.0, 700.0, 50.0), atol=2e-3)
-    assert np.allclose(found.epochs["measure_m"], [400, 450, 500, 450, 400, 350], atol=2e-3)
+    assert np.allclose(found.epochs.table["path_m"], np.arange(400.0, 700.0, 50.0), atol=2e-3)
+    assert np.allclose(found.epochs.table["measure_m"], [400, 450, 500, 450, 400, 350], atol=2e-3)
 
 
 def test_only_the_elements_that_were_visited_are_on_the_path() -> None:
@@ -61,7 +61,7 @@ def test_only_the_elements_that_were_visited_are_on_the_path() -> None:
     links = [("a", 1, "b", 0, "both"), ("b", 1, "c", 0, "both"), ("c", 1, "d", 0, "both")]
     found = matched(run(np.arange(600.0, 1400.0, 20.0), np.zeros(40)), site(elements, links))
     assert found.path.elements() == ["b", "c"]
-    assert found.epochs["path_m"][0] == pytest.approx(100.0, abs=2e-3)
+    assert found.epochs.table["path_m"][0] == pytest.approx(100.0, abs=2e-3)
 
 
 def test_the_balise_antenna_is_behind_the_gnss_antenna() -> None:
@@ -70,7 +70,7 @@ def test_the_balise_antenna_is_behind_the_gnss_antenna() -> None:
     place = site(TWO, TWO_LINKS, heights_m=heights)
     x = np.array([450.0, 510.0, 550.0])
     fixes = run(x, np.zeros(3), height_m=[104.0, 104.4, 106.5])
-    epochs = matched(fixes, place, vehicle=vehicle).epochs
+    epochs = matched(fixes, place, vehicle=vehicle).epochs.table
     assert np.allclose(epochs["path_m"], [420.0, 480.0, 520.0], atol=5e-3)
     assert epochs["netelement_id"].to_list() == ["a", "a", "b"]
     assert np.allclose(epochs["vertical_m"], [0.0, 0.0, 0.5], atol=1e-3)
@@ -79,7 +79,7 @@ def test_the_balise_antenna_is_behind_the_gnss_antenna() -> None:
 
 def test_the_lever_arm_turns_with_the_train() -> None:
     vehicle = Vehicle(gnss_antenna_ahead_m=30.0)
-    epochs = matched(run(np.array([900.0, 850.0, 800.0]), np.zeros(3)), site(EAST), vehicle=vehicle).epochs
+    epochs = matched(run(np.array([900.0, 850.0, 800.0]), np.zeros(3)), site(EAST), vehicle=vehicle).epochs.table
     assert np.allclose(epochs["path_m"], [70.0, 120.0, 170.0], atol=2e-3)
     assert np.allclose(epochs["measure_m"], [930.0, 880.0, 830.0], atol=2e-3)
 
@@ -90,7 +90,7 @@ def test_covariance_is_turned_into_the_track_s_frame() -> None:
     fixes = run(np.array([10.0, 50.0]), np.array([10.0, 50.0])).with_columns(
         cov_ee_m2=pl.lit(4.0), cov_nn_m2=pl.lit(2.0), cov_en_m2=pl.lit(1.0), cov_uu_m2=pl.lit(9.0)
     )
-    epochs = matched(fixes, place).epochs
+    epochs = matched(fixes, place).epochs.table
     # e-4: the plane of the test's layout turns by as much against true north.
     assert np.allclose(epochs["sigma_along_m"], np.sqrt((4 + 2 + 2 * 1) / 2), atol=1e-3)
     assert np.allclose(epochs["sigma_cross_m"], np.sqrt((4 + 2 - 2 * 1) / 2), atol=1e-3)
@@ -104,7 +104,7 @@ def test_a_correlation_that_cannot_be_is_not_used() -> None:
     fixes = run(np.array([10.0, 50.0]), np.array([10.0, 50.0])).with_columns(
         cov_ee_m2=pl.lit(4.0), cov_nn_m2=pl.lit(2.0), cov_en_m2=pl.Series([50.0, 1.0]), cov_uu_m2=pl.lit(9.0)
     )
-    epochs = matched(fixes, place).epochs
+    epochs = matched(fixes, place).epochs.table
     assert np.allclose(epochs["sigma_cross_m"], [np.sqrt(3.0), np.sqrt(2.0)], atol=1e-3)
     assert contradictory_covariances(fixes) == 1
 
@@ -122,7 +122,7 @@ def test_a_correlation_that_cannot_be_is_not_used() -> None:
 )
 def test_without_covariance_a_table_says_the_sigma(fix: str, sigma_m: float) -> None:
     fixes = run(np.array([10.0, 50.0]), np.zeros(2), sigma_m=None).with_columns(fix=pl.lit(fix))
-    epochs = matched(fixes, site(EAST)).epochs
+    epochs = matched(fixes, site(EAST)).epochs.table
     assert np.allclose(epochs["sigma_along_m"], sigma_m)
     assert np.allclose(epochs["sigma_up_m"], 1.5 * sigma_m)
     assert epochs["sigma_source"].cast(str).to_list() == ["table"] * 2
@@ -130,13 +130,13 @@ def test_without_covariance_a_table_says_the_sigma(fix: str, sigma_m: float) -> 
 
 def test_zero_covariance_is_not_certainty() -> None:
     fixes = run(np.array([10.0, 50.0]), np.zeros(2)).with_columns(cov_ee_m2=pl.lit(0.0), cov_nn_m2=pl.lit(0.0))
-    assert matched(fixes, site(EAST)).epochs["sigma_source"].cast(str).to_list() == ["table"] * 2
+    assert matched(fixes, site(EAST)).epochs.table["sigma_source"].cast(str).to_list() == ["table"] * 2
 
 
 def test_an_epoch_without_a_position_has_none() -> None:
     fixes = run(np.array([10.0, 50.0, 90.0]), np.zeros(3), fix=["sbas", "none", "sbas"])
     fixes = fixes.with_columns(latitude_deg=pl.Series([*fixes["latitude_deg"][:2], None]))
-    epochs = matched(fixes, site(EAST)).epochs
+    epochs = matched(fixes, site(EAST)).epochs.table
     assert epochs["fix_valid"].to_list() == [True, False, False]
     assert epochs["on_track"].to_list() == [True, False, False]
     for name in (
@@ -157,14 +157,14 @@ def test_jumps_along_the_track_stay_what_they_are(jump_m: float) -> None:
     x = 350.0 + 5.0 * np.arange(60.0)
     raw = x + np.where((np.arange(60) >= 20) & (np.arange(60) < 40), jump_m, 0.0)
     found = matched(run(raw, np.zeros(60)), site(TWO, TWO_LINKS), odometer(x - x[0]))
-    assert np.allclose(found.epochs["path_m"], raw, atol=5e-3)
+    assert np.allclose(found.epochs.table["path_m"], raw, atol=5e-3)
 
 
 def test_a_slow_drift_and_a_step_across_stay_what_they_are() -> None:
     x = 100.0 + 5.0 * np.arange(100.0)
     drift = 0.5 * np.maximum(0.0, np.arange(100.0) - 30)
     across = np.where(np.arange(100) < 50, 0.0, 30.0)
-    epochs = matched(run(x + drift, across), site(EAST), odometer(x)).epochs
+    epochs = matched(run(x + drift, across), site(EAST), odometer(x)).epochs.table
     assert np.allclose(epochs["path_m"], x + drift, atol=5e-3)
     assert np.allclose(epochs["cross_track_m"], across, atol=5e-3)
     assert epochs["on_track"].to_list() == (across == 0.0).tolist()
@@ -173,28 +173,28 @@ def test_a_slow_drift_and_a_step_across_stay_what_they_are() -> None:
 def test_a_jump_at_the_start_does_not_turn_the_run_round() -> None:
     x = 300.0 + 2.0 * np.arange(60.0)
     raw = x + np.where(np.arange(60) < 5, 80.0, 0.0)
-    assert np.allclose(matched(run(raw, np.zeros(60)), site(EAST), odometer(x)).epochs["path_m"], raw, atol=5e-3)
+    assert np.allclose(matched(run(raw, np.zeros(60)), site(EAST), odometer(x)).epochs.table["path_m"], raw, atol=5e-3)
 
 
 def test_standstill_keeps_the_site_s_sense() -> None:
     rng = np.random.default_rng(5)
     found = matched(run(500.0 + rng.normal(size=50), rng.normal(size=50)), site(EAST))
-    assert found.epochs["on_track"].all()
-    assert found.epochs["heading_deg"].is_not_null().all()
+    assert found.epochs.table["on_track"].all()
+    assert found.epochs.table["heading_deg"].is_not_null().all()
 
 
 def test_beyond_the_ends_the_path_goes_on_straight() -> None:
     x = np.array([-20.0, -5.0, 15.0, 40.0])
     found = matched(run(x, np.zeros(4)), site(EAST))
-    assert np.allclose(found.epochs["path_m"], x, atol=2e-3)
-    far = matched(run(np.array([950.0, 1005.0, 1006.0, 2000.0]), np.zeros(4)), site(EAST)).epochs
+    assert np.allclose(found.epochs.table["path_m"], x, atol=2e-3)
+    far = matched(run(np.array([950.0, 1005.0, 1006.0, 2000.0]), np.zeros(4)), site(EAST)).epochs.table
     assert far["on_track"].to_list() == [True, True, False, False]
 
 
 def test_declared_measures_scale_the_geometry_piece_by_piece() -> None:
     place = site({"e": line((0, 0), (1000, 0), spacing_m=500.0)})
     declared = Site(place.track.with_columns(measure_m=pl.Series([0.0, 510.0, 1000.0])), place.links)
-    epochs = matched(run(np.array([250.0, 500.0, 750.0]), np.zeros(3)), declared).epochs
+    epochs = matched(run(np.array([250.0, 500.0, 750.0]), np.zeros(3)), declared).epochs.table
     assert np.allclose(epochs["path_m"], [255.0, 510.0, 755.0], atol=1e-2)
 
 
@@ -204,7 +204,7 @@ def test_a_grade_is_longer_than_its_plan() -> None:
     measure = place.track["measure_m"] * np.hypot(1.0, 0.03)
     epochs = matched(
         run(np.array([100.0, 200.0]), np.zeros(2)), Site(place.track.with_columns(measure), place.links)
-    ).epochs
+    ).epochs.table
     assert epochs["path_m"].diff()[1] == pytest.approx(100.0 * np.hypot(1.0, 0.03), abs=1e-3)
     assert np.allclose(epochs["slope"], 0.03, atol=1e-5)
 
@@ -216,7 +216,7 @@ def test_an_arc_has_its_curvature_and_its_chords_their_sagitta(turn: float, sign
     arc = np.column_stack([radius * np.sin(angle), turn * radius * (1 - np.cos(angle))])
     at = 0.5 * (angle[10:20] + angle[11:21])
     x, y = radius * np.sin(at), turn * radius * (1 - np.cos(at))
-    epochs = matched(run(x, y), site({"e": arc})).epochs
+    epochs = matched(run(x, y), site({"e": arc})).epochs.table
     assert np.allclose(epochs["curvature_per_m"], sign / radius, rtol=1e-3)
     sagitta = step**2 / (8 * radius)
     assert np.allclose(epochs["interpolation_error_m"], sagitta, rtol=1e-2)
@@ -226,7 +226,7 @@ def test_an_arc_has_its_curvature_and_its_chords_their_sagitta(turn: float, sign
 
 def test_velocity_along_is_signed_by_growing_path() -> None:
     fixes = run(np.array([900.0, 850.0]), np.zeros(2)).with_columns(vel_e_mps=pl.lit(-50.0), vel_n_mps=pl.lit(3.0))
-    assert np.allclose(matched(fixes, site(EAST)).epochs["velocity_along_mps"], 50.0, atol=1e-2)
+    assert np.allclose(matched(fixes, site(EAST)).epochs.table["velocity_along_mps"], 50.0, atol=1e-2)
 
 
 def curved() -> TravelledPath:
@@ -340,6 +340,6 @@ def test_the_lever_arm_stays_where_it_is_on_a_train_that_begins_by_reversing() -
     fixes, place = run(x, np.zeros(x.size)), site(EAST)
     backward = matched(fixes, place, distance=odometer(300.0 - x), vehicle=vehicle)
     forward = matched(fixes, place, distance=odometer(x - 300.0), vehicle=vehicle)
-    assert np.allclose(backward.epochs["path_m"], x + 30.0, atol=2e-3)
-    assert np.allclose(forward.epochs["path_m"], x - 30.0, atol=2e-3)
+    assert np.allclose(backward.epochs.table["path_m"], x + 30.0, atol=2e-3)
+    assert np.allclose(forward.epochs.table["path_m"], x - 30.0, atol=2e-3)
     assert (backward.odometer_sign, forward.odometer_sign) == (-1, 1)

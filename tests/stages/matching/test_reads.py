@@ -55,7 +55,7 @@ def ridden(piece_m: float, name: str | None, read_s: float) -> Match:
 @pytest.mark.parametrize("read_s", [60.05, 60.35, 60.95])
 def test_a_true_read_leaves_its_track_alone(piece_m: float, read_s: float) -> None:
     """Between two positions the train runs over several pieces: the read belongs to none of those at the position."""
-    epochs = ridden(piece_m, passed_at(piece_m, read_s), read_s).epochs
+    epochs = ridden(piece_m, passed_at(piece_m, read_s), read_s).epochs.table
     gate = floats(epochs, "gate_probability")
     # Known with the position after it, and three seconds for that.
     after = np.arange(SECONDS) >= np.ceil(read_s) + 4
@@ -67,13 +67,13 @@ def test_a_true_read_leaves_its_track_alone(piece_m: float, read_s: float) -> No
 
 def test_a_read_excludes_the_track_that_the_train_cannot_have_come_from() -> None:
     """A balise of B at its place; one of A 150 m before the train comes to it."""
-    beside = ridden(12.0, "B", (1810.0 - BEGIN_M) / SPEED_MPS).epochs
+    beside = ridden(12.0, "B", (1810.0 - BEGIN_M) / SPEED_MPS).epochs.table
     assert beside["netelement_id"][-1] == "B"
     assert floats(beside, "gate_probability")[-1] >= 0.99
-    gate = floats(ridden(12.0, passed_at(12.0, 69.0), 64.0).epochs, "gate_probability")
+    gate = floats(ridden(12.0, passed_at(12.0, 69.0), 64.0).epochs.table, "gate_probability")
     assert not np.isnan(gate[:64]).any()
     assert np.isnan(gate[69:]).all()
 
 
 def test_without_a_read_nothing_tells_the_two_apart() -> None:
-    assert (floats(ridden(12.0, None, 0.0).epochs, "gate_probability") < 0.99).all()
+    assert (floats(ridden(12.0, None, 0.0).epochs.table, "gate_probability") < 0.99).all()

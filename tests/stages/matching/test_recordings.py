@@ -62,7 +62,7 @@ def test_where_positions_lie_nearer_the_track_beside_that_is_shown_and_nothing_c
     found, known = matched(31241, network), reviewed(31241)
     shown = found.path.elements()
     assert (shown[:8], shown[-3:]) == (known[:8], known[-3:])
-    beside = found.epochs.filter(~pl.col("netelement_id").is_in(known))
+    beside = found.epochs.table.filter(~pl.col("netelement_id").is_in(known))
     assert beside.select(pl.max_horizontal("gate_probability", "path_probability").max()).item() < 0.99
     tunnel = beside.filter(pl.col("netelement_id") == "88_L_13697")
     assert tunnel["cross_track_m"].abs().median() < 3.0
@@ -71,7 +71,7 @@ def test_where_positions_lie_nearer_the_track_beside_that_is_shown_and_nothing_c
 @pytest.mark.parametrize("number", [28573, 28876, 29304, 31241])
 def test_nothing_is_claimed_off_the_reviewed_path_and_nothing_near_it_is_lost(number: int, network: Site) -> None:
     known = reviewed(number)
-    epochs = matched(number, network).epochs
+    epochs = matched(number, network).epochs.table
     sure = epochs.filter((pl.col("path_probability") >= 0.99) | (pl.col("gate_probability") >= 0.99))
     assert sure.height > 0.6 * epochs["on_track"].sum()
     assert set(sure["netelement_id"]) <= set(known)
@@ -84,9 +84,9 @@ def test_nothing_is_claimed_off_the_reviewed_path_and_nothing_near_it_is_lost(nu
 def test_positions_off_every_track_are_said_to_be_and_the_way_meanwhile_is_in_doubt(network: Site) -> None:
     """Fixes flagged as fixed ambiguities, and yet more than 50 m from any track; the train went on meanwhile."""
     found = matched(28573, network)
-    flagged = found.epochs.with_columns(recording(28573)["fix"]).filter(pl.col("fix") == "rtk_fixed")
+    flagged = found.epochs.table.with_columns(recording(28573)["fix"]).filter(pl.col("fix") == "rtk_fixed")
     assert flagged.filter(~pl.col("on_track")).height >= 200
-    assert found.epochs.filter(pl.col("on_track") & (pl.col("cross_track_m").abs() > 20.0)).is_empty()
+    assert found.epochs.table.filter(pl.col("on_track") & (pl.col("cross_track_m").abs() > 20.0)).is_empty()
     assert found.ambiguous.select(least_belief().min()).item() < 0.5
 
 
@@ -99,9 +99,13 @@ def test_where_the_exact_path_is_unknown_the_doubt_is_listed(network: Site) -> N
 def test_the_constant_offset_of_map_or_antenna_is_told(network: Site) -> None:
     """Element by element -1.0 to -3.0 m, -1.9 m over the run: no fault of the GNSS."""
     found = matched(28876, network)
-    epochs = found.epochs["cross_track_m"]
+    epochs = found.epochs.table["cross_track_m"]
     assert epochs.median() == pytest.approx(-1.9, abs=0.3)
-    used = found.epochs.filter("fix_valid", "on_track").group_by("netelement_id").agg(pl.col("cross_track_m").median())
+    used = (
+        found.epochs.table.filter("fix_valid", "on_track")
+        .group_by("netelement_id")
+        .agg(pl.col("cross_track_m").median())
+    )
     assert used["cross_track_m"].min() > -3.2
     assert used["cross_track_m"].max() < -0.8
-    assert found.epochs["sigma_source"].cast(str).unique().to_list() == ["table"]
+    assert found.epochs.table["sigma_source"].cast(str).unique().to_list() == ["table"]

@@ -7,7 +7,8 @@ import polars as pl
 import pytest
 
 from pipeline.stages.matching import match
-from pipeline.stages.matching.fixes import digit_noise, step_m
+from pipeline.stages.matching.epochs import Shape, Written
+from pipeline.stages.matching.fixes import digit_steps, step_m
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 from tests.stages.matching.builders import line, run, site
@@ -53,7 +54,7 @@ def test_the_finest_step_that_counts_is_a_setting():
     x_m = np.cumsum(2.0 + np.sin(np.arange(400) / 9.0))
     fixes = run(x_m, np.zeros(400)).with_columns(pl.col("longitude_deg").round(7))
     sigmas_m = [
-        match(fixes, None, STRAIGHT, Vehicle(), MatchingConfig(), FixSigma(digits_least_m=least_m)).epochs[
+        match(fixes, None, STRAIGHT, Vehicle(), MatchingConfig(), FixSigma(digits_least_m=least_m)).epochs.table[
             "digits_along_m"
         ][-1]
         for least_m in (0.02, 0.001)
@@ -62,20 +63,25 @@ def test_the_finest_step_that_counts_is_a_setting():
     assert 0.001 < sigmas_m[1] < 0.011 / np.sqrt(12.0)
 
 
+def turned_m(fixes, heading_deg):
+    shape = Shape(heading_deg, *(np.zeros(heading_deg.size) for _ in range(4)))
+    return Written("primary", *digit_steps(fixes, LEAST_M)).turned_m(shape)
+
+
 def test_noise_is_turned_into_the_track():
     values = latitudes()
     fixes = pl.DataFrame(
         {"latitude_deg": np.round(values, 5), "longitude_deg": values - 46.0, "height_m": values // 0.5}
     )
     heading = np.where(np.arange(values.size) < 10, 0.0, np.where(np.arange(values.size) < 20, 90.0, 60.0))
-    along, cross, up = (column.to_numpy() for column in digit_noise(fixes, heading, LEAST_M))
+    along, cross, up = turned_m(fixes, heading)
     north = 1e-5 * _PER_DEG_M / np.sqrt(12.0)
     for row, (a, c) in {0: (1.0, 0.0), 15: (0.0, 1.0), 30: (0.5, np.sqrt(0.75))}.items():
         assert along[row] == pytest.approx(a * north, rel=1e-3, abs=1e-12)
         assert cross[row] == pytest.approx(c * north, rel=1e-3, abs=1e-12)
     assert (up == 0.0).all()
     metres = fixes.with_columns(height_m=pl.Series(np.round(100.0 + 5.0 * np.sin(np.arange(values.size) / 20.0))))
-    up = digit_noise(metres, heading, LEAST_M)[2].to_numpy()
+    up = turned_m(metres, heading)[2]
     assert up == pytest.approx(np.full(values.size, 1.0 / np.sqrt(12.0)))
 
 

@@ -59,10 +59,10 @@ def test_a_place_near_two_of_its_own_is_the_one_that_the_train_came_to(
     fixes = run(x + lasting, y - lasting[::-1], RATE_HZ, sigma_m=1.5)
     reads = fixes[[20, -20]].select("t", balise_id=pl.Series(["first", "last"]))
     found = matched(fixes, place_of(points), odometer(at, RATE_HZ) if with_odometer else None, reads=reads)
-    assert np.abs(found.epochs["path_m"].to_numpy() - at).max() < 8.0
-    assert np.allclose(found.epochs["measure_m"], found.epochs["path_m"], atol=1e-6)
+    assert np.abs(found.epochs.table["path_m"].to_numpy() - at).max() < 8.0
+    assert np.allclose(found.epochs.table["measure_m"], found.epochs.table["path_m"], atol=1e-6)
     assert found.path.elements() == ["r"]
-    assert (found.epochs["path_probability"] >= 0.99).sum() > 0.95 * len(at)
+    assert (found.epochs.table["path_probability"] >= 0.99).sum() > 0.95 * len(at)
     assert found.path.balises(place_of(points).balises)["path_m"].to_list() == pytest.approx(
         [60.0, len(points) - 61.0], abs=0.01
     )
@@ -75,7 +75,7 @@ def test_a_jump_along_the_way_stays_a_jump() -> None:
     shown = at + np.where((np.arange(len(at)) >= 20) & (np.arange(len(at)) < 40), 150.0, 0.0)
     x, y = points[shown.astype(int)].T
     found = matched(run(x, y, RATE_HZ), place_of(points), odometer(at, RATE_HZ))
-    assert np.abs(found.epochs["path_m"].to_numpy() - shown).max() < 1.0
+    assert np.abs(found.epochs.table["path_m"].to_numpy() - shown).max() < 1.0
 
 
 @pytest.mark.parametrize("back_m", [2560.0, 2600.0, 2640.0])
@@ -89,7 +89,7 @@ def test_soon_after_a_jump_the_passage_is_told_by_the_steps_on_both_sides(back_m
     shown = at - 60.0 * ((at >= back_m - 200.0) & (at < back_m))
     x, y = points[shown.astype(int)].T
     fixes = run(x + lasting, y - lasting[::-1], RATE_HZ, sigma_m=0.7)
-    epochs = matched(fixes, site({"r": points}), odometer(at, RATE_HZ)).epochs
+    epochs = matched(fixes, site({"r": points}), odometer(at, RATE_HZ)).epochs.table
     assert np.abs(epochs["path_m"].to_numpy() - shown).max() < 8.0
 
 
@@ -103,5 +103,5 @@ def test_a_jump_over_a_crossing_stays_on_the_passage_that_is_nearer(seed: int) -
     shown = at + 250.0 * ((at >= 2400.0) & (at < 2600.0))
     x, y = points[shown.astype(int)].T
     fixes = run(x + lasting, y - lasting[::-1], 10.0, sigma_m=0.7)
-    epochs = matched(fixes, site({"r": points}), odometer(at, 10.0)).epochs
+    epochs = matched(fixes, site({"r": points}), odometer(at, 10.0)).epochs.table
     assert np.abs(epochs["path_m"].to_numpy() - shown).max() < 8.0

@@ -61,7 +61,7 @@ def replayed(world: Drawn) -> Match:
 
 def claimed(world: Drawn) -> list[str | None]:
     """Per epoch the track that is claimed, none where none is, "off" off the network."""
-    epochs = replayed(world).epochs
+    epochs = replayed(world).epochs.table
     gate, names = floats(epochs, "gate_probability"), epochs["netelement_id"].to_list()
     return [
         "off" if np.isnan(one) else world.first(name) if one >= 0.99 else None
@@ -151,10 +151,10 @@ def test_claims_and_sets_are_those_of_the_network_whatever_it_is_called(
 def test_nothing_live_changes_before_a_cut(seed: int) -> None:
     """Neither claims nor any confidence below them."""
     world = drawn(seed)
-    whole = floats(replayed(world).epochs, "gate_probability")
+    whole = floats(replayed(world).epochs.table, "gate_probability")
     for count in (25, 60, 100, 140):
         part = replace(world, x_m=world.x_m[:count], y_m=world.y_m[:count], way_m=world.way_m[:count])
-        assert np.array_equal(floats(replayed(part).epochs, "gate_probability"), whole[:count], equal_nan=True)
+        assert np.array_equal(floats(replayed(part).epochs.table, "gate_probability"), whole[:count], equal_nan=True)
 
 
 def test_some_of_these_runs_claim_and_some_doubt() -> None:

@@ -24,7 +24,7 @@ def runs(shift_b_m: float, count: int = 12, sigma_m: float = 0.5) -> list[pl.Dat
         x = np.arange(50.0, 1950.0, 10.0)[:: 1 if seed % 2 else -1]
         y = np.where(x > 1000, shift_b_m, 0.0) + gauss_markov(rng, len(x), 1.0, sigma_m, 100.0)
         distance = np.abs(x - x[0])
-        frames.append(matched(run(x, y, sigma_m=sigma_m), site(CHAIN, LINKS), odometer(distance)).epochs)
+        frames.append(matched(run(x, y, sigma_m=sigma_m), site(CHAIN, LINKS), odometer(distance)).epochs.table)
     return frames
 
 
@@ -61,7 +61,7 @@ def test_heights_are_judged_where_there_are_any() -> None:
     x = np.arange(50.0, 1950.0, 10.0)
     fixes = run(x, np.zeros(len(x))).with_columns(height_m=pl.Series(np.where(x < 1000, 112.0, 100.0)))
     place = site(CHAIN, LINKS, heights_m=heights)
-    table = survey_findings([matched(fixes, place).epochs], place.track)
+    table = survey_findings([matched(fixes, place).epochs.table], place.track)
     worst = table.row(0, named=True)
     assert (worst["netelement_id"], worst["axis"]) == ("a", "vertical")
     assert worst["residual_m"] == pytest.approx(12.0, abs=0.01)

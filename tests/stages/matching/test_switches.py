@@ -38,7 +38,7 @@ def claimed_at_m(way_m: Floats, place: Site) -> Floats:
     """Of exact positions along stem and branch, the ways behind the switch [m] at which the branch is claimed."""
     x_m = np.where(way_m < 0.0, way_m, way_m * np.cos(ANGLE))
     y_m = np.where(way_m < 0.0, 0.0, way_m * np.sin(ANGLE))
-    epochs = matched(run(x_m, y_m, sigma_m=0.02), place, odometer(np.abs(way_m - way_m[0]))).epochs
+    epochs = matched(run(x_m, y_m, sigma_m=0.02), place, odometer(np.abs(way_m - way_m[0]))).epochs.table
     on_branch = np.array([name is not None and name[0] == "d" for name in epochs["netelement_id"].to_list()])
     return way_m[on_branch & (np.nan_to_num(floats(epochs, "gate_probability")) >= 0.99)]
 

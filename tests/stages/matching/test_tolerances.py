@@ -52,8 +52,8 @@ def test_an_element_shorter_than_positions_scatter_is_the_same_way() -> None:
     found = match(
         run(np.arange(100.0, 900.0, 10.0), np.zeros(80)), None, place, Vehicle(), MatchingConfig(), FixSigma()
     )
-    assert found.epochs["path_probability"].min() >= 0.99
-    assert found.epochs["gate_probability"].min() >= 0.99
+    assert found.epochs.table["path_probability"].min() >= 0.99
+    assert found.epochs.table["gate_probability"].min() >= 0.99
 
 
 def test_balises_beyond_an_end_by_what_lists_round_lie_where_their_measure_says() -> None:

@@ -50,8 +50,8 @@ def test_a_station_with_eight_tracks(number: int) -> None:
     names = found.path.elements()
     assert (names[0], names[-1], len(names)) == ("in", "out", 3)
     if names[1] != f"t{number}":
-        assert found.epochs.filter(pl.col("netelement_id") == names[1])["path_probability"].max() < 0.9
-    assert found.epochs.filter(pl.col("netelement_id").is_in(["in", "out"]))["path_probability"].min() >= 0.99
+        assert found.epochs.table.filter(pl.col("netelement_id") == names[1])["path_probability"].max() < 0.9
+    assert found.epochs.table.filter(pl.col("netelement_id").is_in(["in", "out"]))["path_probability"].min() >= 0.99
 
 
 def test_the_bias_of_the_line_before_tells_the_track_in_the_station() -> None:
@@ -60,7 +60,7 @@ def test_the_bias_of_the_line_before_tells_the_track_in_the_station() -> None:
     place = site(tracks, [("in", 1, "t", 0, "both"), ("in", 1, "u", 0, "both")])
     at = np.arange(0.0, 3990.0, 20.0)
     found = matched(run(at, np.full(len(at), 1.8), 1.0, sigma_m=0.5), place, odometer(at))
-    assert found.epochs.filter(pl.col("netelement_id") == "t")["path_probability"].tail(20).min() >= 0.99
+    assert found.epochs.table.filter(pl.col("netelement_id") == "t")["path_probability"].tail(20).min() >= 0.99
 
 
 def test_a_single_line_with_a_passing_loop() -> None:
@@ -103,7 +103,7 @@ def test_tracks_that_cross_are_not_changed(angle_deg: float, heights: bool) -> N
         points = np.concatenate([elements[names[0]], elements[names[1]][1:]])
         found = matched(ride(points, at, 5), place, odometer(at, RATE_HZ))
         assert found.path.elements() == names
-        assert found.epochs["path_probability"].min() >= 0.99
+        assert found.epochs.table["path_probability"].min() >= 0.99
 
 
 def arc(centre: tuple[float, float], radius_m: float, begin_deg: float, end_deg: float) -> Floats:
@@ -130,7 +130,7 @@ def test_a_balloon_loop_brings_the_train_back_turned_round(seed: int) -> None:
     at = np.arange(50.0, length - 50.0, 10.0)
     found = matched(ride(points, at, seed), place, odometer(at, RATE_HZ))
     assert found.path.elements() in (["s", "r", "q", "s"], ["s", "q", "r", "s"])
-    moved = found.epochs["path_m"].to_numpy() - found.epochs["path_m"][0]
+    moved = found.epochs.table["path_m"].to_numpy() - found.epochs.table["path_m"][0]
     assert np.abs(moved - (at - at[0])).max() < 5.0
 
 
@@ -152,7 +152,7 @@ def test_heights_show_tracks_over_each_other_and_claim_none(height_m: float) -> 
         heights_m={"low": np.full(201, 300.0), "high": np.full(201, 308.0)},
     )
     x = np.arange(20.0, 1980.0, 20.0)
-    found = matched(run(x, 0.0 * x, height_m=np.full(len(x), height_m + 1.0)), place).epochs
+    found = matched(run(x, 0.0 * x, height_m=np.full(len(x), height_m + 1.0)), place).epochs.table
     assert found["netelement_id"].unique().to_list() == ["low" if height_m == 300.0 else "high"]
     assert found["path_probability"].max() < 0.99
 
@@ -166,7 +166,7 @@ def test_a_shuttle_turns_four_times_on_one_leg() -> None:
     found = matched(ride(line((0, 0), (1800, 0)), at, 7), site(elements, links), odometer(at, RATE_HZ))
     assert found.path.elements() == list("abc")
     assert len(found.path.legs) == 1
-    assert np.abs(found.epochs["path_m"].to_numpy() - at).max() < 5.0
+    assert np.abs(found.epochs.table["path_m"].to_numpy() - at).max() < 5.0
 
 
 def test_what_ended_a_doubt_is_named() -> None:
@@ -182,5 +182,5 @@ def test_what_ended_a_doubt_is_named() -> None:
     reads = pl.DataFrame({"t": times(200, 1.0)[100:101], "balise_id": ["r"]})
     found = matched(fixes, Site(place.track, place.links, balises=balises), reads=reads)
     assert found.ambiguous["resolved_by"].to_list() == ["read"]
-    assert found.epochs["path_probability"].min() >= 0.99
-    assert found.epochs["gate_probability"][:99].max() < 0.9
+    assert found.epochs.table["path_probability"].min() >= 0.99
+    assert found.epochs.table["gate_probability"][:99].max() < 0.9

@@ -67,7 +67,7 @@ def test_the_route_is_doubtful_wherever_the_live_belief_was() -> None:
     assert route.select("netelement_id", "direction", "doubtful").rows() == [("s", "AB", False), ("d", "AB", True)]
     assert route["path_probability"].min() >= 0.99
     assert route["gate_probability"].to_list() == [
-        found.epochs.filter(netelement_id=name)["gate_probability"].min() for name in ("s", "d")
+        found.epochs.table.filter(netelement_id=name)["gate_probability"].min() for name in ("s", "d")
     ]
 
 
@@ -127,7 +127,7 @@ def test_a_run_that_turned_back_over_a_switch_takes_its_own_route_again(tmp_path
     again = matched(fixes, known, odometer(distance - distance[0]))
     assert again.path.elements() == first.path.elements()
     assert again.ambiguous.height <= first.ambiguous.height
-    assert set(again.epochs["netelement_id"]) <= {"s", "m", "d"}
+    assert set(again.epochs.table["netelement_id"]) <= {"s", "m", "d"}
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ def turnout(aside_m: float) -> Site:
 
 def claims(y_m: Floats, place: Site) -> tuple[list[str | None], list[bool]]:
     """Per second the track that is claimed, and whether the set is empty, of positions exact but for `y_m`."""
-    epochs = matched(run(X_M, y_m, sigma_m=0.1), place, odometer(X_M - X_M[0])).epochs
+    epochs = matched(run(X_M, y_m, sigma_m=0.1), place, odometer(X_M - X_M[0])).epochs.table
     gate, names = floats(epochs, "gate_probability"), epochs["netelement_id"].to_list()
     claimed = [name if one >= 0.99 else None for one, name in zip(np.nan_to_num(gate), names, strict=True)]
     return claimed, np.isnan(gate).tolist()

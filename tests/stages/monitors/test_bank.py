@@ -9,12 +9,14 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.epochs.verdicts import DISABLED, NO_ODOMETER, NO_POSITION, NO_VALUE, verdicts
+from pipeline.stages.epochs.verdicts import DISABLED, NO_ODOMETER, NO_POSITION, NO_VALUE, first_reason, verdicts
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.monitors.series import FIRST_EPOCH, NO_HEIGHT, OFF_TRACK
 from pipeline.stages.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor, paired
 from schemas.config import Configuration, Vehicle, threshold_factor
+from schemas.stages import AlignedEpochs
 from schemas.tables import BANK_MONITORS
+from tests.frames import bank_over, verdict_table
 from tests.stages.alignment.straight import NO_NOISE, Straight, align_run, epochs_of, odometer_of, run
 
 CONFIG = Configuration.model_validate({"monitors": NO_NOISE})
@@ -23,7 +25,7 @@ KNOWN = Vehicle(odometer_scale=1.0, gnss_latency_s=0.0)
 
 
 def bank_of(epochs, odometer=None, config=CONFIG, vehicle=KNOWN):
-    return MonitorBank(align_run(epochs, odometer, vehicle, config), {}, config)
+    return bank_over(align_run(epochs, odometer, vehicle, config), {}, config)
 
 
 def table(bank):
@@ -172,7 +174,7 @@ def test_a_switched_off_monitor_says_so_and_raises_no_alarm():
     path = epochs["path_m"].to_numpy().copy()
     path[2:] += 4.0
     aligned = align_run(epochs.with_columns(path_m=pl.Series(path)), odometer, KNOWN, config)
-    bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, config)}, config)
+    bank = bank_over(aligned, {"along_doppler": doppler_monitor(AlignedEpochs.of_table(aligned), config)}, config)
     result = table(bank)
     assert result["along_raw_reason"].unique().to_list() == [DISABLED]
     assert result["along_doppler_reason"].unique().to_list() == [DISABLED]
@@ -190,21 +192,20 @@ def test_doppler_sides_with_gnss_when_the_wheels_slip():
     slip = 5.0 * np.clip(odometer_t - 10.0, 0.0, 1.0)
     epochs = epochs_of(t, 20.0 * t, velocity_along_mps=np.full(t.size, 20.0))
     aligned = align_run(epochs, odometer_of(odometer_t, 20.0 * odometer_t + slip), KNOWN, CONFIG)
-    result = doppler_monitor(aligned, CONFIG)
+    result = verdict_table(doppler_monitor(AlignedEpochs.of_table(aligned), CONFIG))
     fails = [t[k] for k in range(t.size) if result["state"][k] == "fail"]
     assert 10.0 < fails[0] < 10.5
     assert fails[-1] < 12.1
     assert result["value"][120] == pytest.approx(-1.0, abs=4.1)
-    without = doppler_monitor(
-        align_run(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG), CONFIG
-    )
+    without = align_run(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG)
+    without = verdict_table(doppler_monitor(AlignedEpochs.of_table(without), CONFIG))
     assert without["reason"].unique().to_list() == [NO_VELOCITY]
 
 
 def test_channels_are_compared_where_both_have_a_position():
     one = epochs_of([0.0, 1.0, 2.0], [0.0, 20.0, 40.0])
     other = epochs_of([0.0, 1.0, 2.0], [0.0, 30.0, 41.0], fix_valid=[True, True, False])
-    result = channel_monitor(one, other, CONFIG)
+    result = verdict_table(channel_monitor(one, other, CONFIG))
     assert result["state"].to_list() == ["pass", "fail", "not_evaluated"]
     assert result["value"].to_list() == [0.0, -10.0, None]
     assert result["threshold"][0] == pytest.approx(FACTOR * np.sqrt(2.0))
@@ -222,13 +223,14 @@ def test_a_channel_is_compared_with_this_solution_at_its_own_time():
 
 def test_a_single_monitor_without_value_or_threshold_is_no_pass():
     nothing = np.nan
-    frame = verdicts(
+    found = verdicts(
         np.array([1.0, 3.0, nothing, 1.0, 1.0]),
         np.array([2.0, 2.0, 2.0, nothing, 2.0]),
-        pl.Series([None, None, None, None, "why"], dtype=pl.String),
+        first_reason((np.arange(5) == 4, NO_POSITION)),
     )
+    frame = verdict_table(found)
     assert frame["state"].to_list() == ["pass", "fail", "not_evaluated", "not_evaluated", "not_evaluated"]
-    assert frame["reason"].to_list() == [None, None, NO_VALUE, NO_VALUE, "why"]
+    assert frame["reason"].to_list() == [None, None, NO_VALUE, NO_VALUE, NO_POSITION]
 
 
 def test_an_axis_without_any_epoch_hides_no_fail_of_the_others():

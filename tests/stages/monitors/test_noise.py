@@ -11,11 +11,12 @@ import pytest
 
 from benchmarks.truth.noise import Receiver, epochs_of, first_alarm
 from pipeline.stages.monitors.axis import AxisSeries, Source, errors_of
-from pipeline.stages.monitors.bank import NOISE_TOO_LARGE, NOISE_UNKNOWN, MonitorBank
+from pipeline.stages.monitors.bank import NOISE_TOO_LARGE, NOISE_UNKNOWN
 from pipeline.stages.monitors.noise import NoiseMeter
 from schemas.arrays import Floats
 from schemas.config import Configuration
 from schemas.enums import MonitorState
+from tests.frames import bank_over
 
 CONFIG = Configuration()
 
@@ -109,13 +110,13 @@ def test_white_noise_is_taken_for_half_as_much_again() -> None:
 
 def test_what_the_model_knows_is_not_counted_twice() -> None:
     smooth = epochs_of(Receiver(), 1.0, np.random.default_rng(3))
-    bank = MonitorBank(smooth, {}, CONFIG)
+    bank = bank_over(smooth, {}, CONFIG)
     thresholds = pl.DataFrame(bank.columns())["along_raw_threshold"].drop_nulls()
     assert thresholds.max() < 1.3 * thresholds.min()
 
 
 def test_unknown_for_thirty_seconds_and_said_so() -> None:
-    bank = MonitorBank(epochs_of(Receiver(), 0.1, np.random.default_rng(1)), {}, CONFIG)
+    bank = bank_over(epochs_of(Receiver(), 0.1, np.random.default_rng(1)), {}, CONFIG)
     known = [bank.noise_known_at(epoch) for epoch in range(360)]
     assert known == [False] * 30 + [True] * 330
     reasons = pl.DataFrame(bank.columns())["along_raw_reason"]
@@ -123,7 +124,7 @@ def test_unknown_for_thirty_seconds_and_said_so() -> None:
 
 
 def test_no_verdict_where_noise_hides_a_failure() -> None:
-    bank = MonitorBank(epochs_of(Receiver(white_m=3.0), 0.1, np.random.default_rng(1)), {}, CONFIG)
+    bank = bank_over(epochs_of(Receiver(white_m=3.0), 0.1, np.random.default_rng(1)), {}, CONFIG)
     assert pl.DataFrame(bank.columns())["along_raw_reason"][40:].unique().to_list() == [NOISE_TOO_LARGE]
     assert not bank.noise_known_at(200)
 
@@ -131,9 +132,9 @@ def test_no_verdict_where_noise_hides_a_failure() -> None:
 def test_given_noise_holds_from_the_first_epoch_and_replaces_what_is_measured() -> None:
     given = Configuration.model_validate({"monitors": {"noise_along_m": (0.1, 0.0, 0.0, 0.0)}})
     quiet = epochs_of(Receiver(), 0.1, np.random.default_rng(1))
-    thresholds = pl.DataFrame(MonitorBank(quiet, {}, given).columns())["along_raw_threshold"]
+    thresholds = pl.DataFrame(bank_over(quiet, {}, given).columns())["along_raw_threshold"]
     none = Configuration.model_validate({"monitors": {"noise_along_m": (0.0, 0.0, 0.0, 0.0)}})
-    without = pl.DataFrame(MonitorBank(quiet, {}, none).columns())["along_raw_threshold"]
+    without = pl.DataFrame(bank_over(quiet, {}, none).columns())["along_raw_threshold"]
     factor = CONFIG.monitors.threshold_factor
     more = (thresholds[1:] / factor) ** 2 - (without[1:] / factor) ** 2
     np.testing.assert_allclose(more, 2.0 * 0.1**2, rtol=1e-9)
@@ -166,7 +167,7 @@ def test_what_is_under_alarm_never_enters_also_not_later() -> None:
 def test_a_bank_frozen_late_is_one_that_was_frozen_at_once() -> None:
     """The bank looks ahead; what it said of epochs behind the alarm is made anew, what it said before stays."""
     epochs = epochs_of(Receiver(white_m=0.1), 0.4, np.random.default_rng(4))
-    ahead, stepwise = MonitorBank(epochs, {}, CONFIG), MonitorBank(epochs, {}, CONFIG)
+    ahead, stepwise = bank_over(epochs, {}, CONFIG), bank_over(epochs, {}, CONFIG)
     ahead.failed(epochs.height - 1)
     for bank in (ahead, stepwise):
         bank.failed(600)
@@ -178,7 +179,7 @@ def test_a_bank_frozen_late_is_one_that_was_frozen_at_once() -> None:
 
 
 def test_an_alarm_before_the_noise_is_known_freezes_nothing() -> None:
-    bank = MonitorBank(epochs_of(Receiver(white_m=0.1), 0.1, np.random.default_rng(4)), {}, CONFIG)
+    bank = bank_over(epochs_of(Receiver(white_m=0.1), 0.1, np.random.default_rng(4)), {}, CONFIG)
     bank.failed(5)
     bank.freeze(5)
     assert bank.noise_known_at(30)
@@ -226,15 +227,13 @@ def test_a_drift_is_found_before_it_is_a_failure(rate_mps: float, latest_s: floa
 def test_a_step_is_found_within_one_epoch() -> None:
     fault_m = np.where(np.arange(0.0, 1_000.0, 0.1) >= 800.0, 20.0, 0.0)
     for receiver in (Receiver(white_m=0.3), Receiver(rate_hz=10.0, white_m=0.3), Receiver(tau_s=20.0)):
-        columns = MonitorBank(
-            epochs_of(replace(receiver), 0.25, np.random.default_rng(6), fault_m), {}, CONFIG
-        ).columns()
+        columns = bank_over(epochs_of(replace(receiver), 0.25, np.random.default_rng(6), fault_m), {}, CONFIG).columns()
         raw = next(column for column in columns if column.name == "along_raw_state")
         assert raw.to_list()[round(800.0 * receiver.rate_hz)] == MonitorState.FAIL.value
 
 
 def test_white_noise_of_the_run() -> None:
-    bank = MonitorBank(epochs_of(Receiver(white_m=0.2), 0.5, np.random.default_rng(8)), {}, CONFIG)
+    bank = bank_over(epochs_of(Receiver(white_m=0.2), 0.5, np.random.default_rng(8)), {}, CONFIG)
     bank.columns()
     found = bank.white_noise()
     assert found["white_noise_along_m"] == pytest.approx(0.2, rel=0.25)

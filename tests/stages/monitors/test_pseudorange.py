@@ -11,10 +11,16 @@ from pipeline.stages.epochs.verdicts import NO_POSITION
 from pipeline.stages.monitors.pseudorange import AMBIGUOUS, NO_RANGES, NO_RANGES_AT_EPOCH, TOO_FEW, pseudorange_monitor
 from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows, range_variances_m2
 from schemas.config import Configuration, MonitorConfig
+from schemas.stages import MatchedEpochs
+from tests.frames import verdict_table
 
 T0 = datetime(2024, 3, 20, 6, 27, tzinfo=UTC)
 HEADING_DEG, SLOPE, SURVEY_M = 35.0, 0.02, 0.7
 SKY = visible(GPS + GALILEO, np.array([int(T0.timestamp()) * 1_000_000_000]), 50.85, 4.35)
+
+
+def monitored(epochs, satellites, config):
+    return verdict_table(pseudorange_monitor(MatchedEpochs.of_table(epochs), satellites, config))
 
 
 def epochs_of(count: int, **columns: object) -> pl.DataFrame:
@@ -86,7 +92,7 @@ def test_value_is_the_generalised_least_squares_sum() -> None:
     rng = np.random.default_rng(3)
     epochs = epochs_of(1, cross_track_m=[0.8], vertical_m=[-1.3])
     residual = rng.normal(0.0, 2.0, SKY.height)
-    result = pseudorange_monitor(epochs, satellites_of(epochs, residual[None]), Configuration())
+    result = monitored(epochs, satellites_of(epochs, residual[None]), Configuration())
     rows = line_of_sight_rows(SKY["azimuth_deg"].to_numpy(), SKY["elevation_deg"].to_numpy())
     heading, rise = np.radians(HEADING_DEG), np.arctan(SLOPE)
     along = np.array([np.cos(rise) * np.sin(heading), np.cos(rise) * np.cos(heading), np.sin(rise)])
@@ -117,7 +123,7 @@ def test_healthy_ranges_are_chi_square_distributed(heights: bool, systems: str) 
     epochs = epochs_of(count, cross_track_m=cross, vertical_m=up if heights else [None] * count)
     epochs = epochs.with_columns(pl.col("vertical_m").cast(pl.Float64))
     config = Configuration(monitors=MonitorConfig(false_alarm_probability=1e-2))
-    result = pseudorange_monitor(epochs, satellites_of(epochs, residual, sky), config)
+    result = monitored(epochs, satellites_of(epochs, residual, sky), config)
     freedom = sky.height - 1 - len(systems) - (not heights)
     assert result["value"].mean() == pytest.approx(freedom, rel=0.02)
     alarms = int((result["state"] == "fail").sum())
@@ -134,7 +140,7 @@ def test_a_range_ramp_is_found_before_its_position_failure() -> None:
     errors[:, SKY["sv"].to_list().index("G08")] += 0.01 * np.arange(count)
     residual, cross, up = published(errors, np.zeros((count, 2)))
     epochs = epochs_of(count, cross_track_m=cross, vertical_m=up)
-    result = pseudorange_monitor(epochs, satellites_of(epochs, residual), Configuration())
+    result = monitored(epochs, satellites_of(epochs, residual), Configuration())
     first = int(np.flatnonzero((result["state"] == "fail").to_numpy())[0])
     assert 300 < first < 1200
     assert (result["state"][-200:] == "fail").mean() > 0.8  # type: ignore[operator]
@@ -151,7 +157,7 @@ def test_each_gap_in_the_data_has_its_reason() -> None:
     fourth, fifth = epochs["t"][3], epochs["t"][4]
     few = ["G08", "G13"]
     satellites = satellites.filter((pl.col("t") != fourth) & ((pl.col("t") != fifth) | pl.col("sv").is_in(few)))
-    result = pseudorange_monitor(epochs, satellites, Configuration())
+    result = monitored(epochs, satellites, Configuration())
     assert result["state"].to_list() == ["pass"] + ["not_evaluated"] * 5
     assert result["reason"].to_list() == [None, NO_POSITION, AMBIGUOUS, NO_RANGES_AT_EPOCH, TOO_FEW, AMBIGUOUS]
     assert result["value"].null_count() == result["threshold"].null_count() == 5
@@ -160,7 +166,7 @@ def test_each_gap_in_the_data_has_its_reason() -> None:
 def test_no_stream_is_no_health() -> None:
     epochs = epochs_of(2)
     for stream in (None, satellites_of(epochs, np.zeros((2, SKY.height))).clear()):
-        result = pseudorange_monitor(epochs, stream, Configuration())
+        result = monitored(epochs, stream, Configuration())
         assert result["reason"].to_list() == [NO_RANGES] * 2
 
 
@@ -172,7 +178,7 @@ def test_satellites_that_were_not_used_or_have_no_residual_are_left_out() -> Non
         used=pl.Series([False] + [True] * (SKY.height - 1)),
         residual_m=pl.Series([500.0, None] + [0.0] * (SKY.height - 2)),
     )
-    result = pseudorange_monitor(epochs, satellites, Configuration())
+    result = monitored(epochs, satellites, Configuration())
     assert result["value"][0] == pytest.approx(0.0, abs=1e-9)
     assert result["threshold"][0] == pytest.approx(chi2_at(1e-7, SKY.height - 2 - 3), rel=1e-9)
 
@@ -184,8 +190,8 @@ def test_slower_residuals_and_unknown_sigmas() -> None:
     satellites = satellites_of(epochs, rng.normal(0, 1, (10, SKY.height)))
     slow = satellites.filter(pl.col("t").is_in(epochs["t"][::5].implode()))
     nameless = slow.with_columns(sigma_m=pl.lit(None, pl.Float64))
-    full = pseudorange_monitor(epochs, satellites, Configuration())
-    part = pseudorange_monitor(epochs, nameless, Configuration())
+    full = monitored(epochs, satellites, Configuration())
+    part = monitored(epochs, nameless, Configuration())
     assert part["state"].to_list() == (["pass"] + ["not_evaluated"] * 4) * 2
     assert part["value"][5] == pytest.approx(full["value"][5], rel=1e-12)
 
@@ -197,8 +203,8 @@ def test_stamps_may_differ_by_rounding_and_rows_come_in_any_order() -> None:
     shifted = satellites.with_columns(pl.col("t") + pl.duration(nanoseconds=400_000)).sample(
         fraction=1.0, shuffle=True, seed=1
     )
-    full = pseudorange_monitor(epochs, satellites, Configuration())
-    again = pseudorange_monitor(epochs, shifted, Configuration())
+    full = monitored(epochs, satellites, Configuration())
+    again = monitored(epochs, shifted, Configuration())
     assert again["value"].to_list() == pytest.approx(full["value"].to_list(), rel=1e-9)
 
 
@@ -207,7 +213,7 @@ def test_an_epoch_of_few_satellites_is_judged_by_these_alone() -> None:
     epochs, residuals = epochs_of(2), np.random.default_rng(4).normal(0.0, 2.0, (2, SKY.height))
     satellites = satellites_of(epochs, residuals)
     few = satellites.filter((pl.col("t") == epochs["t"][0]) | pl.col("sv").is_in(SKY["sv"].head(7).implode()))
-    together = pseudorange_monitor(epochs, few, Configuration())
-    alone = pseudorange_monitor(epochs.tail(1), few.filter(pl.col("t") == epochs["t"][1]), Configuration())
+    together = monitored(epochs, few, Configuration())
+    alone = monitored(epochs.tail(1), few.filter(pl.col("t") == epochs["t"][1]), Configuration())
     assert together["value"][1] == pytest.approx(alone["value"][0], rel=1e-9)
     assert together["value"][0] != pytest.approx(together["value"][1], rel=1e-3)

@@ -20,7 +20,8 @@ def gate(apart_m: float, aside_m: float, turned: bool = False) -> Floats:
     other = line((begin, apart_m), (end, apart_m))
     place = site({"A": line((0.0, 0.0), (3000.0, 0.0)), "B": other}, sigma_m=2.0)
     return floats(
-        matched(run(X_M, np.full(X_M.size, aside_m), sigma_m=0.3), place, odometer(X_M)).epochs, "gate_probability"
+        matched(run(X_M, np.full(X_M.size, aside_m), sigma_m=0.3), place, odometer(X_M)).epochs.table,
+        "gate_probability",
     )
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import polars as pl
 import pytest
 
 from pipeline.stages.run_row.lost_time import LostTime, lost_columns, lost_time
 from pipeline.stages.run_row.remedies import InUse, remedies, time_in_use
 from schemas.config import Configuration
 from schemas.enums import LostTo, Remedy
+from schemas.stages import EpochFigures
 from schemas.words import remedy_words
 from tests.tables import NS, alarms, epochs
 
@@ -19,8 +21,8 @@ NO_ALARMS = alarms()
 
 
 def lost(t_s: list[float] = TEN_S, found: Any = NO_ALARMS, **columns: Any) -> LostTime:
-    frame = epochs(t_s, **columns)
-    return lost_time(frame.with_columns(lost_columns(frame, CONFIG)), found, CONFIG)
+    judged = EpochFigures.of_table(epochs(t_s, **columns))
+    return lost_time(judged, lost_columns(judged, CONFIG), found, CONFIG)
 
 
 def test_each_epoch_counts_for_the_first_cause_that_applies() -> None:
@@ -207,8 +209,8 @@ def test_where_the_unknown_lies() -> None:
     word = {True: "right", False: "unknown"}
 
     def parts(known: list[bool], **columns: Any) -> InUse:
-        frame = epochs(TEN_S, judgement=[word[k] for k in known], **columns)
-        return time_in_use(frame.with_columns(lost_columns(frame, CONFIG)))
+        judged = EpochFigures.of_table(epochs(TEN_S, judgement=[word[k] for k in known], **columns))
+        return time_in_use(judged, float(lost_columns(judged, CONFIG).moving_s.sum()))
 
     ends = [False, False, True, True, True, True, True, True, True, False]
     middle = [True, True, True, False, True, True, True, True, True, True]
@@ -222,7 +224,7 @@ def test_the_epochs_say_what_each_was_lost_to() -> None:
     t_s = [0.0, 1.0, 2.0, 3.0, 4.0, 24.0, 25.0, 26.0]
     moving = [True, False, True, True, True, True, None, True]
     frame = epochs(t_s, moving=moving, tvb=[k != 3 for k in range(8)], confidence_m=[5.0, 5.0, 5.0, 50.0, *[5.0] * 4])
-    found = lost_columns(frame, CONFIG)
+    found = pl.DataFrame(lost_columns(EpochFigures.of_table(frame), CONFIG).columns())
     assert found["step_s"].to_list() == [1.0, 1.0, 1.0, 1.0, 20.0, 1.0, 1.0, 0.0]
     assert found["gap"].to_list() == [False, False, False, False, True, False, False, False]
     assert found["moving_s"].to_list() == [1.0, 0.0, 1.0, 1.0, 20.0, 1.0, 1.0, 0.0]

@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 
 from pipeline.stages.judge.judge import Judged
 from pipeline.stages.provenance import Provenance
+from pipeline.stages.run_row.lost_time import lost_columns
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import Evidence, Note, VehicleFigures
 from schemas.run import IngestNotes
+from schemas.stages import EpochFigures
 from schemas.tables import CONTRACT_VERSION, SCALES, Runs
 from schemas.words import Remark
 from tests.tables import NS, alarms, epochs, failures, hazards, passages
@@ -35,7 +37,10 @@ def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
     nothing = Judged(hazards(), alarms(), passages(), failures(), frame, pl.DataFrame(), None, Evidence.REFERENCE)
     given = {name: fields.pop(name) for name in vars(nothing) if name in fields}
     own = {name: fields.pop(name) for name in ("ingest", "notes") if name in fields}
-    return SolutionResults("primary", frame, replace(nothing, **given), COLUMNS | fields, **own)
+    judged = EpochFigures.of_table(frame)
+    return SolutionResults(
+        "primary", judged, lost_columns(judged, CONFIG), replace(nothing, **given), COLUMNS | fields, **own
+    )
 
 
 def row(frame: pl.DataFrame, config: Configuration = CONFIG, **fields: Any) -> dict[str, Any]:

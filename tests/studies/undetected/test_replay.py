@@ -19,7 +19,7 @@ from pipeline.stages.ride import Ride
 from pipeline.studies.undetected.columns import rows_of
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.position_tests import range_bounds
-from schemas.arrays import Floats, Ints, floats
+from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
 from tests.replay.journeys import VEHICLE, journey
@@ -156,7 +156,7 @@ def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[
     ride = ride_alone(run, site, VEHICLE, Configuration(), "gps")
     satellites = ride.prepared.ranges("gps")
     assert satellites is not None
-    low_m, high_m = range_bounds(ride.solution.epochs, satellites, Configuration())
+    low_m, high_m = range_bounds(ride.aligned, satellites, Configuration())
     clean, at = replay(run, site, VEHICLE), 9
     most_m, least_m = -np.inf, np.inf
     for name in sorted(satellites.filter(pl.col("used"))["sv"].unique()):
@@ -187,7 +187,7 @@ def test_a_second_solution_without_the_fault_holds_it(sky: tuple[RunLog, Site]) 
     held, epoch, ride = since_the_start(*sky, VEHICLE, one)
     free, _, _ = since_the_start(*sky, VEHICLE, Configuration.model_validate(chosen))
     channel = ride.singles["channel"]
-    room = (floats(channel, "threshold") - floats(channel, "value"))[epoch]
+    room = (channel.threshold - channel.value)[epoch]
     assert (held <= room + 1e-9).all()
     assert (held <= free + 1e-9).all()
     assert (held < free - 0.5).any()

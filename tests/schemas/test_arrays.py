@@ -1,0 +1,27 @@
+"""Small tools between arrays and tables, against what they stand in for."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from schemas.arrays import median
+from schemas.conform import dtypes, table_of_rows
+from schemas.tables import Hazards
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 10, 101, 1000])
+def test_the_median_is_that_of_numpy_to_the_last_bit(size: int) -> None:
+    draw = np.random.default_rng(size)
+    beyond = np.where(draw.random(size) < 0.6, np.inf, 1.0)
+    for values in (draw.normal(size=size), draw.integers(-(2**40), 2**40, size), beyond):
+        assert median(values) == np.median(values)
+    assert np.isnan(median(np.append(draw.normal(size=size), np.nan)))
+    assert np.isnan(median(np.zeros(0)))
+
+
+def test_rows_of_no_run_make_a_table_of_the_same_columns() -> None:
+    kinds = dtypes(Hazards)
+    assert table_of_rows([], kinds).schema == pl.DataFrame([dict.fromkeys(kinds)], schema=kinds).schema
+    assert table_of_rows([{"hazard_id": 3}], {"hazard_id": kinds["hazard_id"]})["hazard_id"].to_list() == [3]
