@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 import polars as pl
@@ -12,6 +11,7 @@ from datasets.expectation import ExpectedHazard, ExpectedRun
 from datasets.scenario import RunSpec
 from pipeline.results.figures.head import word_of, worst_verdict
 from schemas.errors import ConfigError
+from schemas.frozen import frozen
 from schemas.run import RunLog, RunTables
 
 _NOTHING = "none"
@@ -19,7 +19,7 @@ _NOTHING = "none"
 _UNITS = {"latency": " s", "scale": ""}
 
 
-@dataclass(frozen=True)
+@frozen
 class ComparisonRow:
     """One line of the comparison."""
 

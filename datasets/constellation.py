@@ -8,7 +8,6 @@ is typical for the systems, not the one of that day.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
@@ -16,6 +15,7 @@ import polars as pl
 
 from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M, earth_centred_m
 from schemas.arrays import Floats, Ints
+from schemas.frozen import frozen
 
 _DEG = np.pi / 180.0
 _DAY_S = 86400.0
@@ -24,7 +24,7 @@ _GRAVITY_M3_PER_S2 = 3.986005e14
 _J2 = 1.08262982e-3
 
 
-@dataclass(frozen=True)
+@frozen
 class Orbit:
     """A circular orbit: `raan_deg` and `argument_deg` (of latitude) hold at `epoch_ns`, rates are secular."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from pipeline.results.store import read_run
 from pipeline.show.progress import CampaignWatch
 from pipeline.show.report import write_report
 from schemas.config import Configuration
+from schemas.frozen import frozen
 from schemas.project import FILE_NAME, NO_VEHICLE
 from schemas.run import RunTables
 
@@ -33,7 +33,7 @@ _HEAD = (
 Progress = Callable[[str], None]
 
 
-@dataclass(frozen=True)
+@frozen
 class DemoResult:
     """`checks`: one row per thing expected, as `comparison.checks_table`; `tables`: the replay of each run."""
 

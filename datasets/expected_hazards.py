@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from datasets.faults import PlacedFault, offset_m
@@ -11,11 +9,12 @@ from datasets.motion import build_motion
 from datasets.scenario import RunSpec, Scenario
 from datasets.trial import placed
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 
 LIMIT_M = 20.0
 
 
-@dataclass(frozen=True)
+@frozen
 class ExpectedRow:
     """One hazard row; `t_s` is the step after the first epoch, or about when the first VB is hit."""
 
@@ -40,7 +39,7 @@ def expected_hazards(scenario: Scenario, spec: RunSpec) -> tuple[ExpectedRow, ..
     return tuple(found.rows())
 
 
-@dataclass(frozen=True)
+@frozen
 class _World:
     """Without noise, at the epochs: time [s], way run, error in the direction of travel, places of the VBs [m]."""
 

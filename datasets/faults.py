@@ -6,7 +6,6 @@ Sizes are signed: an along-track fault is positive ahead of the train, a cross-t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Self
 
@@ -17,6 +16,7 @@ from pydantic import Field, model_validator
 from schemas.arrays import Bools, Floats
 from schemas.config import NonNegative, Number, Positive, Settings
 from schemas.errors import ConfigError
+from schemas.frozen import frozen
 from schemas.inputs import Faults
 
 NS_PER_S = 1_000_000_000
@@ -134,7 +134,7 @@ class PlacedFault(FaultSpec):
         return self
 
 
-@dataclass(frozen=True)
+@frozen
 class PositionEffect:
     """What faults do to the positions of one solution, per epoch."""
 

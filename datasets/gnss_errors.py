@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.stages.monitors.recursion import linear_recurrence
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Process:
     """A stationary first-order Gauss-Markov process: its share of the variance and its correlation time."""
 

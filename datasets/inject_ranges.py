@@ -6,8 +6,6 @@ would: only the change is computed, so whatever else made the recorded position 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 import polars as pl
@@ -17,12 +15,13 @@ from datasets.line import RailPlaces, shifted
 from datasets.solution import PositionSolution, protection_levels, solve
 from schemas.arrays import Bools, Floats
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import RunLog
 
 _COVARIANCE = (("ee", 0, 0), ("en", 0, 1), ("eu", 0, 2), ("nn", 1, 1), ("nu", 1, 2), ("uu", 2, 2))
 
 
-@dataclass(frozen=True)
+@frozen
 class _RecordedRanges:
     """The recorded satellites of one solution as arrays of shape (epochs, satellites); NaN: not recorded."""
 

@@ -5,7 +5,6 @@ A place on the line is its chainage `s_m`, the 3-D distance along the rail from 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
@@ -17,12 +16,13 @@ from pipeline.stages.track.geodesy import curvature_radii_m, moved_deg
 from schemas.arrays import Floats
 from schemas.conform import conform
 from schemas.errors import ConfigError
+from schemas.frozen import frozen
 from schemas.inputs import Balises, Links, Track
 
 _STEP_M = 1.0
 
 
-@dataclass(frozen=True)
+@frozen
 class RailPlaces:
     """Places on the rail: heading clockwise from north, in the sense of growing chainage; slope is rise over run."""
 
@@ -33,7 +33,7 @@ class RailPlaces:
     slope: Floats
 
 
-@dataclass(frozen=True)
+@frozen
 class LineAxis:
     """The axis of the line, sampled every metre, so that reading between samples errs by less than a millimetre."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Self
 
 import numpy as np
@@ -13,6 +12,7 @@ from schemas.arrays import Floats
 from schemas.config import NonNegative, Positive, Settings
 from schemas.enums import Direction
 from schemas.errors import ConfigError
+from schemas.frozen import frozen
 
 
 class PhaseSpec(Settings):
@@ -45,7 +45,7 @@ class MotionSpec(Settings):
     phases: Annotated[tuple[PhaseSpec, ...], Field(min_length=1)]
 
 
-@dataclass(frozen=True)
+@frozen
 class Motion:
     """Distance run ahead (falling when reversing) as joined parabolas: each holds from `knots_s[i]` on."""
 

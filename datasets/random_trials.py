@@ -5,7 +5,6 @@ Faults that come within the noise of a limit are drawn again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from datasets.motion import Motion, build_motion
 from datasets.scenario import RunSpec, Scenario
 from datasets.trial import build_run, build_site
 from schemas.config import Vehicle
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 
 KINDS = ("none", "step", "offset", "ramp", "slow ramp", "outage", "slip", "slide", "scale")
@@ -23,7 +23,7 @@ _LENGTH_M = 14_000.0
 _DRAWS = 200
 
 
-@dataclass(frozen=True)
+@frozen
 class RandomTrial:
     """A run with everything that its replay needs, and the hazards that must be found."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +20,7 @@ from schemas.arrays import Floats
 from schemas.config import Vehicle
 from schemas.conform import conform
 from schemas.enums import Fix
+from schemas.frozen import frozen
 from schemas.inputs import Gnss, Reference
 
 # The SBAS satellite that the synthetic receiver uses, and the age of what it sends.
@@ -39,7 +39,7 @@ _VELOCITIES = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
 _LEVELS = ("hpl_m", "vpl_m")
 
 
-@dataclass(frozen=True)
+@frozen
 class TrainOnLine:
     """One train on its line: where its GNSS antenna is at any time."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
@@ -18,9 +17,10 @@ from pipeline.storage.noted import note_all_below, noting
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import visible
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Conversion:
     """What was written, how often which kind of record was not used, what the logs consist of, what was corrected, and
     what does not fit.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -12,6 +10,7 @@ from pipeline.stages.track.geodesy import curvature_radii_m, distances_m, moved_
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 
 # Positions are averaged over this much way, and movement below it is taken for noise of a standing train.
@@ -19,7 +18,7 @@ _BIN_M = 10.0
 _OUTER_CELLS = 3
 
 
-@dataclass(frozen=True)
+@frozen
 class DrivenWay:
     """Where positions were along their own way and left of it at some instants, and the way by the distance along it.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -15,12 +14,13 @@ from datasets.scenario import SkySpec
 from datasets.solution import PositionSolution, protection_levels, solve
 from schemas.arrays import Bools, Floats, Ints
 from schemas.conform import conform
+from schemas.frozen import frozen
 from schemas.inputs import Satellites
 
 _SLOTS = {"gps": GPS, "galileo": GALILEO}
 
 
-@dataclass(frozen=True)
+@frozen
 class ObservedSky:
     """One solution per epoch: error east, north, up with the covariance and protection levels stated for it."""
 
@@ -33,7 +33,7 @@ class ObservedSky:
     lost: Bools
 
 
-@dataclass(frozen=True)
+@frozen
 class SimulatedRanges:
     """All satellites of the constellations in use, per epoch; `range_error_m` includes the faults."""
 

@@ -7,12 +7,12 @@ ranges become errors of position and residuals by one matrix per epoch (DO-229 a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats, Ints
+from schemas.frozen import frozen
 
 # DO-229 J.1: horizontal factor for precision approach and for non-precision approach, vertical factor.
 K_H_PA = 6.0
@@ -20,7 +20,7 @@ K_H_NPA = 6.18
 K_V = 5.33
 
 
-@dataclass(frozen=True)
+@frozen
 class PositionSolution:
     """Per epoch: error east, north, up [m], its covariance, residuals [m] (NaN: not in view), used, and solved."""
 
@@ -31,7 +31,7 @@ class PositionSolution:
     solved: Bools
 
 
-@dataclass(frozen=True)
+@frozen
 class ProtectionLevels:
     """DO-229 J.1 [m]; horizontal for precision approach (PA) and for non-precision approach (NPA)."""
 

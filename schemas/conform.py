@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import dataframely as dy
 import polars as pl
 
+from schemas.frozen import frozen
 
-@dataclass(frozen=True)
+
+@frozen
 class _Rule:
     """What a contract asks of one column."""
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING, Literal
+
+from schemas.frozen import frozen
 
 if TYPE_CHECKING:
     import polars as pl
@@ -22,7 +24,7 @@ STREAMS: tuple[Stream, ...] = (
 )
 
 
-@dataclass(frozen=True)
+@frozen
 class IngestNotes:
     """What reading found out about the log beside its data.
 
@@ -42,7 +44,7 @@ class IngestNotes:
     raw_logs: tuple[tuple[str, int, str], ...] = ()
 
 
-@dataclass(frozen=True)
+@frozen
 class RunLog:
     """One recorded journey, one frame per stream as in `schemas.inputs`.
 
@@ -77,7 +79,7 @@ class RunLog:
         return solutions[0] if solutions and "primary" not in solutions else "primary"
 
 
-@dataclass(frozen=True)
+@frozen
 class Finding:
     """One remark on a site: `severity` is `error`, `warning` or `note`."""
 
@@ -91,7 +93,7 @@ BALISE_PLACE = "balises: "
 """What the place of a finding on a balise begins with."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Site:
     """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`.
 
@@ -113,7 +115,7 @@ class Site:
         return [item.place.removeprefix(BALISE_PLACE) for item in self.findings if item.severity == "error"]
 
 
-@dataclass(frozen=True)
+@frozen
 class RunTables:
     """The five output tables of one run (`schemas.tables`), all solutions in each."""
 

@@ -7,12 +7,12 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from schemas.config import Configuration, StreamCorrection, StreamMapping, Vehicle
+from schemas.frozen import frozen
 
 _INTRODUCTION = """# Configuration and vehicle file
 
@@ -62,7 +62,7 @@ _TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
 )
 
 
-@dataclass(frozen=True)
+@frozen
 class Key:
     """One key as it is documented: the full name, the default as shown, and the two paragraphs under it."""
 

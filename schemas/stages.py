@@ -8,7 +8,7 @@ for what reads tables.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import cached_property
 from typing import Any, Self
 
@@ -19,6 +19,7 @@ import polars as pl
 from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns, truths
 from schemas.columns import flag, instant, one_of, real, text
 from schemas.enums import BaliseKind, Evidence, Judgement, LdsMode, LdsState, NotEvaluated, PassageStatus, SigmaSource
+from schemas.frozen import frozen
 
 # Confidence where one track is left of the set of those that the positions do not reject (DOMAIN section 2).
 ONE_TRACK_LEFT = 0.99
@@ -36,7 +37,7 @@ def reason_words(reason: Ints) -> pl.Series:
     return _gathered(_REASON_WORDS, reason)
 
 
-@dataclass(frozen=True)
+@frozen
 class MatchedEpochs:
     """One row per GNSS epoch of a solution, in order of time: the position on the track network, by matching.
 
@@ -148,7 +149,7 @@ class MatchedEpochs:
         return cls(elements=elements, **arrays)
 
 
-@dataclass(frozen=True)
+@frozen
 class AlignedEpochs(MatchedEpochs):
     """`MatchedEpochs` with the odometer at each epoch's time of validity, and what tests along the track allow for.
 
@@ -248,7 +249,7 @@ def _array(name: str, kind: str, table: pl.DataFrame, elements: Sequence[str]) -
     return ints(table[column])
 
 
-@dataclass(frozen=True)
+@frozen
 class EpochFigures:
     """The judged epochs of a solution, as far as the figures of a run are made of them; arrays of shape (epochs,)."""
 

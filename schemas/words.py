@@ -10,13 +10,13 @@ import re
 import shlex
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from importlib.resources import files
 from string import Formatter
 from typing import Any, TypeVar
 
 from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, NotShown, Reason, Remedy, RunVerdict
+from schemas.frozen import frozen
 
 Code = TypeVar("Code", bound=StrEnum)
 BETWEEN = "; "
@@ -64,7 +64,7 @@ NOT_SHOWN = _sentences(NotShown, "not_shown")
 REMEDIES = _sentences(Remedy, "remedies")
 
 
-@dataclass(frozen=True)
+@frozen
 class Remark:
     """A note with its figures or names, in the order in which its words take them."""
 

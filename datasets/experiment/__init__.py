@@ -5,16 +5,17 @@ Their names cost nothing; what an experiment needs is loaded when it is called.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from schemas.frozen import frozen
 
 if TYPE_CHECKING:
     from schemas.config import Configuration
 
 
-@dataclass(frozen=True)
+@frozen
 class Experiment:
     """Writes its tables into a folder and returns what it wrote; its own size where no repetitions are given.
 

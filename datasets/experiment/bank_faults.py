@@ -7,7 +7,6 @@ replay. All begin at 0 s; the train runs at a steady speed.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy.typing as npt
 from datasets.experiment.geometry import Geometry
 from datasets.experiment.linear_bank import AXES, LinearBank
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 
 Kind = Literal["ramp", "step", "latency", "frozen", "slip", "slide", "scale", "odometer late", "noise"]
 Shape = Literal["ramp", "step", "noise"]
@@ -37,7 +37,7 @@ _KINDS: dict[Kind, tuple[Shape, str, Callable[[float], float]]] = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Fault:
     """An error that begins at 0 s: a ramp [m/s], a step [m], or white noise [m] of GNSS against odometer or track.
 

@@ -16,7 +16,7 @@ _PLACE = ("latitude_deg", "longitude_deg", "height_m")
 _VELOCITY = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
 
 
-def frozen(run: RunLog, site: Site, onset_ns: int, size_s: float) -> tuple[RunLog, Site]:
+def position_frozen(run: RunLog, site: Site, onset_ns: int, size_s: float) -> tuple[RunLog, Site]:
     """The receiver repeats its last position and velocity for `size_s`, with fresh stamps."""
     held = _from(onset_ns) & ~_from(onset_ns + round(size_s * _SECOND_NS))
     last = pl.when(~held).then(pl.struct(*_PLACE, *_VELOCITY))

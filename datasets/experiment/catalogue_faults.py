@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 from datasets.experiment.catalogue_changes import (
-    frozen,
     list_wrong,
     map_left,
     odometer_late,
@@ -15,6 +14,7 @@ from datasets.experiment.catalogue_changes import (
     read_missing,
     stamps_ahead,
 )
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 
 Journey = Literal["short", "long", "physical"]
@@ -26,7 +26,7 @@ HEALTHY = "healthy"
 _SLOW_MPS = 0.1
 
 
-@dataclass(frozen=True)
+@frozen
 class CatalogueFault:
     """One fault from the onset on. `injected`: faults of a scenario (times from the onset); `change`: the rest.
 

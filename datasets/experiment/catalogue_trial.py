@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -13,6 +11,7 @@ from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from schemas.config import Vehicle
+from schemas.frozen import frozen
 from schemas.inputs import BaliseReads
 from schemas.run import RunLog, Site
 
@@ -27,7 +26,7 @@ _BALISES_EVERY_M = 500.0
 _FIRST_BALISE_M = 700.0
 
 
-@dataclass(frozen=True)
+@frozen
 class JourneyPlan:
     """How long it lasts and when the fault begins [s after the first epoch], under which sky and where to.
 
@@ -48,7 +47,7 @@ JOURNEYS: dict[Journey, JourneyPlan] = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Stage:
     """A journey made ready: its scenario and line, built once for all faults."""
 

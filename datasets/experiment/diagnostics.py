@@ -9,7 +9,6 @@ is missed, and enters expected times with the end of the span, which makes them 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -22,6 +21,7 @@ from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
 from schemas.arrays import Bools, Ints
 from schemas.config import Configuration
+from schemas.frozen import frozen
 
 REPETITIONS = 10_000
 _BLOCK_REPETITIONS = 256
@@ -69,7 +69,7 @@ def detection_times(plan: ExperimentPlan, passages: FirstPassages) -> pl.DataFra
     return table([_detection_row(plan, cell) for cell in _cells(plan, passages)])
 
 
-@dataclass(frozen=True)
+@frozen
 class _RateAnswers:
     """One question at one rate: seconds from onset, the span where it never came."""
 

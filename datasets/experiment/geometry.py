@@ -6,7 +6,6 @@ constellations above two European places, satellite 8 (slot B4 of GPS) faulty an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal, NamedTuple
 
@@ -15,6 +14,7 @@ import numpy as np
 from datasets.constellation import GALILEO, GPS, SIDEREAL_DAY_S, look_angles
 from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows, range_variances_m2
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 
 Constellation = Literal["gps", "gps_galileo"]
 
@@ -42,7 +42,7 @@ _DAY_NS = int(datetime(2024, 3, 20, tzinfo=UTC).timestamp()) * 1_000_000_000
 _DEFAULT_SECOND_OF_DAY = 23_220
 
 
-@dataclass(frozen=True)
+@frozen
 class Geometry:
     """A fixed sky: satellites with azimuth and elevation [deg], range error variances R_ij [m^2] by source."""
 

@@ -8,7 +8,7 @@ two epochs follows from powers of A.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property, partial
 from typing import ClassVar
 
@@ -21,11 +21,12 @@ from datasets.experiment.plan import BANKS, Reading, Sensors
 from datasets.experiment.splitting import Limits
 from schemas.arrays import Bools, Floats
 from schemas.config import MonitorConfig, threshold_factor
+from schemas.frozen import frozen
 
 AXES: tuple[str, ...] = ("along", "cross", "up")
 
 
-@dataclass(frozen=True)
+@frozen
 class BankSpec:
     """A bank that a user may configure: EWMA weights at 1 s (1 = raw), sensors, probability, rate of epochs.
 
@@ -62,7 +63,7 @@ class BankSpec:
         return ", ".join(f"{alpha:g}" for alpha in self.weights)
 
 
-@dataclass(frozen=True)
+@frozen
 class LinearBank:
     """Monitors along, and with track across and up, as a `System`; stationary, unless the bank has an age.
 

@@ -7,7 +7,7 @@ satellite geometry is in the rows; the noise path is drawn once for all of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import Literal
 
@@ -18,6 +18,7 @@ from datasets.experiment.geometry import TAUS_S, Geometry
 from datasets.experiment.sigmas import bank_sigmas
 from schemas.arrays import Floats
 from schemas.config import threshold_factor
+from schemas.frozen import frozen
 
 Reading = Literal["increments", "position"]
 Sensors = Literal["odometer", "odometer_and_track"]
@@ -34,7 +35,7 @@ BANKS: dict[Reading, tuple[float, ...]] = {
 SIGNALS: tuple[str, ...] = ("east", "north", "up", "map_cross", "odometer_increments", "odometer_position")
 
 
-@dataclass(frozen=True)
+@frozen
 class ExperimentPlan:
     """The grid. `span_s` epochs at 1 Hz, ramp from `onset_s`, failure beyond `failure_limit_m` along the track."""
 
@@ -66,7 +67,7 @@ class ExperimentPlan:
         return len(SIGNALS) * self.alphas.size + 2
 
 
-@dataclass(frozen=True)
+@frozen
 class Forms:
     """Monitors as linear forms; shapes (monitors, basis), (monitors, alpha index), ...
 

@@ -8,7 +8,6 @@ looks at these epochs only.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -23,6 +22,7 @@ from datasets.experiment.workers import in_pieces
 from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
+from schemas.frozen import frozen
 
 REPETITIONS = 5_000
 # Every course of a train: to the other side the error along the track is the same with the other sign.
@@ -31,7 +31,7 @@ _BLOCK_REPETITIONS = 250
 _UNDETECTED = -1
 
 
-@dataclass(frozen=True)
+@frozen
 class RangePlan:
     """What is asked of the monitor: `period_s` between recorded residuals, `survey_m` sigma of the track survey."""
 

@@ -8,7 +8,6 @@ twisted population serves (`splitting`). Alarms: an exceedance is forced at an e
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
@@ -19,9 +18,10 @@ from datasets.experiment.geometry import TAUS_S
 from datasets.experiment.ranges import RangePlan, held_rows, statistic
 from datasets.experiment.splitting import Limits
 from schemas.arrays import Bools, Floats
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class RangeSystem:
     """Whitened residuals z of a fixed sky and heading, in d dimensions, as a `System`.
 

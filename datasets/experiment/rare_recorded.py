@@ -8,7 +8,6 @@ model: below 1 the monitors scatter less than counted.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +22,7 @@ from pipeline.stages.monitors.axis import error_model
 from schemas.config import Configuration, threshold_factor
 from schemas.enums import MonitorState, RunStatus
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 from schemas.tables import SCALES
 
 REPETITIONS = 20_000
@@ -35,7 +35,7 @@ _LASTING = 1.5
 _SLOWEST_AT_RECORDED_RATE_MPS = 0.1
 
 
-@dataclass(frozen=True)
+@frozen
 class RecordedNoise:
     """Noise along the track of one solution over all runs of a result: medians over epochs and runs."""
 

@@ -7,7 +7,7 @@ number of processes change nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.campaign.ground import site_of
@@ -17,6 +17,7 @@ from pipeline.read.site.route import with_route
 from pipeline.results.workers import mapped
 from schemas.config import Configuration, digest_of
 from schemas.errors import BaliseError, InputError, UsageError
+from schemas.frozen import frozen
 
 if TYPE_CHECKING:
     from pipeline.studies.calibration.calibrate import Observed
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 AUTO = "auto"
 
 
-@dataclass(frozen=True)
+@frozen
 class _CalibrationRun:
     """A run that may calibrate others; `reason`: why it does not, empty where it does."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from pipeline.campaign import resume
 from pipeline.campaign.lock import locked
@@ -13,9 +12,10 @@ from pipeline.results.outcome import RunOutcome
 from pipeline.results.packing import RUNS_PER_PACK, pack_runs, unpack
 from pipeline.results.workers import tell
 from pipeline.storage.address import Address, is_url
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Compaction:
     """How a result lies now: runs in packs, packs, runs with files of their own; `left_out`: these with the reason."""
 

@@ -22,9 +22,10 @@ from pipeline.campaign.watch import Follower
 from pipeline.campaign.worker import fail_run
 from pipeline.results.outcome import RunOutcome
 from schemas.errors import BaliseError, UsageError
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class _Attempt:
     """One attempt at a run, and how often a worker was to begin it."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import traceback
 from concurrent.futures import Future
-from dataclasses import dataclass
 from typing import Any
 
 import polars as pl
@@ -19,13 +18,14 @@ from pipeline.stages.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import BaliseError, InputError
+from schemas.frozen import frozen
 from schemas.run import RunTables
 from schemas.tables import TABLES
 from schemas.version import SOFTWARE
 from schemas.words import lost_words, reason_words
 
 
-@dataclass(frozen=True)
+@frozen
 class RunFailure:
     """Why a run failed; a `lasting` reason comes again with the same input, so that the run is not tried again."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 from pipeline import storage
 from pipeline.campaign.ground import hold
@@ -16,13 +16,14 @@ from pipeline.storage import files
 from pipeline.storage.address import Address, join, name_of, redacted, stem_of
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.errors import InputError, UsageError
+from schemas.frozen import frozen
 from schemas.run import STREAMS
 from schemas.version import SOFTWARE
 
 _NULL_OF_HIVE = "__HIVE_DEFAULT_PARTITION__"
 
 
-@dataclass(frozen=True)
+@frozen
 class RunJob:
     """One run as a worker gets it; everything in it survives the way to another machine.
 
@@ -49,7 +50,7 @@ class RunJob:
     site_files: str = ""
 
 
-@dataclass(frozen=True)
+@frozen
 class Plan:
     """All runs of one call, and where their results go; `given`: the settings files of the call.
 

@@ -6,7 +6,7 @@ import math
 import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from enum import StrEnum
 from typing import Any
 
@@ -30,6 +30,7 @@ from pipeline.storage.address import Address, join
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 from schemas.tables import TABLES
 
 Problem = tuple[str, str, str]
@@ -58,7 +59,7 @@ _NOT_COMPARED = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Verification:
     """What was compared and what differs: `what, found, expected`, digests shortened."""
 

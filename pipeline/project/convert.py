@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from datetime import date
 from itertools import groupby
 from pathlib import Path
@@ -17,11 +16,12 @@ from pipeline.read.ingest.correct import corrected, corrected_further
 from pipeline.storage.noted import note_all_below, noting
 from schemas.config import FixSigma, IngestConfig
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 from schemas.project import ConvertEntry, LogEntry
 from schemas.run import RunLog
 
 
-@dataclass(frozen=True)
+@frozen
 class Recordings:
     """What public recordings need no mapping for, and how a run is written; both are known to `datasets` alone."""
 
@@ -29,7 +29,7 @@ class Recordings:
     write: Callable[[RunLog, Path], None]
 
 
-@dataclass(frozen=True)
+@frozen
 class _Part:
     """Logs that are read in one call, what their positions are for, and what they hold."""
 

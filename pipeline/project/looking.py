@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from datetime import date, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,13 @@ from pipeline.read.ingest.run import read_part
 from schemas.config import IngestConfig, settings_from, toml_of
 from schemas.enums import Fix
 from schemas.errors import BaliseError, InputError
+from schemas.frozen import frozen
 from schemas.run import STREAMS, RunLog, Stream
 
 _A_DAY = timedelta(days=1)  # clocks of one ride may be local and UTC
 
 
-@dataclass(frozen=True)
+@frozen
 class StreamSpan:
     """Rows of a stream, and the times of the first and the last."""
 
@@ -38,7 +39,7 @@ class StreamSpan:
     end: datetime
 
 
-@dataclass(frozen=True)
+@frozen
 class SeenLog:
     """A log and what it feeds; `mapping`: of a table, by stream; `is_run`: needs no conversion; `parts`: what it
     consists of; `assumed`: what was taken for granted where its header leaves it open.

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +18,7 @@ from pipeline.storage.address import is_url
 from pipeline.storage.noted import NO_DIGEST, digest_now, noting
 from schemas.config import Settings
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 
 _NAME = "made.json"
 
@@ -38,7 +38,7 @@ class _Made(BaseModel):
 _RECORD = TypeAdapter(dict[str, _Made])
 
 
-@dataclass(frozen=True)
+@frozen
 class Product:
     """What a step makes: a file or a folder of files, and the SHA-256 over the settings that decide them."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 from pipeline.storage.address import is_url
 from schemas.config import Configuration, Settings, Vehicle, load_settings, read_toml
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 from schemas.project import FILE_NAME, NO_VEHICLE, Project, configuration_of, is_project, load_project
 from schemas.words import say
 
@@ -20,7 +20,7 @@ MEASURED_CONFIG = "config_measured.toml"
 RECORD = ".balise"
 
 
-@dataclass(frozen=True)
+@frozen
 class Opened:
     """A project and its file; places that it names are told as seen from the working directory."""
 

@@ -27,13 +27,14 @@ from pipeline.show.report.site_page import site_page
 from pipeline.storage.address import is_url
 from schemas.config import Configuration, Vehicle, digest_of, load_settings, to_toml
 from schemas.errors import InputError, UsageError
+from schemas.frozen import frozen
 from schemas.project import CalibrateEntry, ConvertEntry, TrackEntry, load_configuration
 
 Said = Callable[[str, str], None]
 """Receives a step and what there is to say of it."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Call:
     """What one call of `balise run` adds: none of it decides a result. `prune`: results of other runs are removed."""
 
@@ -45,7 +46,7 @@ class Call:
     prune: bool = False
 
 
-@dataclass(frozen=True)
+@frozen
 class Ended:
     """How the replay ended, and the first page of the report; `changed`: whether anything had to be done.
 

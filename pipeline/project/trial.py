@@ -30,6 +30,7 @@ from pipeline.studies.plausibility.check import CONFIGURATION, FitState
 from pipeline.studies.plausibility.report import FitReport, fit_report
 from schemas.config import IngestConfig, StreamCorrection, settings_from, toml_of
 from schemas.errors import BaliseError, InputError, UsageError
+from schemas.frozen import frozen
 from schemas.project import FILE_NAME, ConvertEntry, Project, ReplayEntry, TrackEntry
 from schemas.run import Site, Stream
 from schemas.words import say
@@ -38,7 +39,7 @@ _ZONES_S = 900.0  # time zones are whole quarters of an hour apart
 _ROUNDS = 4  # a clock shows when the unit is right, an axis when the clock is
 
 
-@dataclass(frozen=True)
+@frozen
 class Wanted:
     """What the user named: logs, line, balises; `references`: those of the logs that are the truth.
 
@@ -55,7 +56,7 @@ class Wanted:
     strict: bool = True
 
 
-@dataclass(frozen=True)
+@frozen
 class Proposal:
     run_id: str
     found: tuple[str, ...]

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import polars as pl
 
 from pipeline.storage.described import PREFIX
+from schemas.frozen import frozen
 
 NAME = "runs"
 """The table whose file marks a run complete."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Marker:
     """`source`: the `runs` file, or its metadata as JSON; `sha256`: of that file, which holds those of the others."""
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import polars as pl
 
 from pipeline.results.figures.head import CampaignHead, figures_beside, head_of
 from schemas.enums import RunStatus, RunVerdict
+from schemas.frozen import frozen
 
 BESIDE = {
     "balises_found": pl.Int64,
@@ -26,7 +26,7 @@ UnderWay = Sequence[tuple[str, float]]
 """Ids of the runs under way, and for how long [s]."""
 
 
-@dataclass(frozen=True)
+@frozen
 class RunOutcome:
     """What became of one run. With a `trace` its failure is a defect of ours, else the input's.
 
@@ -68,7 +68,7 @@ class RunOutcome:
         return self.trace is not None
 
 
-@dataclass(frozen=True)
+@frozen
 class CampaignSummary:
     planned: int
     outcomes: tuple[RunOutcome, ...]

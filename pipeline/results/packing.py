@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import polars as pl
 import pyarrow as pa
@@ -21,6 +20,7 @@ from pipeline.results.workers import each
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, join
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 from schemas.tables import TABLES
 
 RUNS_PER_PACK = 2000
@@ -37,7 +37,7 @@ class _UnfitError(Exception):
     """The run cannot be packed; `str` says why."""
 
 
-@dataclass(frozen=True)
+@frozen
 class _Step:
     """What one pack is made of: runs of one build of the program."""
 
@@ -46,7 +46,7 @@ class _Step:
     runs: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@frozen
 class Packed:
     """A pack that was written, if any, and the runs in it; `left_out`: those that cannot be packed, and why."""
 

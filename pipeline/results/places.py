@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -11,12 +10,13 @@ import polars as pl
 from pipeline.stages.track.geodesy import moved_deg, points_of
 from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 from schemas.run import Site
 
 _POINTS = 3000
 
 
-@dataclass(frozen=True)
+@frozen
 class GroundPositions:
     """Positions in degrees and metres, NaN where not known; `heading_deg` of growing measure, clockwise from north."""
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
 import polars as pl
 
+from schemas.frozen import frozen
 
-@dataclass(frozen=True)
+
+@frozen
 class View:
     """A question: its SQL over tables and other views, and (name, unit, meaning) of the columns of its answer.
 

@@ -11,8 +11,9 @@ import math
 import re
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
+
+from schemas.frozen import frozen
 
 _GAP = 2
 _HEADING_LINES = 3
@@ -25,7 +26,7 @@ _NOTHING = ("-", "", "none")
 _FEW_ROWS = 5
 
 
-@dataclass(frozen=True)
+@frozen
 class Column:
     """A column as text; numbers stand to the right and are never folded. `rank`: the smaller, the more it matters."""
 

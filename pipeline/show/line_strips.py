@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
 import polars as pl
 
 from schemas.enums import BaliseKind, Navigability
+from schemas.frozen import frozen
 from schemas.line import LineCause, LineDirection, PieceClass
 
 _TONES = {PieceClass.SUITABLE: "right", PieceClass.UNSUITABLE: "wrong", PieceClass.UNKNOWN: "unknown"}
@@ -34,7 +34,7 @@ _TICKS_KM = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 _LETTER = 6.5
 
 
-@dataclass(frozen=True)
+@frozen
 class Stretch:
     """A net element on a line: its measure grows with the line's kilometres, or falls where it is `reversed`."""
 
@@ -122,7 +122,7 @@ def _strip(number: int, line: Line, pieces: Mapping[str, pl.DataFrame], balises:
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class _Window:
     """A row of the drawing: from here to there on the line [m], and where that is drawn."""
 

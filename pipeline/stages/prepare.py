@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import polars as pl
 
@@ -21,11 +21,12 @@ from pipeline.stages.track.network import network_in_pieces, site_network
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Remedy, VehicleFigures
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 from schemas.words import remedy_words
 
 
-@dataclass(frozen=True)
+@frozen
 class PreparedRun:
     """`recorded`: in order of time; `run`: without streams of another day. `odometers`: each as it counted, the one of
     the LDS first; `odometry`: that one, by other independent ones where it slips. `follows`: whether the odometer of

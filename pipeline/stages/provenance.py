@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 
 from schemas.config import Configuration, Vehicle, digest_of
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 from schemas.version import SOFTWARE
 
 
-@dataclass(frozen=True)
+@frozen
 class Provenance:
     """The same provenance always gives the same tables; `calibrated_by`: runs that tell of vehicle and noise."""
 

@@ -6,7 +6,7 @@ Nothing here knows of the truth, but for one case: without an odometer the direc
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -24,13 +24,14 @@ from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun
 from schemas.arrays import Ints, times_ns
 from schemas.enums import NotEvaluated
+from schemas.frozen import frozen
 from schemas.stages import AlignedEpochs
 from schemas.tables import ALL_MONITORS
 
 _AGAINST_ODOMETER = tuple(monitor.name for monitor in ALL_MONITORS if monitor.against_odometer)
 
 
-@dataclass(frozen=True)
+@frozen
 class Ride:
     """What the train made of one solution; `odometry` grows with its path.
 

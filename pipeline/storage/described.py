@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import dataframely as dy
 import numpy as np
@@ -14,6 +13,7 @@ import pyarrow.parquet as pq
 
 from pipeline.storage.parquet import GroupedFile, metadata_of, parquet_bytes
 from schemas.conform import meanings
+from schemas.frozen import frozen
 from schemas.tables import CONTRACT_VERSION
 
 PREFIX = "balise."
@@ -41,7 +41,7 @@ def noted(metadata: Mapping[str, str]) -> dict[str, str]:
     return {key.removeprefix(PREFIX): value for key, value in metadata.items() if key.startswith(PREFIX)}
 
 
-@dataclass(frozen=True)
+@frozen
 class FileDescription:
     """What a file says of itself: rows, key-value metadata, and `column, dtype, unit, meaning` of its columns."""
 

@@ -6,7 +6,6 @@ weaker evidence never shows what stronger evidence refutes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 
 import polars as pl
@@ -22,6 +21,7 @@ from pipeline.stages.run_row.bounds import (
 )
 from pipeline.studies.reservations import sentences
 from schemas.enums import RunVerdict
+from schemas.frozen import frozen
 
 S_PER_H = 3600.0
 # Share of the distance by which two records of one journey differ at most.
@@ -36,7 +36,7 @@ class Compliance(StrEnum):
     NOT_SHOWN = "not shown"
 
 
-@dataclass(frozen=True)
+@frozen
 class Shown:
     """A finding with the bounds that it rests on; `needed`: good trials or hours still needed to show the limit.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,6 +20,7 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_n
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Judgement, LeftOut, OwnError
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 
 _REASONS = tuple(LeftOut)
@@ -28,7 +28,7 @@ _REASONS = tuple(LeftOut)
 _RANGES_BESIDE = 0.99
 
 
-@dataclass(frozen=True)
+@frozen
 class Baseline:
     """One solution of a run, replayed and judged without a fault.
 

@@ -7,7 +7,7 @@ import io
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -37,6 +37,7 @@ from schemas.conform import conform, dtypes
 from schemas.enums import RunStatus
 from schemas.errors import ConfigError, InputError, UsageError
 from schemas.experiment import EXPERIMENT_TABLES, ExperimentInjections, ExperimentRuns
+from schemas.frozen import frozen
 from schemas.run import Site
 from schemas.version import SOFTWARE
 
@@ -61,7 +62,7 @@ def _silent(text: str) -> None:
     """Nobody listens."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Inputs:
     """What the command names."""
 
@@ -75,7 +76,7 @@ class Inputs:
     digest: str
 
 
-@dataclass(frozen=True)
+@frozen
 class Made:
     """The tables by name, the runs that could not be used, with the reason, and what was written, the page first."""
 
@@ -89,7 +90,7 @@ class Made:
         return remarks_on(self.tables)
 
 
-@dataclass(frozen=True)
+@frozen
 class _Surveyed:
     """A run without a fault, by all banks, which took `replays_s`; `error` where it cannot be used."""
 
@@ -102,7 +103,7 @@ class _Surveyed:
     error: InputError | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class Part:
     """What became of the injections of a piece; `lost`: bank, cell and reason of those that were not possible."""
 
@@ -110,7 +111,7 @@ class Part:
     lost: tuple[tuple[str, str, str], ...]
 
 
-@dataclass(frozen=True)
+@frozen
 class _Piece:
     """Some injections of one run and bank, and the file that keeps what became of them."""
 

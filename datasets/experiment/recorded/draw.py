@@ -5,7 +5,6 @@ from __future__ import annotations
 import zlib
 from bisect import bisect_left, insort
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,11 +13,12 @@ from datasets.experiment.recorded.plan import Cell, RecordedPlan
 from datasets.experiment.workers import generator
 from schemas.arrays import NS_PER_S, Bools, Ints
 from schemas.enums import LeftOut
+from schemas.frozen import frozen
 
 _REASONS = tuple(LeftOut)
 
 
-@dataclass(frozen=True)
+@frozen
 class Room:
     """Where faults may begin in one run, by all banks; arrays per epoch.
 
@@ -74,7 +74,7 @@ def room_of(baselines: Sequence[Baseline], quiet_s: float) -> Room:
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class Onset:
     """One fault to put in: of this cell, into this run, at this epoch; `lot`: what a satellite is drawn by, [0, 1)."""
 

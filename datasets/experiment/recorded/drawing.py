@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from html import escape
 from math import isfinite, log10
+
+from schemas.frozen import frozen
 
 WIDTH, HEIGHT = 900.0, 420.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 690.0, 16.0, 370.0
@@ -24,7 +26,7 @@ def both_ways_log(value: float) -> float:
     return log10(1.0 + abs(value)) * (1.0 if value >= 0.0 else -1.0)
 
 
-@dataclass(frozen=True)
+@frozen
 class Axis:
     """Title, scale, and the values that it spans and names."""
 
@@ -41,7 +43,7 @@ class Axis:
         return min(max((self.scale(value) - low) / (high - low), 0.0), 1.0)
 
 
-@dataclass(frozen=True)
+@frozen
 class Curve:
     """A named line; `band`: lower and upper y of each point; `marks`: points drawn as open triangles (more than)."""
 

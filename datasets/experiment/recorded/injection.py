@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import polars as pl
 
@@ -15,10 +15,11 @@ from pipeline.stages.ride import Ride, ride_of
 from pipeline.studies.plausibility.fit import clock_advice
 from schemas.arrays import NS_PER_S
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import RunLog
 
 
-@dataclass(frozen=True)
+@frozen
 class Injected:
     """The fault as a fault file of `balise inject` would hold it, and what the train made of it."""
 

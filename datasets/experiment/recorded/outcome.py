@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -16,6 +14,7 @@ from pipeline.stages.judge.in_use import time_in_use
 from pipeline.stages.judge.judgement import RIGHT, UNKNOWN, WRONG
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of, times_ns
 from schemas.enums import MonitorState
+from schemas.frozen import frozen
 from schemas.tables import MONITORS, SCALES
 
 # Epochs before the onset that the time in use is reckoned from: a negation in force there has no part in it.
@@ -24,7 +23,7 @@ _LEAD_S = 30.0
 _LASTING_S = 1.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Watch:
     """The epochs of an injected run from a little before the onset on, beside those of the fault-free run.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -21,6 +20,7 @@ from schemas.config import (
     settings_from,
 )
 from schemas.errors import ConfigError
+from schemas.frozen import frozen
 
 _AMOUNTS = {
     FaultKind.RAMP: ("rates_mps", "rate_mps", "m/s"),
@@ -146,7 +146,7 @@ class RecordedPlan(Settings):
         return tuple(cell for fault in self.faults for cell in _cells(self, fault, limit_m))
 
 
-@dataclass(frozen=True)
+@frozen
 class Cell:
     """One fault of one amount in one direction, `count` times.
 
@@ -233,7 +233,7 @@ _DEFAULT = RecordedPlan(
 """DIAG's rates (0.01 to 5 m/s, section Simulation), and what the paper does not inject."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Bank:
     """A bank to compare, with the vehicle that its runs are replayed with; None: that of the command."""
 

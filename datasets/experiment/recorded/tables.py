@@ -9,7 +9,6 @@ Pearson on as many trials as there are passes: watches of one run that neither o
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from pipeline.stages.run_row.bounds import CONFIDENCE, UNKNOWN, columns_of, pois
 from schemas.arrays import NS_PER_S, Floats, floats, times_ns
 from schemas.conform import conform
 from schemas.experiment import ExperimentBanks, ExperimentCells, ExperimentPlaces, ExperimentPmd
+from schemas.frozen import frozen
 
 _PMD_STEPS = 40
 _QUANTILES = {"median": 0.5, "p95": 0.95, "max": 1.0}
@@ -29,7 +29,7 @@ _QUANTILES = {"median": 0.5, "p95": 0.95, "max": 1.0}
 _ROUNDING = 1e-9
 
 
-@dataclass(frozen=True)
+@frozen
 class Quiet:
     """One bank on the recorded runs without a fault: alarms in so many hours, share of time with a TVB."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -11,13 +10,14 @@ import polars as pl
 from schemas.config import FixSigma
 from schemas.enums import Fix
 from schemas.errors import InputError, UsageError
+from schemas.frozen import frozen
 from schemas.run import STREAMS, RunLog, Stream
 
 Streams = dict[Stream, pl.DataFrame]
 BY_SOLUTION: tuple[Stream, ...] = ("gnss", "satellites")
 
 
-@dataclass(frozen=True)
+@frozen
 class Purpose:
     """What positions of the logs are for: a solution by its name, or the reference of the run."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import date
 from itertools import pairwise
 from pathlib import Path
@@ -31,10 +31,11 @@ from pipeline.read.ingest.plan import absent_topics
 from pipeline.storage import FileDigest, files
 from schemas.config import FixSigma, IngestConfig, StreamCorrection
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 
-@dataclass(frozen=True)
+@frozen
 class Converted:
     """The run, what could not be used, reason to number, and what the logs consist of."""
 
@@ -119,7 +120,7 @@ def _refuse_unlike(
         )
 
 
-@dataclass(frozen=True)
+@frozen
 class Gatherings:
     """The streams of all logs, as the contract has them, and what could not be used: reason to number.
 

@@ -15,6 +15,7 @@ import polars as pl
 
 from pipeline.read.ingest.stamps import LATEST_NS
 from schemas.enums import Fix
+from schemas.frozen import frozen
 from schemas.inputs import Gnss, Satellites
 from schemas.run import Stream
 
@@ -105,7 +106,7 @@ class Gathered:
         return Epochs(timed)
 
 
-@dataclass(frozen=True)
+@frozen
 class Epochs:
     """The epochs of a log, put together."""
 

@@ -7,7 +7,6 @@ calendar or week and seconds. Degrees with minutes and baselines are refused: RT
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from pipeline.read.numbers import numbers_of
 from schemas.arrays import NS_PER_S, Floats
 from schemas.enums import Fix
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.inputs import Gnss
 from schemas.run import Stream
 
@@ -38,7 +38,7 @@ _DATE = re.compile(r"[0-9]{4}/[0-9]{1,2}/[0-9]{1,2}")
 _GEOID = "height over the geoid: left empty, since the file has no separation"
 
 
-@dataclass(frozen=True)
+@frozen
 class _RtklibHeader:
     """What the header says: scale of the times, names of the columns without units, and the comments themselves."""
 

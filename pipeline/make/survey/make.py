@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +24,14 @@ from pipeline.storage.writing import replace_files
 from schemas.config import Configuration, Vehicle
 from schemas.enums import TravelAlong
 from schemas.errors import SiteError, UsageError
+from schemas.frozen import frozen
 from schemas.inputs import SITE_SCHEMAS
 from schemas.run import Finding, Site
 
 _FILES = ("track", "links", "balises", "route")
 
 
-@dataclass(frozen=True)
+@frozen
 class Wish:
     """What a site is made of: balises every so many metres or of a list; ends this near [m] meet.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -20,13 +20,14 @@ from pipeline.stages.track.survey import geometric_measures_m, track_of
 from schemas.arrays import Floats, Ints, spans_of
 from schemas.config import SurveyConfig
 from schemas.enums import Navigability
+from schemas.frozen import frozen
 from schemas.inputs import Links
 
 # OpenStreetMap writes seven decimals of a degree: equal positions are the same node.
 _NODE_DEG = 1e-7
 
 
-@dataclass(frozen=True)
+@frozen
 class SurveyNetwork:
     """Net elements with the nodes at their two ends, and the links between ends.
 

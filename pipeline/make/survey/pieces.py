@@ -14,6 +14,7 @@ from pipeline.storage.noted import note
 from schemas.arrays import Floats, Ints
 from schemas.config import SurveyConfig
 from schemas.errors import SiteError
+from schemas.frozen import frozen
 from schemas.run import Finding
 
 
@@ -40,7 +41,7 @@ def content_of_survey(path: Path, config: SurveyConfig) -> bytes:
         raise SiteError(f"cannot be read: {error.strerror}", place=str(path)) from None
 
 
-@dataclass(frozen=True)
+@frozen
 class LinePiece:
     """Points in order along one line: degrees, metres, kilometres of the line; NaN where not known.
 

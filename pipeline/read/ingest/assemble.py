@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import polars as pl
 
@@ -13,11 +13,12 @@ from pipeline.read.ingest.reader import ORDINAL
 from pipeline.read.ingest.wraps import said_of_wraps, whole_stream, with_whole_counts
 from schemas.config import IngestConfig
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
 
-@dataclass(frozen=True)
+@frozen
 class DecodedRows:
     """Fields of all messages of a source, one row per message, with its times and place in the file."""
 

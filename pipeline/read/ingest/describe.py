@@ -24,12 +24,13 @@ from pipeline.storage import files
 from pipeline.storage.address import Address, join, name_of
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
+from schemas.frozen import frozen
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 _MOST_SAMPLES = 1000  # topics whose fields are looked for: each takes the time of parsing its schema
 
 
-@dataclass(frozen=True)
+@frozen
 class StreamSummary:
     """One stream, of GNSS one solution: `rate_hz` from the median step, gaps longer than 1.5 steps."""
 
@@ -47,7 +48,7 @@ class StreamSummary:
     columns: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@frozen
 class TopicSummary:
     """One topic of an MCAP file; `mapping` is stream column to recorded fields, empty where left over."""
 
@@ -62,7 +63,7 @@ class TopicSummary:
     remark: str = ""
 
 
-@dataclass(frozen=True)
+@frozen
 class LogDescription:
     """What `balise inspect` shows of a log; `problems` is what keeps it from being replayed."""
 

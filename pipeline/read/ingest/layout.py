@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -22,6 +22,7 @@ from pipeline.read.ingest.mcap_block import Bytes, Messages, Stretches
 from pipeline.read.ingest.mcap_records import Channel
 from schemas.arrays import Bools, Ints
 from schemas.errors import InputError
+from schemas.frozen import frozen
 
 _MOST_LAYOUTS = 256  # of one channel that are kept
 _LARGEST_KEPT = 1 << 16  # bytes of a message whose layout is kept
@@ -57,7 +58,7 @@ Columns = Mapping[str, Values]
 Decoded = tuple[Messages, Columns]
 
 
-@dataclass(frozen=True)
+@frozen
 class Field:
     """Where a value lies in each message, and how it is taken from these bytes of each message, in rows."""
 
@@ -128,7 +129,7 @@ def constant(value: float | str | bool | None, dtype: pl.DataType) -> Field:
     return Field(type(dtype), 0, 0, lambda rows: values.new_from_index(0, len(rows)))
 
 
-@dataclass(frozen=True)
+@frozen
 class ByteStretch:
     """Bytes of a message that are taken together; those `at` some places among them must agree under a mask."""
 
@@ -139,7 +140,7 @@ class ByteStretch:
     expected: Bytes
 
 
-@dataclass(frozen=True)
+@frozen
 class Layout:
     """Of messages of one length: where they hold the fields, in the order of the rows that they make (mostly one),
     and the stretches that hold these and all that shapes the layout.

@@ -15,6 +15,7 @@ from mcap.opcode import Opcode
 
 from pipeline.read.ingest.mcap_records import HEAD, HEAD_SIZE, DamageError
 from schemas.arrays import Bools, Ints
+from schemas.frozen import frozen
 
 Bytes = npt.NDArray[np.uint8]
 OnRecord = Callable[[int, bytes, int], None]  # opcode, content, offset of its chunk in the file
@@ -39,7 +40,7 @@ Wanted = Callable[[int], Stretches | None]
 """Of a channel: what will be read of its messages, none of a length that is not named; None where nobody reads them."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Records:
     """Records of neighbouring chunks; side by side only where somebody asks for more than was read ahead.
 
@@ -58,7 +59,7 @@ OfLengths = Mapping[int, Mapping[Stretch, Bytes]]
 """By length of the messages: stretches of their payloads, a row per message of the channel, also of other lengths."""
 
 
-@dataclass(frozen=True)
+@frozen
 class ReadAhead:
     """Stretches of payloads that were read while their chunk was in the cache.
 
@@ -77,7 +78,7 @@ class ReadAhead:
         return replace(self, rows=rows if self.rows is None else self.rows[rows])
 
 
-@dataclass(frozen=True)
+@frozen
 class Messages:
     """Messages of one channel in a block, in order of the file: where their payloads lie in the records of the block.
 
@@ -139,7 +140,7 @@ def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
     return every_offset[starts].view(np.uint8).reshape(-1, width)
 
 
-@dataclass(frozen=True)
+@frozen
 class Part:
     """Messages of one channel among records side by side, in order: where they begin, and how long payloads are."""
 
@@ -173,7 +174,7 @@ class Part:
         return bool(np.isin(self.lengths, list(self.ahead)).all())
 
 
-@dataclass(frozen=True)
+@frozen
 class Piece:
     """Records side by side, as of one chunk, and the messages among them, by channel.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from io import BytesIO
 from struct import Struct
 from typing import TypeVar
@@ -13,6 +12,8 @@ from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.records import Chunk, McapRecord
+
+from schemas.frozen import frozen
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = Struct("<BQ")  # opcode, length of what follows
@@ -26,7 +27,7 @@ class DamageError(Exception):
         super().__init__(f"damaged at byte {offset}: {kind}")
 
 
-@dataclass(frozen=True)
+@frozen
 class Schema:
     id: int
     name: str
@@ -34,7 +35,7 @@ class Schema:
     data: bytes
 
 
-@dataclass(frozen=True)
+@frozen
 class Channel:
     """A channel with its schema; `file` serves error messages, `notes` are this program's in the channel's metadata."""
 

@@ -6,7 +6,7 @@ import hashlib
 import io
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +27,7 @@ from pipeline.storage.budget import most_unpacked
 from schemas.arrays import times_ns
 from schemas.config import IngestConfig, StreamCorrection
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import IngestNotes, RunLog
 
@@ -96,7 +97,7 @@ def _pieces(messages: Messages) -> Iterator[Messages]:
     yield from (messages.chosen(rows) for rows in np.split(np.arange(len(messages)), cuts))
 
 
-@dataclass(frozen=True)
+@frozen
 class _WalkedLog:
     """One file that was walked, and what its messages fed."""
 

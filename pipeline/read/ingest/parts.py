@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -11,12 +10,13 @@ from pipeline.read.ingest.csv_text import read_log_table
 from pipeline.read.ingest.describe import TopicSummary, starting_config
 from pipeline.read.ingest.mapping import mappings_of
 from schemas.config import IngestConfig, StreamMapping, settings_from, toml_of
+from schemas.frozen import frozen
 from schemas.run import STREAMS, Stream
 
 PartKind = Literal["column", "topic", "message", "file"]
 
 
-@dataclass(frozen=True)
+@frozen
 class LogPart:
     """One column, topic or kind of message of a log, or a file or column of a run.
 

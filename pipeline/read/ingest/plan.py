@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import polars as pl
 
@@ -25,6 +24,7 @@ from pipeline.read.ingest.stamps import (
 )
 from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import ConfigError, InputError
+from schemas.frozen import frozen
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
@@ -34,7 +34,7 @@ _WORLD = r"(map|odom|world|earth|ecef|enu|ned|utm|wgs84|global|local|navigation|
 _USUAL_STAMPS = ("header.stamp", "timestamp", "stamp")
 
 
-@dataclass(frozen=True)
+@frozen
 class Sample:
     """A channel with the fields of its first message and their kinds."""
 
@@ -42,7 +42,7 @@ class Sample:
     fields: Mapping[str, str]
 
 
-@dataclass(frozen=True)
+@frozen
 class Source:
     """One channel that feeds a stream: fields to decode, columns and times over them.
 

@@ -7,18 +7,19 @@ deliver one column per path, and a recipe turns these into the columns of a stre
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import polars as pl
 
 from pipeline.read.ingest.stamps import CivilTime
 from schemas.enums import Fix
+from schemas.frozen import frozen
 from schemas.run import Stream
 
 FIX_TYPE = pl.Enum([kind.value for kind in Fix])
 
 
-@dataclass(frozen=True)
+@frozen
 class Recipe:
     """Columns of one stream from the fields of one message.
 

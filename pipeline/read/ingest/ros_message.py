@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
 from typing import NamedTuple
@@ -12,6 +11,7 @@ from typing import NamedTuple
 import polars as pl
 
 from pipeline.read.ingest.layout import Field, Layout, UndecodableError, constant, fixed, flag, layout_of, text
+from schemas.frozen import frozen
 
 PRIMITIVES = {
     "bool": "u1", "byte": "u1", "char": "i1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
@@ -31,7 +31,7 @@ class DefinitionError(ValueError):
     """A definition that is not understood."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Member:
     """A field of a message: `count` none for a single value, 0 for a sequence, else a fixed array."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Literal
 
@@ -12,6 +12,7 @@ import polars as pl
 from pipeline.read.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
 from schemas.arrays import NS_PER_S
 from schemas.config import StreamMapping
+from schemas.frozen import frozen
 
 LATEST_NS = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * NS_PER_S  # leaves room in 64 bits for the GPS epoch
 _DAY_S = 86_400
@@ -27,7 +28,7 @@ _NANOSECONDS = ("nanosec", "nsec", "nsecs", "nanos")
 TIME_KINDS: Mapping[str, pl.DataType] = {"int": pl.Int64(), "float": pl.Float64(), "text": pl.String()}
 
 
-@dataclass(frozen=True)
+@frozen
 class TimeSource:
     """Fields of a stamp and what they count: whole `unit_s` since the epoch of `epoch` on `scale`."""
 
@@ -122,7 +123,7 @@ def time_source(parts: Sequence[str], kinds: Mapping[str, str], mapping: StreamM
     return TimeSource(tuple(parts), types, unit_s, mapping.time_scale, mapping.time_epoch)
 
 
-@dataclass(frozen=True)
+@frozen
 class CivilTime:
     """A UTC calendar in six fields, nanoseconds that may be negative, and flags of which bits 0 and 1
     say that date and time are valid.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from itertools import islice
 from typing import NamedTuple
 
@@ -22,13 +21,14 @@ from pipeline.stages.track.survey import SurveyedTrack, places_along
 from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, LdsConfig, MatchingConfig, SiteConfig
 from schemas.enums import BaliseKind
+from schemas.frozen import frozen
 from schemas.run import Finding, Site
 
 _DEFAULTS = SiteConfig()
 _WHOLE = Configuration()
 
 
-@dataclass(frozen=True)
+@frozen
 class _Point:
     """An announced balise `at_m` from the entry of an oriented element."""
 
@@ -141,7 +141,7 @@ def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Findi
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class _ParallelStretch:
     """A part of an element beside another one, by measure."""
 

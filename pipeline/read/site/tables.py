@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import dataframely as dy
 import polars as pl
 
@@ -14,12 +12,13 @@ from pipeline.storage.parquet import metadata_of, read_parquet, unpacked_size
 from schemas.config import IngestConfig
 from schemas.enums import BaliseDirection, Reaction
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.inputs import SITE_SCHEMAS
 
 EPSG_WGS84 = 4326
 
 
-@dataclass(frozen=True)
+@frozen
 class RawTable:
     """A table as it stands in the file; `epsg` is what the file names, if it does."""
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import polars as pl
 
 from pipeline.results.diff.rules import Rules
 from pipeline.results.diff.tables import NO_RULES, Difference, compare_tables
+from schemas.frozen import frozen
 from schemas.tables import Hazards
 
 # Of the comparison of two results, which have a configuration each: an onset moves by an epoch at 1 Hz either way.
@@ -22,7 +22,7 @@ _DECIDING = {
 Change = Literal["appeared", "vanished", "changed"]
 
 
-@dataclass(frozen=True)
+@frozen
 class HazardChange:
     """A hazard that stands in one result only, or in both with other values."""
 

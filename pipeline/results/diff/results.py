@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import polars as pl
 
@@ -17,6 +17,7 @@ from pipeline.results.workers import told
 from pipeline.storage.address import Address, redacted
 from pipeline.storage.parquet import ParquetError, read_parquet
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 from schemas.tables import TABLES
 
 _KEYS: dict[str, tuple[str, ...]] = {
@@ -42,7 +43,7 @@ _LINES_SHOWN = 20
 _COLUMNS_SHOWN = 8
 
 
-@dataclass(frozen=True)
+@frozen
 class RunDiff:
     """What changed in one run. `made_otherwise`: digests and versions that differ, which is no change.
 
@@ -73,7 +74,7 @@ class RunDiff:
         return {item.place for item in self.differences} - shown
 
 
-@dataclass(frozen=True)
+@frozen
 class ResultDiff:
     """What changed from result A to result B: `runs` holds the changed ones only."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +14,7 @@ from pydantic import Field
 
 from schemas.config import Settings, settings_from, toml_of
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 from schemas.near import nearest
 from schemas.tables import TABLES
 
@@ -25,7 +26,7 @@ class RulesFile(Settings):
     ignore: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@frozen
 class Rules:
     """`tolerances` and `ignored` by `(table, column)`; a column without a tolerance has that of the contract."""
 

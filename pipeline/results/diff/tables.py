@@ -7,18 +7,18 @@ one, which would call positions tens of metres apart the same.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Literal
 
 import dataframely as dy
 import polars as pl
 
 from pipeline.results.diff.rules import Rules
+from schemas.frozen import frozen
 
 NO_RULES = Rules()
 
 
-@dataclass(frozen=True)
+@frozen
 class Difference:
     """One difference between two tables; `rows` counts the rows concerned."""
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import polars as pl
 
 from schemas.enums import RunStatus, RunVerdict
+from schemas.frozen import frozen
 
 
 def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
@@ -21,7 +21,7 @@ def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | N
     return RunVerdict.SAFE if known == {RunVerdict.SAFE} else RunVerdict.UNPROVEN
 
 
-@dataclass(frozen=True)
+@frozen
 class CampaignHead:
     """The verdict of a campaign, and how many runs have which; `failed`: no solution could be replayed."""
 

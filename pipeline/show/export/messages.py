@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 from typing import Any, Literal
@@ -13,6 +12,7 @@ from typing import Any, Literal
 import polars as pl
 
 from schemas.arrays import NS_PER_S
+from schemas.frozen import frozen
 
 Encoding = Literal["protobuf", "cdr"]
 
@@ -41,7 +41,7 @@ _ENUMS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Topic:
     """One channel to write: its schema, one payload per time [ns since 1970], and notes for its metadata."""
 

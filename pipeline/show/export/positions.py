@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
 from pipeline.results.places import GroundPositions, beside, ground_of, sign_of, stretches_of
 from schemas.arrays import floats
 from schemas.config import HazardConfig
+from schemas.frozen import frozen
 from schemas.run import Site
 
 _COVARIANCE = ("ee", "en", "eu", "nn", "nu", "uu")
 
 
-@dataclass(frozen=True)
+@frozen
 class ExportedPositions:
     """Frames of `t, latitude_deg, longitude_deg, height_m`, rows without a position left out.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from html import escape
 
 import polars as pl
@@ -37,11 +36,12 @@ from pipeline.show.report.words import plots_of, plural
 from pipeline.studies.safety.sentences import level_statements, plain_statements
 from schemas.campaign import CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
 from schemas.enums import TRUTH, Hazard, RunVerdict
+from schemas.frozen import frozen
 from schemas.tables import Hazards
 from schemas.words import accepted_words, notes_apart
 
 
-@dataclass(frozen=True)
+@frozen
 class Campaign:
     """Tables of all runs, `run_id` in front, and `derived` from them by the name of their file; `pieces` as from
     `availability_pieces`; `hrefs` of the runs' pages, as far as there are; `architectures` as from `added`.

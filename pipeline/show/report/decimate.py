@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from schemas.arrays import Bools, Floats, Ints
+from schemas.frozen import frozen
 
 BINS = 2500
 WHOLE_SERIES = 4 * BINS
@@ -73,7 +72,7 @@ def detail_rows(t_ns: Ints, moments_ns: Ints, reach_s: float = 60.0, limit: int 
     return np.asarray(away <= reach_ns)
 
 
-@dataclass(frozen=True)
+@frozen
 class Band:
     """Pieces of constant state: piece i has `codes[i]` from `starts_ms[i]` to the next start, the last to `end_ms`."""
 

@@ -5,7 +5,6 @@ Metres east and north of the site's first point; without a site along the path a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import ceil
 
 import numpy as np
@@ -26,6 +25,7 @@ from pipeline.show.report.decimate import detail_rows, worst_rows
 from pipeline.show.report.markup import Json, packed, packed_line
 from schemas.arrays import Floats, Ints, floats
 from schemas.enums import Judgement
+from schemas.frozen import frozen
 from schemas.run import Site
 
 STATES = (Judgement.RIGHT.value, Judgement.UNKNOWN.value, Judgement.WRONG.value)
@@ -35,7 +35,7 @@ _POINTS = 8000
 _AROUND_M = 500.0
 
 
-@dataclass(frozen=True)
+@frozen
 class _View:
     """How path positions and epochs become points of the drawing."""
 

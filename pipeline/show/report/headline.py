@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import polars as pl
 
@@ -14,13 +13,14 @@ from pipeline.show.report.columns import Row
 from pipeline.show.report.markup import Cell, cell, number, table
 from pipeline.show.report.words import WORDS, plural, some_of
 from schemas.enums import Origin, Reason, RunVerdict
+from schemas.frozen import frozen
 from schemas.run import RunTables
 from schemas.words import beside_words, part_words, reason_words, say, unnoticed_words
 
 _ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
 
 
-@dataclass(frozen=True)
+@frozen
 class Headline:
     """`word` is the verdict, `worst` the sentence behind it, `beside` its figures, `reasons` all that made it."""
 

@@ -7,7 +7,6 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from html import escape
@@ -17,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from schemas.frozen import frozen
 
 Json = Any
 
@@ -28,7 +29,7 @@ _SHOWN_COLUMNS = 10
 _SHARED_SCRIPTS = ("tables.js", "scales.js", "plots.js", "plans.js")
 
 
-@dataclass(frozen=True)
+@frozen
 class Cell:
     """What is shown, what it is sorted by, and HTML instead of the text where there is some.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 from urllib.parse import quote
@@ -36,6 +35,7 @@ from pipeline.stages.run_row.verdict import LEVEL_LISTS
 from schemas.campaign import CampaignLevels
 from schemas.config import Configuration
 from schemas.enums import TRUTH
+from schemas.frozen import frozen
 from schemas.run import RunTables, Site
 from schemas.tables import Alarms, Hazards, Passages, Runs
 from schemas.words import notes_apart
@@ -58,7 +58,7 @@ ALLOWED = "Wrong positions in use against the allowed T_D (TVB eq. 7)"
 _KEYS = "Keys: n p next and previous hazard, + - 0 zoom, ← → time, [ ] previous and next run"
 
 
-@dataclass(frozen=True)
+@frozen
 class Made:
     """What stands on every page: limits, and the configuration as it was resolved."""
 
@@ -67,7 +67,7 @@ class Made:
     site: Site | None
 
 
-@dataclass(frozen=True)
+@frozen
 class Neighbours:
     """The runs before and after in the campaign, each with its page; None at the ends."""
 

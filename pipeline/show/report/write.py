@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
 
@@ -39,6 +39,7 @@ from pipeline.studies.safety.side_by_side import side_by_side
 from pipeline.studies.safety.tally import COUNTS, added
 from schemas.config import Configuration, to_toml
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 from schemas.run import Site
 
 # Kept of each run until it changes: what its page was made from, the digest of the page, and what the run adds to the
@@ -50,7 +51,7 @@ MOST_PAGES = 1000
 _RUNS_AT_ONCE = 256
 
 
-@dataclass(frozen=True)
+@frozen
 class _Page:
     """What the page of one run is made from; `made_of`: the digest of that, empty where nobody knows it."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from pipeline.stages.odometry.odometry import Odometry
 from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, Vehicle
 from schemas.enums import NotEvaluated
+from schemas.frozen import frozen
 from schemas.stages import AlignedEpochs, MatchedEpochs
 
 BEYOND_SPAN = NotEvaluated.BEYOND_SPAN
@@ -68,7 +69,7 @@ def stated_excess_m2(aligned: AlignedEpochs, holds: Sequence[Hold], config: Conf
     return np.asarray(np.where(known < 0, 0.0, meter.stated_excess_m2()[known]))
 
 
-@dataclass(frozen=True)
+@frozen
 class _Allowed:
     """What every test allows for the position at each epoch [m]; shape (epochs,).
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -26,6 +25,7 @@ from pipeline.stages.odometry.odometry import Odometry
 from pipeline.stages.odometry.recovery import RecoveryRule
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, Vehicle
+from schemas.frozen import frozen
 
 Hold = tuple[int, int]
 """From the epoch of an alarm along the track to that of recovery (past the last one if there is none): nothing is
@@ -33,7 +33,7 @@ learned.
 """
 
 
-@dataclass(frozen=True)
+@frozen
 class ToLearn:
     """What is learned from, of each epoch of a solution; arrays of shape (epochs,)."""
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ from pipeline.stages.odometry.odometry import KnownNoise, Odometry
 from pipeline.stages.odometry.scale_lag import slopes
 from schemas.arrays import Floats, Ints
 from schemas.config import AlignConfig, Vehicle
+from schemas.frozen import frozen
 
 
 class Estimates(NamedTuple):
@@ -103,7 +103,7 @@ def _scatters(known: KnownNoise, jitter_s: Floats) -> list[_Scatter]:
     return [_Scatter(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 
 
-@dataclass(frozen=True)
+@frozen
 class ScaleLatencyFilter:
     """States are passed in and out."""
 

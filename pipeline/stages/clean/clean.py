@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from pipeline.stages.clean.placeholders import without_placeholders
 from schemas.arrays import Bools, times_ns
 from schemas.config import Configuration
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 _KEYS: dict[Stream, list[str]] = {
@@ -37,7 +38,7 @@ def no_advice(run: RunLog) -> str:
     return ""
 
 
-@dataclass(frozen=True)
+@frozen
 class StreamCounts:
     """Rows dropped because their key stands twice, and rows that came before an earlier one.
 
@@ -53,7 +54,7 @@ class StreamCounts:
     held: int = 0
 
 
-@dataclass(frozen=True)
+@frozen
 class CleanCounts:
     """Per GNSS solution and per stream."""
 

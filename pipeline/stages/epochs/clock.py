@@ -6,7 +6,6 @@ nanoseconds in order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -14,6 +13,7 @@ import polars as pl
 
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median, times_ns
 from schemas.config import Configuration, LdsConfig
+from schemas.frozen import frozen
 from schemas.stages import ONE_TRACK_LEFT
 
 Time = TypeVar("Time", float, pl.Expr)
@@ -24,7 +24,7 @@ GAP_PERIODS = 1.5
 _PERIOD_STEPS = 100
 
 
-@dataclass(frozen=True)
+@frozen
 class Clock:
     """The epochs' times and how long the state of each holds; `period_s`: from one position to the next."""
 

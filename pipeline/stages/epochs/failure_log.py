@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.verdicts import FAIL
 from schemas.arrays import NS_PER_S, Bools, Ints, flags, ints, times_ns, truths
 from schemas.enums import MonitorState
+from schemas.frozen import frozen
 from schemas.tables import MONITORS
 
 
-@dataclass(frozen=True)
+@frozen
 class AlarmEpisode:
     """Fails less than the recovery time apart: first and last failing epoch, monitors in order of failing."""
 
@@ -25,7 +24,7 @@ class AlarmEpisode:
     peak_ratio: float
 
 
-@dataclass(frozen=True)
+@frozen
 class FailureLog:
     """All epochs' times and where they are negated, the failing epochs with their first monitor, and the alarms."""
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
 from schemas.arrays import Bools, Floats, Ints
 from schemas.enums import MonitorState, NotEvaluated
+from schemas.frozen import frozen
 from schemas.stages import NO_REASON, REASONS, reason_words
 
 # Reasons that several monitors give.
@@ -31,7 +30,7 @@ NUMBER = {reason: number for number, reason in enumerate(REASONS)}
 _STATE_WORDS = pl.Series(STATES, dtype=pl.Enum(STATES))
 
 
-@dataclass(frozen=True)
+@frozen
 class Verdicts:
     """What one monitor says of each epoch; arrays of shape (epochs,)."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Self
 
@@ -21,6 +21,7 @@ from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of, times_ns
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import BaliseKind, Evidence
+from schemas.frozen import frozen
 
 # DOMAIN section 5.1: the reference is held against the odometer over so long; a spike is no longer [s].
 _WINDOW_S = 10.0
@@ -37,7 +38,7 @@ _DIRECTION_SIGMAS = 4.0
 _EVEN_S = 2.0
 
 
-@dataclass(frozen=True)
+@frozen
 class KnownPath:
     """One path of the reference: per sample the coordinate and its least and largest value [m].
 
@@ -62,7 +63,7 @@ class KnownPath:
         return Place(int(element[0]), float(measure[0]))
 
 
-@dataclass(frozen=True)
+@frozen
 class KnownStretch:
     """A stretch of the reference on the odometer's clock; the train was on one of its paths.
 
@@ -134,7 +135,7 @@ class KnownStretch:
         return self.anchor(first), self.anchor(last)
 
 
-@dataclass(frozen=True)
+@frozen
 class Sided:
     """A stretch with the sense of its first path: metres that the odometer counted with it and against it."""
 
@@ -353,7 +354,7 @@ def _confirming_ns(
     return sorted(confirming)
 
 
-@dataclass(frozen=True)
+@frozen
 class ReferenceStep:
     """From one sample to the next the reference moves by `step_m` more than every odometer; more than `noise_m`.
 
@@ -368,7 +369,7 @@ class ReferenceStep:
     leap: bool = False
 
 
-@dataclass(frozen=True)
+@frozen
 class Witness:
     """An odometer that may contradict a reference.
 
@@ -477,7 +478,7 @@ def _drifts(
     return steps
 
 
-@dataclass(frozen=True)
+@frozen
 class Levels:
     """The samples between steps that last, with how high each lies over the first; `confirmed` by a read.
 
@@ -522,7 +523,7 @@ class Levels:
         return float("nan") if self.drifts.any() else float(self.heights_m[-1])
 
 
-@dataclass(frozen=True)
+@frozen
 class Beyond:
     """Levels of the reference before and after a stretch, up to one that a read confirms: how high they lie [m].
 

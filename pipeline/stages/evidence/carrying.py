@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -15,12 +15,13 @@ from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
 from schemas.config import Configuration
 from schemas.enums import Evidence
+from schemas.frozen import frozen
 
 Interval = tuple[Floats, Floats]
 """Least and largest coordinate [m], NaN where nothing is known."""
 
 
-@dataclass(frozen=True)
+@frozen
 class TrueAnchor:
     """At an instant of the odometer's clock the train was at one of `places`.
 
@@ -38,7 +39,7 @@ class TrueAnchor:
     open_m: float = 0.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Counter:
     """An odometer as evidence, silent where its distance is in doubt by more than `silent_m`.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from pipeline.stages.evidence.carrying import Counter
 from pipeline.stages.odometry.scale_lag import ScaleLag, possible_lags, scale_and_lag
 from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, HazardConfig
+from schemas.frozen import frozen
 
 # A lag of less than so many of its sigmas may be none.
 _SHOWN_SIGMAS = 2.0
@@ -20,7 +20,7 @@ _DIFFER_SIGMAS = 4.0
 _LAG_STEP_S = 1.0
 
 
-@dataclass(frozen=True)
+@frozen
 class RecorderClock:
     """How a recorder is put on the odometer's clock: its stamps less `shift_s`, +- `delta_s`.
 
@@ -32,7 +32,7 @@ class RecorderClock:
     assumed: bool = False
 
 
-@dataclass(frozen=True)
+@frozen
 class Lags:
     """What the ways of a recorder say of its lag behind one odometer: `found`, and the least and largest `possible_s`.
 

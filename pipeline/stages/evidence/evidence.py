@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -24,6 +24,7 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Evidence as Kind
 from schemas.enums import Origin
+from schemas.frozen import frozen
 
 KINDS = tuple(Kind)
 NOTHING = -1
@@ -37,7 +38,7 @@ _IN_STEP_S = 0.5
 _AGREES = 1.0 - 1.0 / np.sqrt(2.0)
 
 
-@dataclass(frozen=True)
+@frozen
 class Alternative:
     """One track that the train may have been on at some of the instants, and where on it [m]; `rows` in order."""
 
@@ -68,7 +69,7 @@ class Alternative:
         return Alternative(self.rows, self.route, self.middle_m - half_m, self.middle_m + half_m)
 
 
-@dataclass(frozen=True)
+@frozen
 class EvidenceSet:
     """Evidence at instants: where there are several alternatives the train was on one of them.
 
@@ -82,7 +83,7 @@ class EvidenceSet:
     on_survey: Bools
 
 
-@dataclass(frozen=True)
+@frozen
 class _Shown:
     """What the sources of evidence write per instant, as in `EvidenceSet`."""
 
@@ -91,7 +92,7 @@ class _Shown:
     on_survey: Bools
 
 
-@dataclass(frozen=True)
+@frozen
 class TrainEvidence:
     """All evidence of a run.
 
@@ -385,7 +386,7 @@ def either(sets: Sequence[EvidenceSet]) -> EvidenceSet:
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class _Instants:
     """Instants in any order."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
@@ -14,9 +14,10 @@ from pipeline.stages.track.chain import Chain
 from pipeline.stages.track.network import Network
 from schemas.arrays import NS_PER_S, Ints
 from schemas.config import Configuration
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class GapChain:
     """A chain through a gap, in the sense in which the odometer counts up, with its anchors at `at_m`.
 
@@ -32,7 +33,7 @@ class GapChain:
         return self.at_m[-1] - self.at_m[0]
 
 
-@dataclass(frozen=True)
+@frozen
 class Gap:
     """Time between two anchors, or on one side of one.
 
@@ -77,7 +78,7 @@ class Gap:
         return len(self.anchors) == 2 and self.ways == []
 
 
-@dataclass(frozen=True)
+@frozen
 class Carried:
     """What one odometer carries from anchors, by its gaps."""
 
@@ -85,7 +86,7 @@ class Carried:
     gaps: tuple[Gap, ...]
 
 
-@dataclass(frozen=True)
+@frozen
 class GapSearch:
     """One odometer over the network, and which way the train ran as the odometer of the LDS counted up.
 

@@ -6,8 +6,6 @@ than by what it wrote before and after. One that is made of the positions has th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -15,6 +13,7 @@ from pipeline.stages.follows.stands import correlated_at_stands
 from pipeline.stages.follows.steps import Steps, common_steps
 from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, EvidenceConfig
+from schemas.frozen import frozen
 
 # Steps on either side that predict one: of the series itself, and of the positions.
 _OWN = 4
@@ -28,7 +27,7 @@ _HEIGHT_OVER_CROSS = 1.5
 _LEAST_M = 1e-4
 
 
-@dataclass(frozen=True)
+@frozen
 class Follows:
     """`ratio`: V, None where too few steps could be looked at; `at_stands`: odometer and positions err as one there."""
 

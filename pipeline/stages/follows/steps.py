@@ -8,8 +8,6 @@ direction, where `Odometry` asks whether the train left its place.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -17,6 +15,7 @@ from pipeline.stages.track.geodesy import curvature_radii_m
 from schemas.arrays import Bools, Floats, floats, median, times_ns
 from schemas.config import Configuration
 from schemas.enums import Fix
+from schemas.frozen import frozen
 
 # Slower, positions that scatter by metres show no direction [m/s]; speeds and directions are of so long around [s].
 _MOVING_MPS = 1.0
@@ -26,7 +25,7 @@ _PAUSE_PERIODS = 1.6
 _FEWEST = 10
 
 
-@dataclass(frozen=True)
+@frozen
 class Steps:
     """From one stamp of the slower recorder to the next, `t_s` at their begins; all arrays of one length.
 

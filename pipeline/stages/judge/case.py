@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,9 +13,10 @@ from pipeline.stages.track.path import RoutePath, TravelledPath
 from schemas.arrays import NS_PER_S, Ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, PassageStatus
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Solution:
     """One solution: `fixes` as recorded, `epochs` with all columns up to the LDS, `balises` on its path."""
 
@@ -42,7 +42,7 @@ class Solution:
         return self.offers.filter("accepted").sort("t")
 
 
-@dataclass(frozen=True)
+@frozen
 class Case:
     """One solution with the evidence of its run; `odometry` grows with its path, `faults` were injected.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -14,11 +14,12 @@ from pipeline.stages.judge.failures import Course, Failure, failure_at
 from pipeline.stages.judge.judgement import WRONG
 from pipeline.stages.judge.jumps import Jump
 from schemas.arrays import NS_PER_S, Bools, spans_of
+from schemas.frozen import frozen
 
 _ODOMETER = "odometer"
 
 
-@dataclass(frozen=True)
+@frozen
 class Detection:
     """First fail of a monitor in an episode; `standing`: the alarm was there before the fault was visible."""
 
@@ -27,7 +28,7 @@ class Detection:
     standing: bool = False
 
 
-@dataclass(frozen=True)
+@frozen
 class Extent:
     """Positions of an episode, numbered as in `Course`, from the onset on; `end` is the first after it.
 
@@ -41,7 +42,7 @@ class Extent:
     jump_back: Jump | None
 
 
-@dataclass(frozen=True)
+@frozen
 class Episode(Extent):
     """A fault from its onset until the position is right again; `begin_ns`: that of a step included.
 

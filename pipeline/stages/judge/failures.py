@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -15,10 +14,11 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, s
 from schemas.config import Configuration, HazardConfig
 from schemas.conform import dtypes
 from schemas.enums import Judgement
+from schemas.frozen import frozen
 from schemas.stages import Failures
 
 
-@dataclass(frozen=True)
+@frozen
 class Offers:
     """Judged offers in arrays; `number`: the position, by its row, that completes each."""
 
@@ -54,7 +54,7 @@ class Offers:
         return next((JUDGEMENTS[code] for code in (WRONG, UNKNOWN) if code in codes), Judgement.RIGHT)
 
 
-@dataclass(frozen=True)
+@frozen
 class Course:
     """The positions in order of time, with the jumps between them and the offers; numbers are rows of `positions`.
 
@@ -133,7 +133,7 @@ def _quiet(judged: Judgements, sigma_m: Floats, config: HazardConfig) -> Bools:
     return np.logical_and(within, ~judged.is_wrong)
 
 
-@dataclass(frozen=True)
+@frozen
 class Failure:
     """Positions `begin` to `end` (the first after it), those judged wrong in use `first` to `last`; for how long.
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -19,6 +17,7 @@ from pipeline.stages.judge.judgement import RIGHT, WRONG
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, runs_of, times_ns
 from schemas.config import Configuration
 from schemas.enums import LdsState
+from schemas.frozen import frozen
 
 # Numerics: times shorter than half a nanosecond are rounding.
 _LEAST_S = 0.5 / NS_PER_S
@@ -43,7 +42,7 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
     return pl.DataFrame({"in_use": in_use, "used_s": used_s, "wrong_s": wrong_s, "counted_s": counted_s})
 
 
-@dataclass(frozen=True)
+@frozen
 class _StepTimes:
     """The time from the position before to each, ending at `end_s`; `is_gap`: longer than a movement is interpolated.
 

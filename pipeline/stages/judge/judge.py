@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import polars as pl
 
@@ -20,9 +20,10 @@ from pipeline.stages.judge.passages import passages_table
 from pipeline.stages.judge.travel import odometer_steps
 from schemas.arrays import flags, times_ns
 from schemas.enums import Evidence
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Judged:
     """Tables by the contract, and the frames that they were read from (`schemas.stages`).
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ from pipeline.stages.track.path import RoutePath
 from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import HazardConfig
 from schemas.enums import Evidence, Judgement
+from schemas.frozen import frozen
 
 JUDGEMENTS = tuple(Judgement)
 _JUDGEMENT_WORDS = pl.Series("judgement", [word.value for word in Judgement], dtype=pl.Enum(Judgement))
@@ -24,7 +25,7 @@ RIGHT, WRONG, UNKNOWN = (JUDGEMENTS.index(word) for word in (Judgement.RIGHT, Ju
 REFERENCE, BALISE, ODOMETER = (KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER))
 
 
-@dataclass(frozen=True)
+@frozen
 class MatchedPositions:
     """Positions of a solution, or balises that it offers, on the network; `element` -1 without a position.
 
@@ -48,7 +49,7 @@ class MatchedPositions:
         return np.isfinite(self.path_m) & np.greater_equal(self.element, 0)
 
 
-@dataclass(frozen=True)
+@frozen
 class Judgements:
     """Per instant: judgement (number in `JUDGEMENTS`), interval of the error along the track [m], kind of evidence.
 

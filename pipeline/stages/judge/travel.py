@@ -6,8 +6,6 @@ says of the same, and the odometer as the LDS used it held against the evidence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -16,9 +14,10 @@ from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.judgement import REFERENCE, Judgements
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, spans_of, times_ns
 from schemas.config import Configuration, HazardConfig, LdsConfig
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class OdometerSteps:
     """From each epoch to the next: `counts`, the odometer has no gap there; `moves`, it shows movement.
 

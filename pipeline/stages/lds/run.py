@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -29,11 +28,12 @@ from schemas.arrays import Bools, Floats
 from schemas.config import Configuration, LdsConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode
+from schemas.frozen import frozen
 from schemas.stages import AlignedEpochs
 from schemas.tables import Epochs, Passages
 
 
-@dataclass(frozen=True)
+@frozen
 class LdsResult:
     """What the LDS made of one solution.
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.stages.paths.path_set import Node, PathSet
 from pipeline.stages.track.network import Network
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 
 # Numerics: branches of the longest switches part by 1.5 m within 60 m; no farther is looked.
 _LONGEST_M = 300.0
@@ -37,7 +36,7 @@ def branches_beyond_m(network: Network, wanted: set[int]) -> dict[int, float]:
     return beyond
 
 
-@dataclass(frozen=True)
+@frozen
 class Zone:
     """Of one end of a line without a branch: the oriented element that leads to the switch there, and how far behind it
     the branches are one track [m].

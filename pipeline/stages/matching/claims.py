@@ -5,8 +5,6 @@ A claim is a confidence, no probability: 0.99 where one track is left of the set
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -15,6 +13,7 @@ from pipeline.stages.paths.path_set import PathSet, Span
 from pipeline.stages.track.network import Network
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 from schemas.config import MatchingConfig
+from schemas.frozen import frozen
 from schemas.stages import ONE_TRACK_LEFT, MatchedEpochs
 
 # No other track within reach; more than one left of the set.
@@ -43,7 +42,7 @@ OFF_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Possible:
     """Per step of a second the net elements that no position refutes in hindsight, and the confidence in each.
 
@@ -56,7 +55,7 @@ class Possible:
     confidence: Floats
 
 
-@dataclass(frozen=True)
+@frozen
 class Claims:
     """Per epoch the confidence in its track: `live`, by what came before, and in `hindsight`; NaN while off.
 
@@ -69,7 +68,7 @@ class Claims:
     possible: Possible
 
 
-@dataclass(frozen=True)
+@frozen
 class _Left:
     """Per step what is left of a set: line (-1: none, -2: several), the two likeliest lines, way to a branch [m].
 

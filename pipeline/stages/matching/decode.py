@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.stages.matching.least_squares import Course
@@ -12,9 +10,10 @@ from pipeline.stages.track.chain import Chain, moved_on
 from pipeline.stages.track.leg import Leg, Visit, leg_of, segments_at, shifted
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Decoded:
     """Legs, and for each step its leg, element number in it and place from that element's entry [m]."""
 

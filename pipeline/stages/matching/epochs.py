@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,12 +13,13 @@ from pipeline.stages.track.segments import Feet
 from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig, Vehicle
 from schemas.enums import SigmaSource
+from schemas.frozen import frozen
 from schemas.stages import SIGMA_SOURCES, MatchedEpochs
 
 _RECEIVER, _TABLE = (SIGMA_SOURCES.index(source) for source in (SigmaSource.RECEIVER, SigmaSource.TABLE))
 
 
-@dataclass(frozen=True)
+@frozen
 class Assignment:
     """What the search found per epoch: leg, a hint at the passage [m], and how sure it is."""
 
@@ -29,7 +29,7 @@ class Assignment:
     gate_probability: Floats
 
 
-@dataclass(frozen=True)
+@frozen
 class Placed:
     """Every epoch on its leg: its foot, path position of the antenna and height over the track [m], NaN if unknown."""
 
@@ -43,7 +43,7 @@ class Placed:
         return cls(feet, *path.places(assignment.leg, feet, fixes.height_m))
 
 
-@dataclass(frozen=True)
+@frozen
 class Shape:
     """The track at places of the path."""
 
@@ -60,7 +60,7 @@ class Shape:
         return np.sin(heading), np.cos(heading)
 
 
-@dataclass(frozen=True)
+@frozen
 class Written:
     """How a solution is written down: its name, and the deviation by its coordinates' steps [m] (`digit_steps`)."""
 

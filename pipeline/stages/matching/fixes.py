@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -12,9 +10,10 @@ from pipeline.stages.track.geodesy import MEAN_RADIUS_M, Points, points_of
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import FixSigma
 from schemas.enums import Fix
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Fixes:
     """Epochs of one solution in order; NaN where not known.
 

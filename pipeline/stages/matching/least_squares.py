@@ -7,19 +7,18 @@ only where positions stay there for long enough.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.stages.matching.path_states import PathStates, unbroken
 from pipeline.stages.paths.moves import Moves, Place
 from schemas.arrays import Bools, Floats, Ints
+from schemas.frozen import frozen
 
 # Numerics: more than a step that no error explains costs one that is left out, in squares of sigmas.
 _LEFT_OUT = 1.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Reached:
     """The cheapest way to a state of a block; `place`: at its last step."""
 
@@ -30,7 +29,7 @@ class _Reached:
     before: _Reached | None
 
 
-@dataclass(frozen=True)
+@frozen
 class Course:
     """Steps of the set in order of time with the oriented element of the path at each, and metres from its entry."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -21,11 +21,12 @@ from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import NS_PER_S, Ints, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import Site
 from schemas.stages import MatchedEpochs
 
 
-@dataclass(frozen=True)
+@frozen
 class Match:
     """Epochs on the path, the path, when it was in doubt, and when the positions were `off` the network.
 

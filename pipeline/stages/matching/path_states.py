@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.stages.paths.candidates import Candidates, overtaken
@@ -12,9 +10,10 @@ from pipeline.stages.paths.path_steps import PathSteps
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class PathStates:
     """Oriented elements in order of step; `first[k] : first[k + 1]` are those of the step `step[k]` of the set.
 

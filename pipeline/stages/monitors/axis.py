@@ -6,7 +6,7 @@ Along the track (DIAG eq. 1-3) for the bank and for learning.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 
@@ -22,12 +22,13 @@ from pipeline.stages.monitors.recursion import (
 from pipeline.stages.odometry.odometry import Increments
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, MonitorConfig
+from schemas.frozen import frozen
 
 # Rows evaluated at once: few after a restart, which may soon be followed by another; never more than the cache holds.
 FIRST_BLOCK, BLOCK = 2048, 8192
 
 
-@dataclass(frozen=True)
+@frozen
 class AxisSeries:
     """Increments of one axis, one row per usable epoch, in order; all arrays of one length m.
 
@@ -128,7 +129,7 @@ def _raw_variance(series: AxisSeries, increment_m2: Floats) -> Floats:
     return np.asarray((increment_m2 + border) / series.dt_s**2 + (series.lasting_mps**2).sum(axis=1))
 
 
-@dataclass(frozen=True)
+@frozen
 class AlongEpochs:
     """Epochs with a position and an odometer, in order, and the errors there; all arrays of one length m.
 

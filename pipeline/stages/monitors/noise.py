@@ -6,7 +6,6 @@ constant ramp has no second difference.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.special import ndtri
 from pipeline.stages.monitors.axis import AxisSeries, error_model
 from schemas.arrays import Bools, Floats, Ints, median
 from schemas.config import Configuration, MonitorConfig
+from schemas.frozen import frozen
 
 # M = (second difference)^2 / 4 is exact for a random walk; for white noise, whose second differences have six times its
 # variance, it is 6 / 4 of it, so on the safe side (DOMAIN section 3).
@@ -151,7 +151,7 @@ class NoiseMeter:
         return np.minimum(more_m2, np.maximum(known_m2, self._limit_m2))
 
 
-@dataclass(frozen=True)
+@frozen
 class _SecondDifferences:
     """Second differences over one lag, in order of time.
 

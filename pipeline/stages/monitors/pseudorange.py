@@ -9,7 +9,6 @@ stays in it for as long as it lasts.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -21,6 +20,7 @@ from pipeline.stages.monitors.sight import line_of_sight_rows, range_variances_m
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
+from schemas.frozen import frozen
 from schemas.stages import MatchedEpochs
 
 NO_RANGES = NotEvaluated.NO_RANGES
@@ -54,7 +54,7 @@ def pseudorange_monitor(epochs: MatchedEpochs, satellites: pl.DataFrame | None, 
     return verdicts(value, threshold, reasons)
 
 
-@dataclass(frozen=True)
+@frozen
 class _Ranges:
     """Used satellites with a residual, by epoch; `system` numbers the constellations."""
 
@@ -69,7 +69,7 @@ class _Ranges:
         return int(self.system.max(initial=-1)) + 1
 
 
-@dataclass(frozen=True)
+@frozen
 class _TrackFrame:
     """At each epoch: unit vectors east, north, up, and the position's offset [m]."""
 
@@ -128,7 +128,7 @@ def _track_of(epochs: MatchedEpochs, config: Configuration) -> _TrackFrame:
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class Equations:
     """The ranges of some epochs against a position on the track; shapes (epochs, satellites, ...).
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 
 
 def linear_recurrence(decay: Floats, drive: Floats, initial: Floats) -> Floats:
@@ -36,7 +35,7 @@ def ewma_weight(alpha: Floats, dt_s: Floats) -> Floats:
     return 1.0 - ((1.0 - alpha[:, None]) ** dt_s[None, :]).T
 
 
-@dataclass(frozen=True)
+@frozen
 class AxisState:
     """What the recursions of one axis carry on; all zero at a restart. Shapes (alphas,), (alphas, sources).
 

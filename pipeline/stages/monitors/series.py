@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -14,6 +13,7 @@ from pipeline.stages.odometry.odometry import Increments
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, MonitorConfig
 from schemas.enums import NotEvaluated
+from schemas.frozen import frozen
 from schemas.stages import NO_REASON, AlignedEpochs
 
 OFF_TRACK = NotEvaluated.OFF_TRACK
@@ -22,7 +22,7 @@ FIRST_EPOCH = NotEvaluated.FIRST_EPOCH
 _STRAIGHT_PER_M = 1e-6
 
 
-@dataclass(frozen=True)
+@frozen
 class Axis:
     """Its increments, at which of them the train moves, and per epoch why there is none (`NO_REASON`: there is)."""
 

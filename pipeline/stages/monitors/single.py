@@ -6,7 +6,6 @@ Each yields `Verdicts`, row for row with the epochs.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +18,7 @@ from pipeline.stages.monitors.series import FIRST_EPOCH
 from schemas.arrays import Floats, floats, times_ns, truths
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import NotEvaluated
+from schemas.frozen import frozen
 from schemas.stages import NO_REASON, AlignedEpochs
 
 NO_VELOCITY = NotEvaluated.NO_VELOCITY
@@ -173,7 +173,7 @@ def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
     return placed.select("t_ns", *_PLACE, sense=moved.sign().cast(pl.Int8))
 
 
-@dataclass(frozen=True)
+@frozen
 class Seen:
     """What monitors without memory may look at; `other` on this solution's path, `absent`: why there is none."""
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.stages.odometry.odd_steps import LOST_M, weighed
 from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig
+from schemas.frozen import frozen
 
 # Each step of slip is in doubt by so much at least [m]: a locked wheel counts nothing.
 LEAST_DOUBT_M = 1e-3
@@ -20,7 +19,7 @@ def is_lost(doubt_m: Floats) -> Bools:
     return lost
 
 
-@dataclass(frozen=True)
+@frozen
 class Bound:
     """Sums over runs of steps whose count may be off, per row at `t_s` [m].
 

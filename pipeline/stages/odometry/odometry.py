@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -28,6 +28,7 @@ from pipeline.stages.odometry.rows import Ways, filled_in, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, median, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
+from schemas.frozen import frozen
 
 # Numerics: of so many rows the declared sigma is usual.
 _DECLARED_ROWS = 100
@@ -51,7 +52,7 @@ class Increments(NamedTuple):
     speed_mps: Floats
 
 
-@dataclass(frozen=True)
+@frozen
 class Noise:
     """Noise of the distance as the whole run shows it: what gathers in a second, and the scatter of rows. For
     evidence and calibration; detection uses `KnownNoise`.
@@ -61,7 +62,7 @@ class Noise:
     quantisation: QuantisationNoise = NO_QUANTISATION
 
 
-@dataclass(frozen=True)
+@frozen
 class KnownNoise:
     """The same as the rows up to each sample show it, and the period of the rows [s].
 
@@ -86,7 +87,7 @@ class KnownNoise:
         return np.asarray(self.still_m2 + self.moving_s2 * speed_mps**2 + self.faster_s2 * faster)
 
 
-@dataclass(frozen=True)
+@frozen
 class Odometry:
     """Distance over time with its noise and two sums of doubt.
 

@@ -7,7 +7,6 @@ show, evidence and calibration what the run shows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ import polars as pl
 
 from schemas.arrays import Bools, Floats, Ints, median
 from schemas.config import AlignConfig
+from schemas.frozen import frozen
 
 # Numerics of the fit: so many rows of a piece, and the degree of its curve.
 _MOST_ROWS = 16
@@ -28,7 +28,7 @@ _FIRST_ROWS, _FEWEST_FIRST = 100, 5
 _MEDIAN_SIGMAS = 0.6745
 
 
-@dataclass(frozen=True)
+@frozen
 class QuantisationNoise:
     """Variance [m^2] of a row at a stand, and its growth with the square of the speed [s^2]."""
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 
 from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
+from schemas.frozen import frozen
 
 Number = TypeVar("Number", float, Floats)
 
 
-@dataclass(frozen=True)
+@frozen
 class RecoveryRule:
     """`recovery_s` without a fast failure, and GNSS minus odometer what it was at the anchor, within the bound."""
 

@@ -15,7 +15,7 @@ nearly as well, or where the changes of speed are noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
 from functools import cached_property
 from typing import TypeVar
@@ -23,6 +23,7 @@ from typing import TypeVar
 import numpy as np
 
 from schemas.arrays import Bools, Floats, Ints, median
+from schemas.frozen import frozen
 
 # Numerics: a lag shows where the speed changes, so ways over this time are compared, one every so often [s]; no longer
 # ones where a recorder pauses.
@@ -78,7 +79,7 @@ class LagState(StrEnum):
     AMBIGUOUS = "several lags fit"
 
 
-@dataclass(frozen=True)
+@frozen
 class ScaleLag:
     """Way of the other recorder over that counted; stamp of a moment by the other minus the counter's [s].
 
@@ -98,7 +99,7 @@ class ScaleLag:
         return self.state is LagState.MEASURED
 
 
-@dataclass(frozen=True)
+@frozen
 class CountedRows:
     """Rows of a counter: times [s], distance [m], how many steps before each row are in doubt; sigma of a row [m]."""
 
@@ -249,7 +250,7 @@ def _left_over(counted: Floats, seen: Floats, scale_off: float) -> Floats:
     return np.asarray(np.minimum((seen - scale[:, None] * counted) ** 2, _USUAL**2).sum(axis=1))
 
 
-@dataclass(frozen=True)
+@frozen
 class _Ways:
     """Ways that a recorder saw between its stamps, and the counter that counted them too."""
 
@@ -382,7 +383,7 @@ class _Ways:
         return _Regression(design, beside, self.way_m, used, self.overlap)
 
 
-@dataclass(frozen=True)
+@frozen
 class _Regression:
     """way = design @ (scale, scale * rest of the lag), by the moments of `beside`, over the `used` ways."""
 

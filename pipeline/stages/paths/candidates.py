@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from pipeline.stages.track.once import Once
 from pipeline.stages.track.segments import Box, Feet, Polyline, box_about, downhill
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
+from schemas.frozen import frozen
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -25,7 +26,7 @@ PROBE_SPACING_M = 40.0
 BEND_M = 2.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Segments(Polyline):
     """All segments of the network, element by element; `first[e] : first[e + 1]` are those of element e.
 
@@ -64,7 +65,7 @@ class Segments(Polyline):
         return start + fraction[kept][:, None] * (self.end[chosen] - start), chosen
 
 
-@dataclass(frozen=True)
+@frozen
 class Search:
     """A search tree over probes, and the segment of each."""
 
@@ -73,7 +74,7 @@ class Search:
     segment: Ints
 
 
-@dataclass(frozen=True)
+@frozen
 class Candidates:
     """Candidates in order of step, then element; `first[k] : first[k + 1]` are those of step k.
 

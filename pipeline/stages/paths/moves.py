@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from typing import NamedTuple
@@ -15,6 +14,7 @@ from pipeline.stages.track.chain import Chain, search
 from pipeline.stages.track.network import Edge, Network
 from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig
+from schemas.frozen import frozen
 
 # Ways that are looked for are longer than the distance by so many of its sigmas (`detour_share`, `detour_m`).
 _MARGIN_SIGMAS = 10.0
@@ -46,7 +46,7 @@ class Place(NamedTuple):
     at_m: float
 
 
-@dataclass(frozen=True)
+@frozen
 class Moves:
     """`counted_m`: signed distance at each step by an odometer, NaN where unknown; `doubt_m`: running sum of its doubt.
 

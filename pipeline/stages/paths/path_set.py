@@ -30,6 +30,7 @@ from pipeline.stages.paths.way_back import Left, WayBack
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
+from schemas.frozen import frozen
 
 # Numerics: means that are rounded stay below a limit where their terms do by so much.
 _SURELY_ALIKE = 1.0 - 1e-9
@@ -116,7 +117,7 @@ class Span(NamedTuple):
     p: Floats
 
 
-@dataclass(frozen=True)
+@frozen
 class PathSet:
     """All hypotheses of a run with what became of each; `groups`: lines without a branch, per net element.
 

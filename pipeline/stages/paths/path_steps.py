@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.track.geodesy import Points
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median
+from schemas.frozen import frozen
 
 # Steps on each side with which one is compared before it counts.
 _NEIGHBOURS = 3
@@ -20,7 +20,7 @@ _PERIOD_STEPS = 31
 _HEADING_STEPS = 5
 
 
-@dataclass(frozen=True)
+@frozen
 class PathSteps:
     """Means of a second of positions, shapes (n,); `points` (n, 3).
 

@@ -7,7 +7,6 @@ receiver. Tested are movements over several windows, the offset, and the lasting
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ import numpy as np
 from pipeline.stages.paths.path_steps import PathSteps
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
+from schemas.frozen import frozen
 from schemas.stages import ONE_TRACK_LEFT
 
 # Windows of the movements [s].
@@ -90,7 +90,7 @@ class Stretch(NamedTuple):
 NO_STRETCH = Stretch(*(np.zeros(0) for _ in range(5)))
 
 
-@dataclass(frozen=True)
+@frozen
 class Trail:
     """A path as far back as any test looks: from step `start` on, those from `begin` on being new.
 
@@ -104,7 +104,7 @@ class Trail:
     before: Totals
 
 
-@dataclass(frozen=True)
+@frozen
 class PathTests:
     """The tests at one level, of one bias.
 

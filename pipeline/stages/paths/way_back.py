@@ -8,7 +8,6 @@ than noise and survey explain, and to stay there.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -19,12 +18,13 @@ from pipeline.stages.paths.path_tests import PathTests
 from pipeline.stages.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
+from schemas.frozen import frozen
 
 # Numerics: lines over the switches passed on the way that are looked at; on more of them no way back is seen.
 _LINES = 24
 
 
-@dataclass(frozen=True)
+@frozen
 class Left:
     """A path that was refuted: its last oriented element, at which step, its mean residual before the movement [m] and
     the survey's sigma there [m].
@@ -36,7 +36,7 @@ class Left:
     survey_m: float
 
 
-@dataclass(frozen=True)
+@frozen
 class WayBack:
     """The steps of a run, and where they may lie on the network."""
 

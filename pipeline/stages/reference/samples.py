@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -13,9 +11,10 @@ from pipeline.stages.track.network import Network
 from pipeline.stages.track.segments import box_about
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Samples:
     """`sigma_m` of each; `near`: places by sample, `survey_m` the survey's sigma at each of these, `root_m` of both.
 

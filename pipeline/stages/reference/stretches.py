@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -19,9 +19,10 @@ from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class ReferencePath:
     """One way that the samples of a stretch may have taken: per sample its leg and the coordinate on it [m].
 
@@ -40,7 +41,7 @@ class ReferencePath:
         return replace(self, **arrays)
 
 
-@dataclass(frozen=True)
+@frozen
 class ReferenceStretch:
     """Reference samples from gap to gap, and every way that they may have taken: the train was on one of them."""
 
@@ -101,7 +102,7 @@ def _silent_spans(t_ns: Ints, covered: Bools, gap_s: float) -> list[tuple[int, i
     return spans
 
 
-@dataclass(frozen=True)
+@frozen
 class _Search:
     """The samples of a run, and where they may lie on the network."""
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from schemas.frozen import frozen
+
 
 @dataclass(eq=False)
 class VisitNode:
@@ -18,7 +20,7 @@ class VisitNode:
     before: list[Link] = field(default_factory=list)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Link:
     """From one visit to the next, behind the step `at`."""
 
@@ -28,7 +30,7 @@ class Link:
     back: bool
 
 
-@dataclass(frozen=True)
+@frozen
 class ElementStay:
     """An oriented element from step `first` to `last`; `back`: entered against its sense."""
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 
 import polars as pl
 
@@ -17,12 +16,14 @@ import polars as pl
 # second that importing scipy.stats costs every worker.
 from scipy.special import betaincinv, gammaincinv
 
+from schemas.frozen import frozen
+
 CONFIDENCE = 0.95
 CONTINUITY_S = 15.0
 """Most critical phase of an APV-I/LPV-200 operation (LOC section VI); part of the column names `continuity_15s`."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Estimate:
     """A measured figure with its bounds; a part is None where the data cannot say it."""
 

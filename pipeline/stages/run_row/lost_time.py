@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 import polars as pl
@@ -13,6 +13,7 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns, truths
 from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.enums import LostTo, MonitorState, Verdict
+from schemas.frozen import frozen
 from schemas.stages import EpochFigures
 from schemas.tables import MONITORS, Epochs
 from schemas.words import lost_words
@@ -21,7 +22,7 @@ _LOST_TO = dtypes(Epochs)["lost_to"]
 _NUMBER = {cause: number for number, cause in enumerate(LostTo)}
 
 
-@dataclass(frozen=True)
+@frozen
 class LostTime:
     """`share` of moving time without a valid TVB, None where the train never moved; `causes`: shares, largest first.
 
@@ -44,7 +45,7 @@ class LostTime:
         return {**causes, "lost_to_monitor": self.monitor}
 
 
-@dataclass(frozen=True)
+@frozen
 class LostColumns:
     """What each epoch's time was lost to, from it to the next; arrays of shape (epochs,)."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from pipeline.stages.epochs.clock import reaction_of
 from pipeline.stages.run_row.lost_time import LostTime
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, LostTo, Origin, Reason, Remedy, RunVerdict, VehicleFigures
+from schemas.frozen import frozen
 from schemas.stages import EpochFigures
 from schemas.tables import ALL_MONITORS
 
@@ -25,7 +25,7 @@ _LACKING = {Reason.ACCEPTED_UNKNOWN, Reason.BUDGET_UNKNOWN, Reason.UNKNOWN_IN_US
 _STAMPS_S = 1e-3
 
 
-@dataclass(frozen=True)
+@frozen
 class InUse:
     """Moving time [s]: all of it, with a position in use, and of this what is unknown before the first and after the
     last epoch that is judged, and between them.

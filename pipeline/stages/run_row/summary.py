@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.enums import Note, Reason, RunStatus
+from schemas.frozen import frozen
 from schemas.run import IngestNotes
 from schemas.stages import EpochFigures
 from schemas.tables import CONTRACT_VERSION, Runs
@@ -31,7 +32,7 @@ from schemas.words import Remark, notes_text, remedy_words
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
+@frozen
 class SolutionResults:
     """What the stages say of one solution; `lost`: of each of `epochs`, `columns` of `runs` as they stand there.
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from dataclasses import dataclass
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pipeline.stages.track.path import RoutePath
+from schemas.frozen import frozen
 
 if TYPE_CHECKING:
     from pipeline.stages.track.network import Edge, Network
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 BARRED_DETOUR_M = 10_000.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Chain:
     """Oriented net elements in order, and the coordinate [m] at which each is entered.
 

@@ -6,11 +6,10 @@ measured in the tangent plane of the point itself.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from schemas.arrays import Floats, Ints
+from schemas.frozen import frozen
 
 # NIMA TR8350.2, table 3.1 and 3.3: semi-major axis [m] and first eccentricity squared of WGS 84.
 SEMI_MAJOR_AXIS_M = 6_378_137.0
@@ -19,7 +18,7 @@ ECCENTRICITY_SQUARED = 6.694_379_990_14e-3
 MEAN_RADIUS_M = SEMI_MAJOR_AXIS_M * (2.0 + float(np.sqrt(1.0 - ECCENTRICITY_SQUARED))) / 3.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Points:
     """Points on the ellipsoid: earth-centred positions at height zero [m], unit vectors east and north."""
 

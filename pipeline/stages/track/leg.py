@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,7 @@ from pipeline.stages.track.segments import (
 )
 from pipeline.stages.track.survey import GAP_COUNTS_M, SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
+from schemas.frozen import frozen
 
 # A hint further than this from the nearest place may mean another passage of the same place,
 # if the track of that passage lies within the second distance of the first. Geometry of a line: anything between the
@@ -31,7 +32,7 @@ SAME_PLACE_M = 10.0
 BASELINE_M = 2.5
 
 
-@dataclass(frozen=True)
+@frozen
 class Visit:
     """One net element on the path; `forward` when its measure grows with the path position."""
 
@@ -39,7 +40,7 @@ class Visit:
     forward: bool
 
 
-@dataclass(frozen=True)
+@frozen
 class Leg:
     """A chain of net elements on which `path_m` is one to one; arrays are per segment, in order.
 

@@ -32,6 +32,7 @@ from pipeline.stages.track.survey import (
 )
 from schemas.arrays import Bools, Floats, Ints, ints
 from schemas.enums import Navigability
+from schemas.frozen import frozen
 from schemas.run import Site
 
 
@@ -44,7 +45,7 @@ class Edge(NamedTuple):
     backward: bool
 
 
-@dataclass(frozen=True)
+@frozen
 class Ways:
     """All ways on, as arrays: `first[one] : first[one + 1]` are those from an oriented element, in their order."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ from pipeline.stages.track.segments import Feet, no_feet
 from pipeline.stages.track.survey import MEASURE_TOLERANCE_M, SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import BaliseDirection, BaliseKind
+from schemas.frozen import frozen
 
 Objects = npt.NDArray[np.object_]
 BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
@@ -52,7 +53,7 @@ _ALONG_MEASURE = {BaliseDirection.AB.value: 1, BaliseDirection.BA.value: -1, Bal
 _OUTSIDE_COUNTS = 1e3
 
 
-@dataclass(frozen=True)
+@frozen
 class Place:
     """A place on the network: net element by its number in the survey, and measure [m]."""
 
@@ -60,7 +61,7 @@ class Place:
     measure_m: float
 
 
-@dataclass(frozen=True)
+@frozen
 class RoutePath:
     """Net elements in order with one coordinate [m]; arrays per visit.
 
@@ -146,7 +147,7 @@ def routes_of(track: SurveyedTrack, legs: Sequence[Leg]) -> list[RoutePath]:
     return routes
 
 
-@dataclass(frozen=True)
+@frozen
 class TravelledPath:
     """The legs of a run in order of time; `path_m` is 0 at the start of the first net element."""
 

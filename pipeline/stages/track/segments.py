@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.stages.track.geodesy import Points
 from schemas.arrays import Floats, Ints
+from schemas.frozen import frozen
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree as Tree
@@ -20,7 +21,7 @@ SAMPLE_SPACING_M = 20.0
 _ABOUT_M = 10_000.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Box:
     """What lies within a reach of some places, along the three axes."""
 
@@ -41,7 +42,7 @@ def box_about(places: Floats, reach_m: float) -> Box:
     return Box(places.min(axis=0) - reach_m, places.max(axis=0) + reach_m)
 
 
-@dataclass(frozen=True)
+@frozen
 class Polyline:
     """Segments in order along one line; `start` and `end` are earth-centred [m] at height zero."""
 
@@ -89,7 +90,7 @@ class Polyline:
         return cKDTree(places, balanced_tree=False), segment
 
 
-@dataclass(frozen=True)
+@frozen
 class Feet:
     """The nearest place on a line for each point.
 

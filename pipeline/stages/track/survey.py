@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,7 @@ import polars as pl
 
 from pipeline.stages.track.geodesy import distances_m, earth_centred_m, steps_m
 from schemas.arrays import Floats, Ints, floats, ints
+from schemas.frozen import frozen
 
 # Both belong to how a site is read, as the limits of its check do: a site is the same for every run and configuration.
 # A gap between linked ends that is more than survey noise [m]; it counts as straight track.
@@ -28,7 +29,7 @@ MEASURE_TOLERANCE_M = 0.5
 _DIRECTION_OVER_M = 10.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SurveyedTrack:
     """Net elements, each a run of vertices `first[e] : first[e + 1]`, in the order of the survey.
 
@@ -152,7 +153,7 @@ def by_element(frame: pl.DataFrame) -> pl.DataFrame:
     return ordered.sort("_first", maintain_order=True).drop("_first")
 
 
-@dataclass(frozen=True)
+@frozen
 class Along:
     """Places along all elements, in order: element number and measure [m] of each, degrees."""
 

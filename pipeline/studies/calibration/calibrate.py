@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 
 import numpy as np
 import polars as pl
@@ -30,6 +30,7 @@ from pipeline.studies.calibration.vehicle import RunEstimate, estimate_run, pool
 from pipeline.studies.plausibility.fit import clock_advice, required_fit
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 from schemas.tables import AXES
 
@@ -37,7 +38,7 @@ _AS_STATED = {"sigma_intercept_m": 0.0, "sigma_slope": 1.0}
 _NO_NOISE = {f"noise_{axis}_m": (0.0, 0.0, 0.0, 0.0) for axis in AXES}
 
 
-@dataclass(frozen=True)
+@frozen
 class Calibration:
     """The vehicle has no latency where the runs show none. `monitors`: the keys of `[monitors]` that were measured.
 
@@ -55,7 +56,7 @@ class Calibration:
         return tomli_w.dumps({"monitors": self.monitors}) if self.monitors else ""
 
 
-@dataclass(frozen=True)
+@frozen
 class Observed:
     """What one run shows of its vehicle; `estimate` is None where GNSS and odometer could not be compared.
 

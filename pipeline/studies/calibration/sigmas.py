@@ -7,7 +7,7 @@ a + b sigma_axis, measured over predicted is b + a / sigma_axis; a = 0, b = 1 sa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 
 import numpy as np
 import polars as pl
@@ -16,6 +16,7 @@ from scipy.optimize import nnls
 from schemas.arrays import Floats
 from schemas.config import CalibrationConfig, Configuration
 from schemas.enums import MonitorState
+from schemas.frozen import frozen
 from schemas.tables import ALL_MONITORS, AXES, SCALES
 
 # Numerics of the regression: bins of the same number of epochs. Half or twice as many change a simulated fit by less
@@ -33,7 +34,7 @@ COMPARED = (
 """Columns of epochs that sigmas are regressed on."""
 
 
-@dataclass(frozen=True)
+@frozen
 class SigmaFit:
     """Position sigma = `intercept_m` + `slope` * stated sigma, as a monitor shows it; standard errors beside."""
 

@@ -6,17 +6,16 @@ diagnosed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.stages.evidence.carrying import Counter
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.scale_lag import scale_and_lag, spans_of_rows
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class RunEstimate:
     """One run's scale and latency [s], by so many ways of 10 s; no latency where it is not measured."""
 
@@ -45,7 +44,7 @@ def estimate_run(t_s: Floats, path_m: Floats, odometry: Odometry) -> RunEstimate
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class Pooled:
     """Of the next run of the vehicle."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from pipeline.storage.files import exists, read_bytes
 from schemas.arrays import Floats, Ints
 from schemas.enums import AreaType
 from schemas.errors import SiteError, listed
+from schemas.frozen import frozen
 from schemas.inputs import Areas
 from schemas.run import Site
 
@@ -22,7 +22,7 @@ NO_AREA = -1
 _NAMES = ("areas.parquet", "areas.csv")
 
 
-@dataclass(frozen=True)
+@frozen
 class AreaPlaces:
     """Number of the area type in `AREA_TYPES` (`NO_AREA` outside all), and track speed [m/s] (NaN: not known)."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import polars as pl
@@ -19,6 +19,7 @@ from pipeline.studies.reservations import failed_runs, runs_without_truth, sente
 from pipeline.studies.tally import S_PER_H, Compliance, distinct
 from schemas.config import Configuration
 from schemas.enums import NotShown, RunStatus
+from schemas.frozen import frozen
 from schemas.run import Site
 from schemas.words import NOT_SHOWN, say
 
@@ -30,7 +31,7 @@ SCHEMA = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Claim:
     """`table`: one row per solution and requirement; `notes`: what the result as a whole cannot say."""
 

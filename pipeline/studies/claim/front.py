@@ -9,7 +9,6 @@ Its speed is compared with the one that the evidence leaves, as means over windo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -24,9 +23,10 @@ from pipeline.studies.claim.tally import codes, within
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 from schemas.config import Configuration
 from schemas.enums import Judgement, PassageStatus, VehicleFigures
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Front:
     """Of one solution of one run, per epoch; NaN is not known.
 
@@ -177,7 +177,7 @@ def _areas_at(front_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None,
     return placed(areas, places["netelement_id"], places["measure_m"])
 
 
-@dataclass(frozen=True)
+@frozen
 class SpeedErrors:
     """Per window: its end, length, largest estimated speed, and the mean of estimate minus truth as an interval.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import pairwise
 
@@ -26,11 +26,12 @@ from pipeline.studies.claim.tally import (
 from pipeline.studies.tally import S_PER_H
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags
 from schemas.enums import AreaType, BaliseKind, PassageStatus
+from schemas.frozen import frozen
 
 ALL = "all"
 
 
-@dataclass(frozen=True)
+@frozen
 class ClaimRide:
     """One solution of one run: its front end, and the tables that the requirements ask for beside it."""
 
@@ -99,7 +100,7 @@ Key = tuple[str, str]
 Tallies = dict[Key, Tally]
 
 
-@dataclass(frozen=True)
+@frozen
 class Requirement:
     """One requirement: its limit in words, what is demanded, and how a run counts."""
 

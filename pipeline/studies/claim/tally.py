@@ -7,7 +7,6 @@ err together. A gap of the log is time of which nobody knows.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from pipeline.stages.run_row.bounds import UNKNOWN, Estimate, clopper_pearson, poisson_rate
 from pipeline.studies.tally import S_PER_H, Compliance, Shown, rate_shown, share_shown
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
+from schemas.frozen import frozen
 
 KEPT = 1
 NOT_KNOWN = 0
@@ -23,7 +23,7 @@ BROKEN = -1
 _COUNTS = ("trials", "kept", "broken", "events", "possible", "held_s", "known_s")
 
 
-@dataclass(frozen=True)
+@frozen
 class Tally:
     """Of one run, or of many added up.
 
@@ -129,7 +129,7 @@ class Kind(StrEnum):
     AVAILABILITY = "availability"
 
 
-@dataclass(frozen=True)
+@frozen
 class Demand:
     """What is demanded of a requirement, and what counts show of it.
 

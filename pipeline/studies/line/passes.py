@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 from scipy.spatial import cKDTree
@@ -14,6 +12,7 @@ from pipeline.studies.line.spans import FIRST_LOSS, SpanState, spans_of, states_
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Judgement, PassageStatus
+from schemas.frozen import frozen
 from schemas.line import LineCause, LineCriteria
 from schemas.run import Site
 
@@ -41,7 +40,7 @@ _OUTCOMES: dict[str, pl.DataType | type[pl.DataType]] = {
 _PASSES = _OUTCOMES | {"monitor": pl.String, "satellites": pl.Float64}
 
 
-@dataclass(frozen=True)
+@frozen
 class PieceIndex:
     """The pieces with their middles in the plane, to find those beside a place."""
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
 from pipeline.results.places import GroundPositions, ground_of, origin_of, plane_m
 from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.arrays import Floats, Ints
+from schemas.frozen import frozen
 from schemas.run import Site
 
 
-@dataclass(frozen=True)
+@frozen
 class Pieces:
     """Pieces of all net elements, numbered in the order of the survey; element e has `first[e] : first[e + 1]`."""
 

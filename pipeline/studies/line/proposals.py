@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -18,6 +18,7 @@ from schemas.arrays import Bools
 from schemas.config import LdsConfig
 from schemas.conform import conform, dtypes
 from schemas.enums import BaliseDirection, BaliseKind, Reaction
+from schemas.frozen import frozen
 from schemas.line import LineBalises, LineCriteria, LineDirection, LineProposals, PieceClass
 from schemas.run import Site
 
@@ -25,7 +26,7 @@ from schemas.run import Site
 MODES = {"both": (True, False), "ahead": (True,), "back": (False,)}
 
 
-@dataclass(frozen=True)
+@frozen
 class LineEvidence:
     """What a proposal is made of: classes and counts per piece, the ways, the points to serve."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import polars as pl
@@ -19,13 +18,14 @@ from pipeline.studies.tally import distinct
 from schemas.config import Configuration
 from schemas.enums import Evidence
 from schemas.errors import InputError, UsageError
+from schemas.frozen import frozen
 from schemas.line import LineCriteria
 from schemas.run import Site
 
 POINT_COLUMNS = {"name": pl.String, "netelement_id": pl.String, "measure_m": pl.Float64}
 
 
-@dataclass(frozen=True)
+@frozen
 class LineResult:
     """What the runs say of a line: classes per piece, proposals and their balises, what cannot be said."""
 

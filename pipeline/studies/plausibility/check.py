@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 
 from schemas.enums import MisfitCause, MisfitPlace
+from schemas.frozen import frozen
 from schemas.run import Stream
 from schemas.words import CAUSES, MISFIT_PLACES
 
@@ -24,7 +24,7 @@ class FitState(StrEnum):
     NOT_CHECKED = "not checked"
 
 
-@dataclass(frozen=True)
+@frozen
 class Cause:
     """Why two streams do not fit, or in which of the two the cause lies; `figures`: a unit, an amount, a stream."""
 
@@ -37,7 +37,7 @@ class Cause:
         return sentence.format(*self.figures)
 
 
-@dataclass(frozen=True)
+@frozen
 class Check:
     """One comparison: `found` in words with figures, its `causes`, and the lines that mend it.
 

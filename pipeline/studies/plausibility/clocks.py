@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from pipeline.read.ingest.timescale import leap_seconds
 from pipeline.studies.plausibility.causes import explain_lag
@@ -21,6 +21,7 @@ from pipeline.studies.plausibility.check import (
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.robust import SIGNIFICANT_SIGMAS
 from schemas.enums import MisfitCause, MisfitPlace
+from schemas.frozen import frozen
 from schemas.run import Stream
 
 # Two lags so near to each other are of one clock.
@@ -32,7 +33,7 @@ _WHOLE_NEAR_S = 0.3
 _LEAP_NEAR_S = 0.12
 
 
-@dataclass(frozen=True)
+@frozen
 class StreamLag:
     """Of one stream against the GNSS [s]: its stamp of a moment minus the GNSS's; `reason`: why it is not known.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from pipeline.stages.prepare import PreparedRun
 from pipeline.studies.plausibility.check import Check, FitState, not_checked
@@ -23,11 +22,12 @@ from pipeline.studies.plausibility.witnesses import follows_check
 from schemas.config import PlausibilityConfig, Vehicle
 from schemas.enums import MisfitCause, Note
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 from schemas.words import Remark
 
 
-@dataclass(frozen=True)
+@frozen
 class Fit:
     """All checks of one solution."""
 

@@ -6,7 +6,7 @@ of the lag, up to half a minute, by the ways of windows and the one estimator of
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pipeline.stages.odometry.scale_lag import CountedRows, scale_and_lag
 from pipeline.studies.plausibility.records import MOVING_MPS, SPEED_S, Places, Record
 from pipeline.studies.plausibility.robust import LEAST, SIGNIFICANT_SIGMAS, explains, steady, usual
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 
 # Windows of this length tell ways to 2 % where positions scatter by 2 m; they last neither so short that stamps tell
 # little nor so long that a train does not keep its speed.
@@ -53,7 +54,7 @@ _PAUSE_S = 3_600.0
 _SPARSE_S = 100.0
 
 
-@dataclass(frozen=True)
+@frozen
 class PairFit:
     """How a counter fits positions.
 

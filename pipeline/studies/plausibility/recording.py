@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import polars as pl
@@ -12,10 +11,11 @@ from pipeline.studies.plausibility.records import Places, Record, counters_of, p
 from pipeline.studies.plausibility.shifts import SurveyLine, line_of
 from schemas.arrays import Floats, times_ns
 from schemas.config import PlausibilityConfig, Vehicle
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 
 
-@dataclass(frozen=True)
+@frozen
 class Recording:
     """One solution of a cleaned run, its fixes and places, and whatever it meets; each comparison is made once."""
 

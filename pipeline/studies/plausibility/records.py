@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +10,7 @@ import polars as pl
 from pipeline.stages.track.geodesy import Points, points_of
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.enums import Fix
+from schemas.frozen import frozen
 
 # A speed is a mean over this time: positions that scatter by 2 m give it to 0.7 m/s.
 SPEED_S = 4.0
@@ -25,7 +25,7 @@ _ROW_S = 0.5
 _LEAST_ROWS = 10
 
 
-@dataclass(frozen=True)
+@frozen
 class Record:
     """Values over time [s]: what a counter has counted, in any unit, or places (n, 3) in earth-centred metres."""
 
@@ -70,7 +70,7 @@ class Record:
         return np.where(self.known(t_s), np.linalg.norm(gained, axis=1) / over_s, np.nan)
 
 
-@dataclass(frozen=True)
+@frozen
 class Places(Record):
     """Positions over time, on the ellipsoid: ways at 1,000 m above it are longer by 2e-4; their heights beside."""
 

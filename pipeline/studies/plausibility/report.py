@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import polars as pl
 
@@ -14,13 +14,14 @@ from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run, lines_
 from pipeline.studies.plausibility.witnesses import follows_checks, origins_table, undeclared
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
+from schemas.frozen import frozen
 from schemas.run import RunLog, Site, Stream
 
 ODOMETERS = "Odometers"
 """Title of the table that says where each odometer comes from."""
 
 
-@dataclass(frozen=True)
+@frozen
 class FitReport:
     """Tables by title, what keeps the run from being replayed, and the lines that mend it by what to do with them."""
 

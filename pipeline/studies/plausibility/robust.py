@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from schemas.arrays import Bools, Floats
+from schemas.frozen import frozen
 
 # Tukey's biweight, 95 % efficient on Gaussian noise (Huber and Ronchetti 2009), after least absolute deviations.
 _BIWEIGHT = 4.685
@@ -19,7 +18,7 @@ LEAST = 6
 SIGNIFICANT_SIGMAS = 5.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Regression:
     """`estimate` with `sigma` (inf: not known); `weight` of each observation, `spread` of what is left [m].
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from pipeline.studies.plausibility.records import MOVING_MPS, Places
 from pipeline.studies.plausibility.robust import LEAST, explains, halves_of, regressed, sampled, steady
 from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
+from schemas.frozen import frozen
 from schemas.run import Site
 
 # Passages of single places agree on a lag within this time, and so large a share of them has to.
@@ -32,7 +33,7 @@ _LAG_ROUNDS = 4
 _STAYS_S = 1e-3
 
 
-@dataclass(frozen=True)
+@frozen
 class PlaceFit:
     """How a record of places fits the GNSS: `lag_s` is its stamp of a moment minus the GNSS's.
 
@@ -131,7 +132,7 @@ def common_lag(lags_s: Floats, count: int) -> tuple[float | None, float]:
     return float(np.median(common_s)), float(np.std(common_s) / np.sqrt(common_s.size))
 
 
-@dataclass(frozen=True)
+@frozen
 class SurveyLine(Polyline):
     """The segments of a survey, with the heights of their ends."""
 
@@ -143,7 +144,7 @@ class SurveyLine(Polyline):
         return float(np.median(self.nearest_sample(points.surface[:: max(1, len(points) // 100)])[0]))
 
 
-@dataclass(frozen=True)
+@frozen
 class SurveyFit:
     """How positions lie to the track; `shift_m` is the survey's place minus the positions', east and north.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import polars as pl
@@ -28,9 +27,10 @@ from pipeline.studies.safety.side_by_side import EPOCH_COLUMNS, side_by_side
 from pipeline.studies.safety.tally import added, architecture_figures
 from schemas.config import Configuration
 from schemas.enums import TRUTH, RunStatus, ThrVerdict
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Assessment:
     """`statements` in words, the verdict first; `tables` by name."""
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -14,6 +12,7 @@ from pipeline.stages.run_row.independent import missed_detection, since_when_at_
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import HazardConfig
 from schemas.enums import Verdict
+from schemas.frozen import frozen
 
 _OPEN_END_NS = 2**63 - 1
 
@@ -90,7 +89,7 @@ def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
     return None if first is None else first[0]
 
 
-@dataclass(frozen=True)
+@frozen
 class SolutionTables:
     """Tables of one solution of a run; `faults` one row per fault; `with_truth`: judged by a reference or reads."""
 

@@ -8,7 +8,7 @@ to P3 at HR_Diag, P1 to P2 at mu = 1/T_D; P2 and P3 are not left.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple
 
 import numpy as np
 import polars as pl
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from pipeline.studies.safety.budget import S_PER_H, levels_table
 from schemas.config import SafetyConfig
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class LdsModel:
     """Rates of the model [1/h] and the time to detect and negate [h], whose inverse is mu."""
 
@@ -31,7 +32,7 @@ class LdsModel:
         return 1.0 / self.time_to_detect_h
 
 
-@dataclass(frozen=True)
+@frozen
 class StateProbabilities:
     p0: float
     p1: float

@@ -7,7 +7,6 @@ enough (LOC eq. 11). All are judged after the fact on the same faults, whatever 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
 
 import polars as pl
@@ -22,6 +21,7 @@ from pipeline.studies.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
 from schemas.arrays import NS_PER_S, Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
+from schemas.frozen import frozen
 from schemas.tables import ALL_MONITORS
 
 Row = dict[str, object]
@@ -40,7 +40,7 @@ EPOCH_COLUMNS = (
 """Columns of the epochs that the comparison takes."""
 
 
-@dataclass(frozen=True)
+@frozen
 class _Diagnosed:
     """Epochs under one kind of diagnosis: its fails, where it worked, and where a truth judged."""
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import dataframely as dy
 import numpy as np
 import polars as pl
@@ -20,6 +18,7 @@ from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import Configuration, UndetectedConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind
+from schemas.frozen import frozen
 from schemas.tables import SCALES, Epochs, Passages
 
 _OF_EPOCHS = ("undetected_{}_m", "undetected_{}_in_use_m")
@@ -27,7 +26,7 @@ _OF_RANGE = "undetected_range_{}_m"
 _WAYS = ("ahead", "behind")
 
 
-@dataclass(frozen=True)
+@frozen
 class Undetected:
     """`epochs`: columns row for row with the epochs; `passages`: the same with the passages; `spacing` of the run."""
 
@@ -104,7 +103,7 @@ def windows_of(ride: Ride, rows: Watched) -> list[FaultWindow]:
     return windows(rows, times_ns(ride.solution.epochs), fixes)
 
 
-@dataclass(frozen=True)
+@frozen
 class _BothWays:
     """Errors along growing path and against it at each row [m] (2, rows), NaN at the first row.
 

@@ -7,7 +7,6 @@ its anchor; a monitor without memory bounds it outright, there and, with the gro
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,13 +15,14 @@ from pipeline.studies.undetected.stretch import GrowthStretch, stretch_after
 from pipeline.studies.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import UndetectedConfig
+from schemas.frozen import frozen
 
 Grow = Callable[[GrowthStretch], Growth]
 # How many rows to look back over, and the split of these rows.
 After = list[tuple[int, Floats]]
 
 
-@dataclass(frozen=True)
+@frozen
 class Errors:
     """The largest error ahead at each row [m], and what bounds it: `paid_m` (rows, 1 + averages), or `outright`."""
 

@@ -6,7 +6,6 @@ equations, and every quantity is counted in its own bound, so that tolerances ar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from pipeline.studies.undetected.watched import Watched
 from schemas.arrays import Floats, Ints
 from schemas.errors import BaliseError
+from schemas.frozen import frozen
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -24,7 +24,7 @@ _TOLERANCE = 1e-9
 MARGIN = 1e-6
 
 
-@dataclass(frozen=True)
+@frozen
 class Optimum:
     """The largest error at the last row of a window [m], the fault at each of its rows, and the monitors it reaches.
 

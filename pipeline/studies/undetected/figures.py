@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import polars as pl
 
+from schemas.frozen import frozen
 
-@dataclass(frozen=True)
+
+@frozen
 class Spacing:
     """The shortest way and time from a physical balise, wherever it is thought to be, to an error beyond the limit.
 

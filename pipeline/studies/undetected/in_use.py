@@ -16,8 +16,6 @@ bounded from a start of mission to the first fix after the first TVB.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -26,12 +24,13 @@ from pipeline.stages.odometry.recovery import RecoveryRule
 from pipeline.studies.undetected.watched import FaultWindow, Watched
 from schemas.arrays import NS_PER_S, Bools, Floats, floats
 from schemas.config import Configuration
+from schemas.frozen import frozen
 
 # The hold ends after the memory of the slowest average; growth counts from a row in its last tenth, where there is one.
 _LAST_TENTH = 0.9
 
 
-@dataclass(frozen=True)
+@frozen
 class Returns:
     """What decides whether a negated position returns, at the rows of `Watched`.
 
@@ -99,7 +98,7 @@ def _of_mission(rows: Watched, window: FaultWindow, config: Configuration) -> Bo
     return rows.t_s >= max(since_s, default=-np.inf)
 
 
-@dataclass(frozen=True)
+@frozen
 class _Window:
     """One window, which begins with a fix, in one direction."""
 

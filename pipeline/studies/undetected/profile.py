@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -14,10 +12,11 @@ from pipeline.studies.undetected.exact import MARGIN, largest_profile
 from pipeline.studies.undetected.steps_and_ramps import largest_of_shape
 from schemas.arrays import NS_PER_S, ints, times_ns
 from schemas.errors import UsageError
+from schemas.frozen import frozen
 from schemas.tables import SCALES
 
 
-@dataclass(frozen=True)
+@frozen
 class FaultProfile:
     """`fault`: `t_s` after the first epoch and `size_m` along growing path; `t`: stamps of where it begins and ends.
 

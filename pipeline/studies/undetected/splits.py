@@ -9,13 +9,13 @@ evaluated on every row (`paid_m`), so blocks cost closeness, never validity.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.studies.undetected.stretch import GrowthStretch, paid_m
 from schemas.arrays import Floats, Ints
+from schemas.frozen import frozen
 
 # Blocks are so much longer than the stretch before them; so much farther on lies the next row with a split of its own.
 GROWTH = 0.3
@@ -133,7 +133,7 @@ def _tested(threshold: Floats) -> Floats:
     return np.where(tested, threshold, _NOT_TESTED * dearest)
 
 
-@dataclass(frozen=True)
+@frozen
 class Growth:
     """`most_m` (rows,): the fault's growth since the start, at most; `paid_m` (rows, 1 + averages): what bounds it."""
 

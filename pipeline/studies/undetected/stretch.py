@@ -12,15 +12,16 @@ With q_i the part of row i that falls to an average A_i = (1 - w_i) A_(i-1) + w_
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.studies.undetected.watched import Watched
 from schemas.arrays import Floats
+from schemas.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class GrowthStretch:
     """`seen`: the rows after a start, to be bounded one by one.
 

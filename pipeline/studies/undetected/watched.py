@@ -7,7 +7,7 @@ threshold is a linear bound on y, and the fault is what y gathers beyond u. It b
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from datetime import datetime
 from typing import NamedTuple
 
@@ -20,6 +20,7 @@ from pipeline.stages.monitors.recursion import ewma_weight
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, UndetectedConfig, Vehicle
 from schemas.enums import BaliseKind
+from schemas.frozen import frozen
 from schemas.run import RunLog
 
 NO_ROW = -1
@@ -27,7 +28,7 @@ _BESIDE_CURVES = ("curvature_per_m", "cross_track_m")
 _RELINKED = ("anchor", "low_m", "high_m", "held_low_m", "held_high_m", "free")
 
 
-@dataclass(frozen=True)
+@frozen
 class Watched:
     """One row per epoch that the bank used while the position was not negated, in order; all of the same length m.
 
