@@ -10,6 +10,7 @@ from datasets.experiment.catalogue_changes import (
     list_wrong,
     map_left,
     odometer_late,
+    position_frozen,
     read_late,
     read_missing,
     stamps_ahead,
@@ -104,7 +105,7 @@ def _receiver() -> list[CatalogueFault]:
     return [
         *_injected("latency", "s", (0.2, 1.0, 3.0), "latency", "position", "latency_s"),
         *_changed("clock ahead", "s", (0.2, 1.0, 3.0), stamps_ahead),
-        *_changed("frozen position", "s", (2.0, 10.0), frozen),
+        *_changed("frozen position", "s", (2.0, 10.0), position_frozen),
         *_injected("outage", "s", (5.0, 30.0, 90.0), "outage", "position", "duration_s"),
         *(replace(one, injected=(gap, *one.injected)) for one in off),
         *_injected("noise along", "m", (1.0, 3.0, 10.0), "noise", "along", "sigma_m"),
