@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.stages.monitors.recursion import linear_recurrence
+from pipeline.stages.monitors.axis import linear_recurrence
 from schemas.arrays import Floats
 from schemas.frozen import frozen
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from datasets.gnss_errors import gauss_markov
-from pipeline.stages.monitors.sight import ionosphere_m2, troposphere_m2
+from pipeline.stages.monitors.pseudorange import ionosphere_m2, troposphere_m2
 from schemas.arrays import Floats
 from schemas.config import NonNegative, Positive, Settings
 

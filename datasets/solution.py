@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
+from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats, Ints
 from schemas.frozen import frozen
 

@@ -8,14 +8,13 @@ from dataclasses import replace
 import polars as pl
 
 from pipeline.stages.evidence import TrainEvidence
-from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.judge import Judged, judge
+from pipeline.stages.judge.judgement import Case
 from pipeline.stages.matching import Match
 from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.stages.ride import Ride, ride_of
 from pipeline.stages.run_row.lost_time import lost_columns
-from pipeline.stages.run_row.notes import ride_notes
-from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
+from pipeline.stages.run_row.summary import SolutionResults, failed_row, ride_notes, summarise
 from pipeline.studies.plausibility.accuracy import accuracy_checks, refuted
 from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, with_checks
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of

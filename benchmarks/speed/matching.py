@@ -17,7 +17,7 @@ from benchmarks.results import Figure, best_of
 from pipeline.stages.matching import match
 from pipeline.stages.odometry import odometry_of
 from pipeline.stages.track.geodesy import points_of
-from pipeline.stages.track.leg import Visit, leg_of, nearest_on_leg, path_at
+from pipeline.stages.track.segments import Visit, leg_of, nearest_on_leg, path_at
 from pipeline.stages.track.survey import geometric_measures_m, track_of
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.inputs import Links, Track

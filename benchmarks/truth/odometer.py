@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.odometry import Odometry, odometry_of
-from pipeline.stages.odometry.odd_steps import odd_runs
+from pipeline.stages.odometry.bound import odd_runs
 from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig, Configuration, Vehicle
 from tests.stages.odometry.drives import drive, recorded

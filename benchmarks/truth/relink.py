@@ -20,7 +20,7 @@ import polars as pl
 from benchmarks.results import Figure
 from pipeline.stages.alignment.align import align
 from pipeline.stages.lds import LdsResult, run_lds
-from pipeline.stages.lds.relink import Relink
+from pipeline.stages.lds.link_monitors import Relink
 from pipeline.stages.matching import match
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.odometry import odometry_of

@@ -20,9 +20,8 @@ from datasets.experiment.geometry import TAUS_S, Constellation, Geometry, defaul
 from datasets.experiment.linear_bank import BankSpec, linear_bank
 from datasets.experiment.rare import missed_detection_probability
 from pipeline.show.terminal import show_table
-from pipeline.stages.monitors.axis import AxisSeries, run_axis
-from pipeline.stages.monitors.recursion import ewma_weight
-from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
+from pipeline.stages.monitors.axis import AxisSeries, ewma_weight, run_axis
+from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.steps_and_ramps import Shape, largest_of_shape
 from pipeline.studies.undetected.watched import NO_ROW, Watched

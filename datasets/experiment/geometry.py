@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from datasets.constellation import GALILEO, GPS, SIDEREAL_DAY_S, look_angles
-from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows, range_variances_m2
+from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows, range_variances_m2
 from schemas.arrays import Floats
 from schemas.frozen import frozen
 

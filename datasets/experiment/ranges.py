@@ -19,7 +19,7 @@ from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, defau
 from datasets.experiment.passage import joined
 from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
-from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
+from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 from schemas.frozen import frozen

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.stages.monitors.recursion import AxisState, increment_variance, variance_of_ewma
+from pipeline.stages.monitors.axis import AxisState, increment_variance, variance_of_ewma
 from schemas.arrays import Floats
 
 

@@ -146,7 +146,7 @@ def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
 def _write_travelled_route(job: RunJob, run: RunLog, site: Site) -> None:
     """The route by the run's `primary` solution, or the first by name: all of them were on the same train."""
     # Imported here for the same reason.
-    from pipeline.stages.matching.travelled_route import travelled_route
+    from pipeline.stages.matching.match import travelled_route
     from pipeline.stages.prepare import prepare
 
     prepared = prepare(run, site, job.vehicle, job.config)

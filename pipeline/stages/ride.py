@@ -14,8 +14,8 @@ import polars as pl
 from pipeline.stages.alignment.align import align, odometer_at
 from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.evidence import TrainEvidence
-from pipeline.stages.judge.case import Case, Solution
 from pipeline.stages.judge.epochs import direction_by_evidence
+from pipeline.stages.judge.judgement import Case, Solution
 from pipeline.stages.lds.run import LdsResult, run_lds
 from pipeline.stages.matching import Match
 from pipeline.stages.monitors.bank import MonitorBank

@@ -22,7 +22,7 @@ from datasets.experiment.plan import SIGNALS, ExperimentPlan, bank_forms, failur
 from datasets.experiment.sigmas import bank_sigmas, limit_sigmas
 from datasets.experiment.tables import expected
 from datasets.experiment.workers import generator
-from pipeline.stages.monitors.sight import range_variances_m2
+from pipeline.stages.monitors.pseudorange import range_variances_m2
 
 SMALL = {"span_s": 700, "onset_s": 100, "rates_mps": (0.05, 0.5, 5.0), "headings_deg": (0.0, 45.0)}
 

@@ -10,8 +10,7 @@ from datasets.experiment import EXPERIMENTS
 from datasets.experiment.geometry import CONSTELLATIONS, default_geometry
 from datasets.experiment.ranges import RangePlan, range_passages, run_ranges, statistic
 from datasets.experiment.workers import generator
-from pipeline.stages.monitors.pseudorange import pseudorange_monitor
-from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows
+from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows, pseudorange_monitor
 from schemas.config import Configuration
 
 

@@ -14,8 +14,7 @@ from pipeline import one_run
 from pipeline.results.places import stretches_of
 from pipeline.stages.evidence.carrying import carried_forward
 from pipeline.stages.judge.judgement import margins_m
-from pipeline.stages.run_row.lost_time import LostTime
-from pipeline.stages.run_row.remedies import remedies
+from pipeline.stages.run_row.lost_time import LostTime, remedies
 from pipeline.studies.line.spans import SpanState, spans_of, states_of
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration, HazardConfig

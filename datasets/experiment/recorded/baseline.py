@@ -12,8 +12,8 @@ from datasets.inject import Recording
 from pipeline.one_run import ride_alone
 from pipeline.stages.epochs.clock import Clock, met, unambiguous
 from pipeline.stages.evidence import TrainEvidence
-from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.judge import Judged, judge
+from pipeline.stages.judge.judgement import Case
 from pipeline.stages.prepare import require_independent_odometer
 from pipeline.stages.ride import Ride
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns

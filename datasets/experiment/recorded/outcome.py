@@ -10,7 +10,7 @@ from datasets.experiment.recorded.draw import Onset
 from datasets.experiment.recorded.injection import Injected
 from datasets.experiment.tables import Row
 from pipeline.stages.epochs.clock import met, reactions_ns, unambiguous
-from pipeline.stages.judge.in_use import time_in_use
+from pipeline.stages.judge.epochs import time_in_use
 from pipeline.stages.judge.judgement import RIGHT, UNKNOWN, WRONG
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of, times_ns
 from schemas.enums import MonitorState

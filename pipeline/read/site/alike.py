@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.stages.lds.windows import DEFAULTS, minimal_spacing_m, window_m
+from pipeline.stages.lds.crossings import DEFAULTS, minimal_spacing_m, window_m
 from pipeline.stages.paths.candidates import candidates_of, search_about
 from pipeline.stages.paths.path_tests import told_by_a_switch_m, told_by_offset_m
-from pipeline.stages.track.chain import Chain, search
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Edge, Network, network_of, surveyed
-from pipeline.stages.track.path import valid_along_measure
+from pipeline.stages.track.path import Chain, search, valid_along_measure
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import SurveyedTrack, places_along
 from schemas.arrays import Floats, Ints

@@ -18,17 +18,19 @@ from pipeline.results.figures.campaign_tables import (
 from pipeline.results.figures.map_errors import map_places
 from pipeline.results.figures.undetected import spacing_of_runs
 from pipeline.stages.run_row.bounds import (
+    DETECTION_TIMES,
     Estimator,
     clopper_pearson,
     continuity_15s,
     hours_still_needed,
     hours_to_substantiate,
+    independent_episodes,
     mtbf,
     poisson_rate,
     poisson_rate_upper,
     with_estimates,
+    without_copies,
 )
-from pipeline.stages.run_row.independent import DETECTION_TIMES, independent_episodes, without_copies
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform, dtypes

@@ -9,10 +9,22 @@ import polars as pl
 
 from pipeline.results.figures.undetected import undetected_spread
 from pipeline.stages.epochs.clock import reaction_of
-from pipeline.stages.run_row.bounds import Estimator, clopper_pearson, poisson_rate, with_estimates
-from pipeline.stages.run_row.independent import independent_episodes
-from pipeline.stages.run_row.run_figures import acceptances, accepted, is_passage, outcomes, spread
-from pipeline.stages.run_row.verdict import DECISIVE, level_rows
+from pipeline.stages.run_row.bounds import (
+    Estimator,
+    clopper_pearson,
+    independent_episodes,
+    poisson_rate,
+    with_estimates,
+)
+from pipeline.stages.run_row.run_figures import (
+    DECISIVE,
+    acceptances,
+    accepted,
+    is_passage,
+    level_rows,
+    outcomes,
+    spread,
+)
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes

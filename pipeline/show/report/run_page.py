@@ -31,7 +31,7 @@ from pipeline.show.report.markup import (
 from pipeline.show.report.route_found import route_section
 from pipeline.show.report.series import MOMENTS, moments_of, monitor_lines, stanford_data, time_data
 from pipeline.show.report.words import WORDS, plots_of
-from pipeline.stages.run_row.verdict import LEVEL_LISTS
+from pipeline.stages.run_row.run_figures import LEVEL_LISTS
 from schemas.campaign import CampaignLevels
 from schemas.config import Configuration
 from schemas.enums import TRUTH

@@ -14,15 +14,15 @@ from pipeline.stages.monitors.axis import (
     FIRST_BLOCK,
     AlongEpochs,
     AxisSeries,
+    AxisState,
     along_series,
     error_model,
     run_axis,
 )
 from pipeline.stages.monitors.noise import NoiseMeter
-from pipeline.stages.monitors.recursion import AxisState
+from pipeline.stages.odometry.bound import RecoveryRule
 from pipeline.stages.odometry.driven import under_way
 from pipeline.stages.odometry.odometry import Odometry
-from pipeline.stages.odometry.recovery import RecoveryRule
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, Vehicle
 from schemas.frozen import frozen

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.stages.clean.held import copies
 from pipeline.stages.clean.journey import DAY_NS, require_spans, require_two_times
-from pipeline.stages.clean.placeholders import without_placeholders
-from schemas.arrays import Bools, times_ns
-from schemas.config import Configuration
+from pipeline.stages.track.geodesy import points_of
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, median, times_ns
+from schemas.config import Configuration, IngestConfig
+from schemas.enums import Fix
 from schemas.errors import InputError
 from schemas.frozen import frozen
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -285,3 +285,91 @@ def _require_common_time(run: RunLog, clock_advice: ClockAdvice) -> None:
             expected=f"times within {gnss['t'][0]} to {gnss['t'][-1]}",
             remedy=f"{remedy} {advice}".rstrip(),
         )
+
+
+# Numerics of the reading: with fewer updates no period is known; a regular one is met, to a logged step, by so many of
+# the updates. Digits that repeat at low speed are not: their time changes with the speed.
+_FEWEST = 20
+_REGULAR_SHARE = 0.8
+_LEAST_RATIO = 1.5
+_STEP_NOISE = 1.2
+
+
+def copies(t_s: Floats, latitude_deg: Floats, longitude_deg: Floats) -> Bools:
+    """Rows [s, deg] that repeat the place of the row before within one period of the receiver."""
+    none: Bools = np.zeros(t_s.size, dtype=np.bool_)
+    same = np.append(False, (np.diff(latitude_deg) == 0.0) & (np.diff(longitude_deg) == 0.0))
+    updates = t_s[~same & np.isfinite(latitude_deg)]
+    if not same.any() or updates.size < _FEWEST:
+        return none
+    step_s = median(np.diff(t_s))
+    apart_s = np.diff(updates)
+    period_s = median(apart_s)
+    regular = np.mean(np.abs(apart_s - period_s) <= _STEP_NOISE * step_s)
+    if period_s < _LEAST_RATIO * step_s or regular < _REGULAR_SHARE:
+        return none
+    kept_s = -np.inf
+    for row in range(t_s.size):
+        none[row] = same[row] and t_s[row] - kept_s < period_s - step_s / 2.0
+        kept_s = kept_s if none[row] else t_s[row]
+    return none
+
+
+def without_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps: float) -> tuple[pl.DataFrame, int]:
+    """One solution in order of time, placeholders without a fix, and how many they are.
+
+    0/0; places repeated to the last digit and farther than `placeholder_far_m` from the rest; and what comes before the
+    first fix, where the run goes on so far away that no train can have gone there.
+    """
+    latitude = floats(fixes, "latitude_deg")
+    longitude = floats(fixes, "longitude_deg")
+    valid = np.isfinite(latitude) & np.isfinite(longitude)
+    valid &= (fixes["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
+    origin = valid & (np.maximum(np.abs(latitude), np.abs(longitude)) < config.placeholder_origin_deg)
+    rows = np.flatnonzero(valid & ~origin)
+    placeholder = origin
+    if rows.size > 2:
+        places = points_of(latitude[rows], longitude[rows]).surface
+        placeholder = origin.copy()
+        placeholder[rows] = _far(times_ns(fixes)[rows], places, config, fastest_mps)
+    count = int(placeholder.sum())
+    if not count:
+        return fixes, 0
+    none = pl.lit(Fix.NONE.value).cast(fixes["fix"].dtype)
+    marked = pl.when(pl.Series(placeholder)).then(none).otherwise(pl.col("fix")).alias("fix")
+    return fixes.with_columns(marked), count
+
+
+def _far(t_ns: Ints, places: Floats, config: IngestConfig, fastest_mps: float) -> Bools:
+    """Placeholders among valid positions: far pieces of the run, between leaps that no train can make.
+
+    A far piece counts if it is one place repeated exactly, or the brief begin of the run (search for a first fix).
+    """
+    step_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    step_s = np.diff(t_ns) / NS_PER_S
+    leap = step_m > config.placeholder_far_m + fastest_mps * step_s
+    piece = np.concatenate([[0], np.cumsum(leap)])
+    placeholder = np.zeros(t_ns.size, dtype=np.bool_)
+    if not leap.any():
+        return placeholder
+    sizes = np.bincount(piece)
+    main = int(np.argmax(sizes))
+    home = np.median(places[piece == main], axis=0)
+    for number in range(sizes.size):
+        if number == main:
+            continue
+        rows = np.flatnonzero(piece == number)
+        # Several epochs of exactly one place are a default: a fix never repeats to the last digit far away.
+        same = rows.size > 1 and np.ptp(places[rows], axis=0).max() == 0.0
+        first = rows[0] == 0 and number < main and _is_brief(t_ns, rows[-1] + 1, config)
+        far = np.linalg.norm(np.median(places[rows], axis=0) - home) > config.placeholder_far_m
+        placeholder[rows] = far and (same or first)
+    return placeholder
+
+
+def _is_brief(t_ns: Ints, until: int, config: IngestConfig) -> bool:
+    spent_s = (t_ns[until - 1] - t_ns[0]) / NS_PER_S
+    whole_s = (t_ns[-1] - t_ns[0]) / NS_PER_S
+    return bool(
+        spent_s <= config.first_fix_share * whole_s or (spent_s <= config.first_fix_s and spent_s < 0.5 * whole_s)
+    )

@@ -11,8 +11,7 @@ import numpy as np
 import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.stages.evidence.carrying import Counter, TrueAnchor
-from pipeline.stages.evidence.clock import Lags, RecorderClock, clock_of
+from pipeline.stages.evidence.carrying import Counter, Lags, RecorderClock, TrueAnchor, clock_of
 from pipeline.stages.odometry.polarity import sense_of_ways, shared_ways_m
 from pipeline.stages.odometry.scale_lag import ScaleLag, spans_of_rows
 from pipeline.stages.reference import ReferencePath, ReferenceStretch

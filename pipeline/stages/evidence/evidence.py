@@ -12,8 +12,18 @@ import polars as pl
 
 from pipeline.stages.evidence import anchors
 from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
-from pipeline.stages.evidence.carrying import Counter, Interval, TrueAnchor, between_anchors, carried
-from pipeline.stages.evidence.clock import Lags, RecorderClock, clocks_of, lags_of, true_clocks_s
+from pipeline.stages.evidence.carrying import (
+    Counter,
+    Interval,
+    Lags,
+    RecorderClock,
+    TrueAnchor,
+    between_anchors,
+    carried,
+    clocks_of,
+    lags_of,
+    true_clocks_s,
+)
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
 from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
 from pipeline.stages.odometry import Odometry

@@ -1,20 +1,307 @@
-"""Everything that is judged of each epoch, and of each offer, as columns of one frame each (`schemas.stages`)."""
+"""Faults that were put into the positions on purpose, as the `faults` stream of a trial names them."""
 
 from __future__ import annotations
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import met, unambiguous
+from pipeline.stages.epochs.clock import (
+    crossing_gaps_ns,
+    met,
+    nominal_period_s,
+    periods_before_s,
+    reactions_ns,
+    trusted,
+    unambiguous,
+)
 from pipeline.stages.evidence import true_places
-from pipeline.stages.evidence.evidence import within_spans
-from pipeline.stages.judge.case import Case
-from pipeline.stages.judge.cross_errors import cross_errors
-from pipeline.stages.judge.in_use import lds_states, time_in_use
-from pipeline.stages.judge.injected import under_injection
-from pipeline.stages.judge.judgement import REFERENCE, Judgements, MatchedPositions, judge_positions, judgements_of
-from pipeline.stages.judge.travel import OdometerSteps, beyond_confidence, moving, travel_direction
-from schemas.arrays import Ints, flags, floats, ints, times_ns
+from pipeline.stages.evidence.evidence import Span, within_spans
+from pipeline.stages.judge.judgement import (
+    REFERENCE,
+    RIGHT,
+    WRONG,
+    Case,
+    Judgements,
+    MatchedPositions,
+    judge_positions,
+    judgements_of,
+)
+from pipeline.stages.track.geodesy import points_of
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of, spans_of, times_ns
+from schemas.config import Configuration, HazardConfig, LdsConfig
+from schemas.enums import LdsState
+from schemas.frozen import frozen
+
+# An axis of the position, the position itself, a constellation or a satellite; any other target is no fault of GNSS.
+_GNSS = r"(?i)^(along|cross|up|east|north|position|velocity|gnss|satellites?|gps|galileo|glonass|beidou|[A-Z][0-9]{2})$"
+
+
+def under_injection(t_ns: Ints, faults: pl.DataFrame | None, recovery_s: float) -> Bools:
+    """Instants from the begin of an injected fault of GNSS to `recovery_s` after its end, where it has one."""
+    under = np.zeros(t_ns.size, dtype=np.bool_)
+    if faults is None:
+        return under
+    of_gnss = faults.filter(pl.col("target").str.contains(_GNSS))
+    spans = of_gnss.select(pl.col("t_start", "t_end").dt.timestamp("ns")).iter_rows()
+    for begin_ns, end_ns in spans:
+        under |= (t_ns >= begin_ns) & (end_ns is None or t_ns <= (end_ns or 0) + round(recovery_s * NS_PER_S))
+    return under
+
+
+def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
+    """`error_cross_m`, `error_up_m`: position minus reference, left of growing path and upwards.
+
+    Null where the reference is silent, and where the position is farther ahead or behind than the failure limit: over
+    such a distance a curve alone is metres aside, and a slope metres up.
+    """
+    at_ns = case.instants_of_epochs()
+    errors_m = np.full((2, at_ns.size), np.nan)
+    reference = case.reference
+    if reference is not None and reference.height >= 2:
+        stamps = times_ns(reference)
+        since_s = (stamps - stamps[0]) / NS_PER_S
+        at_s = (at_ns - stamps[0]) / NS_PER_S
+        after = np.searchsorted(since_s, at_s).clip(1, since_s.size - 1)
+        covered = (at_s >= since_s[0]) & (at_s <= since_s[-1])
+        covered &= since_s[after] - since_s[after - 1] <= case.config.hazards.reference_gap_s
+        columns = ("latitude_deg", "longitude_deg", "height_m")
+        latitude, longitude, height_m = (floats(case.solution.fixes, name) for name in columns)
+        rows = np.flatnonzero(covered & np.isfinite(latitude))
+        there = [np.interp(at_s[rows], since_s, floats(reference, name)) for name in columns]
+        points = points_of(latitude[rows], longitude[rows])
+        away = points.surface - points_of(there[0], there[1]).surface
+        east = np.einsum("ij,ij->i", away, points.east)
+        north = np.einsum("ij,ij->i", away, points.north)
+        heading = np.radians(heading_deg[rows])
+        # The vector from reference to position, turned from east and north to along and left of the heading.
+        along_m = east * np.sin(heading) + north * np.cos(heading)
+        left_m = north * np.sin(heading) - east * np.cos(heading)
+        near = np.abs(along_m) <= case.config.hazards.limits.abreast_m
+        errors_m[:, rows] = np.where(near, [left_m, height_m[rows] - there[2]], np.nan)
+    names = ("error_cross_m", "error_up_m")
+    return [pl.Series(name, error_m, nan_to_null=True) for name, error_m in zip(names, errors_m, strict=True)]
+
+
+@frozen
+class OdometerSteps:
+    """From each epoch to the next: `counts`, the odometer has no gap there; `moves`, it shows movement.
+
+    `stood`: times [ns] in which it shows none while positions leave their place by more than the failure limit.
+    """
+
+    moves: Bools
+    counts: Bools
+    stood: tuple[Span, ...] = ()
+
+
+def odometer_steps(case: Case) -> OdometerSteps:
+    """What the odometer says of the steps between the epochs; without one, or of unknown origin, nothing of motion."""
+    at_ns = case.instants_of_epochs()
+    odometry = case.odometry
+    # One that may be made of the positions tells no motion (DOMAIN section 5.0).
+    if odometry is None or not odometry.independent:
+        return OdometerSteps(*np.zeros((2, at_ns.size), dtype=np.bool_))
+    moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
+    counts = _to_the_next(np.isfinite(odometry.steps_m(at_ns)), at_ns.size)
+    path_m = floats(case.solution.epochs, "path_m")
+    stood: list[Span] = []
+    for first, last in spans_of(counts & ~moves):
+        rows = slice(first, min(last + 2, at_ns.size))
+        places_m = path_m[rows][np.isfinite(path_m[rows])]
+        if np.abs(places_m - places_m[:1]).max(initial=0.0) > case.config.hazards.limits.stand_m:
+            stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
+    return OdometerSteps(moves, counts, tuple(stood))
+
+
+def travel_direction(
+    direction: Ints, along: Judgements, at_ns: Ints, path_m: Floats, has_odometer: bool, config: HazardConfig
+) -> Ints:
+    """Direction of travel along growing path, 1 or -1, per epoch; `direction`: as the LDS knew it.
+
+    Without an odometer the evidence decides, as a position that jumps back does not turn the train. With one the
+    odometer does, unless the reference shows that it counts up in reverse.
+    """
+    train_m = path_m - along.known_m(config.known_error_m)
+    moved_m, noise_m, _ = _moved_m(at_ns, train_m, along.half_m, config.turn_s)
+    sure = np.abs(moved_m) > noise_m
+    by_reference = along.kind == REFERENCE
+    if has_odometer:
+        # Not over a turn: the odometer knows best when that was.
+        turned_by, _, _ = _moved_m(at_ns, direction.astype(np.float64), along.half_m, config.turn_s)
+        sure &= by_reference & (turned_by == 0.0)
+    rows = np.flatnonzero(sure)
+    if rows.size == 0:
+        return direction
+    last = rows[np.maximum(np.searchsorted(rows, np.arange(at_ns.size), side="right") - 1, 0)]
+    sense = np.sign(moved_m[last]).astype(np.int64)
+    if not has_odometer:
+        return sense
+    # Until the reference says otherwise, the odometer agrees with it, or contradicts it, as at the last sure epoch.
+    return direction * np.where(by_reference, sense * direction[last], 1)
+
+
+def moving(
+    at_ns: Ints, reference_m: Floats, half_m: Floats, steps: OdometerSteps, stood: Bools, config: Configuration
+) -> pl.Series:
+    """Per epoch whether the train moves to the next one, null where neither reference nor odometer knows.
+
+    By the reference (`reference_m` +- `half_m`) it does where its way over a second exceeds dead band and noise.
+    """
+    moved_m, noise_m, elapsed_s = _moved_m(at_ns, reference_m, half_m, config.align.speed_window_s)
+    by_reference = np.abs(moved_m) > config.matching.deadband_mps * elapsed_s + noise_m
+    moves = by_reference | (steps.moves & steps.counts)
+    sure = np.isfinite(moved_m) | (steps.counts & ~stood)
+    frame = pl.DataFrame({"moving": _to_the_next(moves[:-1], at_ns.size), "sure": _to_the_next(sure[:-1], at_ns.size)})
+    return frame.select(pl.when("sure").then("moving")).to_series()
+
+
+def _moved_m(at_ns: Ints, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
+    """From each epoch to the one `window_s` later: the way [m], the half intervals of both places [m], the time [s]."""
+    ahead = np.searchsorted(at_ns, at_ns + round(window_s * NS_PER_S)).clip(0, at_ns.size - 1)
+    return place_m[ahead] - place_m, half_m + half_m[ahead], (at_ns[ahead] - at_ns) / NS_PER_S
+
+
+def _to_the_next(steps: Bools, size: int) -> Bools:
+    """Steps as a column of epochs: each epoch has that of the step after it, the last epoch that of the step before."""
+    last = steps[-1:] if steps.size else np.zeros(1, dtype=np.bool_)
+    return np.concatenate([steps, last])[:size]
+
+
+def beyond_confidence(
+    t_ns: Ints, odometer_m: Floats, train_m: Floats, half_m: Floats, accepted_ns: Ints, lds: LdsConfig
+) -> Bools:
+    """The distance counted since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1).
+
+    `train_m` +- `half_m`: path position of the train, NaN where not known; the error counts where it exceeds the
+    allowance and the half intervals of both places.
+    """
+    beyond = np.zeros(t_ns.size, dtype=np.bool_)
+    rows = np.flatnonzero(np.isfinite(odometer_m) & np.isfinite(train_m))
+    last = np.searchsorted(accepted_ns, t_ns[rows], side="right") - 1
+    rows = rows[last >= 0]
+    if rows.size == 0:
+        return beyond
+    since_ns = (t_ns[rows] - t_ns[rows[0]]).astype(np.float64)
+    accepted = (accepted_ns[last[last >= 0]] - t_ns[rows[0]]).astype(np.float64)
+    odometer_then_m, train_then_m, half_then_m = (
+        np.interp(accepted, since_ns, values[rows]) for values in (odometer_m, train_m, half_m)
+    )
+    counted_m = odometer_m[rows] - odometer_then_m
+    driven_m = train_m[rows] - train_then_m
+    allowed_m = lds.odometer_fixed_m + lds.odometer_share * np.abs(counted_m) + half_m[rows] + half_then_m
+    beyond[rows] = np.abs(counted_m - driven_m) > allowed_m
+    return beyond
+
+
+def speed_at(epochs: pl.DataFrame, t_ns: Ints) -> Floats:
+    """Speed [m/s] as the epochs around each instant show it, the train's own; NaN where no epoch knows it."""
+    known = epochs.filter(pl.col("speed_mps").is_not_null())
+    if known.is_empty():
+        return np.full(t_ns.size, np.nan)
+    begin_ns = times_ns(epochs)[0]
+    at_s, stamps_s = ((values - begin_ns) / NS_PER_S for values in (t_ns, times_ns(known)))
+    return np.asarray(np.interp(at_s, stamps_s, np.abs(floats(known, "speed_mps"))))
+
+
+# Numerics: times shorter than half a nanosecond are rounding.
+_LEAST_S = 0.5 / NS_PER_S
+
+
+def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.DataFrame:
+    """Per epoch `in_use`, and the time before it that it accounts for [s] (DOMAIN section 5.3).
+
+    `used_s`: of a position in use all time since the position before, up to the longest step that is no gap; `wrong_s`:
+    of it where the position was wrong. `counted_s`: for shares of time, `wrong_s` where there is any. An epoch without
+    a position accounts for time only in a gap.
+    """
+    known = np.isfinite(floats(epochs, "path_m"))
+    steps = _StepTimes.of(epochs, known, config)
+    usable = met(epochs, trusted(config) & ~pl.col("withheld"))
+    in_use = np.zeros(known.size, dtype=np.bool_)
+    in_use[known] = usable[known] & (steps.left_s(steps.alone_s) > _LEAST_S)
+    used_s = np.zeros(known.size)
+    used_s[known] = np.where(in_use[known], steps.left_s(steps.near_s), 0.0)
+    wrong_s = np.where(code == WRONG, used_s, 0.0)
+    counted_s = np.where(wrong_s > 0.0, wrong_s, _counted_s(times_ns(epochs), known, steps, config))
+    return pl.DataFrame({"in_use": in_use, "used_s": used_s, "wrong_s": wrong_s, "counted_s": counted_s})
+
+
+@frozen
+class _StepTimes:
+    """The time from the position before to each, ending at `end_s`; `is_gap`: longer than a movement is interpolated.
+
+    `near_s`: up to the longest step that is no gap (the fault may be that old); `alone_s`: up to one period.
+    `blocked_s`: total time negated up to each of `edge_s`, the begins and ends of the negations; linear between them.
+    """
+
+    end_s: Floats
+    near_s: Floats
+    alone_s: Floats
+    is_gap: Bools
+    edge_s: Floats
+    blocked_s: Floats
+
+    @classmethod
+    def of(cls, epochs: pl.DataFrame, known: Bools, config: Configuration) -> _StepTimes:
+        all_ns = times_ns(epochs)
+        t_ns = all_ns[known]
+        all_s = (all_ns - all_ns[:1]) / NS_PER_S
+        # Before the first position there is none: it accounts for one period of the run, as far as that is known.
+        step_s = np.diff(all_s[known], prepend=all_s[known][:1] - (nominal_period_s(t_ns) or 0.0))
+        gap_s = crossing_gaps_ns(t_ns, config.lds) / NS_PER_S
+        period_s = periods_before_s(t_ns)
+        near_s = np.minimum(step_s, gap_s)
+        alone_s = np.where(period_s > 0.0, np.minimum(near_s, period_s), near_s)
+        reaction_s = reactions_ns(all_ns, t_ns, config) / NS_PER_S
+        negated = _negated_spans(all_s, flags(epochs, "negated"), flags(epochs, "withheld"), reaction_s)
+        blocked_s = np.cumsum(np.diff(negated, axis=1, prepend=negated[:, :1]).ravel())
+        return cls(all_s[known], near_s, alone_s, step_s > gap_s, negated.ravel(), blocked_s)
+
+    def left_s(self, length_s: Floats) -> Floats:
+        """This much time before each position, less the negated part of it."""
+        if self.edge_s.size == 0:
+            return length_s
+        until_s, since_s = (np.interp(t_s, self.edge_s, self.blocked_s) for t_s in (self.end_s, self.end_s - length_s))
+        left_s = length_s - (until_s - since_s)
+        return np.where(left_s > _LEAST_S, left_s, 0.0)
+
+
+def _negated_spans(t_s: Floats, negated: Bools, withheld: Bools, reaction_s: Floats) -> Floats:
+    """Begin and end of each negation [s]: a reaction after it, or at once where already withheld, to the return."""
+    firsts, lasts = runs_of(negated)
+    until_s = np.append(t_s, t_s[-1:])[lasts + 1]
+    from_s = t_s[firsts] + np.where(withheld[firsts], 0.0, reaction_s[firsts])
+    return np.column_stack([np.minimum(from_s, until_s), until_s])
+
+
+def _counted_s(t_ns: Ints, known: Bools, steps: _StepTimes, config: Configuration) -> Floats:
+    """Time since the epoch before [s], of a gap no more than a movement is interpolated over.
+
+    Of epochs between two near positions the later position accounts for all, the others for none.
+    """
+    longest_s = crossing_gaps_ns(t_ns, config.lds) / NS_PER_S
+    since_s = np.minimum(np.diff(t_ns, prepend=t_ns[:1]) / NS_PER_S, longest_s)
+    rows = np.flatnonzero(known)
+    after = np.searchsorted(rows, np.arange(t_ns.size))
+    since_s[(after > 0) & np.append(~steps.is_gap, False)[after]] = 0.0
+    since_s[rows] = np.where(steps.is_gap, since_s[rows], steps.near_s)
+    return since_s
+
+
+def lds_states(epochs: pl.DataFrame, code: Ints, in_use: Bools, undiagnosed: Bools) -> pl.Series:
+    """P1 wrong in use, P2 negated, P3 not diagnosed, P0 right, the first that applies (DOMAIN section 4).
+
+    Null where the evidence cannot say, and where a wrong position was not in use.
+    """
+    applies = {
+        LdsState.P1: (code == WRONG) & in_use,
+        LdsState.P2: flags(epochs, "negated"),
+        LdsState.P3: undiagnosed,
+        LdsState.P0: code == RIGHT,
+    }
+    words = pl.Series("lds_state", [*(state.value for state in applies), None], dtype=pl.Enum(LdsState))
+    first = np.select(list(applies.values()), list(range(len(applies))), default=len(applies))
+    return words[first.astype(np.uint32)]
 
 
 def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:

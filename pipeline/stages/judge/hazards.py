@@ -11,12 +11,10 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import reactions_ns
 from pipeline.stages.evidence.evidence import KINDS
-from pipeline.stages.judge.alarms import suspect_of
-from pipeline.stages.judge.case import Case
-from pipeline.stages.judge.episodes import Episode
-from pipeline.stages.judge.failures import Course, Offers
-from pipeline.stages.judge.jumps import Jump
-from pipeline.stages.judge.travel import speed_at
+from pipeline.stages.judge.episodes import Episode, suspect_of
+from pipeline.stages.judge.epochs import speed_at
+from pipeline.stages.judge.failures import Course, Jump, Offers
+from pipeline.stages.judge.judgement import Case
 from schemas.arrays import NS_PER_S
 from schemas.conform import dtypes, table_of_rows
 from schemas.enums import Evidence, FailureMode, Hazard, Timing

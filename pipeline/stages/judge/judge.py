@@ -1,26 +1,303 @@
-"""The judge: one solution of a run against the evidence, in the order in which an assessor asks."""
+"""When the train itself passed each balise, by the evidence alone (CONTRACT section 3, `t_true`)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
+import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gaps_ns
-from pipeline.stages.epochs.failure_log import failure_log
-from pipeline.stages.evidence.evidence import within_spans
-from pipeline.stages.judge.alarms import alarms_table
-from pipeline.stages.judge.case import Case
-from pipeline.stages.judge.episodes import find_episodes
-from pipeline.stages.judge.epochs import judged_epochs, judged_offers
-from pipeline.stages.judge.failures import course_of, failures_table, find_failures, positions_of
-from pipeline.stages.judge.hazards import hazard_rows, hazards_table
-from pipeline.stages.judge.jumps import jumps_of
-from pipeline.stages.judge.passages import passages_table
-from pipeline.stages.judge.travel import odometer_steps
-from schemas.arrays import flags, times_ns
-from schemas.enums import Evidence
+from pipeline.stages.epochs.clock import crossing_gaps_ns, met, passings
+from pipeline.stages.epochs.verdicts import failure_log
+from pipeline.stages.evidence.evidence import NOTHING, Alternative, EvidenceSet, Span, within_spans
+from pipeline.stages.judge.episodes import alarms_table, find_episodes
+from pipeline.stages.judge.epochs import judged_epochs, judged_offers, odometer_steps, speed_at
+from pipeline.stages.judge.failures import course_of, failures_table, find_failures, jumps_of, positions_of
+from pipeline.stages.judge.hazards import HazardRow, hazard_rows, hazards_table
+from pipeline.stages.judge.judgement import Case, Judgements
+from pipeline.stages.track.path import Place
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, ints, times_ns
+from schemas.config import Configuration, LdsConfig
+from schemas.enums import BaliseKind, Cause, Direction, Evidence, FailureMode, LinkingError, PassageStatus, Reaction
 from schemas.frozen import frozen
+from schemas.tables import Passages
+
+# Numerics: so many instants before and after a track show where the train came from and went on to.
+_BESIDE = 100
+
+
+class TrueCrossing(NamedTuple):
+    """Instant [ns] by the middle of the interval; `sense` +1 with the measure of the balise's net element, else -1.
+
+    `clear`: the train came from beyond the re-arming distance and went on beyond it.
+    """
+
+    t_ns: int
+    sense: int
+    clear: bool
+
+
+Crossings = dict[str, list[TrueCrossing]]
+"""Of each balise, in order of time."""
+
+
+def crossings_of(case: Case) -> Crossings:
+    """Crossings of each balise of the path by the train, in a direction in which the balise is valid."""
+    balises = case.solution.balises.unique("balise_id", keep="first")
+    elements = case.element_numbers(balises["netelement_id"]).tolist()
+    spots = zip(balises["balise_id"], elements, balises["measure_m"], strict=True)
+    places = {name: Place(element, measure_m) for name, element, measure_m in spots}
+    at_ns = between_far_epochs(case.instants_of_epochs(), case.config.align.speed_window_s)
+    crossings = true_crossings(at_ns, case.evidence.at(at_ns), places, case.config)
+    # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both ways.
+    valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).iter_rows())
+    return {
+        name: [crossing for crossing in crossed if valid[name] in (0, crossing.sense)]
+        for name, crossed in crossings.items()
+    }
+
+
+def between_far_epochs(at_ns: Ints, step_s: float) -> Ints:
+    """The instants of the positions, and others between those that are far apart."""
+    step_ns = round(step_s * NS_PER_S)
+    far = np.flatnonzero(np.diff(at_ns) > 1.5 * step_ns)
+    gaps = zip(at_ns[far].tolist(), at_ns[far + 1].tolist(), strict=True)
+    between = [np.arange(begin, end, step_ns, dtype=np.int64)[1:] for begin, end in gaps]
+    return np.unique(np.concatenate([at_ns, *between]))
+
+
+class _Train(NamedTuple):
+    """Where the train was at each instant, NaN where not known: net element, measure, half the interval."""
+
+    t_ns: Ints
+    element: Floats
+    measure_m: Floats
+    half_m: Floats
+
+
+def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], config: Configuration) -> Crossings:
+    """Crossings where the evidence leaves one track; `t_ns`: of the evidence.
+
+    Where the half interval is at most `known_error_m`, its middle counts; else the whole interval has to pass from one
+    side of the balise to the other.
+    """
+    alternatives = np.bincount(
+        np.concatenate([track.rows for track in evidence.alternatives] or [np.zeros(0, np.int64)]), minlength=t_ns.size
+    )
+    tracks = [track.where(alternatives[track.rows] == 1) for track in evidence.alternatives]
+    train = _Train(t_ns, *np.full((3, t_ns.size), np.nan))
+    for track in tracks:
+        train.element[track.rows], train.measure_m[track.rows], _ = track.route.locate(track.middle_m)
+        train.half_m[track.rows] = 0.5 * (track.high_m - track.low_m)
+    names = list(places)
+    elements = np.array([place.element for place in places.values()])
+    measures_m = np.array([place.measure_m for place in places.values()])
+    crossings: Crossings = {name: [] for name in names}
+    for track in tracks:
+        if track.rows.size == 0:
+            continue
+        rows, at_m = _with_beside(track, train)
+        on_track = np.isin(rows, track.rows)
+        for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
+            if at_m.min() <= visit_m <= at_m.max():
+                crossed = _crossed(train, rows, on_track, at_m - visit_m, config)
+                turned = [crossing._replace(sense=int(crossing.sense * sense)) for crossing in crossed]
+                crossings[names[balise]] += turned
+    return {name: sorted(crossed) for name, crossed in crossings.items()}
+
+
+def _with_beside(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
+    """Rows and coordinates on a track, also of the rows just before and after, where the train's place lies on it."""
+    rows = track.rows
+    around = np.arange(max(rows[0] - _BESIDE, 0), min(rows[-1] + _BESIDE + 1, train.t_ns.size))
+    beside = np.setdiff1d(around, rows)
+    element = np.nan_to_num(train.element[beside], nan=-1).astype(np.int64)
+    near_m = track.middle_m[np.searchsorted(rows, beside).clip(0, rows.size - 1)]
+    there_m, _ = track.route.coordinate(element, train.measure_m[beside], near_m)
+    known = np.isfinite(there_m)
+    both = np.concatenate([rows, beside[known]])
+    order = np.argsort(both, kind="stable")
+    return both[order], np.concatenate([track.middle_m, there_m[known]])[order]
+
+
+def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config: Configuration) -> list[TrueCrossing]:
+    """Instants, the later one `on_track`, at which the train went from one side of the balise to the other.
+
+    A train that came no farther than `rearm_m` from a balise since it passed it has not passed it again.
+    """
+    half_m = train.half_m[rows]
+    close = half_m <= config.hazards.known_error_m
+    beyond = np.abs(away_m) >= np.maximum(config.lds.rearm_m, half_m)
+    ahead = away_m >= 0.0
+    crossings: list[TrueCrossing] = []
+    armed_from = 0
+    passed = False
+    far = np.flatnonzero(beyond)
+    for passing in passings(away_m, [0.0]):
+        change = passing.after
+        if rows[change] - rows[change - 1] != 1:
+            continue
+        armed = bool((beyond & (ahead != ahead[change]))[armed_from:change].any())
+        # However often its middle wavers at the balise: on which side the train is next known to be beyond it.
+        next_far = int(np.searchsorted(far, change))
+        clear = armed and next_far < far.size and bool(ahead[far[next_far]] == ahead[change])
+        if not clear and not (close[change - 1 : change + 1].all() and (armed or not passed)):
+            continue
+        armed_from = change
+        passed = True
+        if on_track[change]:
+            instant_ns = passing.instant_ns(*train.t_ns[rows[change - 1 : change + 1]].tolist())
+            crossings.append(TrueCrossing(instant_ns, passing.sense, clear))
+    return crossings
+
+
+def passages_table(
+    case: Case, epochs: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[HazardRow], undetected: Sequence[Span]
+) -> pl.DataFrame:
+    """Passages of the LDS, and those of the train that it knows nothing of, with the columns of the evidence.
+
+    `epochs`, `offers`: judged; `undetected`: from each fault's onset to its detection.
+    """
+    stamps = times_ns(epochs.filter(pl.col("path_m").is_not_null()))
+    crossings = crossings_of(case)
+    known = case.solution.passages.with_columns(_true_times(case.solution.passages, crossings))
+    passages = _with_unoffered(known, case, crossings, stamps)
+    t_true = passages["t_true"]
+    accepted = (pl.col("status") == PassageStatus.ACCEPTED.value) & (pl.col("kind") == BaliseKind.VIRTUAL.value)
+    offered_ns = ints(passages["t_offered"].dt.timestamp("ns"))
+    frame = passages.with_columns(
+        pl.col("t_true").cast(pl.Datetime("ns", "UTC")),
+        *_of_offers(passages, offers, rows),
+        _speeds(passages, t_true, epochs, case.config.lds),
+        _positioned=pl.Series(_within_gap(stamps, ints(t_true), case.config.lds)) & t_true.is_not_null(),
+        suspect_after_the_fact=pl.Series(met(passages, accepted) & within_spans(offered_ns, undetected)),
+    )
+    return _with_failures(frame).select(Passages.column_names())
+
+
+def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[HazardRow]) -> pl.DataFrame:
+    """Judgement, error, hazard and insertion from the offer of each passage; from a telegram its error alone.
+
+    Inserted: by a jump, on another track, or early and wrong.
+    """
+    judged = Judgements.of(offers)
+    hazard = np.full(offers.height, NOTHING)
+    inserted = judged.is_wrong & ((judged.low_m > 0.0) | judged.wrong_track)
+    for number, row in reversed(list(enumerate(rows))):
+        hazard[row.hits] = number
+        inserted[row.crossed] = True
+    of_virtual = ("judgement", "error_low_m", "error_high_m", "evidence", "proof_margin_m")
+    columns = offers.select(
+        *("crossing_id", "location_error_m"),
+        *(pl.when("virtual").then(pl.col(name)).alias(name) for name in of_virtual),
+        hazard_id=pl.Series(hazard).replace(NOTHING, None),
+        _inserted=pl.Series(inserted),
+    )
+    joined = passages.select("crossing_id").join(columns, on="crossing_id", how="left", maintain_order="left")
+    return joined.drop("crossing_id").with_columns(pl.col("_inserted").fill_null(value=False))
+
+
+def _true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
+    """The train's crossing of each passage [ns], taken out of `crossings`: the nearest to its offer or reckoning.
+
+    A passage with neither takes what is left, in order.
+    """
+    about = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series().dt.timestamp("ns").to_list()
+    balises = passages["balise_id"].to_list()
+    pairs = sorted(
+        (abs(crossing.t_ns - t_ns), row, crossing)
+        for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True))
+        if t_ns is not None
+        for crossing in crossings.get(balise, ())
+    )
+    times: list[int | None] = [None] * len(balises)
+    for _, row, crossing in pairs:
+        if times[row] is None and crossing in crossings[balises[row]]:
+            crossings[balises[row]].remove(crossing)
+            times[row] = crossing.t_ns
+    for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True)):
+        if t_ns is None and crossings.get(balise):
+            times[row] = crossings[balise].pop(0).t_ns
+    return pl.Series("t_true", times, dtype=pl.Int64)
+
+
+def _within_gap(stamps: Ints, t_ns: Ints, lds: LdsConfig) -> Bools:
+    """Positions on both sides of each instant, no farther apart than a crossing is interpolated over."""
+    if stamps.size < 2:
+        return np.zeros(t_ns.size, dtype=np.bool_)
+    after = np.searchsorted(stamps, t_ns).clip(1, stamps.size - 1)
+    inside = (t_ns >= stamps[0]) & (t_ns <= stamps[-1])
+    return np.asarray(inside & (stamps[after] - stamps[after - 1] <= crossing_gaps_ns(stamps, lds)[after]))
+
+
+def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, lds: LdsConfig) -> pl.Series:
+    """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
+    at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
+    stamps = times_ns(epochs.filter(pl.col("speed_mps").is_not_null()))
+    known = at.is_not_null().to_numpy() & _within_gap(stamps, ints(at), lds)
+    return pl.Series("speed_mps", np.where(known, speed_at(epochs, ints(at)), np.nan), nan_to_null=True)
+
+
+def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:
+    """ETCS failure mode and cause: insertion where offered where it is not, deletion where not offered in time."""
+    beyond_window = (pl.col("odometer_distance_m") > pl.col("window_close_m")).fill_null(value=False)
+    offered = pl.col("t_offered").is_not_null()
+    wrong = (pl.col("judgement") == "wrong").fill_null(value=False)
+    absent = pl.col("status") == PassageStatus.NOT_AVAILABLE.value
+    insertion = offered & pl.col("_inserted")
+    deletion = absent | ~offered | beyond_window
+    by_position = insertion | (beyond_window & wrong) | (~offered & ~absent & pl.col("_positioned"))
+    without = absent | (~offered & ~pl.col("_positioned"))
+    mode = _first_of(insertion, FailureMode.INSERTION, deletion, FailureMode.DELETION)
+    cause = _first_of(by_position, Cause.POSITION, without, Cause.NO_POSITION)
+    kinds = frame.schema
+    return frame.with_columns(failure_mode=mode.cast(kinds["failure_mode"]), cause=cause.cast(kinds["cause"]))
+
+
+def _first_of(first: pl.Expr, word: FailureMode | Cause, second: pl.Expr, other: FailureMode | Cause) -> pl.Expr:
+    """The word of the first condition that holds, `none` where neither does."""
+    return pl.when(first).then(pl.lit(word.value)).when(second).then(pl.lit(other.value)).otherwise(pl.lit("none"))
+
+
+def _with_unoffered(passages: pl.DataFrame, case: Case, crossings: Crossings, stamps: Ints) -> pl.DataFrame:
+    """Adds a passage for each true crossing of a virtual balise without one: the LDS, misled by the position, has none.
+
+    `crossings`: those that belong to no passage; `stamps`: of valid positions.
+    """
+    virtual = case.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
+    missed = [
+        (balise, crossing)
+        for balise in virtual.unique("balise_id", keep="first", maintain_order=True).iter_rows(named=True)
+        for crossing in crossings.get(balise["balise_id"], ())
+        if crossing.clear
+    ]
+    if not missed:
+        return passages
+    times = np.array([crossing.t_ns for _, crossing in missed])
+    positioned = _within_gap(stamps, times, case.config.lds).tolist()
+    rows = [_unoffered(*pair, case.solution.name, seen) for pair, seen in zip(missed, positioned, strict=True)]
+    added = pl.DataFrame(rows, schema=passages.schema)
+    when = pl.coalesce("t_offered", "t_reckoned")
+    ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
+    return pl.concat([ordered, added.with_columns(_when=when)]).sort("_when", maintain_order=True).drop("_when")
+
+
+def _unoffered(balise: dict[str, Any], crossing: TrueCrossing, solution: str, positioned: bool) -> dict[str, Any]:
+    """The row of such a passage; `sense` of crossing and balise are along the measure, `direction` along the path."""
+    names = ("balise_id", "kind", "netelement_id", "measure_m", "path_m", "location_accuracy_m")
+    growing = crossing.sense * balise["sense"] > 0
+    return {name: balise[name] for name in names} | {
+        "solution": solution,
+        "direction": (Direction.GROWING if growing else Direction.FALLING).value,
+        "status": (PassageStatus.MISSED if positioned else PassageStatus.NOT_AVAILABLE).value,
+        "linking_error": LinkingError.NONE.value,
+        "reaction": Reaction.NONE.value,
+        "initialising": False,
+        "t_reckoned": crossing.t_ns,
+        "t_true": crossing.t_ns,
+    }
 
 
 @frozen

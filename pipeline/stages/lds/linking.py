@@ -10,9 +10,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.stages.lds.crossings import Balise, Crossing, Passage
-from pipeline.stages.lds.journey import Journey
-from pipeline.stages.lds.windows import Window, window_after_turn_m, window_m
+from pipeline.stages.lds.crossings import Balise, Crossing, Journey, Passage, Window, window_after_turn_m, window_m
 from schemas.config import LdsConfig
 from schemas.enums import LinkingError, PassageStatus, Reaction
 

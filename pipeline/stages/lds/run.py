@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.passing import passings
+from pipeline.stages.epochs.clock import passings
 from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.lds.crossings import (
     PLACE,
     Crossing,
+    Journey,
     Passage,
     balises_of,
     crossing_rows,
@@ -19,10 +20,9 @@ from pipeline.stages.lds.crossings import (
     in_order_of_time,
     reads_of,
 )
-from pipeline.stages.lds.journey import Journey
+from pipeline.stages.lds.link_monitors import Held
 from pipeline.stages.lds.linking import LrvbChange
 from pipeline.stages.lds.machine import LocationSystem
-from pipeline.stages.lds.relink import Held
 from pipeline.stages.monitors.bank import MonitorBank
 from schemas.arrays import Bools, Floats
 from schemas.config import Configuration, LdsConfig

@@ -7,9 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.stages.matching.fixes import Fixes
-from pipeline.stages.track.leg import segments_at
 from pipeline.stages.track.path import TravelledPath
-from pipeline.stages.track.segments import Feet
+from pipeline.stages.track.segments import Feet, segments_at
 from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig, Vehicle
 from schemas.enums import SigmaSource

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.stages.odometry.written_steps import step_of
+from pipeline.stages.odometry.rows import step_of
 from pipeline.stages.track.geodesy import MEAN_RADIUS_M, Points, points_of
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import FixSigma

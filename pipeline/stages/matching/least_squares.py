@@ -1,18 +1,139 @@
-"""The path shown: of the paths of the set the one with the least sum of squared residuals (Viterbi 1967).
-
-It goes on over relations only, reversals included. Where positions leave every track of the set, the path is carried on
-without them, each costing what one costs that no error explains; it begins anew on a track that no relation leads to
-only where positions stay there for long enough.
-"""
+"""Where each step may have been on the network, and what it costs to say so."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from pipeline.stages.matching.path_states import PathStates, unbroken
-from pipeline.stages.paths.moves import Moves, Place
+from pipeline.stages.paths.candidates import Candidates, overtaken
+from pipeline.stages.paths.path_set import PathSet
+from pipeline.stages.paths.path_steps import Move, Moves, PathSteps, Place
+from pipeline.stages.track.network import Network
+from pipeline.stages.track.path import Chain, moved_on
+from pipeline.stages.track.segments import Leg, Visit, leg_of, segments_at, shifted
 from schemas.arrays import Bools, Floats, Ints
+from schemas.config import MatchingConfig
 from schemas.frozen import frozen
+
+
+@frozen
+class PathStates:
+    """Oriented elements in order of step; `first[k] : first[k + 1]` are those of the step `step[k]` of the set.
+
+    `place_m`: from the entry of the oriented element; `cost`: square of the residual over its sigma, limited;
+    `refuted`: the whole run refutes every path over it then.
+    """
+
+    step: Ints
+    first: Ints
+    oriented: Ints
+    place_m: Floats
+    cost: Floats
+    refuted: Bools
+
+
+def path_states(found: PathSet, height_m: Floats, sigma_up_m: Floats, config: MatchingConfig) -> PathStates:
+    """All places within reach, of steps with one at least.
+
+    `height_m`, `sigma_up_m`: of each step over the survey's zero, NaN where unknown. All elements at a step are weighed
+    by one sigma, else a coarse survey would win. Where the set knows where the train may have been, every other place
+    costs as much as a position that no error explains.
+    """
+    steps, network = found.steps, found.network
+    candidates = found.candidates.take(np.flatnonzero(~overtaken(found.candidates, network)), len(steps))
+    kept = np.diff(candidates.first) > 0
+    variance_m2 = (config.cross_bias_sigma_m**2 + steps.sigma_m**2)[candidates.step]
+    most = config.outlier_sigmas**2
+    cost = np.minimum(candidates.distance_m**2 / variance_m2, most)
+    refuted = _refuted(found, candidates)
+    cost = np.where(refuted, most, cost + _height_costs(candidates, height_m, sigma_up_m, config))
+    candidates = candidates.renumbered(kept)
+    both = np.column_stack([2 * candidates.element, 2 * candidates.element + 1])
+    index = np.flatnonzero(network.usable[both].ravel())
+    oriented = both.ravel()[index]
+    row = index // 2
+    backward = oriented % 2 == 1
+    return PathStates(
+        step=np.flatnonzero(kept),
+        first=np.searchsorted(candidates.step[row], np.arange(int(kept.sum()) + 1)),
+        oriented=oriented,
+        place_m=np.where(backward, candidates.left_m[row], candidates.along_m[row]),
+        cost=cost[row],
+        refuted=refuted[row],
+    )
+
+
+def unbroken(states: PathStates, steps: PathSteps, config: MatchingConfig) -> Bools:
+    """Steps that follow the one before at once, with the same states.
+
+    But for one every `break_s` where there are several: a path may break off there.
+    """
+    count = np.diff(states.first)
+    number = np.repeat(np.arange(len(count)), count)
+    state = np.arange(len(states.oriented))
+    # With equal counts, the same place in the step before is `count` states back.
+    before = np.maximum(state - count[number], 0)
+    equal = (states.oriented == states.oriented[before]) & (states.refuted == states.refuted[before])
+    same = np.logical_and.reduceat(equal, states.first[:-1]) & (np.diff(count, prepend=0) == 0)
+    at_once = np.diff(states.step, prepend=-2) == 1
+    soon = np.diff(steps.end_s, prepend=-np.inf)[states.step] <= config.paths_gap_s
+    spell = np.floor(steps.end_s[states.step] / config.break_s)
+    return np.asarray(same & at_once & soon & ((count == 1) | (np.diff(spell, prepend=-1.0) == 0.0)))
+
+
+def _refuted(found: PathSet, candidates: Candidates) -> Bools:
+    """Candidates on an element that the whole run refutes; none where every path is refuted."""
+    count = len(found.steps)
+    elements = found.network.count
+    lives = found.to_the_end()
+    # Between two elements a step belongs to either.
+    spans = [(node.element, max(begin - 1, 0), min(end + 1, count)) for node, begin, end, _ in lives]
+    keys = [np.arange(begin, end) * elements + element for element, begin, end in spans]
+    possible = np.unique(np.concatenate([*keys, np.zeros(0, dtype=np.int64)]))
+    known = np.zeros(count, dtype=np.bool_)
+    for _, begin, end, _ in lives:
+        known[begin:end] = True
+    step = candidates.step
+    return np.asarray(known[step] & ~np.isin(step * elements + candidates.element, possible))
+
+
+def _height_costs(candidates: Candidates, height_m: Floats, sigma_up_m: Floats, config: MatchingConfig) -> Floats:
+    """Of the height over the track, where tracks lie over each other; none without heights.
+
+    Tracks at one level differ by superelevation and errors of the survey, which say nothing of the train.
+    """
+    track_m = candidates.height_m
+    if not np.isfinite(track_m).any():
+        return np.zeros(track_m.size)
+    begin = candidates.first[:-1][np.diff(candidates.first) > 0]
+    of_step = np.repeat(np.arange(begin.size), np.diff(np.append(begin, track_m.size)))
+    apart_m = (np.maximum.reduceat(track_m, begin) - np.minimum.reduceat(track_m, begin))[of_step]
+    variance_m2 = sigma_up_m[candidates.step] ** 2 + config.height_bias_sigma_m**2
+    square = (height_m[candidates.step] - track_m) ** 2 / variance_m2
+    counts = (apart_m >= config.clearance_m) & np.isfinite(square)
+    return np.where(counts, np.minimum(square, config.outlier_sigmas**2), 0.0)
+
+
+def polarity_of_parts(network: Network, states: PathStates, counted_m: Floats) -> Ints:
+    """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown.
+
+    `counted_m`: per step of the states the way since the step before, signed, NaN where unknown. The sign belongs to
+    the installation and holds for the whole run, but the orientation of a connected part of the network is arbitrary:
+    so one sign for each part, by the votes of all states that stay on one element for a step. Of the path shown, which
+    looks back; the sign that the train counts with is `odometry.polarity`, by the first metres on that path.
+    """
+    count = len(network.successors)
+    if not network.orientable:
+        return np.zeros(count, dtype=np.int64)
+    part = network.parts
+    step = np.repeat(np.arange(len(states.first) - 1), np.diff(states.first))
+    # Step and oriented element in one sorted number: the same element a step before is `count` less.
+    keys = step * count + states.oriented
+    before = np.minimum(np.searchsorted(keys, keys - count), len(keys) - 1)
+    stayed = np.flatnonzero((keys[before] == keys - count) & np.isfinite(counted_m[step]))
+    moved_m = states.place_m[stayed] - states.place_m[before[stayed]]
+    votes = np.sign(moved_m) * counted_m[step[stayed]]
+    return np.sign(np.bincount(part[states.oriented[stayed]], votes, part.max() + 1)).astype(np.int64)[part]
+
 
 # Numerics: more than a step that no error explains costs one that is left out, in squares of sigmas.
 _LEFT_OUT = 1.0
@@ -114,3 +235,128 @@ def _course(states: PathStates, begins: Ints, ends: Ints, last: _Reached) -> Cou
     part = np.concatenate(parts[::-1])
     row = np.concatenate(rows[::-1])
     return Course(states.step[part], states.oriented[row], states.place_m[row])
+
+
+@frozen
+class Decoded:
+    """Legs, and for each step its leg, element number in it and place from that element's entry [m]."""
+
+    chains: tuple[Chain, ...]
+    leg: Ints
+    number: Ints
+    place_m: Floats
+
+    def turned(self, network: Network, legs: range) -> Decoded:
+        """Some legs run the other way round."""
+        chains = tuple(chain.turned(network) if index in legs else chain for index, chain in enumerate(self.chains))
+        inside = (self.leg >= legs.start) & (self.leg < legs.stop)
+        length = np.array(
+            [
+                network.length_m(self.chains[leg].oriented[number - self.chains[leg].low])
+                for leg, number in zip(self.leg.tolist(), self.number.tolist(), strict=True)
+            ]
+        )
+        number = np.where(inside, -self.number, self.number)
+        return Decoded(chains, self.leg, number, np.where(inside, length - self.place_m, self.place_m))
+
+
+def decode(course: Course, moves: Moves) -> Decoded:
+    """Follow the course over the network, elements without any fix included."""
+    oriented = course.oriented
+    chains = [Chain((int(oriented[0]),), (0.0,))]
+    leg = np.zeros(len(oriented), dtype=np.int64)
+    number = np.zeros(len(oriented), dtype=np.int64)
+    at = 0
+    before = 0
+    for row in np.flatnonzero(_to_be_asked(course)).tolist():
+        leg[before:row] = len(chains) - 1
+        number[before:row] = at
+        before = row
+        move = moves.best(course.place(row - 1), course.place(row))
+        at = _follow(chains, moves.network, at, move, int(oriented[row]))
+    leg[before:] = len(chains) - 1
+    number[before:] = at
+    return Decoded(tuple(chains), leg, number, course.place_m)
+
+
+def _to_be_asked(course: Course) -> Bools:
+    """Rows at which the course comes to another element."""
+    return np.concatenate([[False], course.oriented[1:] != course.oriented[:-1]])
+
+
+def legs_of(moves: Moves, course: Course, decoded: Decoded) -> list[Leg]:
+    """Legs with one path position: equal on what two legs share, carried on by distance over a break."""
+    legs: list[Leg] = []
+    for index, chain in enumerate(decoded.chains):
+        visits = [Visit(oriented // 2, oriented % 2 == 0) for oriented in chain.oriented]
+        leg = leg_of(moves.network.track, visits)
+        if legs and chain.shared is not None:
+            before = decoded.chains[index - 1]
+            there = legs[-1].entry_m(chain.shared - before.low)
+            leg = shifted(leg, there - leg.entry_m(chain.shared - chain.low))
+        elif legs:
+            leg = shifted(leg, _over_break(moves, course, decoded, legs[-1], leg, index))
+        legs.append(leg)
+    return legs
+
+
+def positions_m(decoded: Decoded, legs: list[Leg]) -> Floats:
+    """Path position of each step."""
+    entries = [[leg.entry_m(number) for number in range(len(leg.visits))] for leg in legs]
+    return np.array(
+        [
+            entries[leg][number - decoded.chains[leg].low] + place
+            for leg, number, place in zip(
+                decoded.leg.tolist(), decoded.number.tolist(), decoded.place_m.tolist(), strict=True
+            )
+        ]
+    )
+
+
+def aligned(moves: Moves, course: Course, decoded: Decoded) -> Decoded:
+    """After a break the path goes on in the direction it had: legs beyond it are turned where needed."""
+    for index, chain in enumerate(decoded.chains):
+        if index and chain.shared is None:
+            legs = legs_of(moves, course, decoded)
+            turn = _heading_at(decoded, legs, index) - _heading_at(decoded, legs, index, before=True)
+            if np.cos(np.radians(turn)) < 0:
+                decoded = decoded.turned(moves.network, range(index, _next_break(decoded, index)))
+    return decoded
+
+
+def _follow(chains: list[Chain], network: Network, at: int, move: Move | None, to: int) -> int:
+    """Extend the legs by one move; where the network does not lead there, begin a new one."""
+    if move is None:
+        number = chains[-1].high + 1
+        chains.append(Chain((to,), (0.0,), number))
+        return number
+    for oriented in (*move.between, to) if move.sense else ():
+        at = moved_on(chains, network, at, oriented, move.sense)
+    return at
+
+
+def _next_break(decoded: Decoded, index: int) -> int:
+    later = range(index + 1, len(decoded.chains))
+    return next((number for number in later if decoded.chains[number].shared is None), len(decoded.chains))
+
+
+def _border(decoded: Decoded, index: int) -> int:
+    """First step of a leg."""
+    return int(np.searchsorted(decoded.leg, index))
+
+
+def _heading_at(decoded: Decoded, legs: list[Leg], index: int, before: bool = False) -> float:
+    step = _border(decoded, index) - before
+    leg = legs[int(decoded.leg[step])]
+    segment, _ = segments_at(leg, positions_m(decoded, legs)[[step]])
+    return float(leg.heading_deg[segment[0]])
+
+
+def _over_break(moves: Moves, course: Course, decoded: Decoded, before: Leg, after: Leg, index: int) -> float:
+    """Shift of a leg beyond a break, so that path position grows by the distance in between."""
+    step = _border(decoded, index)
+    last = decoded.chains[index - 1]
+    there = before.entry_m(int(decoded.number[step - 1]) - last.low) + float(decoded.place_m[step - 1])
+    here = after.entry_m(int(decoded.number[step]) - decoded.chains[index].low) + float(decoded.place_m[step])
+    way = moves.way(int(course.step[step - 1]), int(course.step[step]))
+    return there + abs(way.distance_m) - here

@@ -1,4 +1,4 @@
-"""The matching stage: positions of one solution on the track network."""
+"""Finding the path shown: the one of the set with the least sum of squared residuals (DOMAIN section 2)."""
 
 from __future__ import annotations
 
@@ -7,23 +7,125 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
+from pipeline.stages.epochs.clock import least_belief
 from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches, off_stretches
 from pipeline.stages.matching.epochs import Assignment, Placed, Written, matched_epochs
 from pipeline.stages.matching.fixes import Fixes, digit_steps, fixes_of
-from pipeline.stages.matching.path_search import find_path
+from pipeline.stages.matching.least_squares import (
+    Course,
+    Decoded,
+    aligned,
+    decode,
+    least_squares,
+    legs_of,
+    path_states,
+    polarity_of_parts,
+    positions_m,
+)
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.odometry.polarity import polarity
-from pipeline.stages.paths.path_set import path_set
-from pipeline.stages.paths.path_steps import path_steps
+from pipeline.stages.odometry.polarity import grows_with, polarity
+from pipeline.stages.paths.path_set import PathSet, path_set
+from pipeline.stages.paths.path_steps import Moves, PathSteps, path_steps
+from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import network_in_pieces
 from pipeline.stages.track.path import TravelledPath
+from pipeline.stages.track.segments import Leg, segments_at
 from pipeline.stages.track.survey import SurveyedTrack
-from schemas.arrays import NS_PER_S, Ints, ints, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.frozen import frozen
 from schemas.run import Site
-from schemas.stages import MatchedEpochs
+from schemas.stages import ONE_TRACK_LEFT, MatchedEpochs
+
+
+def find_path(
+    fixes: Fixes, odometry: Odometry | None, found: PathSet, config: MatchingConfig
+) -> tuple[TravelledPath, Assignment]:
+    """The path shown, and each epoch's leg on it. Raises `InputError` where no position is near any track."""
+    network = found.network
+    if not found.candidates.step.size:
+        raise off_the_network(fixes, network.track, config)
+    middle = _middle_rows(fixes, found.steps)
+    states = path_states(found, fixes.height_m[middle], np.sqrt(fixes.cov_uu_m2[middle]), config)
+    moves = Moves.without_odometer(network, found.steps, config)
+    if odometry is not None:
+        at_ns = found.steps.t_ns
+        counted_m = (odometry.scale or 1.0) * odometry.distance_at(at_ns)
+        since_m = np.full(states.step.size, np.nan)
+        since_m[1:] = odometry.distance_between(at_ns[states.step[:-1]], at_ns[states.step[1:]])
+        doubt_m = odometry.doubt_at_s(odometry.seconds(at_ns))
+        moves = Moves(network, found.steps, counted_m, doubt_m, polarity_of_parts(network, states, since_m), config)
+    course = least_squares(states, moves)
+    decoded = aligned(moves, course, decode(course, moves))
+    legs = legs_of(moves, course, decoded)
+    at_m = positions_m(decoded, legs)
+    if not grows_with(at_m, found.steps.t_ns[course.step], odometry, config.orientation_distance_m):
+        decoded = decoded.turned(network, range(len(decoded.chains)))
+        legs = legs_of(moves, course, decoded)
+        at_m = positions_m(decoded, legs)
+    return TravelledPath(network.track, tuple(legs)), _assign(fixes, found.steps, course, decoded, at_m)
+
+
+def _middle_rows(fixes: Fixes, steps: PathSteps) -> Ints:
+    """The epoch with a position in the middle of each step."""
+    rows = np.flatnonzero(fixes.valid)
+    return np.asarray(rows[np.minimum(np.searchsorted(fixes.t_ns[rows], steps.t_ns), rows.size - 1)])
+
+
+def _assign(fixes: Fixes, steps: PathSteps, course: Course, decoded: Decoded, at_m: Floats) -> Assignment:
+    """Every epoch by the step that it is in, or the one before it: its place moved on towards the next step.
+
+    Between the steps of two legs an epoch belongs to the later one.
+    """
+    own = np.searchsorted(steps.begin_ns, fixes.t_ns, side="right") - 1
+    last = np.searchsorted(course.step, own, side="right") - 1
+    following = np.clip(last + 1, 0, len(course.step) - 1)
+    last = np.maximum(last, 0)
+    inside = course.step[last] == own
+    leg = np.where(inside, decoded.leg[last], decoded.leg[following])
+    # Over a jump or an outage places are hundreds of metres apart: interpolated to tell passages apart.
+    begin_ns = steps.t_ns[course.step[last]]
+    span_ns = steps.t_ns[course.step[following]] - begin_ns
+    share = np.clip((fixes.t_ns - begin_ns) / np.maximum(span_ns, 1), 0.0, 1.0)
+    moved_m = np.where(decoded.leg[last] == decoded.leg[following], at_m[following] - at_m[last], 0.0)
+    unknown = np.full(len(fixes), np.nan)
+    return Assignment(leg, at_m[last] + share * moved_m, unknown, unknown)
+
+
+def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) -> InputError:
+    """The error for a run of which no epoch is within reach of any track."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(track.surface)
+    rows = np.flatnonzero(fixes.valid)
+    nearest_m, vertex = tree.query(fixes.points.surface[rows])
+    row = int(np.argmin(nearest_m))
+    swapped = points_of(fixes.longitude_deg[rows], fixes.latitude_deg[rows]).surface
+    swapped_m, _ = tree.query(swapped)
+    latitude = fixes.latitude_deg[rows[row]]
+    longitude = fixes.longitude_deg[rows[row]]
+    at = int(vertex[row])
+    if float(np.min(swapped_m)) < min(10 * config.reach_m + 1000.0, float(nearest_m[row])):
+        remedy = "Latitude and longitude are swapped, in the log or in the site: exchange them."
+    elif nearest_m[row] > 10_000.0:
+        remedy = "Check that this is the right site, and that track file and log name the correct coordinate system."
+    elif nearest_m[row] < 500.0:
+        remedy = "A national grid or datum read as WGS 84 gives such a shift: check the EPSG codes of both."
+    else:
+        remedy = "Check that the site covers this run; matching.reach_m is the largest accepted distance from a track."
+    return InputError(
+        "all positions of the run are off the track",
+        place="gnss: columns latitude_deg, longitude_deg",
+        found=f"positions {_length(float(nearest_m[row]))} or more from any track, nearest at "
+        f"{latitude:.5f}, {longitude:.5f} (track at {track.latitude_deg[at]:.5f}, {track.longitude_deg[at]:.5f})",
+        expected=f"positions within {config.reach_m:g} m of a net element",
+        remedy=remedy,
+    )
+
+
+def _length(metres: float) -> str:
+    return f"{metres / 1000:.0f} km" if metres >= 10_000 else f"{metres:.0f} m"
 
 
 @frozen
@@ -128,3 +230,91 @@ def pins_of(fixes: Fixes, site: Site, track: SurveyedTrack, balise_reads: pl.Dat
     inside = epoch < len(fixes)
     pinned[epoch[inside]] = ints(read["element"])[inside]
     return pinned
+
+
+ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
+    "netelement_id": pl.String,
+    "direction": pl.String,
+    "leg": pl.Int64,
+    "doubtful": pl.Boolean,
+    "gate_probability": pl.Float64,
+    "path_probability": pl.Float64,
+    "rivals": pl.String,
+    "cross_bias_m": pl.Float64,
+    "t_start": pl.Datetime("ns", "UTC"),
+    "t_end": pl.Datetime("ns", "UTC"),
+}
+
+
+def travelled_route(match: Match) -> pl.DataFrame:
+    """One row per net element in the order of growing path, leg by leg: the route, and what of it is in doubt.
+
+    `doubtful`: the track was, at the time or in hindsight (the least probabilities of both stand beside it), or no
+    position tells of it. `rivals`: other elements possible
+    meanwhile, the most probable first, each with its highest probability, in words. `cross_bias_m`: by how much the
+    positions lie left of growing path there (median), which survey and antenna do and no GNSS fault.
+    """
+    leg = match.epochs.leg
+    rows = [
+        _row(match, number, one, visits, leg == number)
+        for number, one in enumerate(match.path.legs)
+        for visits in _passages(match.path.track, one)
+    ]
+    return pl.DataFrame(rows, schema=ROUTE_COLUMNS, orient="row")
+
+
+def _passages(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
+    """Visits that are one passage of an element: its pieces, one after the other. Each lap of a ring is another."""
+    passages: list[list[int]] = []
+    ended: object = None
+    for number, visit in enumerate(leg.visits):
+        measure = track.measure_m[track.vertices(visit.element)]
+        begin, end = (measure[0], measure[-1]) if visit.forward else (measure[-1], measure[0])
+        if passages and ended == (track.ids[visit.element], visit.forward, begin):
+            passages[-1].append(number)
+        else:
+            passages.append([number])
+        ended = (track.ids[visit.element], visit.forward, end)
+    return passages
+
+
+def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools) -> tuple[object, ...]:
+    path_m = match.epochs.path_m
+    segment, _ = segments_at(leg, np.nan_to_num(path_m))
+    known = np.isfinite(match.epochs.path_probability)
+    inside = np.flatnonzero(on_leg & np.isin(leg.visit[segment], visits) & known)
+    epochs = match.epochs.table[inside]
+    least = epochs.select(least_belief().min()).item()
+    first_visit = leg.visits[visits[0]]
+    times = match.epochs.table["t"]
+    return (
+        match.path.track.ids[first_visit.element],
+        "AB" if first_visit.forward else "BA",
+        number,
+        least is None or least < ONE_TRACK_LEFT,
+        epochs["gate_probability"].min(),
+        epochs["path_probability"].min(),
+        _rivals(match, inside, 1.0 - ONE_TRACK_LEFT),
+        float(np.median(match.epochs.cross_track_m[inside])) if len(inside) else None,
+        times[int(inside[0])] if len(inside) else None,
+        times[int(inside[-1])] if len(inside) else None,
+    )
+
+
+def _rivals(match: Match, rows: Ints, least: float) -> str:
+    """Elements off the path that are possible at some of these epochs."""
+    if len(rows) == 0:
+        return ""
+    highest = _highest(match.possible, int(rows[0]), int(rows[-1]))
+    ids = match.path.track.ids
+    on_path = set(match.path.elements())
+    order = sorted((-probability, ids[element]) for element, probability in highest.items())
+    return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in on_path)
+
+
+def _highest(possible: Possible, first: int, last: int) -> dict[int, float]:
+    """The highest confidence in each element at the steps from one epoch to another."""
+    begin, end = np.searchsorted(possible.epoch, [first, last + 1])
+    part = slice(int(possible.first[max(int(begin) - 1, 0)]), int(possible.first[int(end)]))
+    found = pl.DataFrame({"element": possible.element[part], "probability": possible.confidence[part]})
+    return dict(found.group_by("element").agg(pl.col("probability").max()).iter_rows())

@@ -13,8 +13,8 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.epochs.verdicts import NO_POSITION, Verdicts, first_reason, no_verdicts, verdicts
+from pipeline.stages.monitors.bank import FIRST_EPOCH
 from pipeline.stages.monitors.pseudorange import pseudorange_monitor
-from pipeline.stages.monitors.series import FIRST_EPOCH
 from schemas.arrays import Floats, floats, times_ns, truths
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import NotEvaluated

@@ -10,6 +10,6 @@ recorder; with the LDS and alignment: `recovery`, when a position may return aft
 """
 
 from pipeline.stages.odometry.odometry import OdometerWay, Odometry, odometry_of
-from pipeline.stages.odometry.over_slip import counted_over_slip
+from pipeline.stages.odometry.polarity import counted_over_slip
 
 __all__ = ["Odometry", "OdometerWay", "counted_over_slip", "odometry_of"]

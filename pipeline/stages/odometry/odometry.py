@@ -10,11 +10,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import periods_before_s
-from pipeline.stages.odometry.bound import LEAST_DOUBT_M, Bound, is_lost
-from pipeline.stages.odometry.contradicted import Contradiction, contradicted_by_speeds
-from pipeline.stages.odometry.counts import CountStep, count_step
+from pipeline.stages.odometry.bound import LEAST_DOUBT_M, LOST_M, Bound, is_lost
 from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_steps, travelled_m
-from pipeline.stages.odometry.odd_steps import LOST_M
 from pipeline.stages.odometry.origin import declared_origin
 from pipeline.stages.odometry.quantisation import (
     NO_QUANTISATION,
@@ -24,7 +21,15 @@ from pipeline.stages.odometry.quantisation import (
     of_the_run,
     scatter_pieces,
 )
-from pipeline.stages.odometry.rows import Ways, filled_in, ways_between
+from pipeline.stages.odometry.rows import (
+    Contradiction,
+    CountStep,
+    Ways,
+    contradicted_by_speeds,
+    count_step,
+    filled_in,
+    ways_between,
+)
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, median, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin

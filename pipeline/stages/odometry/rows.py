@@ -1,17 +1,165 @@
-"""The way from each row of an odometer to the next: by its distance where that says it, else by its speeds.
-
-Rows may hold the one or the other by turns. Between rows far apart distances lie on curves that a train can drive.
-"""
+"""The step in which a recorder writes a quantity down: counts of an odometer, decimals of a coordinate."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
+import polars as pl
 
-from pipeline.stages.odometry.odd_steps import OddRun, driven_within_m, odd_runs
-from schemas.arrays import Bools, Floats, Ints
+from pipeline.stages.odometry.bound import OddRun, driven_within_m, odd_runs
+from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import AlignConfig
+
+# Numerics: how far a change may be from a multiple of the step, in steps, since written numbers are rounded.
+_TOLERANCE = 0.02
+# Fewer changes of the change are chance.
+FEWEST_BENDS = 8
+
+
+def step_of(changes: Floats, single: Floats, least: float, rounded: float) -> float:
+    """The step that all these changes are multiples of, in their unit; 0 where there is none of at least `least`.
+
+    `single`: differences of which some are of one step; up to `rounded` is none, as decimal numbers are not whole in
+    binary. A change that is always the same shows no step.
+    """
+    single = np.abs(single)
+    single = single[single > rounded]
+    if not single.size or (step := float(single.min())) < least:
+        return 0.0
+    steps, multiples = multiples_of(changes, step)
+    return step if multiples.all() and np.count_nonzero(np.diff(steps)) >= FEWEST_BENDS else 0.0
+
+
+def multiples_of(changes: Floats, step: float) -> tuple[Floats, Bools]:
+    """How many steps each change is, and whether it is a whole number of them."""
+    counts = changes / step
+    steps = np.rint(counts)
+    whole: Bools = np.abs(counts - steps) < _TOLERANCE
+    return steps, whole
+
+
+# Less is rounding of decimal numbers, which are not whole in binary; far below any `counter_step_m`.
+_ROUNDED_M = 1e-3
+# Numerics: ways before each that show what is usual, and that are looked at first.
+_USUAL_ROWS, _NEAR_ROWS = 100, 200
+
+
+class CountStep(NamedTuple):
+    """The step of the counter as known at each row [m], 0 where none is; `shown`: a step would have shown by then.
+
+    Of a counter that stands, or moves on evenly, nothing is to be seen, and nothing scatters.
+    """
+
+    step_m: Floats
+    shown: Bools
+
+
+def count_step(distance_m: Floats, config: AlignConfig) -> CountStep:
+    """Rows without a distance (NaN) know what the last one did.
+
+    All usual ways so far are multiples of the step, one is a single step; 0 where there is none, or one finer than
+    `counter_step_m`. Ways that no train drives do not count: beside those before them they are leaps.
+    """
+    rows = np.flatnonzero(np.isfinite(distance_m))
+    known = CountStep(np.zeros(distance_m.size), np.ones(distance_m.size, dtype=np.bool_))
+    if rows.size < 2:
+        return known
+    ways_m = np.abs(np.diff(distance_m[rows]))
+    usual = np.flatnonzero(_usual(ways_m, config))
+    last = np.searchsorted(rows[usual + 1], np.arange(distance_m.size), side="right") - 1
+    after = last >= 0
+    known.step_m[after] = _steps_known_m(ways_m[usual], config.counter_step_m)[last[after]]
+    known.shown[after] = _shown(ways_m[usual])[last[after]]
+    return known
+
+
+def _shown(ways_m: Floats) -> Bools:
+    """Ways differ from those before them as often as makes a step, or never; or so many were the same under way."""
+    written = np.rint(ways_m / _ROUNDED_M)
+    bent = np.concatenate([[False], np.diff(written) != 0.0])
+    bends = np.cumsum(bent)
+    since_bend = np.arange(written.size) - np.maximum.accumulate(np.where(bent, np.arange(written.size), 0))
+    even = np.logical_or.accumulate((since_bend >= FEWEST_BENDS) & (written > 0.0))
+    shown: Bools = (bends == 0) | (bends >= FEWEST_BENDS) | even
+    return shown
+
+
+def _usual(ways_m: Floats, config: AlignConfig) -> Bools:
+    medians_m = pl.Series(ways_m).rolling_median(_USUAL_ROWS, min_samples=1).to_numpy()
+    usual: Bools = ways_m <= config.bunched_stamps_m + 2.0 * np.concatenate([[0.0], medians_m[:-1]])
+    return usual
+
+
+def _steps_known_m(ways_m: Floats, least_m: float) -> Floats:
+    """Of which step all ways up to each are multiples; 0 where there is none [m]."""
+    single_m = np.minimum.accumulate(np.where(ways_m > _ROUNDED_M, ways_m, np.inf))
+    begins = np.flatnonzero(single_m < np.concatenate([[np.inf], single_m[:-1]]))
+    steps_m = np.zeros(ways_m.size)
+    ends = np.append(begins[1:], ways_m.size)
+    for begin, end in zip(begins.tolist(), ends[: begins.size].tolist(), strict=True):
+        step_m = float(single_m[begin])
+        if step_m < least_m:
+            break
+        # The last ways first: where the smallest way shrinks row by row, all of them would be looked at each time.
+        if multiples_of(ways_m[max(begin - _NEAR_ROWS, 0) : begin + 1], step_m)[1].all():
+            steps_m[begin:end] = np.where(_is_step(ways_m[:end], step_m)[begin:], step_m, 0.0)
+    return steps_m
+
+
+def _is_step(ways_m: Floats, step_m: float) -> Bools:
+    """Whether all ways up to each are multiples, of which enough differ from the one before."""
+    counts, multiples = multiples_of(ways_m, step_m)
+    bends = np.concatenate([[0], np.cumsum(np.diff(counts) != 0.0)])
+    shown: Bools = np.logical_and.accumulate(multiples) & (bends >= FEWEST_BENDS)
+    return shown
+
+
+class Contradiction(NamedTuple):
+    """Per step: in a run that the speeds contradict; by how much [m]; what of that is known by then, all at once."""
+
+    steps: Bools
+    off_m: Floats
+    doubt_m: Floats
+
+
+def contradicted_by_speeds(
+    t_s: Floats, recorded_m: Floats, driven_m: Floats, rows_m: Floats, deadband_mps: float, config: AlignConfig
+) -> Contradiction:
+    """Runs of rows over which speeds (`driven_m`) and distance (`recorded_m`, per step) part by more than a leap.
+
+    `rows_m`: what the noise of two rows makes of a distance, as known at each. A second before each row counts: more
+    than `speed_agreement` of the way, the dead band and that. A run counts where it sums up to `leap_m` beside the
+    same. Speeds that never agreed with the distance contradict nothing.
+    """
+    both = np.isfinite(recorded_m) & np.isfinite(driven_m)
+    recorded_sum_m, driven_sum_m, way_m = (
+        np.concatenate([[0.0], np.cumsum(np.where(both, values, 0.0))])
+        for values in (recorded_m, driven_m, np.maximum(np.abs(recorded_m), np.abs(driven_m)))
+    )
+    share = config.speed_agreement
+    agreed = (way_m >= config.leap_m / share) & (np.abs(driven_sum_m - recorded_sum_m) <= share * way_m)
+    before = np.searchsorted(t_s, t_s - config.speed_window_s * (1.0 + 1e-9))
+    apart_m = np.abs((driven_sum_m - recorded_sum_m) - (driven_sum_m - recorded_sum_m)[before])
+    allowed_m = share * (way_m - way_m[before]) + deadband_mps * (t_s - t_s[before]) + rows_m
+    parts = (apart_m > allowed_m) & np.concatenate([[False], both])
+    found = Contradiction(np.zeros(both.size, dtype=np.bool_), *np.zeros((2, both.size)))
+    for first, last in spans_of(parts):
+        run = slice(int(before[first]), last)
+        if not agreed[run.start]:
+            continue
+        so_far_m = np.abs(np.cumsum(np.where(both, driven_m - recorded_m, 0.0)[run]))
+        allowed_so_far_m = config.leap_m + rows_m[run] + share * np.cumsum(np.diff(way_m[run.start : last + 1]))
+        beyond = np.flatnonzero(so_far_m > allowed_so_far_m)
+        if beyond.size:
+            found.steps[run] = True
+            found.off_m[run] = np.abs(np.diff(np.concatenate([[0.0], so_far_m])))
+            # Known at the row where it is too much: from there on each step as it comes.
+            at = run.start + int(beyond[0])
+            found.doubt_m[at] = so_far_m[beyond[0]]
+            found.doubt_m[at + 1 : last] = found.off_m[at + 1 : last]
+    return found
+
 
 # G holds for an emergency brake right after as hard acceleration: a Gaussian error comes as far in 3 of 1000 cases.
 _BOUND_SIGMAS = 3.0

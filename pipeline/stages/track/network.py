@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.stages.track.chain import Chain, Reach, search
 from pipeline.stages.track.chords import Chords
-from pipeline.stages.track.leg import Visit
 from pipeline.stages.track.once import Once
+from pipeline.stages.track.path import Chain, Reach, search
+from pipeline.stages.track.segments import Visit
 from pipeline.stages.track.survey import (
     SurveyedTrack,
     end_places,

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import polars as pl
 
-from pipeline.stages.judge.injected import under_injection
+from pipeline.stages.judge.epochs import under_injection
 from pipeline.studies.plausibility.causes import explain_accuracy
 from pipeline.studies.plausibility.check import Cause, Check, FitState
 from schemas.arrays import Bools, Floats, floats, times_ns

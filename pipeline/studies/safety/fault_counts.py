@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog
-from pipeline.stages.judge.alarms import verdict_within
+from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
+from pipeline.stages.judge.episodes import verdict_within
 from pipeline.stages.judge.judgement import margins_m
-from pipeline.stages.run_row.independent import missed_detection, since_when_at_most
+from pipeline.stages.run_row.bounds import missed_detection, since_when_at_most
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import HazardConfig
 from schemas.enums import Verdict

@@ -15,7 +15,7 @@ import polars as pl
 
 from pipeline.results import store
 from pipeline.results.figures.head import head_of, run_verdicts
-from pipeline.stages.run_row.verdict import failures_in, level_counts, reasons_of, verdict_of
+from pipeline.stages.run_row.run_figures import failures_in, level_counts, reasons_of, verdict_of
 from schemas.config import Configuration
 from schemas.enums import RunStatus
 

@@ -12,9 +12,9 @@ from itertools import combinations
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, held_s, may_move, met, nominal_period_s, position_ns, trusted, uptime
-from pipeline.stages.epochs.failure_log import FailureLog, failure_log
+from pipeline.stages.epochs.verdicts import FailureLog, failure_log
 from pipeline.stages.monitors.single import channel_monitor, on_path_of, paired
-from pipeline.stages.run_row.independent import independent_episodes
+from pipeline.stages.run_row.bounds import independent_episodes
 from pipeline.stages.run_row.run_figures import judged as judged_epoch
 from pipeline.studies.safety.fault_counts import SolutionTables, fault_counts, faults_of_pair, verdict_of_both
 from pipeline.studies.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT

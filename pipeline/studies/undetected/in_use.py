@@ -19,8 +19,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.stages.odometry.bound import is_lost
-from pipeline.stages.odometry.recovery import RecoveryRule
+from pipeline.stages.odometry.bound import RecoveryRule, is_lost
 from pipeline.studies.undetected.watched import FaultWindow, Watched
 from schemas.arrays import NS_PER_S, Bools, Floats, floats
 from schemas.config import Configuration

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.stages.lds.relink import Held
+from pipeline.stages.lds.link_monitors import Held
+from pipeline.stages.monitors.axis import ewma_weight
 from pipeline.stages.monitors.bank import AxisBank
-from pipeline.stages.monitors.recursion import ewma_weight
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, UndetectedConfig, Vehicle
 from schemas.enums import BaliseKind

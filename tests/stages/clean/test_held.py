@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.stages.clean.held import copies
+from pipeline.stages.clean.clean import copies
 
 
 def track(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.epochs.clock import share_of_time
-from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog, failure_log
+from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog, failure_log
 from schemas.arrays import NS_PER_S
 
 ALARMS = (AlarmEpisode(1, 2, 10, 20, ("raw", "slow"), 2.0), AlarmEpisode(4, 4, 40, 40, ("fast",), 1.5))

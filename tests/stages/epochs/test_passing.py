@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.stages.epochs.passing import Passing, passings
+from pipeline.stages.epochs.clock import Passing, passings
 
 
 def test_touching_a_place_and_turning_back_are_two() -> None:

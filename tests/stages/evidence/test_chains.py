@@ -7,10 +7,9 @@ import polars as pl
 import pytest
 
 from pipeline.stages.evidence.anchors import read_anchors
-from pipeline.stages.evidence.chains import chains_between, extended
-from pipeline.stages.track.chain import Chain
+from pipeline.stages.evidence.gaps import chains_between, extended
 from pipeline.stages.track.network import Network, network_of
-from pipeline.stages.track.path import Place, RoutePath
+from pipeline.stages.track.path import Chain, Place, RoutePath
 from pipeline.stages.track.survey import track_of
 from schemas.config import HazardConfig
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.stages.evidence.clock import Lags, RecorderClock, clock_of, true_clocks_s
+from pipeline.stages.evidence.carrying import Lags, RecorderClock, clock_of, true_clocks_s
 from pipeline.stages.odometry.scale_lag import LagState, ScaleLag
 from schemas.config import HazardConfig
 

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.judge.failures import Course, course_of
-from pipeline.stages.judge.jumps import Jump
+from pipeline.stages.judge.failures import Course, Jump, course_of
 from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.stages import JudgedEpochs, JudgedOffers

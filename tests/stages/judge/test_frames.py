@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from pipeline.one_run import ride_alone
-from pipeline.stages.judge.case import Case
 from pipeline.stages.judge.judge import judge
+from pipeline.stages.judge.judgement import Case
 from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.stages import JudgedEpochs, JudgedOffers

@@ -10,39 +10,64 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.epochs.failure_log import AlarmEpisode, FailureLog
+from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
-from pipeline.stages.judge.alarms import _belongs, healthy_across, suspect_of, verdict_of, verdict_within
-from pipeline.stages.judge.case import Case, Solution
-from pipeline.stages.judge.cross_errors import cross_errors
 from pipeline.stages.judge.episodes import (
     Detection,
     Episode,
     Extent,
+    _belongs,
     _failed,
     _failed_may_ns,
     _is_back,
     find_episodes,
+    healthy_across,
     named_onset_ns,
+    suspect_of,
+    verdict_of,
+    verdict_within,
 )
-from pipeline.stages.judge.failures import Course, Failure, Offers, find_failures, within_budget
+from pipeline.stages.judge.epochs import (
+    OdometerSteps,
+    beyond_confidence,
+    cross_errors,
+    lds_states,
+    moving,
+    time_in_use,
+    travel_direction,
+    under_injection,
+)
+from pipeline.stages.judge.failures import (
+    Course,
+    Failure,
+    Jump,
+    Offers,
+    find_failures,
+    find_jumps,
+    steps_of,
+    within_budget,
+)
 from pipeline.stages.judge.hazards import HazardRow, _evidence, crossed_by, hazard_rows, instants, rate_mps, size_m
-from pipeline.stages.judge.in_use import lds_states, time_in_use
-from pipeline.stages.judge.injected import under_injection
+from pipeline.stages.judge.judge import (
+    TrueCrossing,
+    _true_times,
+    _with_failures,
+    _within_gap,
+    between_far_epochs,
+    true_crossings,
+)
 from pipeline.stages.judge.judgement import (
     RIGHT,
     UNKNOWN,
     WRONG,
+    Case,
     Judgements,
     MatchedPositions,
+    Solution,
     judge_positions,
     margins_m,
     with_own_anchors,
 )
-from pipeline.stages.judge.jumps import Jump, find_jumps, steps_of
-from pipeline.stages.judge.passages import _true_times, _with_failures, _within_gap
-from pipeline.stages.judge.travel import OdometerSteps, beyond_confidence, moving, travel_direction
-from pipeline.stages.judge.true_crossings import TrueCrossing, between_far_epochs, true_crossings
 from pipeline.stages.track.path import Place, RoutePath
 from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
 from schemas.enums import Evidence, Hazard, Judgement, Suspect, Verdict

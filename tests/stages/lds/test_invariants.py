@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from pipeline.stages.lds import LdsResult
 from pipeline.stages.lds.machine import LocationSystem
-from pipeline.stages.odometry.odd_steps import LOST_M
+from pipeline.stages.odometry.bound import LOST_M
 from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, reads_at, run
 
 _NOT_OFFERED = ("missed", "not_available")

@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 from pipeline.stages.lds import LdsResult
-from pipeline.stages.lds.crossings import balises_of, reads_of
-from pipeline.stages.lds.journey import Journey
-from pipeline.stages.lds.relink import Relink
-from pipeline.stages.odometry.odd_steps import LOST_M
+from pipeline.stages.lds.crossings import Journey, balises_of, reads_of
+from pipeline.stages.lds.link_monitors import Relink
+from pipeline.stages.odometry.bound import LOST_M
 from schemas.enums import BaliseKind, NotEvaluated
 from schemas.stages import AlignedEpochs
 from tests.stages.lds.scripted import (

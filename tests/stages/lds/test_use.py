@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from pipeline.stages.lds import LdsResult
-from pipeline.stages.odometry.odd_steps import LOST_M
+from pipeline.stages.odometry.bound import LOST_M
 from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, run, steps
 
 COUNT = 120

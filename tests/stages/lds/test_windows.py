@@ -6,11 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.stages.lds.windows import (
-    minimal_spacing_m,
-    window_after_turn_m,
-    window_m,
-)
+from pipeline.stages.lds.crossings import minimal_spacing_m, window_after_turn_m, window_m
 from schemas.config import LdsConfig
 
 CONFIG = LdsConfig()

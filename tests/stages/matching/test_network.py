@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.matching.travelled_route import travelled_route
+from pipeline.stages.matching.match import travelled_route
 from schemas.errors import InputError
 from schemas.run import Site
 from tests.stages.matching.builders import Link, line, matched, odometer, run, site, times

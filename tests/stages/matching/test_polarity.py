@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.stages.matching.path_states import PathStates, polarity_of_parts
+from pipeline.stages.matching.least_squares import PathStates, polarity_of_parts
 
 
 def signs_of(place_m: list[list[float]], odometer_m: list[float], orientable: bool = True) -> list[int]:

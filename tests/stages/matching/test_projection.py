@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from pipeline.stages.matching.fixes import contradictory_covariances
 from pipeline.stages.track.geodesy import points_of
-from pipeline.stages.track.leg import Visit, leg_of
 from pipeline.stages.track.path import TravelledPath
+from pipeline.stages.track.segments import Visit, leg_of
 from pipeline.stages.track.survey import track_of
 from schemas.config import Vehicle
 from schemas.errors import InputError

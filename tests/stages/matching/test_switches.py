@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.stages.matching.branches import OneTrack
+from pipeline.stages.matching.claims import OneTrack
 from pipeline.stages.paths.path_set import path_set
 from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.track.geodesy import points_of

@@ -12,7 +12,7 @@ from pipeline.campaign import make_plan, run_campaign
 from pipeline.read.site.read import read_site
 from pipeline.read.site.route import with_route
 from pipeline.results import store
-from pipeline.stages.matching.travelled_route import travelled_route
+from pipeline.stages.matching.match import travelled_route
 from schemas.config import SiteConfig
 from schemas.errors import InputError, UsageError
 from schemas.run import Site

@@ -8,8 +8,16 @@ import pytest
 
 from datasets.constellation import GALILEO, GPS, visible
 from pipeline.stages.epochs.verdicts import NO_POSITION
-from pipeline.stages.monitors.pseudorange import AMBIGUOUS, NO_RANGES, NO_RANGES_AT_EPOCH, TOO_FEW, pseudorange_monitor
-from pipeline.stages.monitors.sight import clock_columns, line_of_sight_rows, range_variances_m2
+from pipeline.stages.monitors.pseudorange import (
+    AMBIGUOUS,
+    NO_RANGES,
+    NO_RANGES_AT_EPOCH,
+    TOO_FEW,
+    clock_columns,
+    line_of_sight_rows,
+    pseudorange_monitor,
+    range_variances_m2,
+)
 from schemas.config import Configuration, MonitorConfig
 from schemas.stages import MatchedEpochs
 from tests.frames import verdict_table

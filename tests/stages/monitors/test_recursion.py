@@ -7,13 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.stages.monitors.axis import AxisSeries, errors_of, run_axis
-from pipeline.stages.monitors.recursion import (
+from pipeline.stages.monitors.axis import (
+    AxisSeries,
     AxisState,
     before_steps,
+    errors_of,
     ewma_weight,
     increment_variance,
     linear_recurrence,
+    run_axis,
     variance_of_ewma,
 )
 from schemas.config import MonitorConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.stages.monitors.sight import line_of_sight_rows, range_variances_m2
+from pipeline.stages.monitors.pseudorange import line_of_sight_rows, range_variances_m2
 
 
 def test_variances_of_a_range_at_three_elevations() -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.stages.odometry.bound import is_lost
-from pipeline.stages.odometry.odd_steps import odd_runs
+from pipeline.stages.odometry.bound import is_lost, odd_runs
 from schemas.arrays import NS_PER_S
 from schemas.config import AlignConfig
 from tests.stages.alignment.straight import odometer_of, odometry_from

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.stages.odometry.bound import is_lost
+from pipeline.stages.odometry.bound import LOST_M, is_lost
 from pipeline.stages.odometry.driven import turns_of
-from pipeline.stages.odometry.odd_steps import LOST_M
 from pipeline.stages.odometry.odometry import Noise
 from pipeline.stages.odometry.odometry import odometry_of as odometry_of_stream
 from pipeline.stages.odometry.polarity import grows_with, polarity

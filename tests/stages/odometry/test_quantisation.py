@@ -7,9 +7,9 @@ import polars as pl
 import pytest
 
 from pipeline.stages.monitors.axis import AlongEpochs, along_series, run_axis
-from pipeline.stages.odometry.counts import count_step
 from pipeline.stages.odometry.odometry import Increments
 from pipeline.stages.odometry.quantisation import QuantisationNoise
+from pipeline.stages.odometry.rows import count_step
 from schemas.config import Configuration, threshold_factor
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 from tests.stages.alignment.straight import align_run, epochs_of, odometer_of, odometry_from

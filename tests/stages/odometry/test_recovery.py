@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from pipeline.stages.odometry.recovery import RecoveryRule
+from pipeline.stages.odometry.bound import RecoveryRule
 from schemas.config import Configuration, HazardConfig
 
 RULE = RecoveryRule(Configuration())

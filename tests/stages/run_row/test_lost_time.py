@@ -7,8 +7,7 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.stages.run_row.lost_time import LostTime, lost_columns, lost_time
-from pipeline.stages.run_row.remedies import InUse, remedies, time_in_use
+from pipeline.stages.run_row.lost_time import InUse, LostTime, in_use_of, lost_columns, lost_time, remedies
 from schemas.config import Configuration
 from schemas.enums import LostTo, Remedy
 from schemas.stages import EpochFigures
@@ -210,7 +209,7 @@ def test_where_the_unknown_lies() -> None:
 
     def parts(known: list[bool], **columns: Any) -> InUse:
         judged = EpochFigures.of_table(epochs(TEN_S, judgement=[word[k] for k in known], **columns))
-        return time_in_use(judged, float(lost_columns(judged, CONFIG).moving_s.sum()))
+        return in_use_of(judged, float(lost_columns(judged, CONFIG).moving_s.sum()))
 
     ends = [False, False, True, True, True, True, True, True, True, False]
     middle = [True, True, True, False, True, True, True, True, True, True]

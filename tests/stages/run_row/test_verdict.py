@@ -7,8 +7,8 @@ import polars as pl
 import pytest
 
 from pipeline.results.figures.head import head_of, run_verdicts, worst_verdict
-from pipeline.stages.run_row.independent import independent_episodes, missed_detection
-from pipeline.stages.run_row.verdict import reasons_of, verdict_of
+from pipeline.stages.run_row.bounds import independent_episodes, missed_detection
+from pipeline.stages.run_row.run_figures import reasons_of, verdict_of
 from schemas.enums import Reason, RunVerdict
 from schemas.tables import Runs
 from schemas.words import part_words, reason_words

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.stages.track.geodesy import points_of
-from pipeline.stages.track.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.stages.track.path import TravelledPath
+from pipeline.stages.track.segments import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.stages.track.survey import track_of
 from tests.stages.matching.builders import degrees, line, site
 

@@ -8,8 +8,7 @@ import pytest
 
 from pipeline.results.figures.campaign_figures import detection_by_level, measured_figures
 from pipeline.results.figures.campaign_tables import campaign_levels
-from pipeline.stages.run_row.bounds import clopper_pearson, poisson_rate, poisson_rate_upper
-from pipeline.stages.run_row.independent import independent_episodes
+from pipeline.stages.run_row.bounds import clopper_pearson, independent_episodes, poisson_rate, poisson_rate_upper
 from pipeline.studies.safety.sentences import plain_statements
 from schemas.config import Configuration, SafetyConfig
 from schemas.tables import Runs

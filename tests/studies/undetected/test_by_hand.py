@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.stages.lds.relink import Held
+from pipeline.stages.lds.link_monitors import Held
 from pipeline.stages.monitors.pseudorange import Equations
 from pipeline.studies.undetected import spacing
 from pipeline.studies.undetected.position_tests import _worst, bounded
