@@ -15,8 +15,8 @@ from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.stages.ride import Ride, ride_of
 from pipeline.stages.run_row.lost_time import lost_columns
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, ride_notes, summarise
-from pipeline.studies.plausibility.accuracy import accuracy_checks, refuted
 from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, with_checks
+from pipeline.studies.plausibility.report import accuracy_checks, refuted
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.results import Figure
-from pipeline.stages.odometry.scale_lag import CountedRows, ScaleLag, scale_and_lag
+from pipeline.stages.odometry.regression import ScaleLag
+from pipeline.stages.odometry.scale_lag import CountedRows, scale_and_lag
 
 TICK_S = 0.02
 RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)

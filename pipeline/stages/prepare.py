@@ -8,10 +8,16 @@ from dataclasses import field, replace
 import polars as pl
 
 from pipeline.stages.clean import CleanCounts
-from pipeline.stages.clean.clean import ClockAdvice, clean, no_advice, of_the_journey
-from pipeline.stages.clean.journey import require_one_journey, require_two_times
+from pipeline.stages.clean.clean import (
+    ClockAdvice,
+    clean,
+    no_advice,
+    of_the_journey,
+    require_one_journey,
+    require_two_times,
+)
 from pipeline.stages.evidence import TrainEvidence, evidence_of
-from pipeline.stages.evidence.recorders import on_time, without_frozen
+from pipeline.stages.evidence.gathering import on_time, without_frozen
 from pipeline.stages.follows import NOT_TESTED, Follows, follows_positions
 from pipeline.stages.matching import Match, match
 from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.stages.matching.fixes import Fixes
+from pipeline.stages.matching.epochs import Fixes
 from schemas.arrays import Bools, Floats, Ints
 
 # No train is faster, and none brakes, speeds up or turns harder: 3 m/s2 is already much.

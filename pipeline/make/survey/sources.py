@@ -16,7 +16,7 @@ from pipeline.make.survey.reachable import reachable
 from pipeline.make.survey.tables import read_points
 from pipeline.make.survey.xml_lines import read_kmz, read_xml
 from pipeline.read.ingest.run import read_run
-from pipeline.stages.matching.fixes import fixes_of
+from pipeline.stages.matching.epochs import fixes_of
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Fix
 from schemas.errors import SiteError

@@ -20,7 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.stages.odometry.odometry import KnownNoise, Odometry
+from pipeline.stages.odometry.odometry import Odometry
+from pipeline.stages.odometry.quantisation import KnownNoise
 from pipeline.stages.odometry.scale_lag import slopes
 from schemas.arrays import Floats, Ints
 from schemas.config import AlignConfig, Vehicle

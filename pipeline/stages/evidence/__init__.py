@@ -8,7 +8,7 @@ far does the odometer carry them: `carrying`. Which chains of net elements lead 
 `chains`. The net elements as columns of epochs: `places`.
 """
 
-from pipeline.stages.evidence.evidence import EvidenceSet, TrainEvidence, either, evidence_of
-from pipeline.stages.evidence.places import true_places
+from pipeline.stages.evidence.evidence import EvidenceSet, TrainEvidence, either
+from pipeline.stages.evidence.gathering import evidence_of, true_places
 
 __all__ = ["EvidenceSet", "TrainEvidence", "either", "evidence_of", "true_places"]

@@ -10,7 +10,8 @@ import numpy as np
 
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.odometry import OdometerWay
-from pipeline.stages.odometry.scale_lag import CountedRows, ScaleLag, possible_lags, scale_and_lag
+from pipeline.stages.odometry.regression import ScaleLag
+from pipeline.stages.odometry.scale_lag import CountedRows, possible_lags, scale_and_lag
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
 from schemas.config import Configuration, HazardConfig

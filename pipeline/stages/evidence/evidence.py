@@ -5,43 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
-import polars as pl
 
-from pipeline.stages.evidence import anchors
-from pipeline.stages.evidence.anchors import KnownPath, KnownStretch
-from pipeline.stages.evidence.carrying import (
-    Counter,
-    Interval,
-    Lags,
-    RecorderClock,
-    TrueAnchor,
-    between_anchors,
-    carried,
-    clocks_of,
-    lags_of,
-    true_clocks_s,
-)
-from pipeline.stages.evidence.gaps import Carried, Gap, GapChain, GapSearch
-from pipeline.stages.evidence.stands import Stand, final_stands, still_standing
-from pipeline.stages.odometry import Odometry
-from pipeline.stages.reference import ReferenceStretch
+from pipeline.stages.evidence.anchors import KnownStretch, Stand, still_standing
+from pipeline.stages.evidence.carrying import Counter, Interval, RecorderClock, between_anchors, carried
+from pipeline.stages.evidence.contradictions import KnownPath
+from pipeline.stages.evidence.gaps import Carried, Gap, GapChain
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import RoutePath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration
 from schemas.enums import Evidence as Kind
-from schemas.enums import Origin
 from schemas.frozen import frozen
 
 KINDS = tuple(Kind)
 NOTHING = -1
 Span = tuple[int, int]
-
-# Numerics: ways over which two odometers are compared [s].
-_PARTED_S = 60.0
 # Clocks within this of each other are no whole seconds apart [s].
 _IN_STEP_S = 0.5
 # Two intervals agree from this share of the narrower one on.
@@ -435,138 +415,3 @@ def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
         if gap.end is not None and begin_ns < gap.end_ns:
             void |= t_ns <= end_ns
     return void
-
-
-def evidence_of(
-    reference: tuple[Sequence[ReferenceStretch], Sequence[Span]],
-    reads: pl.DataFrame | None,
-    balises: pl.DataFrame | None,
-    odometers: Sequence[Odometry],
-    network: Network,
-    vehicle: Vehicle,
-    config: Configuration,
-) -> TrainEvidence:
-    """Everything that is known of where the train was, except from GNSS.
-
-    `reference`: as from `reference_stretches`; `odometers`: that of the LDS first. Where any is independent, the others
-    confirm nothing and narrow nothing; where none is, what they carry proves nothing.
-    """
-    hazards = config.hazards
-    independent = [odometer for odometer in odometers if odometer.independent]
-    counters = [Counter(odometer, config.hazards.limits.doubt_m) for odometer in independent or odometers]
-    main = counters[0] if counters else None
-    least_m = config.matching.orientation_distance_m
-    stretches, silent = reference
-    sides = [anchors.sided(stretch, main, least_m) for stretch in stretches]
-    facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
-    if any(min(side.with_m, side.against_m) >= least_m for side in sides):
-        counters = [counter.without_sign() for counter in counters]
-    searches = [GapSearch(counter, network, config, facing) for counter in counters]
-    lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
-    # Any odometer contradicts a reference; where one is independent, the others are not asked.
-    found = [anchors.Witness.of(*of_one, config) for of_one in zip(counters, lags, strict=True)]
-    read = anchors.read_anchors(reads, balises, network.track, hazards)
-    lags_of_reads = [_lags_of_reads(search.carried(_points(read)), config) for search in searches]
-    of_reference, of_reads = clocks_of((lags, lags_of_reads), bool(independent), hazards)
-    clocked = anchors.on_clock(read, of_reads, main)
-    recorded, unclosed = _known_stretches(sides, of_reference, found, clocked, searches, vehicle, config)
-    known = tuple(part for stretch in recorded for part in stretch.trusted())
-    unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
-    apart = anchors.outside(clocked, known)
-    shift_ns = round(of_reference.shift_s * NS_PER_S)
-    return TrainEvidence(
-        stretches=known,
-        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent),
-        carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
-        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
-        reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
-        clocks=(of_reference,) * bool(known) + (of_reads,) * bool(apart),
-        network=network,
-        config=config,
-        stands=final_stands([stretch.reference for stretch in known], independent, config),
-        parted=_parted(odometers, config),
-        unsure=tuple(unsure),
-        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + (of_reads,) * bool(clocked)),
-        disputes=tuple(span for stretch in recorded for span in stretch.disputed),
-        doubted=unclosed
-        + sum(stretch.levels.doubts for stretch in recorded)
-        + (0 if counters else sum(len(stretch.disputed) for stretch in recorded))
-        + sum(len(of_one.found) > 1 for of_one in lags),
-    )
-
-
-def _known_stretches(
-    sides: Sequence[anchors.Sided],
-    clock: RecorderClock,
-    witnesses: Sequence[anchors.Witness],
-    reads: Sequence[TrueAnchor],
-    searches: Sequence[GapSearch],
-    vehicle: Vehicle,
-    config: Configuration,
-) -> tuple[list[KnownStretch], int]:
-    """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
-    ahead_m = vehicle.gnss_antenna_ahead_m
-    known = [anchors.known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
-    order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
-    steps_m = [0.0] * max(len(known) - 1, 0)
-    for search, witness in zip(searches[:1], witnesses[:1], strict=True):
-        borders = [known[number].ends(search.counter) for number in order]
-        steps_m = [
-            search.misclosure_m(before[1], after[0], witness.scale, witness.scale_sigma)
-            for before, after in pairwise(borders)
-        ]
-    levels = [known[number].levels for number in order]
-    if len(known) < 2 or not (any(steps_m) or any(of.doubts for of in levels)):
-        return known, 0
-    for number, beyond in zip(order, anchors.levels_beyond(levels, steps_m), strict=True):
-        known[number] = anchors.known_stretch(sides[number], clock, witnesses, reads, ahead_m, config, beyond)
-    return known, sum(map(bool, steps_m))
-
-
-def _borders(
-    stretches: Sequence[KnownStretch], counter: Counter, reads: Sequence[TrueAnchor]
-) -> list[tuple[TrueAnchor, TrueAnchor]]:
-    return [*(stretch.ends(counter) for stretch in stretches), *_points(reads)]
-
-
-def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
-    return [(anchor, anchor) for anchor in known]
-
-
-def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> Lags:
-    """Its clock against that of one odometer, in the sense in which that one counts.
-
-    One that counts up both ways is compared where the train cannot have turned.
-    """
-    sides = [anchors.sided(stretch, search.counter, least_m) for stretch in stretches]
-    begin_ns, end_ns, way_m, sigma_m = anchors.reference_ways(sides, search.only_length_m)
-    way_m = way_m if search.counter.signed else np.abs(way_m)
-    return lags_of(begin_ns, end_ns, way_m, sigma_m, search.counter, search.config)
-
-
-def _lags_of_reads(source: Carried, config: Configuration) -> Lags:
-    """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
-    ways = [
-        (gap.begin_ns, gap.end_ns, apart_m, float(np.linalg.norm([anchor.sigma_m for anchor in gap.anchors])))
-        for gap in source.gaps
-        for apart_m in gap.only_length_m
-    ]
-    begins, ends, *lengths = zip(*ways, strict=True) if ways else ((), (), (), ())
-    way_m, sigma_m = (np.array(values, np.float64) for values in lengths)
-    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), way_m, sigma_m, source.counter, config)
-
-
-def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
-    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a way."""
-    independent = [odometer for odometer in odometers if odometer.independent]
-    others = [odometer for odometer in odometers if odometer.origin is Origin.UNKNOWN and not odometer.follows_gnss]
-    for other in others:
-        for witness in independent:
-            begin_ns = max(other.begin_ns, witness.begin_ns)
-            end_ns = min(other.end_ns, witness.end_ns)
-            at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
-            ways = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
-            allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
-            if (np.abs(ways[0] - ways[1]) > allowed_m).any():
-                return True
-    return False

@@ -9,8 +9,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import least_belief
 from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches, off_stretches
-from pipeline.stages.matching.epochs import Assignment, Placed, Written, matched_epochs
-from pipeline.stages.matching.fixes import Fixes, digit_steps, fixes_of
+from pipeline.stages.matching.epochs import Assignment, Fixes, Placed, Written, digit_steps, fixes_of, matched_epochs
 from pipeline.stages.matching.least_squares import (
     Course,
     Decoded,
@@ -24,7 +23,8 @@ from pipeline.stages.matching.least_squares import (
 )
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import grows_with, polarity
-from pipeline.stages.paths.path_set import PathSet, path_set
+from pipeline.stages.paths.growth import path_set
+from pipeline.stages.paths.path_set import PathSet
 from pipeline.stages.paths.path_steps import Moves, PathSteps, path_steps
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import network_in_pieces

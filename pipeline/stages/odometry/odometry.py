@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.odometry.bound import LEAST_DOUBT_M, LOST_M, Bound, is_lost
 from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_steps, travelled_m
-from pipeline.stages.odometry.origin import declared_origin
-from pipeline.stages.odometry.quantisation import (
-    NO_QUANTISATION,
-    QuantisationNoise,
-    first_scatter_m2,
-    known_at_rows,
-    of_the_run,
-    scatter_pieces,
-)
+from pipeline.stages.odometry.quantisation import KnownNoise, Noise, noise_of_rows, row_periods_s
 from pipeline.stages.odometry.rows import (
     Contradiction,
-    CountStep,
     Ways,
     contradicted_by_speeds,
     count_step,
+    declared_origin,
     filled_in,
     ways_between,
 )
@@ -55,41 +46,6 @@ class Increments(NamedTuple):
 
     distance_m: Floats
     speed_mps: Floats
-
-
-@frozen
-class Noise:
-    """Noise of the distance as the whole run shows it: what gathers in a second, and the scatter of rows. For
-    evidence and calibration; detection uses `KnownNoise`.
-    """
-
-    white_m2_per_s: float
-    quantisation: QuantisationNoise = NO_QUANTISATION
-
-
-@frozen
-class KnownNoise:
-    """The same as the rows up to each sample show it, and the period of the rows [s].
-
-    `still_m2`, `moving_s2`: of `QuantisationNoise`; a first figure where too few rows show them yet (not `shown`). What
-    shows at one speed may be noise of the stamps: beyond `seen_mps` it grows by `faster_s2` with the speed squared.
-    """
-
-    white_m2_per_s: Floats
-    still_m2: Floats
-    moving_s2: Floats
-    faster_s2: Floats
-    seen_mps: Floats
-    period_s: Floats
-    shown: Bools
-
-    def at(self, samples: Ints) -> KnownNoise:
-        return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
-
-    def row_m2(self, speed_mps: Floats) -> Floats:
-        """Variance of a row [m^2]."""
-        faster = np.maximum(speed_mps**2 - self.seen_mps**2, 0.0)
-        return np.asarray(self.still_m2 + self.moving_s2 * speed_mps**2 + self.faster_s2 * faster)
 
 
 @frozen
@@ -350,7 +306,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     t_s: Floats = ((t_ns - int(t_ns[0])) * 1e-9).astype(np.float64)
     dt_s = np.diff(t_s)
     distance_m = floats(stream, "distance_m")
-    period_s = _periods_s(t_ns)
+    period_s = row_periods_s(t_ns)
     limit_s = np.maximum(align.odometer_gap_s, align.odometer_gap_periods * period_s[1:])
     counts = count_step(distance_m, align)
     ways = ways_between(t_s, distance_m, speed, counts.step_m, limit_s, align)
@@ -365,7 +321,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     way_m = np.where(guessed, guess_m, way_m)
     distance_m = _sums(np.where(unknown, 0.0, way_m))
     whole = counted & ~lost & ~pause
-    noise, known_noise = _noise(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
+    noise, known_noise = noise_of_rows(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
     parts = _contradicted(t_s, distance_m, ways, known_noise, config)
     doubt_m = _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
     doubt_m += np.where(guessed, guess_doubt_m, parts.doubt_m)
@@ -430,51 +386,6 @@ def _guessed_ways(
     stand_m = 0.5 * period_s * (speed_mps[:-1] + speed_mps[1:])
     stand_doubt_m = 0.5 * period_s * (slower_mps + faster_mps) + slower_mps * dt_s
     return np.where(stood, stand_m, way_m), np.where(stood, stand_doubt_m, 0.25 * braking_mps2 * dt_s**2)
-
-
-def _periods_s(t_ns: Ints) -> Floats:
-    """The period of the rows as known before each; of the first step nothing is known but that step."""
-    period_s = periods_before_s(t_ns)
-    period_s[:2] = (t_ns[1] - t_ns[0]) / NS_PER_S
-    return period_s
-
-
-def _noise(
-    t_s: Floats,
-    distance_m: Floats,
-    whole: Bools,
-    counts: CountStep,
-    period_s: Floats,
-    declared_mps: Floats,
-    config: Configuration,
-) -> tuple[Noise, KnownNoise]:
-    """Noise as the run shows it, and as the rows up to each do.
-
-    `whole`: steps that the counter recorded without a gap; `counts`, `period_s`, `declared_mps`: step of the counter,
-    period and sigma of the speed as known at each row.
-    """
-    align = config.align
-    least_m2_per_s = config.monitors.odometer_sigma_mps**2
-    white_m2_per_s = np.maximum(least_m2_per_s, np.nan_to_num(declared_mps) ** 2 * period_s)
-    pieces = scatter_pieces(t_s, distance_m, whole, period_s, white_m2_per_s, config.matching.deadband_mps, align)
-    noise = Noise(
-        white_m2_per_s=median(white_m2_per_s),
-        quantisation=of_the_run(pieces, align).of_counter(float(counts.step_m[-1])),
-    )
-    # Rows far apart, or of speeds alone, have no such noise.
-    none = (period_s > align.straight_s) | ~np.concatenate([whole[:1], whole])
-    first_m2 = np.where(none, 0.0, first_scatter_m2(t_s, distance_m, period_s, white_m2_per_s, align))
-    known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)
-    return noise, KnownNoise(
-        white_m2_per_s=white_m2_per_s,
-        still_m2=np.maximum(known.still_m2, counts.step_m**2 / 12.0),
-        moving_s2=known.moving_s2,
-        # Twice what the counts explain are still the counts.
-        faster_s2=np.maximum(known.still_m2 - counts.step_m**2 / 6.0, 0.0) / known.seen_mps**2,
-        seen_mps=known.seen_mps,
-        period_s=period_s,
-        shown=known.shown | none | counts.shown,
-    )
 
 
 def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:

@@ -7,13 +7,16 @@ show, evidence and calibration what the run shows.
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
-from schemas.arrays import Bools, Floats, Ints, median
-from schemas.config import AlignConfig
+from pipeline.stages.epochs.clock import periods_before_s
+from pipeline.stages.odometry.rows import CountStep
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median
+from schemas.config import AlignConfig, Configuration
 from schemas.frozen import frozen
 
 # Numerics of the fit: so many rows of a piece, and the degree of its curve.
@@ -237,3 +240,83 @@ def _beyond(scatter_m2: Floats, explained_m2: Floats, config: AlignConfig) -> fl
     scatter = median(scatter_m2)
     explained = median(explained_m2)
     return scatter - explained if scatter > config.quantisation_factor * explained else 0.0
+
+
+@frozen
+class Noise:
+    """Noise of the distance as the whole run shows it: what gathers in a second, and the scatter of rows. For
+    evidence and calibration; detection uses `KnownNoise`.
+    """
+
+    white_m2_per_s: float
+    quantisation: QuantisationNoise = NO_QUANTISATION
+
+
+@frozen
+class KnownNoise:
+    """The same as the rows up to each sample show it, and the period of the rows [s].
+
+    `still_m2`, `moving_s2`: of `QuantisationNoise`; a first figure where too few rows show them yet (not `shown`). What
+    shows at one speed may be noise of the stamps: beyond `seen_mps` it grows by `faster_s2` with the speed squared.
+    """
+
+    white_m2_per_s: Floats
+    still_m2: Floats
+    moving_s2: Floats
+    faster_s2: Floats
+    seen_mps: Floats
+    period_s: Floats
+    shown: Bools
+
+    def at(self, samples: Ints) -> KnownNoise:
+        return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
+
+    def row_m2(self, speed_mps: Floats) -> Floats:
+        """Variance of a row [m^2]."""
+        faster = np.maximum(speed_mps**2 - self.seen_mps**2, 0.0)
+        return np.asarray(self.still_m2 + self.moving_s2 * speed_mps**2 + self.faster_s2 * faster)
+
+
+def row_periods_s(t_ns: Ints) -> Floats:
+    """The period of the rows as known before each; of the first step nothing is known but that step."""
+    period_s = periods_before_s(t_ns)
+    period_s[:2] = (t_ns[1] - t_ns[0]) / NS_PER_S
+    return period_s
+
+
+def noise_of_rows(
+    t_s: Floats,
+    distance_m: Floats,
+    whole: Bools,
+    counts: CountStep,
+    period_s: Floats,
+    declared_mps: Floats,
+    config: Configuration,
+) -> tuple[Noise, KnownNoise]:
+    """Noise as the run shows it, and as the rows up to each do.
+
+    `whole`: steps that the counter recorded without a gap; `counts`, `period_s`, `declared_mps`: step of the counter,
+    period and sigma of the speed as known at each row.
+    """
+    align = config.align
+    least_m2_per_s = config.monitors.odometer_sigma_mps**2
+    white_m2_per_s = np.maximum(least_m2_per_s, np.nan_to_num(declared_mps) ** 2 * period_s)
+    pieces = scatter_pieces(t_s, distance_m, whole, period_s, white_m2_per_s, config.matching.deadband_mps, align)
+    noise = Noise(
+        white_m2_per_s=median(white_m2_per_s),
+        quantisation=of_the_run(pieces, align).of_counter(float(counts.step_m[-1])),
+    )
+    # Rows far apart, or of speeds alone, have no such noise.
+    none = (period_s > align.straight_s) | ~np.concatenate([whole[:1], whole])
+    first_m2 = np.where(none, 0.0, first_scatter_m2(t_s, distance_m, period_s, white_m2_per_s, align))
+    known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)
+    return noise, KnownNoise(
+        white_m2_per_s=white_m2_per_s,
+        still_m2=np.maximum(known.still_m2, counts.step_m**2 / 12.0),
+        moving_s2=known.moving_s2,
+        # Twice what the counts explain are still the counts.
+        faster_s2=np.maximum(known.still_m2 - counts.step_m**2 / 6.0, 0.0) / known.seen_mps**2,
+        seen_mps=known.seen_mps,
+        period_s=period_s,
+        shown=known.shown | none | counts.shown,
+    )

@@ -1,4 +1,4 @@
-"""The step in which a recorder writes a quantity down: counts of an odometer, decimals of a coordinate."""
+"""Where the figures of an odometer come from, as declared (DOMAIN section 5.0)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,22 @@ import polars as pl
 
 from pipeline.stages.odometry.bound import OddRun, driven_within_m, odd_runs
 from schemas.arrays import Bools, Floats, Ints, spans_of
-from schemas.config import AlignConfig
+from schemas.config import AlignConfig, Vehicle
+from schemas.enums import Origin
+
+_WORST_LAST = (Origin.WHEEL, Origin.RADAR, Origin.INERTIAL, Origin.UNKNOWN, Origin.FUSED, Origin.GNSS)
+
+
+def declared_origin(stream: pl.DataFrame, vehicle: Vehicle) -> Origin:
+    """What the rows of one sensor say, for those that say nothing the vehicle file.
+
+    Of rows that say different things the origin that proves least: GNSS before a filter before unknown.
+    """
+    told = stream["origin"].cast(pl.String).unique().to_list() if "origin" in stream.columns else [None]
+    unsaid = vehicle.odometer_origin or Origin.UNKNOWN
+    origins = {unsaid if name in (None, Origin.UNKNOWN.value) else Origin(name) for name in told}
+    return max(origins, key=_WORST_LAST.index, default=unsaid)
+
 
 # Numerics: how far a change may be from a multiple of the step, in steps, since written numbers are rounded.
 _TOLERANCE = 0.02

@@ -14,14 +14,27 @@ nearly as well, or where the changes of speed are noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from enum import StrEnum
 from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 
+from pipeline.stages.odometry.regression import (
+    SHOWN,
+    WORSE,
+    LagState,
+    Regression,
+    ScaleLag,
+    half_apart,
+    has_enough_ways,
+    huber_loss,
+    least_absolute_scale,
+    robust_sigma,
+    solved_moments,
+    student_factor,
+    widened,
+)
 from schemas.arrays import Bools, Floats, Ints, median
 from schemas.frozen import frozen
 
@@ -52,51 +65,10 @@ _SPEED_S = 0.5
 _APART_S = 0.25
 # Outliers, in robust standard deviations: slip, or a step of the other recorder.
 _USUAL = 4.5
-# 1.4826 MAD is the sigma of normal residuals, whatever less than half of them do.
-_MAD = 1.4826
-# A change of speed, as a share of the usual one.
-_CHANGES = 0.5
-# So many lengths of a way are left out to see how much depends on them.
-_LEFT_OUT = 6
-# Numerics: with less independent information about scale and lag, as a share of the whole, they are not told apart.
-_LEAST_INDEPENDENT = 1e-12
 # Numerics: ways are not written finer than this [m].
 _FINEST_M = 1e-3
-# Noise is correlated over so many lengths of a way, beyond those that overlap.
-_MEMORY = 10
-# Changes of speed, and ways, are more than noise by so many sigmas; far lags are worse than the one found by so many.
-_SHOWN, _WORSE = 6.0, 3.0
 # A lag so many sigmas, and so many seconds, from the one found is far.
 _FAR_SIGMAS, _FAR_S = 15.0, 2.0
-
-
-class LagState(StrEnum):
-    """Whether a lag is measured, and why not."""
-
-    MEASURED = "measured"
-    TOO_FEW = "too few ways"
-    CONSTANT_SPEED = "the speed changes too little"
-    AMBIGUOUS = "several lags fit"
-
-
-@frozen
-class ScaleLag:
-    """Way of the other recorder over that counted; stamp of a moment by the other minus the counter's [s].
-
-    Standard deviations beside them, infinite where a figure is not measured: 4 of them hold whatever the noise is like.
-    `halves`: scale and lag of the first and the second half of the run alone.
-    """
-
-    scale: float = 1.0
-    scale_sigma: float = float("inf")
-    lag_s: float = 0.0
-    lag_sigma_s: float = float("inf")
-    state: LagState = LagState.TOO_FEW
-    halves: tuple[tuple[float, float], ...] = ()
-
-    @property
-    def measured(self) -> bool:
-        return self.state is LagState.MEASURED
 
 
 @frozen
@@ -226,7 +198,7 @@ def possible_lags(
     best = float(left[likeliest] + counts.max() - counts[likeliest])
     # Two ways fit some lag and scale whatever their noise is.
     free = max(float(counts[likeliest]) - 2.0, 0.0)
-    noise = max(_student(free) ** 2 * float(left[likeliest]) / free, 1.0) if free else 1.0
+    noise = max(student_factor(free) ** 2 * float(left[likeliest]) / free, 1.0) if free else 1.0
     possible = left - best <= factor**2 * noise
     # One or two ways leave nothing over that would show that a slip was it, and no lag.
     possible[_FINE_LAGS_S.size // 2] |= free == 0.0
@@ -242,7 +214,7 @@ def _left_over(counted: Floats, seen: Floats, scale_off: float) -> Floats:
     known = np.isfinite(counted) & np.isfinite(seen)
     counted, seen = np.where(known, counted, 0.0), np.where(known, seen, 0.0)
     limits = 1.0 - scale_off, 1.0 + scale_off
-    scale = np.clip(_least_absolute_scale(counted, seen), *limits)
+    scale = np.clip(least_absolute_scale(counted, seen), *limits)
     for _ in range(_SCALES):
         used = np.where(np.abs(seen - scale[:, None] * counted) <= _USUAL, counted, 0.0)
         squares = (used * counted).sum(axis=1)
@@ -282,7 +254,7 @@ class _Ways:
         some = slice(None, None, self.step)
         begin_s, end_s, way_m = (values[some] for values in (self.begin_s, self.end_s, self.way_m))
         counted = self.counter.gained(begin_s - lag_s[:, None], end_s - lag_s[:, None])
-        scale = _least_absolute_scale(counted, way_m)
+        scale = least_absolute_scale(counted, way_m)
         return np.abs(way_m - scale[:, None] * counted), scale
 
     @cached_property
@@ -294,7 +266,7 @@ class _Ways:
         """The lag that leaves the least mean difference, of those at which half of the ways are known."""
         apart, _ = self._search
         mean = np.nansum(apart, axis=1) / np.maximum(np.isfinite(apart).sum(axis=1), 1)
-        return float(_LAGS_S[np.where(_enough(apart), mean, np.inf).argmin()])
+        return float(_LAGS_S[np.where(has_enough_ways(apart), mean, np.inf).argmin()])
 
     def _fits(self, lag_s: float) -> Bools:
         """Which lags of the search fit as well as this one: what they leave more is no more than chance.
@@ -303,12 +275,12 @@ class _Ways:
         of losses. Where less than half of the ways are known at both it is not said to fit.
         """
         here, _ = self._apart_m(np.full(1, lag_s))
-        limit_m = _USUAL * max(_robust(here[here > 0.0]), self.counter.noise_m)
-        loss, losses = (_huber(apart, limit_m) for apart in (here, self._search[0]))
+        limit_m = _USUAL * max(robust_sigma(here[here > 0.0]), self.counter.noise_m)
+        loss, losses = (huber_loss(apart, limit_m) for apart in (here, self._search[0]))
         worse = losses - loss
         # An outlier is one at both lags: its losses differ by no more than by what noise does to it.
-        chance = _WORSE * np.sqrt(2.0 * np.nansum(np.minimum(loss, limit_m**2) ** 2))
-        fits: Bools = _enough(worse) & (np.nansum(worse, axis=1) <= chance)
+        chance = WORSE * np.sqrt(2.0 * np.nansum(np.minimum(loss, limit_m**2) ** 2))
+        fits: Bools = has_enough_ways(worse) & (np.nansum(worse, axis=1) <= chance)
         return fits
 
     def stands_out(self, found: ScaleLag) -> bool:
@@ -324,8 +296,8 @@ class _Ways:
         scale, sigma = found.with_sigmas(slice(1))
         halves = found.halves(0.0, slice(1))
         scales = self._search[1][self._fits(self.likeliest_s)]
-        sigma = max(float(np.hypot(sigma, 0.5 * np.ptp(scales))) if scales.size else sigma, _apart(halves))
-        if abs(scale) <= _SHOWN * sigma:
+        sigma = max(float(np.hypot(sigma, 0.5 * np.ptp(scales))) if scales.size else sigma, half_apart(halves))
+        if abs(scale) <= SHOWN * sigma:
             return ScaleLag(state=state)
         return ScaleLag(scale, sigma, state=state, halves=halves)
 
@@ -347,7 +319,7 @@ class _Ways:
             doubt_s = min(0.5 * doubt_s, 2.0 * moved_s + 0.5 * found.lag_sigma_s)
         return replace(found, lag_sigma_s=found.lag_sigma_s + moved_s)
 
-    def _regression(self, lag_s: float, doubt_s: float) -> _Regression | None:
+    def _regression(self, lag_s: float, doubt_s: float) -> Regression | None:
         """At the lag assumed; `doubt_s`: by how much it may still be off, which makes no outlier."""
         begin_s, end_s = self.begin_s - lag_s, self.end_s - lag_s
         counted = self.counter.gained(begin_s, end_s)
@@ -363,183 +335,21 @@ class _Ways:
         if moving.sum() < FEWEST:
             return None
         design, beside = (np.where(known[:, None], values, 0.0) for values in (design, beside))
-        scale = float(_least_absolute_scale(counted[None], self.way_m)[0])
+        scale = float(least_absolute_scale(counted[None], self.way_m)[0])
         theta = np.array([scale, 0.0])
         used = moving
         for _ in range(_ROUNDS):
             left = self.way_m - design @ theta
-            spread = max(_robust(np.abs(left[moving])), abs(scale) * self.counter.noise_m)
+            spread = max(robust_sigma(np.abs(left[moving])), abs(scale) * self.counter.noise_m)
             kept = moving & (np.abs(left) <= _USUAL * spread + doubt_s * np.abs(scale * design[:, 1]))
             if kept.sum() < FEWEST:
                 return None
-            solved = _solved(design[kept], beside[kept], self.way_m[kept])
+            solved = solved_moments(design[kept], beside[kept], self.way_m[kept])
             same = np.array_equal(kept, used) and np.allclose(solved, theta, rtol=1e-9, atol=1e-9)
             theta, used = solved, kept
             if same:
                 break
-        used = used & ~_near(moving & ~used, self.overlap // 2)
+        used = used & ~widened(moving & ~used, self.overlap // 2)
         if used.sum() < FEWEST:
             return None
-        return _Regression(design, beside, self.way_m, used, self.overlap)
-
-
-@frozen
-class _Regression:
-    """way = design @ (scale, scale * rest of the lag), by the moments of `beside`, over the `used` ways."""
-
-    design: Floats
-    beside: Floats
-    way_m: Floats
-    used: Bools
-    overlap: int
-
-    def solved(self, assumed_s: float) -> ScaleLag:
-        """Scale and lag."""
-        if not self._changes_show():
-            return ScaleLag(state=LagState.CONSTANT_SPEED)
-        scale, sigma, rest_s, sigma_s = self.with_sigmas(slice(None))
-        halves = self.halves(assumed_s)
-        return ScaleLag(
-            scale=scale,
-            scale_sigma=max(sigma, _apart(halves)),
-            lag_s=assumed_s + rest_s / scale,
-            lag_sigma_s=sigma_s / abs(scale),
-            state=LagState.MEASURED,
-            halves=halves,
-        )
-
-    def with_sigmas(self, parts: slice) -> list[float]:
-        """Each part of the estimate, and its sigma: the largest of several ways to look at the noise."""
-        design, beside = (values[:, parts] * self.used[:, None] for values in (self.design, self.beside))
-        inverse = np.linalg.inv(beside.T @ design)
-        theta = inverse @ (beside.T @ self.way_m)
-        left = np.where(self.used, self.way_m - design @ theta, 0.0)
-        spreads = [_spread(beside, left, self.used, reach) for reach in (self.overlap, _MEMORY * self.overlap)]
-        variances = np.max([np.diag(inverse @ one @ inverse.T) for one in spreads], axis=0)
-        sigmas = _student(self.used.sum() / self.overlap - 2.0) * np.sqrt(np.maximum(variances, 0.0))
-        sigmas = np.maximum(sigmas, self._without_one(design, beside, theta))
-        return [float(value) for pair in zip(theta, sigmas, strict=True) for value in pair]
-
-    def _without_one(self, design: Floats, beside: Floats, theta: Floats) -> Floats:
-        """By how much each part of the estimate changes at most without a change of speed, a minute, a quarter.
-
-        One change of speed alone looks like a step or drift of the other recorder, or a slip, that came with it and
-        may last as long.
-        """
-        moments = beside[:, :, None] * np.concatenate([design, self.way_m[:, None]], axis=1)[:, None, :]
-        sums = np.cumsum(np.concatenate([np.zeros((1, *moments.shape[1:])), moments]), axis=0)
-        reach = max(self.overlap + 1, min(_LEFT_OUT * self.overlap, len(design) // 4))
-        begin = np.arange(len(design) - reach + 1)
-        end = begin + reach
-        if theta.size > 1:
-            changes = self._changes()
-            begin, end = np.append(begin, changes[0]), np.append(end, changes[1])
-        left = sums[-1] - (sums[end] - sums[begin])
-        normal, right = left[:, :, :-1], left[:, :, -1:]
-        if not np.all(np.linalg.det(normal)):
-            return np.full(theta.size, np.inf)
-        return np.asarray(np.abs(np.linalg.solve(normal, right)[:, :, 0] - theta).max(axis=0))
-
-    def _changes(self) -> tuple[Ints, Ints]:
-        """First row of each change of speed, and the one after its last: one sense, whatever outliers are in it.
-
-        Where the speed changes by less than half as much as it does usually it does not change.
-        """
-        used = np.flatnonzero(self.used)
-        change = self.beside[used, 1]
-        usual = float(np.sqrt(np.mean(change[change != 0.0] ** 2)))
-        rows = np.flatnonzero(np.abs(change) > _CHANGES * usual)
-        other = (np.diff(rows) > self.overlap) | (np.diff(np.sign(change[rows])) != 0.0)
-        begin, end = used[rows[np.append(True, other)]], used[rows[np.append(other, True)]] + 1
-        return begin, end
-
-    def _changes_show(self) -> bool:
-        """Two figures of each change of speed, by other rows, have in common more than their noise would by chance."""
-        if _alike_columns(self.beside[self.used].T @ self.design[self.used]):
-            return False
-        near, beside = self.design[self.used, 1], self.beside[self.used, 1]
-        noise = 0.5 * float(((near - beside) ** 2).sum()) / np.sqrt(near.size / self.overlap)
-        return bool(near @ beside > _SHOWN * noise)
-
-    def halves(self, assumed_s: float, parts: slice = slice(None)) -> tuple[tuple[float, float], ...]:
-        """Scale and lag by the first and by the second half of the ways."""
-        rows = np.flatnonzero(self.used)
-        found = []
-        for half in (rows[: rows.size // 2], rows[rows.size // 2 :]):
-            design, beside = self.design[half, parts], self.beside[half, parts]
-            if not _alike_columns(beside.T @ design):
-                scale, *rest = np.linalg.solve(beside.T @ design, beside.T @ self.way_m[half]).tolist()
-                found.append((scale, assumed_s + (rest[0] / scale if rest and scale else 0.0)))
-        return tuple(found)
-
-
-def _apart(halves: Sequence[tuple[float, float]]) -> float:
-    """Half of what the scales of both halves differ by: a drift of the other recorder is one of them for a while."""
-    return 0.5 * abs(halves[0][0] - halves[1][0]) if len(halves) == 2 else float("inf")
-
-
-def _solved(design: Floats, beside: Floats, way_m: Floats) -> Floats:
-    """Scale and scale * lag; the scale alone where nothing tells the lag."""
-    normal = beside.T @ design
-    if _alike_columns(normal):
-        return np.array([float(design[:, 0] @ way_m / (design[:, 0] @ design[:, 0])), 0.0])
-    return np.asarray(np.linalg.solve(normal, beside.T @ way_m))
-
-
-def _enough(values: Floats) -> Bools:
-    """Lags (rows) at which at least half as many ways are known as at any."""
-    counts = np.isfinite(values).sum(axis=1)
-    enough: Bools = counts >= max(0.5 * counts.max(initial=0), 3)
-    return enough
-
-
-def _alike_columns(normal: Floats) -> bool:
-    """Ways and changes of speed are proportional, or there are no changes: nothing tells the two apart."""
-    return bool(abs(np.linalg.det(normal)) <= _LEAST_INDEPENDENT * abs(float(np.prod(np.diag(normal)))))
-
-
-def _near(rows: Bools, reach: int) -> Bools:
-    """These rows, and so many on both sides: an outlier's neighbour begins or ends in the same slip or step."""
-    return np.asarray(np.convolve(rows, np.ones(2 * reach + 1), "same")[: rows.size] > 0.5)
-
-
-def _robust(size: Floats) -> float:
-    """Sigma of normal values of this size, whatever a part of them does."""
-    return _MAD * median(size) if size.size else 0.0
-
-
-def _huber(size: Floats, limit: float) -> Floats:
-    """Square up to the limit, then straight on (Huber 1964)."""
-    return np.where(size <= limit, size**2, limit * (2.0 * size - limit))
-
-
-def _least_absolute_scale(counted: Floats, way_m: Floats) -> Floats:
-    """Per row of `counted` (lags, ways) the scale with the least sum of absolute differences: a weighted median."""
-    weight = np.nan_to_num(np.abs(counted))
-    ratio = np.where(weight > 0.0, way_m / np.where(weight > 0.0, counted, 1.0), np.inf)
-    order = np.argsort(ratio, axis=1)
-    sums = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)
-    middle = np.minimum((sums < 0.5 * sums[:, -1:]).sum(axis=1), ratio.shape[1] - 1)
-    scale = np.take_along_axis(ratio, np.take_along_axis(order, middle[:, None], axis=1), axis=1)[:, 0]
-    return np.where(np.isfinite(scale), scale, 1.0)
-
-
-def _spread(beside: Floats, left: Floats, used: Bools, reach: int) -> Floats:
-    """Variance of the moments where the noise is alike everywhere: by its autocovariance up to `reach` ways."""
-    count = min(reach + 1, left.size)
-    counts = used.astype(np.float64)
-    pairs = np.array([counts[apart:] @ counts[: left.size - apart] for apart in range(count)])
-    sums = np.array([left[apart:] @ left[: left.size - apart] for apart in range(count)])
-    share = 1.0 - np.arange(count) / (reach + 1.0)
-    covariance = share * sums / np.maximum(pairs, 1.0)
-    total: Floats = covariance[0] * beside.T @ beside
-    for apart in range(1, count):
-        product = covariance[apart] * beside[apart:].T @ beside[:-apart]
-        total += product + product.T
-    return total
-
-
-def _student(free: float) -> float:
-    """What makes 4 sigmas from so many degrees of freedom as sure as of a normal one (Abramowitz, Stegun 26.7.5)."""
-    free = max(free, 2.0)
-    return 1.0 + 4.25 / free + 16.0 / free**2
+        return Regression(design, beside, self.way_m, used, self.overlap)

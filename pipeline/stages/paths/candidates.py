@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.stages.track.geodesy import Points, points_of
-from pipeline.stages.track.network import Network
-from pipeline.stages.track.once import Once
+from pipeline.stages.track.network import Network, Once
 from pipeline.stages.track.segments import Box, Feet, Polyline, box_about, downhill
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints

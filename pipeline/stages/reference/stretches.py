@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, search_about, segments_of
-from pipeline.stages.paths.path_set import path_set
+from pipeline.stages.paths.growth import path_set
 from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.reference.ways import ElementStay, ways_of
 from pipeline.stages.track.geodesy import Points, points_of, steps_m

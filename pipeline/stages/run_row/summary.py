@@ -16,7 +16,7 @@ from pipeline.stages.epochs.verdicts import NUMBER, Verdicts
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.failures import failures_within
 from pipeline.stages.judge.judge import Judged
-from pipeline.stages.matching.fixes import contradictory_covariances
+from pipeline.stages.matching.epochs import contradictory_covariances
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.provenance import Provenance
 from pipeline.stages.ride import Ride

@@ -1,24 +1,19 @@
-"""The track network as oriented net elements, and how far it is from one to another.
-
-An oriented element is a net element together with the sense in which the path runs over it. Moving forward
-over a net relation leads from one to its successors, reversing leads back, and a train that reverses over
-a switch comes out on another predecessor. So direction of travel is no state of its own.
-"""
+"""What is made of something that stays is made once, and kept as long as that."""
 
 from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import polars as pl
 
 from pipeline.stages.track.chords import Chords
-from pipeline.stages.track.once import Once
 from pipeline.stages.track.path import Chain, Reach, search
 from pipeline.stages.track.segments import Visit
 from pipeline.stages.track.survey import (
@@ -34,6 +29,26 @@ from schemas.arrays import Bools, Floats, Ints, ints
 from schemas.enums import Navigability
 from schemas.frozen import frozen
 from schemas.run import Site
+
+Source = TypeVar("Source")
+Made = TypeVar("Made")
+
+
+class Once(Generic[Source, Made]):
+    """A function of one argument that is itself alone (no other is equal to it): a site, a track."""
+
+    def __init__(self, make: Callable[[Source], Made]) -> None:
+        self._make = make
+        self._made: WeakKeyDictionary[Source, Made] = WeakKeyDictionary()
+
+    def __call__(self, source: Source) -> Made:
+        if source not in self._made:
+            self.keep(source, self._make(source))
+        return self._made[source]
+
+    def keep(self, source: Source, made: Made) -> None:
+        """Whoever has made it already need not have it made again."""
+        self._made[source] = made
 
 
 class Edge(NamedTuple):

@@ -18,8 +18,8 @@ from pipeline.studies.plausibility.check import (
     misfit,
     not_checked,
 )
+from pipeline.studies.plausibility.pairs import SIGNIFICANT_SIGMAS
 from pipeline.studies.plausibility.recording import Recording
-from pipeline.studies.plausibility.robust import SIGNIFICANT_SIGMAS
 from schemas.enums import MisfitCause, MisfitPlace
 from schemas.frozen import frozen
 from schemas.run import Stream

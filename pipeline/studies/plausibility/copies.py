@@ -11,8 +11,8 @@ import polars as pl
 
 from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M
 from pipeline.studies.plausibility.check import Cause, Check, FitState
+from pipeline.studies.plausibility.pairs import LEAST
 from pipeline.studies.plausibility.recording import Recording
-from pipeline.studies.plausibility.robust import LEAST
 from pipeline.studies.plausibility.shifts import fit_survey
 from schemas.arrays import Floats
 from schemas.config import FixSigma

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pipeline.stages.prepare import PreparedRun
 from pipeline.studies.plausibility.check import Check, FitState, not_checked
 from pipeline.studies.plausibility.clocks import clock_checks
-from pipeline.studies.plausibility.odometer import odometer_checks
+from pipeline.studies.plausibility.odometer import follows_check, odometer_checks, velocity_checks
 from pipeline.studies.plausibility.places import (
     read_stamp_checks,
     reads_lag,
@@ -17,8 +17,6 @@ from pipeline.studies.plausibility.places import (
     written_check,
 )
 from pipeline.studies.plausibility.recording import Recording, recording_of
-from pipeline.studies.plausibility.velocity import velocity_checks
-from pipeline.studies.plausibility.witnesses import follows_check
 from schemas.config import PlausibilityConfig, Vehicle
 from schemas.enums import MisfitCause, Note
 from schemas.errors import InputError

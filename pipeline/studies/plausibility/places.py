@@ -13,11 +13,10 @@ from pipeline.studies.plausibility.causes import KNOWN
 from pipeline.studies.plausibility.check import Cause, Check, FitState, correction, fits, misfit, not_checked
 from pipeline.studies.plausibility.clocks import StreamLag
 from pipeline.studies.plausibility.copies import copy_check
-from pipeline.studies.plausibility.odometer import odometer_checks
+from pipeline.studies.plausibility.odometer import odometer_checks, velocity_checks
+from pipeline.studies.plausibility.pairs import SIGNIFICANT_SIGMAS, explains, halves_of, steady, usual
 from pipeline.studies.plausibility.recording import Recording
-from pipeline.studies.plausibility.robust import SIGNIFICANT_SIGMAS, explains, halves_of, steady, usual
 from pipeline.studies.plausibility.shifts import SurveyLine, common_lag, fit_places, fit_survey, in_words, passing_lags
-from pipeline.studies.plausibility.velocity import velocity_checks
 from schemas.arrays import NS_PER_S, Floats, floats, times_ns
 from schemas.enums import MisfitCause, MisfitPlace
 from schemas.run import Site

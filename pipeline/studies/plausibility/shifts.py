@@ -7,12 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.stages.track.geodesy import Points
-from pipeline.stages.track.network import surveyed
-from pipeline.stages.track.once import Once
+from pipeline.stages.track.network import Once, surveyed
 from pipeline.stages.track.segments import Polyline, on_segments
-from pipeline.studies.plausibility.pairs import clock_lag
+from pipeline.studies.plausibility.pairs import LEAST, clock_lag, explains, halves_of, regressed, sampled, steady
 from pipeline.studies.plausibility.records import MOVING_MPS, Places
-from pipeline.studies.plausibility.robust import LEAST, explains, halves_of, regressed, sampled, steady
 from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
 from schemas.frozen import frozen

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.make.survey.reachable import reachable
-from pipeline.stages.matching.fixes import fixes_of
+from pipeline.stages.matching.epochs import fixes_of
 from schemas.arrays import Floats
 from schemas.config import FixSigma
 from tests.stages.matching.builders import run

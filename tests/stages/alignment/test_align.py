@@ -13,8 +13,7 @@ from pipeline.stages.alignment.align import BEYOND_SPAN, align, odometer_at, spe
 from pipeline.stages.alignment.odometer_filter import stamp_jitter_s
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER
-from pipeline.stages.odometry.odometry import Noise
-from pipeline.stages.odometry.quantisation import QuantisationNoise
+from pipeline.stages.odometry.quantisation import Noise, QuantisationNoise
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration, Vehicle, threshold_factor
 from schemas.stages import AlignedEpochs, MatchedEpochs

@@ -6,8 +6,7 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.stages.clean.clean import StreamCounts, clean
-from pipeline.stages.clean.journey import require_one_journey
+from pipeline.stages.clean.clean import StreamCounts, clean, require_one_journey
 from schemas.config import AlignConfig, Configuration, IngestConfig
 from schemas.errors import InputError
 from schemas.run import RunLog

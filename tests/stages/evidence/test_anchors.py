@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.stages.evidence.anchors import Sided, Witness, known_stretch, reference_ways, sided
+from pipeline.stages.evidence.anchors import Sided, reference_ways, sided
 from pipeline.stages.evidence.carrying import Counter, Lags, RecorderClock, TrueAnchor, lags_of
+from pipeline.stages.evidence.contradictions import Witness
+from pipeline.stages.evidence.gathering import known_stretch
 from pipeline.stages.odometry import odometry_of
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place, RoutePath

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.stages.evidence.carrying import Lags, RecorderClock, clock_of, true_clocks_s
-from pipeline.stages.odometry.scale_lag import LagState, ScaleLag
+from pipeline.stages.odometry.regression import LagState, ScaleLag
 from schemas.config import HazardConfig
 
 

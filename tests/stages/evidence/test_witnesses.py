@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.evidence.evidence import KINDS, NOTHING
-from pipeline.stages.evidence.recorders import on_time, without_frozen
+from pipeline.stages.evidence.gathering import on_time, without_frozen
 from pipeline.stages.odometry import odometry_of
 from schemas.config import Configuration, HazardConfig, Vehicle
 from schemas.enums import Evidence as Kind

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.stages.matching.fixes import contradictory_covariances
+from pipeline.stages.matching.epochs import contradictory_covariances
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.path import TravelledPath
 from pipeline.stages.track.segments import Visit, leg_of

@@ -7,8 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.matching import match
-from pipeline.stages.matching.epochs import Shape, Written
-from pipeline.stages.matching.fixes import digit_steps, step_m
+from pipeline.stages.matching.epochs import Shape, Written, digit_steps, step_m
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 from tests.stages.matching.builders import line, run, site

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.stages.matching.claims import OneTrack
-from pipeline.stages.paths.path_set import path_set
+from pipeline.stages.paths.growth import path_set
 from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import network_in_pieces

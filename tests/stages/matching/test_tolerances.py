@@ -10,8 +10,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.matching import match
-from pipeline.stages.matching.epochs import on_track_limit_m
-from pipeline.stages.matching.fixes import contradictory_covariances
+from pipeline.stages.matching.epochs import contradictory_covariances, on_track_limit_m
 from pipeline.stages.matching.match import pins_of
 from pipeline.stages.track.survey import track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle

@@ -9,10 +9,9 @@ import pytest
 
 from pipeline.stages.odometry.bound import LOST_M, is_lost
 from pipeline.stages.odometry.driven import turns_of
-from pipeline.stages.odometry.odometry import Noise
 from pipeline.stages.odometry.odometry import odometry_of as odometry_of_stream
 from pipeline.stages.odometry.polarity import grows_with, polarity
-from pipeline.stages.odometry.quantisation import QuantisationNoise
+from pipeline.stages.odometry.quantisation import Noise, QuantisationNoise
 from schemas.config import Configuration, Vehicle
 from tests.stages.alignment.straight import odometer_of, odometry_from
 

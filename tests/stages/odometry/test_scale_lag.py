@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.truth.clock import draw, estimate
-from pipeline.stages.odometry.scale_lag import CountedRows, LagState, ScaleLag, possible_lags, scale_and_lag
+from pipeline.stages.odometry.regression import LagState, ScaleLag
+from pipeline.stages.odometry.scale_lag import CountedRows, possible_lags, scale_and_lag
 from schemas.arrays import Floats
 
 

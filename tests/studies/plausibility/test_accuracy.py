@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.studies.plausibility.accuracy import accuracy_checks, refuted
+from pipeline.studies.plausibility.report import accuracy_checks, refuted
 from schemas.config import Configuration
 from schemas.enums import MisfitCause
 

@@ -1,0 +1,381 @@
+"""Evidence from all recorders: their clocks, what they say of each other, and the stretches between known places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import polars as pl
+
+from pipeline.stages.evidence.anchors import (
+    KnownStretch,
+    Sided,
+    final_stands,
+    on_clock,
+    outside,
+    read_anchors,
+    reference_ways,
+    shown_on_its_track,
+    sided,
+)
+from pipeline.stages.evidence.carrying import (
+    Counter,
+    Lags,
+    RecorderClock,
+    TrueAnchor,
+    clocks_of,
+    lags_of,
+    true_clocks_s,
+)
+from pipeline.stages.evidence.contradictions import (
+    EVEN_S,
+    Beyond,
+    KnownPath,
+    Levels,
+    Witness,
+    contradictions,
+    left_open,
+    levels_beyond,
+    path_speed_mps,
+)
+from pipeline.stages.evidence.evidence import Alternative, EvidenceSet, Span, TrainEvidence
+from pipeline.stages.evidence.gaps import Carried, GapSearch
+from pipeline.stages.odometry import Odometry
+from pipeline.stages.reference import ReferenceStretch
+from pipeline.stages.track.network import Network
+from pipeline.stages.track.survey import SurveyedTrack
+from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
+from schemas.config import Configuration, HazardConfig, Vehicle
+from schemas.enums import Origin
+
+
+def on_time(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | None:
+    """The stream with its declared lag taken off (vehicle file, `reference_latency_s`, `reads_latency_s`)."""
+    if stream is None or latency_s == 0.0:
+        return stream
+    return stream.with_columns(pl.col("t") - pl.duration(nanoseconds=round(latency_s * 1e9)))
+
+
+def without_frozen(
+    reference: pl.DataFrame | None, odometers: Sequence[Odometry], config: HazardConfig
+) -> pl.DataFrame | None:
+    """The reference without samples that repeat the one before while an odometer moves on: any, or any independent one.
+
+    A recorder that stands still says nothing of where the train is (DOMAIN section 5.0): after so long the stretch
+    ends. A train that stands repeats too: there the odometer shows no way beyond its dead band and the sample's noise.
+    """
+    witnesses = [odometer for odometer in odometers if odometer.independent] or list(odometers)
+    if reference is None or reference.height < 2 or not witnesses:
+        return reference
+    t_ns = times_ns(reference)
+    places = np.column_stack([floats(reference, "latitude_deg"), floats(reference, "longitude_deg")])
+    repeats = np.concatenate([[False], (np.diff(places, axis=0) == 0.0).all(axis=1)])
+    if not repeats.any():
+        return reference
+    held = np.arange(t_ns.size)[~repeats][np.cumsum(~repeats) - 1]
+    noise_m = config.evidence_factor * reference["sigma_m"].fill_null(config.reference_sigma_m).to_numpy()
+    frozen = np.zeros(t_ns.size, dtype=np.bool_)
+    for odometer in witnesses:
+        frozen |= repeats & odometer.drove(t_ns[held], t_ns, noise_m)
+    return reference.filter(~pl.Series(frozen))
+
+
+# Numerics: before and after all runs [ns].
+_EVER_NS = 2**62
+
+
+def known_stretch(
+    side: Sided,
+    clock: RecorderClock,
+    witnesses: Sequence[Witness],
+    reads: Sequence[TrueAnchor],
+    ahead_m: float,
+    config: Configuration,
+    beyond: Beyond | None = None,
+) -> KnownStretch:
+    """The stretch as evidence; `reads` close a step of the reference where they confirm it.
+
+    `beyond`: what the reference does on both sides of the stretch.
+    """
+    beyond = beyond or Beyond()
+    t_ns = side.stretch.t_ns - round(clock.shift_s * NS_PER_S)
+    stretch = replace(side.stretch, t_ns=t_ns)
+    paths: list[KnownPath] = []
+    speed_mps = np.zeros(t_ns.size)
+    levels: list[Levels] = []
+    possible_ns: set[int] = set()
+    for path in stretch.paths:
+        at_m = path.at_m - side.sense * ahead_m
+        path_mps = path_speed_mps(t_ns, at_m, path.leg)
+        speed_mps = np.maximum(speed_mps, path_mps)
+        known = KnownPath(path, side.sense, at_m, at_m, at_m, np.zeros(t_ns.size))
+        clock_m = path_mps * clock.delta_s
+        # A clock that leaves more than half the failure limit open lets a read confirm nothing.
+        most_m = config.hazards.limits.confirming_m
+        reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor, most_m)
+        steps = contradictions(known, side.stretch, witnesses, config)
+        of_path = Levels.of(steps, t_ns, reads_ns)
+        levels.append(of_path.seen(side.sense))
+        opened = left_open(known, t_ns, steps, of_path, beyond.seen(side.sense))
+        paths.append(opened)
+        possible_ns |= set(_confirming_ns(opened, stretch, clock_m, reads, config.align.sure_sigmas, np.inf))
+    disputed = _disputed(t_ns, reads, possible_ns)
+    for first_ns, last_ns in [] if witnesses else disputed:
+        # Nothing is carried from the reads, so nobody knows since when the reference has been off.
+        open_m = np.where((t_ns >= first_ns) & (t_ns <= last_ns), np.inf, 0.0)
+        paths = [replace(known, low_m=known.low_m - open_m, high_m=known.high_m + open_m) for known in paths]
+    if t_ns.size == 1 and witnesses:
+        # One sample shows no speed.
+        speed_mps = np.abs(witnesses[0].counter.odometer.speed_about(t_ns))
+    since_s = (t_ns - t_ns[0]) / NS_PER_S
+    lates_s = np.linspace(-clock.delta_s, clock.delta_s, 3 + 2 * int(clock.delta_s / EVEN_S))
+    around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in lates_s.tolist()]
+    clock_m = np.maximum.reduce(around) * clock.delta_s
+    proved = shown_on_its_track(stretch, config)
+    return KnownStretch(
+        t_ns,
+        stretch.sigma_m,
+        clock_m,
+        tuple(paths),
+        proved,
+        stretch,
+        levels[0],
+        round(clock.delta_s * NS_PER_S),
+        tuple(disputed),
+    )
+
+
+def _disputed(t_ns: Ints, reads: Sequence[TrueAnchor], possible_ns: set[int]) -> list[tuple[int, int]]:
+    """For each read within the stretch at which the train was on none of its paths: the time between its neighbours.
+
+    Which of the two was right nobody knows, nor since when: without end where no read confirms the reference.
+    """
+    within = sorted(read.t_ns for read in reads if t_ns[0] <= read.t_ns <= t_ns[-1])
+    found: list[tuple[int, int]] = []
+    for read_ns in within:
+        if read_ns not in possible_ns:
+            before_ns = max((at_ns for at_ns in possible_ns if at_ns < read_ns), default=-_EVER_NS)
+            after_ns = min((at_ns for at_ns in possible_ns if at_ns > read_ns), default=_EVER_NS)
+            found.append((before_ns, after_ns))
+    return found
+
+
+def _confirming_ns(
+    known: KnownPath,
+    stretch: ReferenceStretch,
+    clock_m: Floats,
+    reads: Sequence[TrueAnchor],
+    factor: float,
+    most_m: float,
+) -> list[int]:
+    """Times of reads at balises where the reference may have been, within `factor` sigmas of both and both clocks.
+
+    Not where these are more than `most_m`.
+    """
+    t_ns = stretch.t_ns
+    since_ns = (t_ns - t_ns[0]).astype(np.float64)
+    confirming: set[int] = set()
+    for read in reads:
+        if not t_ns[0] <= read.t_ns <= t_ns[-1]:
+            continue
+        at_m = np.interp([float(read.t_ns - t_ns[0])], since_ns, known.at_m)
+        sample = int(np.searchsorted(t_ns, read.t_ns))
+        beside = slice(max(sample - 1, 0), sample + 1)
+        low_m = float(at_m[0] + (known.low_m - known.at_m)[beside].min())
+        high_m = float(at_m[0] + (known.high_m - known.at_m)[beside].max())
+        route = known.path.legs[int(known.path.leg[sample])]
+        half_m = factor * float(np.hypot(stretch.sigma_m[sample], read.sigma_m))
+        half_m += float(clock_m[sample]) + read.clock_m
+        for place in read.places:
+            there_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
+            if low_m - half_m <= float(there_m[0]) <= high_m + half_m and half_m <= most_m:
+                confirming.add(read.t_ns)
+    return sorted(confirming)
+
+
+# Numerics: ways over which two odometers are compared [s].
+_PARTED_S = 60.0
+
+
+def evidence_of(
+    reference: tuple[Sequence[ReferenceStretch], Sequence[Span]],
+    reads: pl.DataFrame | None,
+    balises: pl.DataFrame | None,
+    odometers: Sequence[Odometry],
+    network: Network,
+    vehicle: Vehicle,
+    config: Configuration,
+) -> TrainEvidence:
+    """Everything that is known of where the train was, except from GNSS.
+
+    `reference`: as from `reference_stretches`; `odometers`: that of the LDS first. Where any is independent, the others
+    confirm nothing and narrow nothing; where none is, what they carry proves nothing.
+    """
+    hazards = config.hazards
+    independent = [odometer for odometer in odometers if odometer.independent]
+    counters = [Counter(odometer, config.hazards.limits.doubt_m) for odometer in independent or odometers]
+    main = counters[0] if counters else None
+    least_m = config.matching.orientation_distance_m
+    stretches, silent = reference
+    sides = [sided(stretch, main, least_m) for stretch in stretches]
+    facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
+    if any(min(side.with_m, side.against_m) >= least_m for side in sides):
+        counters = [counter.without_sign() for counter in counters]
+    searches = [GapSearch(counter, network, config, facing) for counter in counters]
+    lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
+    # Any odometer contradicts a reference; where one is independent, the others are not asked.
+    found = [Witness.of(*of_one, config) for of_one in zip(counters, lags, strict=True)]
+    read = read_anchors(reads, balises, network.track, hazards)
+    lags_of_reads = [_lags_of_reads(search.carried(_points(read)), config) for search in searches]
+    of_reference, of_reads = clocks_of((lags, lags_of_reads), bool(independent), hazards)
+    clocked = on_clock(read, of_reads, main)
+    recorded, unclosed = _known_stretches(sides, of_reference, found, clocked, searches, vehicle, config)
+    known = tuple(part for stretch in recorded for part in stretch.trusted())
+    unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
+    apart = outside(clocked, known)
+    shift_ns = round(of_reference.shift_s * NS_PER_S)
+    return TrainEvidence(
+        stretches=known,
+        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent),
+        carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
+        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
+        reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
+        clocks=(of_reference,) * bool(known) + (of_reads,) * bool(apart),
+        network=network,
+        config=config,
+        stands=final_stands([stretch.reference for stretch in known], independent, config),
+        parted=_parted(odometers, config),
+        unsure=tuple(unsure),
+        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + (of_reads,) * bool(clocked)),
+        disputes=tuple(span for stretch in recorded for span in stretch.disputed),
+        doubted=unclosed
+        + sum(stretch.levels.doubts for stretch in recorded)
+        + (0 if counters else sum(len(stretch.disputed) for stretch in recorded))
+        + sum(len(of_one.found) > 1 for of_one in lags),
+    )
+
+
+def _known_stretches(
+    sides: Sequence[Sided],
+    clock: RecorderClock,
+    witnesses: Sequence[Witness],
+    reads: Sequence[TrueAnchor],
+    searches: Sequence[GapSearch],
+    vehicle: Vehicle,
+    config: Configuration,
+) -> tuple[list[KnownStretch], int]:
+    """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
+    ahead_m = vehicle.gnss_antenna_ahead_m
+    known = [known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
+    order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
+    steps_m = [0.0] * max(len(known) - 1, 0)
+    for search, witness in zip(searches[:1], witnesses[:1], strict=True):
+        borders = [known[number].ends(search.counter) for number in order]
+        steps_m = [
+            search.misclosure_m(before[1], after[0], witness.scale, witness.scale_sigma)
+            for before, after in pairwise(borders)
+        ]
+    levels = [known[number].levels for number in order]
+    if len(known) < 2 or not (any(steps_m) or any(of.doubts for of in levels)):
+        return known, 0
+    for number, beyond in zip(order, levels_beyond(levels, steps_m), strict=True):
+        known[number] = known_stretch(sides[number], clock, witnesses, reads, ahead_m, config, beyond)
+    return known, sum(map(bool, steps_m))
+
+
+def _borders(
+    stretches: Sequence[KnownStretch], counter: Counter, reads: Sequence[TrueAnchor]
+) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    return [*(stretch.ends(counter) for stretch in stretches), *_points(reads)]
+
+
+def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    return [(anchor, anchor) for anchor in known]
+
+
+def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> Lags:
+    """Its clock against that of one odometer, in the sense in which that one counts.
+
+    One that counts up both ways is compared where the train cannot have turned.
+    """
+    sides = [sided(stretch, search.counter, least_m) for stretch in stretches]
+    begin_ns, end_ns, way_m, sigma_m = reference_ways(sides, search.only_length_m)
+    way_m = way_m if search.counter.signed else np.abs(way_m)
+    return lags_of(begin_ns, end_ns, way_m, sigma_m, search.counter, search.config)
+
+
+def _lags_of_reads(source: Carried, config: Configuration) -> Lags:
+    """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
+    ways = [
+        (gap.begin_ns, gap.end_ns, apart_m, float(np.linalg.norm([anchor.sigma_m for anchor in gap.anchors])))
+        for gap in source.gaps
+        for apart_m in gap.only_length_m
+    ]
+    begins, ends, *lengths = zip(*ways, strict=True) if ways else ((), (), (), ())
+    way_m, sigma_m = (np.array(values, np.float64) for values in lengths)
+    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), way_m, sigma_m, source.counter, config)
+
+
+def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
+    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a way."""
+    independent = [odometer for odometer in odometers if odometer.independent]
+    others = [odometer for odometer in odometers if odometer.origin is Origin.UNKNOWN and not odometer.follows_gnss]
+    for other in others:
+        for witness in independent:
+            begin_ns = max(other.begin_ns, witness.begin_ns)
+            end_ns = min(other.end_ns, witness.end_ns)
+            at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
+            ways = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
+            allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
+            if (np.abs(ways[0] - ways[1]) > allowed_m).any():
+                return True
+    return False
+
+
+def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> pl.DataFrame:
+    """Per instant `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m`.
+
+    Null where nothing is known; the measures also where there are several net elements.
+    """
+    parts = [_touched(alternative) for alternative in evidence.alternatives]
+    touched = pl.concat([pl.DataFrame(schema=_TOUCHED), *parts])
+    elements = pl.col("element").unique().sort()
+    places = touched.group_by("row").agg(elements, low=pl.col("low").min(), high=pl.col("high").max())
+    alone = pl.col("element").list.len() == 1
+    names = pl.Series(track.ids, dtype=pl.String)
+    numbers = pl.Series(range(names.len()), dtype=pl.Int64)
+    rows = pl.DataFrame({"row": np.arange(evidence.kind.size)})
+    return rows.join(places, on="row", how="left", maintain_order="left").select(
+        true_netelement_ids=pl.col("element").list.eval(pl.element().replace_strict(numbers, names)),
+        true_measure_low_m=pl.when(alone).then("low"),
+        true_measure_high_m=pl.when(alone).then("high"),
+    )
+
+
+_TOUCHED = {"row": pl.Int64, "element": pl.Int64, "low": pl.Float64, "high": pl.Float64}
+
+
+def _touched(there: Alternative) -> pl.DataFrame:
+    """Every net element that the interval touches, with the measures on it: one row per instant and visit."""
+    route = there.route
+    first, last = (
+        np.maximum(np.searchsorted(route.entry_m, at_m, side="right") - 1, 0) for at_m in (there.low_m, there.high_m)
+    )
+    count = last - first + 1
+    numbers = np.repeat(np.arange(there.rows.size), count)
+    visit = np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
+    low = route.low_m[visit]
+    high = route.high_m[visit]
+    begin, end = (
+        np.clip(at_m[numbers] - route.entry_m[visit], 0.0, high - low) for at_m in (there.low_m, there.high_m)
+    )
+    forward = route.forward[visit]
+    columns = {
+        "row": there.rows[numbers],
+        "element": route.element[visit],
+        "low": np.where(forward, low + begin, high - end),
+        "high": np.where(forward, low + end, high - begin),
+    }
+    return pl.DataFrame(columns, schema=_TOUCHED)
