@@ -656,14 +656,14 @@ def calibrate(
 ) -> None:
     """Measure odometer scale, GNSS latency, fast noise and the monitors' sigmas on fault-free runs."""
     from pipeline.campaign import find_runs
-    from pipeline.results.workers import told
+    from pipeline.results.workers import with_progress
     from pipeline.storage import write_bytes
     from pipeline.studies.calibration.calibrate import calibrate as measure
     from schemas.config import to_toml
 
     settings = _configuration(config)
     with _telling("runs read"):
-        logs = [_log(address, settings) for address in told(find_runs(runs).values())]
+        logs = [_log(address, settings) for address in with_progress(find_runs(runs).values())]
     with _telling("runs measured"):
         found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())

@@ -22,7 +22,7 @@ from datasets.faults import (
 )
 from datasets.inject_ranges import inject_ranges
 from datasets.line import RailPlaces, shifted
-from datasets.run_path import DrivenWay, displacement_m, driven_way
+from datasets.run_path import DrivenPath, displacement_m, driven_way
 from datasets.trial import write_run_as
 from pipeline.read.ingest import read_run
 from schemas.arrays import Floats
@@ -77,10 +77,10 @@ class Recording:
     def __init__(self, run: RunLog, site: Site | None = None) -> None:
         self._run = run
         self._site = site
-        self._ways: dict[str, DrivenWay] = {}
+        self._ways: dict[str, DrivenPath] = {}
         self.first_ns, self.last_ns = _span_ns(run)
 
-    def way(self, solution: str) -> DrivenWay:
+    def way(self, solution: str) -> DrivenPath:
         """The way of this solution, found once."""
         if solution not in self._ways:
             self._ways[solution] = driven_way(self._run, solution, self._site)

@@ -19,7 +19,7 @@ _OUTER_CELLS = 3
 
 
 @frozen
-class DrivenWay:
+class DrivenPath:
     """Where positions were along their own way and left of it at some instants, and the way by the distance along it.
 
     `own_height_m`: of the positions. `course_m`: over so much of it, to both sides, its course is taken.
@@ -42,12 +42,12 @@ class DrivenWay:
         return latitude, longitude, height
 
 
-def driven_way(run: RunLog, solution: str, site: Site | None = None) -> DrivenWay:
+def driven_way(run: RunLog, solution: str, site: Site | None = None) -> DrivenPath:
     """The track of the site where one is given, else what the run's own positions show, averaged over 10 m."""
     return _own_way(run, solution) if site is None else _site_way(run, solution, site)
 
 
-def displacement_m(way: DrivenWay, t_ns: Ints, ahead_m: Floats, left_m: Floats) -> Floats:
+def displacement_m(way: DrivenPath, t_ns: Ints, ahead_m: Floats, left_m: Floats) -> Floats:
     """East, north, up [m] of positions moved along the track and to its left, shape (instants, 3).
 
     Ahead is the run's first direction of travel.
@@ -66,14 +66,14 @@ def displacement_m(way: DrivenWay, t_ns: Ints, ahead_m: Floats, left_m: Floats) 
     return np.column_stack([east + left_m * east_here, north + left_m * north_here, there[2] - here[2]])
 
 
-def _left_of(way: DrivenWay, s_m: Floats) -> tuple[Floats, Floats]:
+def _left_of(way: DrivenPath, s_m: Floats) -> tuple[Floats, Floats]:
     """East and north of the unit vector to the left of the way at these distances."""
     course_e, course_n, _ = _local_m(way.places(s_m - way.course_m), way.places(s_m + way.course_m))
     norm = np.hypot(course_e, course_n)
     return -course_n / norm, course_e / norm
 
 
-def _own_way(run: RunLog, solution: str) -> DrivenWay:
+def _own_way(run: RunLog, solution: str) -> DrivenPath:
     """From the run's own positions, by odometer distance where recorded, else by the way the positions make."""
     fixes = _fixes(run, solution)
     t_ns = fixes["t"].to_physical().to_numpy()
@@ -88,10 +88,10 @@ def _own_way(run: RunLog, solution: str) -> DrivenWay:
         raise InputError("the train moves too little to know its track", place=run.run_id, expected="30 m or more")
     count = np.bincount(of_epoch)
     means = [np.bincount(of_epoch, weights=values) / count for values in (s_m, *places)]
-    return DrivenWay(t_ns, s_m, np.zeros_like(s_m), places[2], _BIN_M, *means)
+    return DrivenPath(t_ns, s_m, np.zeros_like(s_m), places[2], _BIN_M, *means)
 
 
-def _site_way(run: RunLog, solution: str, site: Site) -> DrivenWay:
+def _site_way(run: RunLog, solution: str, site: Site) -> DrivenPath:
     """From the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
     prepared = prepare(run, site, Vehicle(), Configuration())
     fixes = prepared.fixes(solution)
@@ -108,7 +108,7 @@ def _site_way(run: RunLog, solution: str, site: Site) -> DrivenWay:
     left_m = epochs["cross_track_m"].to_numpy()
     own = fixes.join(epochs.select("t"), on="t", how="right", maintain_order="right")
     own_m = np.nan_to_num(floats(own, "height_m"))
-    return DrivenWay(epochs["t"].to_physical().to_numpy(), s_m, left_m, own_m, _AT_POINT_M, axis, *places)
+    return DrivenPath(epochs["t"].to_physical().to_numpy(), s_m, left_m, own_m, _AT_POINT_M, axis, *places)
 
 
 # The survey is straight from point to point, so its course at a place is that of the segment there.

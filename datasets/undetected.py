@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tomli_w
 
-from pipeline.one_run import ride_alone
+from pipeline.one_run import monitor_alone
 from pipeline.studies.undetected.profile import FaultProfile, epoch_of, profile_at
 from schemas.config import Configuration, Vehicle
 from schemas.errors import OutputError
@@ -27,8 +27,8 @@ def largest_fault(
     behind: bool = False,
 ) -> FaultProfile:
     """The largest fault that no monitor would have noticed, at a balise, a time after the first epoch, or the end."""
-    ride = ride_alone(run, site, vehicle, config, solution)
-    return profile_at(ride, epoch_of(ride, balise, at_s), behind)
+    monitored = monitor_alone(run, site, vehicle, config, solution)
+    return profile_at(monitored, epoch_of(monitored, balise, at_s), behind)
 
 
 def sentence_of(found: FaultProfile) -> str:

@@ -9,12 +9,12 @@ import polars as pl
 
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.judge import Judged, judge
-from pipeline.stages.judge.judgement import Case
+from pipeline.stages.judge.judgement import JudgeInput
 from pipeline.stages.matching import Match
+from pipeline.stages.monitored import MonitoredSolution, monitor_solution
 from pipeline.stages.prepare import PreparedRun, prepare
-from pipeline.stages.ride import Ride, ride_of
 from pipeline.stages.run_row.lost_time import lost_columns
-from pipeline.stages.run_row.summary import SolutionResults, failed_row, ride_notes, summarise
+from pipeline.stages.run_row.summary import SolutionResults, failed_row, notes_of_replay, summarise
 from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, with_checks
 from pipeline.studies.plausibility.report import accuracy_checks, refuted
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
@@ -40,13 +40,13 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
     """
     prepared = prepare(run, site, vehicle or Vehicle(), config or Configuration(), clock_advice)
     evidence = prepared.evidence()
-    beside = _compared_with(prepared)
+    channel_match = _compared_with(prepared)
     errors: list[InputError] = []
     parts: list[Tables] = []
     # A solution at a time: of those done only the tables are kept.
     for solution in prepared.run.solutions():
         try:
-            parts.append(_of_solution(prepared, solution, beside, evidence))
+            parts.append(_of_solution(prepared, solution, channel_match, evidence))
         except InputError as error:
             # A receiver that never had a fix must not take the run's other solutions with it.
             errors.append(error)
@@ -58,14 +58,14 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
     return RunTables(run_id=run.run_id, **whole)
 
 
-def ride_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> Ride:
+def monitor_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> MonitoredSolution:
     """What the train made of one solution, without a judge: for studies of what the monitors could have seen."""
     if solution not in run.solutions():
         raise InputError("has no such solution", place=run.run_id, found=solution, expected=", ".join(run.solutions()))
     prepared = prepare(run, site, vehicle, config, clock_advice)
     required_fit(prepared, solution, vehicle)
     matches = _with_match(_compared_with(prepared), prepared, solution)
-    return ride_of(prepared, solution, matches, prepared.evidence())
+    return monitor_solution(prepared, solution, matches, prepared.evidence())
 
 
 def _compared_with(prepared: PreparedRun) -> Matches:
@@ -83,21 +83,21 @@ def _compared_with(prepared: PreparedRun) -> Matches:
         return {}
 
 
-def _with_match(beside: Matches, prepared: PreparedRun, solution: str) -> Matches:
-    return beside if solution in beside else {**beside, solution: prepared.match(solution)}
+def _with_match(channel_match: Matches, prepared: PreparedRun, solution: str) -> Matches:
+    return channel_match if solution in channel_match else {**channel_match, solution: prepared.match(solution)}
 
 
-def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence: TrainEvidence) -> Tables:
+def _of_solution(prepared: PreparedRun, solution: str, channel_match: Matches, evidence: TrainEvidence) -> Tables:
     """What the train made of one solution, what nobody would have noticed, and what the judge says of it.
 
     Raises `InputError` where the solution does not fit the run or lies on no track.
     """
     fit = required_fit(prepared, solution, prepared.vehicle)
-    ride = ride_of(prepared, solution, _with_match(beside, prepared, solution), evidence)
-    unnoticed = unnoticed_of(ride)
-    judged = judge(_case(ride, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
-    results = _results(ride, judged, unnoticed, fit, evidence)
-    epochs = judged.epochs.with_columns(*results.lost.columns(), ride.solution.fixes["satellites"])
+    monitored = monitor_solution(prepared, solution, _with_match(channel_match, prepared, solution), evidence)
+    unnoticed = unnoticed_of(monitored)
+    judged = judge(_case(monitored, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
+    results = _results(monitored, judged, unnoticed, fit, evidence)
+    epochs = judged.epochs.with_columns(*results.lost.columns(), monitored.solution.fixes["satellites"])
     tables = {
         "hazards": judged.hazards,
         "passages": judged.passages,
@@ -109,30 +109,34 @@ def _of_solution(prepared: PreparedRun, solution: str, beside: Matches, evidence
     return {name: conform(table, TABLES[name]) for name, table in tables.items()}
 
 
-def _case(ride: Ride, unnoticed: Undetected, evidence: TrainEvidence, leaps_s: Sequence[int]) -> Case:
+def _case(
+    monitored: MonitoredSolution, unnoticed: Undetected, evidence: TrainEvidence, leaps_s: Sequence[int]
+) -> JudgeInput:
     """The solution before the judge."""
-    replayed = ride.solution
-    run = ride.prepared.run
+    replayed = monitored.solution
+    run = monitored.prepared.run
     epochs = pl.concat([replayed.epochs, unnoticed.epochs], how="horizontal")
-    return Case(
+    return JudgeInput(
         solution=replace(replayed, epochs=epochs, passages=replayed.passages.with_columns(unnoticed.passages)),
         evidence=evidence,
-        odometry=ride.odometry,
-        vehicle=ride.prepared.vehicle,
-        config=ride.prepared.config,
+        odometry=monitored.odometry,
+        vehicle=monitored.prepared.vehicle,
+        config=monitored.prepared.config,
         reference=run.reference,
         faults=run.faults,
         leaps_s=tuple(leaps_s),
     )
 
 
-def _results(ride: Ride, judged: Judged, unnoticed: Undetected, fit: Fit, evidence: TrainEvidence) -> SolutionResults:
+def _results(
+    monitored: MonitoredSolution, judged: Judged, unnoticed: Undetected, fit: Fit, evidence: TrainEvidence
+) -> SolutionResults:
     """All that the `runs` row is made of."""
-    prepared = ride.prepared
+    prepared = monitored.prepared
     run = prepared.run
     accuracy = accuracy_checks(judged.epochs, run.faults, prepared.config)
     fit = with_checks(fit, accuracy)
-    counts = prepared.counts.solutions[ride.solution.name]
+    counts = prepared.counts.solutions[monitored.solution.name]
     odometry = prepared.odometry
     epochs = EpochFigures.of_table(judged.epochs)
     columns = {
@@ -143,10 +147,10 @@ def _results(ride: Ride, judged: Judged, unnoticed: Undetected, fit: Fit, eviden
         "out_of_order": counts.out_of_order,
         "odometer_contradicted": evidence.contradicted,
         "odometer_origin": None if odometry is None else odometry.origin,
-        "odometer_follows": prepared.follows_of(ride.solution.name).ratio,
-        "ambiguous_stretches": ride.match.ambiguous.height,
-        **ride.at_the_end(),
-        **ride.bank.white_noise(),
+        "odometer_follows": prepared.follows_of(monitored.solution.name).ratio,
+        "ambiguous_stretches": monitored.match.ambiguous.height,
+        **monitored.at_the_end(),
+        **monitored.bank.white_noise(),
         **unnoticed.figures(judged.epochs, prepared.config),
     }
     # What stands against a verdict whatever was judged (DOMAIN section 5.4).
@@ -161,13 +165,13 @@ def _results(ride: Ride, judged: Judged, unnoticed: Undetected, fit: Fit, eviden
         Reason.CLOCK_ASSUMED: evidence.clock_assumed,
     }
     return SolutionResults(
-        solution=ride.solution.name,
+        solution=monitored.solution.name,
         epochs=epochs,
         lost=lost_columns(epochs, prepared.config),
         judged=judged,
         columns=columns,
         ingest=run.notes,
-        notes=[*fit.notes, *ride_notes(ride, evidence)],
+        notes=[*fit.notes, *notes_of_replay(monitored, evidence)],
         reasons=[reason for reason, applies in against.items() if applies],
         anchored_ns=evidence.anchored_ns,
         clock_open_s=evidence.clock_open_s,

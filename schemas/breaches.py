@@ -38,7 +38,7 @@ _WORDS = {
 }
 
 
-def told(error: ValidationError, kind: type[BaseModel]) -> list[str]:
+def breach_messages(error: ValidationError, kind: type[BaseModel]) -> list[str]:
     """Every breach with its path: an unknown key with the nearest known one, else what was found and expected."""
     return [
         _unknown(breach, kind) if breach["type"] == "extra_forbidden" else _wrong(breach) for breach in error.errors()

@@ -17,7 +17,7 @@ from typing import Annotated, Self, TypeVar
 import tomli_w
 from pydantic import Field, ValidationError, model_validator
 
-from schemas.breaches import told
+from schemas.breaches import breach_messages
 from schemas.config_base import NonNegative, Number, Positive, Probability, Settings
 from schemas.config_ingest import (
     FixSigma,
@@ -156,7 +156,7 @@ def settings_from(
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(listed(told(error, kind)), place=place, remedy=remedy) from None
+        raise ConfigError(listed(breach_messages(error, kind)), place=place, remedy=remedy) from None
 
 
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){50}""")

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.results import Figure
 from pipeline.stages.odometry.regression import ScaleLag
-from pipeline.stages.odometry.scale_lag import CountedRows, scale_and_lag
+from pipeline.stages.odometry.scale_lag import CounterRows, scale_and_lag
 
 TICK_S = 0.02
 RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
@@ -31,7 +31,7 @@ class Drawn:
     begin_s: np.ndarray
     end_s: np.ndarray
     way_m: np.ndarray
-    counter: CountedRows
+    counter: CounterRows
     lag_s: float
     scale: float
 
@@ -122,7 +122,7 @@ def journey(rng: np.random.Generator, family: str, length_s: float) -> tuple[np.
 
 def counted(
     rng: np.random.Generator, t_s: np.ndarray, true_m: np.ndarray, speed: np.ndarray, scale: float, rate_hz: float
-) -> CountedRows:
+) -> CounterRows:
     """Rows of a counter that walks, slips unnoticed, and counts in steps."""
     moving = np.abs(speed) > 0.05
     walk = np.cumsum(np.where(moving, rng.normal(size=t_s.size), 0.0)) * float(rng.uniform(0.0, 0.05)) * np.sqrt(TICK_S)
@@ -138,7 +138,7 @@ def counted(
     step_m = float(rng.choice([0.0, 0.01, 0.05, 0.2, 0.5, 2.0]))
     if step_m:
         distance_m = np.floor(distance_m / step_m + float(rng.uniform(0.0, 1.0))) * step_m
-    return CountedRows(row_s, distance_m, np.zeros(row_s.size), step_m / np.sqrt(12.0))
+    return CounterRows(row_s, distance_m, np.zeros(row_s.size), step_m / np.sqrt(12.0))
 
 
 def noise(rng: np.random.Generator, t_s: np.ndarray) -> np.ndarray:

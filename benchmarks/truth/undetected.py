@@ -25,8 +25,8 @@ from datasets.inject import inject
 from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
-from pipeline.one_run import replay, ride_alone
-from pipeline.stages.ride import Ride
+from pipeline.one_run import monitor_alone, replay
+from pipeline.stages.monitored import MonitoredSolution
 from pipeline.studies.undetected.columns import rows_of, windows_of
 from pipeline.studies.undetected.profile import FaultProfile, profile_at
 from schemas.arrays import floats, times_ns
@@ -171,11 +171,11 @@ def proof(seed: int, curved: bool, folder: Path) -> Outcome | None:
     """
     trial, config = trial_of(seed, curved), _NOISE_GIVEN
     rng = np.random.default_rng([250, seed])
-    ride = ride_alone(trial.run, trial.site, trial.vehicle, config, "primary")
-    epoch = _some_epoch(ride, rng)
+    monitored = monitor_alone(trial.run, trial.site, trial.vehicle, config, "primary")
+    epoch = _some_epoch(monitored, rng)
     if epoch is None:
         return None
-    found = profile_at(ride, epoch, bool(rng.random() < 0.5))
+    found = profile_at(monitored, epoch, bool(rng.random() < 0.5))
     clean = replay(trial.run, trial.site, trial.vehicle, config).epochs
     once = _injected(trial, found, 1.0, folder)
     size_m = found.fault["size_m"][-1] * clean["direction"][epoch]
@@ -194,9 +194,9 @@ def proof(seed: int, curved: bool, folder: Path) -> Outcome | None:
     )
 
 
-def _some_epoch(ride: Ride, rng: np.random.Generator) -> int | None:
-    rows = rows_of(ride)
-    parts = windows_of(ride, rows)
+def _some_epoch(monitored: MonitoredSolution, rng: np.random.Generator) -> int | None:
+    rows = rows_of(monitored)
+    parts = windows_of(monitored, rows)
     if not parts:
         return None
     chosen = parts[int(rng.integers(len(parts)))]

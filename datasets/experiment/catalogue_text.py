@@ -29,7 +29,7 @@ def catalogue_page(faults: pl.DataFrame, monitors: pl.DataFrame) -> str:
         "",
         "## What no monitor sees in most replays",
         "",
-        *_unseen(real),
+        *_undetected_lines(real),
         "",
         "## What each monitor beyond the bank of averages is for",
         "",
@@ -77,7 +77,7 @@ def _percent(value: object) -> str:
     return "-" if value is None else f"{value:.1%}"
 
 
-def _unseen(faults: pl.DataFrame) -> list[str]:
+def _undetected_lines(faults: pl.DataFrame) -> list[str]:
     lines = []
     for row in faults.filter(pl.col("detected") < 0.5).iter_rows(named=True):
         harm = f"unsafe in {row['runs_with_unsafe']} of {row['runs']}" if row["runs_with_unsafe"] else "nothing unsafe"

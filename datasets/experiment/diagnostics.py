@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from datasets.experiment.geometry import CONSTELLATIONS, Geometry, default_geometry
-from datasets.experiment.passage import NEVER, FirstPassages, first_passages, joined
+from datasets.experiment.passage import NEVER, FirstPassages, concat_passages, first_passages
 from datasets.experiment.plan import ExperimentPlan, bank_forms, failure_forms
 from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
@@ -54,7 +54,7 @@ def run_diagnostics(repetitions: int = REPETITIONS, seed: int = 1, jobs: int = 1
 def simulate(plans: tuple[ExperimentPlan, ...], repetitions: int, seed: int, jobs: int) -> list[FirstPassages]:
     """First passages of every plan; the same for any number of jobs."""
     return [
-        joined(in_pieces(partial(passages_of, plan), repetitions, _BLOCK_REPETITIONS, (seed, number), jobs))
+        concat_passages(in_pieces(partial(passages_of, plan), repetitions, _BLOCK_REPETITIONS, (seed, number), jobs))
         for number, plan in enumerate(plans)
     ]
 

@@ -142,7 +142,7 @@ def alarm_rate(spec: BankSpec, runs: int, seed: int = 1, jobs: int = 1) -> Row:
     """
     bank = linear_bank(default_geometry("gps"), 30.0, spec)
     counted = spec.false_alarm_probability >= min(PROBABILITIES)
-    value, low, high = _counted(bank, runs, seed, jobs) if counted else _sampled(bank, runs, seed, jobs)
+    value, low, high = _count_alarms(bank, runs, seed, jobs) if counted else _sampled(bank, runs, seed, jobs)
     return {
         "sensors": spec.sensors,
         "white_track": spec.map_m > _STEADY_TRACK_M,
@@ -157,7 +157,7 @@ def alarm_rate(spec: BankSpec, runs: int, seed: int = 1, jobs: int = 1) -> Row:
     }
 
 
-def _counted(bank: LinearBank, runs: int, seed: int, jobs: int) -> tuple[float | None, ...]:
+def _count_alarms(bank: LinearBank, runs: int, seed: int, jobs: int) -> tuple[float | None, ...]:
     """Alarms per hour and their bounds."""
     episodes = sum(in_pieces(partial(_episodes, bank), runs, 100, (seed, 54), jobs))
     rate = poisson_rate(episodes, runs * _HORIZON_S / 3600.0)

@@ -50,7 +50,7 @@ class FirstPassages(NamedTuple):
 P = TypeVar("P", bound=tuple[npt.NDArray[np.generic], ...])
 
 
-def joined(parts: list[P]) -> P:
+def concat_passages(parts: list[P]) -> P:
     """Passages of further repetitions, in order; those are the last axis of every array."""
     return type(parts[0])(*(np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True)))
 

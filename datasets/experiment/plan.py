@@ -93,9 +93,9 @@ def bank_forms(plan: ExperimentPlan) -> Forms:
         if "odometer_and_track" in plan.sensors:
             axis = plan.geometry.axes(heading)[1]
             signals = {"east": axis[0], "north": axis[1], "map_cross": -plan.map_m}
-            forms += _beside(plan, f"cross_{heading:g}", axis, signals, heading)
+            forms += _forms_against_map(plan, f"cross_{heading:g}", axis, signals, heading)
     if "odometer_and_track" in plan.sensors:
-        forms += _beside(plan, "up", np.array([0.0, 0.0, 1.0]), {"up": 1.0}, None)
+        forms += _forms_against_map(plan, "up", np.array([0.0, 0.0, 1.0]), {"up": 1.0}, None)
     rows, alpha, sigma, slope, members, names = zip(*forms, strict=True)
     return Forms(
         np.array(rows),
@@ -144,7 +144,7 @@ def _along(plan: ExperimentPlan, heading: float, reading: Reading) -> list[_Form
     return [_form(plan, name, axis, alpha, signals, white, members) for alpha in plan.banks[reading]]
 
 
-def _beside(
+def _forms_against_map(
     plan: ExperimentPlan, name: str, axis: Floats, signals: dict[str, float], heading: float | None
 ) -> list[_Form]:
     """Across the track, or in height at any heading: against the map."""

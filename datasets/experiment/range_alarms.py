@@ -27,7 +27,7 @@ def range_alarms(probabilities: tuple[float, ...], epochs: int, seed: int, jobs:
     """One row per constellation, heading, survey and probability; the epochs are drawn independently."""
     rows: list[Row] = []
     for number, constellation in enumerate(CONSTELLATIONS):
-        count = partial(_counted, constellation, probabilities)
+        count = partial(_count_alarms, constellation, probabilities)
         counts = np.sum(in_pieces(count, epochs, _BLOCK, (seed, 53, number), jobs), axis=0)
         plan = RangePlan(default_geometry(constellation))
         for h, s, p in np.ndindex(counts.shape):
@@ -51,7 +51,7 @@ def range_alarms(probabilities: tuple[float, ...], epochs: int, seed: int, jobs:
     return table(rows)
 
 
-def _counted(
+def _count_alarms(
     constellation: Constellation, probabilities: tuple[float, ...], epochs: int, rng: np.random.Generator
 ) -> Ints:
     """Epochs beyond each limit, (headings, surveys, probabilities)."""

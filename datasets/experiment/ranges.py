@@ -16,7 +16,7 @@ import polars as pl
 from scipy.special import chdtri
 
 from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, default_geometry
-from datasets.experiment.passage import joined
+from datasets.experiment.passage import concat_passages
 from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows
@@ -159,7 +159,7 @@ def run_ranges(
     rows = []
     for number, plan in enumerate(plans):
         pieces = in_pieces(partial(range_passages, plan), repetitions, _BLOCK_REPETITIONS, (seed, 77, number), jobs)
-        found = joined(pieces)
+        found = concat_passages(pieces)
         rows += [
             _row(plan, heading, rate, found.detected_s[h, r], found.failed_first[h, r])
             for h, heading in enumerate(plan.headings_deg)

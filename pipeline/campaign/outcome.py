@@ -117,11 +117,11 @@ def outcome_of(
         why=_why(runs, verdict),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(log),
-        **_beside(runs, verdict, low),
+        **_figures_beside_verdict(runs, verdict, low),
     )
 
 
-def _beside(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
+def _figures_beside_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
     """What stands beside the verdict, of the solution that heads the run; nothing where all failed."""
     if verdict is None:
         return {}

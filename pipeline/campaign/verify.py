@@ -25,7 +25,7 @@ from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.packing import not_as_marked
 from pipeline.results.software import software_digest
-from pipeline.results.workers import tell, told
+from pipeline.results.workers import tell, with_progress
 from pipeline.storage.address import Address, join
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.enums import RunStatus
@@ -216,7 +216,7 @@ def _unpacked(out: Address, there: Mapping[str, Any]) -> tuple[list[Problem], tu
     """
     problems: list[Problem] = []
     unlike: tuple[NotCompared, ...] = ()
-    for pack in told(packs.listed(out)):
+    for pack in with_progress(packs.listed(out)):
         for run, table in not_as_marked(out, pack):
             if there[run]["software_digest"] == software_digest():
                 problems.append((f"run {run}, {table} in its pack", "other rows", "those of its marker"))

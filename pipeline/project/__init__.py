@@ -6,6 +6,7 @@ Touches files; what each step does is done by the door whose command it is (`mak
 
 - Where does a project stand, what do its paths mean, which options do other commands take from it? `opened`.
 - What is up to date? `made`. One run of its logs: `convert`. All steps, in order: `run`.
-- Which stream does a log feed, which logs are of one ride, what has to be corrected? `looking`, `rides`, `trial`.
+- Which stream does a log feed, which logs are of one run, what has to be corrected? `looking`, `recorded_runs`,
+  `trial`.
 - What lies in a folder? `found`. How is the file written? `draft`.
 """

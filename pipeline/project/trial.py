@@ -18,7 +18,7 @@ from pipeline.project.convert import Recordings, run_of_logs
 from pipeline.project.found import Kind, is_one_log, is_prose, is_site, logs_below, look_around, require_name
 from pipeline.project.looking import SeenLog, look_at, look_at_dates
 from pipeline.project.opened import Opened, named_from
-from pipeline.project.rides import Ride, rides_of, stem_of
+from pipeline.project.recorded_runs import RecordedRun, group_into_runs, stem_of
 from pipeline.project.run import wish_for
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected_further
@@ -91,8 +91,8 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     logs, unread = _looked_at(wanted, base.given_config().ingest, recordings, remarks)
     remarks += _passed_over(wanted)
     remarks += [f"{log.path.name}: {text}" for log in logs for text in log.assumed]
-    rides, alone = rides_of(logs, [path.absolute() for path in wanted.references])
-    if not rides and logs:
+    recorded_runs, alone = group_into_runs(logs, [path.absolute() for path in wanted.references])
+    if not recorded_runs and logs:
         # Why the log that does could not be read is what has to be mended.
         raise InputError(
             "no log holds positions",
@@ -102,9 +102,9 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
         )
     remarks += [_unused(log) for log in alone]
     parts = tuple(part for log in logs for part in log.parts)
-    drafted = Drafted(base, _table_of(rides), [], remarks + lines_of_parts(parts), parts)
-    drafted.remarks += _without_odometer(rides)
-    drafted.remarks += [note for ride in rides for note in _notes_of(ride)]
+    drafted = Drafted(base, _table_of(recorded_runs), [], remarks + lines_of_parts(parts), parts)
+    drafted.remarks += _without_odometer(recorded_runs)
+    drafted.remarks += [note for recorded_run in recorded_runs for note in _notes_of(recorded_run)]
     site = _site(base)
     if site is not None:
         listed = "`balise inspect` of the site lists them"
@@ -112,12 +112,12 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     entries = []
     ready = []
     of_odometers: dict[str, Sequence[str]] = {}
-    for ride in rides:
-        proposal, entry, report = _checked(ride, base, site, recordings, wanted.day, accept)
-        of_odometers[ride.run_id] = report.of_odometers()
+    for recorded_run in recorded_runs:
+        proposal, entry, report = _checked(recorded_run, base, site, recordings, wanted.day, accept)
+        of_odometers[recorded_run.run_id] = report.of_odometers()
         drafted.proposals += [proposal] if proposal else []
-        if ride.is_ready and proposal is None:
-            ready.append(named_from(ride.logs[0].path, folder))
+        if recorded_run.is_ready and proposal is None:
+            ready.append(named_from(recorded_run.logs[0].path, folder))
         else:
             entries.append(entry)
     drafted.remarks += _of_all(of_odometers)
@@ -245,61 +245,68 @@ def _unused(log: SeenLog) -> str:
     )
 
 
-def _without_odometer(rides: Sequence[Ride]) -> list[str]:
-    bare = [ride.run_id for ride in rides if not any("odometer" in log.spans for log in ride.logs)]
-    which = "no run has an odometer" if len(bare) == len(rides) else f"without odometer: {', '.join(bare)}"
+def _without_odometer(recorded_runs: Sequence[RecordedRun]) -> list[str]:
+    bare = [
+        recorded_run.run_id
+        for recorded_run in recorded_runs
+        if not any("odometer" in log.spans for log in recorded_run.logs)
+    ]
+    which = "no run has an odometer" if len(bare) == len(recorded_runs) else f"without odometer: {', '.join(bare)}"
     return [f"{which}; nothing is monitored along the track"] if bare else []
 
 
-def _notes_of(ride: Ride) -> list[str]:
-    if len(ride.receivers) < 2:
+def _notes_of(recorded_run: RecordedRun) -> list[str]:
+    if len(recorded_run.receivers) < 2:
         return []
-    names = ", ".join(f"{files[0].path.name} ({_solution(ride, files)})" for files in ride.receivers)
-    fixed = [files[0].path for files in ride.receivers if files[0].mostly_fixed and not ride.references]
+    names = ", ".join(f"{files[0].path.name} ({_solution(recorded_run, files)})" for files in recorded_run.receivers)
+    fixed = [files[0].path for files in recorded_run.receivers if files[0].mostly_fixed and not recorded_run.references]
     return [
-        f"{ride.run_id}: receivers of the same time, each a solution of its own: {names}",
-        *(f"{ride.run_id}: {path.name} is RTK-fixed; if it is the truth, add --reference {path}" for path in fixed),
+        f"{recorded_run.run_id}: receivers of the same time, each a solution of its own: {names}",
+        *(
+            f"{recorded_run.run_id}: {path.name} is RTK-fixed; if it is the truth, add --reference {path}"
+            for path in fixed
+        ),
     ]
 
 
-def _solution(ride: Ride, files: Sequence[SeenLog]) -> str:
+def _solution(recorded_run: RecordedRun, files: Sequence[SeenLog]) -> str:
     """The first receiver is `primary`, others are named after their logs."""
-    place = next(number for number, other in enumerate(ride.receivers) if other is files)
-    stems = [stem_of(others[0].path) for others in ride.receivers]
+    place = next(number for number, other in enumerate(recorded_run.receivers) if other is files)
+    stems = [stem_of(others[0].path) for others in recorded_run.receivers]
     if place == 0:
         return "primary"
     return stems[place] if stems.count(stems[place]) == 1 else f"{stems[place]}_{place + 1}"
 
 
-def _entry(ride: Ride, folder: Path, day: date | None) -> ConvertEntry:
+def _entry(recorded_run: RecordedRun, folder: Path, day: date | None) -> ConvertEntry:
     logs: list[dict[str, Any]] = []
-    for files in ride.receivers:
-        name = _solution(ride, files)
+    for files in recorded_run.receivers:
+        name = _solution(recorded_run, files)
         # A log of several solutions has their names itself.
         own = {} if name == "primary" else {"solution": name}
         logs.append({"files": [log.path for log in files], **own, **files[0].mapping})
-    logs += [{"files": [log.path], "stream": "reference", **log.mapping} for log in ride.references]
-    logs += [{"files": [log.path], **log.mapping} for log in ride.others]
+    logs += [{"files": [log.path], "stream": "reference", **log.mapping} for log in recorded_run.references]
+    logs += [{"files": [log.path], **log.mapping} for log in recorded_run.others]
     for log in logs:
         if day is not None and any(path.suffix.lower() not in (".csv", ".mcap") for path in log["files"]):
             log["date"] = day
         log["files"] = [named_from(path, folder) for path in log["files"]]
     # A run that lies where converted ones go is not overwritten by its correction.
-    home = "converted" if folder / "runs" / ride.run_id in [log.path for log in ride.logs] else "runs"
-    return settings_from({"to": f"{home}/{ride.run_id}", "logs": logs}, ConvertEntry, str(folder / FILE_NAME))
+    home = "converted" if folder / "runs" / recorded_run.run_id in [log.path for log in recorded_run.logs] else "runs"
+    return settings_from({"to": f"{home}/{recorded_run.run_id}", "logs": logs}, ConvertEntry, str(folder / FILE_NAME))
 
 
 def _checked(
-    ride: Ride, base: Opened, site: Site | None, recordings: Recordings, day: date | None, accept: Accept
+    recorded_run: RecordedRun, base: Opened, site: Site | None, recordings: Recordings, day: date | None, accept: Accept
 ) -> tuple[Proposal | None, ConvertEntry, FitReport]:
     """What mends a ride whose streams do not fit each other, the ride with it where that is accepted, and how it fits
     then.
     """
     config = base.given_config()
     vehicle = base.given_vehicle()
-    entry = _entry(ride, base.folder, day)
-    if ride.is_ready:
-        run = read_run(ride.logs[0].path, config.ingest, with_digest=False)
+    entry = _entry(recorded_run, base.folder, day)
+    if recorded_run.is_ready:
+        run = read_run(recorded_run.logs[0].path, config.ingest, with_digest=False)
     else:
         run = run_of_logs(base, entry, config.ingest, config.fix_sigma, recordings).run
     corrections: list[StreamCorrection] = []
@@ -309,7 +316,7 @@ def _checked(
         proposed = _corrections_of(report)
         if not proposed:
             break
-        fresh, log = _by_recorder(proposed, ride, report)
+        fresh, log = _by_recorder(proposed, recorded_run, report)
         sentences = _sentences(report)
         if log is not None:
             mine = say("misfit_places", "rather_in_stream", log.path.name, "GNSS")
@@ -319,8 +326,8 @@ def _checked(
         run = corrected_further(run, fresh)
     if not corrections:
         return None, entry, report
-    accepted = accept(ride.run_id, found, corrections)
-    proposal = Proposal(ride.run_id, tuple(found), tuple(corrections), accepted)
+    accepted = accept(recorded_run.run_id, found, corrections)
+    proposal = Proposal(recorded_run.run_id, tuple(found), tuple(corrections), accepted)
     return proposal, entry.model_copy(update={"correct": tuple(corrections)}) if accepted else entry, report
 
 
@@ -345,18 +352,24 @@ def _corrections_of(report: FitReport) -> list[StreamCorrection]:
 
 
 def _by_recorder(
-    proposed: list[StreamCorrection], ride: Ride, report: FitReport
+    proposed: list[StreamCorrection], recorded_run: RecordedRun, report: FitReport
 ) -> tuple[list[StreamCorrection], SeenLog | None]:
     """The same for all streams of one log, which have one clock; and that log, where its clock and not the GNSS's is
     corrected: what a receiver sends is never a time zone off.
     """
-    shared = [log for log in ride.others if len(log.spans) > 1]
+    shared = [log for log in recorded_run.others if len(log.spans) > 1]
     if len(shared) != 1:
         return proposed, None
     log = shared[0]
     shift_s = next((one.shift_s for one in proposed if one.stream == "gnss"), 0.0)
-    of_receivers = not any(other.mapping or other.is_run for files in ride.receivers for other in files)
-    if shift_s and shift_s % _ZONES_S == 0.0 and of_receivers and len(ride.others) == 1 and not ride.references:
+    of_receivers = not any(other.mapping or other.is_run for files in recorded_run.receivers for other in files)
+    if (
+        shift_s
+        and shift_s % _ZONES_S == 0.0
+        and of_receivers
+        and len(recorded_run.others) == 1
+        and not recorded_run.references
+    ):
         kept = [one for one in proposed if one.stream not in ("gnss", "satellites")]
         return [*kept, *(_shifted(name, -shift_s) for name in log.spans)], log
     shifts = [one.shift_s for one in proposed if one.shift_s and one.stream in log.spans]
@@ -390,13 +403,13 @@ def _site(base: Opened) -> Site | None:
     return read_site(named, config.site) if Path(named).exists() else None
 
 
-def _table_of(rides: Sequence[Ride]) -> pl.DataFrame:
+def _table_of(recorded_runs: Sequence[RecordedRun]) -> pl.DataFrame:
     columns = ("run_id", "log", "feeds", "rows", "from", "to")
     rows = []
-    for ride in rides:
-        for log in ride.logs:
+    for recorded_run in recorded_runs:
+        for log in recorded_run.logs:
             for stream, span in log.spans.items():
-                feeds = "reference" if log in ride.references and stream == "gnss" else stream
+                feeds = "reference" if log in recorded_run.references and stream == "gnss" else stream
                 start, end = (f"{time:%Y-%m-%d %H:%M:%S}" for time in (span.start, span.end))
-                rows.append((ride.run_id, log.path.name, feeds, str(span.rows), start, end))
+                rows.append((recorded_run.run_id, log.path.name, feeds, str(span.rows), start, end))
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row").cast({"rows": pl.Int64})

@@ -25,10 +25,10 @@ _THREADS = (
 
 def mapped(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> list[R]:
     """`function` of every task; `jobs` processes, or this one for a single job or task."""
-    return [result for _, result in zip(told(tasks), each(function, tasks, jobs), strict=True)]
+    return [result for _, result in zip(with_progress(tasks), each(function, tasks, jobs), strict=True)]
 
 
-def told(items: Collection[T]) -> Iterator[T]:
+def with_progress(items: Collection[T]) -> Iterator[T]:
     """The items, one after the other; whoever watches hears how many of how many are done."""
     for done, item in enumerate(items, start=1):
         yield item
@@ -42,7 +42,7 @@ def tell(done: int, total: int) -> None:
 
 @contextmanager
 def watched(progress: Callable[[int, int], None] | None) -> Iterator[None]:
-    """Tell how many of how many tasks of each `mapped`, and items of each `told` inside are done."""
+    """Tell how many of how many tasks of each `mapped`, and items of each `with_progress` inside are done."""
     before = _PROGRESS.set(progress)
     try:
         yield

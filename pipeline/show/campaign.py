@@ -49,13 +49,13 @@ def ending_rows(summary: CampaignSummary) -> pl.DataFrame:
     ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
     names = ("verdict", "run_id", "accepted", "available", "margin", "why", "faults")
     rows = [
-        (word_of(outcome.verdict), outcome.run_id, *_beside(outcome), _reason(outcome), _few(outcome.faults))
+        (word_of(outcome.verdict), outcome.run_id, *_outcome_figures(outcome), _reason(outcome), _few(outcome.faults))
         for outcome in ranked
     ]
     return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")
 
 
-def _beside(outcome: RunOutcome) -> tuple[str, str, str]:
+def _outcome_figures(outcome: RunOutcome) -> tuple[str, str, str]:
     """Balises accepted of those on the path, availability, proof margin."""
     if outcome.verdict is None:
         return "-", "-", "-"

@@ -301,12 +301,12 @@ class GroupedFile:
         """Of a table that was read of these groups the rows of the spans, which are in order and apart."""
         begins = np.cumsum([0, *(self._starts[number + 1] - self._starts[number] for number in groups)])
         before = {number: int(self._starts[number] - begins[place]) for place, number in enumerate(groups)}
-        asked = [(span, before[self._groups(span)[0]]) for span in _joined(spans)]
+        asked = [(span, before[self._groups(span)[0]]) for span in _merge_spans(spans)]
         parts = [table.slice(first - left_out, end - first) for (first, end), left_out in asked]
         return pa.concat_tables(parts) if parts else table.slice(0, 0)
 
 
-def _joined(spans: Sequence[Span]) -> list[Span]:
+def _merge_spans(spans: Sequence[Span]) -> list[Span]:
     """Spans that follow one another without a gap as one; empty ones left out."""
     joined: list[Span] = []
     for first, end in spans:

@@ -10,7 +10,7 @@ import pytest
 
 import cli
 from pipeline.project.looking import SeenLog, StreamSpan, look_at_dates
-from pipeline.project.rides import rides_of
+from pipeline.project.recorded_runs import group_into_runs
 from schemas.config import IngestConfig, StreamCorrection
 from schemas.project import Project, load_project
 from tests.conftest import SmallTrial
@@ -42,25 +42,25 @@ def log(name: str, begin_min: float, end_min: float, stream: str = "gnss") -> Se
         ),
     ],
 )
-def test_logs_of_one_ride(logs: list[SeenLog], rides: list[list[str]]) -> None:
-    found, alone = rides_of(logs, [])
+def test_logs_of_one_ride(logs: list[SeenLog], recorded_runs: list[list[str]]) -> None:
+    found, alone = group_into_runs(logs, [])
     assert alone == []
     told = [
-        ["+".join(file.path.name for file in files) for files in ride.receivers]
-        + [other.path.name for other in ride.others]
-        for ride in found
+        ["+".join(file.path.name for file in files) for files in recorded_run.receivers]
+        + [other.path.name for other in recorded_run.others]
+        for recorded_run in found
     ]
-    assert told == rides
+    assert told == recorded_runs
 
 
 def test_a_log_of_no_ride_is_told() -> None:
-    _, alone = rides_of([log("a.ubx", 0, 1), log("b.ubx", 90, 91), log("o.csv", 30, 31, "odometer")], [])
+    _, alone = group_into_runs([log("a.ubx", 0, 1), log("b.ubx", 90, 91), log("o.csv", 30, 31, "odometer")], [])
     assert [one.path.name for one in alone] == ["o.csv"]
 
 
 def test_logs_of_one_name_have_ids_of_their_own() -> None:
-    found, _ = rides_of([log("/x/mon/log.ubx", 0, 1), log("/x/tue/log.ubx", 90, 91)], [])
-    assert [ride.run_id for ride in found] == ["mon_log", "tue_log"]
+    found, _ = group_into_runs([log("/x/mon/log.ubx", 0, 1), log("/x/tue/log.ubx", 90, 91)], [])
+    assert [recorded_run.run_id for recorded_run in found] == ["mon_log", "tue_log"]
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ import polars as pl
 
 from datasets.experiment.recorded.plan import Bank
 from datasets.inject import Recording
-from pipeline.one_run import ride_alone
-from pipeline.stages.epochs.clock import Clock, met, unambiguous
+from pipeline.one_run import monitor_alone
+from pipeline.stages.epochs.clock import Clock, holds, unambiguous
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.judge import Judged, judge
-from pipeline.stages.judge.judgement import Case
+from pipeline.stages.judge.judgement import JudgeInput
+from pipeline.stages.monitored import MonitoredSolution
 from pipeline.stages.prepare import require_independent_odometer
-from pipeline.stages.ride import Ride
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Judgement, LeftOut, OwnError
@@ -38,7 +38,7 @@ class Baseline:
     run: RunLog
     site: Site
     bank: Bank
-    ride: Ride
+    monitored: MonitoredSolution
     evidence: TrainEvidence
     epochs: pl.DataFrame
     alarms: pl.DataFrame
@@ -46,7 +46,7 @@ class Baseline:
 
     @property
     def solution(self) -> str:
-        return self.ride.solution.name
+        return self.monitored.solution.name
 
     @property
     def config(self) -> Configuration:
@@ -87,19 +87,19 @@ class Baseline:
     def watched(self) -> Bools:
         """Some monitor had a verdict."""
         states = pl.any_horizontal(pl.col(r"^.*_state$").cast(pl.String).is_in(["pass", "fail"]))
-        return met(self.epochs, states)
+        return holds(self.epochs, states)
 
     def left_out(self, quiet_s: float) -> Ints:
         """Per epoch the reason (number in `LeftOut`) why no fault begins there, -1 where one may."""
         after_gap = np.diff(self.t_ns, prepend=self.t_ns[:1]) > self.clock.limit_s * NS_PER_S
         doubtful = np.zeros(self.t_ns.size, dtype=bool)
         if self.own_error is OwnError.MEASURED:
-            doubtful = ~met(self.epochs, pl.col("judgement") == Judgement.RIGHT.value)
+            doubtful = ~holds(self.epochs, pl.col("judgement") == Judgement.RIGHT.value)
         reason = np.full(self.t_ns.size, -1)
         for why, where in (
             (LeftOut.NOT_RIGHT, doubtful),
             (LeftOut.NO_TVB, ~flags(self.epochs, "tvb") | after_gap),
-            (LeftOut.AMBIGUOUS, ~met(self.epochs, unambiguous()) & floats_known(self.epochs, "path_m")),
+            (LeftOut.AMBIGUOUS, ~holds(self.epochs, unambiguous()) & floats_known(self.epochs, "path_m")),
             (LeftOut.ALARM, self.alarming),
         ):
             reason[where] = _REASONS.index(why)
@@ -107,7 +107,7 @@ class Baseline:
 
     def satellites_at(self, t_ns: int) -> list[str]:
         """Satellites used at this epoch, in order of name."""
-        ranges = self.ride.prepared.ranges(self.solution)
+        ranges = self.monitored.prepared.ranges(self.solution)
         if ranges is None:
             return []
         stamp = pl.lit(t_ns).cast(pl.Datetime("ns", "UTC"))
@@ -116,7 +116,7 @@ class Baseline:
     @cached_property
     def has_ranges(self) -> bool:
         """Satellites stand beside nearly all positions, so that a range fault can move them."""
-        ranges = self.ride.prepared.ranges(self.solution)
+        ranges = self.monitored.prepared.ranges(self.solution)
         if ranges is None or ranges.is_empty():
             return False
         return float(np.isin(self.t_ns, times_ns(ranges)).mean()) >= _RANGES_BESIDE
@@ -146,15 +146,17 @@ def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution:
             found=f"{run.faults.height} rows",
             expected="a run as it was recorded",
         )
-    ride = ride_alone(run, site, vehicle, bank.config, solution)
+    monitored = monitor_alone(run, site, vehicle, bank.config, solution)
     # Along the track the experiment would measure how well the positions agree with themselves, or nothing at all.
-    require_independent_odometer(ride.prepared)
-    evidence = ride.prepared.evidence()
-    judged = _judged(ride, evidence)
-    return Baseline(run, site, bank, ride, evidence, judged.epochs, judged.alarms, Recording(run, site))
+    require_independent_odometer(monitored.prepared)
+    evidence = monitored.prepared.evidence()
+    judged = _judged(monitored, evidence)
+    return Baseline(run, site, bank, monitored, evidence, judged.epochs, judged.alarms, Recording(run, site))
 
 
-def _judged(ride: Ride, evidence: TrainEvidence) -> Judged:
-    prepared = ride.prepared
+def _judged(monitored: MonitoredSolution, evidence: TrainEvidence) -> Judged:
+    prepared = monitored.prepared
     reference = prepared.run.reference
-    return judge(Case(ride.solution, evidence, ride.odometry, prepared.vehicle, prepared.config, reference))
+    return judge(
+        JudgeInput(monitored.solution, evidence, monitored.odometry, prepared.vehicle, prepared.config, reference)
+    )

@@ -58,7 +58,7 @@ _LOST_KEY = "balise.lost"
 _LOST = {"bank": pl.String, "cell": pl.String, "reason": pl.String}
 
 
-def _silent(text: str) -> None:
+def _ignore(text: str) -> None:
     """Nobody listens."""
 
 
@@ -133,7 +133,7 @@ def recorded_experiment(
     per_cell: int | None,
     solution: str,
     jobs: int,
-    say: Callable[[str], None] = _silent,
+    say: Callable[[str], None] = _ignore,
 ) -> Made:
     """Run the experiment; what is in `out` of the same inputs is not made again. Writes tables, pictures and a page.
 

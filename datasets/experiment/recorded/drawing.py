@@ -105,21 +105,23 @@ def _curve(curve: Curve, x: Axis, y: Axis) -> list[str]:
     if curve.band:
         lows = [(_across(x, px), _up(y, low)) for (px, _), (low, _) in zip(curve.points, curve.band, strict=True)]
         highs = [(_across(x, px), _up(y, high)) for (px, _), (_, high) in zip(curve.points, curve.band, strict=True)]
-        parts.append(f'<polygon points="{_joined([*lows, *reversed(highs)])}" fill="{curve.colour}" opacity="0.06"/>')
+        parts.append(
+            f'<polygon points="{_svg_points([*lows, *reversed(highs)])}" fill="{curve.colour}" opacity="0.06"/>'
+        )
     dash = ' stroke-dasharray="6 4"' if curve.dashed else ""
     parts.append(
-        f'<polyline points="{_joined(at)}" fill="none" stroke="{curve.colour}" stroke-width="1.6"{dash}>'
+        f'<polyline points="{_svg_points(at)}" fill="none" stroke="{curve.colour}" stroke-width="1.6"{dash}>'
         f"<title>{escape(curve.name)}</title></polyline>"
     )
     for px, py in curve.marks:
         left = _across(x, px)
         top = _up(y, py)
         corners = [(left - 5, top + 4), (left + 5, top + 4), (left, top - 5)]
-        parts.append(f'<polygon points="{_joined(corners)}" fill="#ffffff" stroke="{curve.colour}"/>')
+        parts.append(f'<polygon points="{_svg_points(corners)}" fill="#ffffff" stroke="{curve.colour}"/>')
     return parts
 
 
-def _joined(points: Sequence[Point]) -> str:
+def _svg_points(points: Sequence[Point]) -> str:
     return " ".join(f"{px:.1f},{py:.1f}" for px, py in points)
 
 

@@ -10,8 +10,8 @@ from datasets.experiment.recorded.baseline import Baseline
 from datasets.experiment.recorded.draw import Onset
 from datasets.faults import FaultKind, FaultSpec
 from datasets.inject import inject
+from pipeline.stages.monitored import MonitoredSolution, monitor_solution
 from pipeline.stages.prepare import PreparedRun, prepare
-from pipeline.stages.ride import Ride, ride_of
 from pipeline.studies.plausibility.fit import clock_advice
 from schemas.arrays import NS_PER_S
 from schemas.errors import InputError
@@ -24,7 +24,7 @@ class Injected:
     """The fault as a fault file of `balise inject` would hold it, and what the train made of it."""
 
     fault: FaultSpec
-    ride: Ride
+    monitored: MonitoredSolution
     end_ns: int
 
 
@@ -38,7 +38,7 @@ def injected(base: Baseline, onset: Onset) -> Injected:
     # The monitor that compares two solutions needs both.
     named = (base.solution, base.config.monitors.channel_reference)
     matches = {name: faulty.match(name) for name in faulty.run.solutions() if name in named}
-    return Injected(fault, ride_of(faulty, base.solution, matches, base.evidence), end_ns)
+    return Injected(fault, monitor_solution(faulty, base.solution, matches, base.evidence), end_ns)
 
 
 def _satellite(base: Baseline, onset: Onset) -> str:
@@ -50,21 +50,21 @@ def _satellite(base: Baseline, onset: Onset) -> str:
 
 def _gnss_hit(base: Baseline, fault: FaultSpec, begin_ns: int, end_ns: int) -> PreparedRun:
     """Positions and ranges as cleaned, the fault added from its first epoch on; odometer and reads as they were."""
-    run = base.ride.prepared.run
+    run = base.monitored.prepared.run
     # A late position is one of before the fault.
     from_ns = base.recording.first_ns if fault.kind is FaultKind.LATENCY else begin_ns
     tail = run.with_streams(gnss=_between(run.gnss, from_ns, end_ns), satellites=_cut(run.satellites, begin_ns, end_ns))
     hit = inject(tail, fault, base.site, base.recording)
     streams = {
         "gnss": pl.concat([_before(run.gnss, begin_ns), _between(hit.gnss, begin_ns, end_ns)]),
-        "satellites": None if run.satellites is None else _joined(run.satellites, hit.satellites, begin_ns),
+        "satellites": None if run.satellites is None else _append_hit(run.satellites, hit.satellites, begin_ns),
     }
-    return replace(base.ride.prepared, run=run.with_streams(**streams))
+    return replace(base.monitored.prepared, run=run.with_streams(**streams))
 
 
 def _odometer_hit(base: Baseline, fault: FaultSpec, end_ns: int) -> PreparedRun:
     """All odometers with the fault; positions as recorded, to the end of the watch."""
-    prepared = base.ride.prepared
+    prepared = base.monitored.prepared
     first_ns = base.recording.first_ns
     hit = inject(base.run, fault, base.site, base.recording)
     cut = RunLog.with_streams(
@@ -73,7 +73,7 @@ def _odometer_hit(base: Baseline, fault: FaultSpec, end_ns: int) -> PreparedRun:
     return prepare(cut, base.site, prepared.vehicle, prepared.config, clock_advice)
 
 
-def _joined(recorded: pl.DataFrame, hit: pl.DataFrame | None, begin_ns: int) -> pl.DataFrame:
+def _append_hit(recorded: pl.DataFrame, hit: pl.DataFrame | None, begin_ns: int) -> pl.DataFrame:
     before = _before(recorded, begin_ns)
     return before if hit is None else pl.concat([before, hit])
 

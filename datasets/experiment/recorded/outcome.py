@@ -9,7 +9,7 @@ from datasets.experiment.recorded.baseline import Baseline
 from datasets.experiment.recorded.draw import Onset
 from datasets.experiment.recorded.injection import Injected
 from datasets.experiment.tables import Row
-from pipeline.stages.epochs.clock import met, reactions_ns, unambiguous
+from pipeline.stages.epochs.clock import holds, reactions_ns, unambiguous
 from pipeline.stages.judge.epochs import time_in_use
 from pipeline.stages.judge.judgement import RIGHT, UNKNOWN, WRONG
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of, times_ns
@@ -78,7 +78,7 @@ def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
 
 def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
     lead_ns = onset.t_ns - round(_LEAD_S * NS_PER_S)
-    epochs = found.ride.solution.epochs
+    epochs = found.monitored.solution.epochs
     all_ns = times_ns(epochs)
     epochs = epochs.filter(pl.Series(all_ns >= lead_ns))
     t_ns = times_ns(epochs)
@@ -94,7 +94,7 @@ def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
     with np.errstate(invalid="ignore"):
         code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
         code[(low_m > limit_m) | (high_m < -limit_m)] = WRONG
-    code[astray & met(epochs, unambiguous())] = WRONG
+    code[astray & holds(epochs, unambiguous())] = WRONG
     was_right = (own_low_m >= -limit_m) & (own_high_m <= limit_m)
     doubtful = (code == UNKNOWN) & np.isfinite(moved_m) & (was_right | (np.abs(moved_m) > limit_m))
     return Watch(epochs, t_ns, moved_m, low_m, high_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))
@@ -102,7 +102,7 @@ def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
 
 def _moved_m(base: Baseline, found: Injected, epochs: pl.DataFrame, row: Ints) -> tuple[Floats, Bools]:
     """By what the position lies further along the fault-free run's path [m]; and where it lies off that path."""
-    path = base.ride.match.path
+    path = base.monitored.match.path
     element = epochs["netelement_id"].replace_strict(path.track.index, default=-1, return_dtype=pl.Int64)
     number = element.fill_null(-1).to_numpy()
     measure_m = floats(epochs, "measure_m")
@@ -160,7 +160,9 @@ def _tvb_lost_s(base: Baseline, watch: Watch, onset: Onset, end_ns: int) -> floa
 
 def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
     """Balises accepted since the onset, and of them those whose position was wrong there, or may have been."""
-    accepted = found.ride.solution.accepted.filter(pl.col("t") >= pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC")))
+    accepted = found.monitored.solution.accepted.filter(
+        pl.col("t") >= pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC"))
+    )
     t_ns = times_ns(accepted)
     row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
     train_m, sense = _train_at(base, t_ns, row)
@@ -196,7 +198,7 @@ def _what(onset: Onset, found: Injected) -> Row:
         "injection_id": onset.number,
         "cell": cell.name,
         "run_id": onset.run_id,
-        "solution": found.ride.solution.name,
+        "solution": found.monitored.solution.name,
         "kind": cell.fault.kind.value,
         "target": found.fault.target,
         "direction": cell.direction,
@@ -210,7 +212,7 @@ def _what(onset: Onset, found: Injected) -> Row:
 def _where(base: Baseline, onset: Onset) -> Row:
     """The place and what the bank knew there, in the fault-free run."""
     epoch = base.epochs.row(int(np.searchsorted(base.t_ns, onset.t_ns)), named=True)
-    fixes = base.ride.solution.fixes
+    fixes = base.monitored.solution.fixes
     stamp = pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC"))
     satellites = fixes.filter(pl.col("t") == stamp)["satellites"].to_list()
     kept = ("netelement_id", "measure_m", "path_m", "speed_mps", "curvature_per_m", "sigma_along_m")

@@ -88,11 +88,11 @@ def added(run: RunLog, streams: Streams, force: bool, place: Path) -> RunLog:
         if new is None:
             continue
         _refuse_other_times(run, name, new, place)
-        merged[name] = new if old is None else _beside(name, old, new, force, place)
+        merged[name] = new if old is None else _add_rows(name, old, new, force, place)
     return run.with_streams(**merged)
 
 
-def _beside(name: Stream, old: pl.DataFrame, new: pl.DataFrame, force: bool, place: Path) -> pl.DataFrame:
+def _add_rows(name: Stream, old: pl.DataFrame, new: pl.DataFrame, force: bool, place: Path) -> pl.DataFrame:
     by_solution = name in BY_SOLUTION
     shared = sorted(set(old["solution"]) & set(new["solution"])) if by_solution else [name]
     if shared and not force:

@@ -180,7 +180,7 @@ def gather(
     _refuse_overlaps(parts)
     damages = [f"{log.name}: {gathered.damage}" for log, gathered in parts if gathered.damage is not None]
     listed = tuple(part for _, gathered in parts for part in gathered.parts)
-    return Gatherings(_joined(parts), dict(dropped), _common(parts), "; ".join(damages) or None, listed)
+    return Gatherings(_concat_streams(parts), dict(dropped), _common(parts), "; ".join(damages) or None, listed)
 
 
 def _refuse_unread(unread: list[NoEpochError | UnknownError], parts: list[tuple[Path, Gatherings]]) -> None:
@@ -228,7 +228,7 @@ def _reasons(dropped: Mapping[str, int]) -> str:
     return "".join(f" Not used: {reason} ({count})." for reason, count in sorted(dropped.items()))
 
 
-def _joined(parts: list[tuple[Path, Gatherings]]) -> Streams:
+def _concat_streams(parts: list[tuple[Path, Gatherings]]) -> Streams:
     """The streams of all logs, one after the other, as the contract has them."""
     breaches: list[InputError] = []
     collected: dict[Stream, list[pl.DataFrame]] = {}

@@ -70,7 +70,7 @@ def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Seri
         texts = columns[0] if len(columns) == 1 else columns[0] + " " + columns[1]
         return utc_of(_texts(texts, mapping, place), mapping.time_scale)
     if len(columns) == 1:
-        return _counted(columns[0], mapping, place)
+        return _parse_counts(columns[0], mapping, place)
     raise InputError(
         "holds no times",
         place=place,
@@ -262,7 +262,7 @@ def _looks_like(count: int) -> str:
     return next((f"; looks like {unit}" for unit, unit_s in units_s.items() if 5e8 < count * unit_s < 3e9), "")
 
 
-def _counted(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
+def _parse_counts(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
     """Numbers: seconds, whole ones of 18 digits nanoseconds, and of another unit as `factors.t` says."""
     kind = "int" if recorded.dtype.is_integer() else "float"
     source = time_source((recorded.name,), {recorded.name: kind}, mapping)

@@ -145,7 +145,7 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
     for way in (1, -1):
         for known, epoch in pairwise(gathered.epochs[::way]):
             if epoch.t_ns is None and known.t_ns is not None:
-                epoch.t_ns = _beside(known.t_ns, epoch.key, way)
+                epoch.t_ns = _time_next_to(known.t_ns, epoch.key, way)
 
 
 def _turned_dates(epochs: list[Epoch]) -> int:
@@ -170,7 +170,7 @@ def _turned_dates(epochs: list[Epoch]) -> int:
     return turned
 
 
-def _beside(known_ns: int, moment: time, way: int) -> int:
+def _time_next_to(known_ns: int, moment: time, way: int) -> int:
     """The time of an epoch after (1) or before (-1) one whose time is known: of the same day, or past midnight."""
     t_ns = known_ns - known_ns % _DAY_NS + _time_ns(date(1970, 1, 1), moment)
     return t_ns + way * _DAY_NS if way * (known_ns - t_ns) > _DAY_NS // 2 else t_ns

@@ -73,7 +73,7 @@ def _new_track(piece: LinePiece, name: str, survey: Survey, config: SurveyConfig
     """The stretches of a pass that no earlier one covers, itself included, thinned, each with the toe of its switch."""
     parts: list[LinePiece] = []
     known = list(survey.pieces)
-    for lap in _laps(piece, config):
+    for lap in _split_at_repeats(piece, config):
         covered = _covered(lap.surface, known, config.same_track_m)
         way = way_m(lap.surface)
         for first, last in spans_of(~covered):
@@ -87,7 +87,7 @@ def _new_track(piece: LinePiece, name: str, survey: Survey, config: SurveyConfig
     return [replace(part, name=own, recorded=False) for part, own in zip(parts, named, strict=True)]
 
 
-def _laps(piece: LinePiece, config: SurveyConfig) -> Iterator[LinePiece]:
+def _split_at_repeats(piece: LinePiece, config: SurveyConfig) -> Iterator[LinePiece]:
     """A pass cut where it turns back or comes to where it was, so that each lap covers a place once."""
     places = piece.surface
     way = way_m(places)

@@ -165,7 +165,7 @@ def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
     contract = STREAM_SCHEMAS[source.recipe.stream].columns()
     names = [name for name in source.implicit if contract[name].nullable and frame[name].dtype.is_numeric()]
     silent = [name for name in names if not (frame[name] != 0).any()]
-    if "speed_mps" in silent and not _counted(frame, silent):  # a train that stands says so
+    if "speed_mps" in silent and not _gives_distance(frame, silent):  # a train that stands says so
         silent.remove("speed_mps")
     empty = [pl.lit(None, dtype=frame[name].dtype).alias(name) for name in silent]
     zero = [
@@ -177,7 +177,7 @@ def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
     return frame.with_columns(*empty, *zero, *text)
 
 
-def _counted(frame: pl.DataFrame, silent: Sequence[str]) -> bool:
+def _gives_distance(frame: pl.DataFrame, silent: Sequence[str]) -> bool:
     """Whether the odometer gives a distance."""
     return "distance_m" in set(frame.columns) - set(silent) and frame["distance_m"].null_count() < frame.height
 

@@ -54,7 +54,7 @@ class JsonDecoder:
 
     def decode(self, messages: Messages) -> Iterator[Decoded]:
         """The fields of all messages."""
-        content = _joined(messages)
+        content = _join_payloads(messages)
         try:
             table = None if content is None else self._parsed(content)
         except pa.ArrowInvalid:
@@ -130,7 +130,7 @@ def _value(path: str) -> pl.Expr:
     return value
 
 
-def _joined(messages: Messages) -> bytearray | None:
+def _join_payloads(messages: Messages) -> bytearray | None:
     """The payloads, one after the other; none if any is not the UTF-8 text of something between braces."""
     content = bytearray(_with_byte_before(messages))
     ends = np.cumsum(messages.length + 1)

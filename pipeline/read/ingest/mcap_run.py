@@ -240,7 +240,7 @@ def _frames(
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
     breaches: list[InputError] = []
     remarks: list[str] = []
-    frames = stream_frames(decoded if len(logs) == 1 else _joined(decoded), breaches, config, remarks)
+    frames = stream_frames(decoded if len(logs) == 1 else _merge_files(decoded), breaches, config, remarks)
     if "gnss" not in frames and not (partly and frames):
         breaches.append(_no_gnss(logs, left_over))
     refuse(breaches)
@@ -251,7 +251,7 @@ def _frames(
     return frames, held, slow_messages, (*left_over, *remarks), damage
 
 
-def _joined(decoded: Sequence[DecodedRows]) -> list[DecodedRows]:
+def _merge_files(decoded: Sequence[DecodedRows]) -> list[DecodedRows]:
     """The rows of one topic in several files as those of one source."""
     joined: dict[tuple[object, ...], DecodedRows] = {}
     for part in decoded:

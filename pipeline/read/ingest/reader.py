@@ -63,12 +63,14 @@ class SourceReader:
 
     def frame(self) -> pl.DataFrame:
         """One row per message in order of the file; what was collected is given up."""
-        places = _joined(self._parts[ORDINAL], pl.Int64())
+        places = _concat_parts(self._parts[ORDINAL], pl.Int64())
         order = None if places.is_sorted() else np.argsort(places.to_numpy(), kind="stable")
-        return pl.DataFrame({name: _joined(self._parts.pop(name), dtype, order) for name, dtype in self._types.items()})
+        return pl.DataFrame(
+            {name: _concat_parts(self._parts.pop(name), dtype, order) for name, dtype in self._types.items()}
+        )
 
 
-def _joined(parts: list[Values], dtype: pl.DataType, order: Ints | None = None) -> pl.Series:
+def _concat_parts(parts: list[Values], dtype: pl.DataType, order: Ints | None = None) -> pl.Series:
     """The parts one after the other, or in this order."""
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
     if parts and len(arrays) == len(parts):

@@ -104,7 +104,7 @@ def counted_on(values: Floats, size: float) -> Floats:
     return whole
 
 
-class Counted(NamedTuple):
+class UnwrappedColumn(NamedTuple):
     """A column that counts on, and what was found of each of its counters."""
 
     column: pl.Series
@@ -113,7 +113,7 @@ class Counted(NamedTuple):
 
 def with_whole_counts(
     column: pl.Series, t_ns: Ints | None, declared: float | None, sensors: pl.Series | None, config: WrapsConfig
-) -> Counted:
+) -> UnwrappedColumn:
     """A recorded counter over its ends: as `declared`, else where it is certain. `sensors`: by row."""
     values = column.cast(pl.Float64).fill_null(float("nan")).to_numpy().copy()
     found: list[Wrap] = []
@@ -125,7 +125,7 @@ def with_whole_counts(
             found += [Wrap(declared, turned, certain=True)] if declared and turned else []
             values[rows] = whole
         found += [wrap] if wrap is not None else []
-    return Counted(pl.Series(column.name, values).fill_nan(None), found)
+    return UnwrappedColumn(pl.Series(column.name, values).fill_nan(None), found)
 
 
 def _rows_of(sensors: pl.Series | None, size: int) -> Iterable[Ints]:

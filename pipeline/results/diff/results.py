@@ -13,7 +13,7 @@ from pipeline.results import store
 from pipeline.results.diff.hazards import HazardChange, compare_hazards
 from pipeline.results.diff.rules import Rules
 from pipeline.results.diff.tables import NO_RULES, Difference, compare_tables
-from pipeline.results.workers import told
+from pipeline.results.workers import with_progress
 from pipeline.storage.address import Address, redacted
 from pipeline.storage.parquet import ParquetError, read_parquet
 from schemas.errors import UsageError
@@ -133,7 +133,7 @@ def diff_results(out_a: Address, out_b: Address, rules: Rules = NO_RULES) -> Res
     """
     runs_a, runs_b = (store.complete_runs(out) for out in (out_a, out_b))
     common = [run for run in runs_a if run in set(runs_b)]
-    diffs = [_diff_run(out_a, out_b, run, rules) for run in told(common)]
+    diffs = [_diff_run(out_a, out_b, run, rules) for run in with_progress(common)]
     others = Counter(column for run in diffs for column in run.made_otherwise)
     return ResultDiff(
         compared=len(common),

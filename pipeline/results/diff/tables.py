@@ -84,16 +84,16 @@ def _paired(
     by = [*keys, "_turn"]
     a, b = (frame.with_columns(_turn=pl.int_range(pl.len()).over(list(keys))) for frame in (a, b))
     differences = []
-    for word, rows in (("lost", _joined(a, b, by, "anti")), ("new", _joined(b, a, by, "anti"))):
+    for word, rows in (("lost", _join_rows(a, b, by, "anti")), ("new", _join_rows(b, a, by, "anti"))):
         if rows.height:
             first = ", ".join(f"{key} {_text(rows[key][0])}" for key in keys)
             differences.append(Difference(table, "rows", "", f"{rows.height} rows {word}, first: {first}", rows.height))
-    kept = _joined(a, b, by, "semi")
-    partners = _joined(kept.select(by), b, by, "left").select(b.columns)
+    kept = _join_rows(a, b, by, "semi")
+    partners = _join_rows(kept.select(by), b, by, "left").select(b.columns)
     return differences, kept.drop("_turn"), partners.drop("_turn")
 
 
-def _joined(a: pl.DataFrame, b: pl.DataFrame, by: list[str], how: Literal["anti", "semi", "left"]) -> pl.DataFrame:
+def _join_rows(a: pl.DataFrame, b: pl.DataFrame, by: list[str], how: Literal["anti", "semi", "left"]) -> pl.DataFrame:
     return a.join(b, on=by, how=how, nulls_equal=True, maintain_order="left")
 
 

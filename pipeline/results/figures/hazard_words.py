@@ -34,7 +34,7 @@ def withstood(hazards: pl.DataFrame) -> str:
     parts = []
     for (kind,), rows in faults.group_by(kinds, maintain_order=True):
         for (detected,), part in rows.group_by("detected", maintain_order=True):
-            met = _met(part, detected=bool(detected))
+            met = _response_words(part, detected=bool(detected))
             parts.append(f"{part.height} {kind}{'s' * (part.height > 1)}{_sizes(part['size_m'])} {met}")
     return ", ".join(parts)
 
@@ -46,7 +46,7 @@ def _sizes(size_m: pl.Series) -> str:
     return _say("of_size" if len(size_m) == 1 else "of_sizes", largest_m)
 
 
-def _met(rows: pl.DataFrame, *, detected: bool) -> str:
+def _response_words(rows: pl.DataFrame, *, detected: bool) -> str:
     """How the LDS met these faults: from the begin of the fault to the block."""
     if not detected:
         return _say("withstood")

@@ -94,14 +94,14 @@ def band(t_ms: Ints, codes: Ints, hold_ms: int, gap_code: int, pieces: int = 300
     states = np.concatenate([codes, np.full(len(gaps), gap_code)])
     order = np.argsort(times, kind="stable")
     end_ms = int(t_ms[-1]) + hold_ms
-    starts, states = _joined(times[order], states[order])
+    starts, states = _merge_equal(times[order], states[order])
     if len(starts) > pieces:
         edges = np.linspace(int(t_ms[0]), end_ms, pieces + 1).astype(np.int64)[:-1]
-        starts, states = _joined(*_worst(starts, states, edges))
+        starts, states = _merge_equal(*_worst(starts, states, edges))
     return Band(starts, states, end_ms)
 
 
-def _joined(starts: Ints, codes: Ints) -> tuple[Ints, Ints]:
+def _merge_equal(starts: Ints, codes: Ints) -> tuple[Ints, Ints]:
     first = np.flatnonzero(np.diff(codes, prepend=-1))
     return starts[first], codes[first]
 

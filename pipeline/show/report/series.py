@@ -56,11 +56,11 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
         "t": packed(shown_ms, "u4") if len(shown_ms) <= WHOLE_SERIES else None,
         "series": {name: _series(shown_ms, np.insert(values, gaps, np.nan), whole) for name, values in known.items()},
         "bands": [_band(*row, t_ms, hold_ms) for row in _states(epochs)],
-        "silent": _silent(epochs, known),
+        "silent": _never_evaluated(epochs, known),
     }
 
 
-def _silent(epochs: pl.DataFrame, known: Collection[str]) -> dict[str, str]:
+def _never_evaluated(epochs: pl.DataFrame, known: Collection[str]) -> dict[str, str]:
     """Per drawing of monitors none of which was ever evaluated: the most frequent reason."""
     silent = {}
     for drawing, lines in monitor_lines().items():

@@ -26,7 +26,7 @@ from pipeline.results.store import (
     read_run,
     tables_of,
 )
-from pipeline.results.workers import mapped, told
+from pipeline.results.workers import mapped, with_progress
 from pipeline.show.report.against_page import against_page
 from pipeline.show.report.campaign_page import Campaign, campaign_page
 from pipeline.show.report.ground import PIECE_COLUMNS, availability_pieces, together
@@ -209,7 +209,9 @@ def _of_tables(out: Path, made: Made) -> tuple[pl.DataFrame, pl.DataFrame]:
     for run, metadata in completed_runs(out).items():
         check_site(made.site, metadata.get("site_digest"), run)
     portions = [names[first : first + _RUNS_AT_ONCE] for first in range(0, len(names), _RUNS_AT_ONCE)]
-    pieces = [availability_pieces(tables_of(out, "epochs", some, PIECE_COLUMNS).lazy()) for some in told(portions)]
+    pieces = [
+        availability_pieces(tables_of(out, "epochs", some, PIECE_COLUMNS).lazy()) for some in with_progress(portions)
+    ]
     runs, hazards, alarms = (store.read_table(out, table).collect() for table in ("runs", "hazards", "alarms"))
     return together(pl.concat(pieces)), added(compare_architectures(out, runs, hazards, alarms, made.config).values())
 

@@ -50,7 +50,7 @@ class Clock:
         return float(self.t_ns[-1] - self.t_ns[0]) / 1e9 if len(self.t_ns) else None
 
 
-def met(frame: pl.DataFrame, condition: pl.Expr) -> Bools:
+def holds(frame: pl.DataFrame, condition: pl.Expr) -> Bools:
     """Where a condition holds; null is false."""
     return frame.select(condition.fill_null(value=False)).to_series().to_numpy()
 

@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.odometry.odometry import OdometerWay
+from pipeline.stages.odometry.odometry import OdometerDistance
 from pipeline.stages.odometry.regression import ScaleLag
-from pipeline.stages.odometry.scale_lag import CountedRows, possible_lags, scale_and_lag
+from pipeline.stages.odometry.scale_lag import CounterRows, possible_lags, scale_and_lag
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
 from schemas.config import Configuration, HazardConfig
@@ -63,7 +63,7 @@ class Counter:
         """Scale and its sigma are those of a vehicle file."""
         return self.odometer.scale is not None
 
-    def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
+    def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerDistance:
         """True distance between instants, its variance and bound; NaN over a break."""
         counted = self.odometer.between(begin_ns, end_ns)
         known = self._same(begin_ns, end_ns) & (counted.bound_m <= self.silent_m)
@@ -74,13 +74,13 @@ class Counter:
         return np.where(self._same(begin_ns, end_ns), self.odometer.proved_between(begin_ns, end_ns), np.nan)
 
     @cached_property
-    def rows(self) -> CountedRows:
+    def rows(self) -> CounterRows:
         """Its rows; a step of which anything is in doubt tells no way."""
         odometer = self.odometer
         t_ns = odometer.epoch_ns + np.round(odometer.t_s * NS_PER_S).astype(np.int64)
         doubtful = np.concatenate([[0.0], np.cumsum(np.isnan(self.distance_m(t_ns[:-1], t_ns[1:])))])
         noise_m = float(np.sqrt(odometer.noise.quantisation.still_m2))
-        return CountedRows(odometer.t_s, (odometer.scale or 1.0) * odometer.distance_m, doubtful, noise_m)
+        return CounterRows(odometer.t_s, (odometer.scale or 1.0) * odometer.distance_m, doubtful, noise_m)
 
     def within(self, t_ns: Ints, beyond_s: float) -> tuple[Ints, Floats]:
         """The instants, those less than `beyond_s` off its recording put at its ends, and how far the train drives."""
@@ -190,7 +190,7 @@ def _narrower(
     anchors: tuple[TrueAnchor, TrueAnchor],
     at_m: tuple[float, float],
     t_ns: Ints,
-    ways: list[OdometerWay],
+    ways: list[OdometerDistance],
     config: Configuration,
 ) -> Interval:
     """By both anchors together, or by the one from which less is in doubt, where that is narrower."""
@@ -340,10 +340,10 @@ def clocks_of(
 ) -> tuple[RecorderClock, RecorderClock]:
     """Those of reference and reads. One that cannot be measured may have the odometer's clock or that of the other."""
     first, second = (clock_of(of_one, independent, config) for of_one in lags)
-    return _beside(first, second, config), _beside(second, first, config)
+    return _toward_measured_clock(first, second, config), _toward_measured_clock(second, first, config)
 
 
-def _beside(clock: RecorderClock, other: RecorderClock, config: HazardConfig) -> RecorderClock:
+def _toward_measured_clock(clock: RecorderClock, other: RecorderClock, config: HazardConfig) -> RecorderClock:
     if not clock.assumed or other.shift_s == 0.0:
         return clock
     middle_s = 0.5 * other.shift_s

@@ -49,7 +49,7 @@ def common_steps(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Configurat
     if not odometer.height or not fixes.height:
         return None
     epoch_ns = int(times_ns(fixes)[0])
-    counted = _counted(odometer, epoch_ns)
+    counted = _distances_of_sensor(odometer, epoch_ns)
     placed = _placed(fixes, epoch_ns)
     if counted is None or placed is None:
         return None
@@ -85,7 +85,7 @@ def common_steps(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Configurat
     )
 
 
-def _counted(odometer: pl.DataFrame, epoch_ns: int) -> tuple[Floats, Floats] | None:
+def _distances_of_sensor(odometer: pl.DataFrame, epoch_ns: int) -> tuple[Floats, Floats] | None:
     """Times [s] and distances [m] of a sensor: counted, or its speeds summed up where it hardly counts."""
     distance_m = floats(odometer, "distance_m")
     speed_mps = floats(odometer, "speed_mps")

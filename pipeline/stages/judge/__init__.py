@@ -1,7 +1,7 @@
 """Was each position right, which failures and hazards follow, were alarms due (DOMAIN sections 5.2 to 5.5).
 
-In: a solution as it was replayed, the evidence of its run, the odometer (`Case`). Out: `Judged`, the contract's tables.
-Touches no file. Velocity, and scale and latency learned in the run, decide no judgement, time or verdict.
+In: a solution as it was replayed, the evidence of its run, the odometer (`JudgeInput`). Out: `Judged`, the contract's
+tables. Touches no file. Velocity, and scale and latency learned in the run, decide no judgement, time or verdict.
 
 - One epoch, from position to judgement: `judge.judge`, `epochs.judged_epochs`, `judgement.judge_positions`.
 - One crossing, from offer to `unsafe_accepted`: `epochs.judged_offers`, `passages.passages_table`, and in `run_row`
@@ -11,7 +11,7 @@ Touches no file. Velocity, and scale and latency learned in the run, decide no j
 | question | module |
 |---|---|
 | in which order is it judged | `judge.py` |
-| what is judged, and by what | `case.py` |
+| what is judged, and by what | `given.py` |
 | was a position right | `judgement.py` |
 | did the train move, which way, does the odometer count wrong | `travel.py` |
 | for how long was a position in use; state of the LDS | `in_use.py` |

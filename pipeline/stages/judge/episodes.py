@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import NOTHING
-from pipeline.stages.judge.failures import Course, Failure, Jump, failure_at
+from pipeline.stages.judge.failures import ErrorHistory, Failure, Jump, failure_at
 from pipeline.stages.judge.judgement import ODOMETER, WRONG, Judgements, margins_m
 from schemas.arrays import NS_PER_S, Bools, Floats, floats, spans_of, times_ns
 from schemas.config import Configuration, HazardConfig
@@ -33,7 +33,7 @@ class Detection:
 
 @frozen
 class Extent:
-    """Positions of an episode, numbered as in `Course`, from the onset on; `end` is the first after it.
+    """Positions of an episode, numbered as in `ErrorHistory`, from the onset on; `end` is the first after it.
 
     `mark`: the first that is wrong or completes a wrong offer; `step`, `jump_back`: the jumps at its ends.
     """
@@ -67,87 +67,87 @@ class Episode(Extent):
 
 
 def find_episodes(
-    course: Course, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None
+    history: ErrorHistory, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None
 ) -> list[Episode]:
     """One episode for each time that positions left the evidence, or offered a VB wrong."""
     episodes: list[Episode] = []
     floor = 0
-    for mark in np.flatnonzero(course.judged.is_wrong | _offered_wrong(course)).tolist():
+    for mark in np.flatnonzero(history.judged.is_wrong | _offered_wrong(history)).tolist():
         if mark >= floor:
-            extent = _extent(course, mark, floor)
-            episodes.append(_episode(course, extent, failures, log, faults))
+            extent = _extent(history, mark, floor)
+            episodes.append(_episode(history, extent, failures, log, faults))
             floor = max(extent.end, mark + 1, 0 if extent.jump_back is None else extent.jump_back.last + 1)
     return episodes
 
 
-def _offered_wrong(course: Course) -> Bools:
+def _offered_wrong(history: ErrorHistory) -> Bools:
     """Positions that complete an offer judged wrong; balises that a jump passes on its way belong to the jump."""
-    marked = np.zeros(course.size, dtype=np.bool_)
-    marked[course.offers.number[course.offers.offered & course.offers.judged.is_wrong]] = True
-    for jump in course.jumps:
+    marked = np.zeros(history.size, dtype=np.bool_)
+    marked[history.offers.number[history.offers.offered & history.offers.judged.is_wrong]] = True
+    for jump in history.jumps:
         marked[jump.first : jump.last + 1] = False
     return marked
 
 
-def _extent(course: Course, mark: int, floor: int) -> Extent:
+def _extent(history: ErrorHistory, mark: int, floor: int) -> Extent:
     """Since and until when positions are off around a mark; no earlier than `floor`."""
-    onset = course.after_quiet(floor, mark)
-    step = next(iter(course.jumps_in(onset, mark + 1)), None)
-    calm = int(course.calm_from[mark])
+    onset = history.after_noise(floor, mark)
+    step = next(iter(history.jumps_in(onset, mark + 1)), None)
+    settled = int(history.settled_from[mark])
     after_step = mark if step is None else max(mark, step.last)
-    later = course.jumps_in(mark + 1, calm + 1)
-    back = next((jump for jump in later if jump.first > after_step and _is_back(course, jump)), None)
+    later = history.jumps_in(mark + 1, settled + 1)
+    back = next((jump for jump in later if jump.first > after_step and _is_back(history, jump)), None)
     return Extent(
         mark=mark,
         onset=onset if step is None else max(floor, step.first),
-        end=calm if back is None else back.first,
+        end=settled if back is None else back.first,
         step=step,
         jump_back=back,
     )
 
 
-def _is_back(course: Course, jump: Jump) -> bool:
+def _is_back(history: ErrorHistory, jump: Jump) -> bool:
     """The jump goes against the error before it, and the error after it is within the limit."""
-    judged = course.judged
+    judged = history.judged
     back = float(judged.middle_m[jump.first - 1]) * jump.step_m < 0.0
-    within = float(judged.least_m[jump.last]) <= course.config.hazards.limits.failure_m
+    within = float(judged.least_m[jump.last]) <= history.config.hazards.limits.failure_m
     return back and within and judged.code[jump.last] != WRONG
 
 
 def _episode(
-    course: Course, extent: Extent, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None
+    history: ErrorHistory, extent: Extent, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None
 ) -> Episode:
     step = extent.step
-    end_ns = int(course.t_ns[extent.end]) if extent.end < course.size else int(course.t_ns[-1]) + 1
-    onset_ns, detection = _detected(course, extent, end_ns, log, faults)
-    failed = _failed(course, extent)
+    end_ns = int(history.t_ns[extent.end]) if extent.end < history.size else int(history.t_ns[-1]) + 1
+    onset_ns, detection = _detected(history, extent, end_ns, log, faults)
+    failed = _failed(history, extent)
     in_use = (failure for failure in failures if failure.first < extent.end and failure.last >= extent.onset)
     no_use = np.zeros(0, dtype=np.int64)
     return Episode(
         **vars(extent),
-        begin_ns=onset_ns if step is None else min(onset_ns, int(course.t_ns[step.first - 1]) + 1),
+        begin_ns=onset_ns if step is None else min(onset_ns, int(history.t_ns[step.first - 1]) + 1),
         onset_ns=onset_ns,
         end_ns=end_ns,
         failed=failed,
-        may_ns=None if failed is None else _failed_may_ns(course, failed),
+        may_ns=None if failed is None else _failed_may_ns(history, failed),
         detection=detection,
-        failure=next(in_use, None) or failure_at(course, extent.onset, extent.end, no_use),
+        failure=next(in_use, None) or failure_at(history, extent.onset, extent.end, no_use),
     )
 
 
 def _detected(
-    course: Course, extent: Extent, end_ns: int, log: FailureLog, faults: pl.DataFrame | None
+    history: ErrorHistory, extent: Extent, end_ns: int, log: FailureLog, faults: pl.DataFrame | None
 ) -> tuple[int, Detection]:
     """Onset, as a `faults` stream names it, else the first epoch of the step or drift; and detection.
 
     A drift is visible late: an alarm up to `alarm_lead_s` before its onset becomes the onset, with T_D 0. Detection is
     the first fail of any monitor from the onset on; at once where an alarm was standing.
     """
-    onset_ns = int(course.t_ns[extent.onset])
-    named_ns = named_onset_ns(faults, onset_ns, int(course.t_ns[extent.mark]))
+    onset_ns = int(history.t_ns[extent.onset])
+    named_ns = named_onset_ns(faults, onset_ns, int(history.t_ns[extent.mark]))
     alarm_ns = None
     if named_ns is None and extent.step is None:
-        lead_ns = round(course.config.hazards.alarm_lead_s * NS_PER_S)
+        lead_ns = round(history.config.hazards.alarm_lead_s * NS_PER_S)
         alarm_ns = log.start_within(onset_ns - lead_ns, onset_ns)
     begin_ns = next((t_ns for t_ns in (named_ns, alarm_ns) if t_ns is not None), onset_ns)
     standing = log.standing_at(begin_ns)
@@ -169,32 +169,32 @@ def named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> 
     return before[-1] if before else next(iter(begins), None)
 
 
-def _failed(course: Course, extent: Extent) -> int | None:
+def _failed(history: ErrorHistory, extent: Extent) -> int | None:
     """First position that stays wrong for `failure_hold_s`, a step at once; else the first wrong one of the episode."""
     onset = extent.onset
     step = extent.step
-    spans = [(onset + first, onset + last) for first, last in spans_of(course.judged.is_wrong[onset : extent.end])]
-    hold_ns = round(course.config.hazards.failure_hold_s * NS_PER_S)
+    spans = [(onset + first, onset + last) for first, last in spans_of(history.judged.is_wrong[onset : extent.end])]
+    hold_ns = round(history.config.hazards.failure_hold_s * NS_PER_S)
     for first, last in spans:
         at_once = step is not None and step.first <= first <= step.last
-        if at_once or course.t_ns[last] - course.t_ns[first] >= hold_ns:
+        if at_once or history.t_ns[last] - history.t_ns[first] >= hold_ns:
             return first
     return spans[0][0] if spans else None
 
 
-def _failed_may_ns(course: Course, failed: int) -> int | None:
+def _failed_may_ns(history: ErrorHistory, failed: int) -> int | None:
     """When the failure may have begun: the first position not proved right whose interval reaches beyond the limit.
 
     Looked for since the last right position. None where the evidence is silent for some of that time.
     """
-    judged = course.judged
+    judged = history.judged
     right = np.flatnonzero(judged.is_right[:failed])
     since = slice(int(right[-1]) + 1 if right.size else 0, failed + 1)
     if (judged.kind[since] == NOTHING).any():
         return None
     # Where no place along the track can be compared (NaN), any error may be.
-    may = ~(judged.largest_m <= course.config.hazards.limits.failure_m) | judged.is_wrong
-    return int(course.t_ns[since][may[since]][0])
+    may = ~(judged.largest_m <= history.config.hazards.limits.failure_m) | judged.is_wrong
+    return int(history.t_ns[since][may[since]][0])
 
 
 Healthy = dict[str | None, Bools]

@@ -7,7 +7,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import (
     crossing_gaps_ns,
-    met,
+    holds,
     nominal_period_s,
     periods_before_s,
     reactions_ns,
@@ -20,7 +20,7 @@ from pipeline.stages.judge.judgement import (
     REFERENCE,
     RIGHT,
     WRONG,
-    Case,
+    JudgeInput,
     Judgements,
     MatchedPositions,
     judge_positions,
@@ -48,24 +48,24 @@ def under_injection(t_ns: Ints, faults: pl.DataFrame | None, recovery_s: float) 
     return under
 
 
-def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
+def cross_errors(given: JudgeInput, heading_deg: Floats) -> list[pl.Series]:
     """`error_cross_m`, `error_up_m`: position minus reference, left of growing path and upwards.
 
     Null where the reference is silent, and where the position is farther ahead or behind than the failure limit: over
     such a distance a curve alone is metres aside, and a slope metres up.
     """
-    at_ns = case.instants_of_epochs()
+    at_ns = given.instants_of_epochs()
     errors_m = np.full((2, at_ns.size), np.nan)
-    reference = case.reference
+    reference = given.reference
     if reference is not None and reference.height >= 2:
         stamps = times_ns(reference)
         since_s = (stamps - stamps[0]) / NS_PER_S
         at_s = (at_ns - stamps[0]) / NS_PER_S
         after = np.searchsorted(since_s, at_s).clip(1, since_s.size - 1)
         covered = (at_s >= since_s[0]) & (at_s <= since_s[-1])
-        covered &= since_s[after] - since_s[after - 1] <= case.config.hazards.reference_gap_s
+        covered &= since_s[after] - since_s[after - 1] <= given.config.hazards.reference_gap_s
         columns = ("latitude_deg", "longitude_deg", "height_m")
-        latitude, longitude, height_m = (floats(case.solution.fixes, name) for name in columns)
+        latitude, longitude, height_m = (floats(given.solution.fixes, name) for name in columns)
         rows = np.flatnonzero(covered & np.isfinite(latitude))
         there = [np.interp(at_s[rows], since_s, floats(reference, name)) for name in columns]
         points = points_of(latitude[rows], longitude[rows])
@@ -76,7 +76,7 @@ def cross_errors(case: Case, heading_deg: Floats) -> list[pl.Series]:
         # The vector from reference to position, turned from east and north to along and left of the heading.
         along_m = east * np.sin(heading) + north * np.cos(heading)
         left_m = north * np.sin(heading) - east * np.cos(heading)
-        near = np.abs(along_m) <= case.config.hazards.limits.abreast_m
+        near = np.abs(along_m) <= given.config.hazards.limits.abreast_m
         errors_m[:, rows] = np.where(near, [left_m, height_m[rows] - there[2]], np.nan)
     names = ("error_cross_m", "error_up_m")
     return [pl.Series(name, error_m, nan_to_null=True) for name, error_m in zip(names, errors_m, strict=True)]
@@ -94,21 +94,21 @@ class OdometerSteps:
     stood: tuple[Span, ...] = ()
 
 
-def odometer_steps(case: Case) -> OdometerSteps:
+def odometer_steps(given: JudgeInput) -> OdometerSteps:
     """What the odometer says of the steps between the epochs; without one, or of unknown origin, nothing of motion."""
-    at_ns = case.instants_of_epochs()
-    odometry = case.odometry
+    at_ns = given.instants_of_epochs()
+    odometry = given.odometry
     # One that may be made of the positions tells no motion (DOMAIN section 5.0).
     if odometry is None or not odometry.independent:
         return OdometerSteps(*np.zeros((2, at_ns.size), dtype=np.bool_))
     moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
     counts = _to_the_next(np.isfinite(odometry.steps_m(at_ns)), at_ns.size)
-    path_m = floats(case.solution.epochs, "path_m")
+    path_m = floats(given.solution.epochs, "path_m")
     stood: list[Span] = []
     for first, last in spans_of(counts & ~moves):
         rows = slice(first, min(last + 2, at_ns.size))
         places_m = path_m[rows][np.isfinite(path_m[rows])]
-        if np.abs(places_m - places_m[:1]).max(initial=0.0) > case.config.hazards.limits.stand_m:
+        if np.abs(places_m - places_m[:1]).max(initial=0.0) > given.config.hazards.limits.stand_m:
             stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
     return OdometerSteps(moves, counts, tuple(stood))
 
@@ -216,7 +216,7 @@ def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.D
     """
     known = np.isfinite(floats(epochs, "path_m"))
     steps = _StepTimes.of(epochs, known, config)
-    usable = met(epochs, trusted(config) & ~pl.col("withheld"))
+    usable = holds(epochs, trusted(config) & ~pl.col("withheld"))
     in_use = np.zeros(known.size, dtype=np.bool_)
     in_use[known] = usable[known] & (steps.left_s(steps.alone_s) > _LEAST_S)
     used_s = np.zeros(known.size)
@@ -304,33 +304,33 @@ def lds_states(epochs: pl.DataFrame, code: Ints, in_use: Bools, undiagnosed: Boo
     return words[first.astype(np.uint32)]
 
 
-def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
+def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> pl.DataFrame:
     """The epochs of the solution with evidence, judgement, direction, movement, time in use and state of the LDS."""
-    epochs = case.solution.epochs
-    config = case.config
-    at_ns = case.instants_of_epochs()
-    positions = MatchedPositions.of(case, epochs, met(epochs, unambiguous()))
-    evidence = case.evidence_at(at_ns)
-    along = judgements_of(case, positions, at_ns, evidence)
-    direction = _direction(case, positions, at_ns, along)
+    epochs = given.solution.epochs
+    config = given.config
+    at_ns = given.instants_of_epochs()
+    positions = MatchedPositions.of(given, epochs, holds(epochs, unambiguous()))
+    evidence = given.evidence_at(at_ns)
+    along = judgements_of(given, positions, at_ns, evidence)
+    direction = _direction(given, positions, at_ns, along)
     judged = along.turned(direction)
     train_m = positions.path_m - along.known_m(config.hazards.known_error_m)
     reference_m = np.where(along.kind == REFERENCE, train_m, np.nan)
-    stood = within_spans(at_ns, case.evidence.stood)
-    accepted_ns = times_ns(case.solution.accepted)
+    stood = within_spans(at_ns, given.evidence.stood)
+    accepted_ns = times_ns(given.solution.accepted)
     odometer_m = floats(epochs, "odometer_m")
     wrong_count = beyond_confidence(times_ns(epochs), odometer_m, train_m, along.half_m, accepted_ns, config.lds)
     undiagnosed = flags(epochs, "diagnosis_faulty") | wrong_count
     use = time_in_use(epochs, along.code, config)
-    injected = under_injection(times_ns(epochs), case.faults, config.lds.recovery_s)
+    injected = under_injection(times_ns(epochs), given.faults, config.lds.recovery_s)
     return epochs.drop("direction").with_columns(
         pl.Series("epoch", np.arange(epochs.height)),
         pl.Series("at", at_ns).cast(pl.Datetime("ns", "UTC")),
         pl.Series("direction", direction, dtype=pl.Int8),
         *judged.columns(),
-        *true_places(evidence, case.evidence.network.track),
+        *true_places(evidence, given.evidence.network.track),
         pl.Series("error_along_m", judged.known_m(config.hazards.known_error_m), nan_to_null=True),
-        *cross_errors(case, floats(epochs, "heading_deg")),
+        *cross_errors(given, floats(epochs, "heading_deg")),
         *use,
         (use["wrong_s"] * ~pl.Series(injected)).alias("natural_s"),
         lds_states(epochs, along.code, flags(use, "in_use"), undiagnosed),
@@ -344,36 +344,36 @@ def judged_epochs(case: Case, steps: OdometerSteps) -> pl.DataFrame:
     )
 
 
-def _direction(case: Case, positions: MatchedPositions, at_ns: Ints, along: Judgements) -> Ints:
-    as_driven = ints(case.solution.epochs["direction"], 1)
-    hazards = case.config.hazards
-    return travel_direction(as_driven, along, at_ns, positions.path_m, case.odometry is not None, hazards)
+def _direction(given: JudgeInput, positions: MatchedPositions, at_ns: Ints, along: Judgements) -> Ints:
+    as_driven = ints(given.solution.epochs["direction"], 1)
+    hazards = given.config.hazards
+    return travel_direction(as_driven, along, at_ns, positions.path_m, given.odometry is not None, hazards)
 
 
-def direction_by_evidence(case: Case) -> Ints:
+def direction_by_evidence(given: JudgeInput) -> Ints:
     """Direction of travel of a run without an odometer, before anything is judged: `epochs` as they are aligned."""
-    at_ns = case.instants_of_epochs()
-    positions = MatchedPositions.of(case, case.solution.epochs, met(case.solution.epochs, unambiguous()))
-    along = judge_positions(positions, case.evidence_at(at_ns), case.legs(), case.config.hazards)
-    return _direction(case, positions, at_ns, along)
+    at_ns = given.instants_of_epochs()
+    positions = MatchedPositions.of(given, given.solution.epochs, holds(given.solution.epochs, unambiguous()))
+    along = judge_positions(positions, given.evidence_at(at_ns), given.legs(), given.config.hazards)
+    return _direction(given, positions, at_ns, along)
 
 
-def judged_offers(case: Case, epochs: pl.DataFrame) -> pl.DataFrame:
+def judged_offers(given: JudgeInput, epochs: pl.DataFrame) -> pl.DataFrame:
     """The offers of the LDS, every telegram among them, as `schemas.stages.JudgedOffers`; `epochs`: judged.
 
     Judged is the place of the balise: at the time of the telegram, or of the crossing less the GNSS latency.
     """
-    offers = case.solution.offers
-    hazards = case.config.hazards
+    offers = given.solution.offers
+    hazards = given.config.hazards
     t_ns = times_ns(offers)
     before = ints(offers["before"])
     sure = flags(epochs, "unambiguous")
-    positions = MatchedPositions.of(case, offers, sure[before] & sure[ints(offers["epoch"])])
-    at_ns = np.where(flags(offers, "virtual"), case.instants(t_ns), t_ns)
-    along = judgements_of(case, positions, at_ns, case.evidence_at(at_ns))
+    positions = MatchedPositions.of(given, offers, sure[before] & sure[ints(offers["epoch"])])
+    at_ns = np.where(flags(offers, "virtual"), given.instants(t_ns), t_ns)
+    along = judgements_of(given, positions, at_ns, given.evidence_at(at_ns))
     judged = along.turned(ints(epochs["direction"])[before])
     margin_m = np.where(judged.is_right, hazards.limits.failure_m - judged.largest_m, np.nan)
-    late = case.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
+    late = given.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
     return offers.select(
         *("crossing_id", "balise_id", "t", "epoch", "path_m", "virtual", "accepted"),
         offered=pl.col("virtual") & pl.col("offered"),

@@ -144,18 +144,18 @@ class Offers:
 
 
 @frozen
-class Course:
+class ErrorHistory:
     """The positions in order of time, with the jumps between them and the offers; numbers are rows of `positions`.
 
-    `calm_from`: the first position from each on at which the error stays within half the limit for long enough;
-    `quiet`: noise explains the error.
+    `settled_from`: the first position from each on at which the error stays within half the limit for long enough;
+    `within_noise`: noise explains the error.
     """
 
     positions: pl.DataFrame
     t_ns: Ints
     judged: Judgements
-    calm_from: Ints
-    quiet: Bools
+    settled_from: Ints
+    within_noise: Bools
     jumps: Sequence[Jump]
     offers: Offers
     config: Configuration
@@ -170,10 +170,10 @@ class Course:
         last = bisect_left(self.jumps, end, key=lambda jump: jump.first)
         return [jump for jump in self.jumps[max(first - 1, 0) : last] if jump.last >= begin]
 
-    def after_quiet(self, floor: int, number: int) -> int:
+    def after_noise(self, floor: int, number: int) -> int:
         """The position after the last quiet one between `floor` and a position."""
-        quiet = np.flatnonzero(self.quiet[floor:number])
-        return floor + int(quiet[-1]) + 1 if quiet.size else floor
+        within_noise = np.flatnonzero(self.within_noise[floor:number])
+        return floor + int(within_noise[-1]) + 1 if within_noise.size else floor
 
 
 def positions_of(epochs: pl.DataFrame) -> pl.DataFrame:
@@ -187,34 +187,36 @@ _POSITION_COLUMNS = (
 )
 
 
-def course_of(positions: pl.DataFrame, offers: pl.DataFrame, jumps: Sequence[Jump], config: Configuration) -> Course:
+def error_history_of(
+    positions: pl.DataFrame, offers: pl.DataFrame, jumps: Sequence[Jump], config: Configuration
+) -> ErrorHistory:
     t_ns = times_ns(positions)
     judged = Judgements.of(positions)
-    return Course(
+    return ErrorHistory(
         positions=positions,
         t_ns=t_ns,
         judged=judged,
-        calm_from=_calm_from(t_ns, judged, config.hazards),
-        quiet=_quiet(judged, floats(positions, "sigma_along_m"), config.hazards),
+        settled_from=_settled_from(t_ns, judged, config.hazards),
+        within_noise=_is_within_noise(judged, floats(positions, "sigma_along_m"), config.hazards),
         jumps=jumps,
         offers=Offers.of(offers, positions),
         config=config,
     )
 
 
-def _calm_from(t_ns: Ints, judged: Judgements, config: HazardConfig) -> Ints:
-    """`Course.calm_from`: from each position on, the first that begins `episode_end_s` within half the limit."""
-    calm = (judged.largest_m <= config.limits.settled_m) & ~judged.is_wrong
+def _settled_from(t_ns: Ints, judged: Judgements, config: HazardConfig) -> Ints:
+    """`ErrorHistory.calm_from`: from each position on, the first that begins `episode_end_s` within half the limit."""
+    settled = (judged.largest_m <= config.limits.settled_m) & ~judged.is_wrong
     hold_ns = round(config.episode_end_s * NS_PER_S)
     begins = np.full(t_ns.size, t_ns.size)
-    for first, last in spans_of(calm):
+    for first, last in spans_of(settled):
         # The positions of a calm span up to here have `hold_ns` of it ahead of them.
         after_last = int(np.searchsorted(t_ns, t_ns[last] - hold_ns, side="right"))
         begins[first:after_last] = np.arange(first, max(first, after_last))
     return np.asarray(np.minimum.accumulate(begins[::-1])[::-1])
 
 
-def _quiet(judged: Judgements, sigma_m: Floats, config: HazardConfig) -> Bools:
+def _is_within_noise(judged: Judgements, sigma_m: Floats, config: HazardConfig) -> Bools:
     """|e| at most min(3 sqrt(sigma_x^2 + sigma_ref^2), half the limit)."""
     sigma_ref_m = np.nan_to_num(judged.half_m) / config.evidence_factor
     noise_m = config.evidence_factor * np.hypot(np.nan_to_num(sigma_m), sigma_ref_m)
@@ -240,38 +242,38 @@ class Failure:
     within_budget: bool | None
 
 
-def find_failures(course: Course) -> list[Failure]:
+def find_failures(history: ErrorHistory) -> list[Failure]:
     """Wrong positions in use, in order of time.
 
     Two belong to one failure where less than `recovery_s` lies between them, or no calm position does.
     """
-    wrong = np.flatnonzero(floats(course.positions, "wrong_s") > 0.0)
+    wrong = np.flatnonzero(floats(history.positions, "wrong_s") > 0.0)
     if wrong.size == 0:
         return []
-    apart = np.diff(course.t_ns[wrong]) >= course.config.lds.recovery_s * NS_PER_S
-    calm_between = course.calm_from[wrong[:-1]] < wrong[1:]
+    apart = np.diff(history.t_ns[wrong]) >= history.config.lds.recovery_s * NS_PER_S
+    calm_between = history.settled_from[wrong[:-1]] < wrong[1:]
     failures: list[Failure] = []
     for part in np.split(wrong, np.flatnonzero(apart & calm_between) + 1):
-        begin = course.after_quiet(failures[-1].end if failures else 0, int(part[0]))
-        failures.append(failure_at(course, begin, int(course.calm_from[part[-1]]), part))
+        begin = history.after_noise(failures[-1].end if failures else 0, int(part[0]))
+        failures.append(failure_at(history, begin, int(history.settled_from[part[-1]]), part))
     return failures
 
 
-def failure_at(course: Course, begin: int, end: int, wrong: Ints) -> Failure:
+def failure_at(history: ErrorHistory, begin: int, end: int, wrong: Ints) -> Failure:
     """Positions `begin` to `end` as a failure; `wrong`: those judged wrong in use, maybe none."""
-    hazardous_s, natural_s = (float(floats(course.positions, name)[wrong].sum()) for name in ("wrong_s", "natural_s"))
-    may_be_wrong = ~course.judged.is_right[begin:end]
-    may_s = float(floats(course.positions, "used_s")[begin:end][may_be_wrong].sum())
-    accepted = course.offers.worst_accepted(begin, end)
-    within = within_budget(hazardous_s, may_s, accepted, course.config.budget_s)
+    hazardous_s, natural_s = (float(floats(history.positions, name)[wrong].sum()) for name in ("wrong_s", "natural_s"))
+    may_be_wrong = ~history.judged.is_right[begin:end]
+    may_s = float(floats(history.positions, "used_s")[begin:end][may_be_wrong].sum())
+    accepted = history.offers.worst_accepted(begin, end)
+    within = within_budget(hazardous_s, may_s, accepted, history.config.budget_s)
     first, last = (int(wrong[0]), int(wrong[-1])) if wrong.size else (begin, end)
     return Failure(begin, first, last, end, hazardous_s, natural_s, may_s, accepted, within)
 
 
 def failures_within(epochs: pl.DataFrame, offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """The failures of a part of the epochs judged, as if it were all."""
-    course = course_of(positions_of(epochs), offers, (), config)
-    return failures_table(find_failures(course), course)
+    history = error_history_of(positions_of(epochs), offers, (), config)
+    return failures_table(find_failures(history), history)
 
 
 def within_budget(hazardous_s: float, hazardous_may_s: float, accepted: Judgement, budget_s: float) -> bool | None:
@@ -281,13 +283,13 @@ def within_budget(hazardous_s: float, hazardous_may_s: float, accepted: Judgemen
     return True if hazardous_may_s <= budget_s and accepted is Judgement.RIGHT else None
 
 
-def failures_table(failures: Sequence[Failure], course: Course) -> pl.DataFrame:
+def failures_table(failures: Sequence[Failure], history: ErrorHistory) -> pl.DataFrame:
     """One row per failure: frame as `schemas.stages.Failures`."""
     rows = [
         vars(failure)
         | {
-            "t_start": int(course.t_ns[failure.begin]),
-            "t_end": int(course.t_ns[min(failure.end, course.size - 1)]),
+            "t_start": int(history.t_ns[failure.begin]),
+            "t_end": int(history.t_ns[min(failure.end, history.size - 1)]),
             "accepted": failure.accepted.value,
         }
         for failure in failures

@@ -13,8 +13,8 @@ from pipeline.stages.epochs.clock import reactions_ns
 from pipeline.stages.evidence.evidence import KINDS
 from pipeline.stages.judge.episodes import Episode, suspect_of
 from pipeline.stages.judge.epochs import speed_at
-from pipeline.stages.judge.failures import Course, Jump, Offers
-from pipeline.stages.judge.judgement import Case
+from pipeline.stages.judge.failures import ErrorHistory, Jump, Offers
+from pipeline.stages.judge.judgement import JudgeInput
 from schemas.arrays import NS_PER_S
 from schemas.conform import dtypes, table_of_rows
 from schemas.enums import Evidence, FailureMode, Hazard, Timing
@@ -36,56 +36,56 @@ class HazardRow:
     caused_by: HazardRow | None = None
 
 
-def hazard_rows(episodes: Iterable[Episode], course: Course) -> list[HazardRow]:
+def hazard_rows(episodes: Iterable[Episode], history: ErrorHistory) -> list[HazardRow]:
     """At most one row per episode and class, and one for VBs that the jump back crosses; in order of time."""
-    return [row for episode in episodes for row in _of_episode(episode, course)]
+    return [row for episode in episodes for row in _of_episode(episode, history)]
 
 
-def _of_episode(episode: Episode, course: Course) -> list[HazardRow]:
-    by_class = _jumps(episode, course)
+def _of_episode(episode: Episode, history: ErrorHistory) -> list[HazardRow]:
+    by_class = _jumps(episode, history)
     crossed = {hit for row in by_class.values() for hit in row.crossed}
-    for hit in _hits(episode, course):
+    for hit in _hits(episode, history):
         if hit not in crossed:
-            astray = course.offers.judged.wrong_track[hit]
+            astray = history.offers.judged.wrong_track[hit]
             hazard = Hazard.VB_WRONG_TRACK if astray else min(by_class.keys() & _JUMPS, default=Hazard.VB_SHIFT)
             by_class.setdefault(hazard, HazardRow(hazard, episode)).hits.append(hit)
-    rows = sorted(by_class.values(), key=lambda row: t_hazard_ns(row, course))
+    rows = sorted(by_class.values(), key=lambda row: t_hazard_ns(row, history))
     back = episode.jump_back
-    crossed_back = [] if back is None else crossed_by(back, course)
+    crossed_back = [] if back is None else crossed_by(back, history)
     if crossed_back:
-        hazard = _class_of(crossed_back, course.offers)
+        hazard = _class_of(crossed_back, history.offers)
         rows.append(HazardRow(hazard, episode, back, crossed_back, crossed_back, next(iter(rows), None)))
     return rows
 
 
-def _jumps(episode: Episode, course: Course) -> dict[Hazard, HazardRow]:
+def _jumps(episode: Episode, history: ErrorHistory) -> dict[Hazard, HazardRow]:
     """A row per class of jump; VBs crossed later by a jump of the same class are appended."""
     rows: dict[Hazard, HazardRow] = {}
-    for jump in course.jumps_in(episode.onset, episode.end):
-        crossed = crossed_by(jump, course)
+    for jump in history.jumps_in(episode.onset, episode.end):
+        crossed = crossed_by(jump, history)
         if crossed:
-            hazard = _class_of(crossed, course.offers)
+            hazard = _class_of(crossed, history.offers)
             row = rows.setdefault(hazard, HazardRow(hazard, episode, jump))
             row.hits += crossed
             row.crossed += crossed
     return rows
 
 
-def _hits(episode: Episode, course: Course) -> list[int]:
+def _hits(episode: Episode, history: ErrorHistory) -> list[int]:
     """Offers judged wrong during the episode, beyond the shift limit or on another track."""
-    offers = course.offers
-    beyond = (offers.judged.least_m > course.config.hazards.limits.shift_m) | offers.judged.wrong_track
+    offers = history.offers
+    beyond = (offers.judged.least_m > history.config.hazards.limits.shift_m) | offers.judged.wrong_track
     wrong = offers.offered & offers.judged.is_wrong & offers.between(episode.onset, episode.end)
     return np.flatnonzero(beyond & wrong).tolist()
 
 
-def crossed_by(jump: Jump, course: Course) -> list[int]:
+def crossed_by(jump: Jump, history: ErrorHistory) -> list[int]:
     """Virtual balises on the way of a jump that the train's own step does not cross."""
-    offers = course.offers
+    offers = history.offers
     on_the_way = np.flatnonzero(offers.virtual & offers.between(jump.first, jump.last + 1))
     if on_the_way.size == 0:
         return []
-    before, after = (course.positions.row(number, named=True) for number in (jump.first - 1, jump.last))
+    before, after = (history.positions.row(number, named=True) for number in (jump.first - 1, jump.last))
     step_m = jump.step_m * after["direction"]
     # Where the train was is better known by the evidence than by the position before the jump.
     start_m = before["path_m"] if before["train_m"] is None else before["train_m"]
@@ -101,20 +101,20 @@ def _names(hits: list[int], offers: Offers) -> list[str]:
     return list(dict.fromkeys(offers.balise_id[hit] for hit in hits))
 
 
-def t_hazard_ns(row: HazardRow, course: Course) -> int:
+def t_hazard_ns(row: HazardRow, history: ErrorHistory) -> int:
     """The step, or the offered crossing of the first VB hit."""
-    return int(course.offers.t_ns[row.hits[0]] if row.jump is None else course.t_ns[row.jump.first])
+    return int(history.offers.t_ns[row.hits[0]] if row.jump is None else history.t_ns[row.jump.first])
 
 
-def size_m(row: HazardRow, course: Course) -> float | None:
+def size_m(row: HazardRow, history: ErrorHistory) -> float | None:
     """The largest |e| of the episode with its sign, by the interval's centre; of a jump back the error that it ended.
 
     The step of a jump serves where no place along the track can be compared with the evidence.
     """
     episode = row.episode
     jump = row.jump
-    of_positions = course.judged.middle_m[episode.onset : episode.end]
-    error_m = np.concatenate([of_positions, course.offers.judged.middle_m[row.hits]])
+    of_positions = history.judged.middle_m[episode.onset : episode.end]
+    error_m = np.concatenate([of_positions, history.offers.judged.middle_m[row.hits]])
     error_m = error_m[np.isfinite(error_m)]
     if jump is not None and jump is episode.jump_back:
         return -jump.step_m
@@ -123,40 +123,42 @@ def size_m(row: HazardRow, course: Course) -> float | None:
     return float(error_m[np.argmax(np.abs(error_m))]) if error_m.size else None
 
 
-def rate_mps(row: HazardRow, course: Course) -> float | None:
+def rate_mps(row: HazardRow, history: ErrorHistory) -> float | None:
     """Slope of the error from onset to failure [m/s], by the interval's centre; None for a step."""
     episode = row.episode
     if episode.step is not None or row.jump is not None:
         return None
     until = episode.mark if episode.failed is None else episode.failed
     part = slice(episode.onset, until + 1)
-    error_m = course.judged.middle_m[part]
-    t_s = (course.t_ns[part] - episode.onset_ns) / NS_PER_S
+    error_m = history.judged.middle_m[part]
+    t_s = (history.t_ns[part] - episode.onset_ns) / NS_PER_S
     known = np.isfinite(error_m)
     if known.sum() < 2 or np.ptp(t_s[known]) == 0.0:
         return None
     return float(np.polyfit(t_s[known], error_m[known], 1)[0])
 
 
-def hazards_table(rows: Sequence[HazardRow], case: Case, epochs: pl.DataFrame, course: Course) -> pl.DataFrame:
+def hazards_table(
+    rows: Sequence[HazardRow], given: JudgeInput, epochs: pl.DataFrame, history: ErrorHistory
+) -> pl.DataFrame:
     """Rows in order of time; `hazard_id` is the place in `rows`; `epochs`: judged."""
     ids = {id(row): number for number, row in enumerate(rows)}
     values = [
         {
-            "solution": case.solution.name,
+            "solution": given.solution.name,
             "hazard_id": number,
             "caused_by": ids.get(id(row.caused_by)),
-            "suspect": suspect_of(epochs, row.episode.onset_ns, row.episode.end_ns, case.config).value,
-            "size_m": size_m(row, course),
-            "rate_mps": rate_mps(row, course),
-            "evidence": _evidence(row, course).value,
+            "suspect": suspect_of(epochs, row.episode.onset_ns, row.episode.end_ns, given.config).value,
+            "size_m": size_m(row, history),
+            "rate_mps": rate_mps(row, history),
+            "evidence": _evidence(row, history).value,
             "hazardous_s": row.episode.failure.hazardous_s,
             "hazardous_may_s": row.episode.failure.hazardous_may_s,
-            "budget_s": case.config.budget_s,
+            "budget_s": given.config.budget_s,
             "within_budget": row.episode.failure.within_budget,
-            **_kind(row, course.offers),
-            **instants(row, course),
-            **_place(row, case, epochs, course),
+            **_kind(row, history.offers),
+            **instants(row, history),
+            **_place(row, given, epochs, history),
         }
         for number, row in enumerate(rows)
     ]
@@ -181,24 +183,24 @@ def _kind(row: HazardRow, offers: Offers) -> Row:
     }
 
 
-def _evidence(row: HazardRow, course: Course) -> Evidence:
+def _evidence(row: HazardRow, history: ErrorHistory) -> Evidence:
     """What the judgement of the first VB hit rests on, else that of the mark; the odometer where nothing else is."""
-    kinds = (course.offers.judged.kind[row.hits[0]], course.judged.kind[row.episode.mark])
+    kinds = (history.offers.judged.kind[row.hits[0]], history.judged.kind[row.episode.mark])
     return next((KINDS[kind] for kind in kinds if kind >= 0), Evidence.ODOMETER)
 
 
-def instants(row: HazardRow, course: Course) -> Row:
+def instants(row: HazardRow, history: ErrorHistory) -> Row:
     """When it began, hit, failed, was detected and ended, and the times between (DIAG, T_D and T_dsf)."""
     episode = row.episode
     detected_ns = episode.detection.t_ns
-    failed_ns = None if episode.failed is None else int(course.t_ns[episode.failed])
+    failed_ns = None if episode.failed is None else int(history.t_ns[episode.failed])
     return {
         "t_onset": episode.onset_ns,
-        "t_hazard": t_hazard_ns(row, course),
+        "t_hazard": t_hazard_ns(row, history),
         "t_failure": failed_ns,
         "t_failure_may": episode.may_ns,
         "t_detected": detected_ns,
-        "t_negated": None if detected_ns is None else _negated_ns(detected_ns, course),
+        "t_negated": None if detected_ns is None else _negated_ns(detected_ns, history),
         "t_end": episode.end_ns,
         "monitor": episode.detection.monitor,
         "detected": detected_ns is not None,
@@ -209,21 +211,21 @@ def instants(row: HazardRow, course: Course) -> Row:
     }
 
 
-def _negated_ns(detected_ns: int, course: Course) -> int:
-    return detected_ns + int(reactions_ns(np.array([detected_ns]), course.t_ns, course.config)[0])
+def _negated_ns(detected_ns: int, history: ErrorHistory) -> int:
+    return detected_ns + int(reactions_ns(np.array([detected_ns]), history.t_ns, history.config)[0])
 
 
 def _seconds(begin_ns: int | None, end_ns: int | None) -> float | None:
     return None if begin_ns is None or end_ns is None else (end_ns - begin_ns) / NS_PER_S
 
 
-def _place(row: HazardRow, case: Case, epochs: pl.DataFrame, course: Course) -> Row:
+def _place(row: HazardRow, given: JudgeInput, epochs: pl.DataFrame, history: ErrorHistory) -> Row:
     """Where the train was at the hazard, and how fast it went; null where nobody knows."""
-    number = int(course.offers.number[row.hits[0]]) if row.jump is None else row.jump.first
-    there = course.positions.row(number, named=True)
-    path_m = there["path_m"] - there["direction"] * float(course.judged.middle_m[number])
-    names, measures_m = case.solution.path.locate(max(there["leg"], 0), path_m)
-    speed_mps = speed_at(epochs, np.array([t_hazard_ns(row, course)]))
+    number = int(history.offers.number[row.hits[0]]) if row.jump is None else row.jump.first
+    there = history.positions.row(number, named=True)
+    path_m = there["path_m"] - there["direction"] * float(history.judged.middle_m[number])
+    names, measures_m = given.solution.path.locate(max(there["leg"], 0), path_m)
+    speed_mps = speed_at(epochs, np.array([t_hazard_ns(row, history)]))
     figures = {"measure_m": measures_m[0], "path_m": path_m, "speed_mps": speed_mps[0]}
     known = {name: None if np.isnan(value) else float(value) for name, value in figures.items()}
     return {"netelement_id": names[0], **known}

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gaps_ns, met, passings
+from pipeline.stages.epochs.clock import crossing_gaps_ns, holds, passings
 from pipeline.stages.epochs.verdicts import failure_log
 from pipeline.stages.evidence.evidence import NOTHING, Alternative, EvidenceSet, Span, within_spans
 from pipeline.stages.judge.episodes import alarms_table, find_episodes
 from pipeline.stages.judge.epochs import judged_epochs, judged_offers, odometer_steps, speed_at
-from pipeline.stages.judge.failures import course_of, failures_table, find_failures, jumps_of, positions_of
+from pipeline.stages.judge.failures import error_history_of, failures_table, find_failures, jumps_of, positions_of
 from pipeline.stages.judge.hazards import HazardRow, hazard_rows, hazards_table
-from pipeline.stages.judge.judgement import Case, Judgements
+from pipeline.stages.judge.judgement import JudgeInput, Judgements
 from pipeline.stages.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, ints, times_ns
 from schemas.config import Configuration, LdsConfig
@@ -43,14 +43,14 @@ Crossings = dict[str, list[TrueCrossing]]
 """Of each balise, in order of time."""
 
 
-def crossings_of(case: Case) -> Crossings:
+def crossings_of(given: JudgeInput) -> Crossings:
     """Crossings of each balise of the path by the train, in a direction in which the balise is valid."""
-    balises = case.solution.balises.unique("balise_id", keep="first")
-    elements = case.element_numbers(balises["netelement_id"]).tolist()
+    balises = given.solution.balises.unique("balise_id", keep="first")
+    elements = given.element_numbers(balises["netelement_id"]).tolist()
     spots = zip(balises["balise_id"], elements, balises["measure_m"], strict=True)
     places = {name: Place(element, measure_m) for name, element, measure_m in spots}
-    at_ns = between_far_epochs(case.instants_of_epochs(), case.config.align.speed_window_s)
-    crossings = true_crossings(at_ns, case.evidence.at(at_ns), places, case.config)
+    at_ns = between_far_epochs(given.instants_of_epochs(), given.config.align.speed_window_s)
+    crossings = true_crossings(at_ns, given.evidence.at(at_ns), places, given.config)
     # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both ways.
     valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).iter_rows())
     return {
@@ -154,25 +154,25 @@ def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config:
 
 
 def passages_table(
-    case: Case, epochs: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[HazardRow], undetected: Sequence[Span]
+    given: JudgeInput, epochs: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[HazardRow], undetected: Sequence[Span]
 ) -> pl.DataFrame:
     """Passages of the LDS, and those of the train that it knows nothing of, with the columns of the evidence.
 
     `epochs`, `offers`: judged; `undetected`: from each fault's onset to its detection.
     """
     stamps = times_ns(epochs.filter(pl.col("path_m").is_not_null()))
-    crossings = crossings_of(case)
-    known = case.solution.passages.with_columns(_true_times(case.solution.passages, crossings))
-    passages = _with_unoffered(known, case, crossings, stamps)
+    crossings = crossings_of(given)
+    known = given.solution.passages.with_columns(_true_times(given.solution.passages, crossings))
+    passages = _with_unoffered(known, given, crossings, stamps)
     t_true = passages["t_true"]
     accepted = (pl.col("status") == PassageStatus.ACCEPTED.value) & (pl.col("kind") == BaliseKind.VIRTUAL.value)
     offered_ns = ints(passages["t_offered"].dt.timestamp("ns"))
     frame = passages.with_columns(
         pl.col("t_true").cast(pl.Datetime("ns", "UTC")),
         *_of_offers(passages, offers, rows),
-        _speeds(passages, t_true, epochs, case.config.lds),
-        _positioned=pl.Series(_within_gap(stamps, ints(t_true), case.config.lds)) & t_true.is_not_null(),
-        suspect_after_the_fact=pl.Series(met(passages, accepted) & within_spans(offered_ns, undetected)),
+        _speeds(passages, t_true, epochs, given.config.lds),
+        _positioned=pl.Series(_within_gap(stamps, ints(t_true), given.config.lds)) & t_true.is_not_null(),
+        suspect_after_the_fact=pl.Series(holds(passages, accepted) & within_spans(offered_ns, undetected)),
     )
     return _with_failures(frame).select(Passages.column_names())
 
@@ -261,12 +261,12 @@ def _first_of(first: pl.Expr, word: FailureMode | Cause, second: pl.Expr, other:
     return pl.when(first).then(pl.lit(word.value)).when(second).then(pl.lit(other.value)).otherwise(pl.lit("none"))
 
 
-def _with_unoffered(passages: pl.DataFrame, case: Case, crossings: Crossings, stamps: Ints) -> pl.DataFrame:
+def _with_unoffered(passages: pl.DataFrame, given: JudgeInput, crossings: Crossings, stamps: Ints) -> pl.DataFrame:
     """Adds a passage for each true crossing of a virtual balise without one: the LDS, misled by the position, has none.
 
     `crossings`: those that belong to no passage; `stamps`: of valid positions.
     """
-    virtual = case.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
+    virtual = given.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
     missed = [
         (balise, crossing)
         for balise in virtual.unique("balise_id", keep="first", maintain_order=True).iter_rows(named=True)
@@ -276,8 +276,8 @@ def _with_unoffered(passages: pl.DataFrame, case: Case, crossings: Crossings, st
     if not missed:
         return passages
     times = np.array([crossing.t_ns for _, crossing in missed])
-    positioned = _within_gap(stamps, times, case.config.lds).tolist()
-    rows = [_unoffered(*pair, case.solution.name, seen) for pair, seen in zip(missed, positioned, strict=True)]
+    positioned = _within_gap(stamps, times, given.config.lds).tolist()
+    rows = [_unoffered(*pair, given.solution.name, seen) for pair, seen in zip(missed, positioned, strict=True)]
     added = pl.DataFrame(rows, schema=passages.schema)
     when = pl.coalesce("t_offered", "t_reckoned")
     ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
@@ -317,40 +317,40 @@ class Judged:
     evidence: Evidence | None
 
 
-def judge(case: Case) -> Judged:
+def judge(given: JudgeInput) -> Judged:
     """Judge one solution: epochs, offers, jumps, failures, episodes, then the rows."""
-    config = case.config
-    steps = odometer_steps(case)
-    case = replace(case, evidence=replace(case.evidence, stood=steps.stood))
-    epochs = judged_epochs(case, steps)
-    offers = judged_offers(case, epochs)
+    config = given.config
+    steps = odometer_steps(given)
+    given = replace(given, evidence=replace(given.evidence, stood=steps.stood))
+    epochs = judged_epochs(given, steps)
+    offers = judged_offers(given, epochs)
     positions = positions_of(epochs)
     gap_ns = crossing_gaps_ns(times_ns(positions), config.lds)
-    course = course_of(positions, offers, jumps_of(positions, case.odometry, gap_ns, config.hazards), config)
-    failures = find_failures(course)
-    log = failure_log(case.solution.epochs, config.lds.recovery_s)
-    episodes = find_episodes(course, failures, log, case.faults)
-    rows = hazard_rows(episodes, course)
+    history = error_history_of(positions, offers, jumps_of(positions, given.odometry, gap_ns, config.hazards), config)
+    failures = find_failures(history)
+    log = failure_log(given.solution.epochs, config.lds.recovery_s)
+    episodes = find_episodes(history, failures, log, given.faults)
+    rows = hazard_rows(episodes, history)
     # From a fault's onset to its detection.
     undetected = [episode.undetected_ns for episode in episodes]
     suspect_after = within_spans(times_ns(epochs), undetected) & flags(epochs, "tvb")
     return Judged(
-        hazards=hazards_table(rows, case, epochs, course),
-        alarms=alarms_table(case.solution.name, epochs, log, [row.episode for row in rows], config),
-        passages=passages_table(case, epochs, offers, rows, undetected),
-        failures=failures_table(failures, course),
+        hazards=hazards_table(rows, given, epochs, history),
+        alarms=alarms_table(given.solution.name, epochs, log, [row.episode for row in rows], config),
+        passages=passages_table(given, epochs, offers, rows, undetected),
+        failures=failures_table(failures, history),
         epochs=epochs.with_columns(pl.Series("suspect_after_the_fact", suspect_after)),
         offers=offers,
-        distance_m=_distance_m(case, epochs),
+        distance_m=_distance_m(given, epochs),
         evidence=_evidence(epochs["evidence"]),
     )
 
 
-def _distance_m(case: Case, epochs: pl.DataFrame) -> float | None:
+def _distance_m(given: JudgeInput, epochs: pl.DataFrame) -> float | None:
     """Way driven: by the odometer, else by the reference, else by the positions; None where none of them shows it."""
-    if case.odometry is not None:
-        begin_m, end_m = case.odometry.travelled_at(times_ns(epochs, "at")[[0, -1]]).tolist()
-        return float(end_m - begin_m) * (case.odometry.scale or 1.0)
+    if given.odometry is not None:
+        begin_m, end_m = given.odometry.travelled_at(times_ns(epochs, "at")[[0, -1]]).tolist()
+        return float(end_m - begin_m) * (given.odometry.scale or 1.0)
     train = epochs["train_m"].drop_nulls()
     place = train if train.len() > 1 else epochs["path_m"].drop_nulls()
     return float(place.diff().abs().sum()) if place.len() > 1 else None

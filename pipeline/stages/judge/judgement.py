@@ -47,7 +47,7 @@ class Solution:
 
 
 @frozen
-class Case:
+class JudgeInput:
     """One solution with the evidence of its run; `odometry` grows with its path, `faults` were injected.
 
     `leaps_s`: whole leap seconds that may have to be added to the stamps of the positions, beside none; nobody knows.
@@ -111,9 +111,9 @@ class MatchedPositions:
     unambiguous: Bools
 
     @classmethod
-    def of(cls, case: Case, frame: pl.DataFrame, unambiguous: Bools) -> MatchedPositions:
+    def of(cls, given: JudgeInput, frame: pl.DataFrame, unambiguous: Bools) -> MatchedPositions:
         path_m = floats(frame, "path_m")
-        element = np.where(np.isfinite(path_m), case.element_numbers(frame["netelement_id"]), -1)
+        element = np.where(np.isfinite(path_m), given.element_numbers(frame["netelement_id"]), -1)
         return cls(element, floats(frame, "measure_m"), ints(frame["leg"]), path_m, unambiguous)
 
     @property
@@ -206,25 +206,25 @@ def margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
     return np.maximum(config.false_alarm_margin_m, noise)
 
 
-def judgements_of(case: Case, positions: MatchedPositions, at_ns: Ints, evidence: EvidenceSet) -> Judgements:
+def judgements_of(given: JudgeInput, positions: MatchedPositions, at_ns: Ints, evidence: EvidenceSet) -> Judgements:
     """Positions against the evidence; where there is none, against the odometer since the last accepted VB."""
-    judged = judge_positions(positions, evidence, case.legs(), case.config.hazards)
-    if case.odometry is None:
+    judged = judge_positions(positions, evidence, given.legs(), given.config.hazards)
+    if given.odometry is None:
         return judged
-    accepted = case.solution.accepted
-    accepted_ns = case.instants(times_ns(accepted))
-    stood = case.evidence.stood
+    accepted = given.solution.accepted
+    accepted_ns = given.instants(times_ns(accepted))
+    stood = given.evidence.stood
     place_m = floats(accepted, "path_m")
     own = [
-        carried_forward(anchor_ns, place_m, clock_ns, case.odometry, stood, case.config)
-        for anchor_ns, clock_ns in zip(case.clocks_ns(accepted_ns), case.clocks_ns(at_ns), strict=True)
+        carried_forward(anchor_ns, place_m, clock_ns, given.odometry, stood, given.config)
+        for anchor_ns, clock_ns in zip(given.clocks_ns(accepted_ns), given.clocks_ns(at_ns), strict=True)
     ]
     # NaN, where one of the clocks leaves nothing known.
     low_m, high_m = np.min([low for low, _ in own], axis=0), np.max([high for _, high in own], axis=0)
     # Where it contradicts a reference, and nobody knows which of the two failed, it shows nothing.
-    unsure = within_spans(at_ns, case.evidence.unsure)
+    unsure = within_spans(at_ns, given.evidence.unsure)
     train_m = np.where(unsure, np.nan, low_m), np.where(unsure, np.nan, high_m)
-    return with_own_anchors(judged, positions, train_m, case.config.hazards)
+    return with_own_anchors(judged, positions, train_m, given.config.hazards)
 
 
 def judge_positions(

@@ -163,7 +163,7 @@ def match(
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
     network = network_in_pieces(site).unsearched()
-    pinned = pins_of(arrays, site, network.track, balise_reads)
+    pinned = read_elements(arrays, site, network.track, balise_reads)
     rows = np.flatnonzero(arrays.valid)
     steps = path_steps(
         arrays.t_ns[rows],
@@ -171,7 +171,7 @@ def match(
         np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2))[rows],
         way=None if odometry is None else odometry.distance_between,
         independent=odometry is not None and odometry.independent,
-        pinned=_pins_of_positions(pinned, rows),
+        pinned=_read_elements_of_positions(pinned, rows),
     )
     found = path_set(steps, network, config)
     path, assignment = find_path(arrays, odometry, found, config)
@@ -200,12 +200,12 @@ def elements_of(fixes: Fixes, path: TravelledPath, assignment: Assignment, place
     return np.where(fixes.valid & np.isfinite(placed.antenna_m), element, -1)
 
 
-def _pins_of_positions(pinned: Ints, rows: Ints) -> Ints:
+def _read_elements_of_positions(pinned: Ints, rows: Ints) -> Ints:
     """The element of each read at the position that it belongs to: the last one not after its epoch."""
-    pins = np.full(rows.size, -1, dtype=np.int64)
+    read_element = np.full(rows.size, -1, dtype=np.int64)
     read = np.flatnonzero(pinned >= 0)
-    pins[np.maximum(np.searchsorted(rows, read, side="right") - 1, 0)] = pinned[read]
-    return pins
+    read_element[np.maximum(np.searchsorted(rows, read, side="right") - 1, 0)] = pinned[read]
+    return read_element
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: MatchedEpochs, config: MatchingConfig) -> int:
@@ -216,7 +216,7 @@ def _odometer_sign(odometry: Odometry | None, epochs: MatchedEpochs, config: Mat
     return polarity(odometry, epochs.t_ns, path_m, config.orientation_distance_m)
 
 
-def pins_of(fixes: Fixes, site: Site, track: SurveyedTrack, balise_reads: pl.DataFrame | None) -> Ints:
+def read_elements(fixes: Fixes, site: Site, track: SurveyedTrack, balise_reads: pl.DataFrame | None) -> Ints:
     """Per epoch the element of the balise read then (at the first epoch not before the read), else -1."""
     pinned = np.full(len(fixes), -1, dtype=np.int64)
     if balise_reads is None or site.balises is None:

@@ -174,7 +174,7 @@ def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
 
 
 @frozen
-class Seen:
+class MonitorInput:
     """What monitors without memory may look at; `other` on this solution's path, `absent`: why there is none."""
 
     epochs: AlignedEpochs
@@ -184,7 +184,7 @@ class Seen:
     config: Configuration
 
 
-WITHOUT_MEMORY: Mapping[str, Callable[[Seen], Verdicts]] = {
+WITHOUT_MEMORY: Mapping[str, Callable[[MonitorInput], Verdicts]] = {
     "along_doppler": lambda seen: doppler_monitor(seen.epochs, seen.config),
     "channel": lambda seen: channel_monitor(seen.epochs.table, seen.other, seen.config, seen.absent),
     "pseudorange": lambda seen: pseudorange_monitor(seen.epochs, seen.satellites, seen.config),

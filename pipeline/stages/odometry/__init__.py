@@ -9,7 +9,7 @@ with evidence, plausibility, calibration and alignment: `scale_lag`, scale and l
 recorder; with the LDS and alignment: `recovery`, when a position may return after an alarm.
 """
 
-from pipeline.stages.odometry.odometry import OdometerWay, Odometry, odometry_of
+from pipeline.stages.odometry.odometry import OdometerDistance, Odometry, odometry_of
 from pipeline.stages.odometry.polarity import counted_over_slip
 
-__all__ = ["Odometry", "OdometerWay", "counted_over_slip", "odometry_of"]
+__all__ = ["Odometry", "OdometerDistance", "counted_over_slip", "odometry_of"]

@@ -51,7 +51,7 @@ class OddRuns(NamedTuple):
     near: list[OddRun]
 
 
-class _Counted(NamedTuple):
+class _CounterRows(NamedTuple):
     """Rows of a counter without gaps, its step as known before each, and what second differences scatter by [m]."""
 
     t_s: Floats
@@ -82,7 +82,7 @@ def odd_runs(t_s: Floats, distance_m: Floats, counts_m: Floats | float, config: 
     counts_m = np.broadcast_to(counts_m, t_s.shape)[rows]
     t_s, distance_m = t_s[rows], distance_m[rows]
     before_m = np.concatenate([counts_m[:1], counts_m[:-1]])
-    counted = _Counted(t_s, distance_m, before_m, _scatter_m(t_s, distance_m, before_m, config))
+    counted = _CounterRows(t_s, distance_m, before_m, _scatter_m(t_s, distance_m, before_m, config))
     leaps, _ = _places(counted, config)
     # Near ones are for evidence, which may look back: a counter whose step is not yet known is healthy all the same.
     _, near = _places(counted._replace(counts_m=np.maximum(before_m, counts_m[-1])), config)
@@ -139,7 +139,7 @@ def _periods_s(t_s: Floats, config: AlignConfig) -> Floats:
     return np.concatenate([means_s[:1], means_s[:-1]])
 
 
-def _places(counted: _Counted, config: AlignConfig) -> tuple[Bools, Bools]:
+def _places(counted: _CounterRows, config: AlignConfig) -> tuple[Bools, Bools]:
     """Rows between steps that differ more than a train and the tolerance, and than a train and the rows' scatter."""
     dt_s = np.diff(counted.t_s)
     speed_mps = np.diff(counted.distance_m) / dt_s
@@ -186,7 +186,7 @@ def _too_far(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Bools:
     return far
 
 
-def _stalls(counted: _Counted, config: AlignConfig) -> tuple[Bools, Bools]:
+def _stalls(counted: _CounterRows, config: AlignConfig) -> tuple[Bools, Bools]:
     """Repeated rows while the train drove on, with the step after them; and those where it may have stood but for
     `near_leap_m`.
     """
@@ -211,7 +211,7 @@ def _stalls(counted: _Counted, config: AlignConfig) -> tuple[Bools, Bools]:
     return stalls, nears
 
 
-def _set_in_a_hole(counted: _Counted, odd: Bools, config: AlignConfig) -> Bools:
+def _set_in_a_hole(counted: _CounterRows, odd: Bools, config: AlignConfig) -> Bools:
     """Steps over missing rows: the short step beside one shows little of a leap in it."""
     t_s, distance_m = counted.t_s, counted.distance_m
     dt_s = np.diff(t_s)
@@ -272,11 +272,11 @@ class _Sums(NamedTuple):
 
 def weighed(t_s: Floats, distance_m: Floats, steps: Bools, config: AlignConfig) -> list[OddRun]:
     """Each run of these steps (pauses, slip) by the mean speed beside it."""
-    counted = _Counted(t_s, distance_m, np.zeros(t_s.size), np.zeros(max(t_s.size - 2, 1)))
+    counted = _CounterRows(t_s, distance_m, np.zeros(t_s.size), np.zeros(max(t_s.size - 2, 1)))
     return _runs(counted, steps, steps, config)
 
 
-def _runs(counted: _Counted, steps: Bools, left_out: Bools, config: AlignConfig) -> list[OddRun]:
+def _runs(counted: _CounterRows, steps: Bools, left_out: Bools, config: AlignConfig) -> list[OddRun]:
     """Runs of `steps`; speeds beside them are taken of steps that are neither in `steps` nor in `left_out`."""
     if not steps.any():
         return []

@@ -14,7 +14,7 @@ from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_
 from pipeline.stages.odometry.quantisation import KnownNoise, Noise, noise_of_rows, row_periods_s
 from pipeline.stages.odometry.rows import (
     Contradiction,
-    Ways,
+    StepDistances,
     contradicted_by_speeds,
     count_step,
     declared_origin,
@@ -30,7 +30,7 @@ from schemas.frozen import frozen
 _DECLARED_ROWS = 100
 
 
-class OdometerWay(NamedTuple):
+class OdometerDistance(NamedTuple):
     """True distance between two instants, signed [m], and its variance [m^2]; NaN where it is not known.
 
     `bound_m`: by how much it may be off besides, as braking and acceleration prove it.
@@ -144,7 +144,7 @@ class Odometry:
     def _still_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         return np.asarray(self.deadband_mps * np.abs(end_ns - begin_ns) / NS_PER_S)
 
-    def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerWay:
+    def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerDistance:
         """True distance between instants, and its variance.
 
         s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) + (sigma_s
@@ -162,7 +162,7 @@ class Odometry:
         moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))
         rows_m2 = self.row_sigma_m(begin_s) ** 2 + self.row_sigma_m(end_s) ** 2
         variance = scale**2 * (self.noise.white_m2_per_s * moving_s + rows_m2) + (scale_sigma * recorded) ** 2
-        return OdometerWay(scale * recorded, variance, bound_m)
+        return OdometerDistance(scale * recorded, variance, bound_m)
 
     def bound_between_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """By how much the way between instants may be off, as braking and acceleration prove it [m]."""
@@ -359,7 +359,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 
 
 def _contradicted(
-    t_s: Floats, distance_m: Floats, ways: Ways, noise: KnownNoise, config: Configuration
+    t_s: Floats, distance_m: Floats, ways: StepDistances, noise: KnownNoise, config: Configuration
 ) -> Contradiction:
     """Where the speeds contradict the counted distance beyond the noise of its rows, at their speed by the distance."""
     align = config.align

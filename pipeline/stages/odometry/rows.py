@@ -180,7 +180,7 @@ def contradicted_by_speeds(
 _BOUND_SIGMAS = 3.0
 
 
-class Ways(NamedTuple):
+class StepDistances(NamedTuple):
     """Per step: way [m], NaN where not known; whether it is of the recorded distance; sigma over a bridged reset [m].
 
     `odd`: where the count may be off; `driven_m`: by the speeds, NaN where not recorded; `resets`: the rows to which it
@@ -197,7 +197,7 @@ class Ways(NamedTuple):
 
 def ways_between(
     t_s: Floats, distance_m: Floats, speed_mps: Floats, counts_m: Floats, limit_s: Floats, config: AlignConfig
-) -> Ways:
+) -> StepDistances:
     """Ways between rows at these times [s]; `distance_m` and `speed_mps` as recorded, NaN where not.
 
     `counts_m`: the step of the counter as known at each row. Over a leap of the distance the speeds count, if they
@@ -220,7 +220,7 @@ def ways_between(
     for run in (*runs.odd, *runs.near):
         odd[run.first : run.last] = True
     if not unknown.any():
-        return Ways(way_m, ~np.isnan(recorded), np.zeros(way_m.size), odd, by_speeds, places)
+        return StepDistances(way_m, ~np.isnan(recorded), np.zeros(way_m.size), odd, by_speeds, places)
     # Rows by turns: fill the gaps of either column between its own rows, then decide again.
     carried_m = _carried(t_s, distance_m, limit_s)
     recorded = np.where(unknown & ~leap, np.diff(carried_m), recorded)
@@ -230,7 +230,7 @@ def ways_between(
     bridged_m = np.zeros(way_m.size)
     for run in resets:
         _bridge(run, t_s, way_m, bridged_m, config)
-    return Ways(way_m, counted, bridged_m, odd, by_speeds, places)
+    return StepDistances(way_m, counted, bridged_m, odd, by_speeds, places)
 
 
 def _bridge(run: OddRun, t_s: Floats, way_m: Floats, sigma_m: Floats, config: AlignConfig) -> None:

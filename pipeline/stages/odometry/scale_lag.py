@@ -72,7 +72,7 @@ _FAR_SIGMAS, _FAR_S = 15.0, 2.0
 
 
 @frozen
-class CountedRows:
+class CounterRows:
     """Rows of a counter: times [s], distance [m], how many steps before each row are in doubt; sigma of a row [m]."""
 
     t_s: Floats
@@ -102,7 +102,7 @@ class CountedRows:
         return near, (before + after) / (4.0 * half_s)
 
     @cached_property
-    def smooth(self) -> CountedRows:
+    def smooth(self) -> CounterRows:
         """Rows no farther apart than `_APART_S`, by cubics through the speeds at the rows.
 
         A straight line over a second is off by 15 cm at 1.2 m/s2: ahead of a train that starts, behind one that brakes.
@@ -119,7 +119,7 @@ class CountedRows:
         distance_m = self.distance_m[begin] + u * way_m + u * (1.0 - u) * bent
         t_s = self.t_s[begin] + u * length_s
         doubtful = self.doubtful[begin] + u * np.diff(self.doubtful)[begin]
-        return CountedRows(
+        return CounterRows(
             t_s=np.append(t_s, self.t_s[-1]),
             distance_m=np.append(distance_m, self.distance_m[-1]),
             doubtful=np.append(doubtful, self.doubtful[-1]),
@@ -136,7 +136,7 @@ class CountedRows:
         """Sigma of a way by the noise of its two rows."""
         return max(self.row_sigma_m * float(np.sqrt(2.0)), _FINEST_M)
 
-    def driven(self) -> CountedRows:
+    def driven(self) -> CounterRows:
         """Way driven, to and fro."""
         return replace(self, distance_m=np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.distance_m)))]))
 
@@ -159,11 +159,11 @@ def spans_of_rows(t_s: Floats) -> tuple[Ints, Ints]:
     return begin[whole], end[whole]
 
 
-def scale_and_lag(begin_s: Floats, end_s: Floats, way_m: Floats, counter: CountedRows) -> ScaleLag:
+def scale_and_lag(begin_s: Floats, end_s: Floats, way_m: Floats, counter: CounterRows) -> ScaleLag:
     """Of the recorder that saw the ways `way_m` between its stamps, in order of time; they may overlap."""
     if begin_s.size < FEWEST:
         return ScaleLag()
-    ways = _Ways(begin_s, end_s, way_m, counter.smooth)
+    ways = _DistancePairs(begin_s, end_s, way_m, counter.smooth)
     found = ways.refined(ways.likeliest_s)
     if ways.count < FEWEST or (ways.count < _FEWEST_FAR and abs(found.lag_s) > _NEAR_S):
         return ways.without_lag(LagState.TOO_FEW)
@@ -173,7 +173,7 @@ def scale_and_lag(begin_s: Floats, end_s: Floats, way_m: Floats, counter: Counte
 
 
 def possible_lags(
-    ways: tuple[Floats, Floats, Floats], counter: CountedRows, sigma_m: Floats, scale_off: float, factor: float
+    ways: tuple[Floats, Floats, Floats], counter: CounterRows, sigma_m: Floats, scale_off: float, factor: float
 ) -> tuple[float, float] | None:
     """Least and largest lag [s] that the ways (begin, end [s], length [m]) do not refute; None if they tell nothing.
 
@@ -185,7 +185,7 @@ def possible_lags(
     begin_s, end_s, way_m = ways
     if begin_s.size == 0:
         return None
-    apart = slice(None, None, _Ways(begin_s, end_s, way_m, counter).step)
+    apart = slice(None, None, _DistancePairs(begin_s, end_s, way_m, counter).step)
     begin_s, end_s, seen, sigma_m = begin_s[apart], end_s[apart], way_m[apart] / sigma_m[apart], sigma_m[apart]
     counted = counter.smooth.gained(begin_s - _FINE_LAGS_S[:, None], end_s - _FINE_LAGS_S[:, None]) / sigma_m
     left = _left_over(counted, seen, scale_off)
@@ -223,13 +223,13 @@ def _left_over(counted: Floats, seen: Floats, scale_off: float) -> Floats:
 
 
 @frozen
-class _Ways:
+class _DistancePairs:
     """Ways that a recorder saw between its stamps, and the counter that counted them too."""
 
     begin_s: Floats
     end_s: Floats
     way_m: Floats
-    counter: CountedRows
+    counter: CounterRows
 
     @property
     def count(self) -> float:

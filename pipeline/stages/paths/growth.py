@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, search_about
-from pipeline.stages.paths.path_set import Left, Node, PathSet, ResidualsBefore, WayBack
+from pipeline.stages.paths.path_set import Left, Node, PathSet, ResidualsBefore, ReturnSearch
 from pipeline.stages.paths.path_steps import PathSteps
 from pipeline.stages.paths.path_tests import LOOKED_S, WINDOWS_S, PathTests, Stretch, Totals, Trail
 from pipeline.stages.track.network import Network
@@ -131,7 +131,7 @@ class _Growth:
         if not before.any():
             return len(steps)
         left = Left(node.oriented, died, float(np.mean(residual_m[before])), float(np.median(node.along.survey_m)))
-        return WayBack(steps, self.network, self.candidates, self.tests, self.config).after(left)
+        return ReturnSearch(steps, self.network, self.candidates, self.tests, self.config).after(left)
 
     def _begin(self, step: int) -> int:
         """The first step from this one on with an element that its offset does not refute, else the number of steps."""

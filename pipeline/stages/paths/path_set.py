@@ -191,7 +191,7 @@ class Left:
 
 
 @frozen
-class WayBack:
+class ReturnSearch:
     """The steps of a run, and where they may lie on the network."""
 
     steps: PathSteps

@@ -164,7 +164,7 @@ class Move(NamedTuple):
     sense: int
 
 
-class Way(NamedTuple):
+class StepDistance(NamedTuple):
     """Between two steps [m]: signed in the odometer's sense where `measured`, else its size; how far to search."""
 
     distance_m: float
@@ -201,7 +201,7 @@ class Moves:
         unknown = np.zeros(len(network.successors), dtype=np.int64)
         return cls(network, steps, np.full(count, np.nan), np.zeros(count), unknown, config)
 
-    def way(self, earlier: int, later: int) -> Way:
+    def way(self, earlier: int, later: int) -> StepDistance:
         """By the odometer where it knows it, else straight on."""
         places = self.steps.points.surface
         chord_m = float(np.linalg.norm(places[later] - places[earlier]))
@@ -211,9 +211,9 @@ class Moves:
         measured = bool(np.isfinite(counted_m))
         distance_m = counted_m if measured else chord_m
         limit_m = (1.0 + self.config.detour_share) * max(chord_m, abs(distance_m)) + self.config.detour_m
-        return Way(distance_m, measured, limit_m)
+        return StepDistance(distance_m, measured, limit_m)
 
-    def cost(self, here: Place, there: Place, way: Way) -> float:
+    def cost(self, here: Place, there: Place, way: StepDistance) -> float:
         """The least cost of a move between two places, infinite where the network has none."""
         return min((cost for cost, _, _ in self._all(here, there, way)), default=np.inf)
 
@@ -231,7 +231,7 @@ class Moves:
         """Of going over to a track that no relation leads to: so many seconds of positions off the path."""
         return self.config.break_s * self.config.outlier_sigmas**2
 
-    def _all(self, here: Place, there: Place, way: Way) -> Iterator[tuple[float, int, tuple[int, ...]]]:
+    def _all(self, here: Place, there: Place, way: StepDistance) -> Iterator[tuple[float, int, tuple[int, ...]]]:
         """Cost and sense of every move, and what lies between: on the element, ahead, behind.
 
         A relation that is passed against its navigability costs as much as a break.
@@ -270,7 +270,7 @@ class Moves:
         onward = self.network.successors[chain.oriented[-1]]
         return (edge for edge in onward if (edge.forward if sense > 0 else edge.backward))
 
-    def _mismatch(self, driven_m: float, oriented: int, way: Way) -> float:
+    def _mismatch(self, driven_m: float, oriented: int, way: StepDistance) -> float:
         """Square of the difference from the way made over its own sigma, limited as that of every position."""
         sign = int(self.polarity[oriented]) if way.measured else 0
         apart_m = driven_m - sign * way.distance_m if sign else abs(driven_m) - abs(way.distance_m)

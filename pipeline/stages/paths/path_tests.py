@@ -149,7 +149,7 @@ class PathTests:
 
     def totals(self, steps: PathSteps, begin: int, along: Stretch) -> Totals:
         """Over the steps from `begin` on."""
-        counted = self._counted(steps, begin, along)
+        counted = self._step_terms(steps, begin, along)
         return Totals(*(float(value) for value in counted[: len(NO_STEPS)].sum(axis=1)))
 
     def farthest_m(self, steps: PathSteps, apart_m: Floats, last: int, window_s: float) -> float:
@@ -173,7 +173,7 @@ class PathTests:
 
     def of(self, steps: PathSteps, trail: Trail) -> Verdict:
         """Test the new steps of a path."""
-        values = self._counted(steps, trail.start, trail.along)
+        values = self._step_terms(steps, trail.start, trail.along)
         sums = np.zeros((values.shape[0], values.shape[1] + 1))
         np.cumsum(values, axis=1, out=sums[:, 1:])
         at = np.arange(trail.begin, trail.start + values.shape[1])
@@ -193,7 +193,7 @@ class PathTests:
         first = np.flatnonzero(refuted)
         return Verdict(int(at[first[0]]) if first.size else 2**62, np.minimum.accumulate(p))
 
-    def _counted(self, steps: PathSteps, begin: int, along: Stretch) -> Floats:
+    def _step_terms(self, steps: PathSteps, begin: int, along: Stretch) -> Floats:
         """Per step 1, residual, sigma of the survey, square of the position's, tracks beside, normal (north, east).
 
         Zeros where it does not count; shape (8, n).

@@ -245,10 +245,10 @@ def balise_counts(passages: pl.DataFrame) -> Row:
     errors = spread(pl.col("location_error_m").filter(accepted()), "location_error", "count")
     each_once = {"balises_passed": is_passage(), "balises_found": is_passage() & accepted()}
     once = {name: virtual.filter(condition)["balise_id"].n_unique() for name, condition in each_once.items()}
-    return _counted(virtual, counts | acceptances()) | virtual.select(**errors).row(0, named=True) | once
+    return _count_rows(virtual, counts | acceptances()) | virtual.select(**errors).row(0, named=True) | once
 
 
-def _counted(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
+def _count_rows(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
     """In how many rows each condition holds."""
     return frame.select(condition.sum().alias(name) for name, condition in conditions.items()).row(0, named=True)
 
@@ -270,7 +270,7 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
     # A fault counts once, whatever its rows.
     faults = independent_episodes(hazards)["missed"] if hazards.height else pl.Series(dtype=pl.Boolean)
     of_faults = {"faults": faults.len(), "missed_detections": faults.sum()}
-    return _counted(hazards, counts) | of_faults | {f"{name}_max_s": hazards[f"{name}_s"].max() for name in times}
+    return _count_rows(hazards, counts) | of_faults | {f"{name}_max_s": hazards[f"{name}_s"].max() for name in times}
 
 
 def failure_counts(failures: pl.DataFrame) -> Row:
@@ -278,7 +278,7 @@ def failure_counts(failures: pl.DataFrame) -> Row:
     counts = {"failures_within_budget": pl.col("within_budget"), "failures_beyond_budget": ~pl.col("within_budget")}
     return {
         "failures": failures.height,
-        **_counted(failures, counts),
+        **_count_rows(failures, counts),
         "hazardous_max_s": failures["hazardous_s"].max(),
         "hazardous_s": failures["hazardous_s"].sum(),
         "hazardous_natural_s": failures["natural_s"].sum(),

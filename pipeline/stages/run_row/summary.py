@@ -17,9 +17,9 @@ from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.failures import failures_within
 from pipeline.stages.judge.judge import Judged
 from pipeline.stages.matching.epochs import contradictory_covariances
+from pipeline.stages.monitored import MonitoredSolution
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.provenance import Provenance
-from pipeline.stages.ride import Ride
 from pipeline.stages.run_row.lost_time import LostColumns, LostTime, in_use_of, lost_time, remedies
 from pipeline.stages.run_row.run_figures import (
     accuracy,
@@ -75,12 +75,12 @@ def ingest_notes(ingest: IngestNotes) -> list[Remark]:
     )
 
 
-def ride_notes(ride: Ride, evidence: TrainEvidence) -> list[Remark]:
+def notes_of_replay(monitored: MonitoredSolution, evidence: TrainEvidence) -> list[Remark]:
     """What went in, and what matching, alignment and the LDS made of it."""
-    prepared = ride.prepared
+    prepared = monitored.prepared
     run = prepared.run
-    counts = prepared.counts.solutions[ride.solution.name]
-    doubtful = ride.match.ambiguous.iter_rows(named=True)
+    counts = prepared.counts.solutions[monitored.solution.name]
+    doubtful = monitored.match.ambiguous.iter_rows(named=True)
     return remarks(
         {
             Note.FAULTS_INJECTED: "" if run.faults is None else ", ".join(sorted(set(run.faults["kind"]))),
@@ -91,12 +91,12 @@ def ride_notes(ride: Ride, evidence: TrainEvidence) -> list[Remark]:
             Note.CONTRADICTING: counts.contradicting,
             Note.SPANS_DIFFER: _spans_differ(run),
             **_of_odometer(prepared.odometry, prepared.config.align.straight_s),
-            Note.ODOMETER_REVERSED: ride.match.odometer_sign < 0 and prepared.vehicle.gnss_antenna_ahead_m,
-            Note.COVARIANCE: contradictory_covariances(ride.solution.fixes),
+            Note.ODOMETER_REVERSED: monitored.match.odometer_sign < 0 and prepared.vehicle.gnss_antenna_ahead_m,
+            Note.COVARIANCE: contradictory_covariances(monitored.solution.fixes),
             Note.AMBIGUOUS: ", ".join(say("ambiguity", "stretch", **row) for row in doubtful),
-            Note.OFF_NETWORK: _few([_off(row) for row in ride.match.off.iter_rows(named=True)]),
-            Note.UNLINKED: _unlinked(ride.lds.linking["link_distance"]),
-            Note.UNKNOWN_TELEGRAMS: ", ".join(sorted(set(ride.lds.unknown_reads["balise_id"]))),
+            Note.OFF_NETWORK: _few([_off(row) for row in monitored.match.off.iter_rows(named=True)]),
+            Note.UNLINKED: _unlinked(monitored.lds.linking["link_distance"]),
+            Note.UNKNOWN_TELEGRAMS: ", ".join(sorted(set(monitored.lds.unknown_reads["balise_id"]))),
             Note.READS_DISPUTED: evidence.disputed,
             Note.READS_UNREACHABLE: evidence.unreachable,
         }

@@ -61,7 +61,7 @@ class Edge(NamedTuple):
 
 
 @frozen
-class Ways:
+class Onward:
     """All ways on, as arrays: `first[one] : first[one + 1]` are those from an oriented element, in their order."""
 
     first: Ints
@@ -99,7 +99,7 @@ class Network:
     """
 
     track: SurveyedTrack
-    successors: Ways
+    successors: Onward
     parts: Ints
     usable: Bools
     orientable: bool
@@ -248,7 +248,7 @@ def _linked_ends(track: SurveyedTrack, links: pl.DataFrame, side: str) -> tuple[
     return ints(element), ints(both["end"])
 
 
-def _ways(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backward: Bools) -> Ways:
+def _ways(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backward: Bools) -> Onward:
     """Ways in the order given; relations given twice, or once from each side, are one way with what either allows."""
     _, begins, same = np.unique(here * count + to, return_index=True, return_inverse=True)
     allowed = np.zeros((2, len(begins)), dtype=np.bool_)
@@ -256,10 +256,10 @@ def _ways(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backw
     np.logical_or.at(allowed[1], same, backward)
     order = np.lexsort((begins, here[begins]))
     first = np.searchsorted(here[begins[order]], np.arange(count + 1))
-    return Ways(first, to[begins[order]], gap_m[begins[order]], allowed[0][order], allowed[1][order])
+    return Onward(first, to[begins[order]], gap_m[begins[order]], allowed[0][order], allowed[1][order])
 
 
-def _oriented(track: SurveyedTrack, ways: Ways) -> Network:
+def _oriented(track: SurveyedTrack, ways: Onward) -> Network:
     """The network over these ways, with the orientations in use of each connected part."""
     part = connected_parts(len(ways), ways.here, ways.to)
     turned = part.reshape(-1, 2)[:, ::-1].ravel()
@@ -305,11 +305,11 @@ def network_along(track: SurveyedTrack, visits: list[Visit]) -> Network:
     split = track_in_parts(track, [(visit.element, part) for visit, part in parts])
     usable = np.array([visit.forward == (side == 0) for visit, _ in parts for side in (0, 1)])
     along = [Visit(number, visit.forward) for number, (visit, _) in enumerate(parts)]
-    ways = _joined(split, along)
+    ways = _onward_along_route(split, along)
     return Network(split, ways, connected_parts(len(ways), ways.here, ways.to), usable, orientable=True)
 
 
-def _joined(track: SurveyedTrack, visits: Sequence[Visit]) -> Ways:
+def _onward_along_route(track: SurveyedTrack, visits: Sequence[Visit]) -> Onward:
     """Ways on from each oriented element by the relations that the route uses, and no other."""
     element = np.array([visit.element for visit in visits], dtype=np.int64)
     forward = np.array([visit.forward for visit in visits], dtype=np.int64)
@@ -344,4 +344,4 @@ def site_network(site: Site) -> Network:
     track = surveyed(site)
     if site.route is None:
         return network_of(track, site.links)
-    return _oriented(track, _joined(track, visits_of(track, site.route)))
+    return _oriented(track, _onward_along_route(track, visits_of(track, site.route)))

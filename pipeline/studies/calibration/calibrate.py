@@ -10,7 +10,7 @@ import polars as pl
 import tomli_w
 
 from pipeline.one_run import replay
-from pipeline.results.workers import told
+from pipeline.results.workers import with_progress
 from pipeline.stages.alignment.align import align
 from pipeline.stages.matching import Match
 from pipeline.stages.monitors.bank import MonitorBank
@@ -87,7 +87,7 @@ def calibrate(
         raise InputError("no run has this solution", place=solution, found=", ".join(known), remedy=remedy)
     config = config or Configuration()
     base = vehicle or Vehicle()
-    return calibration_of([observe(log, site, base, config, solution) for log in told(logs)], base, config)
+    return calibration_of([observe(log, site, base, config, solution) for log in with_progress(logs)], base, config)
 
 
 def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> Observed:

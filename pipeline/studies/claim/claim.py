@@ -9,11 +9,11 @@ from typing import Any
 import polars as pl
 
 from pipeline.results import store
-from pipeline.results.workers import told
+from pipeline.results.workers import with_progress
 from pipeline.storage.address import Address
 from pipeline.studies.claim.front import front_of
 from pipeline.studies.claim.profile import RequirementProfile
-from pipeline.studies.claim.requirements import ALL, ClaimRide, Requirement, Tallies, requirements, tallies
+from pipeline.studies.claim.requirements import ALL, ClaimJourney, Requirement, Tallies, requirements, tallies
 from pipeline.studies.claim.tally import Kind, Tally, drawn
 from pipeline.studies.reservations import failed_runs, runs_without_truth, sentences, several_settings
 from pipeline.studies.tally import S_PER_H, Compliance, distinct
@@ -58,7 +58,7 @@ def claim(
     by_solution: dict[str, Tallies] = defaultdict(dict)
     days: set[tuple[object, ...]] = set()
     # Which run of a day is its trial is drawn before an error is looked at, and apart from its instant.
-    for run in told(sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}"))):
+    for run in with_progress(sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}"))):
         of_run = _tallies_of(out, run, config, profile, areas, ahead_m)
         if profile.method.independent == "day" and run["t_start"] is not None:
             of_run = _once_a_day(of_run, (run["solution"], run["t_start"].date()), days)
@@ -90,8 +90,8 @@ def _tallies_of(
     of_run = (store.read_table(out, name, run["run_id"]).collect() for name in ("epochs", "passages"))
     epochs, passages = (frame.filter(pl.col("solution") == run["solution"]) for frame in of_run)
     front = front_of(epochs, passages, run, config, profile.method, areas, ahead_m)
-    ride = ClaimRide(_name(run), front, epochs, passages, profile)
-    return tallies(ride) | {("no_area", ALL): ride.outside()}
+    journey = ClaimJourney(_name(run), front, epochs, passages, profile)
+    return tallies(journey) | {("no_area", ALL): journey.outside()}
 
 
 def _name(run: dict[str, Any]) -> str:

@@ -119,7 +119,7 @@ class Availability(Settings):
     clause: str
 
 
-class WayLimits(Settings):
+class DistanceLimits(Settings):
     without_balise_m: Positive
     clause: str
 
@@ -145,7 +145,7 @@ class RequirementProfile(Settings):
     start: Start
     cold_movement: ColdMovement
     availability: Availability
-    way: WayLimits
+    way: DistanceLimits
     failure_rate: FailureRate
 
 

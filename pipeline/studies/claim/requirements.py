@@ -21,7 +21,7 @@ from pipeline.studies.claim.tally import (
     Kind,
     Tally,
     codes,
-    counted,
+    count_claims,
 )
 from pipeline.studies.tally import S_PER_H
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags
@@ -32,7 +32,7 @@ ALL = "all"
 
 
 @frozen
-class ClaimRide:
+class ClaimJourney:
     """One solution of one run: its front end, and the tables that the requirements ask for beside it."""
 
     name: str
@@ -50,7 +50,9 @@ class ClaimRide:
         held = np.where(here, clock.held_s[rows], 0.0)
         codes = np.where(here, code[rows], NOT_KNOWN)
         sizes = None if size is None else np.where(here, size[rows], np.nan)
-        return counted(self.name, clock.t_ns[rows], held, codes, self.profile.method.event_gap_s, sizes, silent[rows])
+        return count_claims(
+            self.name, clock.t_ns[rows], held, codes, self.profile.method.event_gap_s, sizes, silent[rows]
+        )
 
     def inside(self, kind: AreaType) -> Bools:
         """Epochs with an estimated front end in areas of this type."""
@@ -109,16 +111,16 @@ class Requirement:
     limit: str
     demand: Demand
     clause: str
-    count: Callable[[ClaimRide], Tally] = lambda _: Tally()
+    count: Callable[[ClaimJourney], Tally] = lambda _: Tally()
 
     @property
     def key(self) -> Key:
         return self.name, self.applies_to
 
 
-def tallies(ride: ClaimRide) -> Tallies:
+def tallies(journey: ClaimJourney) -> Tallies:
     """Every requirement on one ride."""
-    return {requirement.key: requirement.count(ride) for requirement in requirements(ride.profile)}
+    return {requirement.key: requirement.count(journey) for requirement in requirements(journey.profile)}
 
 
 def requirements(profile: RequirementProfile) -> list[Requirement]:
@@ -136,10 +138,10 @@ def requirements(profile: RequirementProfile) -> list[Requirement]:
     ]
 
 
-def _safe(ride: ClaimRide, kind: AreaType | None = None) -> Tally:
+def _safe(journey: ClaimJourney, kind: AreaType | None = None) -> Tally:
     """The train between min and max safe front end, in areas of one type or wherever it is."""
-    where = ride.front.output if kind is None else ride.inside(kind)
-    return ride.tally(ride.safe, where, ride.front.least_m)
+    where = journey.front.output if kind is None else journey.inside(kind)
+    return journey.tally(journey.safe, where, journey.front.least_m)
 
 
 def _asked(code: Ints, limit: Floats) -> Ints:
@@ -147,13 +149,13 @@ def _asked(code: Ints, limit: Floats) -> Ints:
 
 
 def _of_area(kind: AreaType, area: AreaLimits, profile: RequirementProfile) -> list[Requirement]:
-    def exceeded(ride: ClaimRide, name: str) -> Tally:
-        code, size = ride.beyond[name]
-        return ride.tally(code, ride.inside(kind), size)
+    def exceeded(journey: ClaimJourney, name: str) -> Tally:
+        code, size = journey.beyond[name]
+        return journey.tally(code, journey.inside(kind), size)
 
-    def close(ride: ClaimRide) -> Tally:
-        code = ride.front.within(area.accuracy_m, area.accuracy_m)
-        return ride.tally(code, ride.inside(kind), ride.front.least_m)
+    def close(journey: ClaimJourney) -> Tally:
+        code = journey.front.within(area.accuracy_m, area.accuracy_m)
+        return journey.tally(code, journey.inside(kind), journey.front.least_m)
 
     of = kind.value
     rate = profile.failure_rate
@@ -176,15 +178,15 @@ def _slow(kind: AreaType, profile: RequirementProfile) -> list[Requirement]:
     slow = profile.slow
     of = kind.value
 
-    def here(ride: ClaimRide) -> Bools:
-        return ride.inside(kind) & (np.abs(ride.front.speed_mps) * KMH_PER_MPS < slow.below_kmh)
+    def here(journey: ClaimJourney) -> Bools:
+        return journey.inside(kind) & (np.abs(journey.front.speed_mps) * KMH_PER_MPS < slow.below_kmh)
 
-    def claimed(ride: ClaimRide) -> Tally:
-        width = np.maximum(ride.front.over_m, ride.front.under_m)
-        return ride.tally(codes(width <= slow.limit_m, width > slow.limit_m), here(ride), width)
+    def claimed(journey: ClaimJourney) -> Tally:
+        width = np.maximum(journey.front.over_m, journey.front.under_m)
+        return journey.tally(codes(width <= slow.limit_m, width > slow.limit_m), here(journey), width)
 
-    def known(ride: ClaimRide, limit_m: float) -> Tally:
-        return ride.tally(ride.front.within(limit_m, limit_m), here(ride))
+    def known(journey: ClaimJourney, limit_m: float) -> Tally:
+        return journey.tally(journey.front.within(limit_m, limit_m), here(journey))
 
     limit = f"{slow.limit_m:g} m"
     close = f"{slow.accuracy_m:g} m"
@@ -203,19 +205,19 @@ def _after_balise(profile: RequirementProfile) -> list[Requirement]:
     """
     after = profile.after_balise
 
-    def count(ride: ClaimRide, kind: BaliseKind) -> Tally:
+    def count(journey: ClaimJourney, kind: BaliseKind) -> Tally:
         """The balises of one kind on one ride, those passed faster than the requirement reaches left out."""
-        front = ride.front
-        limit = after.limit_m(ride.front.speed_mps)
+        front = journey.front
+        limit = after.limit_m(journey.front.speed_mps)
         # One more row: no epoch after the balise.
         code = np.append(_asked(front.within(limit, limit), limit), NOT_KNOWN)
         faster = np.append(np.abs(front.speed_mps) * KMH_PER_MPS > after.to_kmh, False)
-        at_ns = _passed(ride.passages, kind)
+        at_ns = _passed(journey.passages, kind)
         rows = _first_after(front, at_ns)
         at_ns = at_ns[~faster[rows]]
         rows = rows[~faster[rows]]
         # Each balise weighs the same, whatever time its epoch holds.
-        counts = counted(ride.name, at_ns, np.zeros(rows.size), code[rows], profile.method.event_gap_s)
+        counts = count_claims(journey.name, at_ns, np.zeros(rows.size), code[rows], profile.method.event_gap_s)
         held = np.append(front.clock.held_s, 0.0)[rows]
         known = code[rows] != NOT_KNOWN
         return replace(counts, held_s=float(held.sum()), known_s=float(held[known].sum()))
@@ -248,10 +250,12 @@ def _speed(profile: RequirementProfile) -> list[Requirement]:
     safe = profile.safe_speed
     speed = profile.speed
 
-    def count(ride: ClaimRide, limit_kmh: Callable[[Floats], Floats], over: bool = True, under: bool = True) -> Tally:
-        limit = limit_kmh(ride.speeds.fastest_kmh)
-        code = ride.speeds.within(limit if over else np.inf, limit if under else np.inf)
-        return _of_windows(ride, code, np.isfinite(limit))
+    def count(
+        journey: ClaimJourney, limit_kmh: Callable[[Floats], Floats], over: bool = True, under: bool = True
+    ) -> Tally:
+        limit = limit_kmh(journey.speeds.fastest_kmh)
+        code = journey.speeds.within(limit if over else np.inf, limit if under else np.inf)
+        return _of_windows(journey, code, np.isfinite(limit))
 
     margin = f"{safe.low_kmh:g} km/h to {safe.below_kmh:g}, {safe.high_kmh:g} at {safe.at_kmh:g} km/h"
     near = f"{speed.fixed_kmh:g} km/h to {speed.to_kmh:g} km/h, {speed.above_share:.0%} above"
@@ -265,32 +269,32 @@ def _speed(profile: RequirementProfile) -> list[Requirement]:
     ]
 
 
-def _of_windows(ride: ClaimRide, code: Ints, where: Bools) -> Tally:
+def _of_windows(journey: ClaimJourney, code: Ints, where: Bools) -> Tally:
     """Of windows of speed, and of the gaps of the log between them, in order of time."""
-    speeds = ride.speeds
-    gaps = np.flatnonzero(ride.front.silent_s > 0)
-    gap_s = ride.front.silent_s[gaps]
+    speeds = journey.speeds
+    gaps = np.flatnonzero(journey.front.silent_s > 0)
+    gap_s = journey.front.silent_s[gaps]
     nothing = np.zeros(gaps.size)
-    t_ns = np.concatenate((speeds.t_ns, ride.front.clock.t_ns[gaps]))
+    t_ns = np.concatenate((speeds.t_ns, journey.front.clock.t_ns[gaps]))
     held_s = np.concatenate((speeds.length_s, nothing))
     silent_s = np.concatenate((np.zeros(speeds.t_ns.size), gap_s))
     codes = np.concatenate((code, np.full(gaps.size, NOT_KNOWN)))
     order = np.argsort(t_ns, kind="stable")
     rows = order[np.concatenate((where, gap_s > 0))[order]]
-    gap = ride.profile.method.event_gap_s
-    return counted(ride.name, t_ns[rows], held_s[rows], codes[rows], gap, silent_s=silent_s[rows])
+    gap = journey.profile.method.event_gap_s
+    return count_claims(journey.name, t_ns[rows], held_s[rows], codes[rows], gap, silent_s=silent_s[rows])
 
 
 def _start(profile: RequirementProfile) -> list[Requirement]:
     """Start of mission: times from the log's begin, which is no switch-on."""
     start = profile.start
 
-    def first(ride: ClaimRide) -> Tally:
-        return Tally(trials=1, worst=_first_s(ride, flags(ride.epochs, "in_use")))
+    def first(journey: ClaimJourney) -> Tally:
+        return Tally(trials=1, worst=_first_s(journey, flags(journey.epochs, "in_use")))
 
-    def nothing(ride: ClaimRide) -> Tally:
-        worst = _first_s(ride, flags(ride.epochs, "tvb") | ride.epochs["lrvb_id"].is_not_null().to_numpy())
-        waited = (ride.front.clock.duration_s or 0.0) if worst is None else worst
+    def nothing(journey: ClaimJourney) -> Tally:
+        worst = _first_s(journey, flags(journey.epochs, "tvb") | journey.epochs["lrvb_id"].is_not_null().to_numpy())
+        waited = (journey.front.clock.duration_s or 0.0) if worst is None else worst
         return replace(_one(broken=waited > start.nothing_s), worst=worst)
 
     moved = profile.cold_movement
@@ -302,9 +306,9 @@ def _start(profile: RequirementProfile) -> list[Requirement]:
     ]
 
 
-def _first_s(ride: ClaimRide, there: Bools) -> float | None:
+def _first_s(journey: ClaimJourney, there: Bools) -> float | None:
     """Time from the first epoch to the first one of these [s]."""
-    t_ns = ride.front.clock.t_ns
+    t_ns = journey.front.clock.t_ns
     return float((t_ns[there][0] - t_ns[0]) / NS_PER_S) if there.any() else None
 
 
@@ -325,15 +329,15 @@ def _operation(profile: RequirementProfile) -> list[Requirement]:
     ]
 
 
-def _availability(ride: ClaimRide) -> Tally:
+def _availability(journey: ClaimJourney) -> Tally:
     """Time lost once there was an output; broken where so much of it lies within so long.
 
     Lost is no output, or an interval wider than MAPCI; gaps of the log, where nobody knows, are left out.
     """
-    front = ride.front
-    asked = ride.profile.availability
+    front = journey.front
+    asked = journey.profile.availability
     with np.errstate(invalid="ignore"):
-        lost: Bools = ~front.output | (front.over_m + front.under_m > 2.0 * ride.limit_m)
+        lost: Bools = ~front.output | (front.over_m + front.under_m > 2.0 * journey.limit_m)
     held = front.clock.held_s * (np.cumsum(front.output) > 0)
     t_s = (front.clock.t_ns - front.clock.t_ns[:1]) / NS_PER_S
     until = np.cumsum(np.where(lost, held, 0.0))
@@ -348,14 +352,14 @@ def _availability(ride: ClaimRide) -> Tally:
     )
 
 
-def _ways(ride: ClaimRide) -> Tally:
+def _ways(journey: ClaimJourney) -> Tally:
     """Ways of at least the demanded length between physical balises; broken where MAPO or MAPU was exceeded on one."""
-    odometer = ride.epochs["odometer_m"].cast(pl.Float64).to_numpy()
+    odometer = journey.epochs["odometer_m"].cast(pl.Float64).to_numpy()
     way = np.cumsum(np.abs(np.nan_to_num(np.diff(odometer, prepend=odometer[:1]))))
-    cuts = np.searchsorted(ride.front.clock.t_ns, _passed(ride.passages, BaliseKind.PHYSICAL))
+    cuts = np.searchsorted(journey.front.clock.t_ns, _passed(journey.passages, BaliseKind.PHYSICAL))
     bounds = np.unique(np.concatenate(([0], cuts, [way.size])))
-    broken = np.logical_or.reduce([code == BROKEN for code, _ in ride.beyond.values()])
+    broken = np.logical_or.reduce([code == BROKEN for code, _ in journey.beyond.values()])
     lengths = [float(way[min(last, way.size - 1)] - way[first]) for first, last in pairwise(bounds)]
-    long = [number for number, length in enumerate(lengths) if length >= ride.profile.way.without_balise_m]
+    long = [number for number, length in enumerate(lengths) if length >= journey.profile.way.without_balise_m]
     bad = sum(bool(broken[bounds[number] : bounds[number + 1]].any()) for number in long)
     return Tally(trials=len(long), broken=bad, events=bad, possible=len(long), worst=max(lengths, default=None))

@@ -59,7 +59,7 @@ def codes(kept: Bools, broken: Bools) -> Ints:
     return np.where(broken, BROKEN, np.where(kept, KEPT, NOT_KNOWN)).astype(np.int64)
 
 
-def counted(
+def count_claims(
     run: str,
     t_ns: Ints,
     held_s: Floats,

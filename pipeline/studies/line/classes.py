@@ -36,7 +36,7 @@ def piece_classes(
     ).join(pl.DataFrame({"growing": [True, False]}), how="cross")
     side = pl.when("growing").then(pl.lit(LineDirection.GROWING.value)).otherwise(pl.lit(LineDirection.FALLING.value))
     counted = (
-        places.join(_counted(passes, criteria), on=KEYS, how="left", maintain_order="left")
+        places.join(_count_per_piece(passes, criteria), on=KEYS, how="left", maintain_order="left")
         .join(undetected, on="piece", how="left", maintain_order="left")
         .with_columns(
             pl.col(pl.UInt32).cast(pl.Int64).fill_null(0),
@@ -65,7 +65,7 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     return worst.first().drop("claimed").join(claimed, on=[*KEYS, "day"])
 
 
-def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
+def _count_per_piece(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Counts per piece and direction; hours of the day are those of all right passes."""
     state = pl.col("state")
     cause = pl.col("cause")

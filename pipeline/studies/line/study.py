@@ -7,7 +7,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.results.store import check_site, complete_runs, completed_runs, read_config, read_table
-from pipeline.results.workers import told
+from pipeline.results.workers import with_progress
 from pipeline.studies.line.classes import piece_classes
 from pipeline.studies.line.passes import PieceIndex, passes_of
 from pipeline.studies.line.pieces import Pieces, middles, pieces_of
@@ -98,7 +98,7 @@ def passes_of_runs(
     config = read_config(out) or Configuration()
     parts = []
     errors = []
-    for run, solution, evidence in told(runs.select("run_id", "solution", "evidence").rows()):
+    for run, solution, evidence in with_progress(runs.select("run_id", "solution", "evidence").rows()):
         of_solution = pl.col("solution") == solution
         epochs = read_table(out, "epochs", run).select(EPOCH_COLUMNS).filter(of_solution).collect()
         passages, alarms = (read_table(out, name, run).filter(of_solution).collect() for name in ("passages", "alarms"))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.stages.odometry.scale_lag import CountedRows, scale_and_lag
+from pipeline.stages.odometry.scale_lag import CounterRows, scale_and_lag
 from pipeline.studies.plausibility.records import MOVING_MPS, SPEED_S, Places, Record
 from schemas.arrays import Bools, Floats
 from schemas.frozen import frozen
@@ -243,10 +243,10 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     )
 
 
-def _driven(counter: Record, lag_s: float) -> CountedRows:
+def _driven(counter: Record, lag_s: float) -> CounterRows:
     """The counter as way driven, by the clock of the positions: their ways have no sign. None over a pause."""
     paused = np.diff(counter.t_s) > counter.limit_s
-    return CountedRows(counter.t_s - lag_s, counter.values, np.concatenate([[0.0], np.cumsum(paused)])).driven()
+    return CounterRows(counter.t_s - lag_s, counter.values, np.concatenate([[0.0], np.cumsum(paused)])).driven()
 
 
 def _windows(gnss: Places, begin_s: float, end_s: float) -> tuple[Floats, Floats]:

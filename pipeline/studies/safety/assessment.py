@@ -13,7 +13,7 @@ from pipeline.results import store
 from pipeline.results.figures.campaign_figures import derived_tables
 from pipeline.results.figures.map_errors import map_suspects
 from pipeline.results.manifest import NAME, read_manifest
-from pipeline.results.workers import told
+from pipeline.results.workers import with_progress
 from pipeline.storage.address import Address, join
 from pipeline.studies.safety.sensitivity import Replay, sensitivity
 from pipeline.studies.safety.sentences import (
@@ -82,7 +82,7 @@ def compare_architectures(
     done = runs.filter(pl.col("status") != RunStatus.FAILED)
     several = done.group_by("run_id").len().filter(pl.col("len") > 1)["run_id"].sort()
     compared = {}
-    for run_id in told(several.to_list()):
+    for run_id in with_progress(several.to_list()):
         epochs = store.read_table(out, "epochs", run_id).select(EPOCH_COLUMNS).collect()
         of_hazards, of_alarms, of_runs = (frame.filter(pl.col("run_id") == run_id) for frame in (hazards, alarms, done))
         compared[run_id] = side_by_side(epochs, of_hazards, of_alarms, of_runs, config)

@@ -22,7 +22,7 @@ def faults_of_pair(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
 
     `common`: a failure of each solution at the same time.
     """
-    both = pl.concat([_beside(first, second), _beside(second, first)]).sort("begin")
+    both = pl.concat([_mark_common(first, second), _mark_common(second, first)]).sort("begin")
     end_ns = pl.col("t_end").to_physical().fill_null(_OPEN_END_NS)
     begin_ns = pl.col("begin").to_physical()
     apart = begin_ns > end_ns.cum_max().shift(1)
@@ -37,7 +37,7 @@ def faults_of_pair(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _beside(faults: pl.DataFrame, others: pl.DataFrame) -> pl.DataFrame:
+def _mark_common(faults: pl.DataFrame, others: pl.DataFrame) -> pl.DataFrame:
     """`faults`, `common` where both they and one of the others at the same time are failures."""
     spans = _spans(faults).with_columns(pl.col("end").fill_null(_OPEN_END_NS)).rows()
     failed = _spans(others.filter("failed"))

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import polars as pl
 
-from pipeline.stages.epochs.clock import Clock, held_s, may_move, met, nominal_period_s, position_ns, trusted, uptime
+from pipeline.stages.epochs.clock import Clock, held_s, holds, may_move, nominal_period_s, position_ns, trusted, uptime
 from pipeline.stages.epochs.verdicts import FailureLog, failure_log
 from pipeline.stages.monitors.single import channel_monitor, on_path_of, paired
 from pipeline.stages.run_row.bounds import independent_episodes
@@ -151,12 +151,12 @@ def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, c
     columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
     fails = failure_log(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
     clock = Clock.of(epochs, config)
-    seen = met(epochs, judged)
-    working = seen & met(epochs, pl.col("trusted"))
+    seen = holds(epochs, judged)
+    working = seen & holds(epochs, pl.col("trusted"))
     for span in fails.alarms:
         until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
         working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
-    known, wrong, moving = (met(epochs, pl.col(name)) for name in ("known", "wrong", "moving"))
+    known, wrong, moving = (holds(epochs, pl.col(name)) for name in ("known", "wrong", "moving"))
     return _Diagnosed(clock, fails, working, known, known & wrong, moving)
 
 

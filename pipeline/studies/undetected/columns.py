@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
-from pipeline.stages.ride import Ride
+from pipeline.stages.monitored import MonitoredSolution
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
 from pipeline.studies.undetected.in_use import Returns, in_use_errors
@@ -39,22 +39,22 @@ class Undetected:
         return undetected_figures(epochs, self.spacing, config.hazards.limits.failure_m)
 
 
-def unnoticed_of(ride: Ride) -> Undetected:
+def unnoticed_of(monitored: MonitoredSolution) -> Undetected:
     """The largest error that no monitor would have noticed at each epoch and passage; nulls where nobody asked.
 
     Never smaller than what any fault of the definition reaches.
     """
-    config = ride.prepared.config
-    epochs = ride.solution.epochs
-    nothing = _nothing(Passages, ride.lds.passages.height)
+    config = monitored.prepared.config
+    epochs = monitored.solution.epochs
+    nothing = _nothing(Passages, monitored.lds.passages.height)
     if not config.undetected.compute:
         return Undetected(_nothing(Epochs, epochs.height), nothing)
-    rows = rows_of(ride)
-    parts = windows_of(ride, rows)
+    rows = rows_of(monitored)
+    parts = windows_of(monitored, rows)
     errors = _both(rows, parts, config.undetected)
     spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
     facing = ints(epochs["direction"], unknown=1)[rows.epoch]
-    sizes_m = (errors.error_m, _in_use_m(ride, rows, parts, errors), _range_m(ride, rows, parts))
+    sizes_m = (errors.error_m, _in_use_m(monitored, rows, parts, errors), _range_m(monitored, rows, parts))
     columns = {
         name.format(way): values
         for name, error_m in zip((*_OF_EPOCHS, _OF_RANGE), sizes_m, strict=True)
@@ -63,8 +63,8 @@ def unnoticed_of(ride: Ride) -> Undetected:
     at_rows = pl.DataFrame(columns | {"physical_before_m": before_m}).fill_nan(None)
     at_epochs = np.full(epochs.height, NO_ROW)
     at_epochs[rows.epoch] = np.arange(rows.rows)
-    at = rows_of_passages(ride, rows)
-    of_passages = _gathered(at_rows, at).with_columns(_holding(ride, errors, at))
+    at = rows_of_passages(monitored, rows)
+    of_passages = _gathered(at_rows, at).with_columns(_holding(monitored, errors, at))
     return Undetected(
         _gathered(at_rows, at_epochs).select(name.format(way) for name in _OF_EPOCHS for way in _WAYS),
         of_passages.select(nothing.columns),
@@ -83,28 +83,28 @@ def _gathered(at_rows: pl.DataFrame, at: Ints) -> pl.DataFrame:
     return at_rows.select(pl.all().gather(place))
 
 
-def rows_of(ride: Ride) -> Watched:
+def rows_of(monitored: MonitoredSolution) -> Watched:
     """What the monitors watched, the comparison with another solution where the fault is in one alone."""
-    prepared = ride.prepared
+    prepared = monitored.prepared
     config = prepared.config
-    epochs = ride.solution.epochs
-    rows = watched(epochs, ride.bank.along(), ride.lds.held, prepared.vehicle, config)
+    epochs = monitored.solution.epochs
+    rows = watched(epochs, monitored.bank.along(), monitored.lds.held, prepared.vehicle, config)
     if config.undetected.solutions_at_fault == "all":
         return rows
-    return with_channel(rows, epochs, ride.singles["channel"], ride.other, config.lds)
+    return with_channel(rows, epochs, monitored.singles["channel"], monitored.other, config.lds)
 
 
-def windows_of(ride: Ride, rows: Watched) -> list[FaultWindow]:
+def windows_of(monitored: MonitoredSolution, rows: Watched) -> list[FaultWindow]:
     """From each independent fix to the next."""
-    prepared = ride.prepared
+    prepared = monitored.prepared
     fixes = fixes_ns(
-        prepared.run, ride.lds.crossings, prepared.config.lds.starts_of_mission, prepared.config.undetected
+        prepared.run, monitored.lds.crossings, prepared.config.lds.starts_of_mission, prepared.config.undetected
     )
-    return windows(rows, times_ns(ride.solution.epochs), fixes)
+    return windows(rows, times_ns(monitored.solution.epochs), fixes)
 
 
 @frozen
-class _BothWays:
+class _BothDirections:
     """Errors along growing path and against it at each row [m] (2, rows), NaN at the first row.
 
     `since_ns`: when they began at the earliest, else -1. `paid_m`, `outright`: what holds the larger (`error.Errors`).
@@ -116,7 +116,7 @@ class _BothWays:
     outright: Bools
 
 
-def _both(rows: Watched, parts: list[FaultWindow], config: UndetectedConfig) -> _BothWays:
+def _both(rows: Watched, parts: list[FaultWindow], config: UndetectedConfig) -> _BothDirections:
     error = np.full((2, rows.rows), np.nan)
     since_ns = np.full(rows.rows, -1)
     paid = np.zeros((rows.rows, 1 + rows.weight.shape[1]))
@@ -130,13 +130,13 @@ def _both(rows: Watched, parts: list[FaultWindow], config: UndetectedConfig) -> 
         since_ns[part] = window.since_ns
         paid[part] = np.where(worse[:, None], ahead.paid_m, behind.paid_m)
         outright[part] = np.where(worse, ahead.outright, behind.outright)
-    return _BothWays(error, since_ns, paid, outright)
+    return _BothDirections(error, since_ns, paid, outright)
 
 
-def _in_use_m(ride: Ride, rows: Watched, parts: list[FaultWindow], errors: _BothWays) -> Floats:
-    config = ride.prepared.config
-    vehicle = ride.prepared.vehicle
-    epochs = ride.solution.epochs
+def _in_use_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWindow], errors: _BothDirections) -> Floats:
+    config = monitored.prepared.config
+    vehicle = monitored.prepared.vehicle
+    epochs = monitored.solution.epochs
     returns = None
     # No negated position returns between fixes without a re-link, or a vehicle file to compare with.
     if config.lds.relink and vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None:
@@ -144,13 +144,15 @@ def _in_use_m(ride: Ride, rows: Watched, parts: list[FaultWindow], errors: _Both
     return in_use_errors(rows, parts, errors.error_m, flags(epochs, "tvb")[rows.epoch], returns, config)
 
 
-def _range_m(ride: Ride, rows: Watched, parts: list[FaultWindow]) -> Floats:
+def _range_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWindow]) -> Floats:
     """By the worst range at fault; NaN without ranges."""
-    satellites = ride.prepared.ranges(ride.solution.name)
+    satellites = monitored.prepared.ranges(monitored.solution.name)
     if satellites is None:
         return np.full((2, rows.rows), np.nan)
-    low_m, high_m = range_bounds(ride.aligned, satellites, ride.prepared.config)
-    return _both(bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts, ride.prepared.config.undetected).error_m
+    low_m, high_m = range_bounds(monitored.aligned, satellites, monitored.prepared.config)
+    return _both(
+        bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts, monitored.prepared.config.undetected
+    ).error_m
 
 
 def _way_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
@@ -160,35 +162,35 @@ def _way_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
     return way
 
 
-def rows_of_passages(ride: Ride, rows: Watched) -> Ints:
+def rows_of_passages(monitored: MonitoredSolution, rows: Watched) -> Ints:
     """The row that each passage looks at, `NO_ROW` where there is none.
 
     Of a virtual balise the epoch that offered it. Of a physical one the last row before its telegram, no longer before
     than a crossing may be seen over: that is how wrong the position can have become since the read before.
     """
-    epoch_of = ride.lds.crossings.select("crossing_id", "epoch")
-    seen = ride.lds.passages.join(epoch_of, on="crossing_id", how="left", maintain_order="left")
+    epoch_of = monitored.lds.crossings.select("crossing_id", "epoch")
+    seen = monitored.lds.passages.join(epoch_of, on="crossing_id", how="left", maintain_order="left")
     if not rows.rows:
         return np.full(seen.height, NO_ROW)
-    t_ns = times_ns(ride.solution.epochs)
+    t_ns = times_ns(monitored.solution.epochs)
     wanted = ints(seen["epoch"])
     row = np.searchsorted(rows.epoch, wanted).clip(max=rows.rows - 1)
     offered = np.where((wanted >= 0) & (rows.epoch[row] == wanted), row, NO_ROW)
     read_ns = ints(seen["t_offered"].dt.timestamp("ns"))
     stamps = t_ns[rows.epoch]
     before = np.searchsorted(stamps, read_ns, side="right") - 1
-    longest_ns = crossing_gaps_ns(t_ns, ride.prepared.config.lds)[rows.epoch]
+    longest_ns = crossing_gaps_ns(t_ns, monitored.prepared.config.lds)[rows.epoch]
     near = (before >= 0) & (read_ns - stamps[before.clip(0)] <= longest_ns[before.clip(0)])
     physical = (seen["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
     return np.where(physical, np.where(near, before, NO_ROW), offered)
 
 
-def _holding(ride: Ride, errors: _BothWays, at: Ints) -> list[pl.Series]:
+def _holding(monitored: MonitoredSolution, errors: _BothDirections, at: Ints) -> list[pl.Series]:
     """`undetected_since, undetected_monitors` of passages at these rows; null where no error is known."""
     known = (at != NO_ROW) & (np.append(errors.since_ns, -1)[at] >= 0)
     rows = [int(row) if yes else None for row, yes in zip(at, known, strict=True)]
-    names = _names(ride)
-    share = ride.prepared.config.undetected.holding_share
+    names = _names(monitored)
+    share = monitored.prepared.config.undetected.holding_share
     since = [None if row is None else int(errors.since_ns[row]) for row in rows]
     monitors = [None if row is None else _monitors(errors, row, names, share) for row in rows]
     return [
@@ -197,14 +199,14 @@ def _holding(ride: Ride, errors: _BothWays, at: Ints) -> list[pl.Series]:
     ]
 
 
-def _names(ride: Ride) -> list[str]:
+def _names(monitored: MonitoredSolution) -> list[str]:
     """The monitors along the track in use (raw stands for the largest rate of a fault too), and who holds outright."""
-    enabled = ride.bank.along().enabled
+    enabled = monitored.bank.along().enabled
     along = [f"along_{name}" for index, name in enumerate(SCALES) if enabled[index] or index == 0]
-    return [*along, "channel" if ride.prepared.config.undetected.solutions_at_fault == "one" else "link_distance"]
+    return [*along, "channel" if monitored.prepared.config.undetected.solutions_at_fault == "one" else "link_distance"]
 
 
-def _monitors(errors: _BothWays, row: int, names: list[str], least: float) -> list[str]:
+def _monitors(errors: _BothDirections, row: int, names: list[str], least: float) -> list[str]:
     """Monitors that hold the larger error at a row, first what holds most of it; none where the bank was blind."""
     if errors.outright[row]:
         return [names[-1]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.stages.ride import Ride
+from pipeline.stages.monitored import MonitoredSolution
 from pipeline.studies.undetected.columns import rows_of, rows_of_passages, windows_of
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.exact import MARGIN, largest_profile
@@ -34,12 +34,12 @@ class FaultProfile:
     monitors: tuple[str, ...]
 
 
-def profile_at(ride: Ride, epoch: int, behind: bool) -> FaultProfile:
+def profile_at(monitored: MonitoredSolution, epoch: int, behind: bool) -> FaultProfile:
     """The largest unnoticed fault at an epoch, ahead or behind in the direction of travel there."""
-    epochs = ride.solution.epochs
-    rows = rows_of(ride)
+    epochs = monitored.solution.epochs
+    rows = rows_of(monitored)
     row = int(np.searchsorted(rows.epoch, epoch))
-    window = next((part for part in windows_of(ride, rows) if part.start < row <= part.end), None)
+    window = next((part for part in windows_of(monitored, rows) if part.start < row <= part.end), None)
     if window is None or row >= rows.rows or rows.epoch[row] != epoch:
         raise UsageError(
             "has no fault to look for",
@@ -50,7 +50,7 @@ def profile_at(ride: Ride, epoch: int, behind: bool) -> FaultProfile:
     part = rows.since(window.start, row, window.since_s)
     seen = part.mirrored() if against else part
     optimum = largest_profile(seen, MARGIN)
-    enabled = ride.bank.along().enabled
+    enabled = monitored.bank.along().enabled
     names = [name for name, on in zip(SCALES, enabled, strict=True) if on or name == "raw"]
     return FaultProfile(
         fault=pl.DataFrame(
@@ -58,24 +58,24 @@ def profile_at(ride: Ride, epoch: int, behind: bool) -> FaultProfile:
         ),
         t=pl.Series("t", [window.since_ns, int(times_ns(epochs)[epoch])]).cast(pl.Datetime("ns", "UTC")),
         error_m=optimum.error_m,
-        bound_m=float(largest_errors(seen, ride.prepared.config.undetected).most_m[-1]),
+        bound_m=float(largest_errors(seen, monitored.prepared.config.undetected).most_m[-1]),
         step_m=largest_of_shape(seen, "step"),
         ramp_m=largest_of_shape(seen, "ramp"),
         monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in optimum.binding),
     )
 
 
-def epoch_of(ride: Ride, balise: str | None, at_s: float | None) -> int:
+def epoch_of(monitored: MonitoredSolution, balise: str | None, at_s: float | None) -> int:
     """The epoch that is asked for: of the first passage of a balise, the last one up to a time, or the last one."""
-    rows = rows_of(ride)
-    passages = ride.lds.passages
+    rows = rows_of(monitored)
+    passages = monitored.lds.passages
     if balise is None:
-        t_ns = times_ns(ride.solution.epochs)
+        t_ns = times_ns(monitored.solution.epochs)
         stamps = t_ns[rows.epoch]
         latest = stamps[-1:].sum() if at_s is None else t_ns[0] + round(at_s * NS_PER_S)
         row = int(np.searchsorted(stamps, latest, side="right")) - 1
         return int(rows.epoch[row]) if row >= 0 else 0
-    at = rows_of_passages(ride, rows)
+    at = rows_of_passages(monitored, rows)
     watched = at >= 0
     of_balise = (passages["balise_id"] == balise).to_numpy()
     if not (of_balise & watched).any():

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.judge.failures import Course, Jump, course_of
+from pipeline.stages.judge.failures import ErrorHistory, Jump, error_history_of
 from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.stages import JudgedEpochs, JudgedOffers
@@ -52,8 +52,8 @@ def offers(epochs: Sequence[int], **columns: Any) -> pl.DataFrame:
     return _frame(size, values, dtypes(JudgedOffers))
 
 
-def course(frame: pl.DataFrame, *jumps: Jump, offered: pl.DataFrame | None = None) -> Course:
-    return course_of(frame, offers([]) if offered is None else offered, jumps, CONFIG)
+def history(frame: pl.DataFrame, *jumps: Jump, offered: pl.DataFrame | None = None) -> ErrorHistory:
+    return error_history_of(frame, offers([]) if offered is None else offered, jumps, CONFIG)
 
 
 def _frame(size: int, values: dict[str, Any], kinds: Any) -> pl.DataFrame:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pipeline.one_run import ride_alone
+from pipeline.one_run import monitor_alone
 from pipeline.stages.judge.judge import judge
-from pipeline.stages.judge.judgement import Case
+from pipeline.stages.judge.judgement import JudgeInput
 from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.stages import JudgedEpochs, JudgedOffers
@@ -14,10 +14,12 @@ from tests.replay.journeys import VEHICLE, journey
 def test_judged_epochs_and_offers_have_their_columns() -> None:
     """Epochs keep the columns of the stages before the judge too."""
     run, site = journey()
-    ride = ride_alone(run, site, VEHICLE, Configuration(), "primary")
+    ride = monitor_alone(run, site, VEHICLE, Configuration(), "primary")
     prepared = ride.prepared
-    case = Case(ride.solution, prepared.evidence(), ride.odometry, prepared.vehicle, prepared.config, run.reference)
-    judged = judge(case)
+    given = JudgeInput(
+        ride.solution, prepared.evidence(), ride.odometry, prepared.vehicle, prepared.config, run.reference
+    )
+    judged = judge(given)
     expected = dtypes(JudgedEpochs)
     assert dict(judged.epochs.select(list(expected)).schema) == expected
     assert judged.offers.height > 0

@@ -38,7 +38,7 @@ from pipeline.stages.judge.epochs import (
     under_injection,
 )
 from pipeline.stages.judge.failures import (
-    Course,
+    ErrorHistory,
     Failure,
     Jump,
     Offers,
@@ -60,7 +60,7 @@ from pipeline.stages.judge.judgement import (
     RIGHT,
     UNKNOWN,
     WRONG,
-    Case,
+    JudgeInput,
     Judgements,
     MatchedPositions,
     Solution,
@@ -71,7 +71,7 @@ from pipeline.stages.judge.judgement import (
 from pipeline.stages.track.path import Place, RoutePath
 from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
 from schemas.enums import Evidence, Hazard, Judgement, Suspect, Verdict
-from tests.stages.judge.frames import NS, course, offers, positions
+from tests.stages.judge.frames import NS, history, offers, positions
 
 EPISODE = Episode(
     mark=0, onset=0, end=1, begin_ns=0, onset_ns=0, end_ns=1, step=None, jump_back=None, failed=None, may_ns=None,
@@ -93,10 +93,10 @@ def ns(t_s: float | None) -> int | None:
     return None if t_s is None else round(t_s * NS)
 
 
-def episodes(of: Course) -> list[Episode]:
+def episodes(of: ErrorHistory) -> list[Episode]:
     """Where no monitor fails and nothing was offered."""
-    quiet = FailureLog(of.t_ns, np.zeros(of.size, dtype=bool), np.zeros(0, dtype=np.int64), (), ())
-    return find_episodes(of, find_failures(of), quiet, None)
+    within_noise = FailureLog(of.t_ns, np.zeros(of.size, dtype=bool), np.zeros(0, dtype=np.int64), (), ())
+    return find_episodes(of, find_failures(of), within_noise, None)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_a_fault_is_undetected_until_a_monitor_fails_or_to_its_end(detected_ns: 
 def test_what_a_step_offers_on_its_way_lies_before_its_first_position() -> None:
     """A step from the second to the third position: it begins right after the second."""
     frame = positions(range(30), [0.0, 0.0] + [30.0] * 5 + [0.0] * 23)
-    (episode,) = episodes(course(frame, Jump(2, 2, 30.0)))
+    (episode,) = episodes(history(frame, Jump(2, 2, 30.0)))
     assert (episode.onset_ns, episode.begin_ns) == (2 * NS, NS + 1)
 
 
@@ -162,8 +162,8 @@ def errors_across(fixes: pl.DataFrame, heading_deg: Any, at_s: list[float], refe
     absent: Any = None
     stamps = pl.DataFrame({"t": seconds(*at_s)}).cast(pl.Datetime("ns", "UTC"))
     solution = Solution("primary", fixes, stamps, absent, absent, absent, absent)
-    case = Case(solution, absent, None, Vehicle(), Configuration(), reference)
-    return [column.fill_null(np.nan).to_numpy() for column in cross_errors(case, heading_deg)]
+    given = JudgeInput(solution, absent, None, Vehicle(), Configuration(), reference)
+    return [column.fill_null(np.nan).to_numpy() for column in cross_errors(given, heading_deg)]
 
 
 def test_errors_across_are_left_of_growing_path_and_upwards() -> None:
@@ -247,7 +247,7 @@ def test_an_alarm_shortly_before_a_drift_is_its_onset_and_was_there_before_it(
 ) -> None:
     """5 m more each second from 10 s on, beyond 20 m from 15 s on; at most 30 s before lies the alarm."""
     frame = positions(range(40), np.clip(5.0 * (np.arange(40.0) - 9.0), 0.0, 60.0))
-    drift = course(frame)
+    drift = history(frame)
     failing = np.array([] if alarm_s is None else [alarm_s], dtype=np.int64)
     alarms = tuple(AlarmEpisode(t, t, t * NS, t * NS, ("along_raw",), 2.0) for t in failing.tolist())
     log = FailureLog(drift.t_ns, np.zeros(drift.size, bool), failing, ("along_raw",) * failing.size, alarms)
@@ -271,7 +271,7 @@ def test_what_an_episode_hit() -> None:
         epoch, judgement=code, error_low_m=least_m, error_high_m=least_m + 2.0,
         offered=[k != 2 for k in range(10)], track_assumed=False, wrong_track=[number == 7 for number in epoch],
     )  # fmt: skip
-    met = course(positions(range(10)), offered=offered)
+    met = history(positions(range(10)), offered=offered)
     found = hazard_rows([replace(EPISODE, onset=2, end=8)], met)
     assert [(row.hazard, row.hits) for row in found] == [(Hazard.VB_SHIFT, [1, 9]), (Hazard.VB_WRONG_TRACK, [6])]
 
@@ -295,14 +295,14 @@ def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
     low_m = np.where(np.arange(2) == 0, middle_m, size_m)
     kind, track = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=bool)
     judged = Judgements(np.array([WRONG, code]), low_m, low_m, kind, track, np.zeros(2, dtype=bool))
-    judged_course = replace(course(positions(range(2))), judged=judged)
+    judged_course = replace(history(positions(range(2))), judged=judged)
     assert bool(_is_back(judged_course, Jump(1, 1, step_m))) is back
 
 
 @pytest.mark.parametrize(("may_s", "detected_s"), [(104.5, 107.0), (None, 107.0), (104.5, None)])
 def test_the_times_of_a_hazard(may_s: float | None, detected_s: float | None) -> None:
     """Onset at 103 s, a VB hit at 104 s, failure at 105 s or a little before, alarm at 107 s, end at 109 s."""
-    met = course(positions([100.0 + k for k in range(10)]), offered=offers([1, 4], t=[101 * NS, 104 * NS]))
+    met = history(positions([100.0 + k for k in range(10)]), offered=offers([1, 4], t=[101 * NS, 104 * NS]))
     episode = replace(
         EPISODE, onset_ns=103 * NS, end_ns=109 * NS, failed=5, may_ns=ns(may_s), detection=Detection(ns(detected_s))
     )
@@ -358,7 +358,7 @@ def test_a_failure_is_a_second_of_wrong_from_the_onset_on(
     """Positions each 0.5 s, the onset is the third."""
     frame = positions(0.5 * np.arange(8), [30.0 if k in wrong else 0.0 for k in range(8)])
     jump = None if step is None else Jump(*step, 30.0)
-    assert _failed(course(frame), Extent(2, 2, 8, jump, None)) == failure
+    assert _failed(history(frame), Extent(2, 2, 8, jump, None)) == failure
 
 
 @pytest.mark.parametrize(
@@ -375,7 +375,7 @@ def test_since_when_a_drift_may_have_failed(
 ) -> None:
     """6 m more each second, known to 5 m: beyond 20 m for certain at 5 s, and possibly from 3 s on."""
     frame = positions(range(6), 6.0 * np.arange(6), 5.0, judgement=judgement, evidence=evidence)
-    assert _failed_may_ns(course(frame), 5) == ns(may_s)
+    assert _failed_may_ns(history(frame), 5) == ns(may_s)
 
 
 def placed(path_m: list[float], element: int = 0) -> MatchedPositions:
@@ -562,8 +562,8 @@ def test_an_odometer_without_a_sign_is_corrected_by_the_reference_but_not_over_a
 
 @pytest.mark.parametrize(("latency_s", "at_s"), [(0.3, 9.7), (None, 10.0), (-0.2, 10.2)])
 def test_a_position_is_judged_at_its_stamp_less_the_latency(latency_s: float | None, at_s: float) -> None:
-    case = Case(cast(Any, None), cast(Any, None), None, Vehicle(gnss_latency_s=latency_s), Configuration())
-    assert case.instants(seconds(10)).tolist() == [round(at_s * NS)]
+    given = JudgeInput(cast(Any, None), cast(Any, None), None, Vehicle(gnss_latency_s=latency_s), Configuration())
+    assert given.instants(seconds(10)).tolist() == [round(at_s * NS)]
 
 
 def test_what_an_interval_of_errors_says() -> None:
@@ -627,7 +627,7 @@ def test_a_jump_crosses_what_the_train_itself_did_not(train_m: float, crossed: l
     path_m, virtual = [99.0, 125.0, 135.0, 111.0, 138.0, 145.0], [True, True, True, True, False, True]
     offered = offers([2, 3, 3, 3, 3, 4], path_m=path_m, virtual=virtual)
     at = positions(range(5), path_m=[80.0, 90.0, 100.0, 140.0, 150.0], train_m=np.full(5, train_m))
-    assert crossed_by(Jump(3, 3, 30.0), course(at, offered=offered)) == crossed
+    assert crossed_by(Jump(3, 3, 30.0), history(at, offered=offered)) == crossed
 
 
 @pytest.mark.parametrize(
@@ -678,7 +678,7 @@ def test_the_size_and_slope_of_a_hazard(
 ) -> None:
     """2.5 m more each second; the third position is the onset, and the failure the one after it."""
     offered = offers([9], error_low_m=np.nan, error_high_m=np.nan)
-    drift = course(positions(range(12), -2.5 * np.arange(12.0) + 2.5, half_m), offered=offered)
+    drift = history(positions(range(12), -2.5 * np.arange(12.0) + 2.5, half_m), offered=offered)
     episode = replace(EPISODE, onset=2, end=12, mark=10, failed=3, onset_ns=2 * NS, jump_back=jump if back else None)
     row = HazardRow(Hazard.VB_SHIFT, episode, jump, [0])
     assert size_m(row, drift) == pytest.approx(size)
@@ -691,7 +691,7 @@ def test_a_hazard_rests_on_what_judged_its_first_balise_else_on_its_first_positi
     first: str | None, kind: Evidence
 ) -> None:
     offered = offers([2, 3], evidence=[first, "odometer"])
-    met = course(positions(range(5), evidence=["balise", *["odometer"] * 4]), offered=offered)
+    met = history(positions(range(5), evidence=["balise", *["odometer"] * 4]), offered=offered)
     assert _evidence(HazardRow(Hazard.VB_SHIFT, EPISODE, None, [0, 1]), met) is kind
 
 
@@ -699,7 +699,7 @@ def test_pulses_are_one_failure_and_a_calm_half_minute_ends_it() -> None:
     """60 m for 0.3 s in each of ten seconds at 10 Hz, right for 45 s, one pulse more: 3.0 s and 0.3 s wrong in use."""
     t_s = 0.1 * np.arange(600)
     pulse = ((t_s % 1.0) < 0.25) & (t_s < 9.95) | ((t_s > 54.95) & (t_s < 55.25))
-    found = find_failures(course(positions(t_s, np.where(pulse, 60.0, 0.0))))
+    found = find_failures(history(positions(t_s, np.where(pulse, 60.0, 0.0))))
     assert [one.hazardous_s for one in found] == pytest.approx([3.0, 0.3])
     assert [one.within_budget for one in found] == [False, True]
 
@@ -710,7 +710,7 @@ def test_a_failure_goes_on_until_it_is_calm_for_long_enough(apart_s: int, betwee
     error_m = np.full(60, 0.0)
     error_m[10 : 10 + apart_s] = between_m
     error_m[[10, 10 + apart_s]] = 60.0
-    assert len(find_failures(course(positions(range(60), error_m)))) == failures
+    assert len(find_failures(history(positions(range(60), error_m)))) == failures
 
 
 def test_unknown_time_in_use_counts_to_the_failure_that_it_belongs_to() -> None:
@@ -718,7 +718,7 @@ def test_unknown_time_in_use_counts_to_the_failure_that_it_belongs_to() -> None:
     error_m = np.full(30, 0.0)
     error_m[5:9] = [60.0, np.nan, np.nan, np.nan]
     frame = positions(range(30), error_m, path_m=10.0 * np.arange(30))
-    (found,) = find_failures(course(frame, offered=offers([7], judgement="unknown")))
+    (found,) = find_failures(history(frame, offered=offers([7], judgement="unknown")))
     assert (found.hazardous_s, found.hazardous_may_s, found.accepted) == (1.0, 4.0, Judgement.UNKNOWN)
 
 

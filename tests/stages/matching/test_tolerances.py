@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.stages.matching import match
 from pipeline.stages.matching.epochs import contradictory_covariances, on_track_limit_m
-from pipeline.stages.matching.match import pins_of
+from pipeline.stages.matching.match import read_elements
 from pipeline.stages.track.survey import track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from tests.stages.matching.builders import line, run, site
@@ -82,5 +82,5 @@ def test_balises_beyond_an_end_by_what_lists_round_lie_where_their_measure_says(
     times_ns = np.arange(6) * 1_000_000_000
     epochs = cast(Any, type("Epochs", (), {"t_ns": times_ns, "__len__": lambda self: 6})())
     own = replace(place, balises=balises)
-    assert pins_of(epochs, own, track_of(place.track), reads).tolist() == [0, -1, -1, 0, -1, -1]
-    assert pins_of(epochs, own, track_of(place.track), None).tolist() == [-1] * 6
+    assert read_elements(epochs, own, track_of(place.track), reads).tolist() == [0, -1, -1, 0, -1, -1]
+    assert read_elements(epochs, own, track_of(place.track), None).tolist() == [-1] * 6

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from benchmarks.truth.clock import draw, estimate
 from pipeline.stages.odometry.regression import LagState, ScaleLag
-from pipeline.stages.odometry.scale_lag import CountedRows, possible_lags, scale_and_lag
+from pipeline.stages.odometry.scale_lag import CounterRows, possible_lags, scale_and_lag
 from schemas.arrays import Floats
 
 
@@ -19,10 +19,10 @@ def distance_m(t_s: Floats) -> Floats:
     return 900.0 * minute + np.where(second < 30.0, 0.5 * second**2, 900.0 - 0.5 * (60.0 - second) ** 2)
 
 
-def counter(scale: float = 1.0, step_s: float = 0.1) -> CountedRows:
+def counter(scale: float = 1.0, step_s: float = 0.1) -> CounterRows:
     """Exact at its rows; without an end, as far as the tests go."""
     t_s = np.arange(0.0, 4000.0, step_s)
-    return CountedRows(t_s, distance_m(t_s) / scale, np.zeros(t_s.size))
+    return CounterRows(t_s, distance_m(t_s) / scale, np.zeros(t_s.size))
 
 
 def recorded(ways: int, late_s: float, begin_s: float = 600.0) -> tuple[Floats, Floats, Floats]:
@@ -61,7 +61,7 @@ def test_at_constant_speed_the_scale_alone_is_known() -> None:
     """Noise of 2 m, the other 7 s late and 1 % longer: nothing shows the lag."""
     t_s = np.arange(0.0, 1200.0, 0.1)
     rng = np.random.default_rng(1)
-    counted = CountedRows(t_s, 30.0 * t_s + rng.normal(0.0, 0.1, t_s.size), np.zeros(t_s.size))
+    counted = CounterRows(t_s, 30.0 * t_s + rng.normal(0.0, 0.1, t_s.size), np.zeros(t_s.size))
     at_s = np.arange(20.0, 1100.0, 2.0)
     place_m = 30.3 * (at_s - 7.0) + rng.normal(0.0, 2.0, at_s.size)
     found = scale_and_lag(at_s[:-5], at_s[5:], place_m[5:] - place_m[:-5], counted)
@@ -74,7 +74,7 @@ def test_at_constant_speed_the_scale_alone_is_known() -> None:
 def test_a_train_that_stands_shows_nothing() -> None:
     t_s = np.arange(0.0, 600.0, 0.1)
     rng = np.random.default_rng(2)
-    counted = CountedRows(t_s, rng.normal(0.0, 0.01, t_s.size), np.zeros(t_s.size))
+    counted = CounterRows(t_s, rng.normal(0.0, 0.01, t_s.size), np.zeros(t_s.size))
     begin_s = np.arange(20.0, 550.0, 2.0)
     found = scale_and_lag(begin_s, begin_s + 10.0, rng.normal(0.0, 0.1, begin_s.size), counted)
     assert (found.scale, found.scale_sigma, found.measured) == (1.0, float("inf"), False)
@@ -88,7 +88,7 @@ def test_one_change_of_speed_that_comes_with_a_step_is_no_lag() -> None:
     place_m = np.interp(t_s, t_s, way_m) - 31.0 * (t_s > 446.0)
     place_m = place_m + np.random.default_rng(3).normal(0.0, 0.5, t_s.size)
     ways_m = np.interp(begin_s + 10.0, t_s, place_m) - np.interp(begin_s, t_s, place_m)
-    found = scale_and_lag(begin_s, begin_s + 10.0, ways_m, CountedRows(t_s, way_m, np.zeros(t_s.size)))
+    found = scale_and_lag(begin_s, begin_s + 10.0, ways_m, CounterRows(t_s, way_m, np.zeros(t_s.size)))
     assert not found.measured or abs(found.lag_s) < 4.0 * found.lag_sigma_s
 
 
@@ -99,7 +99,7 @@ def drifting(begin_s: float, end_s: float, rate_mps: float, speeds: tuple[list[f
     place_m = way_m + rate_mps * np.clip(t_s - begin_s, 0.0, end_s - begin_s)
     at_s = np.arange(2.0, t_s[-1] - 2.0, 2.0)
     seen_m = np.interp(at_s, t_s, place_m) + np.random.default_rng(4).normal(0.0, 0.1, at_s.size)
-    return scale_and_lag(at_s[:-5], at_s[5:], seen_m[5:] - seen_m[:-5], CountedRows(t_s, way_m, np.zeros(t_s.size)))
+    return scale_and_lag(at_s[:-5], at_s[5:], seen_m[5:] - seen_m[:-5], CounterRows(t_s, way_m, np.zeros(t_s.size)))
 
 
 def test_a_drift_as_long_as_the_only_change_of_speed_is_no_lag() -> None:
@@ -113,7 +113,7 @@ def test_a_step_in_doubt_is_not_compared() -> None:
     whole = counter()
     reset = whole.t_s >= 1000.0
     distance = whole.distance_m - np.where(reset, whole.distance_m[reset][0], 0.0)
-    found = scale_and_lag(*recorded(40, 0.4), CountedRows(whole.t_s, distance, reset.astype(np.float64)))
+    found = scale_and_lag(*recorded(40, 0.4), CounterRows(whole.t_s, distance, reset.astype(np.float64)))
     assert found.lag_s == pytest.approx(0.4, abs=0.01)
     assert found.scale == pytest.approx(1.0, abs=1e-6)
 
@@ -150,7 +150,7 @@ def test_three_ways_refute_all_lags_but_few(late_s: float) -> None:
 
 def test_ways_at_one_speed_say_nothing_of_a_lag() -> None:
     t_s = np.arange(0.0, 1200.0, 0.1)
-    counted = CountedRows(t_s, 30.0 * t_s, np.zeros(t_s.size))
+    counted = CounterRows(t_s, 30.0 * t_s, np.zeros(t_s.size))
     begin_s = np.arange(100.0, 1000.0, 60.0)
     ways = begin_s, begin_s + 60.0, np.full(begin_s.size, 1800.0)
     assert possible_lags(ways, counted, np.ones(begin_s.size), 0.05, 3.0) is None

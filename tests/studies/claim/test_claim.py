@@ -19,8 +19,8 @@ from pipeline.results import store
 from pipeline.studies.claim import claim, load_profile, read_areas
 from pipeline.studies.claim.claim import claim_table
 from pipeline.studies.claim.front import Front, front_of, speed_errors
-from pipeline.studies.claim.requirements import ClaimRide, requirements, tallies
-from pipeline.studies.claim.tally import ALWAYS, Demand, Kind, Tally, clusters_s, counted
+from pipeline.studies.claim.requirements import ClaimJourney, requirements, tallies
+from pipeline.studies.claim.tally import ALWAYS, Demand, Kind, Tally, clusters_s, count_claims
 from pipeline.studies.tally import Compliance, Shown, trials_needed
 from schemas.config import Configuration
 from schemas.errors import ConfigError, SiteError
@@ -80,7 +80,7 @@ def ten() -> Front:
 
 def test_ten_epochs_by_hand() -> None:
     found = ten()
-    limit = ClaimRide("run", found, epochs([]), passages(), PROFILE).limit_m
+    limit = ClaimJourney("run", found, epochs([]), passages(), PROFILE).limit_m
     assert limit[:9].tolist() == [30.0] * 5 + [10.0] * 4
     # Kept 1, not known 0, broken -1. Epoch 8 is on the wrong track; of epoch 6 the evidence says nothing.
     assert found.within(limit, np.inf)[:9].tolist() == [1, 1, 1, 1, -1, 1, 0, 1, -1]
@@ -92,7 +92,7 @@ def test_ten_epochs_by_hand() -> None:
 
 
 def test_ten_epochs_as_counts() -> None:
-    found = tallies(ClaimRide("run", ten(), epochs([float(second) for second in range(10)]), passages(), PROFILE))
+    found = tallies(ClaimJourney("run", ten(), epochs([float(second) for second in range(10)]), passages(), PROFILE))
     hand = {  # events, seconds, seconds known, worst
         ("mapo_claimed", "mainline"): (0, 5.0, 5.0, 8.0),
         ("mapo", "mainline"): (1, 5.0, 5.0, 31.0),
@@ -198,7 +198,7 @@ def test_exceedances_close_to_each_other_are_one_event() -> None:
     t_ns = np.array([0, 10, 310, 611]) * NS
     assert clusters_s(t_ns, t_ns, 300.0) == [310.0, 0.0]
     code = np.array([-1, 0, 0, -1])
-    counts = counted("run", t_ns, np.ones(4), code, 300.0)
+    counts = count_claims("run", t_ns, np.ones(4), code, 300.0)
     # What is not known between them may hold another event.
     assert (counts.events, counts.possible, counts.trials, counts.known_s) == (2, 3, 1, 2.0)
 
@@ -211,7 +211,9 @@ def test_a_gap_of_the_log_is_time_of_which_nobody_knows() -> None:
     for one in requirements(PROFILE):
         if one.key not in (("front_accuracy", "mainline"), ("speed_accuracy", "all")):
             continue
-        total = sum((one.count(ClaimRide(str(run), found, frame, passages(), PROFILE)) for run in range(100)), Tally())
+        total = sum(
+            (one.count(ClaimJourney(str(run), found, frame, passages(), PROFILE)) for run in range(100)), Tally()
+        )
         assert total.trials == 100
         assert 25 <= total.kept <= 55, one.key
         assert (total.broken, total.events, total.possible) == (0, 0, 100)
@@ -225,7 +227,7 @@ def test_a_balise_without_a_first_estimate_is_not_known() -> None:
     balises = passages(3, status="accepted", kind="physical", t_offered=[2 * NS, 8 * NS, 30 * NS])
     found = front_of(frame, balises, RUN, Configuration(), PROFILE.method)
     asked = next(one for one in requirements(PROFILE) if one.key == ("after_balise", "physical"))
-    total = sum((asked.count(ClaimRide(str(run), found, frame, balises, PROFILE)) for run in range(60)), Tally())
+    total = sum((asked.count(ClaimJourney(str(run), found, frame, balises, PROFILE)) for run in range(60)), Tally())
     assert (total.trials, total.broken) == (60, 0)
     assert 10 <= total.kept <= 30
 
@@ -251,8 +253,8 @@ def test_weaker_evidence_never_shows_what_stronger_refutes(runs: list[list[tuple
         t_ns, held = np.arange(len(run)) * 200 * NS, np.full(len(run), 200.0)
         full = np.array([code for code, _ in run])
         less = np.array([0 if hidden else code for code, hidden in run])
-        strong += counted(str(number), t_ns, held, full, 300.0)
-        weak += counted(str(number), t_ns, held, less, 300.0)
+        strong += count_claims(str(number), t_ns, held, full, 300.0)
+        weak += count_claims(str(number), t_ns, held, less, 300.0)
     fault_free = Tally(trials=1, kept=1, held_s=3600.0, known_s=3600.0)
     for shown in (lambda c: of_share(c, 0.6), lambda c: of_rate(c, 8.0), ALWAYS.shown):
         findings = (shown(strong).finding, shown(weak).finding)
@@ -348,7 +350,7 @@ def test_the_front_end_decides_on_the_area() -> None:
         error_high_m=0.0,
     )
     found = front_of(frame, passages(), RUN, Configuration(), PROFILE.method, AREAS, ahead_m=30.0)
-    assert ClaimRide("run", found, frame, passages(), PROFILE).limit_m.tolist() == [30.0] * 5 + [10.0] * 5
+    assert ClaimJourney("run", found, frame, passages(), PROFILE).limit_m.tolist() == [30.0] * 5 + [10.0] * 5
     assert found.output.all()
     assert found.within(5.0, 5.0).tolist() == [1] * 10
 
@@ -412,8 +414,8 @@ def test_means_of_speed_call_no_accuracy_met() -> None:
         columns = {"speed_mps": speed_mps, "error_low_m": -0.1, "error_high_m": 0.1}
         found = front(seconds, **columns)
         frame, nothing = epochs(seconds), passages()
-        rides = [ClaimRide(f"{number}", found, frame, nothing, PROFILE) for number in range(300)]
-        counts = sum((asked.count(ride) for ride in rides), Tally())
+        rides = [ClaimJourney(f"{number}", found, frame, nothing, PROFILE) for number in range(300)]
+        counts = sum((asked.count(journey) for journey in rides), Tally())
         assert (counts.trials, counts.kept, counts.broken) in ((300, 300, 0), (300, 0, 300))
         assert asked.demand.shown(counts).finding == finding
 
@@ -425,7 +427,7 @@ def test_after_a_balise_start_and_availability() -> None:
     frame = epochs(seconds, in_use=[not gone for gone in lost], error_low_m=0.29, error_high_m=0.31, tvb=False)
     balise = passages(1, status="accepted", kind="physical", t_offered=[2 * NS])
     found = tallies(
-        ClaimRide("run", front_of(frame, balise, RUN, Configuration(), PROFILE.method), frame, balise, PROFILE)
+        ClaimJourney("run", front_of(frame, balise, RUN, Configuration(), PROFILE.method), frame, balise, PROFILE)
     )
     assert found["after_balise", "physical"].broken == 1
     assert found["after_balise", "virtual"].trials == 0
@@ -438,7 +440,7 @@ def test_after_a_balise_start_and_availability() -> None:
 def test_a_run_without_epochs_says_nothing() -> None:
     nothing = epochs([], t=[], path_m=[], odometer_m=[])
     found = tallies(
-        ClaimRide(
+        ClaimJourney(
             "run", front_of(nothing, passages(), RUN, Configuration(), PROFILE.method), nothing, passages(), PROFILE
         )
     )

@@ -10,7 +10,7 @@ import pytest
 
 from datasets.faults import FaultSpec, faults_table, offset_m
 from datasets.inject import inject, load_faults
-from pipeline.one_run import replay, ride_alone
+from pipeline.one_run import monitor_alone, replay
 from pipeline.studies.undetected.profile import epoch_of, profile_at
 from schemas.config import Configuration
 from schemas.errors import ConfigError, UsageError
@@ -55,18 +55,18 @@ def test_a_fault_along_the_site_moves_the_position_on_its_path_and_not_beside_it
 
 def test_there_is_no_profile_where_nothing_watched() -> None:
     run, site = journey(gnss=ONE_HZ)
-    ride = ride_alone(run, site, VEHICLE, Configuration(), "primary")
+    monitored = monitor_alone(run, site, VEHICLE, Configuration(), "primary")
     with pytest.raises(UsageError, match="epoch 0"):
-        profile_at(ride, 0, False)
-    found = profile_at(ride, 60, False)
+        profile_at(monitored, 0, False)
+    found = profile_at(monitored, 60, False)
     # The fault grows since the last balise read before its epoch.
     epoch_t = run.gnss["t"][60]
     assert found.t.to_list() == [run.balise_reads.filter(pl.col("t") < epoch_t)["t"].max(), epoch_t]
     with pytest.raises(UsageError, match="--balise VB99: was not passed in this run; expected") as refused:
-        epoch_of(ride, "VB99", None)
+        epoch_of(monitored, "VB99", None)
     named = str(refused.value).partition("expected ")[2].rstrip(".").split(", ")
-    assert all(epoch_of(ride, balise, None) > 0 for balise in named), "what is proposed can be asked for"
-    behind = profile_at(ride, 60, True)
+    assert all(epoch_of(monitored, balise, None) > 0 for balise in named), "what is proposed can be asked for"
+    behind = profile_at(monitored, 60, True)
     assert found.fault["size_m"][-1] == pytest.approx(found.error_m)
     assert behind.fault["size_m"][-1] == pytest.approx(-behind.error_m)
     assert found.fault["size_m"][0] == 0.0

@@ -14,8 +14,8 @@ from datasets.faults import FaultSpec
 from datasets.inject import inject
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
-from pipeline.one_run import replay, ride_alone
-from pipeline.stages.ride import Ride
+from pipeline.one_run import monitor_alone, replay
+from pipeline.stages.monitored import MonitoredSolution
 from pipeline.studies.undetected.columns import rows_of
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.position_tests import range_bounds
@@ -95,11 +95,13 @@ def test_spacing_is_the_way_to_the_limit(tables: RunTables) -> None:
     assert row["physical_spacing_s"] <= first_s
 
 
-def since_the_start(run: RunLog, site: Site, vehicle: Vehicle, settings: Configuration) -> tuple[Floats, Ints, Ride]:
+def since_the_start(
+    run: RunLog, site: Site, vehicle: Vehicle, settings: Configuration
+) -> tuple[Floats, Ints, MonitoredSolution]:
     """The largest errors ahead since the first row, their epochs, and what watched."""
-    ride = ride_alone(run, site, vehicle, settings, "primary")
-    rows = rows_of(ride)
-    return largest_errors(rows.since(0, rows.rows - 1), settings.undetected).most_m, rows.epoch[1:], ride
+    monitored = monitor_alone(run, site, vehicle, settings, "primary")
+    rows = rows_of(monitored)
+    return largest_errors(rows.since(0, rows.rows - 1), settings.undetected).most_m, rows.epoch[1:], monitored
 
 
 def test_no_vehicle_file_no_close_bound() -> None:
@@ -153,10 +155,10 @@ def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[
     assert both.satellites is not None
     alone = pl.col("solution") == "gps"
     run = both.with_streams(gnss=both.gnss.filter(alone).head(12), satellites=both.satellites.filter(alone))
-    ride = ride_alone(run, site, VEHICLE, Configuration(), "gps")
-    satellites = ride.prepared.ranges("gps")
+    monitored = monitor_alone(run, site, VEHICLE, Configuration(), "gps")
+    satellites = monitored.prepared.ranges("gps")
     assert satellites is not None
-    low_m, high_m = range_bounds(ride.aligned, satellites, Configuration())
+    low_m, high_m = range_bounds(monitored.aligned, satellites, Configuration())
     clean, at = replay(run, site, VEHICLE), 9
     most_m, least_m = -np.inf, np.inf
     for name in sorted(satellites.filter(pl.col("used"))["sv"].unique()):
@@ -184,9 +186,9 @@ def test_a_second_solution_without_the_fault_holds_it(sky: tuple[RunLog, Site]) 
     # A bank that forgets within seconds holds little by itself.
     chosen = {"monitors": {"channel_reference": "gps", "disabled": ["along_ewma_0p01", "along_ewma_0p001"]}}
     one = Configuration.model_validate({"undetected": {"solutions_at_fault": "one"}} | chosen)
-    held, epoch, ride = since_the_start(*sky, VEHICLE, one)
+    held, epoch, monitored = since_the_start(*sky, VEHICLE, one)
     free, _, _ = since_the_start(*sky, VEHICLE, Configuration.model_validate(chosen))
-    channel = ride.singles["channel"]
+    channel = monitored.singles["channel"]
     room = (channel.threshold - channel.value)[epoch]
     assert (held <= room + 1e-9).all()
     assert (held <= free + 1e-9).all()

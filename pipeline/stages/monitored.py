@@ -15,11 +15,11 @@ from pipeline.stages.alignment.align import align, odometer_at
 from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.epochs import direction_by_evidence
-from pipeline.stages.judge.judgement import Case, Solution
+from pipeline.stages.judge.judgement import JudgeInput, Solution
 from pipeline.stages.lds.run import LdsResult, run_lds
 from pipeline.stages.matching import Match
 from pipeline.stages.monitors.bank import MonitorBank
-from pipeline.stages.monitors.single import NO_OTHER_SOLUTION, WITHOUT_MEMORY, Seen, on_path_of
+from pipeline.stages.monitors.single import NO_OTHER_SOLUTION, WITHOUT_MEMORY, MonitorInput, on_path_of
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun
 from schemas.arrays import Ints, times_ns
@@ -32,7 +32,7 @@ _AGAINST_ODOMETER = tuple(monitor.name for monitor in ALL_MONITORS if monitor.ag
 
 
 @frozen
-class Ride:
+class MonitoredSolution:
     """What the train made of one solution; `odometry` grows with its path.
 
     `other`: the solution of the channel monitor, on this one's path; `singles`: monitors without memory, by name.
@@ -59,7 +59,9 @@ class Ride:
         return {name: None if np.isnan(value) else float(value) for name, value in last.items()}
 
 
-def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: TrainEvidence) -> Ride:
+def monitor_solution(
+    prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: TrainEvidence
+) -> MonitoredSolution:
     """Align one matched solution with the odometer, monitor it, detect balises."""
     config = prepared.config
     matched = matches[solution]
@@ -81,10 +83,10 @@ def ride_of(prepared: PreparedRun, solution: str, matches: Mapping[str, Match], 
     if blind_along is not None:
         found |= {name: found[name].without_passes(blind_along) for name in _AGAINST_ODOMETER}
     verdicts = pl.DataFrame([column for name, one in found.items() for column in one.columns(name)])
-    monitored = pl.concat([aligned.table, lds.epochs.drop("t"), verdicts], how="horizontal")
+    with_monitors = pl.concat([aligned.table, lds.epochs.drop("t"), verdicts], how="horizontal")
     fixes = prepared.fixes(solution)
-    replayed = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, matched.path)
-    return Ride(prepared, replayed, matched, aligned, odometry, channel, singles, bank, lds)
+    replayed = Solution(solution, fixes, with_monitors, lds.crossings, lds.passages, balises, matched.path)
+    return MonitoredSolution(prepared, replayed, matched, aligned, odometry, channel, singles, bank, lds)
 
 
 def _direction(
@@ -92,7 +94,7 @@ def _direction(
 ) -> Ints:
     nothing = pl.DataFrame()
     unjudged = Solution(solution, prepared.fixes(solution), aligned.table, nothing, nothing, nothing, matched.path)
-    return direction_by_evidence(Case(unjudged, evidence, None, prepared.vehicle, prepared.config))
+    return direction_by_evidence(JudgeInput(unjudged, evidence, None, prepared.vehicle, prepared.config))
 
 
 def _other_solution(
@@ -110,7 +112,7 @@ def _without_memory(
 ) -> dict[str, Verdicts]:
     named = prepared.config.monitors.channel_reference
     absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
-    seen = Seen(aligned, prepared.ranges(solution), channel, absent, prepared.config)
+    seen = MonitorInput(aligned, prepared.ranges(solution), channel, absent, prepared.config)
     return {name: monitor(seen) for name, monitor in WITHOUT_MEMORY.items()}
 
 

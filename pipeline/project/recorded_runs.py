@@ -14,7 +14,7 @@ _NEXT_FILE_S = 60.0
 
 
 @dataclass
-class Ride:
+class RecordedRun:
     """One run to be: `receivers` first the one under the name `primary`; of each the files that follow each other."""
 
     run_id: str
@@ -32,48 +32,52 @@ class Ride:
         return [log.is_run for log in self.logs] == [True]
 
 
-def rides_of(logs: Sequence[SeenLog], references: Sequence[Path]) -> tuple[list[Ride], list[SeenLog]]:
+def group_into_runs(logs: Sequence[SeenLog], references: Sequence[Path]) -> tuple[list[RecordedRun], list[SeenLog]]:
     """The rides in order of time, and the logs that are of none of them.
 
     Logs without positions belong to every ride whose time they share; to the only ride whatever their clock says, so
     that a wrong clock is found by comparing streams.
     """
-    rides: list[Ride] = []
+    recorded_runs: list[RecordedRun] = []
     positions = [log for log in logs if log.has_positions and log.path not in references]
     for log in sorted(positions, key=lambda log: (log.start, logs.index(log))):
-        _place(log, rides)
+        _place(log, recorded_runs)
     alone: list[SeenLog] = []
     for log in logs:
         if log in positions:
             continue
-        homes = rides if len(rides) == 1 else [ride for ride in rides if any(map(log.overlaps, _tested(ride)))]
-        for ride in homes:
-            (ride.references if log.path in references else ride.others).append(log)
+        homes = (
+            recorded_runs
+            if len(recorded_runs) == 1
+            else [recorded_run for recorded_run in recorded_runs if any(map(log.overlaps, _tested(recorded_run)))]
+        )
+        for recorded_run in homes:
+            (recorded_run.references if log.path in references else recorded_run.others).append(log)
         if not homes:
             alone.append(log)
     # The receiver named first is the one under test.
-    for ride in rides:
-        ride.receivers.sort(key=lambda files: min(map(logs.index, files)))
-    return _with_own_names(rides), alone
+    for recorded_run in recorded_runs:
+        recorded_run.receivers.sort(key=lambda files: min(map(logs.index, files)))
+    return _with_own_names(recorded_runs), alone
 
 
-def _place(log: SeenLog, rides: list[Ride]) -> None:
+def _place(log: SeenLog, recorded_runs: list[RecordedRun]) -> None:
     """A log continues a file of its kind, is another receiver of a ride, or begins a ride."""
-    for ride in rides:
-        for files in ride.receivers:
+    for recorded_run in recorded_runs:
+        for files in recorded_run.receivers:
             gap_s = (log.start - files[-1].end).total_seconds()
             if log.path.suffix == files[-1].path.suffix and 0 <= gap_s <= _NEXT_FILE_S and not log.is_run:
                 files.append(log)
                 return
-    for ride in rides:
-        if any(map(log.overlaps, _tested(ride))):
-            ride.receivers.append([log])
+    for recorded_run in recorded_runs:
+        if any(map(log.overlaps, _tested(recorded_run))):
+            recorded_run.receivers.append([log])
             return
-    rides.append(Ride(stem_of(log.path), [[log]]))
+    recorded_runs.append(RecordedRun(stem_of(log.path), [[log]]))
 
 
-def _tested(ride: Ride) -> list[SeenLog]:
-    return [log for files in ride.receivers for log in files]
+def _tested(recorded_run: RecordedRun) -> list[SeenLog]:
+    return [log for files in recorded_run.receivers for log in files]
 
 
 def stem_of(path: Path) -> str:
@@ -83,13 +87,13 @@ def stem_of(path: Path) -> str:
     return path.name if path.is_dir() else path.stem
 
 
-def _with_own_names(rides: list[Ride]) -> list[Ride]:
+def _with_own_names(recorded_runs: list[RecordedRun]) -> list[RecordedRun]:
     """Run ids by the first log of each ride; logs of one name in several folders take the folder's name too."""
-    firsts = [ride.receivers[0][0].path for ride in rides]
+    firsts = [recorded_run.receivers[0][0].path for recorded_run in recorded_runs]
     stems = [stem_of(path) for path in firsts]
-    named: list[Ride] = []
-    for ride, path, stem in zip(rides, firsts, stems, strict=True):
+    named: list[RecordedRun] = []
+    for recorded_run, path, stem in zip(recorded_runs, firsts, stems, strict=True):
         unique = stem if stems.count(stem) == 1 else f"{path.resolve().parent.name}_{stem}"
         taken = sum(known.run_id == unique or known.run_id.startswith(f"{unique}_") for known in named)
-        named.append(replace(ride, run_id=f"{unique}_{taken + 1}" if taken else unique))
+        named.append(replace(recorded_run, run_id=f"{unique}_{taken + 1}" if taken else unique))
     return named
