@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 # Each of the processes takes seconds of processor time to start: minutes on a machine that is busy otherwise.
 _START_S = 240.0
 
