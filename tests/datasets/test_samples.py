@@ -115,7 +115,7 @@ def test_infrabel_runs_keep_the_receivers_own_word_on_its_fixes() -> None:
 
 def cross_track_m(run: RunLog, site: Site) -> np.ndarray:
     epochs = match(run.gnss, None, site, Vehicle(), MatchingConfig(), FixSigma()).epochs
-    return epochs["cross_track_m"].to_numpy()
+    return epochs.cross_track_m
 
 
 def test_infrabel_site_of_a_path() -> None:

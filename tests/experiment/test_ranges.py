@@ -12,6 +12,7 @@ from datasets.experiment.ranges import RangePlan, range_passages, run_ranges, st
 from datasets.experiment.workers import generator
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows, pseudorange_monitor
 from schemas.config import Configuration
+from schemas.stages import AlignedEpochs
 
 
 @pytest.mark.parametrize("constellation", CONSTELLATIONS)
@@ -53,10 +54,10 @@ def test_projection_equals_the_monitor_of_the_replay(constellation: str) -> None
             "used": True,
         }
     )
-    replayed = pseudorange_monitor(epochs, satellites, Configuration())
+    replayed = pseudorange_monitor(AlignedEpochs.of_table(epochs), satellites, Configuration())
     value = one.project @ errors
-    assert replayed["value"][0] == pytest.approx(value @ value, rel=1e-9)
-    assert replayed["threshold"][0] == pytest.approx(one.threshold, rel=1e-12)
+    assert replayed.value[0] == pytest.approx(value @ value, rel=1e-9)
+    assert replayed.threshold[0] == pytest.approx(one.threshold, rel=1e-12)
 
 
 def test_fault_free_value_is_chi_square() -> None:

@@ -26,7 +26,7 @@ def log(name: str, begin_min: float, end_min: float, stream: str = "gnss") -> Se
 
 
 @pytest.mark.parametrize(
-    ("logs", "rides"),
+    ("logs", "recorded_runs"),
     [
         ([log("a.ubx", 0, 60), log("b.ubx", 60.5, 120)], [["a.ubx+b.ubx"]]),
         ([log("a.ubx", 0, 60), log("b.ubx", 90, 120)], [["a.ubx"], ["b.ubx"]]),

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-import schemas.config
+import schemas.config_judge
 from pipeline import one_run
 from pipeline.results.places import stretches_of
 from pipeline.stages.evidence.carrying import carried_forward
@@ -44,7 +44,7 @@ def changed(monkeypatch: pytest.MonkeyPatch) -> Changed:
             limits = limits_of(hazards)
             return limits._replace(**{name: factor * getattr(limits, name)})
 
-        monkeypatch.setattr(schemas.config, "limits_of", one_changed)
+        monkeypatch.setattr(schemas.config_judge, "limits_of", one_changed)
 
     return change
 
