@@ -50,6 +50,7 @@ _ONLY_THERE = _AFTER_THE_DATA[2:]
 _KNOWN = int(max(Opcode))  # unknown records, of higher ones, are skipped, by specification
 _TOGETHER = 4 * 1024 * 1024  # chunks of up to so many bytes are taken at once
 _LEAST_PIECE = 8 * 1024  # what a piece that waits takes itself
+_MOST_AGAIN = 16  # times as many bytes as are taken at once may have to be unpacked again at once
 _LOOSE = 64 * 1024  # of a log without chunks read at once
 _FREE_RECORDS = 1 << 18  # records that the chunks of a log may hold beyond one per byte
 _SLACK = 1024 * 1024  # what does not compress grows a little
@@ -294,7 +295,7 @@ class McapWalk:
 
     def _keep(self, piece: Piece) -> None:
         self._pieces.append(piece)
-        self._waiting += max(piece.held, _LEAST_PIECE)
+        self._waiting += max(piece.held, piece.size // _MOST_AGAIN, _LEAST_PIECE)
 
     def _block(self) -> Block:
         """The messages that wait."""
