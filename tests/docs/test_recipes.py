@@ -1,4 +1,4 @@
-"""The recipes of `docs/developer.md` followed in a copy of the project: a monitor, a column, an input stream."""
+"""Recipes of `docs/developer.md` followed in a copy of the project: a monitor, column, input stream, message format."""
 
 from __future__ import annotations
 
@@ -52,6 +52,21 @@ STREAM = [
         '    """Topics that hold door states.\n\n    As for `ingest.gnss`.\n    """\n',
     ),
 ]
+MESSAGE = [
+    (
+        "pipeline/read/ingest/recipes_drivers.py",
+        "BY_SCHEMA: dict[str,",
+        "def _acme() -> Recipe:\n"
+        '    places = {"latitude_deg": pl.col("pos.lat"), "longitude_deg": pl.col("pos.lon")}\n'
+        "    fix = pl.lit(Fix.SBAS.value, dtype=FIX_TYPE)\n"
+        '    return Recipe(stream="gnss", stamps={"t": "at"}, columns={**places, "fix": fix})\n\n\n',
+    ),
+    (
+        "pipeline/read/ingest/recipes_drivers.py",
+        '    "gps_msgs/msg/GPSFix": (_gps_fix(),),',
+        '    "acme_msgs/msg/Position": (_acme(),),\n',
+    ),
+]
 CHECK = """
 import json, sys
 from pathlib import Path
@@ -63,6 +78,7 @@ from pipeline import read_run, replay
 from pipeline.show.report.series import monitor_lines, time_data
 from pipeline.results.store import write_run
 from schemas.config import Configuration, settings_from
+from mcap.writer import Writer
 from schemas.dictionary import dictionary_markdown
 from schemas.settings_page import settings_markdown
 from schemas.tables import MONITORS
@@ -85,6 +101,15 @@ page = time_data(tables.epochs, np.array([], dtype=np.int64), 1.0)
 folder = Path(sys.argv[2]); folder.mkdir()
 run.gnss.write_parquet(folder / "gnss.parquet")
 pl.DataFrame({"t": run.gnss["t"][:2], "open": [False, True]}).write_parquet(folder / "doors.parquet")
+log = folder.parent / "acme.mcap"
+with log.open("wb") as stream:
+    writer = Writer(stream)
+    writer.start()
+    schema = writer.register_schema("acme_msgs/msg/Position", "jsonschema", b"{}")
+    channel = writer.register_channel("/acme", "json", schema)
+    message = {"at": {"sec": 5, "nsec": 0}, "pos": {"lat": 50.5, "lon": 4.5}}
+    writer.add_message(channel, 6_000_000_000, json.dumps(message).encode(), 6_000_000_000)
+    writer.finish()
 text = dictionary_markdown()
 print(json.dumps({
     "key": "| `ingest.doors` | none |  | Topics that hold door states. |" in settings_markdown(),
@@ -93,6 +118,7 @@ print(json.dumps({
     "drawn": monitor_lines()["other"],
     "series": sorted(name for name in page["series"] if "offside" in name),
     "column": tables.runs["epochs_on_track"].to_list(),
+    "acme": read_run(log).gnss.select("latitude_deg", pl.col("fix").cast(pl.String)).rows(),
     "doors": read_run(folder).doors["open"].to_list(),
     "documented": [name for name in ("offside_value", "epochs_on_track", "doors") if name in text],
     "disabled": Configuration.model_validate({"monitors": {"disabled": ["offside"]}}).monitors.disabled,
@@ -112,11 +138,11 @@ TRIAL = (
 
 @pytest.fixture(scope="module")
 def followed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
-    """What a copy of the project answers once all three recipes are followed in it."""
+    """What a copy of the project answers once all recipes are followed in it."""
     copy = tmp_path_factory.mktemp("copy")
     for folder in ("schemas", "pipeline", "datasets"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    for file, before, text in (*MONITOR, *COLUMN, *STREAM):
+    for file, before, text in (*MONITOR, *COLUMN, *STREAM, *MESSAGE):
         source = (copy / file).read_text(encoding="utf-8")
         assert source.count(before) == 1, (file, before)
         (copy / file).write_text(source.replace(before, text + before), encoding="utf-8")
@@ -149,14 +175,20 @@ def test_a_stream_takes_three_files(followed: dict[str, object]) -> None:
     assert len({file for file, _, _ in STREAM}) == 3
 
 
+def test_a_message_format_takes_one_file_and_its_test(followed: dict[str, object]) -> None:
+    assert followed["acme"] == [[50.5, "sbas"]]
+    assert len({file for file, _, _ in MESSAGE}) == 1
+
+
 def test_the_dictionary_follows(followed: dict[str, object]) -> None:
     assert followed["documented"] == ["offside_value", "epochs_on_track", "doors"]
 
 
-@pytest.mark.parametrize(("title", "edits"), [("monitor", MONITOR), ("column", COLUMN), ("input stream", STREAM)])
+@pytest.mark.parametrize(
+    ("title", "edits"),
+    [("monitor", MONITOR), ("column", COLUMN), ("input stream", STREAM), ("message format", MESSAGE)],
+)
 def test_the_page_names_the_files(title: str, edits: list[tuple[str, str, str]]) -> None:
     page = (ROOT / "docs" / "developer.md").read_text(encoding="utf-8")
     recipe = page.split(f"## How to add a{'n' if title == 'input stream' else ''} {title}\n")[1].split("\n## ")[0]
-    assert {file for file, _, _ in edits} <= {
-        file for file in (SINGLE, TABLES, FIGURES, INPUTS, RUN, CONFIG) if file in recipe
-    }
+    assert {file for file, _, _ in edits if file not in recipe} == set()

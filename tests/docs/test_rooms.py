@@ -63,3 +63,12 @@ def test_files_that_the_page_names_exist() -> None:
     ]
     assert named
     assert {name for name in named if not any(f"/{path}".endswith(f"/{name}") for path in files)} == set()
+
+
+@pytest.mark.parametrize("package", sorted(path.parent.name for path in STAGES.glob("*/__init__.py")))
+def test_a_package_says_what_each_of_its_modules_is_for(package: str) -> None:
+    text = (STAGES / package / "__init__.py").read_text(encoding="utf-8").split('"""')[1]
+    modules = {path.stem for path in (STAGES / package).glob("*.py")} - {"__init__", package}
+    assert {module for module in modules if f"`{module}`" not in text} == set()
+    named = {word.removesuffix(".py") for word in re.findall(r"`([a-z_]+\.py)`", text)}
+    assert named <= modules | {package}

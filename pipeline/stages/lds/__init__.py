@@ -3,9 +3,11 @@
 In: aligned epochs of one solution, a monitor bank, balises of the path, telegrams with the odometer at each. Out: LDS
 columns of the epochs, crossings, passages. Touches no file, and knows of no truth.
 
-`run` is the stage, `journey` the columns of the epochs, `machine` the walk along them with one state of the position
-(`Use`). `crossings`: where a balise is passed or read; `detection` offers them to the two chains of `linking`
-(`windows`); `link_monitors`: order and distance; `relink`: anchor and comparison. Where the sources leave a choice:
+`run` is the stage, `machine` the walk along the epochs with one state of the position (`Use`), which offers crossings
+to the two chains of `linking`. `crossings`: the columns of the journey, and where a balise is passed or read, within
+its window. `link_monitors`: order and distance; the re-link, its anchor and comparison.
+
+Where the sources leave a choice:
 
 - A step that passes a balise is judged by its last epoch: the monitors first, then the match (of both its epochs), the
   confidence, and what is then a detection by linking.

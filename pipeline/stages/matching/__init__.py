@@ -4,9 +4,8 @@ In: fixes of one solution (or the reference), odometer, site. Out: `Match`: `sch
 Touches no file. The path may use the whole run; `gate_probability`, which feeds detection, only what came before.
 
 Which tracks are possible is the set of `paths`; what it lets a train claim: `claims`. `match` places the epochs on the
-path shown, which `path_search` finds within the set. What does each place cost: `path_states`. How does a train get
-from one to the next: `paths`. The least sum of both: `least_squares`. Which legs are that: `decode`. The path as a
-file: `travelled_route`.
+path shown, which it finds within the set, and writes the path as a file. What does each place cost, what is the least
+sum over all, and which legs are that: `least_squares`. Fixes and their sigmas, and the columns of epochs: `epochs`.
 """
 
 from pipeline.stages.matching.match import Match, match

@@ -3,8 +3,8 @@
 In: the reference stream, the survey as a network. Out: stretches of samples with every way that they may have taken.
 Nothing that came from GNSS or the odometer is known here.
 
-Which elements lie near which samples: `samples`. Where may the train have left the survey: `open_ends`. Which paths do
-the samples not refute: the set of `paths`. Which ways are that: `ways`, `visits`; with coordinates: `stretches`.
+Which elements lie near which samples, where may the train have left the survey: `stretches`, with coordinates. Which
+paths do the samples not refute: the set of `paths`. Which ways are that: `ways`.
 """
 
 from pipeline.stages.reference.stretches import ReferencePath, ReferenceStretch, reference_stretches
