@@ -208,14 +208,13 @@ def _by_length(messages: Messages) -> Iterator[tuple[int, Messages]]:
     """The messages of each length, in order of the file."""
     longest = int(messages.length.max())
     if longest == messages.length.min():
-        yield longest, messages.of_length(longest)
+        yield longest, messages
         return
     # As narrow numbers: numpy sorts those of 16 bits in one pass.
     order = np.argsort(messages.length.astype(np.min_scalar_type(longest)), kind="stable")
     lengths = messages.length[order]
     for rows in np.split(order, np.flatnonzero(np.diff(lengths)) + 1):
-        length = int(messages.length[rows[0]])
-        yield length, messages.chosen(rows).of_length(length)
+        yield int(messages.length[rows[0]]), messages.chosen(rows)
 
 
 class LayoutDecoder:

@@ -30,7 +30,6 @@ MESSAGE_HEAD = np.dtype(
     }
 )
 _FIXED_FIELDS = MESSAGE_HEAD.itemsize - HEAD_SIZE
-_MOST_LENGTHS = 8  # of the messages of a channel, that are read ahead
 
 Stretch = tuple[int, int]
 """From one byte of a payload to another."""
@@ -55,27 +54,22 @@ class Records:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-OfLengths = Mapping[int, Mapping[Stretch, Bytes]]
-"""By length of the messages: stretches of their payloads, a row per message of the channel, also of other lengths."""
-
-
 @frozen
 class ReadAhead:
-    """Stretches of payloads that were read while their chunk was in the cache.
+    """Stretches of payloads of one length, read while their chunk was in the cache: one row per message.
 
-    `rows`: of the messages that ask, None for all; `length`: of each of them, None where it is not known to be one.
+    `rows`: of the messages that ask, None for all.
     """
 
-    of: OfLengths = field(default_factory=dict)
+    of: Mapping[Stretch, Bytes] = field(default_factory=dict)
     rows: Ints | None = None
-    length: int | None = None
 
     def get(self, stretch: Stretch) -> Bytes | None:
-        found = None if self.length is None else self.of.get(self.length, {}).get(stretch)
+        found = self.of.get(stretch)
         return found if found is None or self.rows is None else found[self.rows]
 
     def chosen(self, rows: Ints) -> ReadAhead:
-        return replace(self, rows=rows if self.rows is None else self.rows[rows])
+        return ReadAhead(self.of, rows if self.rows is None else self.rows[rows])
 
 
 @frozen
@@ -117,10 +111,6 @@ class Messages:
     def payload(self, row: int) -> bytes:
         return self.data[self.start[row] :][: self.length[row]].tobytes()
 
-    def of_length(self, length: int) -> Messages:
-        """The same, all of which have this length."""
-        return replace(self, ahead=replace(self.ahead, length=length))
-
     def chosen(self, rows: Ints | Bools | slice) -> Messages:
         """Some of them."""
         these = np.arange(len(self))[rows]
@@ -142,36 +132,24 @@ def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
 
 @frozen
 class Part:
-    """Messages of one channel among records side by side, in order: where they begin, and how long payloads are."""
+    """Messages of one channel among records side by side, in order: where they begin, and how long payloads are.
+
+    `ahead`: what was read of all of them; None where that is nothing.
+    """
 
     starts: Ints
     lengths: Ints
     log_times: Ints
-    ahead: OfLengths = field(default_factory=dict)
+    ahead: Mapping[Stretch, Bytes] | None = None
 
     def reading_ahead(self, data: Bytes, wanted: Stretches) -> Part:
-        if not wanted or len(wanted) > _MOST_LENGTHS:
+        """Where all have the one length of which something is wanted; to gather several costs more than it saves."""
+        if len(wanted) != 1 or (self.lengths != next(iter(wanted))).any():
             return self
         starts = self.starts + MESSAGE_HEAD.itemsize
-        read: dict[int, dict[Stretch, Bytes]] = {}
-        for length, stretches in wanted.items():
-            here = self.lengths == length
-            some = slice(None) if here.all() else here
-            read[length] = {}
-            for begin, end in stretches:
-                taken = stretches_of(data, starts[some] + begin, end - begin)
-                if some is here:
-                    rows = np.zeros((len(starts), end - begin), dtype=np.uint8)
-                    rows[here] = taken
-                    taken = rows
-                read[length][begin, end] = taken
-        return replace(self, ahead=read)
-
-    def is_read(self) -> bool:
-        """Every message has a length that was wanted."""
-        if len(self.ahead) == 1:
-            return bool((self.lengths == next(iter(self.ahead))).all())
-        return bool(np.isin(self.lengths, list(self.ahead)).all())
+        (stretches,) = wanted.values()
+        ahead = {(begin, end): stretches_of(data, starts + begin, end - begin) for begin, end in stretches}
+        return replace(self, ahead=ahead)
 
 
 @frozen
@@ -195,7 +173,7 @@ class Piece:
             stretches = wanted(channel)
             if stretches is not None:
                 parts[channel] = part.reading_ahead(self.data, stretches)
-                is_all &= parts[channel].is_read()
+                is_all &= parts[channel].ahead is not None
         return Piece(again if is_all else self.data, parts, self.offset, self.size)
 
     @property
@@ -203,8 +181,8 @@ class Piece:
         """Bytes that it takes."""
         if not callable(self.data):
             return self.size
-        ahead = (rows for part in self.parts.values() for of in part.ahead.values() for rows in of.values())
-        return sum(rows.nbytes for rows in ahead) + sum(24 * len(part.starts) for part in self.parts.values())
+        ahead = sum(rows.nbytes for part in self.parts.values() for rows in (part.ahead or {}).values())
+        return ahead + sum(24 * len(part.starts) for part in self.parts.values())
 
 
 @dataclass
@@ -380,10 +358,10 @@ def _messages(parts: Sequence[tuple[int, Part]], records: Records, before: int) 
     starts = np.concatenate([part.starts + base for base, part in parts])
     lengths = np.concatenate([part.lengths for _, part in parts])
     log_times = np.concatenate([part.log_times for _, part in parts])
-    read = [part.ahead for _, part in parts]
-    # A length that was not wanted in all of these pieces is read when it is asked for.
-    ahead = {
-        length: {stretch: np.concatenate([of_part[length][stretch] for of_part in read]) for stretch in read[0][length]}
-        for length in set(read[0]).intersection(*read[1:])
-    }
+    read = [part.ahead for _, part in parts if part.ahead is not None]
+    # Where not all of these pieces were read alike, a stretch is read when it is asked for.
+    alike = len(read) == len(parts) and all(of_part.keys() == read[0].keys() for of_part in read)
+    if not alike or (lengths != lengths[0]).any():
+        return Messages(records, starts, lengths, log_times, before)
+    ahead = {stretch: np.concatenate([of_part[stretch] for of_part in read]) for stretch in read[0]}
     return Messages(records, starts, lengths, log_times, before, ReadAhead(ahead))
