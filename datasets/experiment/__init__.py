@@ -1,4 +1,4 @@
-"""Published experiments at their own size, and what was added to them; `balise experiment NAME --out DIR`.
+"""The published experiment at its own size, and what was added to it; `balise experiment NAME --out DIR`.
 
 Their names cost nothing; what an experiment needs is loaded when it is called.
 """
@@ -19,14 +19,13 @@ if TYPE_CHECKING:
 class Experiment:
     """Writes its tables into a folder and returns what it wrote; its own size where no repetitions are given.
 
-    Its module has `REPETITIONS`, `made(repetitions, seed, jobs, config)`, which gives the contents of the files by
-    name, and `SETTINGS`, if something is fixed beyond that. `configured`: it judges the bank of a configuration; the
-    published experiments have the paper's settings, and silently ignoring others would mislead.
+    The module of its name has `REPETITIONS`, `made(repetitions, seed, jobs, config)`, which gives the contents of the
+    files by name, and `SETTINGS`, if something is fixed beyond that. `configured`: it judges the bank of a
+    configuration; a published experiment has the paper's settings, and silently ignoring others would mislead.
     """
 
     name: str
-    module: str
-    configured: bool = False
+    configured: bool
 
     def __call__(
         self,
@@ -37,22 +36,21 @@ class Experiment:
         config: Configuration | None = None,
         recorded: Path | None = None,
     ) -> list[Path]:
-        if config is not None and not self.configured:
-            from schemas.errors import UsageError
+        """Run it.
 
-            raise UsageError(
-                "takes no configuration",
-                place=f"experiment {self.name}",
-                expected="the published settings",
-                remedy="`rare`, `bank` and `catalogue` judge the bank of a configuration.",
-            )
-        if recorded is not None and self.name != "rare":
-            from schemas.errors import UsageError
-
-            raise UsageError("takes no recorded noise", place=f"experiment {self.name}", expected="`experiment rare`")
+        `recorded`: a result whose noise replaces the published one, which only `rare` takes. Raises `UsageError` where
+        the experiment does not take what is given.
+        """
         from datasets.experiment.tables import write
+        from schemas.errors import UsageError
 
-        module = import_module(f"datasets.experiment.{self.module if recorded is None else 'rare_recorded'}")
+        place = f"experiment {self.name}"
+        if config is not None and not self.configured:
+            remedy = "`rare` and `catalogue` judge the bank of a configuration."
+            raise UsageError("takes no configuration", place=place, expected="the published settings", remedy=remedy)
+        if recorded is not None and self.name != "rare":
+            raise UsageError("takes no recorded noise", place=place, expected="`experiment rare`")
+        module = import_module(f"datasets.experiment.{self.name if recorded is None else 'rare_recorded'}")
         count = repetitions or module.REPETITIONS
         settings = {"experiment": self.name, "repetitions": count, "seed": seed} | getattr(module, "SETTINGS", {})
         noise = () if recorded is None else (recorded,)
@@ -62,13 +60,9 @@ class Experiment:
 EXPERIMENTS: dict[str, Experiment] = {
     one.name: one
     for one in (
-        Experiment("diagnostics", "diagnostics"),
-        Experiment("findings", "findings"),
-        Experiment("pseudorange", "ranges"),
-        Experiment("thresholds", "false_alarms"),
-        Experiment("rare", "rare_tables", configured=True),
-        Experiment("bank", "bank", configured=True),
-        Experiment("catalogue", "catalogue", configured=True),
+        Experiment("diagnostics", configured=False),
+        Experiment("rare", configured=True),
+        Experiment("catalogue", configured=True),
     )
 }
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from datasets.experiment.plan import READINGS, SENSORS
+from datasets.experiment.bank import READINGS, SENSORS
 from schemas.errors import UsageError
 
 if TYPE_CHECKING:

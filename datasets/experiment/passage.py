@@ -8,7 +8,7 @@ at one by one only where their envelope says that a passage is possible, which c
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -45,14 +45,6 @@ class FirstPassages(NamedTuple):
     detected_s: Ints
     failed_s: Ints
     alarmed_before: Bools
-
-
-P = TypeVar("P", bound=tuple[npt.NDArray[np.generic], ...])
-
-
-def concat_passages(parts: list[P]) -> P:
-    """Passages of further repetitions, in order; those are the last axis of every array."""
-    return type(parts[0])(*(np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True)))
 
 
 class NoisePaths:

@@ -7,31 +7,26 @@ satellite geometry is in the rows; the noise path is drawn once for all of them.
 
 from __future__ import annotations
 
-from dataclasses import field
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from datasets.experiment.bank import (
+    PUBLISHED_WEIGHTS,
+    READINGS,
+    SENSORS,
+    BankSpec,
+    Reading,
+    Sensors,
+    bank_of_axis,
+)
 from datasets.experiment.geometry import TAUS_S, Geometry
-from datasets.experiment.sigmas import bank_sigmas
-from schemas.arrays import Floats
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import threshold_factor
 from schemas.frozen import frozen
 
-Reading = Literal["increments", "position"]
-Sensors = Literal["odometer", "odometer_and_track"]
-
-READINGS: tuple[Reading, ...] = ("increments", "position")
-SENSORS: tuple[Sensors, ...] = ("odometer", "odometer_and_track")
 RATES_MPS: tuple[float, ...] = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 HEADINGS_DEG: tuple[float, ...] = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
-# The two readings of the odometer's noise and the slowest EWMA that goes with each (DOMAIN section 7).
-BANKS: dict[Reading, tuple[float, ...]] = {
-    "increments": (1.0, 0.1, 0.01, 0.001),
-    "position": (1.0, 0.1, 0.01, 0.002),
-}
 SIGNALS: tuple[str, ...] = ("east", "north", "up", "map_cross", "odometer_increments", "odometer_position")
 
 
@@ -44,7 +39,6 @@ class ExperimentPlan:
     rates_mps: tuple[float, ...] = RATES_MPS
     readings: tuple[Reading, ...] = READINGS
     sensors: tuple[Sensors, ...] = SENSORS
-    banks: dict[Reading, tuple[float, ...]] = field(default_factory=lambda: dict(BANKS))
     span_s: int = 15_000
     onset_s: int = 5_000
     failure_limit_m: float = 20.0
@@ -55,7 +49,8 @@ class ExperimentPlan:
     @cached_property
     def alphas(self) -> Floats:
         """Every EWMA weight that some reading uses; the first is the raw monitor."""
-        return np.array(sorted({alpha for bank in self.banks.values() for alpha in bank}, reverse=True))
+        used = {alpha for reading in self.readings for alpha in PUBLISHED_WEIGHTS[reading]}
+        return np.array(sorted(used, reverse=True))
 
     @cached_property
     def questions(self) -> tuple[tuple[Reading, float, Sensors], ...]:
@@ -77,38 +72,36 @@ class Forms:
     """
 
     rows: Floats
-    alpha: npt.NDArray[np.int64]
+    alpha: Ints
     threshold: Floats
     slope: Floats
-    members: npt.NDArray[np.bool_]
-    names: tuple[str, ...]
+    members: Bools
 
 
 def bank_forms(plan: ExperimentPlan) -> Forms:
     """All monitors of all headings and readings (DIAG eq. 1-3, 8, 10-16)."""
-    forms = []
+    forms: list[_Form] = []
     for heading in plan.headings_deg:
         for reading in plan.readings:
-            forms += _along(plan, heading, reading)
+            forms += _forms_along(plan, heading, reading)
         if "odometer_and_track" in plan.sensors:
             axis = plan.geometry.axes(heading)[1]
             signals = {"east": axis[0], "north": axis[1], "map_cross": -plan.map_m}
-            forms += _forms_against_map(plan, f"cross_{heading:g}", axis, signals, heading)
+            forms += _forms_against_map(plan, axis, signals, heading)
     if "odometer_and_track" in plan.sensors:
-        forms += _forms_against_map(plan, "up", np.array([0.0, 0.0, 1.0]), {"up": 1.0}, None)
-    rows, alpha, sigma, slope, members, names = zip(*forms, strict=True)
+        # The signal `up` holds the noise of the map already.
+        forms += _forms_against_map(plan, np.array([0.0, 0.0, 1.0]), {"up": 1.0}, None)
     return Forms(
-        np.array(rows),
-        np.array(alpha),
-        threshold_factor(plan.false_alarm_probability) * np.column_stack(sigma),
-        np.array(slope),
-        np.array(members).T,
-        names,
+        np.array([form.row for form in forms]),
+        np.array([form.alpha for form in forms]),
+        threshold_factor(plan.false_alarm_probability) * np.column_stack([form.sigma_mps for form in forms]),
+        np.array([form.slope for form in forms]),
+        np.array([form.members for form in forms]).T,
     )
 
 
 def failure_forms(plan: ExperimentPlan) -> Forms:
-    """The along-track error itself, by heading, in units of the failure limit."""
+    """The along-track error itself, by heading, against the failure limit."""
     count = len(plan.headings_deg)
     rows = np.zeros((count, plan.basis_size))
     slope = np.zeros(count)
@@ -123,55 +116,68 @@ def failure_forms(plan: ExperimentPlan) -> Forms:
         np.full((1, count), plan.failure_limit_m),
         slope,
         np.eye(count, dtype=np.bool_),
-        tuple(f"failure_{heading:g}" for heading in plan.headings_deg),
     )
+
+
+@frozen
+class _Form:
+    """One monitor: row over the basis, index of its weight, sigma by epoch, slope, and the questions it answers."""
+
+    row: Floats
+    alpha: int
+    sigma_mps: Floats
+    slope: float
+    members: list[bool]
 
 
 def _towards(slope: float) -> float:
     return -1.0 if slope < 0 else 1.0
 
 
-# Row over the basis, index of the weight, sigma by epoch, slope, the questions it answers, name.
-_Form = tuple[Floats, int, Floats, float, list[bool], str]
-
-
-def _along(plan: ExperimentPlan, heading: float, reading: Reading) -> list[_Form]:
+def _forms_along(plan: ExperimentPlan, heading: float, reading: Reading) -> list[_Form]:
+    """Along the track, against the odometer with its noise on this reading."""
     axis = plan.geometry.axes(heading)[0]
-    white = (plan.odometer_m, 0.0) if reading == "increments" else (0.0, plan.odometer_m)
     signals = {"east": axis[0], "north": axis[1], f"odometer_{reading}": -plan.odometer_m}
-    members = [(r, h) == (reading, heading) for r, h, _ in plan.questions]
-    name = f"along_{reading}_{heading:g}"
-    return [_form(plan, name, axis, alpha, signals, white, members) for alpha in plan.banks[reading]]
+    answers = [(r, h) == (reading, heading) for r, h, _ in plan.questions]
+    spec = BankSpec(reading=reading, odometer_m=plan.odometer_m, age_s=0.0)
+    return _forms(plan, axis, spec, 0.0, signals, [answers] * len(spec.weights))
 
 
 def _forms_against_map(
-    plan: ExperimentPlan, name: str, axis: Floats, signals: dict[str, float], heading: float | None
+    plan: ExperimentPlan, axis: Floats, signals: dict[str, float], heading: float | None
 ) -> list[_Form]:
-    """Across the track, or in height at any heading: against the map."""
-    white = (0.0, plan.map_m)
-    return [_form(plan, name, axis, alpha, signals, white, _with_track(plan, alpha, heading)) for alpha in plan.alphas]
+    """Across the track, or in height at any heading, against the map; of questions whose bank has the weight."""
+    spec = BankSpec(alphas=tuple(plan.alphas.tolist()), odometer_m=0.0, age_s=0.0)
+    members = [
+        [
+            sensors == "odometer_and_track" and alpha in PUBLISHED_WEIGHTS[reading] and heading in (None, course)
+            for reading, course, sensors in plan.questions
+        ]
+        for alpha in spec.weights
+    ]
+    return _forms(plan, axis, spec, plan.map_m, signals, members)
 
 
-def _with_track(plan: ExperimentPlan, alpha: float, heading: float | None) -> list[bool]:
-    """The questions with track, of this heading or all, whose bank has the weight."""
-    return [s == "odometer_and_track" and alpha in plan.banks[r] and heading in (None, h) for r, h, s in plan.questions]
-
-
-def _form(
+def _forms(
     plan: ExperimentPlan,
-    name: str,
     axis: Floats,
-    alpha: float,
+    spec: BankSpec,
+    white_m: float,
     signals: dict[str, float],
-    white_m: tuple[float, float],
-    members: list[bool],
-) -> _Form:
-    """The basis is [alpha, signal] with the position at the end; `white_m`: noise on increments and on position."""
-    index = int(np.flatnonzero(plan.alphas == alpha)[0])
+    members: list[list[bool]],
+) -> list[_Form]:
+    """A form for each weight of the bank; the basis is [alpha, signal] with the position at the end.
+
+    `axis`: unit vector (3,). `white_m`: noise on the position. `signals`: what of each signal the monitors see.
+    """
+    variances_m2 = np.einsum("a,jab,b->j", axis, plan.geometry.source_covariances_m2, axis)
+    sigmas_mps = bank_of_axis(spec, variances_m2, TAUS_S, white_m).sigmas(plan.span_s)
     slope = float(axis @ plan.geometry.ramp_direction)
-    row = np.zeros(plan.basis_size)
-    for signal, factor in signals.items():
-        row[index * len(SIGNALS) + SIGNALS.index(signal)] = factor * _towards(slope)
-    variances = np.einsum("a,jab,b->j", axis, plan.geometry.source_covariances_m2, axis)
-    sigma = bank_sigmas(np.array([alpha]), plan.span_s, variances, TAUS_S, *white_m)[:, 0]
-    return row, index, sigma, abs(slope), members, f"{name}_{'raw' if alpha == 1.0 else f'{alpha:g}'}"
+    forms = []
+    for weight, sigma_mps, answers in zip(spec.weights, sigmas_mps.T, members, strict=True):
+        index = int(np.flatnonzero(plan.alphas == weight)[0])
+        row = np.zeros(plan.basis_size)
+        for signal, factor in signals.items():
+            row[index * len(SIGNALS) + SIGNALS.index(signal)] = factor * _towards(slope)
+        forms.append(_Form(row, index, sigma_mps, abs(slope), answers))
+    return forms

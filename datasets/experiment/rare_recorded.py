@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from datasets.experiment.linear_bank import BankSpec, LinearBank, bank_along
-from datasets.experiment.rare import false_alarm_probability, figures, missed_detection_probability
-from datasets.experiment.rare_tables import TARGETS, epochs_until
+from datasets.experiment.bank import BankSpec, LinearBank, bank_of_axis
+from datasets.experiment.rare import HOUR_S, LONGEST_S, REPETITIONS, alarm_figures, miss_figures
 from datasets.experiment.tables import Contents, Row, table
 from pipeline.results.store import read_config, read_table
 from pipeline.stages.monitors.axis import error_model
@@ -25,10 +24,9 @@ from schemas.errors import UsageError
 from schemas.frozen import frozen
 from schemas.tables import SCALES
 
-REPETITIONS = 20_000
+__all__ = ["REPETITIONS", "RecordedNoise", "made", "recorded_noises"]
+
 RATES_MPS: tuple[float, ...] = (0.01, 0.03, 0.1, 1.0)
-_LONGEST_S = 10_000
-_HOUR_S = 3_600
 # White noise of sigma w has the lasting part M = 1.5 w^2 in the thresholds (DOMAIN section 3: 4 M = 6 w^2).
 _LASTING = 1.5
 # Slower ramps are found by the averages, which see the same noise at 1 Hz and at 10 Hz.
@@ -51,7 +49,7 @@ class RecordedNoise:
         """The configured bank on this noise."""
         shares, taus_s = error_model(config.monitors)
         spec = BankSpec.of(config.monitors, "odometer", rate_hz)
-        return bank_along(spec, shares * self.sigma_m**2, taus_s, float(np.sqrt(_LASTING)) * self.white_m)
+        return bank_of_axis(spec, shares * self.sigma_m**2, taus_s, float(np.sqrt(_LASTING)) * self.white_m)
 
 
 def made(result: Path, runs: int, seed: int, jobs: int, config: Configuration | None) -> Contents:
@@ -96,7 +94,7 @@ def _noise_of(result: Path, solution: object, runs: pl.DataFrame) -> RecordedNoi
     return RecordedNoise(
         solution=str(solution),
         runs=runs.height,
-        hours=float(runs["duration_s"].sum()) / _HOUR_S,
+        hours=float(runs["duration_s"].sum()) / HOUR_S,
         rate_hz=_median(runs["gnss_rate_hz"]),
         sigma_m=float(row["sigma_along_m"]),
         white_m=_median(runs["white_noise_along_m"]),
@@ -129,18 +127,14 @@ def _missed(noise: RecordedNoise, config: Configuration, runs: int, seed: int, j
         rate_hz = noise.rate_hz if rate_mps >= _SLOWEST_AT_RECORDED_RATE_MPS else min(1.0, noise.rate_hz)
         bank = noise.bank(config, rate_hz)
         failure_s = config.hazards.limits.failure_m / rate_mps
-        asked = [("failure", int(min(failure_s, _LONGEST_S) * rate_hz))]
-        found = epochs_until(bank, rate_mps, TARGETS, seed, jobs, 1.0 / rate_hz)
-        asked += [(f"{target:g}", epochs) for target, epochs in zip(TARGETS, found, strict=True) if epochs is not None]
-        for reason, epochs in asked:
-            missed = missed_detection_probability(bank, epochs, rate_mps, runs, seed, jobs)
+        at_failure = int(min(failure_s, LONGEST_S) * rate_hz)
+        for reason, epochs, found in miss_figures(bank, rate_mps, at_failure, 1.0 / rate_hz, runs, seed, jobs):
             of = {"solution": noise.solution, "rate_mps": rate_mps, "evaluated_hz": rate_hz, "chosen_for": reason}
             time_s = epochs / rate_hz
-            rows.append(of | {"time_s": time_s, "time_since_failure_s": time_s - failure_s} | figures(missed))
+            rows.append(of | {"time_s": time_s, "time_since_failure_s": time_s - failure_s} | found)
     return rows
 
 
 def _alarms(noise: RecordedNoise, config: Configuration, runs: int, seed: int, jobs: int) -> Row:
-    bank = noise.bank(config, noise.rate_hz)
-    alarm = false_alarm_probability(bank, int(_HOUR_S * noise.rate_hz), max(runs // 20, 20), seed, jobs)
-    return {"solution": noise.solution, "horizon_s": float(_HOUR_S), "evaluated_hz": noise.rate_hz} | figures(alarm)
+    found = alarm_figures(noise.bank(config, noise.rate_hz), int(HOUR_S * noise.rate_hz), runs, seed, jobs)
+    return {"solution": noise.solution, "horizon_s": HOUR_S, "evaluated_hz": noise.rate_hz} | found

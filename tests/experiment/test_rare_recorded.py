@@ -10,8 +10,8 @@ import polars as pl
 import pytest
 
 from datasets.experiment import EXPERIMENTS, rare_recorded
-from datasets.experiment.linear_bank import BankSpec, bank_along
-from datasets.experiment.rare import missed_detection_probability
+from datasets.experiment.bank import BankSpec, bank_of_axis
+from datasets.experiment.sampling import missed_detection_probability
 from schemas.config import Configuration, MonitorConfig
 from schemas.errors import UsageError
 
@@ -21,7 +21,7 @@ R_M2, TAU_S, WHITE_M = np.array([0.2, 0.1, 0.0, 0.7]), np.array([360.0, 1800.0, 
 
 def test_monitors_and_misses_are_those_of_simulated_positions() -> None:
     """2,000 journeys of 1,200 s without a fault, then a ramp of 0.03 m/s for 120 s; thresholds are the bank's own."""
-    made = bank_along(SPEC, R_M2, TAU_S, WHITE_M)
+    made = bank_of_axis(SPEC, R_M2, TAU_S, WHITE_M)
     rng = np.random.default_rng(4)
     journeys, before, after, rate_mps = 2_000, 1_200, 120, 0.03
     phi = np.exp(-1.0 / TAU_S)[:, None]
@@ -92,7 +92,7 @@ def test_a_result_without_fault_free_noise_is_refused(monkeypatch: pytest.Monkey
 
 def test_only_the_rare_side_takes_recorded_noise(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="takes no recorded noise"):
-        EXPERIMENTS["bank"](tmp_path, recorded=tmp_path)
+        EXPERIMENTS["catalogue"](tmp_path, recorded=tmp_path)
 
 
 def test_the_model_is_that_of_the_thresholds() -> None:

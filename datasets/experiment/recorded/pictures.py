@@ -8,7 +8,7 @@ from math import log10
 
 import polars as pl
 
-from datasets.experiment.recorded.drawing import COLOURS, Axis, Curve, both_ways_log, plot, svg, text
+from datasets.experiment.drawing import COLOURS, Axis, Curve, both_ways_log, plot, svg, text
 from datasets.faults import FaultKind
 
 _TIMES_S = (-3000.0, -1000.0, -300.0, -100.0, -30.0, -10.0, -3.0, 0.0, 3.0, 10.0, 30.0, 100.0, 300.0)
